@@ -1,0 +1,1 @@
+"""First floor: arm models, joint effects, statics."""

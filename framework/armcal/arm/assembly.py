@@ -1,0 +1,151 @@
+"""An arm: a model, its effects and its masses, put together under one instance name."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import casadi as ca
+
+from armcal.arm.effects import JointCommand, JointEffect, Spring
+from armcal.arm.model import ArmModel, Chain, forward
+from armcal.arm.statics import Load, Mass, deflections, split_deflection, wrenches
+from armcal.base.parameters import ParameterBlock, scalar
+from armcal.base.se3 import Expression, Transform
+
+
+@dataclass(frozen=True)
+class MassSpec:
+    """A mass as it is stated: kg, centre in m in a named frame, and the last joint it loads (None: the physical one)."""
+
+    name: str
+    mass: float
+    com: tuple[float, float, float]
+    frame: str
+    loads_up_to: int | None = None
+
+
+@dataclass(frozen=True)
+class ArmInputs:
+    """What one record says of one arm: commands and approaches (n x 1), the load, the deflection to start from."""
+
+    joint_angles: Expression
+    approach: Expression
+    load: Load
+    deflection: Expression
+
+
+@dataclass(frozen=True)
+class ArmState:
+    """An arm in one record: its tool and named frames, and the deflection that its springs answer with.
+
+    In equilibrium ``next_deflection`` equals the deflection that was put in.
+    """
+
+    root_T_tool: Transform
+    frames: Mapping[str, Transform]
+    next_deflection: Expression
+
+
+@dataclass(frozen=True)
+class Arm:
+    """One arm of a problem.
+
+    Attributes:
+        name: the instance name, first part of every parameter name.
+        model_name: the model's name within it (``mdh``).
+        model: the arm model.
+        effects: joint effects by their names.
+        masses: what gravity pulls on.
+    """
+
+    name: str
+    model_name: str
+    model: ArmModel
+    effects: Mapping[str, JointEffect]
+    masses: tuple[MassSpec, ...]
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """From the base to the tip."""
+        return self.model.joint_names
+
+    @cached_property
+    def joint_dimensions(self) -> tuple[str, ...]:
+        """``angle`` or ``length`` of each joint's command."""
+        return tuple("angle" if joint.is_revolute else "length" for joint in self.nominal_chain.joints)
+
+    @cached_property
+    def nominal_chain(self) -> Chain:
+        """The chain at nominal parameters."""
+        return self.chain(self._nominal)
+
+    @cached_property
+    def _nominal(self) -> dict[str, Expression]:
+        return {block.name: ca.SX(list(block.nominal)) for block in self.parameters()}
+
+    def parameters(self) -> tuple[ParameterBlock, ...]:
+        """All blocks, under their full names."""
+        blocks = list(prefixed(self._scope(self.model_name), self.model.parameters()))
+        for name, effect in self.effects.items():
+            blocks += prefixed(self._scope(name), effect.parameters())
+        for mass in self.masses:
+            local = [scalar("mass", "kg", mass.mass, 0.1)]
+            local += [scalar(f"com_{axis}", "m", x, 0.01) for axis, x in zip("xyz", mass.com, strict=True)]
+            blocks += prefixed(self._scope(f"links.{mass.name}"), local)
+        return tuple(blocks)
+
+    def chain(self, values: Mapping[str, Expression]) -> Chain:
+        """The model's chain, for full parameter names."""
+        return self.model.chain(scoped(values, self._scope(self.model_name)))
+
+    def springs(self, values: Mapping[str, Expression]) -> tuple[Spring, ...]:
+        """The springs of all effects, in the order of the effects."""
+        return tuple(
+            spring
+            for name, effect in self.effects.items()
+            for spring in effect.springs(scoped(values, self._scope(name)))
+        )
+
+    @cached_property
+    def deflection_size(self) -> int:
+        """How many numbers an elastic state of this arm has."""
+        return sum(spring.size for spring in self.springs(self._nominal))
+
+    def state(self, values: Mapping[str, Expression], inputs: ArmInputs) -> ArmState:
+        """One elastic pass: the arm's frames at a deflection, and the deflection these frames lead to."""
+        chain, springs = self.chain(values), self.springs(values)
+        along, rotations = split_deflection(chain, springs, inputs.deflection)
+        displacements = [
+            joint.offset + along[i] + self._commanded(values, inputs, i) for i, joint in enumerate(chain.joints)
+        ]
+        frames = forward(chain, displacements, rotations)
+        acting = wrenches(chain, frames, self._masses(values), inputs.load)
+        return ArmState(frames.root_T_tool, frames.named, deflections(chain, frames, acting, springs))
+
+    def _commanded(self, values: Mapping[str, Expression], inputs: ArmInputs, index: int) -> Expression:
+        command = JointCommand(index, inputs.joint_angles[index], inputs.approach[index])
+        added = [e.displacement(command, scoped(values, self._scope(n))) for n, e in self.effects.items()]
+        return command.commanded + sum(added, ca.SX(0))
+
+    def _masses(self, values: Mapping[str, Expression]) -> Sequence[Mass]:
+        result = []
+        for mass in self.masses:
+            local = scoped(values, self._scope(f"links.{mass.name}"))
+            com = ca.sparsify(ca.vertcat(*[local[f"com_{axis}"] for axis in "xyz"]))
+            result.append(Mass(mass.name, local["mass"], com, mass.frame, mass.loads_up_to))
+        return result
+
+    def _scope(self, component: str) -> str:
+        return f"{self.name}.{component}."
+
+
+def prefixed(scope: str, blocks: Sequence[ParameterBlock]) -> tuple[ParameterBlock, ...]:
+    """Local blocks under their full names."""
+    return tuple(replace(block, name=scope + block.name) for block in blocks)
+
+
+def scoped(values: Mapping[str, Expression], scope: str) -> dict[str, Expression]:
+    """The values below a scope, under their local names."""
+    return {name.removeprefix(scope): value for name, value in values.items() if name.startswith(scope)}

@@ -1,0 +1,142 @@
+"""Arm models: the chain of joints that a model describes, and the pose of every frame of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import casadi as ca
+
+from armcal.base import se3
+from armcal.base.parameters import ParameterBlock
+from armcal.base.se3 import Expression, Transform
+
+Vector3 = tuple[float, float, float]
+Z_AXIS: Vector3 = (0.0, 0.0, 1.0)
+
+
+@dataclass(frozen=True)
+class Joint:
+    """One joint of a chain.
+
+    Attributes:
+        name: the joint's name.
+        parent_T_joint: from the moving frame of the joint before it (the chain's base for the first) to this
+            joint's frame at zero displacement.
+        angular: the axis of a revolute joint (unit, in its own frame); zeros for a prismatic one.
+        linear: the direction of a prismatic joint; zeros for a revolute one.
+        offset: displacement (rad or m) at zero angle.
+    """
+
+    name: str
+    parent_T_joint: Transform
+    angular: Vector3 = Z_AXIS
+    linear: Vector3 = (0.0, 0.0, 0.0)
+    offset: Expression = 0.0
+
+    @property
+    def is_revolute(self) -> bool:
+        """Whether it turns."""
+        return any(self.angular)
+
+    @property
+    def axis(self) -> Vector3:
+        """The direction about which it turns, or along which it slides."""
+        return self.angular if self.is_revolute else self.linear
+
+    def motion(self, displacement: Expression) -> Transform:
+        """The joint's own motion at a displacement (rad or m), in its frame."""
+        for name, unit in zip("xyz", ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), Z_AXIS), strict=True):
+            if self.angular == unit:
+                return se3.rotation_about(name, displacement)
+            if self.linear == unit and not self.is_revolute:
+                return se3.translation_along(name, displacement)
+        angular, linear = (ca.sparsify(ca.SX(list(vector))) for vector in (self.angular, self.linear))
+        return se3.screw_motion(angular, linear, displacement)
+
+
+@dataclass(frozen=True)
+class Attachment:
+    """A frame fixed to the chain: which joint moves it last (0: none, it stands on the base), and where it sits."""
+
+    joint: int
+    joint_T_frame: Transform
+
+
+@dataclass(frozen=True)
+class Chain:
+    """A serial chain in the form that statics and effects work on.
+
+    Attributes:
+        root_T_base: from the frame in which the arm is measured to the base, the frame that carries joint 1. A
+            base spring deflects about its origin.
+        joints: from the base to the tip.
+        tool: the last frame, as an attachment.
+        frames: further named frames, for masses and measurements.
+    """
+
+    root_T_base: Transform
+    joints: tuple[Joint, ...]
+    tool: Attachment
+    frames: Mapping[str, Attachment] = field(default_factory=dict)
+
+
+class ArmModel(Protocol):
+    """What a plugin provides to describe an arm.
+
+    ``parameters`` are blocks with local names (``theta3``); the framework puts the instance before them
+    (``arm.mdh.theta3``). ``chain`` is given their values as CasADi expressions under the local names.
+    """
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """From the base to the tip."""
+
+    def parameters(self) -> Sequence[ParameterBlock]:
+        """Every number of the model."""
+
+    def chain(self, values: Mapping[str, Expression]) -> Chain:
+        """The chain as an expression of the parameters."""
+
+
+@dataclass(frozen=True)
+class Site:
+    """Where a deflection can happen: the base or a joint, in the root frame, after the joint's motion."""
+
+    origin: Expression
+    rotation: Expression
+
+
+@dataclass(frozen=True)
+class Frames:
+    """The pose of everything, in the root frame: sites (0 the base, i joint i), the tool, the named frames."""
+
+    sites: tuple[Site, ...]
+    root_T_tool: Transform
+    named: Mapping[str, Transform]
+
+
+def forward(
+    chain: Chain, displacements: Sequence[Expression], rotations: Mapping[int, Expression]
+) -> Frames:
+    """Forward kinematics with deflections.
+
+    Args:
+        chain: the arm.
+        displacements: of each joint (rad or m), effects and offsets included.
+        rotations: a further rotation (3x3) at a site (0 the base), after the joint's motion.
+    """
+    moving = [_deflected(chain.root_T_base, rotations.get(0))]
+    for index, (joint, displacement) in enumerate(zip(chain.joints, displacements, strict=True), start=1):
+        here = moving[-1] @ joint.parent_T_joint @ joint.motion(displacement)
+        moving.append(_deflected(here, rotations.get(index)))
+    return Frames(
+        sites=tuple(Site(pose.translation, pose.rotation) for pose in moving),
+        root_T_tool=moving[chain.tool.joint] @ chain.tool.joint_T_frame,
+        named={name: moving[at.joint] @ at.joint_T_frame for name, at in chain.frames.items()},
+    )
+
+
+def _deflected(pose: Transform, rotation: Expression | None) -> Transform:
+    return pose if rotation is None else pose @ Transform(rotation, ca.SX(3, 1))

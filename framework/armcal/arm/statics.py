@@ -1,0 +1,163 @@
+"""Statics: gravity and load to moments at the base and the joints, and what the springs make of them.
+
+The moment of every weight beyond a site is the cross product of one first moment with gravity, so the
+cost does not grow with the number of masses. [Conenna2024]
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import casadi as ca
+
+from armcal.arm.effects import Spring
+from armcal.arm.model import Chain, Frames
+from armcal.base import se3
+from armcal.base.se3 import Expression
+
+BASE_FRAME, TOOL_FRAME = "base", "tool"
+
+
+@dataclass(frozen=True)
+class Mass:
+    """A mass of the arm.
+
+    Attributes:
+        name: what it is.
+        mass: kg.
+        com: centre of mass in its frame (3x1, m).
+        frame: a named frame of the chain, ``base`` or ``tool``.
+        loads_up_to: the last joint it loads (from 1); None for the physical one, the joint that moves it.
+    """
+
+    name: str
+    mass: Expression
+    com: Expression
+    frame: str
+    loads_up_to: int | None = None
+
+
+@dataclass(frozen=True)
+class Load:
+    """What acts on the arm in one record.
+
+    Attributes:
+        gravity: acceleration in the root frame (3x1, m/s^2).
+        payload_mass: kg, on top of the arm's own masses.
+        payload_com: its centre in the tool frame (3x1, m).
+        force: external force at the tool frame's origin, in the root frame's axes (3x1, N).
+        torque: external torque, in the root frame's axes (3x1, N m).
+    """
+
+    gravity: Expression
+    payload_mass: Expression
+    payload_com: Expression
+    force: Expression
+    torque: Expression
+
+
+@dataclass(frozen=True)
+class SiteWrench:
+    """What a site carries, in the root frame: moment about its origin (N m) and force (N)."""
+
+    moment: Expression
+    force: Expression
+
+
+def wrenches(chain: Chain, frames: Frames, masses: Sequence[Mass], load: Load) -> tuple[SiteWrench, ...]:
+    """The wrench that everything beyond it puts on each site (0 the base, i joint i)."""
+    last = len(chain.joints)
+    weight_at: dict[int, Expression] = defaultdict(lambda: ca.SX(0))
+    moment_at: dict[int, Expression] = defaultdict(lambda: ca.SX(3, 1))
+    for mass in masses:
+        pose, moved_by = _frame(chain, frames, mass.frame)
+        up_to = moved_by if mass.loads_up_to is None else mass.loads_up_to
+        weight_at[up_to] += mass.mass
+        moment_at[up_to] += mass.mass * pose.apply(mass.com)
+    weight_at[last] += load.payload_mass
+    moment_at[last] += load.payload_mass * frames.root_T_tool.apply(load.payload_com)
+    result: list[SiteWrench] = []
+    weight, first_moment = ca.SX(0), ca.SX(3, 1)
+    for index in reversed(range(last + 1)):
+        weight, first_moment = weight + weight_at[index], first_moment + moment_at[index]
+        origin = frames.sites[index].origin
+        moment = _cross(first_moment - weight * origin, load.gravity) + load.torque
+        moment += _cross(frames.root_T_tool.translation - origin, load.force)
+        result.append(SiteWrench(moment, weight * load.gravity + load.force))
+    return tuple(reversed(result))
+
+
+def deflections(
+    chain: Chain, frames: Frames, acting: Sequence[SiteWrench], springs: Sequence[Spring]
+) -> Expression:
+    """What each spring coordinate deflects under the wrenches, stacked in the order of the springs."""
+    parts = []
+    for spring in springs:
+        site, wrench = frames.sites[spring.site], acting[spring.site]
+        joint = chain.joints[spring.site - 1] if spring.site else None
+        slides = joint is not None and not spring.directions and not joint.is_revolute
+        generalised = wrench.force if slides else wrench.moment
+        axes = spring.directions or ((joint.axis,) if joint else ())
+        along = [ca.dot(ca.mtimes(site.rotation, ca.SX(list(axis))), generalised) for axis in axes]
+        parts.append(spring.law(ca.vertcat(*along)))
+    return ca.vertcat(*parts) if parts else ca.SX(0, 1)
+
+
+def split_deflection(
+    chain: Chain, springs: Sequence[Spring], deflection: Expression
+) -> tuple[list[Expression], dict[int, Expression]]:
+    """A stacked deflection as displacements on joints' own axes and rotations at sites.
+
+    Returns:
+        what to add to each joint's displacement, and the rotation matrices by site.
+    """
+    along = [ca.SX(0) for _ in chain.joints]
+    vectors: dict[int, Expression] = {}
+    single: dict[int, tuple[Expression, Expression]] = {}
+    start = 0
+    for spring in springs:
+        part = deflection[start : start + spring.size]
+        start += spring.size
+        if not spring.directions:
+            along[spring.site - 1] += part
+            continue
+        directions = ca.horzcat(*[ca.SX(list(axis)) for axis in spring.directions])
+        if spring.site in vectors or spring.size > 1:
+            single.pop(spring.site, None)
+        else:
+            single[spring.site] = (directions, part)
+        vectors[spring.site] = vectors.get(spring.site, ca.SX(3, 1)) + ca.mtimes(directions, part)
+    rotations = {
+        site: _rotation(*single[site]) if site in single else se3.small_rotation(vector)
+        for site, vector in vectors.items()
+    }
+    return along, rotations
+
+
+def _rotation(axis: Expression, angle: Expression) -> Expression:
+    """About one constant axis: exact, and cheap for a coordinate axis."""
+    for index, name in enumerate("xyz"):
+        if all(float(axis[i]) == (i == index) for i in range(3)):
+            return se3.rotation_about(name, angle).rotation
+    return se3.rotation_about_unit(axis, angle)
+
+
+def _frame(chain: Chain, frames: Frames, name: str) -> tuple[se3.Transform, int]:
+    if name == TOOL_FRAME:
+        return frames.root_T_tool, chain.tool.joint
+    if name == BASE_FRAME:
+        site = frames.sites[0]
+        return se3.Transform(site.rotation, site.origin), 0
+    return frames.named[name], chain.frames[name].joint
+
+
+def _cross(a: Expression, b: Expression) -> Expression:
+    return ca.cross(ca.densify(a), ca.densify(b))
+
+
+def frame_names(chain: Chain) -> Mapping[str, int]:
+    """Every frame a mass may be given in, and the joint that moves it."""
+    moved_by = {name: at.joint for name, at in chain.frames.items()}
+    return {BASE_FRAME: 0, **moved_by, TOOL_FRAME: chain.tool.joint}

@@ -1,0 +1,1 @@
+"""Ground floor: units, rigid motions, parameters, datasets."""

@@ -1,0 +1,88 @@
+"""Text of a configuration that remembers where it was written, so that a path in it can be found."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from armcal.errors import ConfigError, Location
+
+
+class ConfigText(str):
+    """A text scalar of a config.
+
+    Attributes:
+        location: where it was written.
+        base_dir: what a relative path in it is relative to: the directory of its file; for a value from the
+            command line the working directory.
+        root: the directory that a path in it may not leave; None: anywhere (from the command line).
+    """
+
+    location: Location
+    base_dir: Path
+    root: Path | None
+
+    def __new__(
+        cls,
+        text: str,
+        location: Location | None = None,
+        base_dir: Path | None = None,
+        root: Path | None = None,
+    ) -> ConfigText:
+        """Wrap a text; without a directory it is relative to the working directory."""
+        made = super().__new__(cls, text)
+        made.location = location or Location()
+        made.base_dir = base_dir or Path.cwd()
+        made.root = root
+        return made
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return ConfigText, (str(self), self.location, self.base_dir, self.root)
+
+
+def plain(value: Any) -> Any:
+    """A config value with every text turned into an ordinary ``str``, through mappings and lists."""
+    if isinstance(value, str):
+        return str(value)
+    if isinstance(value, dict):
+        return {str(key): plain(entry) for key, entry in value.items()}
+    if isinstance(value, list):
+        return [plain(entry) for entry in value]
+    return value
+
+
+def resolve_path(text: ConfigText | str) -> Path:
+    """The absolute path that a config's text names; it need not exist.
+
+    Args:
+        text: relative to the directory of the file it was written in; an ordinary ``str`` is relative to the
+            working directory and may name any place.
+
+    Raises:
+        ConfigError: not a path, or outside the root once symbolic links are followed.
+    """
+    where = text.location if isinstance(text, ConfigText) else None
+    base = text.base_dir if isinstance(text, ConfigText) else Path.cwd()
+    root = text.root if isinstance(text, ConfigText) else None
+    if not text.strip() or "\0" in text:
+        raise ConfigError(
+            f"found {str(text)!r}, expected the path of a file.",
+            where=where,
+            hint="Name the file, or leave the key out.",
+        )
+    try:
+        found = (base / text).resolve()
+        limit = root.resolve() if root is not None else None
+    except (OSError, RuntimeError, ValueError) as fault:
+        raise ConfigError(
+            f"the path {str(text)!r} cannot be followed ({fault}).",
+            where=where,
+            hint="Check its spelling and its symbolic links.",
+        ) from fault
+    if limit is not None and not found.is_relative_to(limit):
+        raise ConfigError(
+            f"the path {str(text)!r} leads to {found}, outside the root {limit}.",
+            where=where,
+            hint="Move the file below the root, or give its path on the command line.",
+        )
+    return found

@@ -1,0 +1,91 @@
+"""Datasets: records as named columns, SI inside."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armcal.base.domains import Array
+from armcal.errors import DataError
+
+
+@dataclass(frozen=True)
+class SetAside:
+    """A record that takes no part, and why."""
+
+    row: int
+    record_id: str
+    reason: str
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """Records as columns.
+
+    Attributes:
+        ids: one a record, as written in the source.
+        channels: SI values by channel name (``arm.q1``, ``tracker.x``, ``gravity_z``), each of length N.
+        extra: columns that nothing asked for, kept as text.
+        rows: where each record stood in its source (from 1; a CSV's line).
+        source: a file name or what made the records.
+        sha256: of the source's bytes; empty if there were none.
+        set_aside: records left out on reading.
+        warnings: what a user should know before trusting the data.
+    """
+
+    ids: tuple[str, ...]
+    channels: Mapping[str, Array]
+    extra: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    rows: tuple[int, ...] = ()
+    source: str = ""
+    sha256: str = ""
+    set_aside: tuple[SetAside, ...] = ()
+    warnings: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    def column(self, channel: str) -> Array:
+        """One channel.
+
+        Raises:
+            DataError: the dataset has no such channel.
+        """
+        if channel not in self.channels:
+            raise DataError(
+                f"{self.source or 'the dataset'} has no values for {channel}; it has {', '.join(self.channels)}."
+            )
+        return self.channels[channel]
+
+    def stacked(self, channels: Sequence[str]) -> Array:
+        """Several channels as rows of a (channels x N) matrix."""
+        if not channels:
+            return np.zeros((0, len(self)))
+        return np.ascontiguousarray(np.vstack([self.column(name) for name in channels]))
+
+    def has(self, channel: str) -> bool:
+        """Whether a channel is there."""
+        return channel in self.channels
+
+    def subset(self, chosen: NDArray[np.intp] | Sequence[int]) -> Dataset:
+        """Some records, in the order of ``chosen``."""
+        index = np.asarray(chosen, dtype=np.intp)
+        return replace(
+            self,
+            ids=tuple(self.ids[i] for i in index),
+            channels={name: values[index] for name, values in self.channels.items()},
+            extra={name: tuple(values[i] for i in index) for name, values in self.extra.items()},
+            rows=tuple(self.rows[i] for i in index) if self.rows else (),
+        )
+
+    def without(self, faulty: Mapping[int, str]) -> Dataset:
+        """All records but some (index to reason), which are listed as set aside."""
+        if not faulty:
+            return self
+        kept = self.subset([i for i in range(len(self)) if i not in faulty])
+        row = self.rows or tuple(range(1, len(self) + 1))
+        listed = tuple(SetAside(row[i], self.ids[i], reason) for i, reason in sorted(faulty.items()))
+        return replace(kept, set_aside=self.set_aside + listed)

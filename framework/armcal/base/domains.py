@@ -1,0 +1,315 @@
+"""Where a parameter block lives, and how an increment moves it.
+
+A block stores one canonical value whatever the solver; a solver sees an increment ``delta`` with
+``value = retract(base, delta)``. Residuals are differentiated with respect to the canonical entries,
+and ``retract_jacobian`` carries that over to increments, so a model's expression never knows how a
+solver moves its parameters.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+_LOWER = np.tril_indices(3)
+_SYMMETRIC = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+
+
+class Domain(Protocol):
+    """What a parameter block needs to know of its own shape."""
+
+    @property
+    def entries(self) -> tuple[str, ...]:
+        """Suffix of each canonical number; one empty suffix for a scalar."""
+
+    @property
+    def dof(self) -> int:
+        """How many numbers an increment has."""
+
+    def check(self, value: Array) -> str:
+        """What is wrong with a canonical value; empty when nothing is."""
+
+    def retract(self, base: Array, delta: Array) -> Array:
+        """The canonical value that ``delta`` (dof) leads to from ``base``."""
+
+    def local(self, base: Array, value: Array) -> Array:
+        """The increment that leads from ``base`` to ``value``; the inverse of ``retract``."""
+
+    def retract_jacobian(self, base: Array, delta: Array) -> Array:
+        """d retract / d delta at ``delta`` (entries x dof)."""
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A number between two bounds, both allowed."""
+
+    lower: float = -math.inf
+    upper: float = math.inf
+
+    @property
+    def entries(self) -> tuple[str, ...]:
+        """One entry, without a suffix."""
+        return ("",)
+
+    @property
+    def dof(self) -> int:
+        """One."""
+        return 1
+
+    def check(self, value: Array) -> str:
+        """Within the bounds."""
+        inside = self.lower <= value[0] <= self.upper
+        return "" if inside else f"{value[0]:g} is outside {self.lower:g} to {self.upper:g}"
+
+    def retract(self, base: Array, delta: Array) -> Array:
+        """Addition."""
+        return np.asarray(base + delta)
+
+    def local(self, base: Array, value: Array) -> Array:
+        """Subtraction."""
+        return np.asarray(value - base)
+
+    def retract_jacobian(self, base: Array, delta: Array) -> Array:
+        """One."""
+        return np.eye(1)
+
+
+@dataclass(frozen=True)
+class Rotation:
+    """A rotation: unit quaternion (w, x, y, z); increments are rotation vectors (rad) in the moved frame."""
+
+    @property
+    def entries(self) -> tuple[str, ...]:
+        """The four numbers of the quaternion."""
+        return ("w", "x", "y", "z")
+
+    @property
+    def dof(self) -> int:
+        """Three."""
+        return 3
+
+    def check(self, value: Array) -> str:
+        """Unit norm."""
+        norm = float(np.linalg.norm(value))
+        return "" if abs(norm - 1) < 1e-6 else f"a quaternion of norm {norm:g} is not a rotation"
+
+    def retract(self, base: Array, delta: Array) -> Array:
+        """base * exp(delta)."""
+        product = _quaternion_matrix(base) @ _quaternion_exp(delta)
+        return np.asarray(product / np.linalg.norm(product))
+
+    def local(self, base: Array, value: Array) -> Array:
+        """log(base^-1 * value)."""
+        return _quaternion_log(_quaternion_matrix(base * np.array([1, -1, -1, -1])) @ value)
+
+    def retract_jacobian(self, base: Array, delta: Array) -> Array:
+        """Half of the quaternion product's matrix, after the right Jacobian of the exponential [Murray1994]."""
+        return np.asarray(0.5 * _quaternion_matrix(self.retract(base, delta))[:, 1:] @ _left_jacobian(delta).T)
+
+
+@dataclass(frozen=True)
+class Pose:
+    """A rigid motion: quaternion then translation (m); increments: rotation vector (rad), translation, both in the moved frame."""  # noqa: E501
+
+    @property
+    def entries(self) -> tuple[str, ...]:
+        """Quaternion and translation."""
+        return ("qw", "qx", "qy", "qz", "x", "y", "z")
+
+    @property
+    def dof(self) -> int:
+        """Six."""
+        return 6
+
+    def check(self, value: Array) -> str:
+        """Unit quaternion."""
+        return Rotation().check(value[:4])
+
+    def retract(self, base: Array, delta: Array) -> Array:
+        """Rotation and translation each moved in the base's own frame."""
+        moved = base[4:] + _rotation_matrix(base[:4]) @ delta[3:]
+        return np.concatenate([Rotation().retract(base[:4], delta[:3]), moved])
+
+    def local(self, base: Array, value: Array) -> Array:
+        """The inverse of ``retract``."""
+        shift = _rotation_matrix(base[:4]).T @ (value[4:] - base[4:])
+        return np.concatenate([Rotation().local(base[:4], value[:4]), shift])
+
+    def retract_jacobian(self, base: Array, delta: Array) -> Array:
+        """Block diagonal (7 x 6)."""
+        jacobian = np.zeros((7, 6))
+        jacobian[:4, :3] = Rotation().retract_jacobian(base[:4], delta[:3])
+        jacobian[4:, 3:] = _rotation_matrix(base[:4])
+        return jacobian
+
+
+@dataclass(frozen=True)
+class ScrewAxis:
+    """The axis of a revolute joint as a twist (w, v = -w x q), |w| = 1, w.v = 0; four degrees of freedom.
+
+    An increment is two turns (rad) and two shifts (m), about and along two directions across the axis at
+    its point nearest the origin. [Murray1994]
+    """
+
+    @property
+    def entries(self) -> tuple[str, ...]:
+        """Direction and moment."""
+        return ("wx", "wy", "wz", "vx", "vy", "vz")
+
+    @property
+    def dof(self) -> int:
+        """Four."""
+        return 4
+
+    def check(self, value: Array) -> str:
+        """Unit direction, moment across it."""
+        norm, pitch = float(np.linalg.norm(value[:3])), float(value[:3] @ value[3:])
+        if abs(norm - 1) > 1e-6:
+            return f"the axis has length {norm:g}, not 1"
+        return "" if abs(pitch) < 1e-9 else f"the screw has pitch {pitch:g} m, a revolute joint has none"
+
+    def retract(self, base: Array, delta: Array) -> Array:
+        """Turn the direction, shift the nearest point."""
+        across, nearest = _across(base[:3]), np.cross(base[:3], base[3:])
+        turn = _rotation_matrix(_quaternion_exp(across @ delta[:2]))
+        direction = turn @ base[:3]
+        direction = direction / np.linalg.norm(direction)
+        return np.concatenate([direction, np.cross(nearest + across @ delta[2:], direction)])
+
+    def local(self, base: Array, value: Array) -> Array:
+        """The inverse of ``retract``."""
+        across, nearest = _across(base[:3]), np.cross(base[:3], base[3:])
+        turn_axis = np.cross(base[:3], value[:3])
+        sine, cosine = float(np.linalg.norm(turn_axis)), float(base[:3] @ value[:3])
+        angle = math.atan2(sine, cosine)
+        turn = across.T @ turn_axis * (angle / sine if sine > 1e-12 else 1.0)
+        # The point of the new axis in the plane across the old one through its nearest point.
+        foot = np.cross(value[:3], value[3:])
+        foot = foot + value[:3] * (base[:3] @ (nearest - foot)) / (base[:3] @ value[:3])
+        return np.concatenate([turn, across.T @ (foot - nearest)])
+
+    def retract_jacobian(self, base: Array, delta: Array) -> Array:
+        """6 x 4."""
+        across, nearest = _across(base[:3]), np.cross(base[:3], base[3:])
+        direction, point = self.retract(base, delta)[:3], nearest + across @ delta[2:]
+        turning = _left_jacobian(across @ delta[:2]) @ across
+        jacobian = np.zeros((6, 4))
+        for column in range(2):
+            turned = np.cross(turning[:, column], direction)
+            jacobian[:3, column] = turned
+            jacobian[3:, column] = np.cross(point, turned)
+            jacobian[3:, 2 + column] = np.cross(across[:, column], direction)
+        return jacobian
+
+
+@dataclass(frozen=True)
+class Semidefinite:
+    """A symmetric positive semidefinite 3x3 matrix: xx, xy, xz, yy, yz, zz; increments move a factor of it.
+
+    C = L L' with L lower triangular, so every increment gives a semidefinite matrix. At L = 0 the
+    gradient vanishes: a start must be definite.
+    """
+
+    @property
+    def entries(self) -> tuple[str, ...]:
+        """The upper triangle, row by row."""
+        return ("xx", "xy", "xz", "yy", "yz", "zz")
+
+    @property
+    def dof(self) -> int:
+        """Six."""
+        return 6
+
+    def check(self, value: Array) -> str:
+        """No negative eigenvalue."""
+        lowest = float(np.linalg.eigvalsh(symmetric(value))[0])
+        largest = float(np.abs(value).max())
+        return "" if lowest >= -1e-12 * max(1.0, largest) else f"its smallest eigenvalue is {lowest:g}"
+
+    def retract(self, base: Array, delta: Array) -> Array:
+        """(L + delta)(L + delta)'."""
+        factor = np.linalg.cholesky(symmetric(base))
+        factor[_LOWER] += delta
+        return _entries(factor @ factor.T)
+
+    def local(self, base: Array, value: Array) -> Array:
+        """The difference of the factors."""
+        difference = np.linalg.cholesky(symmetric(value)) - np.linalg.cholesky(symmetric(base))
+        return np.asarray(difference[_LOWER])
+
+    def retract_jacobian(self, base: Array, delta: Array) -> Array:
+        """6 x 6."""
+        factor = np.linalg.cholesky(symmetric(base))
+        factor[_LOWER] += delta
+        jacobian = np.zeros((6, 6))
+        for column, (row, col) in enumerate(zip(*_LOWER, strict=True)):
+            unit = np.zeros((3, 3))
+            unit[row, col] = 1
+            jacobian[:, column] = _entries(unit @ factor.T + factor @ unit.T)
+        return jacobian
+
+
+def symmetric(entries: Array) -> Array:
+    """The 3x3 matrix of six canonical entries."""
+    matrix = np.zeros((3, 3))
+    for value, (row, col) in zip(entries, _SYMMETRIC, strict=True):
+        matrix[row, col] = matrix[col, row] = value
+    return matrix
+
+
+def _entries(matrix: Array) -> Array:
+    return np.array([matrix[row, col] for row, col in _SYMMETRIC])
+
+
+def _across(direction: Array) -> Array:
+    """Two unit vectors across a direction and across each other (3x2), a smooth choice where it matters."""
+    helper = np.eye(3)[int(np.argmin(np.abs(direction)))]
+    first = np.cross(direction, helper)
+    first = first / np.linalg.norm(first)
+    return np.column_stack([first, np.cross(direction, first)])
+
+
+def _quaternion_matrix(q: Array) -> Array:
+    """Left multiplication: matrix(q) @ p is the product q p."""
+    w, x, y, z = q
+    return np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
+
+
+def _quaternion_exp(vector: Array) -> Array:
+    half = 0.5 * float(np.linalg.norm(vector))
+    return np.concatenate([[math.cos(half)], 0.5 * np.sinc(half / np.pi) * vector])
+
+
+def _quaternion_log(q: Array) -> Array:
+    q = q if q[0] >= 0 else -q
+    sine = float(np.linalg.norm(q[1:]))
+    factor = 2 * math.atan2(sine, q[0]) / sine if sine > 1e-12 else 2.0
+    return np.asarray(factor * q[1:])
+
+
+def _left_jacobian(vector: Array) -> Array:
+    """exp(vector + d) = exp(left_jacobian d) exp(vector) to first order. [Murray1994]"""
+    angle = float(np.linalg.norm(vector))
+    x, y, z = vector
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    if angle < 1e-4:
+        return np.eye(3) + (0.5 - angle**2 / 24) * cross + (1 / 6 - angle**2 / 120) * cross @ cross
+    first, second = (1 - math.cos(angle)) / angle**2, (angle - math.sin(angle)) / angle**3
+    return np.asarray(np.eye(3) + first * cross + second * cross @ cross)
+
+
+def _rotation_matrix(q: Array) -> Array:
+    w, x, y, z = q / np.linalg.norm(q)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )

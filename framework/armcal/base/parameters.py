@@ -1,0 +1,214 @@
+"""Parameter blocks: every number a calibration may find, by name."""
+
+from __future__ import annotations
+
+import difflib
+import fnmatch
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+
+from armcal.base.domains import Array, Domain, Interval
+from armcal.errors import ConfigError
+
+
+_EVERYWHERE = (-math.inf, math.inf)
+
+
+@dataclass(frozen=True)
+class ParameterBlock:
+    """One named parameter.
+
+    Attributes:
+        name: instance, component and local name: ``arm.mdh.theta3``.
+        unit: SI unit of its entries (``m``, ``rad``, ``rad_per_Nm``, ``kg``, ``1``).
+        nominal: canonical entries of the nominal value.
+        domain: where it lives.
+        scale: the size of a correction one would call ordinary, in ``unit``; conditions the solver and the rank
+            decision, never the answer.
+        free: whether the fit may move it.
+        prior_sd: standard deviation of a Gaussian prior about the nominal value, per increment; None for no prior.
+    """
+
+    name: str
+    unit: str
+    nominal: tuple[float, ...]
+    domain: Domain = field(default_factory=Interval)
+    scale: float = 1.0
+    free: bool = False
+    prior_sd: float | None = None
+
+    @property
+    def entry_names(self) -> tuple[str, ...]:
+        """The name of each canonical entry."""
+        return tuple(f"{self.name}[{suffix}]" if suffix else self.name for suffix in self.domain.entries)
+
+    @property
+    def size(self) -> int:
+        """How many canonical entries it has."""
+        return len(self.domain.entries)
+
+
+def scalar(name: str, unit: str, nominal: float, scale: float, domain: Interval | None = None) -> ParameterBlock:
+    """A block of one number."""
+    return ParameterBlock(name, unit, (float(nominal),), domain or Interval(), scale)
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """All blocks of a problem, in a fixed order.
+
+    Value vectors (``values``) hold the canonical entries of all blocks, free and fixed, in that order.
+    """
+
+    blocks: tuple[ParameterBlock, ...]
+
+    def __post_init__(self) -> None:
+        names = [block.name for block in self.blocks]
+        twice = sorted({name for name in names if names.count(name) > 1})
+        if twice:
+            raise ConfigError(f"parameter names stand twice: {', '.join(twice)}.", hint="Rename one of the instances.")
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """The names of the blocks."""
+        return tuple(block.name for block in self.blocks)
+
+    @cached_property
+    def entry_names(self) -> tuple[str, ...]:
+        """The names of all canonical entries."""
+        return tuple(name for block in self.blocks for name in block.entry_names)
+
+    @cached_property
+    def _index(self) -> Mapping[str, tuple[ParameterBlock, slice]]:
+        index, start = {}, 0
+        for block in self.blocks:
+            index[block.name] = (block, slice(start, start + block.size))
+            start += block.size
+        return index
+
+    def __getitem__(self, name: str) -> ParameterBlock:
+        return self._index[name][0]
+
+    def entries_of(self, name: str) -> slice:
+        """Where a block's canonical entries stand in a value vector."""
+        return self._index[name][1]
+
+    def nominal(self) -> Array:
+        """The nominal value vector."""
+        return np.array([number for block in self.blocks for number in block.nominal])
+
+    def select(self, patterns: Iterable[str]) -> tuple[str, ...]:
+        """The names that match any of the globs (``arm.spring.k?``), in the order of the blocks.
+
+        Raises:
+            ConfigError: a pattern matches nothing; the nearest names are given.
+        """
+        chosen: set[str] = set()
+        for pattern in patterns:
+            found = fnmatch.filter(self.names, pattern)
+            if not found:
+                near = difflib.get_close_matches(pattern, self.names, n=3, cutoff=0.5) or list(self.names[:3])
+                raise ConfigError(
+                    f"no parameter is called {pattern!r}.",
+                    hint=f"Nearest: {', '.join(near)}. `armcal check` lists all {len(self.names)} names.",
+                )
+            chosen.update(found)
+        return tuple(name for name in self.names if name in chosen)
+
+    def with_free(self, names: Iterable[str]) -> Parameters:
+        """Exactly these blocks free, all others fixed."""
+        wanted = set(names)
+        return self.replaced({block.name: replace(block, free=block.name in wanted) for block in self.blocks})
+
+    def with_nominal(self, values: Array) -> Parameters:
+        """The same blocks about other nominal values."""
+        return self.replaced(
+            {n: replace(b, nominal=tuple(float(v) for v in values[s])) for n, (b, s) in self._index.items()}
+        )
+
+    def without_bounds(self) -> Parameters:
+        """Every interval opened to the whole line."""
+        return self.replaced(
+            {b.name: replace(b, domain=Interval()) for b in self.blocks if isinstance(b.domain, Interval)}
+        )
+
+    def replaced(self, blocks: Mapping[str, ParameterBlock]) -> Parameters:
+        """The same blocks, some exchanged by name."""
+        return Parameters(tuple(blocks.get(block.name, block) for block in self.blocks))
+
+    @cached_property
+    def free(self) -> tuple[ParameterBlock, ...]:
+        """The free blocks."""
+        return tuple(block for block in self.blocks if block.free)
+
+    @cached_property
+    def free_entries(self) -> tuple[int, ...]:
+        """Positions in a value vector of the free blocks' canonical entries."""
+        return tuple(i for block in self.free for i in range(*self.entries_of(block.name).indices(1 << 30)))
+
+    @cached_property
+    def increment_names(self) -> tuple[str, ...]:
+        """A name for each number of an increment."""
+        names: list[str] = []
+        for block in self.free:
+            single = block.domain.dof == 1
+            names += [block.name if single else f"{block.name}<{i}>" for i in range(block.domain.dof)]
+        return tuple(names)
+
+    def _per_increment(self, of: Mapping[str, float]) -> Array:
+        return np.array([of[block.name] for block in self.free for _ in range(block.domain.dof)])
+
+    def scales(self) -> Array:
+        """The ordinary size of each increment."""
+        return self._per_increment({block.name: block.scale for block in self.free})
+
+    def prior_information(self) -> Array:
+        """1/sd^2 of each increment's prior, 0 where there is none."""
+        return self._per_increment(
+            {block.name: 0.0 if block.prior_sd is None else block.prior_sd**-2 for block in self.free}
+        )
+
+    def increment_bounds(self) -> tuple[Array, Array]:
+        """Lower and upper bound of each increment from the nominal values; infinite for all but intervals."""
+        lower, upper = {}, {}
+        for block in self.free:
+            ends = (block.domain.lower, block.domain.upper) if isinstance(block.domain, Interval) else _EVERYWHERE
+            lower[block.name], upper[block.name] = (end - block.nominal[0] for end in ends)
+        return self._per_increment(lower), self._per_increment(upper)
+
+    def retract(self, delta: Array) -> Array:
+        """The value vector that an increment of the free blocks leads to from the nominal values."""
+        moved, start = self.nominal(), 0
+        for block in self.free:
+            place, dof = self.entries_of(block.name), block.domain.dof
+            moved[place] = block.domain.retract(moved[place], delta[start : start + dof])
+            start += dof
+        return moved
+
+    def local(self, values: Array) -> Array:
+        """The increment of the free blocks that leads from the nominal values to ``values``."""
+        parts = [b.domain.local(np.array(b.nominal), values[self.entries_of(b.name)]) for b in self.free]
+        return np.concatenate(parts) if parts else np.zeros(0)
+
+    def retract_jacobian(self, delta: Array) -> Array:
+        """d free canonical entries / d increment, at an increment from the nominal values."""
+        jacobian = np.zeros((len(self.free_entries), len(delta)))
+        row = column = 0
+        for block in self.free:
+            size, dof = block.size, block.domain.dof
+            part = block.domain.retract_jacobian(np.array(block.nominal), delta[column : column + dof])
+            jacobian[row : row + size, column : column + dof] = part
+            row, column = row + size, column + dof
+        return jacobian
+
+    def check(self, values: Array, names: Sequence[str] | None = None) -> None:
+        """Raise ConfigError for the first block whose value lies outside its domain."""
+        for name in names or self.names:
+            block, place = self._index[name]
+            fault = block.domain.check(values[place])
+            if fault:
+                raise ConfigError(f"{name}: {fault}.", hint="Mend the value or the bounds.")

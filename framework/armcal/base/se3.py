@@ -1,0 +1,131 @@
+"""Rigid motions as CasADi expressions: the one place where rotations and transforms are composed.
+
+Transforms are written ``a_T_b``: they map coordinates in frame b to coordinates in frame a.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+
+Expression = Any
+"""A CasADi ``SX`` (or a number where a constant is meant)."""
+
+_SERIES_TERMS = 10
+
+
+@dataclass(frozen=True)
+class Transform:
+    """A rigid motion: ``rotation`` (3x3 SX) and ``translation`` (3x1 SX, m)."""
+
+    rotation: Expression
+    translation: Expression
+
+    def __matmul__(self, other: Transform) -> Transform:
+        """a_T_c = a_T_b @ b_T_c."""
+        return Transform(
+            ca.mtimes(self.rotation, other.rotation),
+            ca.mtimes(self.rotation, other.translation) + self.translation,
+        )
+
+    def apply(self, point: Expression) -> Expression:
+        """A point (3x1, m) given in frame b, in frame a."""
+        return ca.mtimes(self.rotation, point) + self.translation
+
+    def inverse(self) -> Transform:
+        """b_T_a."""
+        back = self.rotation.T
+        return Transform(back, -ca.mtimes(back, self.translation))
+
+    def matrix(self) -> Expression:
+        """The homogeneous 4x4 matrix."""
+        bottom = ca.horzcat(ca.SX(1, 3), ca.SX(1))
+        return ca.vertcat(ca.horzcat(self.rotation, self.translation), bottom)
+
+
+def identity() -> Transform:
+    """The motion that moves nothing."""
+    return Transform(ca.SX.eye(3), ca.SX(3, 1))
+
+
+def translation(x: Expression, y: Expression, z: Expression) -> Transform:
+    """A translation (m); zeros stay structurally zero, so that they cost nothing later."""
+    return Transform(ca.SX.eye(3), ca.sparsify(ca.vertcat(ca.SX(x), ca.SX(y), ca.SX(z))))
+
+
+def cos_sin(angle: Expression) -> tuple[Expression, Expression]:
+    """Cosine and sine of an angle (rad); exact for constant multiples of a right angle.
+
+    cos(pi/2) in floating point is 6e-17: as a factor it would cost operations in every expression
+    after it and mean nothing.
+    """
+    angle = ca.SX(angle)
+    if angle.is_constant():
+        value = float(angle)
+        quarter_turns = round(value / (math.pi / 2))
+        if abs(value - quarter_turns * math.pi / 2) < 1e-15 * max(1, abs(quarter_turns)):
+            cosine, sine = ((1, 0), (0, 1), (-1, 0), (0, -1))[quarter_turns % 4]
+            return ca.SX(cosine), ca.SX(sine)
+    return ca.cos(angle), ca.sin(angle)
+
+
+def rotation_about(axis: str, angle: Expression) -> Transform:
+    """A rotation (rad) about the x, y or z axis."""
+    cosine, sine = cos_sin(angle)
+    zero, one = ca.SX(1, 1), ca.SX(1)
+    rows = {
+        "x": ((one, zero, zero), (zero, cosine, -sine), (zero, sine, cosine)),
+        "y": ((cosine, zero, sine), (zero, one, zero), (-sine, zero, cosine)),
+        "z": ((cosine, -sine, zero), (sine, cosine, zero), (zero, zero, one)),
+    }[axis]
+    rotation = ca.vertcat(*[ca.horzcat(*row) for row in rows])
+    return Transform(ca.sparsify(rotation), ca.SX(3, 1))
+
+
+def translation_along(axis: str, distance: Expression) -> Transform:
+    """A translation (m) along the x, y or z axis."""
+    return translation(*[distance if axis == name else 0.0 for name in "xyz"])
+
+
+def skew(vector: Expression) -> Expression:
+    """The 3x3 matrix of the cross product with ``vector``."""
+    x, y, z = vector[0], vector[1], vector[2]
+    zero = ca.SX(1, 1)
+    return ca.vertcat(ca.horzcat(zero, -z, y), ca.horzcat(z, zero, -x), ca.horzcat(-y, x, zero))
+
+
+def rotation_about_unit(axis: Expression, angle: Expression) -> Expression:
+    """The rotation matrix of ``angle`` (rad) about a unit vector (3x1). Rodrigues' formula [Murray1994]."""
+    cosine, sine = cos_sin(angle)
+    cross = skew(axis)
+    return ca.sparsify(ca.SX.eye(3) + sine * cross + (1 - cosine) * ca.mtimes(cross, cross))
+
+
+def small_rotation(vector: Expression) -> Expression:
+    """The rotation matrix of a rotation vector (3x1, rad), smooth at zero.
+
+    Rodrigues' formula [Murray1994] with both of its coefficients as power series in the squared angle:
+    exact to double precision below one radian, far more than an elastic deflection or an increment is.
+    """
+    squared = ca.dot(vector, vector)
+    sinc, versine = ca.SX(0), ca.SX(0)
+    for term in reversed(range(_SERIES_TERMS)):
+        sign = (-1) ** term
+        sinc = sinc * squared + sign / math.factorial(2 * term + 1)
+        versine = versine * squared + sign / math.factorial(2 * term + 2)
+    cross = skew(vector)
+    return ca.SX.eye(3) + sinc * cross + versine * ca.mtimes(cross, cross)
+
+
+def screw_motion(angular: Expression, linear: Expression, displacement: Expression) -> Transform:
+    """exp(screw * displacement) for a unit revolute screw through the origin, or a prismatic one.
+
+    ``angular`` is a unit vector (3x1) or structurally zero; ``linear`` (3x1) is the direction of a
+    prismatic joint. [Murray1994]
+    """
+    if ca.SX(angular).nnz() == 0:
+        return Transform(ca.SX.eye(3), linear * displacement)
+    return Transform(rotation_about_unit(angular, displacement), ca.SX(3, 1))

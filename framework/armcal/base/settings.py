@@ -1,0 +1,212 @@
+"""The base class of checked settings: strict types, and a unit for every physical quantity."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Mapping
+from enum import Enum
+from pathlib import Path
+from typing import Any, Self
+
+from pydantic import BaseModel, ConfigDict, GetCoreSchemaHandler, ValidationInfo, model_validator
+from pydantic_core import core_schema
+
+from armcal.base.quantities import (
+    Acceleration,
+    Acceleration3,
+    Angle,
+    Angle3,
+    Compliance,
+    Compliance3,
+    Duration,
+    Fault,
+    Force,
+    Force3,
+    InputPath,
+    Kind,
+    Length,
+    Length3,
+    Mass,
+    Temperature,
+    Torque,
+    Torque3,
+    UnitOf,
+    accepted,
+    convert,
+    example,
+    has_number,
+    kind_of,
+    read_bare,
+    spelt,
+)
+from armcal.base.units import si_unit, split_suffix, units_of
+
+__all__ = [
+    "Acceleration",
+    "Acceleration3",
+    "Angle",
+    "Angle3",
+    "Compliance",
+    "Compliance3",
+    "Duration",
+    "Fault",
+    "Force",
+    "Force3",
+    "InputPath",
+    "Length",
+    "Length3",
+    "Mass",
+    "Settings",
+    "Temperature",
+    "Torque",
+    "Torque3",
+    "UnitOf",
+]
+
+_SI = "armcal_si"
+
+
+def _as_config(value: Any) -> Any:
+    if isinstance(value, Settings):
+        return value.to_config()
+    if isinstance(value, BaseModel):
+        return value.model_dump(mode="json")
+    if isinstance(value, Mapping):
+        return {_as_config(key): _as_config(entry) for key, entry in value.items()}
+    if isinstance(value, (list, tuple, set, frozenset)):
+        entries = sorted(value) if isinstance(value, (set, frozenset)) else value
+        return [_as_config(entry) for entry in entries]
+    if isinstance(value, Enum):
+        return _as_config(value.value)
+    return str(value) if isinstance(value, (str, Path)) else value
+
+
+def _make_scalars_strict(schema: Any) -> None:
+    """Set ``strict`` on every scalar of a core schema, passing over what is not schema."""
+    if isinstance(schema, (list, tuple)):
+        for part in schema:
+            _make_scalars_strict(part)
+    elif isinstance(schema, dict):
+        if schema.get("type") in ("float", "int", "bool", "str"):
+            schema.setdefault("strict", True)
+        for key, part in schema.items():
+            if key in ("fields", "choices") and isinstance(part, dict):  # keyed by the user's names
+                _make_scalars_strict(list(part.values()))
+            elif key not in ("default", "metadata", "serialization", "expected", "config", "cls", "ref"):
+                _make_scalars_strict(part)
+
+
+class Settings(BaseModel):
+    """Checked, frozen settings.
+
+    Unknown keys, text for numbers, booleans for numbers, and values that are not finite are refused. A field
+    of type `Length`, `Angle`, `Mass` and so on is a quantity: it holds SI, and outside it is written with its
+    unit, either in the key (``d_mm: 46.9``) or in the value (``d: 46.9 mm``, which wins over the key's).
+    """
+
+    model_config = ConfigDict(
+        frozen=True,
+        extra="forbid",
+        allow_inf_nan=False,
+        validate_default=True,
+        protected_namespaces=(),
+    )
+
+    @classmethod
+    def si(cls, **values: Any) -> Self:
+        """Build from numbers in SI units under bare names, nested mappings included.
+
+        Raises:
+            pydantic.ValidationError: a value is refused.
+        """
+        return cls.model_validate(values, context={_SI: True})
+
+    @classmethod
+    def quantities(cls) -> dict[str, str]:
+        """The dimension of each field that is a physical quantity, by field name."""
+        kinds = ((name, kind.dimension) for name, kind in cls._kinds().items())
+        return {name: dimension for name, dimension in kinds if dimension is not None}
+
+    @classmethod
+    def keys(cls) -> tuple[str, ...]:
+        """The keys of these settings as a config writes them, quantities in a customary unit (``d_mm``)."""
+        quantities = cls.quantities()
+        return tuple(
+            spelt(name, quantities[name]) if name in quantities else name for name in cls.model_fields
+        )
+
+    def to_config(self) -> dict[str, Any]:
+        """The settings as a config: SI units in the keys; validating it gives equal settings, bit for bit."""
+        kinds = type(self)._kinds()
+        config: dict[str, Any] = {}
+        for name in type(self).model_fields:
+            value = _as_config(getattr(self, name))
+            dimension = kinds[name].dimension
+            if dimension is not None and has_number(value, kinds[name]):
+                config[f"{name}_{si_unit(dimension).name}"] = value
+            else:
+                config[name] = value
+        return config
+
+    @classmethod
+    def _kinds(cls) -> dict[str, Kind]:
+        return {name: kind_of((info.annotation, *info.metadata)) for name, info in cls.model_fields.items()}
+
+    @classmethod
+    def __get_pydantic_core_schema__(
+        cls, source: Any, handler: GetCoreSchemaHandler
+    ) -> core_schema.CoreSchema:
+        """Strict scalars, while lists still make tuples and texts still make paths and enumerations."""
+        schema = handler(source)
+        _make_scalars_strict(schema)
+        return schema
+
+    @model_validator(mode="before")
+    @classmethod
+    def _read_units(cls, data: Any, info: ValidationInfo) -> Any:
+        if not isinstance(data, Mapping):
+            return data
+        is_si = bool(info.context) and isinstance(info.context, dict) and bool(info.context.get(_SI))
+        kinds = cls._kinds()
+        result: dict[Any, Any] = {}
+        written: dict[str, str] = {}
+        for key, value in data.items():
+            name, read = cls._read_entry(key, value, kinds, is_si)
+            if name in written:
+                read = Fault(f"found both {written[name]} and {key}, expected one of them: remove the other.")
+            written[name] = key
+            result[name] = read
+        for name, kind in kinds.items():
+            if kind.dimension is not None and name not in result and cls.model_fields[name].is_required():
+                mend = example(name, kind.dimension)
+                result[name] = Fault(f"found nothing, expected {kind.dimension}: write {mend}.")
+        return result
+
+    @classmethod
+    def _read_entry(cls, key: Any, value: Any, kinds: Mapping[str, Kind], is_si: bool) -> tuple[Any, Any]:
+        if key in kinds:
+            kind = kinds[key]
+            return key, value if kind.dimension is None else read_bare(key, value, kind, is_si)
+        split = split_suffix(key) if isinstance(key, str) else None
+        if split is not None and split[0] in kinds:
+            name, unit = split
+            kind = kinds[name]
+            if kind.dimension == unit.dimension:
+                return name, convert(name, value, kind, unit.name)
+            if kind.dimension is not None:
+                mend = accepted(name, kind.dimension)
+                return name, Fault(
+                    f"found {key} ({unit.dimension}), expected {kind.dimension}: write {mend}."
+                )
+        return key, Fault(cls._unknown(key)) if cls.model_config.get("extra") == "forbid" else value
+
+    @classmethod
+    def _unknown(cls, key: Any) -> str:
+        spellings: dict[str, str] = {name: name for name in cls.model_fields}
+        for name, dimension in cls.quantities().items():
+            spellings[name] = spelt(name, dimension)
+            spellings.update({f"{name}_{u.name}": f"{name}_{u.name}" for u in units_of(dimension)})
+        near = difflib.get_close_matches(str(key), spellings, n=1)
+        if near:
+            return f"found the unknown key {str(key)!r}: did you mean {spellings[near[0]]}?"
+        return f"found the unknown key {str(key)!r}, expected one of {', '.join(cls.keys()) or 'no keys'}."

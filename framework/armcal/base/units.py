@@ -1,0 +1,186 @@
+"""Units at the edges, SI inside: which units a config or a data column may declare."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, overload
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+DIMENSIONLESS = "dimensionless"
+
+
+@dataclass(frozen=True)
+class Unit:
+    """A unit and its factor to SI, ``numerator / denominator``.
+
+    The two are kept apart because ``value / 1000`` is correctly rounded and ``value * 0.001`` is not: 3 mm is
+    then the same float as 0.003 m.
+    """
+
+    name: str
+    dimension: str
+    numerator: float = 1.0
+    denominator: float = 1.0
+
+    @property
+    def factor(self) -> float:
+        """SI units in one of this unit."""
+        return self.numerator / self.denominator
+
+
+_DEGREE = math.pi / 180.0
+
+_ALL = (
+    Unit("m", "length"),
+    Unit("cm", "length", 1.0, 100.0),
+    Unit("mm", "length", 1.0, 1000.0),
+    Unit("um", "length", 1.0, 1e6),
+    Unit("rad", "angle"),
+    Unit("deg", "angle", _DEGREE),
+    Unit("mrad", "angle", 1.0, 1000.0),
+    Unit("kg", "mass"),
+    Unit("g", "mass", 1.0, 1000.0),
+    Unit("s", "time"),
+    Unit("ms", "time", 1.0, 1000.0),
+    Unit("min", "time", 60.0),
+    Unit("h", "time", 3600.0),
+    Unit("m_s2", "acceleration"),
+    Unit("rad_per_Nm", "compliance"),
+    Unit("deg_per_Nm", "compliance", _DEGREE),
+    Unit("N", "force"),
+    Unit("Nm", "torque"),
+    Unit("C", "temperature"),
+    Unit("1", DIMENSIONLESS),
+)
+
+UNITS: Mapping[str, Unit] = MappingProxyType({unit.name: unit for unit in _ALL})
+"""Every unit by name; within a dimension the SI unit comes first."""
+
+_DISPLAY: Mapping[str, str] = MappingProxyType({"length": "mm", "angle": "deg", "mass": "g"})
+_SPELLINGS: Mapping[str, str] = MappingProxyType(
+    {
+        "µm": "um",
+        "μm": "um",
+        "°": "deg",
+        "m/s^2": "m_s2",
+        "m/s2": "m_s2",
+        "m/s²": "m_s2",
+        "rad/Nm": "rad_per_Nm",
+        "rad/(Nm)": "rad_per_Nm",
+        "deg/Nm": "deg_per_Nm",
+        "deg/(Nm)": "deg_per_Nm",
+        "°C": "C",
+    }
+)
+_LONGEST_FIRST = tuple(sorted((n for n in UNITS if n != "1"), key=len, reverse=True))
+_QUANTITY = re.compile(r"\s*([+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?)\s*(\S.*?)?\s*", re.DOTALL)
+_DECIMAL_COMMA = re.compile(r"\s*[+-]?[0-9]+,[0-9]+")
+
+
+def unit(name: str) -> Unit:
+    """The unit of that name; ValueError lists the known ones."""
+    if name not in UNITS:
+        raise ValueError(f"unit {name!r} is not known; expected one of {', '.join(UNITS)}.")
+    return UNITS[name]
+
+
+def units_of(dimension: str) -> tuple[Unit, ...]:
+    """The units of a dimension, the SI unit first; ValueError for an unknown dimension."""
+    found = tuple(u for u in _ALL if u.dimension == dimension)
+    if not found:
+        known = ", ".join(dict.fromkeys(u.dimension for u in _ALL))
+        raise ValueError(f"dimension {dimension!r} is not known; expected one of {known}.")
+    return found
+
+
+def si_unit(dimension: str) -> Unit:
+    """The unit in which values of that dimension are held inside (temperature: degrees Celsius)."""
+    return units_of(dimension)[0]
+
+
+def display_unit(dimension: str) -> Unit:
+    """The unit in which people are shown values of that dimension: mm, deg, g, otherwise the SI unit."""
+    return UNITS[_DISPLAY[dimension]] if dimension in _DISPLAY else si_unit(dimension)
+
+
+def split_suffix(name: str, dimension: str | None = None) -> tuple[str, Unit] | None:
+    """Split a name that declares its unit, ``"x_mm"`` into ``("x", mm)``.
+
+    The longest unit wins (``compliance_rad_per_Nm`` is a compliance, never a torque). None if the name ends
+    in no unit, or in one of another dimension than the one asked for.
+    """
+    for unit_name in _LONGEST_FIRST:
+        stem = name.removesuffix(f"_{unit_name}")
+        if stem and stem != name:
+            found = UNITS[unit_name]
+            return (stem, found) if dimension in (None, found.dimension) else None
+    return None
+
+
+def parse_quantity(text: str, dimension: str) -> float:
+    """Read a number with its unit, ``"5 mm"`` or ``"9.81 m/s^2"``.
+
+    Args:
+        text: the number, and its unit unless the dimension is dimensionless.
+        dimension: what is expected, for example ``"length"``.
+
+    Returns:
+        The value in SI units.
+
+    Raises:
+        ValueError: not a number, no unit, a unit of another dimension, or too large; lists the accepted
+            units.
+    """
+    if _DECIMAL_COMMA.match(text):
+        raise ValueError(_expected(f"{text!r} has a decimal comma, write a point", dimension))
+    match = _QUANTITY.fullmatch(text)
+    if match is None:
+        raise ValueError(_expected(f"{text!r} is not a number with a unit", dimension))
+    number, written = match.groups()
+    if written is None and dimension != DIMENSIONLESS:
+        raise ValueError(_expected(f"{text!r} has no unit", dimension))
+    name = (written or "1").replace("N m", "Nm").replace("N*m", "Nm").replace("N·m", "Nm")
+    found = UNITS.get(_SPELLINGS.get(name, name))
+    if found is None:
+        raise ValueError(_expected(f"{text!r} has an unknown unit {written!r}", dimension))
+    if found.dimension != dimension:
+        raise ValueError(_expected(f"{text!r} has a unit of {found.dimension}", dimension))
+    value = from_unit(float(number), found.name)
+    if not math.isfinite(value):
+        raise ValueError(_expected(f"{text!r} is too large to be a number", dimension))
+    return value
+
+
+def _expected(found: str, dimension: str) -> str:
+    names = [u.name for u in units_of(dimension)]
+    if dimension == DIMENSIONLESS:
+        return f'{found}; expected a number without a unit, for example "0.5".'
+    kind = f"{dimension} in {'one of ' if len(names) > 1 else ''}{', '.join(names)}"
+    return f'{found}; expected a number and a unit of {kind}, for example "5 {display_unit(dimension).name}".'
+
+
+@overload
+def from_unit(value: float, unit_name: str) -> float: ...
+@overload
+def from_unit(value: NDArray[np.float64], unit_name: str) -> NDArray[np.float64]: ...
+def from_unit(value: Any, unit_name: str) -> Any:
+    """The SI value of a number or array in the named unit; ValueError for an unknown unit."""
+    known = unit(unit_name)
+    return value * known.numerator / known.denominator
+
+
+@overload
+def to_unit(si_value: float, unit_name: str) -> float: ...
+@overload
+def to_unit(si_value: NDArray[np.float64], unit_name: str) -> NDArray[np.float64]: ...
+def to_unit(si_value: Any, unit_name: str) -> Any:
+    """The value in the named unit of an SI number or array; ValueError for an unknown unit."""
+    known = unit(unit_name)
+    return si_value * known.denominator / known.numerator

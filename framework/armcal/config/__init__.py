@@ -1,0 +1,1 @@
+"""Fourth floor: from text to checked settings and built components."""

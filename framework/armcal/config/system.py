@@ -1,0 +1,213 @@
+"""The arms, measurements and statics that a configuration (or a calibration) describes, built from plugins."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Literal, TypeVar
+
+from armcal.arm.assembly import Arm, MassSpec, prefixed
+from armcal.arm.statics import frame_names
+from armcal.base.parameters import ParameterBlock, Parameters
+from armcal.base.settings import Acceleration3, Force3, Length3, Mass, Settings, Torque3
+from armcal.config.validate import validate
+from armcal.config.yaml_source import ConfigSource
+from armcal.errors import ConfigError
+from armcal.measure.measurement import Measurement
+from armcal.plugins import PluginRegistry
+from armcal.solve.factor import Environment
+
+T = TypeVar("T")
+Path = tuple[str | int, ...]
+
+
+class LinkSettings(Settings):
+    """A mass: where its centre is, in a named frame of the model, ``base`` or ``tool``.
+
+    ``loads_up_to_joint`` overrides the physical loading where a source counted a link on a joint that does not
+    carry it (from 1; 0 for the base alone).
+    """
+
+    mass: Mass
+    com: Length3
+    frame: str
+    loads_up_to_joint: int | None = None
+
+
+class ArmSettings(Settings):
+    """One arm: its model, its joint effects and its masses, each by name."""
+
+    model: dict[str, Any]
+    effects: dict[str, dict[str, Any]] = {}
+    links: dict[str, LinkSettings] = {}
+
+
+class StaticsSettings(Settings):
+    """Gravity and load in the arm's root frame, where a record does not say otherwise.
+
+    ``payload`` is what hangs on the tool beyond the links (0 g has to be said); ``body`` lets gravity be checked.
+    """
+
+    gravity: Acceleration3
+    body: Literal["earth", "moon", "mars"] | None = None
+    payload: Mass | None = None
+    payload_com: Length3 = (0.0, 0.0, 0.0)
+    force: Force3 = (0.0, 0.0, 0.0)
+    torque: Torque3 = (0.0, 0.0, 0.0)
+
+
+class SystemSettings(Settings):
+    """The part of a configuration that says what the arm is and how it is measured."""
+
+    arms: dict[str, dict[str, Any]]
+    measurements: dict[str, dict[str, Any]]
+    statics: StaticsSettings
+
+
+@dataclass(frozen=True)
+class System:
+    """What is calibrated and measured.
+
+    Attributes:
+        arms: by instance name.
+        measurements: by instance name.
+        statics: as stated.
+        description: arms, measurements and statics as a configuration in SI units, complete and self-contained.
+    """
+
+    arms: Mapping[str, Arm]
+    measurements: Mapping[str, Measurement]
+    statics: StaticsSettings
+    description: Mapping[str, Any]
+
+    @property
+    def environment(self) -> Environment:
+        """What acts where a record does not say."""
+        s = self.statics
+        return Environment(s.gravity, s.payload or 0.0, s.payload_com, s.force, s.torque)
+
+    def parameters(self) -> Parameters:
+        """Every block, all fixed."""
+        blocks: list[ParameterBlock] = [block for arm in self.arms.values() for block in arm.parameters()]
+        for name, measurement in self.measurements.items():
+            blocks += prefixed(f"{name}.", measurement.parameters())
+        return Parameters(tuple(blocks))
+
+
+def build_system(source: ConfigSource, registry: PluginRegistry) -> System:
+    """Build arms and measurements.
+
+    Raises:
+        ConfigError: anything in ``arms``, ``measurements`` or ``statics`` is refused, with file, line and field.
+        PluginError: a type is not known, or its plugin is broken.
+    """
+    parts = replace(source, data={k: source.data[k] for k in SystemSettings.model_fields if k in source.data})
+    settings = validate(SystemSettings, parts)
+    _instance_names(source, [*settings.arms, *settings.measurements])
+    arms, described_arms = {}, {}
+    for name in settings.arms:
+        arms[name], described_arms[name] = _arm(source, registry, name)
+    measurements, described = {}, {}
+    for name in settings.measurements:
+        at: Path = ("measurements", name)
+        measurements[name], described[name] = build_component(source, registry, "measurement", at, tuple(arms))
+    description = {"arms": described_arms, "measurements": described, "statics": settings.statics.to_config()}
+    return System(arms, measurements, settings.statics, description)
+
+
+def build_component(
+    source: ConfigSource, registry: PluginRegistry, kind: str, at: Path, *context: Any
+) -> tuple[Any, dict[str, Any]]:
+    """The component named by ``type`` in the section at a path, and the section in SI units.
+
+    Raises:
+        ConfigError: no ``type``, or settings or component refused.
+        PluginError: the type is not known, or its plugin is broken.
+    """
+    section = _at(source.data, at)
+    if not isinstance(section, dict) or not isinstance(section.get("type"), str):
+        raise ConfigError(
+            f"found no type for this {kind}.", where=source.where(at), hint="Write type: NAME; see armcal plugins list."
+        )
+    name = str(section["type"])
+    component = registry.find(kind, name).load()
+    stripped = {key: value for key, value in section.items() if key != "type"}
+    settings = validate(component.Settings, _with(source, at, stripped), at)
+    built = _refusable(source, at, lambda: component(settings, *context))
+    return built, {"type": name, **settings.to_config()}
+
+
+def _arm(source: ConfigSource, registry: PluginRegistry, name: str) -> tuple[Arm, dict[str, Any]]:
+    at: Path = ("arms", name)
+    settings = validate(ArmSettings, source, at)
+    model, described_model = build_component(source, registry, "model", (*at, "model"))
+    effects, described_effects = {}, {}
+    for effect in settings.effects:
+        place: Path = (*at, "effects", effect)
+        built, described_effects[effect] = build_component(source, registry, "effect", place, model.joint_names)
+        effects[effect] = built
+    masses = tuple(
+        MassSpec(link, s.mass, s.com, s.frame, s.loads_up_to_joint) for link, s in settings.links.items()
+    )
+    arm = _refusable(source, at, lambda: Arm(name, described_model["type"], model, effects, masses))
+    known = _refusable(source, at, lambda: frame_names(arm.nominal_chain))
+    for link, stated in settings.links.items():
+        _check_link(source, (*at, "links", link), stated, known, len(arm.joint_names))
+    links = {link: stated.to_config() for link, stated in settings.links.items()}
+    return arm, {"model": described_model, "effects": described_effects, "links": links}
+
+
+def _check_link(source: ConfigSource, at: Path, link: LinkSettings, known: Mapping[str, int], joints: int) -> None:
+    if link.frame not in known:
+        raise ConfigError(
+            f"no frame is called {link.frame!r}.",
+            where=source.where((*at, "frame")),
+            hint=f"The frames are {', '.join(known)}.",
+        )
+    if link.mass < 0:
+        raise ConfigError("found a mass below zero.", where=source.where((*at, "mass")), hint="Give the mass.")
+    if link.loads_up_to_joint is not None and not 0 <= link.loads_up_to_joint <= joints:
+        raise ConfigError(
+            f"found joint {link.loads_up_to_joint}, expected 0 to {joints}.",
+            where=source.where((*at, "loads_up_to_joint")),
+            hint="Joints count from 1; 0 is the base.",
+        )
+
+
+def _instance_names(source: ConfigSource, names: list[str]) -> None:
+    """Names head parameter names and columns, so they must not collide or hold a dot or a glob."""
+    for name in names:
+        section: Path = ("arms", name) if name in source.data.get("arms", {}) else ("measurements", name)
+        if names.count(name) > 1:
+            raise ConfigError(f"{name!r} names two things.", where=source.where(section), hint="Rename one.")
+        if not name.isidentifier():
+            raise ConfigError(
+                f"{name!r} is no instance name.",
+                where=source.where(section),
+                hint="Use letters, digits and underscores, beginning with a letter.",
+            )
+
+
+def _refusable(source: ConfigSource, at: Path, build: Callable[[], T]) -> T:
+    """A component's own refusal, placed where its section was written."""
+    try:
+        return build()
+    except ValueError as fault:
+        raise ConfigError(f"{fault}.", where=source.where(at)) from fault
+
+
+def _at(data: Any, path: Path) -> Any:
+    for step in path:
+        data = data[step]
+    return data
+
+
+def _with(source: ConfigSource, path: Path, value: Any) -> ConfigSource:
+    """The same configuration with another value at a path."""
+
+    def rebuilt(data: Any, steps: Path) -> Any:
+        if not steps:
+            return value
+        return {**data, steps[0]: rebuilt(data[steps[0]], steps[1:])}
+
+    return replace(source, data=rebuilt(source.data, path))

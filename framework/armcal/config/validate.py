@@ -1,0 +1,233 @@
+"""Settings checked against the configuration they came from: every fault at once, each at its own line."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+from typing import Any, TypeVar
+
+from pydantic import ValidationError
+
+from armcal.base.settings import Fault, Settings
+from armcal.errors import ConfigError, Location
+from armcal.config.yaml_nodes import Step, dotted
+from armcal.config.yaml_source import ConfigSource, find_key
+
+S = TypeVar("S", bound=Settings)
+
+_MOST_LISTED = 50
+_NUMBER_MEND = "write it without quotes, with a decimal point"
+
+# What pydantic expected, and how to mend it, by its error type.
+_EXPECTED: Mapping[str, tuple[str, str]] = MappingProxyType(
+    {
+        "float_type": ("a number", _NUMBER_MEND),
+        "int_type": ("a whole number", "write it without quotes and without a decimal point"),
+        "bool_type": ("true or false", "write one of them without quotes"),
+        "string_type": ("text", "put it in double quotes"),
+        "list_type": ("a list", "write [a, b] or one '- ' line each"),
+        "tuple_type": ("a list", "write [a, b] or one '- ' line each"),
+        "set_type": ("a list", "write [a, b] or one '- ' line each"),
+        "dict_type": ("keys and values", "write indented 'key: value' lines"),
+        "mapping_type": ("keys and values", "write indented 'key: value' lines"),
+        "model_type": ("keys and values", "write indented 'key: value' lines"),
+        "model_attributes_type": ("keys and values", "write indented 'key: value' lines"),
+        "none_required": ("nothing", "leave the key out"),
+        "path_type": ("the path of a file", "write it as text"),
+    }
+)
+
+
+@dataclass(frozen=True)
+class _Finding:
+    """One of pydantic's errors, placed in the config.
+
+    ``branches`` are the union members it was found under, each with the path of the union's value.
+    """
+
+    path: tuple[Step, ...]
+    branches: tuple[tuple[tuple[Step, ...], str], ...]
+    kind: str
+    found: str
+    expected: str
+    mend: str
+    message: str = ""
+
+    @property
+    def text(self) -> str:
+        if self.message:
+            return self.message
+        end = "" if self.mend.endswith("?") else "."
+        return f"found {self.found}, expected {self.expected}: {self.mend}{end}"
+
+
+def validate(settings_class: type[S], source: ConfigSource, at: tuple[Step, ...] = ()) -> S:
+    """Check the part of a configuration below a path.
+
+    Args:
+        settings_class: the settings it must make.
+        source: the configuration.
+        at: the path of the part; ``()`` is the whole.
+
+    Raises:
+        ConfigError: lists every fault with its file, line and field, what was found, what was expected and
+            the mend; its ``where`` is that of the first.
+    """
+    raw = _part(settings_class, source, at)
+    try:
+        return settings_class.model_validate(raw)
+    except ValidationError as fault:
+        findings = [_finding(error, raw) for error in fault.errors(include_url=False)]
+        raise _refusal(_settle(findings), source, at) from fault
+
+
+def _part(settings_class: type[Settings], source: ConfigSource, at: tuple[Step, ...]) -> Any:
+    value: Any = source.data
+    for step in at:
+        key = find_key(value, step)
+        if key is None:
+            raise ConfigError(
+                f"found no {dotted(at)!r}, expected keys and values.",
+                where=source.where(at),
+                hint=f"Write '{at[-1]}:' with some of {', '.join(settings_class.keys())}.",
+            )
+        value = value[key]
+    return value
+
+
+def _finding(error: Mapping[str, Any], raw: Any) -> _Finding:
+    kind, refused = str(error["type"]), error["input"]
+    path: list[Step] = []
+    branches: list[tuple[tuple[Step, ...], str]] = []
+    value, is_fault = raw, isinstance(refused, Fault)
+    loc: Sequence[Step] = error["loc"]
+    for index, step in enumerate(loc):
+        key = find_key(value, step)
+        if key is not None:
+            value = value[key]
+            path.append(key)
+        elif index == len(loc) - 1 and (kind == "missing" or is_fault) and _holds(value, step):
+            path.append(step)
+        else:
+            branches.append((tuple(path), str(step)))
+    made = _Finding(tuple(path), tuple(branches), kind, _shown(value, refused), "", "")
+    if isinstance(refused, Fault):
+        return replace(made, message=refused.message)
+    if kind == "missing":
+        return _missing(made, loc[-1], value)
+    return _explained(made, error)
+
+
+def _holds(value: Any, step: Step) -> bool:
+    """Whether a step that was not found may be a key or an index of the value, not a union member."""
+    return isinstance(value, dict) if isinstance(step, str) else isinstance(value, list)
+
+
+def _missing(made: _Finding, step: Step, value: Any) -> _Finding:
+    if isinstance(step, int) and isinstance(value, list):
+        message = f"found a list of {len(value)} values, expected at least {step + 1}: add the missing ones."
+        return replace(made, path=made.path[:-1], message=message)
+    return replace(made, message=f"found nothing, expected the key {step!r}: write '{step}: ...'.")
+
+
+def _explained(made: _Finding, error: Mapping[str, Any]) -> _Finding:
+    context = error.get("ctx", {})
+    message = str(error["msg"])
+    if made.kind in _EXPECTED:
+        expected, mend = _EXPECTED[made.kind]
+        return replace(made, expected=expected, mend=mend)
+    if made.kind in ("value_error", "assertion_error"):
+        return replace(made, message=message.split(", ", 1)[1])
+    if made.kind in ("literal_error", "enum"):
+        expected = str(context.get("expected"))
+        mend = _nearest(error["input"], expected.replace(" or ", ", "))
+        return replace(made, expected=expected, mend=mend)
+    if made.kind == "union_tag_invalid":
+        tags = str(context.get("expected_tags"))
+        found = f"the {context.get('discriminator')} {context.get('tag')!r}"
+        mend = _nearest(context.get("tag"), tags)
+        return replace(made, found=found, expected=f"one of {tags}", mend=mend)
+    if made.kind == "union_tag_not_found":
+        key = str(context.get("discriminator")).strip("'")
+        return replace(made, message=f"found nothing, expected the key {key!r}: write '{key}: ...'.")
+    expected = message.removeprefix("Input should be ")
+    return replace(made, expected=expected[:1].lower() + expected[1:], mend="correct it")
+
+
+def _nearest(found: Any, choices: str) -> str:
+    near = difflib.get_close_matches(str(found), [word.strip(" '") for word in choices.split(",")], n=1)
+    return f"did you mean {near[0]}?" if near else "write one of these"
+
+
+def _shown(value: Any, refused: Any) -> str:
+    """A value as its writer knows it; with what it became, where a unit was converted."""
+    if isinstance(value, str):
+        text = str(value) if len(value) <= 60 else f"{value[:57]}..."
+        shown = f"the text {text!r}"
+    elif isinstance(value, bool):
+        shown = str(value).lower()
+    elif isinstance(value, (dict, list)):
+        shown = f"a list of {len(value)} values" if isinstance(value, list) else "keys and values"
+    else:
+        shown = "nothing" if value is None else str(value)
+    is_number = isinstance(refused, (int, float)) and not isinstance(refused, bool)
+    return f"{shown} ({refused} in SI units)" if is_number and refused != value else shown
+
+
+def _settle(findings: Sequence[_Finding]) -> list[_Finding]:
+    """Keep, of each union, the member that was meant; then one finding for each place."""
+    kept = list(findings)
+    for depth in range(max((len(f.branches) for f in findings), default=0)):
+        unions: dict[tuple[Step, ...], list[_Finding]] = {}
+        for finding in kept:
+            if len(finding.branches) > depth:
+                unions.setdefault(finding.branches[depth][0], []).append(finding)
+        dropped = {id(f) for path, members in unions.items() for f in _not_meant(path, members, depth)}
+        kept = [f for f in kept if id(f) not in dropped]
+    places: dict[tuple[Step, ...], list[_Finding]] = {}
+    for finding in kept:
+        places.setdefault(finding.path, []).append(finding)
+    return [merged for same in places.values() for merged in _merged(same)]
+
+
+def _not_meant(path: tuple[Step, ...], findings: Sequence[_Finding], depth: int) -> list[_Finding]:
+    members: dict[str, list[_Finding]] = {}
+    for finding in findings:
+        members.setdefault(finding.branches[depth][1], []).append(finding)
+    likely = [name for name, own in members.items() if any(len(f.path) > len(path) for f in own)]
+    if not likely:  # the value has no member's shape: say all that it could be
+        return []
+    named = [name for name in likely if not any(_is_other_type(f) for f in members[name])] or likely
+    meant = min(named, key=lambda name: len(members[name]))
+    return [f for name, own in members.items() if name != meant for f in own]
+
+
+def _is_other_type(finding: _Finding) -> bool:
+    return finding.kind == "literal_error" and finding.path[-1:] in (("type",), ("kind",))
+
+
+def _merged(same: Sequence[_Finding]) -> Iterable[_Finding]:
+    told = list({f.message: f for f in same if f.message}.values())
+    if told or len(same) == 1:
+        return told or same
+    expected = " or ".join(dict.fromkeys(f.expected for f in same))
+    mends = list(dict.fromkeys(f.mend for f in same))
+    return [replace(same[0], expected=expected, mend=mends[0] if len(mends) == 1 else "write one of these")]
+
+
+def _refusal(findings: Sequence[_Finding], source: ConfigSource, at: tuple[Step, ...]) -> ConfigError:
+    placed = [(source.where((*at, *finding.path)), finding.text) for finding in findings]
+    placed.sort(key=_order)
+    first, others = placed[0], placed[1:]
+    lines = [first[1], *(f"{where}: {text}" for where, text in others[: _MOST_LISTED - 1])]
+    if len(placed) > _MOST_LISTED:
+        lines.append(f"and {len(placed) - _MOST_LISTED} more.")
+    if others:
+        lines.append(f"Correct these {len(placed)} places.")
+    return ConfigError("\n".join(lines), where=first[0])
+
+
+def _order(placed: tuple[Location, str]) -> tuple[str, int]:
+    return placed[0].file or "", placed[0].line or 0

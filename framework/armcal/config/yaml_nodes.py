@@ -1,0 +1,269 @@
+"""The strict YAML reader: text to nodes that know their line.
+
+It works on the stream of parser events, not on recursive loading, so that depth and size are checked before
+anything is built and no tag can construct an object.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, NoReturn
+
+import yaml
+
+from armcal.errors import ConfigError, Location
+from armcal.config.yaml_scalars import Scalar, ScalarError, read_plain
+
+MAX_DEPTH = 50
+MAX_NODES = 100_000
+
+Step = str | int
+
+LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+"""The parser of libyaml where PyYAML was built with it: the same events and marks, some ten times faster."""
+
+_PLAIN_TAGS = frozenset((None, "tag:yaml.org,2002:map", "tag:yaml.org,2002:seq"))
+_TEXT_TAGS = frozenset(("!", "tag:yaml.org,2002:str"))
+_TAB_INDENT = re.compile(r"^ *\t[ \t]*[^\s#]", re.MULTILINE)
+_UNPRINTABLE = re.compile("[^\t\n\r\x20-\x7e\x85\xa0-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
+
+
+def dotted(path: tuple[Step, ...]) -> str:
+    """A path as people write it, ``rows.2.d_mm``; a key that itself holds a dot is quoted."""
+    return ".".join(f'"{step}"' if "." in str(step) else str(step) for step in path)
+
+
+@dataclass(frozen=True)
+class Origin:
+    """What a text was read from.
+
+    Attributes:
+        label: the file's name for people, or the command line's argument.
+        base_dir: what relative paths in it are relative to.
+        root: the directory that paths in it may not leave; None: anywhere.
+        numbered: whether its lines mean anything to the user.
+        prefix: the path below which the text's root value stands.
+    """
+
+    label: str
+    base_dir: Path
+    root: Path | None = None
+    numbered: bool = True
+    prefix: tuple[Step, ...] = ()
+
+    def at(self, line: int | None, path: tuple[Step, ...] | None = None) -> Location:
+        """The place of a line, and of a full path in the merged config."""
+        shown = dotted(self.prefix if path is None else path)
+        return Location(self.label, line if self.numbered else None, shown or None)
+
+
+@dataclass(frozen=True, slots=True)
+class Node:
+    """A value, where it was written, and how large it is once aliases are expanded.
+
+    ``value`` is a scalar, a ``tuple`` of nodes, or a ``dict`` of nodes that is never changed once built.
+    """
+
+    origin: Origin
+    line: int
+    value: Scalar | tuple[Node, ...] | dict[str, Node]
+    size: int = 1
+    height: int = 0
+
+
+def read_nodes(text: str, origin: Origin, loader: Any = LOADER) -> Node | None:
+    """Parse one YAML document strictly; None if it holds nothing.
+
+    Raises:
+        ConfigError: with line, field and mend: invalid YAML, tab indentation, duplicate or unclear keys,
+            tags, merge keys, several documents, surprising scalars, too deep or too large.
+    """
+    _check_characters(text, origin)
+    builder = _Builder(origin)
+    try:
+        for event in yaml.parse(text, Loader=loader):
+            builder.take(event)
+    except yaml.MarkedYAMLError as fault:
+        mark = fault.problem_mark or fault.context_mark
+        context = f" {fault.context}" if fault.context else ""
+        builder.refuse(
+            f"this is not valid YAML: {fault.problem}{context}.",
+            "Check indentation, colons, brackets and quotes on this line and the ones before it.",
+            None if mark is None else mark.line + 1,
+        )
+    except (yaml.YAMLError, ValueError, OverflowError) as fault:
+        builder.refuse(f"this is not valid YAML: {fault}.", "Check quotes and escapes.", None)
+    return builder.root
+
+
+def _check_characters(text: str, origin: Origin) -> None:
+    if match := _UNPRINTABLE.search(text):
+        raise ConfigError(
+            f"found the control character U+{ord(match.group()):04X}, expected text.",
+            where=origin.at(text.count("\n", 0, match.start()) + 1),
+            hint="Delete it, or save the file as UTF-8 text.",
+        )
+    if match := _TAB_INDENT.search(text):
+        raise ConfigError(
+            "this line is indented with a tab, expected spaces.",
+            where=origin.at(text.count("\n", 0, match.start()) + 1),
+            hint="Replace the tab by spaces.",
+        )
+
+
+@dataclass
+class _Open:
+    """A collection whose end has not been read."""
+
+    line: int
+    anchor: str | None
+    is_mapping: bool
+    entries: dict[str, Node] = field(default_factory=dict)
+    items: list[Node] = field(default_factory=list)
+    key: str | None = None
+    key_line: int = 0
+    size: int = 1
+    height: int = 1
+
+
+class _Builder:
+    """Builds nodes out of events, one at a time, with a stack of its own."""
+
+    def __init__(self, origin: Origin) -> None:
+        self.root: Node | None = None
+        self._origin = origin
+        self._stack: list[_Open] = []
+        self._anchors: dict[str, Node | None] = {}  # None: still open
+        self._documents = 0
+
+    def refuse(self, message: str, hint: str, line: int | None) -> NoReturn:
+        steps: list[Step] = []
+        for level in self._stack:
+            if not level.is_mapping:
+                steps.append(len(level.items))
+            elif level.key is not None:
+                steps.append(level.key)
+        raise ConfigError(message, where=self._origin.at(line, (*self._origin.prefix, *steps)), hint=hint)
+
+    def take(self, event: Any) -> None:
+        line = event.start_mark.line + 1
+        if isinstance(event, yaml.DocumentStartEvent):
+            self._documents += 1
+            if self._documents > 1:
+                self.refuse("a second document starts here, expected one.", "Remove the line '---'.", line)
+        elif isinstance(event, yaml.AliasEvent):
+            self._alias(event.anchor or "", line)
+        elif isinstance(event, yaml.ScalarEvent):
+            self._scalar(event, line)
+        elif isinstance(event, yaml.CollectionStartEvent):
+            self._open(event, line)
+        elif isinstance(event, yaml.CollectionEndEvent):
+            self._close()
+
+    def _alias(self, anchor: str, line: int) -> None:
+        self._refuse_as_key(line)
+        if anchor not in self._anchors:
+            self.refuse(
+                f"the alias *{anchor} names no anchor.", f"Write &{anchor} before the value it means.", line
+            )
+        node = self._anchors[anchor]
+        if node is None:
+            self.refuse(f"the alias *{anchor} stands inside what it names.", "Write the value out.", line)
+        self._add(replace(node, line=line))
+
+    def _scalar(self, event: Any, line: int) -> None:
+        if event.tag not in _TEXT_TAGS and event.tag is not None:
+            self._refuse_tag(event.tag, line)
+        is_plain = event.tag is None and event.implicit[0]
+        parent = self._stack[-1] if self._stack else None
+        if parent is not None and parent.is_mapping and parent.key is None:
+            self._key(parent, event.value, is_plain, line)
+            return
+        try:
+            value: Scalar = read_plain(event.value) if is_plain else event.value
+        except ScalarError as fault:
+            self.refuse(f"{fault}.", fault.hint, line)
+        node = Node(self._origin, line, value)
+        if event.anchor is not None:
+            self._anchors[event.anchor] = node
+        self._add(node)
+
+    def _key(self, parent: _Open, text: str, is_plain: bool, line: int) -> None:
+        if is_plain and text == "<<":
+            hint = "Write the keys out, or put the shared part into a file named under 'extends'."
+            self.refuse("merge keys (<<) are not read.", hint, line)
+        if is_plain:
+            try:
+                read = read_plain(text)
+            except ScalarError as fault:
+                self.refuse(f"the key {text} is not plain text: {fault}.", f'Quote it: "{text}".', line)
+            if not isinstance(read, str):
+                meaning = "nothing" if read is None else f"the {type(read).__name__} {read}"
+                self.refuse(
+                    f"the key {text!r} is read as {meaning}, expected text.", f'Quote it: "{text}".', line
+                )
+        if not text:
+            self.refuse("found an empty key, expected a name.", "Name the key.", line)
+        if text in parent.entries:
+            first = parent.entries[text].line
+            parent.key = text  # so that the refusal names it
+            self.refuse(
+                f"the key {text!r} stands here and at line {first}, expected once.",
+                "Remove or rename one.",
+                line,
+            )
+        parent.key, parent.key_line = text, line
+
+    def _open(self, event: Any, line: int) -> None:
+        if event.tag not in _PLAIN_TAGS:
+            self._refuse_tag(event.tag, line)
+        self._refuse_as_key(line)
+        if len(self._stack) >= MAX_DEPTH:
+            self._refuse_depth(line)
+        if event.anchor is not None:
+            self._anchors[event.anchor] = None
+        self._stack.append(_Open(line, event.anchor, isinstance(event, yaml.MappingStartEvent)))
+
+    def _close(self) -> None:
+        level = self._stack.pop()
+        value = level.entries if level.is_mapping else tuple(level.items)
+        node = Node(self._origin, level.line, value, level.size, level.height)
+        if level.anchor is not None:
+            self._anchors[level.anchor] = node
+        self._add(node)
+
+    def _add(self, node: Node) -> None:
+        if not self._stack:
+            self.root = node
+            return
+        parent = self._stack[-1]
+        parent.size += node.size
+        parent.height = max(parent.height, node.height + 1)
+        if len(self._stack) + node.height > MAX_DEPTH:
+            self._refuse_depth(node.line)
+        if parent.size > MAX_NODES:
+            hint = "Expand no aliases of aliases; keep measured data in a CSV file."
+            self.refuse(
+                f"the file holds more than {MAX_NODES} values with its aliases expanded.", hint, node.line
+            )
+        if parent.key is None:
+            parent.items.append(node)
+        else:
+            parent.entries[parent.key] = replace(node, line=parent.key_line)
+            parent.key = None
+
+    def _refuse_depth(self, line: int) -> NoReturn:
+        self.refuse(f"values are nested deeper than {MAX_DEPTH} levels.", "Flatten the config.", line)
+
+    def _refuse_as_key(self, line: int) -> None:
+        if self._stack and self._stack[-1].is_mapping and self._stack[-1].key is None:
+            self.refuse(
+                "found a list, mapping or alias as a key, expected text.", "Write a plain name.", line
+            )
+
+    def _refuse_tag(self, tag: str, line: int) -> NoReturn:
+        shown = tag.replace("tag:yaml.org,2002:", "!!")
+        hint = "Remove it: a config holds plain values only."
+        self.refuse(f"found the tag {shown}, expected no tag.", hint, line)

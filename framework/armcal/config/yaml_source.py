@@ -1,0 +1,305 @@
+"""A configuration as it was written: files that extend others, overrides, and the place of every value."""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, NoReturn
+
+import yaml
+
+from armcal.base.config_text import ConfigText, resolve_path
+from armcal.base.units import split_suffix
+from armcal.errors import ConfigError, Location
+from armcal.config.yaml_nodes import MAX_DEPTH, Node, Origin, Step, dotted, read_nodes
+
+__all__ = ["ConfigSource", "ConfigText", "find_key", "load_config", "resolve_path"]
+
+MAX_BYTES = 1 << 20
+MAX_FILES = 32
+
+_STEPS = re.compile(r'(?:"([^"]+)"|([^."\s]+))(?:\.|$)')
+
+
+def _as_plain_text(dumper: Any, text: ConfigText) -> Any:
+    return dumper.represent_str(str(text))
+
+
+# PyYAML looks a class up exactly, so a subclass of str must be made known to both families of dumpers.
+yaml.representer.SafeRepresenter.add_representer(ConfigText, _as_plain_text)
+yaml.representer.Representer.add_representer(ConfigText, _as_plain_text)
+
+
+@dataclass(frozen=True)
+class ConfigSource:
+    """A merged configuration and where each value was written.
+
+    Attributes:
+        data: plain nested dicts, lists and scalars; every text is a `ConfigText`.
+        marks: the place of the value at each path, such as ``("rows", 2, "d_mm")``; ``()`` is the whole.
+        path: the config that was asked for.
+        root: the directory that no path in it may leave.
+        files: every file read, the one asked for first.
+    """
+
+    data: dict[str, Any]
+    marks: Mapping[tuple[Step, ...], Location]
+    path: Path
+    root: Path
+    files: tuple[Path, ...]
+
+    def where(self, path: tuple[Step, ...]) -> Location:
+        """The place of a path, or of its nearest parent that was written; ``("d",)`` also finds ``d_mm``."""
+        steps: list[Step] = []
+        value: Any = self.data
+        for index, step in enumerate(path):
+            key = find_key(value, step)
+            if key is None:
+                return replace(self.marks[tuple(steps)], field=dotted((*steps, *path[index:])))
+            steps.append(key)
+            value = value[key]
+        return self.marks[tuple(steps)]
+
+
+def find_key(value: Any, step: Step) -> Step | None:
+    """The key or index of a config value that a step means: itself, or that name with a unit after it."""
+    if isinstance(value, list):
+        return step if isinstance(step, int) and 0 <= step < len(value) else None
+    if not isinstance(value, dict):
+        return None
+    if step in value:
+        return step
+    for key in value:
+        split = split_suffix(key)
+        if split is not None and split[0] == step:
+            return str(key)
+    return None
+
+
+def load_config(path: str | Path, overrides: Sequence[str] = (), root: Path | None = None) -> ConfigSource:
+    """Read a YAML config with all that it extends, and apply overrides.
+
+    Args:
+        path: the config file.
+        overrides: ``a.b=value`` each, applied in order; a value is YAML, a list is indexed
+            (``rows.2.d_mm=3``), null removes a key, and a key that holds a dot is put in double quotes.
+        root: what no path in a config may leave; the directory of the config unless given.
+
+    Raises:
+        ConfigError: what was found, where, and the mend.
+    """
+    path = Path(path)
+    try:
+        limit = (path.parent if root is None else root).resolve()
+    except (OSError, RuntimeError, ValueError) as fault:
+        _refuse_file(
+            path, f"this path cannot be followed ({fault}).", "Check its spelling and its symbolic links."
+        )
+    reader = _Reader(limit)
+    tree = reader.tree(path, ())
+    for text in overrides:
+        tree = _override(tree, text)
+    marks: dict[tuple[Step, ...], Location] = {}
+    return ConfigSource(_build(tree, (), marks), marks, path, limit, tuple(reader.files))
+
+
+def _refuse_file(path: Path, message: str, hint: str) -> NoReturn:
+    raise ConfigError(message, where=Location(str(path)), hint=hint)
+
+
+def _read_text(path: Path) -> str:
+    try:
+        if path.is_dir():
+            _refuse_file(path, "this is a directory, expected a YAML file.", "Name the file in it.")
+        if not path.exists():
+            near = difflib.get_close_matches(path.name, _neighbours(path), n=1)
+            hint = (
+                f"Did you mean {path.parent / near[0]}?" if near else "Check the spelling and the directory."
+            )
+            _refuse_file(path, "there is no such file.", hint)
+        if not path.is_file():
+            _refuse_file(path, "this is a device or pipe, expected a YAML file.", "Save it to a file.")
+        with path.open("rb") as stream:
+            raw = stream.read(MAX_BYTES + 1)
+    except (OSError, ValueError) as fault:
+        _refuse_file(path, f"the file cannot be read ({fault}).", "Check the path and its permissions.")
+    if len(raw) > MAX_BYTES:
+        _refuse_file(path, f"the file is larger than {MAX_BYTES} bytes.", "Keep measured data in a CSV file.")
+    try:
+        return raw.decode("utf-8").removeprefix("\ufeff")
+    except UnicodeDecodeError as fault:
+        line = raw.count(b"\n", 0, fault.start) + 1
+        message = f"the byte 0x{raw[fault.start]:02x} at offset {fault.start} is not UTF-8."
+        raise ConfigError(message, where=Location(str(path), line), hint="Save the file as UTF-8.") from fault
+
+
+def _neighbours(path: Path) -> list[str]:
+    return sorted(p.name for p in path.parent.glob("*.y*ml")) if path.parent.is_dir() else []
+
+
+@dataclass
+class _Reader:
+    """Reads a config and what it extends, each file once."""
+
+    root: Path
+    files: list[Path] = field(default_factory=list)
+    done: dict[Path, Node] = field(default_factory=dict)
+
+    def tree(self, path: Path, chain: tuple[Path, ...]) -> Node:
+        """The merged tree of a file; ``chain`` is who extends it, resolved."""
+        text = _read_text(path)
+        resolved = path.resolve()
+        if resolved in self.done:
+            return self.done[resolved]
+        if len(self.files) >= MAX_FILES:
+            _refuse_file(path, f"more than {MAX_FILES} files extend one another.", "Merge some of them.")
+        self.files.append(path)
+        origin = Origin(str(path), path.parent, self.root)
+        own = _mapping(read_nodes(text, origin), origin)
+        merged: Node | None = None
+        for parent in _parents(own):
+            base = self._parent(parent, (*chain, resolved))
+            merged = base if merged is None else _merge(merged, base)
+        entries = {key: node for key, node in _entries(own).items() if key != "extends"}
+        own = replace(own, value=entries)
+        self.done[resolved] = own if merged is None else _merge(merged, own)
+        return self.done[resolved]
+
+    def _parent(self, text: ConfigText, chain: tuple[Path, ...]) -> Node:
+        resolved = resolve_path(text)
+        if resolved in chain:
+            circle = " -> ".join(p.name for p in (*chain[chain.index(resolved) :], resolved))
+            raise ConfigError(
+                f"the files extend one another in a circle: {circle}.",
+                where=text.location,
+                hint="Remove one of these 'extends'.",
+            )
+        try:
+            return self.tree(text.base_dir / text, chain)
+        except ConfigError as fault:
+            if (
+                fault.where is not None
+                and fault.where.line is None
+                and text.location.file != fault.where.file
+            ):
+                hint = f"{fault.hint} It is named by 'extends' in {text.location.file}:{text.location.line}."
+                raise ConfigError(fault.message, where=fault.where, hint=hint) from fault
+            raise
+
+
+def _mapping(node: Node | None, origin: Origin) -> Node:
+    if node is None or node.value is None:
+        hint = "Write at least one 'key: value' line."
+        raise ConfigError("the file is empty, expected keys and values.", where=origin.at(None), hint=hint)
+    if not isinstance(node.value, dict):
+        kind = "a list" if isinstance(node.value, tuple) else f"the value {str(node.value)[:60]!r}"
+        raise ConfigError(
+            f"found {kind} at the top, expected keys and values.",
+            where=origin.at(node.line),
+            hint="Write 'key: value' lines; put a space after each colon.",
+        )
+    return node
+
+
+def _entries(node: Node) -> dict[str, Node]:
+    return node.value if isinstance(node.value, dict) else {}
+
+
+def _parents(node: Node) -> list[ConfigText]:
+    named = _entries(node).get("extends")
+    if named is None:
+        return []
+    nodes = named.value if isinstance(named.value, tuple) else (named,)
+    texts = [_scalar(n, ("extends",)) for n in nodes]
+    if not all(isinstance(t, ConfigText) for t in texts) or len(set(texts)) < len(texts):
+        raise ConfigError(
+            "'extends' is neither a file name nor a list of different file names.",
+            where=named.origin.at(named.line, ("extends",)),
+            hint="Write for example 'extends: base.yaml'.",
+        )
+    return texts
+
+
+def _merge(parent: Node, child: Node) -> Node:
+    """The child over the parent: mappings merge, null removes the parent's key, anything else replaces."""
+    if not (isinstance(parent.value, dict) and isinstance(child.value, dict)):
+        return child
+    entries = dict(parent.value)
+    for key, node in child.value.items():
+        if key not in entries:
+            entries[key] = node
+        elif node.value is None:
+            del entries[key]
+        else:
+            entries[key] = _merge(entries[key], node)
+    return replace(child, value=entries)
+
+
+def _override(tree: Node, text: str) -> Node:
+    name, equals, written = text.partition("=")
+    origin = Origin(f"command line (--set {name.strip()})", Path.cwd(), numbered=False)
+    matches = list(_STEPS.finditer(name.strip()))
+    steps = tuple(match[1] or match[2] for match in matches)
+    whole = "".join(match[0] for match in matches) == name.strip() and not name.strip().endswith(".")
+    if not equals or not steps or not whole or not written.strip() or len(steps) > MAX_DEPTH:
+        hint = "Write for example --set arm.rows.2.d_mm=46.9; null as the value removes a key."
+        where = Location(f"command line (--set {text})")
+        raise ConfigError(f"found {text!r}, expected a dotted name, '=' and a value.", where=where, hint=hint)
+    origin = replace(origin, prefix=steps)
+    if steps[0] == "extends":
+        raise ConfigError(
+            "'extends' is read from files only.", where=origin.at(None), hint="Write it in the config."
+        )
+    value = read_nodes(written, origin) or Node(origin, 1, None)
+    return _set(tree, steps, value)
+
+
+def _set(node: Node, steps: tuple[str, ...], value: Node) -> Node:
+    if not steps:
+        return value
+    step, rest = steps[0], steps[1:]
+    if isinstance(node.value, tuple):
+        index = _index(node.value, step, value.origin)
+        items = list(node.value)
+        items[index] = _set(items[index], rest, value)
+        return replace(node, value=tuple(items))
+    if node.value is not None and not isinstance(node.value, dict):
+        raise ConfigError(
+            f"the key above {step!r} holds {str(node.value)[:60]!r}, expected a mapping or a list.",
+            where=value.origin.at(None),
+            hint="Override that key itself, or correct the name.",
+        )
+    entries = dict(_entries(node))
+    if not rest and value.value is None and step in entries:
+        del entries[step]
+    else:
+        entries[step] = _set(entries.get(step, Node(value.origin, 1, None)), rest, value)
+    return replace(node, value=entries)
+
+
+def _index(items: tuple[Node, ...], step: str, origin: Origin) -> int:
+    if step.isascii() and step.isdecimal() and len(step) < 10 and int(step) < len(items):
+        return int(step)
+    raise ConfigError(
+        f"found the index {step!r} into a list of {len(items)} values.",
+        where=origin.at(None),
+        hint=f"Write an index from 0 to {len(items) - 1}." if items else "Override the whole list.",
+    )
+
+
+def _build(node: Node, path: tuple[Step, ...], marks: dict[tuple[Step, ...], Location]) -> Any:
+    marks[path] = node.origin.at(node.line, path)
+    if isinstance(node.value, dict):
+        return {key: _build(entry, (*path, key), marks) for key, entry in node.value.items()}
+    if isinstance(node.value, tuple):
+        return [_build(entry, (*path, index), marks) for index, entry in enumerate(node.value)]
+    return _scalar(node, path)
+
+
+def _scalar(node: Node, path: tuple[Step, ...]) -> Any:
+    if isinstance(node.value, str):
+        return ConfigText(node.value, node.origin.at(node.line, path), node.origin.base_dir, node.origin.root)
+    return node.value

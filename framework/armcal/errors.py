@@ -1,0 +1,82 @@
+"""What armcal raises: every message says what was found, what was expected, where, and what to do next."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+EXIT_DONE = 0
+EXIT_FAULT = 1
+EXIT_BAD_INPUT = 2
+EXIT_NOT_CONVERGED = 3
+
+
+@dataclass(frozen=True)
+class Location:
+    """Where in what a user gave: a file, and in it a line (from 1), a field (dotted) or a data row (from 1)."""
+
+    file: str | None = None
+    line: int | None = None
+    field: str | None = None
+    row: int | None = None
+
+    def __str__(self) -> str:
+        place = self.file or ""
+        if self.line is not None:
+            place += f":{self.line}" if place else f"line {self.line}"
+        parts = [place] if place else []
+        if self.row is not None:
+            parts.append(f"row {self.row}")
+        if self.field:
+            parts.append(self.field)
+        return ", ".join(parts)
+
+
+class ArmcalError(Exception):
+    """The root of armcal's own errors.
+
+    Args:
+        message: what was found and what was expected.
+        where: the place in the user's input.
+        hint: what to do next, a full sentence.
+    """
+
+    exit_code = EXIT_FAULT
+
+    def __init__(self, message: str, *, where: Location | None = None, hint: str = "") -> None:
+        self.message = message
+        self.where = where
+        self.hint = hint
+        super().__init__(str(self))
+
+    def __str__(self) -> str:
+        place = str(self.where) if self.where else ""
+        text = f"{place}: {self.message}" if place else self.message
+        return f"{text} {self.hint}".rstrip()
+
+
+class InputError(ArmcalError):
+    """Something a user gave is refused."""
+
+    exit_code = EXIT_BAD_INPUT
+
+
+class ConfigError(InputError):
+    """A configuration is refused."""
+
+
+class DataError(InputError):
+    """A dataset is refused."""
+
+
+class PluginError(InputError):
+    """A plugin that was asked for is missing, broken or ambiguous."""
+
+
+class ProblemError(InputError):
+    """The data and the parameters asked for do not make a problem that can be solved."""
+
+
+class NotConvergedError(ArmcalError):
+    """A solver or the elastic equilibrium did not converge."""
+
+    exit_code = EXIT_NOT_CONVERGED

@@ -1,0 +1,1 @@
+"""Second floor: what a record measures, and how records are read."""

@@ -1,0 +1,47 @@
+"""Measurements: factor types. Each says what one record constrains, as a residual in physical units."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+from armcal.arm.assembly import ArmState
+from armcal.base.parameters import ParameterBlock
+from armcal.base.se3 import Expression
+
+
+@dataclass(frozen=True)
+class Channel:
+    """One measured number of a record: its local name (``x``) and dimension (``length``, ``angle``, ``1``)."""
+
+    name: str
+    dimension: str
+
+
+class Measurement(Protocol):
+    """What a plugin provides to describe an instrument or a contact.
+
+    Parameters have local names; the framework puts the instance before them (``tracker.target_x``).
+    """
+
+    @property
+    def arms(self) -> tuple[str, ...]:
+        """The instance names of the arms that take part."""
+
+    def parameters(self) -> Sequence[ParameterBlock]:
+        """Parameters of the instrument itself."""
+
+    def channels(self) -> Sequence[Channel]:
+        """The measured numbers it reads from a record."""
+
+    def outputs(self, arms: Mapping[str, ArmState], values: Mapping[str, Expression]) -> Mapping[str, Expression]:
+        """What each channel would read without noise; empty for a contact that reads nothing."""
+
+    def residual(
+        self, arms: Mapping[str, ArmState], measured: Mapping[str, Expression], values: Mapping[str, Expression]
+    ) -> Expression:
+        """Measured minus predicted, or what a contact leaves open (n x 1, m or rad)."""
+
+    def noise(self) -> Sequence[float]:
+        """Standard deviation of each entry of the residual (m or rad)."""

@@ -1,0 +1,92 @@
+"""Readers and simulators: where datasets come from."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+from armcal.arm.assembly import Arm
+from armcal.base.dataset import Dataset
+from armcal.measure.measurement import Measurement
+
+
+@dataclass(frozen=True)
+class WantedChannel:
+    """One number a record may carry.
+
+    Attributes:
+        channel: its name in a dataset (``arm.q1``, ``tracker.x``, ``gravity_x``).
+        columns: names it may have in a file, without the unit suffix, the most specific first.
+        dimension: of its unit.
+        required: whether a record without it is useless.
+    """
+
+    channel: str
+    columns: tuple[str, ...]
+    dimension: str
+    required: bool
+
+
+@dataclass(frozen=True)
+class ReadRequest:
+    """What a reader is asked for: channels, for these arms and measurements (by instance name)."""
+
+    arms: Mapping[str, Arm]
+    measurements: Mapping[str, Measurement]
+    wanted: tuple[WantedChannel, ...]
+
+
+class Reader(Protocol):
+    """What a plugin provides to read a format. Units end here: datasets are SI."""
+
+    def read(self, request: ReadRequest) -> Dataset:
+        """The records of the source.
+
+        Raises:
+            DataError: with file, line and column.
+        """
+
+
+ENVIRONMENT: tuple[tuple[str, str], ...] = (
+    *((f"gravity_{axis}", "acceleration") for axis in "xyz"),
+    ("payload", "mass"),
+    *((f"payload_{axis}", "length") for axis in "xyz"),
+    *((f"force_{axis}", "force") for axis in "xyz"),
+    *((f"torque_{axis}", "torque") for axis in "xyz"),
+    ("time", "time"),
+    ("temperature", "temperature"),
+)
+"""Columns that any record may carry, and their dimensions."""
+
+
+def wanted_channels(
+    arms: Mapping[str, Arm], measurements: Mapping[str, Measurement], measured: bool
+) -> tuple[WantedChannel, ...]:
+    """Every channel a problem of these arms and measurements can use.
+
+    ``measured`` says whether measured values are required (a calibration) or may be absent (a prediction).
+    """
+    wanted = [channel for arm in arms.values() for channel in _arm_channels(arm, len(arms) == 1)]
+    wanted += [WantedChannel(name, (name,), dimension, False) for name, dimension in ENVIRONMENT]
+    local = [c.name for m in measurements.values() for c in m.channels()]
+    for instance, measurement in measurements.items():
+        for channel in measurement.channels():
+            own = f"{instance}.{channel.name}"
+            names = (own, channel.name) if local.count(channel.name) == 1 else (own,)
+            wanted.append(WantedChannel(own, names, channel.dimension, measured))
+    return tuple(wanted)
+
+
+def _arm_channels(arm: Arm, alone: bool) -> Iterator[WantedChannel]:
+    for index, joint in enumerate(arm.joint_names, start=1):
+        own = f"{arm.name}.{joint}"
+        yield WantedChannel(own, _names(own, (joint,), alone), arm.joint_dimensions[index - 1], True)
+        approach = (f"approach{index}", f"approach_{joint}")
+        yield WantedChannel(
+            f"{arm.name}.approach.{joint}", _names(f"{arm.name}.{approach[0]}", approach, alone), "1", False
+        )
+
+
+def _names(own: str, short: Sequence[str], alone: bool) -> tuple[str, ...]:
+    return (own, *short) if alone else (own,)

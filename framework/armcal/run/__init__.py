@@ -1,0 +1,1 @@
+"""Fifth floor: from a configuration to a finished run."""

@@ -1,0 +1,86 @@
+"""What a run knows when it ends: everything that the outputs, the report and the terminal show."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from armcal.base.dataset import Dataset
+from armcal.base.domains import Array
+from armcal.solve.estimator import Estimate
+from armcal.solve.validation import ErrorSummary, Indices, Split
+from armcal.solve.verdict import Verdict
+
+
+@dataclass(frozen=True)
+class RecordErrors:
+    """Error of each record of the dataset, in dataset order (mm).
+
+    Attributes:
+        nominal_mm: with nominal parameters (N).
+        calibrated_mm: with the calibrated ones (N).
+        cross_validated_mm: by the fold that did not train on it (N; nan outside of cross-validation).
+        nominal_residual_mm: measured minus predicted, all factors stacked (n_r x N).
+        calibrated_residual_mm: the same after calibration.
+        position_mm: predicted tool position of the first arm in its root frame (3 x N).
+    """
+
+    nominal_mm: Array
+    calibrated_mm: Array
+    cross_validated_mm: Array
+    nominal_residual_mm: Array
+    calibrated_residual_mm: Array
+    position_mm: Array
+
+
+@dataclass(frozen=True)
+class ErrorTable:
+    """Error summaries (mm) by model (nominal, calibrated) and by records (train, holdout, cross_validated)."""
+
+    nominal: dict[str, ErrorSummary]
+    calibrated: dict[str, ErrorSummary]
+
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {
+            model: {name: summary.as_dict() for name, summary in table.items()}
+            for model, table in (("nominal", self.nominal), ("calibrated", self.calibrated))
+        }
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """A finished run.
+
+    Attributes:
+        name: of the experiment.
+        command: how to repeat it.
+        dataset: the records used.
+        split: which trained and which judged.
+        estimate: what was found.
+        errors: of every record.
+        table: their summaries.
+        verdict: what to conclude.
+        warnings: of config, data and problem.
+        backend: what evaluated the model.
+        seconds: of each stage, and ``total``.
+        provenance: hashes and versions.
+    """
+
+    name: str
+    command: str
+    dataset: Dataset
+    split: Split
+    estimate: Estimate
+    errors: RecordErrors
+    table: ErrorTable
+    verdict: Verdict
+    warnings: tuple[str, ...]
+    backend: str
+    seconds: dict[str, float]
+    provenance: dict[str, Any]
+
+    @property
+    def train(self) -> Indices:
+        """Indices of the training records."""
+        return self.split.train

@@ -1,0 +1,1 @@
+"""Third floor: problems, their compiled functions, estimators, identifiability, validation."""

@@ -1,0 +1,237 @@
+"""Estimators and estimates: from a problem and records to values, and how sure they are."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Protocol
+
+import numpy as np
+from scipy.stats import t
+
+from armcal.base.domains import Array
+from armcal.base.parameters import Parameters
+from armcal.errors import ProblemError
+from armcal.solve.identifiability import POOR_CONDITION, Identifiability, analyse
+from armcal.solve.problem import FactorRecords, Problem
+
+CONFIDENCE = 0.95
+NEAR_A_BOUND_SD = 3.0
+"""Within so many standard deviations of a bound an interval is one-sided."""
+AT_BOUND = 1e-6
+"""In ordinary sizes of the parameter: closer than this, a parameter lies on its bound."""
+
+Progress = Callable[[str, float], None]
+"""Told what is being done, and which fraction of it is."""
+
+
+def no_progress(what: str, fraction: float) -> None:
+    """Says nothing."""
+
+
+@dataclass(frozen=True)
+class SolverVerdict:
+    """What a solver says of its own work; ``status`` in its own words."""
+
+    name: str
+    status: str
+    converged: bool
+    iterations: int
+    seconds: float
+    starts: int = 1
+    agreeing_starts: int = 1
+
+
+@dataclass(frozen=True)
+class Solution:
+    """A value vector (all canonical entries) and the solver's verdict on it."""
+
+    values: Array
+    verdict: SolverVerdict
+
+
+class Estimator(Protocol):
+    """What a plugin provides to solve a problem on all records at once."""
+
+    def solve(
+        self, problem: Problem, records: Sequence[FactorRecords], start: Array, progress: Progress = no_progress
+    ) -> Solution:
+        """Minimise half the squared whitened residuals plus priors, within bounds, from ``start``.
+
+        A solver that does not converge says so in its verdict; it does not raise.
+        """
+
+
+@dataclass(frozen=True)
+class Interval95:
+    """A 95 % interval of one canonical entry; ``one_sided`` near a bound, where the bound itself is the other end."""
+
+    lower: float
+    upper: float
+    one_sided: bool
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What a calibration found.
+
+    Attributes:
+        parameters: the blocks, with their nominal values.
+        values: all canonical entries.
+        free_entries: positions of the free ones.
+        covariance: of the free canonical entries; directions that neither data nor priors determine are left out.
+        unconstrained: free canonical entries after a step that ignores the bounds; equals the values where no
+            bound holds.
+        noise_scale: residuals in units of the declared noise (standard deviation).
+        degrees_of_freedom: residual numbers less determined parameters.
+        identifiability: what the data alone determines.
+        determined: per free entry, whether data and priors together determine it.
+        verdict: the solver's.
+    """
+
+    parameters: Parameters
+    values: Array
+    free_entries: tuple[int, ...]
+    covariance: Array
+    unconstrained: Array
+    noise_scale: float
+    degrees_of_freedom: int
+    identifiability: Identifiability
+    determined: tuple[bool, ...]
+    verdict: SolverVerdict
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Names of the free canonical entries."""
+        return tuple(self.parameters.entry_names[i] for i in self.free_entries)
+
+    @cached_property
+    def deviations(self) -> Array:
+        """Standard deviations of the free canonical entries; not a number where undetermined."""
+        deviation = np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
+        return np.where(np.array(self.determined, dtype=bool), deviation, np.nan)
+
+    @cached_property
+    def at_bound(self) -> tuple[str, ...]:
+        """Free entries that ended on a bound."""
+        lower, upper = _entry_bounds(self.parameters)
+        scale = _entry_scales(self.parameters)
+        value = self.values[list(self.free_entries)]
+        on = (value - lower <= AT_BOUND * scale) | (upper - value <= AT_BOUND * scale)
+        return tuple(name for name, flag in zip(self.names, on, strict=True) if flag)
+
+    @cached_property
+    def intervals(self) -> tuple[Interval95, ...]:
+        """95 % intervals of the free entries, by Student's t; one-sided within 3 deviations of a bound."""
+        lower, upper = _entry_bounds(self.parameters)
+        freedom = max(self.degrees_of_freedom, 1)
+        two_sided, one_sided = t.ppf(0.5 + CONFIDENCE / 2, freedom), t.ppf(CONFIDENCE, freedom)
+        value = self.values[list(self.free_entries)]
+        rows = zip(value, self.unconstrained, self.deviations, lower, upper, strict=True)
+        return tuple(_interval(*row, two_sided, one_sided) for row in rows)
+
+
+def estimate(problem: Problem, records: Sequence[FactorRecords], solution: Solution) -> Estimate:
+    """Covariance, intervals and identifiability at a solution.
+
+    The declared noise is scaled to the residuals found (the a posteriori variance factor [Mikhail1976]): with a
+    model that is wrong by more than the noise the intervals widen accordingly. A parameter at a bound keeps its
+    full covariance: the bound is not evidence.
+    """
+    parameters = problem.parameters
+    scales, prior = parameters.scales(), parameters.prior_information()
+    increment = parameters.local(solution.values)
+    chain = parameters.retract_jacobian(increment)
+    equations = problem.normal_equations(solution.values, records).chained(chain)
+    triangle = problem.triangular_factor(solution.values, records)
+    known = analyse(triangle, scales, parameters.increment_names)
+    count = sum(each.count * len(kernel.factor.noise) for kernel, each in zip(problem.kernels, records, strict=True))
+    freedom = count - known.rank
+    noise_scale = float(np.sqrt(2 * equations.cost / freedom)) if freedom > 0 else 1.0
+    held = np.diag(scales * np.sqrt(prior)) * noise_scale
+    stacked = np.vstack([triangle * scales, held])
+    _, values, directions = np.linalg.svd(stacked, full_matrices=False)
+    seen = values > 1e-9 * max(values[0], 1e-300) if len(values) else np.zeros(0, dtype=bool)
+    inverse = np.where(seen, 1 / np.where(seen, values, 1.0), 0.0)
+    half = scales[:, None] * directions.T * inverse
+    covariance = noise_scale**2 * half @ half.T
+    gradient = equations.gradient + prior * increment
+    step = -(half @ (half.T @ gradient))
+    unseen = np.linalg.norm(directions[~seen], axis=0) if len(values) else np.zeros(0)
+    free = list(parameters.free_entries)
+    return Estimate(
+        parameters=parameters,
+        values=solution.values,
+        free_entries=parameters.free_entries,
+        covariance=chain @ covariance @ chain.T,
+        unconstrained=solution.values[free] + chain @ step,
+        noise_scale=noise_scale,
+        degrees_of_freedom=freedom,
+        identifiability=known,
+        determined=tuple(bool(x) for x in ~(np.abs(chain) @ unseen > 1e-6)),
+        verdict=solution.verdict,
+    )
+
+
+def require_solvable(problem: Problem, records: Sequence[FactorRecords], start: Array) -> tuple[str, ...]:
+    """Refuse a problem whose answer would be made up.
+
+    Returns:
+        warnings: what priors alone hold, and a poor condition.
+
+    Raises:
+        ProblemError: fewer equations than parameters, or undetermined combinations, without priors on them.
+    """
+    parameters = problem.parameters
+    count = sum(each.count * len(kernel.factor.noise) for kernel, each in zip(problem.kernels, records, strict=True))
+    unknown = problem.increments
+    has_prior = parameters.prior_information() > 0
+    warnings = []
+    if count < unknown:
+        text = f"{count} equations ({_poses(records)} records) for {unknown} free parameters"
+        if not has_prior.all():
+            raise ProblemError(f"{text}.", hint="Measure more poses, fix parameters, or give every one a prior.")
+        warnings.append(f"{text}: what the data does not say comes from the priors.")
+    known = analyse(problem.triangular_factor(start, records), parameters.scales(), parameters.increment_names)
+    if known.undetermined:
+        listed = "; ".join(str(combination) for combination in known.undetermined)
+        text = f"the data does not determine {len(known.undetermined)} combinations: {listed}"
+        held = np.diag(np.sqrt(parameters.prior_information()) * parameters.scales())
+        null = known.directions[known.rank :]
+        if np.linalg.matrix_rank(held @ null.T) < len(null):
+            raise ProblemError(
+                f"{text}.", hint="Fix one parameter of each, give it a prior, or measure poses that tell them apart."
+            )
+        warnings.append(f"{text}; their priors hold them.")
+    if known.condition > POOR_CONDITION:
+        warnings.append(f"the scaled condition is {known.condition:.1e}: {known.weakest} is hardly determined.")
+    return tuple(warnings)
+
+
+def _poses(records: Sequence[FactorRecords]) -> int:
+    return max((each.count for each in records), default=0)
+
+
+def _interval(
+    value: float, free_value: float, sd: float, lower: float, upper: float, two_sided: float, one_sided: float
+) -> Interval95:
+    if not np.isfinite(sd):
+        return Interval95(lower, upper, False)
+    if free_value - lower < NEAR_A_BOUND_SD * sd and free_value - lower <= upper - free_value:
+        return Interval95(lower, float(min(max(free_value + one_sided * sd, lower), upper)), True)
+    if upper - free_value < NEAR_A_BOUND_SD * sd:
+        return Interval95(float(max(min(free_value - one_sided * sd, upper), lower)), upper, True)
+    return Interval95(float(value - two_sided * sd), float(value + two_sided * sd), False)
+
+
+def _entry_bounds(parameters: Parameters) -> tuple[Array, Array]:
+    lower, upper = [], []
+    for block in parameters.free:
+        lower += [getattr(block.domain, "lower", -np.inf)] * block.size
+        upper += [getattr(block.domain, "upper", np.inf)] * block.size
+    return np.array(lower), np.array(upper)
+
+
+def _entry_scales(parameters: Parameters) -> Array:
+    return np.array([block.scale for block in parameters.free for _ in range(block.size)])

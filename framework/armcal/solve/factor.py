@@ -1,0 +1,215 @@
+"""One factor type as expressions: what one record says, as a function of values, record and elastic state.
+
+The elastic equilibrium ``state = pass(state)`` is never unrolled. At a state d near it, with pass F and
+residual r, everything follows from one pass and a small solve:
+
+    A = dr/dd (I - dF/dd)^-1,    r* = r + A (F - d),    dr*/dv = d(r + A F)/dv  with A held,
+
+the implicit function theorem in adjoint form [Griewank2008]: its cost hardly grows with the number of
+parameters, and r* is the residual in equilibrium up to the square of what is left of the state's error.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import casadi as ca
+
+from armcal.arm.assembly import Arm, ArmInputs, ArmState, scoped
+from armcal.arm.statics import Load
+from armcal.base.parameters import Parameters
+from armcal.base.se3 import Expression
+from armcal.measure.measurement import Measurement
+
+Vector3 = tuple[float, float, float]
+_ZERO: Vector3 = (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class Environment:
+    """What acts on the arms where a record does not say: gravity (m/s^2), payload (kg, m), wrench (N, N m)."""
+
+    gravity: Vector3
+    payload_mass: float = 0.0
+    payload_com: Vector3 = _ZERO
+    force: Vector3 = _ZERO
+    torque: Vector3 = _ZERO
+
+
+@dataclass(frozen=True)
+class Factor:
+    """The expressions of one measurement.
+
+    Attributes:
+        name: the measurement's instance name.
+        channels: the record channels it reads, in the order of ``record``.
+        values: free canonical entries (symbols, n_v); fixed ones are numbers in the expressions.
+        record: symbols, one a channel.
+        state: deflections of all arms that take part (symbols, n_d).
+        next_state: one elastic pass from ``state``.
+        residual: m or rad (n_r).
+        outputs: what the instrument would read (n_o), named by ``output_channels``.
+        tools: position of each arm's tool in its root frame (3 a arm, m).
+        noise: standard deviation of each residual entry.
+    """
+
+    name: str
+    channels: tuple[str, ...]
+    output_channels: tuple[str, ...]
+    values: Expression
+    record: Expression
+    state: Expression
+    next_state: Expression
+    residual: Expression
+    outputs: Expression
+    tools: Expression
+    noise: tuple[float, ...]
+
+    @property
+    def _inputs(self) -> list[Expression]:
+        return [self.values, self.record, self.state]
+
+    def pass_function(self) -> ca.Function:
+        """(values, record, state) -> (next state, residual)."""
+        return ca.Function("single_pass", self._inputs, [self.next_state, ca.densify(self.residual)], {"cse": True})
+
+    def output_function(self) -> ca.Function:
+        """(values, record, state) -> (next state, outputs and tools)."""
+        shown = ca.densify(ca.vertcat(self.outputs, self.tools))
+        return ca.Function("outputs", self._inputs, [self.next_state, shown], {"cse": True})
+
+    def linearise_function(self) -> ca.Function:
+        """(values, record, state) -> (next state, residual, Jacobian transposed), in equilibrium to second order."""
+        residual, jacobian = self.residual, ca.jacobian(self.residual, self.values)
+        if self.state.numel():
+            adjoint = ca.SX.sym("adjoint", self.residual.numel(), self.state.numel())
+            solved = self._solve_left(ca.jacobian(self.residual, self.state))
+            held = ca.jacobian(self.residual + ca.mtimes(adjoint, self.next_state), self.values)
+            jacobian = ca.substitute(held, adjoint, solved)
+            residual = self.residual + ca.mtimes(solved, self.next_state - self.state)
+        outputs = [self.next_state, ca.densify(residual), ca.densify(jacobian.T)]
+        return ca.Function("linearise", self._inputs, outputs, {"cse": True})
+
+    def newton_function(self) -> ca.Function:
+        """(values, record, state) -> (state after a Newton step on the equilibrium, how far it moves)."""
+        step = ca.solve(self._one_minus_slope(), self.next_state - self.state)
+        return ca.Function("newton", self._inputs, [self.state + step, step], {"cse": True})
+
+    def hessian_function(self) -> ca.Function:
+        """(values, record, state) -> exact Hessian (n_v x n_v) of half the squared weighted residual, in equilibrium.
+
+        The second derivative of the Lagrangian along the equilibrium's tangent. [Griewank2008]
+        """
+        weighted = self.residual / ca.SX(list(self.noise))
+        cost = ca.dot(weighted, weighted) / 2
+        if not self.state.numel():
+            return ca.Function("hessian", self._inputs, [ca.densify(ca.hessian(cost, self.values)[0])])
+        both = ca.vertcat(self.values, self.state)
+        adjoint = ca.SX.sym("adjoint", 1, self.state.numel())
+        lagrangian = ca.hessian(cost + ca.mtimes(adjoint, self.next_state), both)[0]
+        lagrangian = ca.substitute(lagrangian, adjoint, self._solve_left(ca.jacobian(cost, self.state)))
+        slope = ca.solve(self._one_minus_slope(), ca.densify(ca.jacobian(self.next_state, self.values)))
+        tangent = ca.vertcat(ca.SX.eye(self.values.numel()), slope)
+        hessian = ca.mtimes(tangent.T, ca.mtimes(lagrangian, tangent))
+        return ca.Function("hessian", self._inputs, [ca.densify(hessian)], {"cse": True})
+
+    def _one_minus_slope(self) -> Expression:
+        return ca.SX.eye(self.state.numel()) - ca.densify(ca.jacobian(self.next_state, self.state))
+
+    def _solve_left(self, rows: Expression) -> Expression:
+        """rows (I - dF/dd)^-1."""
+        return ca.solve(self._one_minus_slope().T, ca.densify(rows).T).T
+
+
+class _Records:
+    """Hands out a symbol for each channel that is asked for, and remembers their order."""
+
+    def __init__(self, available: frozenset[str]) -> None:
+        self._available = available
+        self.symbols: dict[str, Expression] = {}
+
+    def number(self, channel: str) -> Expression:
+        return self.symbols.setdefault(channel, ca.SX.sym(channel))
+
+    def optional(self, channel: str, default: float) -> Expression:
+        return self.number(channel) if channel in self._available else ca.SX(default)
+
+    def used_by(self, expression: Expression) -> dict[str, Expression]:
+        """The symbols that an expression depends on."""
+        return {name: symbol for name, symbol in self.symbols.items() if ca.depends_on(expression, symbol)}
+
+    def vector(self, channel: str, defaults: Vector3) -> Expression:
+        """Three channels ``channel_x`` to ``channel_z``."""
+        parts = [self.optional(f"{channel}_{axis}", d) for axis, d in zip("xyz", defaults, strict=True)]
+        return ca.sparsify(ca.vertcat(*parts))
+
+
+def build_factor(
+    name: str,
+    measurement: Measurement,
+    arms: Mapping[str, Arm],
+    parameters: Parameters,
+    environment: Environment,
+    available: frozenset[str],
+) -> Factor:
+    """The expressions of one measurement.
+
+    ``available`` are the channels that the records carry; what they do not carry comes from ``environment``.
+    """
+    symbols, values = _value_expressions(parameters)
+    records = _Records(available)
+    load = Load(
+        gravity=records.vector("gravity", environment.gravity),
+        payload_mass=records.optional("payload", environment.payload_mass),
+        payload_com=records.vector("payload", environment.payload_com),
+        force=records.vector("force", environment.force),
+        torque=records.vector("torque", environment.torque),
+    )
+    states, deflections = {}, []
+    for arm_name in measurement.arms:
+        deflection = ca.SX.sym(f"deflection_{arm_name}", arms[arm_name].deflection_size)
+        deflections.append(deflection)
+        states[arm_name] = _arm_state(arms[arm_name], values, records, load, deflection)
+    local = scoped(values, f"{name}.")
+    predicted = measurement.outputs(states, local)
+    measured = {c.name: records.optional(f"{name}.{c.name}", 0.0) for c in measurement.channels()}
+    residual = measurement.residual(states, measured, local)
+    next_state = ca.densify(ca.vertcat(*[states[a].next_deflection for a in measurement.arms]))
+    outputs = ca.vertcat(*predicted.values())
+    tools = ca.vertcat(*[states[a].root_T_tool.translation for a in measurement.arms])
+    used = records.used_by(ca.vertcat(residual, next_state, outputs, tools))
+    return Factor(
+        name=name,
+        channels=tuple(used),
+        output_channels=tuple(f"{name}.{channel}" for channel in predicted),
+        values=symbols,
+        record=ca.vertcat(*used.values()),
+        state=ca.vertcat(*deflections),
+        next_state=next_state,
+        residual=residual,
+        outputs=outputs,
+        tools=tools,
+        noise=tuple(measurement.noise()),
+    )
+
+
+def _value_expressions(parameters: Parameters) -> tuple[Expression, dict[str, Expression]]:
+    """Symbols for the free canonical entries, and every block's value with fixed ones as numbers."""
+    symbols = ca.SX.sym("values", len(parameters.free_entries))
+    values, start = {}, 0
+    for block in parameters.blocks:
+        if block.free:
+            values[block.name] = symbols[start : start + block.size]
+            start += block.size
+        else:
+            values[block.name] = ca.SX(list(block.nominal))
+    return symbols, values
+
+
+def _arm_state(
+    arm: Arm, values: Mapping[str, Expression], records: _Records, load: Load, deflection: Expression
+) -> ArmState:
+    angles = ca.vertcat(*[records.number(f"{arm.name}.{joint}") for joint in arm.joint_names])
+    approach = ca.vertcat(*[records.optional(f"{arm.name}.approach.{j}", 0.0) for j in arm.joint_names])
+    return arm.state(values, ArmInputs(angles, approach, load, deflection))

@@ -1,0 +1,291 @@
+"""Compiled functions of one factor: residuals and Jacobians of many records in elastic equilibrium.
+
+Two backends give the same numbers: CasADi's virtual machine, always there, and generated C, where a
+compiler is found. Arrays are stored channel by channel, (channels x records).
+"""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Literal, Protocol
+
+import casadi as ca
+import numpy as np
+
+from armcal.base.domains import Array
+from armcal.errors import NotConvergedError
+from armcal.solve import c_source, compiler
+from armcal.solve.factor import Factor
+
+EvaluatorChoice = Literal["auto", "compiled", "interpreted"]
+
+REST_RAD = 1e-13
+"""A residual is taken when no deflection moves more than this in a pass: below 1e-6 mm on any arm."""
+REST_BEFORE_LINEARISING_RAD = 1e-8
+"""The linearisation corrects to second order, so it may start from here."""
+MOST_PASSES = 100
+WORTH_COMPILING_RECORDS = 5000
+"""From this many records on, waiting for the compiler costs less than the virtual machine does."""
+_BLOCK = 64
+_AGREEMENT = 1e-12
+
+
+class Backend(Protocol):
+    """Evaluates blocks of records; ``state`` is read as the start and left in equilibrium."""
+
+    name: str
+
+    def residuals(self, values: Array, record: Array, state: Array, residual: Array) -> int:
+        """Fill ``residual``; give how many records (at least) did not settle."""
+
+    def linearise(self, values: Array, record: Array, state: Array, residual: Array, jacobian: Array) -> int:
+        """Fill ``residual``, and ``jacobian`` (n_r * n_v x records, residual entry by residual entry)."""
+
+
+class VirtualMachine:
+    """CasADi's interpreter over blocks of records."""
+
+    name = "virtual machine"
+
+    def __init__(self, factor: Factor) -> None:
+        self._pass = _Mapped(factor.pass_function())
+        self._linearise = _Mapped(factor.linearise_function())
+        self._has_state = factor.state.numel() > 0
+
+    def residuals(self, values: Array, record: Array, state: Array, residual: Array) -> int:
+        """As the protocol says."""
+        return self._settle(values, record, state, residual, REST_RAD)
+
+    def linearise(self, values: Array, record: Array, state: Array, residual: Array, jacobian: Array) -> int:
+        """As the protocol says."""
+        unsettled = 0
+        if self._has_state:
+            unsettled = self._settle(values, record, state, residual, REST_BEFORE_LINEARISING_RAD)
+        following = np.empty_like(state)
+        self._linearise(values, (record, state), (following, residual, jacobian))
+        state[:] = following
+        return unsettled
+
+    def _settle(self, values: Array, record: Array, state: Array, residual: Array, tolerance: float) -> int:
+        following = np.empty_like(state)
+        moving = np.ones(record.shape[1], dtype=bool)
+        for _ in range(MOST_PASSES):
+            self._pass(values, (record, state), (following, residual))
+            moving = ~(np.abs(following - state).max(axis=0, initial=0.0) <= tolerance)
+            state[:] = following
+            if not moving.any():
+                return 0
+        return int(moving.sum())
+
+
+class _Mapped:
+    """A CasADi function over many records, without a conversion for each number."""
+
+    def __init__(self, function: ca.Function) -> None:
+        self._function = function.map(f"{function.name()}_block", "serial", _BLOCK, [0], [])
+        self._out_sizes = [function.numel_out(i) for i in range(function.n_out())]
+        self._in_sizes = [function.numel_in(i) for i in range(1, function.n_in())]
+
+    def __call__(self, values: Array, inputs: Sequence[Array], outputs: Sequence[Array]) -> None:
+        count = inputs[0].shape[1]
+        buffer, evaluate = self._function.buffer()
+        given = [np.zeros((_BLOCK, size)) for size in self._in_sizes]
+        taken = [np.zeros((_BLOCK, size)) for size in self._out_sizes]
+        shared = np.ascontiguousarray(values)
+        for position, array in enumerate([shared, *given]):
+            if array.size:
+                buffer.set_arg(position, memoryview(array))
+        for position, array in enumerate(taken):
+            if array.size:
+                buffer.set_res(position, memoryview(array))
+        for start in range(0, count, _BLOCK):
+            stop = min(start + _BLOCK, count)
+            for block, source in zip(given, inputs, strict=True):
+                block[: stop - start] = source[:, start:stop].T
+            evaluate()
+            for block, target in zip(taken, outputs, strict=True):
+                target[:, start:stop] = self._by_rows(block[: stop - start], target.shape[0])
+
+    @staticmethod
+    def _by_rows(block: Array, rows: int) -> Array:
+        return block.reshape(len(block), rows).T
+
+
+class Compiled:
+    """The same functions in C, several records at once."""
+
+    name = "compiled"
+
+    def __init__(self, library: ctypes.CDLL) -> None:
+        self._residuals = _signature(library.armcal_residuals, outputs=1)
+        self._linearise = _signature(library.armcal_linearise, outputs=2)
+
+    def residuals(self, values: Array, record: Array, state: Array, residual: Array) -> int:
+        """As the protocol says."""
+        pointers = [*_pointers(values, record, state), residual.ctypes.data, _stride(residual)]
+        return int(self._residuals(record.shape[1], _stride(record), *pointers, REST_RAD, MOST_PASSES))
+
+    def linearise(self, values: Array, record: Array, state: Array, residual: Array, jacobian: Array) -> int:
+        """As the protocol says."""
+        pointers = [*_pointers(values, record, state), residual.ctypes.data, _stride(residual)]
+        pointers += [jacobian.ctypes.data, _stride(jacobian)]
+        rest = REST_BEFORE_LINEARISING_RAD, MOST_PASSES
+        return int(self._linearise(record.shape[1], _stride(record), *pointers, *rest))
+
+
+@dataclass(frozen=True)
+class Kernel:
+    """A factor with the backend that evaluates it."""
+
+    factor: Factor
+    backend: Backend
+
+    @cached_property
+    def newton(self) -> ca.Function:
+        """Newton steps on the equilibrium, for records whose passes do not settle."""
+        return self.factor.newton_function()
+
+    @cached_property
+    def outputs(self) -> ca.Function:
+        """What the instrument would read, and where the tools are."""
+        return self.factor.output_function()
+
+    @cached_property
+    def hessian(self) -> ca.Function:
+        """The exact Hessian of one record."""
+        return self.factor.hessian_function()
+
+    def settle_by_newton(self, values: Array, record: Array, state: Array) -> bool:
+        """Bring every record that has not settled to its equilibrium, in place; False where there is none nearby."""
+        for column in range(record.shape[1]):
+            at = np.nan_to_num(state[:, column], nan=0.0, posinf=0.0, neginf=0.0)
+            at = at if np.abs(at).max(initial=0.0) < 1 else np.zeros_like(at)
+            for _ in range(MOST_PASSES):
+                moved, step = (np.asarray(m).ravel() for m in self.newton(values, record[:, column], at))
+                length = float(np.abs(step).max(initial=0.0))
+                at = moved if length < 0.3 else at + step * (0.3 / length)
+                if not np.isfinite(length) or length < REST_RAD:
+                    break
+            if not length < REST_BEFORE_LINEARISING_RAD:
+                return False
+            state[:, column] = at
+        return True
+
+    def predict(self, values: Array, record: Array, state: Array) -> Array:
+        """Outputs and tool positions in equilibrium (n_o + 3 a arm x records).
+
+        Raises:
+            NotConvergedError: a record has no equilibrium.
+        """
+        mapped = _Mapped(self.outputs)
+        shown = np.empty((self.outputs.numel_out(1), record.shape[1]))
+        following = np.empty_like(state)
+        for _ in range(MOST_PASSES):
+            mapped(values, (record, state), (following, shown))
+            moved = np.abs(following - state).max(initial=0.0)
+            state[:] = following
+            if moved <= REST_RAD:
+                return shown
+        if not self.settle_by_newton(values, record, state):
+            raise NotConvergedError("the elastic equilibrium did not settle.", hint="Check compliances and masses.")
+        mapped(values, (record, state), (following, shown))
+        return shown
+
+
+def build_kernel(factor: Factor, records: int, choice: EvaluatorChoice = "auto") -> Kernel:
+    """A kernel for about so many records.
+
+    ``auto`` takes a cached library, else waits for the compiler only where that pays, else interprets and lets
+    the compiler work for the next run. ``compiled`` waits; without a compiler it interprets.
+    """
+    machine = VirtualMachine(factor)
+    if choice == "interpreted" or compiler.find_compiler() is None:
+        return Kernel(factor, machine)
+    functions = (factor.pass_function(), factor.linearise_function())
+    text = "".join(f.serialize() for f in functions) + c_source.support_source() + c_source.driver_source()
+    key = compiler.library_key(text)
+
+    def source() -> str:
+        return kernel_source(factor, *functions)
+
+    library = compiler.load_cached(key)
+    if library is None:
+        if choice == "auto" and records < WORTH_COMPILING_RECORDS:
+            _quietly(lambda: compiler.compile_in_background(key, source))
+            return Kernel(factor, machine)
+        library = _quietly(lambda: compiler.compile_now(key, source))
+    if library is None:
+        return Kernel(factor, machine)
+    compiled = Compiled(library)
+    return Kernel(factor, compiled if _agree(factor, machine, compiled) else machine)
+
+
+def kernel_source(factor: Factor, single_pass: ca.Function, linearise: ca.Function) -> str:
+    """The whole C file of a factor."""
+    one = c_source.write_function(single_pass, "pass", 1)
+    two = c_source.write_function(linearise, "linearise", 1)
+    sizes = {
+        "LANES": c_source.LANES,
+        "N_RECORD": factor.record.numel(),
+        "N_STATE": factor.state.numel(),
+        "N_RESIDUAL": factor.residual.numel(),
+        "N_VALUES": factor.values.numel(),
+        "PASS_HOISTED": one.hoisted,
+        "LINEARISE_HOISTED": two.hoisted,
+    }
+    defines = "".join(f"#define {name} {number}\n" for name, number in sizes.items())
+    return defines + c_source.support_source() + one.source + two.source + c_source.driver_source()
+
+
+def _quietly(build: Callable[[], ctypes.CDLL | None]) -> ctypes.CDLL | None:
+    """An expression without a C form is no fault: the virtual machine serves."""
+    try:
+        return build()
+    except c_source.UnsupportedExpressionError:
+        return None
+
+
+def _agree(factor: Factor, machine: Backend, compiled: Backend) -> bool:
+    """Whether a library gives the virtual machine's numbers, on a made-up block; a miscompiled one is not used."""
+    random = np.random.default_rng(0)
+    count = c_source.LANES
+    record = random.uniform(-1, 1, (factor.record.numel(), count))
+    values = random.uniform(0.01, 0.02, factor.values.numel())
+    results = []
+    for backend in (machine, compiled):
+        state = np.zeros((factor.state.numel(), count))
+        residual = np.zeros((factor.residual.numel(), count))
+        jacobian = np.zeros((factor.residual.numel() * factor.values.numel(), count))
+        backend.linearise(values, record, state, residual, jacobian)
+        results.append((residual, jacobian))
+    for one, two in zip(*results, strict=True):
+        scale = max(1.0, float(np.nanmax(np.abs(one), initial=0.0)))
+        if not np.allclose(one, two, rtol=0, atol=_AGREEMENT * scale, equal_nan=True):
+            return False
+    return True
+
+
+def _stride(array: Array) -> int:
+    """Numbers from one channel to the next."""
+    if array.size and array.strides[1] != array.itemsize:
+        raise ValueError("the records of a channel must lie side by side")
+    return array.strides[0] // array.itemsize
+
+
+def _pointers(values: Array, *channels: Array) -> list[int]:
+    """Addresses; the C side takes contiguous values, and one stride for record and state."""
+    if not values.flags.c_contiguous or len({_stride(array) for array in channels if array.size}) > 1:
+        raise ValueError("values must be contiguous, record and state slices of arrays of one width")
+    return [values.ctypes.data, *(array.ctypes.data for array in channels)]
+
+
+def _signature(function: Any, outputs: int) -> Any:
+    """Count and stride, three inputs, then each output with its own stride, tolerance, most passes."""
+    integer, pointer = ctypes.c_long, ctypes.c_void_p
+    shared = [integer, integer, pointer, pointer, pointer]
+    function.argtypes = [*shared, *[pointer, integer] * outputs, ctypes.c_double, ctypes.c_int]
+    function.restype = integer
+    return function

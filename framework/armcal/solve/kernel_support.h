@@ -1,0 +1,83 @@
+/* Vector arithmetic for the generated kernels. GNU C vector extensions; no intrinsics. */
+#include <math.h>
+#include <stdint.h>
+#include <string.h>
+
+#define BOTH __attribute__((unused)) static inline
+typedef double V __attribute__((vector_size(8 * LANES)));
+typedef int64_t I __attribute__((vector_size(8 * LANES)));
+
+BOTH V broadcast(double x) { return x - (V){0}; }
+BOTH V load(const double *from) { V x; memcpy(&x, from, sizeof x); return x; }
+BOTH void store(double *to, V x) { memcpy(to, &x, sizeof x); }
+BOTH V choose(I mask, V a, V b) { return (V)((mask & (I)a) | (~mask & (I)b)); }
+
+BOTH double s_sign_of(double x) { return (x > 0) - (x < 0); }
+BOTH double s_less(double a, double b) { return a < b; }
+BOTH double s_less_equal(double a, double b) { return a <= b; }
+BOTH double s_equal(double a, double b) { return a == b; }
+BOTH double s_unequal(double a, double b) { return a != b; }
+BOTH double s_negation(double a) { return !(a != 0); }
+BOTH double s_both(double a, double b) { return (a != 0) && (b != 0); }
+BOTH double s_either(double a, double b) { return (a != 0) || (b != 0); }
+BOTH double s_if_else_zero(double a, double b) { return a != 0 ? b : 0; }
+BOTH double s_sine(double x) { return sin(x); }
+BOTH double s_cosine(double x) { return cos(x); }
+
+#define LIBRARY1(name) \
+  BOTH double s_##name(double x) { return name(x); } \
+  BOTH V v_##name(V x) { for (int i = 0; i < LANES; ++i) x[i] = name(x[i]); return x; }
+#define LIBRARY2(name) \
+  BOTH double s_##name(double x, double y) { return name(x, y); } \
+  BOTH V v_##name(V x, V y) { for (int i = 0; i < LANES; ++i) x[i] = name(x[i], y[i]); return x; }
+#define LANEWISE1(name) \
+  BOTH V v_##name(V x) { for (int i = 0; i < LANES; ++i) x[i] = s_##name(x[i]); return x; }
+#define LANEWISE2(name) \
+  BOTH V v_##name(V x, V y) { for (int i = 0; i < LANES; ++i) x[i] = s_##name(x[i], y[i]); return x; }
+LIBRARY1(sqrt) LIBRARY1(tan) LIBRARY1(asin) LIBRARY1(acos) LIBRARY1(atan) LIBRARY1(exp) LIBRARY1(log)
+LIBRARY1(sinh) LIBRARY1(cosh) LIBRARY1(tanh) LIBRARY1(fabs) LIBRARY1(erf)
+LIBRARY2(atan2) LIBRARY2(pow) LIBRARY2(fmin) LIBRARY2(fmax) LIBRARY2(copysign)
+LANEWISE1(sign_of) LANEWISE1(negation)
+LANEWISE2(less) LANEWISE2(less_equal) LANEWISE2(equal) LANEWISE2(unequal) LANEWISE2(both) LANEWISE2(either)
+LANEWISE2(if_else_zero)
+
+/* Sine and cosine together. The angle is reduced to within pi/4 of a multiple of pi/2 in three parts
+   [Cody1980], then Taylor polynomials serve: within 2 units in the last place for |x| below 1e5, beyond
+   any joint angle in radians; larger or non-finite angles go to the C library. */
+BOTH void v_sincos(V x, V *sine, V *cosine) {
+  const double shift = 0x1.8p52;
+  V size = choose(x < 0, -x, x);
+  int small = 1;
+  for (int i = 0; i < LANES; ++i) small &= size[i] < 1e5;
+  if (!small) {
+    for (int i = 0; i < LANES; ++i) { (*sine)[i] = sin(x[i]); (*cosine)[i] = cos(x[i]); }
+    return;
+  }
+  V shifted = x * 0x1.45f306dc9c883p-1 + shift;
+  I quadrant = (I)shifted;
+  V turns = shifted - shift;
+  V r = x - turns * 0x1.921fb54400000p+0;
+  V low = turns * 0x1.0b4611a626331p-34;
+  V reduced = r - low;
+  V z = reduced * reduced;
+  V s = broadcast(-0x1.ae7f3e733b81fp-41);
+  s = s * z + 0x1.6124613a86d09p-33;
+  s = s * z - 0x1.ae64567f544e4p-26;
+  s = s * z + 0x1.71de3a556c734p-19;
+  s = s * z - 0x1.a01a01a01a01ap-13;
+  s = s * z + 0x1.1111111111111p-7;
+  s = s * z - 0x1.5555555555555p-3;
+  s = reduced + reduced * z * s;
+  V c = broadcast(-0x1.93974a8c07c9dp-37);
+  c = c * z + 0x1.1eed8eff8d898p-29;
+  c = c * z - 0x1.27e4fb7789f5cp-22;
+  c = c * z + 0x1.a01a01a01a01ap-16;
+  c = c * z - 0x1.6c16c16c16c17p-10;
+  c = c * z + 0x1.5555555555555p-5;
+  c = 1.0 - 0.5 * z + z * z * c;
+  I swap = (quadrant & 1) != 0;
+  I flip_sine = (quadrant & 2) << 62;
+  I flip_cosine = ((quadrant + 1) & 2) << 62;
+  *sine = (V)((I)choose(swap, c, s) ^ flip_sine);
+  *cosine = (V)((I)choose(swap, s, c) ^ flip_cosine);
+}

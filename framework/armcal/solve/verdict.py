@@ -1,0 +1,166 @@
+"""The verdict: what a person should conclude, each sentence from a test with a stated level."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2, norm
+
+from armcal.base.domains import Array
+from armcal.solve.estimator import Estimate
+from armcal.solve.identifiability import POOR_CONDITION, correlated_pairs
+
+LEVEL = 0.05
+Grade = Literal["good", "note", "warning", "bad"]
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One sentence of the verdict, and how much it matters."""
+
+    grade: Grade
+    text: str
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """The findings, the worst first, and one line that sums them up."""
+
+    headline: str
+    findings: tuple[Finding, ...]
+
+
+def judge(
+    estimate: Estimate, whitened: Array, errors_mm: Array, train: NDArray[np.intp], judged_mm: Array, judged_on: str
+) -> Verdict:
+    """Judge a calibration.
+
+    Args:
+        estimate: what was found.
+        whitened: residuals in units of the declared noise, in recorded order (n_r x N).
+        errors_mm: calibrated error of each record (N).
+        train: which records trained.
+        judged_mm: errors of the records that did not train, or of cross-validation; empty if there are none.
+        judged_on: what these are, in words.
+    """
+    findings = [_convergence(estimate), _determined(estimate), *_condition(estimate), *_bounds(estimate)]
+    findings += [_noise(whitened[:, train]), *_neighbours(whitened[:, train]), *_correlated(estimate)]
+    findings += [*_outliers(errors_mm[train]), _next(estimate)]
+    order = {"bad": 0, "warning": 1, "note": 2, "good": 3}
+    if len(judged_mm):
+        ninety_five = float(np.percentile(judged_mm, 95))
+        headline = (
+            f"Good for {float(np.mean(judged_mm)):.2f} mm on average and {ninety_five:.2f} mm in 95 % of poses, "
+            f"judged on {judged_on}."
+        )
+    else:
+        headline = "No record was held out: how good the model is on new poses is not known."
+    return Verdict(headline, tuple(sorted(findings, key=lambda finding: order[finding.grade])))
+
+
+def _convergence(estimate: Estimate) -> Finding:
+    told = estimate.verdict
+    if not told.converged:
+        return Finding("bad", f"{told.name} did not converge ({told.status}): these values are no calibration.")
+    text = f"{told.name} converged in {told.iterations} iterations"
+    if told.starts > 1:
+        text += f"; {told.agreeing_starts} of {told.starts} starts came to the same answer"
+    return Finding("good", text + ".")
+
+
+def _determined(estimate: Estimate) -> Finding:
+    known = estimate.identifiability
+    if known.undetermined:
+        listed = "; ".join(str(combination) for combination in known.undetermined)
+        return Finding("bad", f"Not determined by the data, held by priors alone: {listed}.")
+    return Finding("good", f"The data determines all {known.rank} free parameters.")
+
+
+def _condition(estimate: Estimate) -> list[Finding]:
+    known = estimate.identifiability
+    if known.condition <= POOR_CONDITION:
+        return []
+    return [Finding("warning", f"Hardly determined (scaled condition {known.condition:.1e}): {known.weakest}.")]
+
+
+def _bounds(estimate: Estimate) -> list[Finding]:
+    if not estimate.at_bound:
+        return []
+    return [
+        Finding(
+            "warning",
+            f"Ended at a bound: {', '.join(estimate.at_bound)}. The data does not ask for an elasticity there, or "
+            "asks for an unphysical one: something else in the model is missing.",
+        )
+    ]
+
+
+def _noise(whitened: Array) -> Finding:
+    """Are the residuals as large as the declared noise? Chi-square, two-sided, at 5 %."""
+    count = whitened.size
+    total = float(np.sum(whitened**2))
+    ratio = float(np.sqrt(total / count))
+    if total > chi2.ppf(1 - LEVEL / 2, count):
+        return Finding(
+            "warning",
+            f"Residuals are {ratio:.1f} times the declared noise (chi-square, 5 %): what is left is the model's "
+            "error, not the tracker's. Intervals are widened to the residuals.",
+        )
+    if ratio < 0.5:
+        return Finding("note", f"Residuals are only {ratio:.2f} times the declared noise: was it stated too large?")
+    return Finding("good", "Residuals are as large as the declared noise: the model explains the data.")
+
+
+def _neighbours(whitened: Array) -> list[Finding]:
+    """Do residuals of neighbouring records correlate? Against independence, two-sided, at 5 %."""
+    count = whitened.shape[1]
+    spread = float(np.sum(whitened**2))
+    if count < 10 or not spread:
+        return []
+    lag_one = float(np.sum(whitened[:, 1:] * whitened[:, :-1])) / spread
+    if abs(lag_one) < norm.ppf(1 - LEVEL / 2) / np.sqrt(whitened[:, 1:].size):
+        return [Finding("good", "Residuals of neighbouring records do not correlate (5 %).")]
+    return [
+        Finding(
+            "warning",
+            f"Residuals of neighbouring records correlate by {lag_one:.2f} (5 %): they are no noise, so the "
+            "intervals are too narrow and errors follow the arm's configuration.",
+        )
+    ]
+
+
+def _correlated(estimate: Estimate) -> list[Finding]:
+    pairs = correlated_pairs(estimate.covariance, estimate.names)
+    if not pairs:
+        return []
+    listed = ", ".join(f"{a} with {b} ({value:+.3f})" for a, b, value in pairs[:5])
+    more = f" and {len(pairs) - 5} more" if len(pairs) > 5 else ""
+    return [Finding("note", f"Hard to tell apart (correlation above 0.95): {listed}{more}.")]
+
+
+def _outliers(errors_mm: Array) -> list[Finding]:
+    """Records beyond five robust standard deviations of the errors."""
+    middle = float(np.median(errors_mm))
+    spread = 1.4826 * float(np.median(np.abs(errors_mm - middle)))
+    suspicious = int(np.sum(errors_mm > middle + 5 * spread)) if spread > 0 else 0
+    if not suspicious:
+        return []
+    return [Finding("warning", f"{suspicious} records lie beyond five robust deviations: see residuals.csv.")]
+
+
+def _next(estimate: Estimate) -> Finding:
+    """The parameter whose uncertainty is largest in its own ordinary size."""
+    scales: Sequence[float] = [b.scale for b in estimate.parameters.free for _ in range(b.size)]
+    if not len(estimate.names):
+        return Finding("note", "No parameter was free.")
+    relative = np.nan_to_num(estimate.deviations / np.array(scales), nan=np.inf)
+    weakest = estimate.names[int(np.argmax(relative))]
+    return Finding(
+        "note",
+        f"Least certain: {weakest}. Poses that change its effect most would help most: vary the joints on either side "
+        f"of it together ({estimate.identifiability.weakest}).",
+    )

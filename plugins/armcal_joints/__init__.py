@@ -1,0 +1,1 @@
+"""Joint effects: servos, gears and springs, for any arm model."""

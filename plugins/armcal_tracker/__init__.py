@@ -1,0 +1,1 @@
+"""Trackers: tip positions, and the CSV files they are kept in."""

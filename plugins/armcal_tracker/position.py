@@ -1,0 +1,72 @@
+"""The position of a target on the tool, measured in the arm's root frame."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
+
+import casadi as ca
+from armcal.arm.assembly import ArmState
+from armcal.base.parameters import ParameterBlock, scalar
+from armcal.base.settings import Length, Length3, Settings
+from armcal.measure.measurement import Channel
+from pydantic import field_validator
+
+
+class TipPositionSettings(Settings):
+    """Which arm, how noisy the tracker is (standard deviation a coordinate), where the target sits on the tool."""
+
+    noise: Length
+    arm: str | None = None
+    target: Length3 = (0.0, 0.0, 0.0)
+
+    @field_validator("noise")
+    @classmethod
+    def _positive(cls, value: float) -> float:
+        if value <= 0:
+            raise ValueError(f"a noise of {value * 1000:g} mm is not above zero: give the tracker's standard deviation")
+        return value
+
+
+class TipPosition:
+    """The measurement ``tip_position``: channels x, y, z; parameters target_x, target_y, target_z in the tool frame."""
+
+    Settings: ClassVar[type[TipPositionSettings]] = TipPositionSettings
+
+    def __init__(self, settings: TipPositionSettings, arm_names: Sequence[str]) -> None:
+        self._settings = settings
+        if settings.arm is None and len(arm_names) != 1:
+            raise ValueError(f"there are {len(arm_names)} arms ({', '.join(arm_names)}); say which by arm: NAME")
+        self._arm = settings.arm or arm_names[0]
+        if self._arm not in arm_names:
+            raise ValueError(f"no arm is called {self._arm!r}; the arms are {', '.join(arm_names)}")
+
+    @property
+    def arms(self) -> tuple[str, ...]:
+        """The one arm that carries the target."""
+        return (self._arm,)
+
+    def parameters(self) -> tuple[ParameterBlock, ...]:
+        """The target on the tool (m)."""
+        return tuple(
+            scalar(f"target_{axis}", "m", value, 0.01) for axis, value in zip("xyz", self._settings.target, strict=True)
+        )
+
+    def channels(self) -> tuple[Channel, ...]:
+        """Three coordinates."""
+        return tuple(Channel(axis, "length") for axis in "xyz")
+
+    def outputs(self, arms: Mapping[str, ArmState], values: Mapping[str, Any]) -> dict[str, Any]:
+        """The target's position in the root frame (m)."""
+        target = ca.sparsify(ca.vertcat(*[values[f"target_{axis}"] for axis in "xyz"]))
+        position = arms[self._arm].root_T_tool.apply(target)
+        return {axis: position[i] for i, axis in enumerate("xyz")}
+
+    def residual(self, arms: Mapping[str, ArmState], measured: Mapping[str, Any], values: Mapping[str, Any]) -> Any:
+        """Measured minus predicted (3x1, m)."""
+        predicted = self.outputs(arms, values)
+        return ca.vertcat(*[measured[axis] - predicted[axis] for axis in "xyz"])
+
+    def noise(self) -> tuple[float, ...]:
+        """The same on each coordinate (m)."""
+        return (self._settings.noise,) * 3
