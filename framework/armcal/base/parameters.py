@@ -14,7 +14,6 @@ import numpy as np
 from armcal.base.domains import Array, Domain, Interval
 from armcal.errors import ConfigError
 
-
 _EVERYWHERE = (-math.inf, math.inf)
 
 

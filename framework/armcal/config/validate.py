@@ -11,9 +11,9 @@ from typing import Any, TypeVar
 from pydantic import ValidationError
 
 from armcal.base.settings import Fault, Settings
-from armcal.errors import ConfigError, Location
 from armcal.config.yaml_nodes import Step, dotted
 from armcal.config.yaml_source import ConfigSource, find_key
+from armcal.errors import ConfigError, Location
 
 S = TypeVar("S", bound=Settings)
 

@@ -13,8 +13,8 @@ from typing import Any, NoReturn
 
 import yaml
 
-from armcal.errors import ConfigError, Location
 from armcal.config.yaml_scalars import Scalar, ScalarError, read_plain
+from armcal.errors import ConfigError, Location
 
 MAX_DEPTH = 50
 MAX_NODES = 100_000

@@ -13,8 +13,8 @@ import yaml
 
 from armcal.base.config_text import ConfigText, resolve_path
 from armcal.base.units import split_suffix
-from armcal.errors import ConfigError, Location
 from armcal.config.yaml_nodes import MAX_DEPTH, Node, Origin, Step, dotted, read_nodes
+from armcal.errors import ConfigError, Location
 
 __all__ = ["ConfigSource", "ConfigText", "find_key", "load_config", "resolve_path"]
 
@@ -57,7 +57,7 @@ class ConfigSource:
         value: Any = self.data
         for index, step in enumerate(path):
             key = find_key(value, step)
-            if key is None:
+            if key is None or (*steps, key) not in self.marks:
                 return replace(self.marks[tuple(steps)], field=dotted((*steps, *path[index:])))
             steps.append(key)
             value = value[key]

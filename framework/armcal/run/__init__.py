@@ -1,1 +1,1 @@
-"""Fifth floor: from a configuration to a finished run."""
+"""Sixth floor: from a configuration to a finished run."""

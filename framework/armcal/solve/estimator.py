@@ -83,6 +83,8 @@ class Estimate:
         covariance: of the free canonical entries; directions that neither data nor priors determine are left out.
         unconstrained: free canonical entries after a step that ignores the bounds; equals the values where no
             bound holds.
+        square_root_information: R (n x n) with R'R the information of data and priors on the increments, at the
+            values; undetermined directions included, as its null space.
         noise_scale: residuals in units of the declared noise (standard deviation).
         degrees_of_freedom: residual numbers less determined parameters.
         identifiability: what the data alone determines.
@@ -95,6 +97,7 @@ class Estimate:
     free_entries: tuple[int, ...]
     covariance: Array
     unconstrained: Array
+    square_root_information: Array
     noise_scale: float
     degrees_of_freedom: int
     identifiability: Identifiability
@@ -166,6 +169,7 @@ def estimate(problem: Problem, records: Sequence[FactorRecords], solution: Solut
         free_entries=parameters.free_entries,
         covariance=chain @ covariance @ chain.T,
         unconstrained=solution.values[free] + chain @ step,
+        square_root_information=np.linalg.qr(stacked / scales / noise_scale, mode="r") if len(values) else triangle,
         noise_scale=noise_scale,
         degrees_of_freedom=freedom,
         identifiability=known,

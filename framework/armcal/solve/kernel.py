@@ -175,7 +175,7 @@ class Kernel:
         return True
 
     def predict(self, values: Array, record: Array, state: Array) -> Array:
-        """Outputs and tool positions in equilibrium (n_o + 3 a arm x records).
+        """Outputs and tool poses in equilibrium (n_o + 12 an arm x records).
 
         Raises:
             NotConvergedError: a record has no equilibrium.

@@ -178,7 +178,7 @@ class Problem:
         return total
 
     def predict(self, values: Array, records: Sequence[FactorRecords]) -> tuple[Array, ...]:
-        """Outputs and tool positions in equilibrium, one (n_o + 3 a arm x N) matrix a factor."""
+        """Outputs and tool positions in equilibrium, one (n_o + 12 an arm x N) matrix a factor."""
         free = self._free_values(values)
         return tuple(
             kernel.predict(free, each.record, each.state)[:, : each.count]

@@ -1,0 +1,102 @@
+"""``armcal check``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+from rich.table import Table
+
+from armcal.cli.common import Voice, overrides, speaking
+from armcal.plugins import discover
+from armcal.run.experiment import Experiment
+from armcal.run.pipeline import Prepared, Stopwatch, prepare
+from armcal.solve.identifiability import Identifiability, analyse
+
+
+@click.command()
+@click.argument("config", type=click.Path(path_type=Path))
+@click.option("--data", type=click.Path(path_type=Path), help="A dataset to read instead of the configured one.")
+@overrides
+@speaking
+def check(voice: Voice, config: Path, data: Path | None, overrides: tuple[str, ...]) -> None:
+    """Check CONFIG and its data without solving: counts, units, rank, excitation."""
+    registry = discover()
+    voice.plugin_faults(registry)
+    experiment = Experiment.load(config, overrides, data, registry)
+    ready = prepare(experiment, Stopwatch())
+    problem = ready.problem
+    start = experiment.parameters.nominal()
+    triangle = problem.triangular_factor(start, ready.training)
+    known = analyse(triangle, experiment.parameters.scales(), experiment.parameters.increment_names)
+    for text in ready.warnings:
+        voice.warn(text)
+    content = _content(experiment, ready, known)
+    voice.result(content)
+    _show(voice, experiment, content)
+
+
+def _content(experiment: Experiment, ready: Prepared, known: Identifiability) -> dict[str, Any]:
+    angles = {
+        f"{name}.{joint}": _excitation(ready, f"{name}.{joint}")
+        for name, arm in experiment.system.arms.items()
+        for joint in arm.joint_names
+    }
+    equations = sum(len(kernel.factor.noise) for kernel in ready.problem.kernels) * len(ready.split.train)
+    return {
+        "experiment": experiment.name,
+        "records": {
+            "used": len(ready.dataset),
+            "train": len(ready.split.train),
+            "holdout": len(ready.split.holdout),
+            "set_aside": [
+                {"row": a.row, "id": a.record_id, "reason": a.reason} for a in ready.dataset.set_aside
+            ],
+        },
+        "equations": equations,
+        "parameters": {
+            "all": list(experiment.parameters.names),
+            "free": list(known.names),
+            "rank": known.rank,
+            "scaled_condition": known.condition if np.isfinite(known.condition) else None,
+            "undetermined": [str(combination) for combination in known.undetermined],
+            "weakest": str(known.weakest) if len(known) else "",
+        },
+        "excitation_rad_or_m": angles,
+        "warnings": list(ready.warnings),
+    }
+
+
+def _excitation(ready: Prepared, channel: str) -> dict[str, float | int]:
+    values = ready.dataset.column(channel)[ready.split.train]
+    return {"min": float(values.min()), "max": float(values.max()), "levels": len(np.unique(values))}
+
+
+def _show(voice: Voice, experiment: Experiment, content: dict[str, Any]) -> None:
+    out, records, parameters = voice.out, content["records"], content["parameters"]
+    out.print(
+        f"{experiment.name}: {records['used']} records ({records['train']} train, {records['holdout']} held out, "
+        f"{len(records['set_aside'])} set aside), {content['equations']} equations for "
+        f"{len(parameters['free'])} free of {len(parameters['all'])} parameters.",
+        markup=False,
+    )
+    table = Table(title="Excitation of the joints", title_justify="left")
+    for column in ("joint", "from", "to", "levels"):
+        table.add_column(column, justify="left" if column == "joint" else "right")
+    for joint, seen in content["excitation_rad_or_m"].items():
+        table.add_row(joint, f"{seen['min']:.3f}", f"{seen['max']:.3f}", str(seen["levels"]))
+    out.print(table)
+    condition = parameters["scaled_condition"]
+    out.print(
+        f"rank {parameters['rank']} of {len(parameters['free'])}, scaled condition "
+        + (f"{condition:.3g}." if condition is not None else "infinite."),
+        markup=False,
+    )
+    if parameters["weakest"]:
+        out.print(f"least determined: {parameters['weakest']}.", markup=False)
+    if voice.verbose:
+        for name in parameters["all"]:
+            out.print(f"  {'free ' if name in parameters['free'] else 'fixed'} {name}", markup=False)
+    out.print("Ready to run.", style="green")

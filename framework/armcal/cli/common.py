@@ -1,0 +1,108 @@
+"""Options and ways of speaking that all commands share."""
+
+from __future__ import annotations
+
+import json
+import shlex
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import click
+from rich.console import Console
+
+from armcal.plugins import PluginRegistry
+from armcal.solve.estimator import Progress, no_progress
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+@dataclass(frozen=True)
+class Voice:
+    """How a command speaks: results to standard output, everything else to standard error."""
+
+    json: bool
+    quiet: bool
+    verbose: bool
+
+    @property
+    def out(self) -> Console:
+        """For results."""
+        return Console(soft_wrap=False, quiet=self.quiet or self.json, highlight=False)
+
+    @property
+    def err(self) -> Console:
+        """For warnings and progress."""
+        return Console(stderr=True, quiet=self.quiet, highlight=False)
+
+    def warn(self, text: str) -> None:
+        """One warning line."""
+        self.err.print(f"warning: {text}", style="yellow", markup=False)
+
+    def detail(self, text: str) -> None:
+        """Only with -v."""
+        if self.verbose:
+            self.err.print(text, style="dim", markup=False)
+
+    def result(self, content: Mapping[str, Any]) -> None:
+        """The machine-readable result, with --json."""
+        if self.json:
+            click.echo(json.dumps(content, indent=2))
+
+    def plugin_faults(self, registry: PluginRegistry) -> None:
+        """One line a broken plugin."""
+        for plugin in registry.faults:
+            self.warn(f"plugin {plugin.name} ({plugin.module}) is left out: {plugin.fault}")
+
+    @contextmanager
+    def progress(self) -> Iterator[Progress]:
+        """A progress line with the time left, on a terminal."""
+        if self.quiet or self.json or not sys.stderr.isatty():
+            yield no_progress
+            return
+        from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
+        from rich.progress import Progress as Bar
+
+        columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())
+        with Bar(*columns, console=self.err, transient=True) as bar:
+            tasks: dict[str, Any] = {}
+
+            def show(what: str, fraction: float) -> None:
+                if what not in tasks:
+                    tasks[what] = bar.add_task(what, total=1.0)
+                bar.update(tasks[what], completed=fraction)
+
+            yield show
+
+
+def speaking(command: F) -> F:
+    """The options --json, -q and -v, handed on as ``voice``."""
+
+    @click.option("--json", "as_json", is_flag=True, help="Print the result as JSON on standard output.")
+    @click.option("-q", "--quiet", is_flag=True, help="Say nothing but errors.")
+    @click.option("-v", "--verbose", is_flag=True, help="Say more on standard error.")
+    @click.pass_context
+    def wrapped(ctx: click.Context, /, as_json: bool, quiet: bool, verbose: bool, **given: Any) -> Any:
+        return ctx.invoke(command, voice=Voice(as_json, quiet, verbose), **given)
+
+    wrapped.__doc__ = command.__doc__
+    wrapped.__name__ = command.__name__
+    wrapped.__click_params__ = [  # type: ignore[attr-defined]
+        *getattr(wrapped, "__click_params__", []),
+        *getattr(command, "__click_params__", []),
+    ]
+    return wrapped  # type: ignore[return-value]
+
+
+def overrides(command: F) -> F:
+    """The option --set."""
+    return click.option(
+        "--set", "overrides", multiple=True, metavar="KEY=VALUE", help="Change a configured value: --set a.b=value."
+    )(command)
+
+
+def command_line() -> str:
+    """How this command was called, to be repeated."""
+    return shlex.join(["armcal", *sys.argv[1:]])

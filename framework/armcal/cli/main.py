@@ -1,0 +1,70 @@
+"""The ``armcal`` command. Commands are imported when they are called, so that help is instant."""
+
+from __future__ import annotations
+
+import os
+import sys
+from importlib import import_module
+
+import click
+
+from armcal import __version__
+from armcal.errors import EXIT_FAULT, ArmcalError
+
+COMMANDS = {
+    "run": ("armcal.cli.run:run", "Calibrate: load, check, fit, validate, report."),
+    "check": ("armcal.cli.check:check", "Everything that can be known before solving."),
+    "predict": ("armcal.cli.predict:predict", "Where a calibrated arm goes for commanded joint angles."),
+    "simulate": ("armcal.cli.simulate:simulate", "Make measurements up from a stated truth."),
+    "plugins": ("armcal.cli.plugins:plugins", "List plugins, or check one."),
+}
+
+
+class LazyGroup(click.Group):
+    """A group that knows its commands by name and imports one only to run it."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """In a fixed order."""
+        return list(COMMANDS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        """Import a command."""
+        if cmd_name not in COMMANDS:
+            return None
+        module, _, attribute = COMMANDS[cmd_name][0].partition(":")
+        command: click.Command = getattr(import_module(module), attribute)
+        return command
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Help from the table, without importing anything."""
+        with formatter.section("Commands"):
+            formatter.write_dl([(name, summary) for name, (_, summary) in COMMANDS.items()])
+
+
+@click.command(cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(__version__, prog_name="armcal")
+def cli() -> None:
+    """Find what a robot arm really is: its geometry, its joints, its compliance, and how sure that is."""
+
+
+def main() -> None:
+    """Entry point: armcal's own errors become one message and an exit code, never a traceback."""
+    # One BLAS thread: sums come out the same to the last bit whatever the number of processors.
+    for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ.setdefault(variable, "1")
+    try:
+        cli.main(prog_name="armcal", standalone_mode=True)
+    except ArmcalError as fault:
+        _report(fault)
+        sys.exit(fault.exit_code)
+    except BrokenPipeError:
+        sys.stderr.close()
+        sys.exit(EXIT_FAULT)
+
+
+def _report(fault: ArmcalError) -> None:
+    if "--json" in sys.argv:
+        import json
+
+        click.echo(json.dumps({"error": {"message": str(fault), "exit_code": fault.exit_code}}, indent=2))
+    click.echo(f"armcal: {fault}", err=True)

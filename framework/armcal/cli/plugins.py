@@ -1,0 +1,97 @@
+"""``armcal plugins``."""
+
+from __future__ import annotations
+
+import json
+import sys
+from typing import Any
+
+import click
+
+from armcal.errors import EXIT_BAD_INPUT, PluginError
+from armcal.hooks import CONTRACT_VERSION
+from armcal.plugins import PluginInfo, PluginRegistry, discover
+
+
+@click.group(context_settings={"help_option_names": ["-h", "--help"]})
+def plugins() -> None:
+    """List plugins, or check one."""
+
+
+@plugins.command("list")
+@click.option("--json", "as_json", is_flag=True, help="Print the result as JSON on standard output.")
+@click.option("-q", "--quiet", is_flag=True, help="Names only.")
+@click.option("-v", "--verbose", is_flag=True, help="Where each component is defined, too.")
+def list_plugins(as_json: bool, quiet: bool, verbose: bool) -> None:
+    """List every plugin and what it provides, without importing any of it."""
+    registry = discover()
+    if as_json:
+        click.echo(json.dumps(_content(registry), indent=2))
+    else:
+        for plugin in registry.plugins:
+            _show(plugin, registry, quiet, verbose)
+
+
+def _show(plugin: PluginInfo, registry: PluginRegistry, quiet: bool, verbose: bool) -> None:
+    if quiet:
+        click.echo(plugin.name)
+        return
+    click.echo(f"{plugin.name}  ({plugin.distribution} {plugin.version}, {plugin.module})")
+    if plugin.fault:
+        click.echo(f"  does not load: {plugin.fault}")
+    for component in registry.components:
+        if component.plugin == plugin.name:
+            place = f"  [{component.target}]" if verbose else ""
+            click.echo(f"  {component.kind:<12} {component.name:<18} {component.summary}{place}")
+
+
+def _content(registry: PluginRegistry) -> dict[str, Any]:
+    return {
+        "contract": CONTRACT_VERSION,
+        "plugins": [
+            {
+                "name": plugin.name,
+                "module": plugin.module,
+                "distribution": plugin.distribution,
+                "version": plugin.version,
+                "fault": plugin.fault or None,
+                "components": [
+                    {"kind": c.kind, "name": c.name, "target": c.target, "summary": c.summary}
+                    for c in registry.components
+                    if c.plugin == plugin.name
+                ],
+            }
+            for plugin in registry.plugins
+        ],
+    }
+
+
+@plugins.command("check")
+@click.argument("name")
+@click.option("--json", "as_json", is_flag=True, help="Print the result as JSON on standard output.")
+@click.option("-q", "--quiet", is_flag=True, help="Say nothing but errors.")
+@click.option("-v", "--verbose", is_flag=True, help="Name every check.")
+def check_plugin(name: str, as_json: bool, quiet: bool, verbose: bool) -> None:
+    """Check the plugin NAME: its import, its hooks, and the contract of each component."""
+    from armcal.testing.contract import check_component
+
+    registry = discover()
+    plugin = next((p for p in registry.plugins if p.name == name), None)
+    if plugin is None:
+        known = ", ".join(p.name for p in registry.plugins)
+        raise PluginError(f"no plugin is called {name!r}.", hint=f"Installed: {known}.")
+    results = [] if plugin.fault else [
+        result for c in registry.components if c.plugin == name for result in check_component(c)
+    ]  # fmt: skip
+    failed = [result for result in results if result.fault]
+    if as_json:
+        rows = [{"component": r.component, "check": r.check, "fault": r.fault or None} for r in results]
+        click.echo(json.dumps({"plugin": name, "fault": plugin.fault or None, "checks": rows}, indent=2))
+    elif not quiet:
+        for result in results:
+            if verbose or result.fault:
+                click.echo(f"{'FAIL' if result.fault else 'ok  '} {result.component}: {result.check} {result.fault}")
+        click.echo(f"{name}: {len(results) - len(failed)} of {len(results)} checks passed.")
+    if plugin.fault or failed or not results:
+        click.echo(f"armcal: {name}: {plugin.fault or 'it breaks the plugin contract'}", err=True)
+        sys.exit(EXIT_BAD_INPUT)

@@ -1,0 +1,51 @@
+"""``armcal run``."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import click
+
+from armcal.cli.common import Voice, command_line, overrides, speaking
+from armcal.cli.tables import show_run
+from armcal.errors import EXIT_NOT_CONVERGED
+from armcal.plugins import discover
+from armcal.report import page
+from armcal.run import outputs
+from armcal.run.experiment import Experiment
+from armcal.run.pipeline import Stopwatch
+from armcal.run.pipeline import run as run_experiment
+
+
+@click.command()
+@click.argument("config", type=click.Path(path_type=Path))
+@click.option("--data", type=click.Path(path_type=Path), help="A dataset to read instead of the configured one.")
+@click.option("--out", type=click.Path(path_type=Path), help="Where the results go [default: runs/NAME of CONFIG].")
+@overrides
+@speaking
+def run(voice: Voice, config: Path, data: Path | None, out: Path | None, overrides: tuple[str, ...]) -> None:
+    """Calibrate the arm that CONFIG describes: load, check, fit, validate, report."""
+    watch = Stopwatch()
+    folder = out or Path("runs") / config.stem
+    outputs.check_folder(folder)
+    registry = discover()
+    voice.plugin_faults(registry)
+    experiment = Experiment.load(config, overrides, data, registry)
+    with voice.progress() as progress:
+        result = run_experiment(experiment, command_line(), progress, watch)
+    for text in result.warnings:
+        voice.warn(text)
+    result.seconds["total"] = watch.total()
+    outputs.write(result, experiment, folder, page.render)
+    converged = result.estimate.verdict.converged
+    registry.manager.hook.armcal_run_ended(name=result.name, folder=str(folder), converged=converged)
+    voice.result({**outputs.metrics(result), "folder": str(folder)})
+    show_run(voice, result, folder, watch.total())
+    if not converged:
+        click.echo(
+            f"armcal: {result.estimate.verdict.name} did not converge ({result.estimate.verdict.status}). "
+            "Nothing was exported as calibrated. Check the data and the start values, or allow more iterations.",
+            err=True,
+        )
+        sys.exit(EXIT_NOT_CONVERGED)

@@ -1,0 +1,39 @@
+"""Lists of record ids: a CSV with one column, or one called pose_id or id."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+from armcal.errors import DataError, Location
+
+
+def read_ids(path: Path) -> tuple[str, ...]:
+    """The ids in a file, in its order.
+
+    Raises:
+        DataError: no such file, no text, no ids, or an id stands twice.
+    """
+    where = Location(str(path))
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except FileNotFoundError as fault:
+        raise DataError("there is no such file.", where=where, hint="Check the path.") from fault
+    except (OSError, UnicodeDecodeError) as fault:
+        raise DataError(f"it cannot be read as UTF-8 text ({fault}).", where=where) from fault
+    rows = [row for row in csv.reader(text.splitlines()) if any(cell.strip() for cell in row)]
+    if not rows:
+        raise DataError("it is empty.", where=where, hint="Give a header pose_id and an id a line.")
+    header = [cell.strip().lower() for cell in rows[0]]
+    column = next((header.index(name) for name in ("pose_id", "id") if name in header), None)
+    if column is None:
+        raise DataError(
+            f"found the columns {', '.join(rows[0])}.", where=where, hint="Give a header pose_id and an id a line."
+        )
+    ids = [row[column].strip() for row in rows[1:] if len(row) > column]
+    if not ids:
+        raise DataError("it lists no ids.", where=where, hint="Give an id a line below the header.")
+    twice = sorted({record for record in ids if ids.count(record) > 1}) if len(set(ids)) < len(ids) else []
+    if twice:
+        raise DataError(f"the id {twice[0]} stands twice.", where=where, hint="List each record once.")
+    return tuple(ids)

@@ -1,0 +1,7 @@
+"""The report: one HTML file that a person decides from, readable offline and without scripts."""
+
+from __future__ import annotations
+
+from armcal.report.page import render
+
+__all__ = ["render"]

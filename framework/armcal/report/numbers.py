@@ -1,0 +1,95 @@
+"""Numbers as people read them: few digits, a true minus sign, the units of the workshop."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+
+from armcal.base.domains import Pose, Rotation, ScrewAxis
+from armcal.base.parameters import ParameterBlock
+from armcal.base.units import UNITS, display_unit
+
+NONE = "–"
+_MINUS = "−"
+_MOST_DECIMALS = 8
+_WORDS = {"deg": "°", "rad_per_Nm": "rad/Nm", "deg_per_Nm": "°/Nm", "m_s2": "m/s²", "1": ""}
+
+
+def fixed(value: float | None, decimals: int, signed: bool = False) -> str:
+    """A number with so many decimals; scientific where that would be unreadable; a dash where there is none."""
+    if value is None or math.isnan(value):
+        return NONE
+    if math.isinf(value):
+        return "∞" if value > 0 else f"{_MINUS}∞"
+    if abs(value) >= 1e7:
+        return f"{value:{'+' if signed else ''}.2e}".replace("-", _MINUS)
+    text = f"{value:{'+' if signed else ''}.{decimals}f}"
+    if not any(digit in text for digit in "123456789"):
+        return text.lstrip("+-")
+    return text.replace("-", _MINUS)
+
+
+def significant(value: float, digits: int = 3) -> str:
+    """A number with so many significant digits, scientific when very large or very small."""
+    if not math.isfinite(value):
+        return fixed(value, 0)
+    if value == 0:
+        return "0"
+    if not 1e-4 <= abs(value) < 1e6:
+        return f"{value:.{digits - 1}e}".replace("-", _MINUS)
+    return fixed(value, decimals_for(value, digits))
+
+
+def decimals_for(size: float, digits: int = 2) -> int:
+    """How many decimals show so many significant digits of ``size``."""
+    if not math.isfinite(size) or size == 0:
+        return 0
+    return min(max(digits - 1 - math.floor(math.log10(abs(size))), 0), _MOST_DECIMALS)
+
+
+def common_decimals(values: Iterable[float | None], least: int = 1, most: int = 4) -> int:
+    """Decimals that show two digits of the smallest of the values."""
+    sizes = [abs(v) for v in values if v is not None and math.isfinite(v) and v != 0]
+    return min(max(decimals_for(min(sizes)), least), most) if sizes else 2
+
+
+def count(number: int) -> str:
+    """A whole number with thin spaces between thousands."""
+    return f"{number:,}".replace(",", "\u202f")
+
+
+def plural(number: int, noun: str) -> str:
+    """``1 record``, ``2 records``."""
+    return f"{count(number)} {noun}{'' if number == 1 else 's'}"
+
+
+def duration(seconds: float) -> str:
+    """Seconds, or milliseconds below a tenth of one."""
+    return f"{seconds * 1000:.0f} ms" if abs(seconds) < 0.0995 else f"{seconds:.2f} s"
+
+
+def ratio(before: float | None, after: float | None) -> str:
+    """How many times smaller ``after`` is."""
+    if before is None or after is None or not (math.isfinite(before) and math.isfinite(after)) or after <= 0:
+        return NONE
+    return f"{significant(before / after, 3 if before >= after else 2)} ×"
+
+
+def entry_unit(block: ParameterBlock, suffix: str) -> str:
+    """The SI unit of one canonical entry; directions and quaternions have none."""
+    if isinstance(block.domain, Rotation):
+        return "1"
+    if isinstance(block.domain, Pose):
+        return "m" if suffix in ("x", "y", "z") else "1"
+    if isinstance(block.domain, ScrewAxis):
+        return "m" if suffix.startswith("v") else "1"
+    return block.unit
+
+
+def shown_unit(si_unit: str) -> tuple[float, str]:
+    """Shown numbers per SI number, and what the unit is called: (1000, mm) for m."""
+    known = UNITS.get(si_unit)
+    if known is None:
+        return 1.0, si_unit
+    shown = display_unit(known.dimension)
+    return known.factor / shown.factor, _WORDS.get(shown.name, shown.name)

@@ -1,0 +1,172 @@
+"""The page: everything a run knows, laid out so that a person can decide from it in a minute."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import armcal
+from armcal.report import error_figures, parameter_figures, workspace
+from armcal.report.numbers import NONE, common_decimals, count, duration, fixed, plural, ratio, significant
+from armcal.report.tables import (
+    Fact,
+    ParameterRow,
+    error_rows,
+    fixed_rows,
+    judged,
+    parameter_rows,
+    provenance_facts,
+    worst_records,
+    worst_rows,
+)
+from armcal.run.result import RunResult
+from armcal.solve.estimator import Estimate
+from armcal.solve.identifiability import CORRELATED, POOR_CONDITION, correlated_pairs, correlations
+
+MOST_LISTED = 50
+"""Of records set aside and of correlated pairs; the rest is counted."""
+_STRONGEST = 20
+_WORDS = {"bad": "Bad", "warning": "Warning", "note": "Note", "good": "Good"}
+_SYMBOLS = {"bad": "✕", "warning": "!", "note": "i", "good": "✓"}
+
+
+def render(result: RunResult) -> str:
+    """One self-contained HTML file: no scripts, no references to anything outside of it."""
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+    loader = FileSystemLoader(Path(__file__).parent)
+    environment = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True)
+    environment.lstrip_blocks = True
+    environment.filters.update(count=count, plural=plural)
+    return environment.get_template("template.html.j2").render(_content(result))
+
+
+def _content(result: RunResult) -> dict[str, Any]:
+    rows = parameter_rows(result.estimate)
+    return {
+        "result": result,
+        "version": armcal.__version__,
+        "words": _WORDS,
+        "symbols": _SYMBOLS,
+        "grade": result.verdict.findings[0].grade if result.verdict.findings else "note",
+        **_accuracy(result),
+        **_poses(result),
+        **_parameters(result.estimate, rows),
+        **_correlations(result.estimate),
+        **_determined(result.estimate),
+        **_records(result),
+        **_origin(result),
+    }
+
+
+def _accuracy(result: RunResult) -> dict[str, Any]:
+    from_set = judged(result)
+    tiles = []
+    if from_set:
+        before, after = from_set.nominal, from_set.calibrated
+        pairs = (("Mean error", before.mean, after.mean), ("95 % below", before.p95, after.p95))
+        pairs += (("Largest error", before.max, after.max),)
+        decimals = common_decimals([v for _, b, a in pairs for v in (b, a)], most=3)
+        tiles = [(name, fixed(b, decimals), fixed(a, decimals), ratio(b, a)) for name, b, a in pairs]
+    return {"judged": from_set, "tiles": tiles, "error_rows": error_rows(result)}
+
+
+def _poses(result: RunResult) -> dict[str, Any]:
+    worst = worst_records(result)
+    return {
+        "distribution": error_figures.distribution(result),
+        "workspace": workspace.views(result),
+        "order": error_figures.in_order(result, worst),
+        "worst": worst_rows(result, worst),
+        "crossed": bool(np.isfinite(result.errors.cross_validated_mm).any()),
+    }
+
+
+def _parameters(estimate: Estimate, rows: tuple[ParameterRow, ...]) -> dict[str, Any]:
+    springs = [row for row in rows if row.si_unit == "rad_per_Nm"]
+    return {
+        "parameters": rows,
+        "fixed": fixed_rows(estimate),
+        "compliance": parameter_figures.compliances(springs),
+        "springs": springs,
+    }
+
+
+def _correlations(estimate: Estimate) -> dict[str, Any]:
+    names = estimate.names
+    if len(names) < 2:
+        return {"map": None, "pairs": (), "more_pairs": 0, "too_many": False, "strongest": ()}
+    with np.errstate(invalid="ignore"):
+        matrix = correlations(estimate.covariance)
+    pairs = correlated_pairs(matrix, names, CORRELATED)
+    strongest = _strongest(matrix, names) if not pairs or len(names) > parameter_figures.MOST_MAPPED else ()
+    return {
+        "map": parameter_figures.correlation_map(matrix, names, estimate.determined),
+        "pairs": [(a, b, fixed(r, 3, signed=True)) for a, b, r in pairs[:MOST_LISTED]],
+        "more_pairs": max(len(pairs) - MOST_LISTED, 0),
+        "too_many": len(names) > parameter_figures.MOST_MAPPED,
+        "strongest": [] if len(pairs) >= _STRONGEST else strongest[len(pairs) :],
+    }
+
+
+def _strongest(matrix: np.ndarray[Any, np.dtype[np.float64]], names: tuple[str, ...]) -> list[tuple[str, str, str]]:
+    """The strongest pairs whatever their size, zeros left out."""
+    rows, columns = np.triu_indices(len(names), 1)
+    sizes = np.abs(matrix[rows, columns])
+    order = np.argsort(-sizes, kind="stable")[:_STRONGEST]
+    chosen = [(int(rows[k]), int(columns[k])) for k in order if sizes[k] > 0]
+    return [(names[i], names[j], fixed(float(matrix[i, j]), 3, signed=True)) for i, j in chosen]
+
+
+def _determined(estimate: Estimate) -> dict[str, Any]:
+    known = estimate.identifiability
+    return {
+        "known": known,
+        "combinations": [str(combination) for combination in known.undetermined],
+        "condition": significant(known.condition),
+        "poor": len(known) > 0 and known.condition > POOR_CONDITION,
+        "poor_limit": f"{POOR_CONDITION:.0e}".replace("e+0", "e"),
+        "weakest": str(known.weakest) if len(known) and known.rank else "",
+        "singular": parameter_figures.singular_values(known),
+    }
+
+
+def _records(result: RunResult) -> dict[str, Any]:
+    aside = result.dataset.set_aside
+    return {
+        "aside": aside[:MOST_LISTED],
+        "more_aside": max(len(aside) - MOST_LISTED, 0),
+        "warnings": tuple(dict.fromkeys((*result.warnings, *result.dataset.warnings))),
+    }
+
+
+def _origin(result: RunResult) -> dict[str, Any]:
+    told, data = result.estimate.verdict, result.dataset
+    answer = "converged" if told.converged else "did not converge"
+    solver = f"{told.name}: {told.status} ({answer}; {plural(told.iterations, 'iteration')}, {duration(told.seconds)})"
+    starts = f"{told.agreeing_starts} of {told.starts} came to the same answer" if told.starts > 1 else "one"
+    facts = [
+        Fact("data", data.source or NONE),
+        Fact("data sha256", data.sha256 or NONE),
+        Fact("records", f"{len(result.split.train)} train, {len(result.split.holdout)} holdout"),
+        Fact("solver", solver),
+        Fact("starts", starts),
+        Fact("backend", result.backend or NONE),
+        Fact("noise scale", f"residuals are {significant(result.estimate.noise_scale)} times the declared noise"),
+        Fact("degrees of freedom", count(result.estimate.degrees_of_freedom)),
+    ]
+    facts += provenance_facts(result.provenance)
+    return {
+        "facts": [f for f in facts if not f.long],
+        "long_facts": [f for f in facts if f.long],
+        "seconds": _seconds(result.seconds),
+    }
+
+
+def _seconds(seconds: Mapping[str, float]) -> list[tuple[str, str]]:
+    """Each stage, the total last."""
+    stages = [(name, duration(value)) for name, value in seconds.items() if name != "total"]
+    return stages + ([("total", duration(seconds["total"]))] if "total" in seconds else [])

@@ -1,0 +1,155 @@
+"""Figures of parameters: compliances with their intervals, correlations, singular values."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from armcal.base.domains import Array
+from armcal.report import svg
+from armcal.report.numbers import plural, significant
+from armcal.report.svg import MONO, Axis, Box, Figure
+from armcal.report.tables import ParameterRow
+from armcal.solve.identifiability import Identifiability
+
+MOST_WHISKERS = 40
+MOST_MAPPED = 40
+"""More free parameters than this are no longer readable in a map."""
+_ROW = 27.0
+_BLUE, _ORANGE = (0, 68, 136), (187, 85, 0)
+
+
+def compliances(rows: Sequence[ParameterRow]) -> Figure | None:
+    """Dot and whisker of each compliance against its bound; None without compliances."""
+    if not rows:
+        return None
+    shown = sorted(rows, key=lambda r: -abs(r.raw.value))[:MOST_WHISKERS] if len(rows) > MOST_WHISKERS else list(rows)
+    unit = shown[0].unit
+    caption = "Dot: value; whisker: 95 % interval; hollow dot: at its bound; dashed whisker: not determined; "
+    caption += "small bar: nominal."
+    if len(shown) < len(rows):
+        caption += f" The {len(shown)} largest of {len(rows)}."
+    said = "; ".join(f"{r.name} {r.value} {unit}, {r.interval}" for r in shown[:12])
+    low, high = _range(shown)
+
+    def draw(width: float) -> tuple[float, list[str]]:
+        most = 14 if width == svg.NARROW else 26
+        left = MONO * max(len(svg.shorten(r.name, most)) for r in shown) + 18
+        beside = 190 if width > svg.NARROW else 14
+        box = Box(left, 8, width - beside, 8 + _ROW * len(shown))
+        x = Axis(low, high, box.left, box.right)
+        parts = svg.frame(box, x, None, (f"compliance, {unit}", ""), (8 if width > svg.NARROW else 4, 0))
+        if low < 0 <= high:
+            parts.append(svg.line(x.of(0), box.top, x.of(0), box.bottom, "bound"))
+        for number, row in enumerate(shown):
+            y = box.top + _ROW * (number + 0.5)
+            parts.append(svg.text(left - 9, y + 4, svg.shorten(row.name, most), "mono", "end"))
+            parts += _whisker(row, x, y)
+            if width > svg.NARROW:
+                parts.append(svg.text(box.right + 12, y + 4, f"{row.value.strip()}   ({row.interval.strip()})", "tick"))
+        return box.bottom + 44, parts
+
+    return svg.both("compliance", ("Compliances and their bounds", said, caption), draw)
+
+
+def _range(rows: Sequence[ParameterRow]) -> tuple[float, float]:
+    ends = [0.0]
+    for row in rows:
+        raw = row.raw
+        ends += [raw.value, raw.nominal]
+        ends += [raw.lower, raw.upper] if math.isfinite(raw.sd) else []
+    finite = [e for e in ends if math.isfinite(e)]
+    low, high = min(finite), max(finite)
+    room = (high - low) * 0.04 or 1e-3
+    return low - room, high + room
+
+
+def _whisker(row: ParameterRow, x: Axis, y: float) -> list[str]:
+    raw = row.raw
+    known = math.isfinite(raw.sd)
+    left, right = (x.of(raw.lower), x.of(raw.upper)) if known else (x.start, x.end)
+    parts = [svg.line(left, y, right, y, "whisker" if known else "whisker unknown")]
+    if known:
+        parts += [svg.line(end, y - 5, end, y + 5, "whisker") for end in (left, right)]
+    parts.append(svg.line(x.of(raw.nominal), y - 9, x.of(raw.nominal), y + 9, "nominal"))
+    parts.append(svg.circle(x.of(raw.value), y, 5, "hollow" if row.at_bound else "solid"))
+    return parts
+
+
+def correlation_map(correlation: Array, names: tuple[str, ...], known: Sequence[bool]) -> Figure | None:
+    """The correlations of all free parameters as coloured cells; None for fewer than two or too many to read."""
+    number = len(names)
+    if not 2 <= number <= MOST_MAPPED:
+        return None
+    short = [svg.shorten(name) for name in names]
+    cell = min(26.0, max(14.0, 560.0 / number))
+    margin = MONO * max(len(name) for name in short) + 14
+    side = cell * number
+    parts = _cells(correlation, names, known, margin, cell)
+    for i, name in enumerate(short):
+        at = (i + 0.5) * cell
+        parts.append(svg.text(margin - 7, 6 + at + 4, name, "mono", "end"))
+        parts.append(svg.text(margin + at + 4, 6 + side + 8, name, "mono", "end", -90))
+    width, height = margin + side + 12, 6 + side + margin + 8
+    parts += _correlation_key(margin + side - 176, 14)
+    said = f"Lower triangle of the correlation matrix of {number} parameters; pairs above 0.95 are listed beside it."
+    title = "Correlations of the parameters' estimates"
+    drawn = svg.document("correlation-map", (width, height), title, said, parts)
+    caption = "Dark cells: the data tells the two apart badly. Grey: not determined, so no correlation is known."
+    return Figure(title, caption, drawn)
+
+
+def _cells(correlation: Array, names: tuple[str, ...], known: Sequence[bool], margin: float, cell: float) -> list[str]:
+    parts = []
+    for i in range(len(names)):
+        for j in range(i + 1):
+            both_known = known[i] and known[j]
+            colour = _colour(float(correlation[i, j])) if both_known else "#d9dce1"
+            value = f"{correlation[i, j]:+.2f}" if both_known else "not known"
+            title = f"{names[i]}, {names[j]}: {value}" if i != j else ""
+            parts.append(svg.rect(margin + j * cell, 6 + i * cell, cell - 1, cell - 1, "#e9ecf0" if i == j else colour, title))
+    return parts
+
+
+def _colour(value: float) -> str:
+    share = min(abs(value), 1.0)
+    end = _BLUE if value < 0 else _ORANGE
+    return "#" + "".join(f"{round(248 + (channel - 248) * share):02x}" for channel in end)
+
+
+def _correlation_key(x: float, y: float) -> list[str]:
+    steps = np.linspace(-1, 1, 11)
+    parts = [svg.rect(x + i * 16, y, 16, 10, _colour(float(v))) for i, v in enumerate(steps)]
+    parts += [svg.text(x + at, y + 24, words, "tick", "middle") for at, words in ((8, "−1"), (88, "0"), (168, "+1"))]
+    return [*parts, svg.text(x + 88, y - 4, "correlation", "tick", "middle")]
+
+
+def singular_values(known: Identifiability) -> Figure | None:
+    """The spectrum on a logarithmic axis; None without parameters."""
+    values = known.singular_values[: len(known)]
+    positive = values[np.isfinite(values) & (values > 0)]
+    if not len(positive):
+        return None
+    largest = float(positive.max())
+    low = max(float(positive.min()), largest * 1e-18)
+    low, high = 10.0 ** math.floor(math.log10(low) - 0.01), 10.0 ** math.ceil(math.log10(largest) + 0.01)
+    said = f"{plural(len(values), 'singular value')} from {significant(largest)} down to {significant(float(values.min()))}."
+    caption = "Each value tells how sharply the data sees one combination of parameters, in ordinary sizes of each."
+    if known.rank < len(values):
+        caption += f" Hollow: the {plural(len(values) - known.rank, 'combination')} that it does not see."
+
+    def draw(width: float) -> tuple[float, list[str]]:
+        box = Box(64, 10, width - 16, 200)
+        x, y = Axis(0.3, len(values) + 0.7, box.left, box.right), Axis(low, high, box.bottom, box.top, log=True)
+        parts = svg.frame(box, x, y, ("combination, the best seen first", "singular value"), (min(10, len(values)), 5))
+        place = x.at(np.arange(1, len(values) + 1))
+        height = y.at(np.nan_to_num(values))
+        seen = min(known.rank, len(values))
+        parts.append(svg.segments(place, np.full(len(values), box.bottom), place, height, "stem"))
+        parts += [svg.circle(a, b, 3.5, "solid") for a, b in zip(place[:seen], height[:seen], strict=True)]
+        parts += [svg.circle(a, b, 3.5, "hollow") for a, b in zip(place[seen:], height[seen:], strict=True)]
+        return box.bottom + 44, parts
+
+    return svg.both("singular", ("Singular values", said, caption), draw)

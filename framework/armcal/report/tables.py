@@ -1,0 +1,263 @@
+"""The report's tables as rows of finished text."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armcal.report.numbers import (
+    NONE,
+    common_decimals,
+    decimals_for,
+    entry_unit,
+    fixed,
+    ratio,
+    shown_unit,
+)
+from armcal.run.result import RunResult
+from armcal.solve.estimator import Estimate, Interval95
+from armcal.solve.validation import ErrorSummary
+
+_SETS = (("train", "Train"), ("holdout", "Holdout"), ("cross_validated", "Cross-validated"))
+_STATISTICS = ("mean", "rms", "p95", "max")
+_EMPTY = ErrorSummary(None, None, None, None, 0)
+_FIGURE_SPACE, _POINT_SPACE = "\u2007", "\u2008"
+_MOST_DECIMALS = 6
+
+
+@dataclass(frozen=True)
+class ErrorRows:
+    """Before, after and ratio over one set of records."""
+
+    name: str
+    count: int
+    nominal: tuple[str, ...]
+    calibrated: tuple[str, ...]
+    ratios: tuple[str, ...]
+
+
+def error_rows(result: RunResult) -> tuple[ErrorRows, ...]:
+    """One entry for each set that has records."""
+    nominal, calibrated = result.table.nominal, result.table.calibrated
+    sets = [(k, w, nominal.get(k, _EMPTY), calibrated.get(k, _EMPTY)) for k, w in _SETS]
+    extra = [k for k in {**nominal, **calibrated} if k not in {key for key, _ in _SETS}]
+    sets += [(k, k.replace("_", " "), nominal.get(k, _EMPTY), calibrated.get(k, _EMPTY)) for k in extra]
+    sets = [row for row in sets if row[2].count or row[3].count]
+    decimals = common_decimals(v for _, _, *pair in sets for s in pair for v in _statistics(s))
+    rows = []
+    for _, words, before, after in sets:
+        pairs = list(zip(_statistics(before), _statistics(after), strict=True))
+        rows.append(
+            ErrorRows(
+                words,
+                after.count or before.count,
+                tuple(fixed(b, decimals) for b, _ in pairs),
+                tuple(fixed(a, decimals) for _, a in pairs),
+                tuple(ratio(b, a) for b, a in pairs),
+            )
+        )
+    return tuple(rows)
+
+
+def _statistics(summary: ErrorSummary) -> tuple[float | None, ...]:
+    return tuple(getattr(summary, name) for name in _STATISTICS)
+
+
+@dataclass(frozen=True)
+class Judged:
+    """The set of records that the headline numbers come from, before and after."""
+
+    words: str
+    nominal: ErrorSummary
+    calibrated: ErrorSummary
+
+
+def judged(result: RunResult) -> Judged | None:
+    """Held-out records if there are any, else cross-validation, else training records."""
+    choices = (("holdout", "held-out records"), ("cross_validated", "cross-validation"), ("train", "training records"))
+    for key, words in choices:
+        after = result.table.calibrated.get(key, _EMPTY)
+        if after.count and after.mean is not None and math.isfinite(after.mean):
+            before = result.table.nominal.get(key, _EMPTY)
+            return Judged(words, before if before.count else _EMPTY, after)
+    return None
+
+
+@dataclass(frozen=True)
+class RawParameter:
+    """The numbers of a row, in the unit shown."""
+
+    nominal: float
+    value: float
+    sd: float
+    lower: float
+    upper: float
+
+
+@dataclass(frozen=True)
+class ParameterRow:
+    """One free parameter, in words."""
+
+    name: str
+    unit: str
+    si_unit: str
+    nominal: str
+    value: str
+    correction: str
+    sd: str
+    interval: str
+    at_bound: bool
+    determined: bool
+    raw: RawParameter
+
+
+def parameter_rows(estimate: Estimate) -> tuple[ParameterRow, ...]:
+    """One row a free canonical entry."""
+    names = estimate.names
+    nominal = estimate.parameters.nominal()
+    units = [entry_unit(b, suffix) for b in estimate.parameters.free for suffix in b.domain.entries]
+    raw, decimals = [], []
+    for i, entry in enumerate(estimate.free_entries):
+        factor, _ = shown_unit(units[i])
+        interval = estimate.intervals[i]
+        numbers = (nominal[entry], estimate.values[entry], estimate.deviations[i], interval.lower, interval.upper)
+        raw.append(RawParameter(*(float(n) * factor for n in numbers)))
+        decimals.append(_decimals(raw[-1]))
+    widest = {u: max(d for d, v in zip(decimals, units, strict=True) if v == u) for u in units}
+    bounds = set(estimate.at_bound)
+    return tuple(
+        _row(names[i], units[i], raw[i], estimate.intervals[i], decimals[i], widest[units[i]], names[i] in bounds)
+        for i in range(len(names))
+    )
+
+
+def _decimals(raw: RawParameter) -> int:
+    """Two digits of the standard deviation; five of the value where there is none."""
+    size = raw.sd if math.isfinite(raw.sd) and raw.sd > 0 else max(abs(raw.value), abs(raw.nominal)) / 1000
+    return min(decimals_for(size), _MOST_DECIMALS)
+
+
+def _row(
+    name: str, si_unit: str, raw: RawParameter, interval: Interval95, decimals: int, widest: int, at_bound: bool
+) -> ParameterRow:
+    def aligned(value: float, signed: bool = False) -> str:
+        padding = _FIGURE_SPACE * (widest - decimals) + (_POINT_SPACE if decimals == 0 < widest else "")
+        written = fixed(value, decimals, signed)
+        return written if written == NONE else written + padding
+
+    determined = math.isfinite(raw.sd)
+    return ParameterRow(
+        name=name,
+        unit=shown_unit(si_unit)[1],
+        si_unit=si_unit,
+        nominal=aligned(raw.nominal),
+        value=aligned(raw.value),
+        correction=aligned(raw.value - raw.nominal, signed=True),
+        sd=aligned(raw.sd),
+        interval=_interval(raw, interval.one_sided, decimals),
+        at_bound=at_bound,
+        determined=determined,
+        raw=raw,
+    )
+
+
+def _interval(raw: RawParameter, one_sided: bool, decimals: int) -> str:
+    if not math.isfinite(raw.sd):
+        return NONE
+    if one_sided:
+        nearer_lower = abs(raw.value - raw.lower) <= abs(raw.upper - raw.value)
+        return f"≤ {fixed(raw.upper, decimals)}" if nearer_lower else f"≥ {fixed(raw.lower, decimals)}"
+    return f"{fixed(raw.lower, decimals)} to {fixed(raw.upper, decimals)}"
+
+
+@dataclass(frozen=True)
+class FixedRow:
+    """A parameter that the run left alone."""
+
+    name: str
+    value: str
+    unit: str
+
+
+def fixed_rows(estimate: Estimate) -> tuple[FixedRow, ...]:
+    """One row a fixed canonical entry."""
+    rows = []
+    for block in estimate.parameters.blocks:
+        if block.free:
+            continue
+        values = estimate.values[estimate.parameters.entries_of(block.name)]
+        for name, suffix, value in zip(block.entry_names, block.domain.entries, values, strict=True):
+            factor, unit = shown_unit(entry_unit(block, suffix))
+            shown = float(value) * factor
+            rows.append(FixedRow(name, f"{shown:.7g}".replace("-", "−"), unit))
+    return tuple(rows)
+
+
+@dataclass(frozen=True)
+class WorstRow:
+    """One of the records with the largest errors."""
+
+    record_id: str
+    row: str
+    role: str
+    before: str
+    after: str
+    crossed: str
+
+
+def worst_records(result: RunResult, number: int = 10) -> NDArray[np.intp]:
+    """The indices with the largest calibrated errors, the largest first; errors that are no number lead."""
+    errors = result.errors.calibrated_mm
+    ranked = np.where(np.isnan(errors), np.inf, errors)
+    return np.argsort(-ranked, kind="stable")[:number].astype(np.intp)
+
+
+def worst_rows(result: RunResult, worst: NDArray[np.intp]) -> tuple[WorstRow, ...]:
+    """Id, source row, role and errors of these records."""
+    errors, data = result.errors, result.dataset
+    train, holdout = set(result.split.train.tolist()), set(result.split.holdout.tolist())
+    columns = (errors.nominal_mm[worst], errors.calibrated_mm[worst], errors.cross_validated_mm[worst])
+    decimals = common_decimals(np.concatenate(columns).tolist())
+    return tuple(
+        WorstRow(
+            record_id=data.ids[i],
+            row=str(data.rows[i]) if data.rows else NONE,
+            role="train" if i in train else "holdout" if i in holdout else "not used",
+            before=fixed(float(errors.nominal_mm[i]), decimals),
+            after=fixed(float(errors.calibrated_mm[i]), decimals),
+            crossed=fixed(float(errors.cross_validated_mm[i]), decimals),
+        )
+        for i in worst.tolist()
+    )
+
+
+@dataclass(frozen=True)
+class Fact:
+    """A name and a value; a long value spans several lines."""
+
+    name: str
+    value: str
+
+    @property
+    def long(self) -> bool:
+        """Whether it is better shown as a block."""
+        return "\n" in self.value
+
+
+def provenance_facts(provenance: Mapping[str, Any], prefix: str = "") -> tuple[Fact, ...]:
+    """Nested hashes and versions as a flat list."""
+    facts: list[Fact] = []
+    for key, value in provenance.items():
+        name = f"{prefix}{key}".replace("_", " ")
+        if isinstance(value, Mapping):
+            facts += provenance_facts(value, f"{name}: ")
+        elif isinstance(value, (list, tuple)):
+            facts.append(Fact(name, ", ".join(str(item) for item in value) or NONE))
+        else:
+            facts.append(Fact(name, NONE if value is None or value == "" else str(value)))
+    return tuple(facts)

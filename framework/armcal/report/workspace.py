@@ -1,0 +1,128 @@
+"""Errors over the workspace: two views of the tip positions, coloured by what is left of the error."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armcal.base.domains import Array
+from armcal.report import svg
+from armcal.report.numbers import count, fixed, plural, significant
+from armcal.report.svg import Axis, Box, Figure
+from armcal.run.result import RunResult
+
+MOST_POINTS = 4000
+"""More positions than this are thinned out."""
+_MOST_VECTORS = 500
+_COLOURS = ("#9bd93c", "#4ac16d", "#1fa187", "#277f8e", "#365c8d", "#46327e", "#440154")
+"""Light to dark, told apart with any colour vision."""
+_NAMES = "xyz"
+
+
+def views(result: RunResult) -> list[Figure]:
+    """The views from above (x, y) and from the side (x, z); empty when no position is known."""
+    position, errors = result.errors.position_mm, result.errors.calibrated_mm
+    if position.shape[0] < 3:
+        return []
+    known = np.flatnonzero(np.isfinite(errors) & np.isfinite(position[:3]).all(axis=0))
+    if not len(known):
+        return []
+    chosen = _thinned(known, errors)
+    chosen = chosen[np.argsort(errors[chosen], kind="stable")]
+    vectors = _vectors(result, chosen)
+    return [_view(position, errors, chosen, len(known), vectors, axes) for axes in ((0, 1), (0, 2))]
+
+
+def _thinned(known: NDArray[np.intp], errors: Array) -> NDArray[np.intp]:
+    """Evenly through the recorded order, and the worst in any case."""
+    if len(known) <= MOST_POINTS:
+        return known
+    worst = known[np.argsort(-errors[known], kind="stable")[:50]]
+    even = known[np.linspace(0, len(known) - 1, MOST_POINTS - 50).astype(np.intp)]
+    return np.unique(np.concatenate([even, worst]))
+
+
+def _vectors(result: RunResult, chosen: NDArray[np.intp]) -> Array | None:
+    """Residual vectors of the chosen records, where the residual is one measured position."""
+    residual = result.errors.calibrated_residual_mm
+    ends = [name.removesuffix(".x") for name in result.dataset.channels if name.endswith(".x")]
+    positions = [p for p in ends if result.dataset.has(f"{p}.y") and result.dataset.has(f"{p}.z")]
+    if residual.shape[0] != 3 or len(positions) != 1 or len(chosen) > _MOST_VECTORS:
+        return None
+    vectors = residual[:, chosen]
+    return vectors if np.isfinite(vectors).all() else None
+
+
+def _view(
+    position: Array, errors: Array, chosen: NDArray[np.intp], total: int, vectors: Array | None, axes: tuple[int, int]
+) -> Figure:
+    shown = position[list(axes)][:, chosen]
+    across, up = (_NAMES[i] for i in axes)
+    step = svg.nice_step(float(np.percentile(errors[chosen], 98)) / len(_COLOURS))
+    enlarged = _enlargement(shown, vectors)
+    caption = _caption(len(chosen), total, enlarged)
+    worst = chosen[-1]
+    said = (
+        f"{plural(len(chosen), 'tip position')} seen along {({'xy': 'z', 'xz': 'y'})[across + up]}; the largest error, "
+        f"{significant(float(errors[worst]))} mm, at {across} {position[axes[0], worst]:.0f}, "
+        f"{up} {position[axes[1], worst]:.0f} mm."
+    )
+
+    def draw(width: float) -> tuple[float, list[str]]:
+        box, x, y = _equal_axes(shown, width)
+        parts = svg.frame(box, x, y, (f"{across}, mm", f"{up}, mm"), (5, 6))
+        if vectors is not None and enlarged:
+            tips = shown + enlarged * vectors[list(axes)]
+            parts.append(svg.segments(x.at(shown[0]), y.at(shown[1]), x.at(tips[0]), y.at(tips[1]), "vector"))
+        level = np.minimum((errors[chosen] / step).astype(int), len(_COLOURS) - 1)
+        css = "dot" if len(chosen) <= 1000 else "dot small"
+        for number, colour in enumerate(_COLOURS):
+            here = level == number
+            parts.append(svg.dots(x.at(shown[0, here]), y.at(shown[1, here]), css, colour))
+        parts += _colour_key(box, step)
+        return box.bottom + 92, parts
+
+    title = "Workspace from above (x, y)" if up == "y" else "Workspace from the side (x, z)"
+    return svg.both(f"workspace-{across}{up}", (title, said, caption), draw, svg.HALF)
+
+
+def _caption(drawn: int, total: int, enlarged: float) -> str:
+    words = "Predicted tip positions; the darker, the larger the calibrated error."
+    if enlarged:
+        words += f" Lines: residuals, {significant(enlarged, 1)} times enlarged."
+    if drawn < total:
+        words += f" {count(drawn)} of {count(total)} drawn, evenly chosen, the 50 worst among them."
+    return words
+
+
+def _enlargement(shown: Array, vectors: Array | None) -> float:
+    """A round factor that makes long residuals about a fifteenth of the view."""
+    if vectors is None:
+        return 0.0
+    long = float(np.percentile(np.linalg.norm(vectors, axis=0), 95))
+    extent = float(np.ptp(shown, axis=1).max())
+    return svg.nice_step(extent / 15 / long / 2) if long > 0 and extent > 0 else 0.0
+
+
+def _equal_axes(shown: Array, width: float) -> tuple[Box, Axis, Axis]:
+    """Axes of one scale around the points."""
+    middle = (shown.max(axis=1) + shown.min(axis=1)) / 2
+    extent = np.maximum(np.ptp(shown, axis=1) * 1.08, 10.0)
+    left, right, top, tallest = 58.0, width - 16, 10.0, width * 0.86
+    scale = min((right - left) / extent[0], tallest / extent[1])
+    height = max(extent[1] * scale, 0.35 * width)
+    box = Box(left, top, right, top + height)
+    half = np.array([right - left, height]) / scale / 2
+    x = Axis(float(middle[0] - half[0]), float(middle[0] + half[0]), box.left, box.right)
+    return box, x, Axis(float(middle[1] - half[1]), float(middle[1] + half[1]), box.bottom, box.top)
+
+
+def _colour_key(box: Box, step: float) -> list[str]:
+    width = min((box.right - box.left) / len(_COLOURS), 44.0)
+    left = (box.left + box.right - width * len(_COLOURS)) / 2
+    y = box.bottom + 50
+    parts = [svg.rect(left + i * width, y, width, 10, colour) for i, colour in enumerate(_COLOURS)]
+    decimals = max(0, -int(np.floor(np.log10(step) + 1e-9)))
+    for i in range(len(_COLOURS)):
+        parts.append(svg.text(left + i * width, y + 24, fixed(i * step, decimals), "tick", "middle"))
+    return [*parts, svg.text(left + width * len(_COLOURS), y + 24, "more, mm", "tick", "middle")]

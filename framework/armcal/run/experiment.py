@@ -1,0 +1,164 @@
+"""An experiment: a configuration, checked and built, before any data is read."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from armcal.base.config_text import ConfigText
+from armcal.base.dataset import Dataset
+from armcal.base.parameters import Parameters
+from armcal.config.selection import select
+from armcal.config.system import System, build_component, build_system
+from armcal.config.validate import validate
+from armcal.config.yaml_source import ConfigSource, load_config
+from armcal.errors import ConfigError
+from armcal.measure.reader import Reader, ReadRequest, wanted_channels
+from armcal.plugins import PluginRegistry, discover
+from armcal.run.settings import ExperimentSettings
+from armcal.solve.estimator import Estimator
+from armcal.solve.simulation import Simulator
+
+STANDARD_GRAVITY = {"earth": 9.80665, "moon": 1.62, "mars": 3.71}
+"""m/s^2; [Williams2024]"""
+_GRAVITY_TOLERANCE = 0.02
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """A configuration made of real components.
+
+    Attributes:
+        name: of the experiment; the configuration file's if it gives none.
+        source: the configuration as written.
+        settings: as checked.
+        system: arms, measurements, statics.
+        parameters: with free ones, bounds and priors as configured.
+        estimator: built.
+        registry: the plugins.
+        warnings: what a user should know before data is read.
+    """
+
+    name: str
+    source: ConfigSource
+    settings: ExperimentSettings
+    system: System
+    parameters: Parameters
+    estimator: Estimator
+    registry: PluginRegistry
+    warnings: tuple[str, ...]
+
+    @classmethod
+    def load(
+        cls,
+        path: str | Path,
+        overrides: Sequence[str] = (),
+        data: str | Path | None = None,
+        registry: PluginRegistry | None = None,
+    ) -> Experiment:
+        """Read and check a configuration.
+
+        Args:
+            path: the YAML file.
+            overrides: ``a.b=value`` texts, as after ``--set``.
+            data: a file to read instead of the configured one; may lie anywhere.
+            registry: plugins, if they were discovered before.
+
+        Raises:
+            ConfigError: the configuration is refused.
+            PluginError: a component is missing or broken.
+        """
+        registry = registry or discover()
+        source = load_config(path, overrides)
+        if data is not None:
+            source = _with_data(source, data)
+        settings = validate(ExperimentSettings, source)
+        system = build_system(source, registry)
+        parameters = select(system.parameters(), settings.parameters, source)
+        estimator = _estimator(source, registry)
+        name = settings.name or Path(path).stem
+        found = tuple(_gravity_warnings(settings))
+        return cls(str(name), source, settings, system, parameters, estimator, registry, found)
+
+    def read(self) -> Dataset:
+        """The measured records.
+
+        Raises:
+            ConfigError: no data is configured, or not enough is known of the load.
+            DataError: the data is refused.
+        """
+        if self.settings.data is None:
+            raise ConfigError(
+                "found no data.",
+                where=self.source.where(("data",)),
+                hint="Give data: {type: csv, path: FILE}, or --data FILE.",
+            )
+        reader: Reader
+        reader, _ = build_component(self.source, self.registry, "reader", ("data",))
+        dataset = reader.read(self.request(measured=True))
+        self._require_payload(dataset)
+        return dataset
+
+    def request(self, *, measured: bool) -> ReadRequest:
+        """What a reader should look for; with ``measured`` the measured values are required."""
+        system = self.system
+        wanted = wanted_channels(system.arms, system.measurements, measured=measured)
+        return ReadRequest(system.arms, system.measurements, wanted)
+
+    def simulator(self) -> Simulator:
+        """The configured simulator.
+
+        Raises:
+            ConfigError: none is configured.
+        """
+        if self.settings.simulation is None:
+            raise ConfigError(
+                "found no simulation.",
+                where=self.source.where(("simulation",)),
+                hint="Give simulation: {type: elastic_arm, truth: FILE, ...}.",
+            )
+        built: Simulator
+        built, _ = build_component(self.source, self.registry, "simulator", ("simulation",))
+        return built
+
+    def _require_payload(self, dataset: Dataset) -> None:
+        """A compliance fitted under an unknown load is wrong by that load."""
+        elastic = [block.name for block in self.parameters.free if block.unit == "rad_per_Nm"]
+        if elastic and self.settings.statics.payload is None and not dataset.has("payload"):
+            raise ConfigError(
+                f"compliances are calibrated ({elastic[0]}, ...) and the payload is not stated.",
+                where=self.source.where(("statics", "payload")),
+                hint="Say what hung on the tool beyond the links, payload_g: 0 if nothing, or add a column payload_g.",
+            )
+
+
+def _estimator(source: ConfigSource, registry: PluginRegistry) -> Estimator:
+    if "estimator" not in source.data:
+        source = replace(source, data={**source.data, "estimator": {"type": "ipopt"}})
+    built: Estimator
+    built, _ = build_component(source, registry, "estimator", ("estimator",))
+    return built
+
+
+def _with_data(source: ConfigSource, data: str | Path) -> ConfigSource:
+    """The configuration with another data file, given on the command line and so free to lie anywhere."""
+    section: dict[str, Any] = dict(source.data.get("data") or {"type": "csv"})
+    section["path"] = ConfigText(str(data))
+    return replace(source, data={**source.data, "data": section})
+
+
+def _gravity_warnings(settings: ExperimentSettings) -> list[str]:
+    statics = settings.statics
+    size = float(np.linalg.norm(statics.gravity))
+    found = []
+    if statics.body is not None:
+        expected = STANDARD_GRAVITY[statics.body]
+        if abs(size - expected) > _GRAVITY_TOLERANCE * expected:
+            found.append(f"gravity is {size:.3f} m/s^2, on the {statics.body} it is {expected:.3f}.")
+    if statics.gravity[2] > 0:
+        found.append("gravity points up along the root frame's z axis: right only for an arm that hangs.")
+    return found

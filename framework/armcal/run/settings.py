@@ -1,0 +1,47 @@
+"""The settings of a run, beyond what the arm is: data, parameters, estimator, validation, simulation."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, model_validator
+
+from armcal.base.settings import InputPath, Settings
+from armcal.config.selection import ParameterSettings
+from armcal.config.system import StaticsSettings
+
+
+class ValidationSettings(Settings):
+    """Which records judge.
+
+    ``holdout`` is a fraction chosen by ``seed``; ``train_ids`` a CSV of record ids to train on (the rest judge);
+    ``folds`` cross-validates over the training records.
+    """
+
+    holdout: Annotated[float, Field(ge=0, lt=1)] = 0.0
+    folds: Annotated[int, Field(ge=0)] = 0
+    seed: Annotated[int, Field(ge=0)] = 0
+    train_ids: InputPath | None = None
+
+    @model_validator(mode="after")
+    def _one_split(self) -> ValidationSettings:
+        if self.holdout and self.train_ids is not None:
+            raise ValueError("found both holdout and train_ids, expected one of them")
+        if self.folds == 1:
+            raise ValueError("found folds: 1, expected 0 (none) or at least 2")
+        return self
+
+
+class ExperimentSettings(Settings):
+    """A whole configuration; components keep their own settings under ``type``."""
+
+    name: str = ""
+    arms: dict[str, Any]
+    measurements: dict[str, Any]
+    statics: StaticsSettings
+    data: dict[str, Any] | None = None
+    simulation: dict[str, Any] | None = None
+    parameters: ParameterSettings = Field(default_factory=ParameterSettings)
+    estimator: dict[str, Any] = Field(default_factory=lambda: {"type": "ipopt"})
+    evaluator: Literal["auto", "compiled", "interpreted"] = "auto"
+    validation: ValidationSettings = Field(default_factory=ValidationSettings)

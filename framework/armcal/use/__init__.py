@@ -1,0 +1,1 @@
+"""Fifth floor: what a calibration is used for."""

@@ -1,0 +1,223 @@
+"""A calibration as a file: everything needed to use it, check it and go on from it."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from armcal.base.config_text import plain
+from armcal.base.dataset import Dataset
+from armcal.base.domains import Array
+from armcal.base.parameters import Parameters
+from armcal.base.settings import Settings
+from armcal.config.system import System, build_system
+from armcal.config.validate import validate
+from armcal.config.yaml_source import load_config
+from armcal.errors import ConfigError, Location
+from armcal.plugins import PluginRegistry, discover
+from armcal.solve.estimator import Estimate
+from armcal.solve.problem import Problem
+
+SCHEMA = 1
+
+
+class ParameterRecord(Settings):
+    """One canonical entry as it is kept; ``sd``, ``lower`` and ``upper`` are null where they are not known."""
+
+    name: str
+    unit: str
+    nominal: float
+    value: float
+    free: bool
+    sd: float | None = None
+    lower: float | None = None
+    upper: float | None = None
+    determined: bool | None = None
+    at_bound: bool = False
+
+
+class InformationRecord(Settings):
+    """Square-root information of the increments of the free parameters about their values."""
+
+    increments: tuple[str, ...]
+    square_root: tuple[tuple[float, ...], ...]
+
+
+class CalibrationFile(Settings):
+    """The schema of calibration.yaml."""
+
+    armcal_calibration: int
+    created: str
+    experiment: str
+    converged: bool
+    software: dict[str, str]
+    identity: dict[str, str]
+    noise: dict[str, Any]
+    quality_mm: dict[str, Any]
+    verdict: dict[str, Any]
+    arms: dict[str, Any]
+    measurements: dict[str, Any]
+    statics: dict[str, Any]
+    parameters: tuple[ParameterRecord, ...]
+    information: InformationRecord
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """A calibrated arm.
+
+    Attributes:
+        system: arms, measurements and statics.
+        parameters: all blocks; their nominal values are the calibrated ones.
+        record: the file's content.
+    """
+
+    system: System
+    parameters: Parameters
+    record: CalibrationFile
+
+    @classmethod
+    def load(cls, path: str | Path, registry: PluginRegistry | None = None) -> Calibration:
+        """Read a calibration.
+
+        Raises:
+            ConfigError: not a calibration, of another schema, damaged, or its description was changed.
+            PluginError: it needs a plugin that is not there.
+        """
+        source = load_config(path)
+        schema = source.data.get("armcal_calibration")
+        if schema != SCHEMA:
+            raise ConfigError(
+                f"found calibration schema {schema!r}, expected {SCHEMA}.",
+                where=Location(str(path)),
+                hint="Give the calibration.yaml of a run, or run the calibration again with this version.",
+            )
+        record = validate(CalibrationFile, source)
+        description = {key: plain(source.data[key]) for key in ("arms", "measurements", "statics")}
+        if identity_of(description) != record.identity.get("arm"):
+            raise ConfigError(
+                "the description of the arm does not match its identity: the file was edited or damaged.",
+                where=Location(str(path)),
+                hint="Change the experiment's configuration and run it again.",
+            )
+        system = build_system(source, registry or discover())
+        parameters = system.parameters()
+        return cls(system, parameters.with_nominal(_values(parameters, record, path)), record)
+
+    def predict(self, commands: Dataset) -> tuple[dict[str, Array], Array]:
+        """What instruments would read and where the first measurement's arms' tools are, in elastic equilibrium.
+
+        Args:
+            commands: records with joint angles; load and gravity where they differ from the configured ones.
+
+        Returns:
+            values (N) by channel (SI), and root_T_tool (arms x N x 4 x 4).
+
+        Raises:
+            NotConvergedError: a record has no equilibrium.
+        """
+        fixed = self.parameters.with_free(())
+        problem = Problem.build(
+            self.system.arms, self.system.measurements, fixed, self.system.environment, commands, "interpreted"
+        )
+        shown = problem.predict(fixed.nominal(), problem.records(commands))
+        channels = {
+            channel: values[row]
+            for kernel, values in zip(problem.kernels, shown, strict=True)
+            for row, channel in enumerate(kernel.factor.output_channels)
+        }
+        return channels, _poses(shown[0][len(problem.kernels[0].factor.output_channels) :])
+
+    def forward(self, joint_angles: Array, arm: str | None = None) -> Array:
+        """root_T_tool (N x 4 x 4) at commanded joint angles (N x n; rad, or m on sliding joints).
+
+        Raises:
+            ValueError: the number of joints differs.
+            NotConvergedError: a record has no equilibrium.
+        """
+        name = arm or next(iter(self.system.arms))
+        joints = self.system.arms[name].joint_names
+        angles = np.atleast_2d(np.asarray(joint_angles, dtype=float))
+        if angles.shape[1] != len(joints):
+            raise ValueError(f"found {angles.shape[1]} joint angles a row, the arm {name} has {len(joints)} joints")
+        channels = {f"{name}.{joint}": angles[:, i] for i, joint in enumerate(joints)}
+        commands = Dataset(tuple(str(i) for i in range(len(angles))), channels)
+        measured = next(n for n, m in self.system.measurements.items() if m.arms == (name,))
+        alone = replace(self.system, measurements={measured: self.system.measurements[measured]})
+        return replace(self, system=alone).predict(commands)[1][0]
+
+
+def identity_of(description: Mapping[str, Any]) -> str:
+    """A hash of an arm's whole description."""
+    return hashlib.sha256(json.dumps(plain(description), sort_keys=True).encode()).hexdigest()
+
+
+def parameter_records(estimate: Estimate) -> tuple[ParameterRecord, ...]:
+    """Every canonical entry of an estimate."""
+    parameters, nominal = estimate.parameters, estimate.parameters.nominal()
+    units = [block.unit for block in parameters.blocks for _ in block.entry_names]
+    place = {name: i for i, name in enumerate(estimate.names)}
+    records = []
+    for position, name in enumerate(parameters.entry_names):
+        i = place.get(name)
+        known = {} if i is None else _uncertainty(estimate, i)
+        records.append(
+            ParameterRecord(
+                name=name,
+                unit=units[position],
+                nominal=float(nominal[position]),
+                value=float(estimate.values[position]),
+                free=i is not None,
+                at_bound=name in estimate.at_bound,
+                **known,
+            )
+        )
+    return tuple(records)
+
+
+def dump(content: Mapping[str, Any]) -> str:
+    """YAML text, keys in order, numbers to their last digit."""
+    return yaml.safe_dump(plain(dict(content)), sort_keys=False, allow_unicode=True, width=110)
+
+
+def _uncertainty(estimate: Estimate, index: int) -> dict[str, Any]:
+    interval = estimate.intervals[index]
+    return {
+        "sd": _finite(estimate.deviations[index]),
+        "lower": _finite(interval.lower),
+        "upper": _finite(interval.upper),
+        "determined": estimate.determined[index],
+    }
+
+
+def _finite(number: float) -> float | None:
+    return float(number) if np.isfinite(number) else None
+
+
+def _values(parameters: Parameters, record: CalibrationFile, path: str | Path) -> Array:
+    kept = {entry.name: entry.value for entry in record.parameters}
+    if tuple(kept) != parameters.entry_names:
+        differing: Sequence[str] = sorted(set(kept) ^ set(parameters.entry_names))
+        raise ConfigError(
+            f"its parameters are not those of its arm: {', '.join(differing[:5]) or 'their order differs'}.",
+            where=Location(str(path)),
+            hint="It was written by another version of a plugin; run the calibration again.",
+        )
+    return np.array(list(kept.values()))
+
+
+def _poses(tools: Array) -> Array:
+    """Stacked 3x4 columns (12 an arm x N) as homogeneous matrices (arms x N x 4 x 4)."""
+    count = tools.shape[1]
+    columns = tools.reshape(-1, 4, 3, count)
+    poses = np.zeros((len(columns), count, 4, 4))
+    poses[:, :, :3, :] = columns.transpose(0, 3, 2, 1)
+    poses[:, :, 3, 3] = 1.0
+    return poses

@@ -1,0 +1,1 @@
+"""The constrained fit by sequential convex steps."""

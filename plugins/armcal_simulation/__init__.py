@@ -1,0 +1,1 @@
+"""A truth to calibrate against."""

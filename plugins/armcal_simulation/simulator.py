@@ -1,0 +1,152 @@
+"""An arm with a stated truth: poses, command quantisation, noise and outliers from a fixed seed.
+
+The recorded command is the one asked for; the arm stands at the nearest one its servo board can make.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, ClassVar, Literal
+
+import numpy as np
+from armcal.base.dataset import Dataset
+from armcal.base.domains import Array
+from armcal.base.settings import Angle, InputPath, Length, Settings
+from armcal.config.selection import with_values
+from armcal.config.yaml_source import load_config
+from armcal.errors import ConfigError
+from armcal.solve.simulation import SimulationRequest, measured_without_noise, with_channels
+from pydantic import Field, model_validator
+
+
+class PoseSettings(Settings):
+    """Which poses are visited.
+
+    ``grid``: ``count`` distinct combinations of each joint's ``levels``, in lexicographic order as a grid is
+    driven. ``random``: ``count`` poses uniform between the smallest and largest level of each joint.
+    """
+
+    kind: Literal["grid", "random"] = "grid"
+    count: Annotated[int, Field(ge=1)]
+    levels: dict[str, Annotated[tuple[Angle, ...], Field(min_length=1)]]
+
+
+class OutlierSettings(Settings):
+    """Some measurements are wrong: how many, and by how much at least (in a random direction)."""
+
+    fraction: Annotated[float, Field(ge=0, le=1)] = 0.0
+    size: Length = 0.03
+
+
+class ElasticArmSettings(Settings):
+    """The truth and how it is measured; ``noise`` defaults to what each measurement declares."""
+
+    truth: InputPath
+    poses: PoseSettings
+    seed: Annotated[int, Field(ge=0)] = 0
+    noise: Length | None = None
+    quantisation: Angle = 0.0
+    outliers: OutlierSettings = Field(default_factory=OutlierSettings)
+
+    @model_validator(mode="after")
+    def _sane(self) -> ElasticArmSettings:
+        if (self.noise or 0) < 0 or self.quantisation < 0:
+            raise ValueError("found a negative noise or quantisation, expected 0 or more")
+        return self
+
+
+class ElasticArmSimulator:
+    """The simulator ``elastic_arm``."""
+
+    Settings: ClassVar[type[ElasticArmSettings]] = ElasticArmSettings
+
+    def __init__(self, settings: ElasticArmSettings) -> None:
+        self._settings = settings
+
+    def simulate(self, request: SimulationRequest) -> Dataset:
+        """Records of the first arm's joints in random or grid poses.
+
+        Raises:
+            ConfigError: the truth names unknown parameters, or a joint has no levels.
+        """
+        settings, random = self._settings, np.random.default_rng(self._settings.seed)
+        arm = next(iter(request.arms.values()))
+        missing = [joint for joint in arm.joint_names if joint not in settings.poses.levels]
+        unknown = [joint for joint in settings.poses.levels if joint not in arm.joint_names]
+        if missing or unknown:
+            raise ConfigError(
+                f"simulation.poses.levels: missing {missing or 'none'}, unknown {unknown or 'none'}.",
+                hint=f"Give one list for each of {', '.join(arm.joint_names)}.",
+            )
+        commands = _poses(settings.poses, arm.joint_names, random)
+        step = settings.quantisation
+        reached = np.round(commands / step) * step if step else commands
+        named = [f"{arm.name}.{joint}" for joint in arm.joint_names]
+        approach = _approach(commands)
+        channels = {f"{arm.name}.approach.{j}": approach[i] for i, j in enumerate(arm.joint_names)}
+        standing = Dataset(
+            tuple(str(i) for i in range(1, commands.shape[1] + 1)),
+            {**dict(zip(named, reached, strict=True)), **channels},
+            source="simulation",
+        )
+        measured = self._measured(request, standing, random)
+        return with_channels(standing, {**dict(zip(named, commands, strict=True)), **measured})
+
+    def _measured(
+        self, request: SimulationRequest, standing: Dataset, random: np.random.Generator
+    ) -> Mapping[str, Array]:
+        true = _with_truth(request, self._settings)
+        exact = measured_without_noise(true, standing)
+        noise = {
+            f"{name}.{channel.name}": deviation
+            for name, measurement in request.measurements.items()
+            for channel, deviation in zip(measurement.channels(), measurement.noise(), strict=True)
+        }
+        stated = self._settings.noise
+        disturbed = {
+            channel: values + random.normal(0.0, noise[channel] if stated is None else stated, len(values))
+            for channel, values in exact.items()
+        }
+        return _with_outliers(disturbed, self._settings.outliers, random)
+
+
+def _poses(poses: PoseSettings, joints: tuple[str, ...], random: np.random.Generator) -> Array:
+    """Commands (joints x poses, rad)."""
+    levels = [np.array(poses.levels[joint]) for joint in joints]
+    if poses.kind == "random":
+        return np.array([random.uniform(level.min(), level.max(), poses.count) for level in levels])
+    total = int(np.prod([len(level) for level in levels]))
+    if poses.count > total:
+        raise ConfigError(
+            f"simulation.poses.count: found {poses.count}, the grid has {total} poses.", hint="Give more levels."
+        )
+    chosen = np.sort(random.choice(total, poses.count, replace=False))
+    indices = np.unravel_index(chosen, [len(level) for level in levels])
+    return np.array([level[index] for level, index in zip(levels, indices, strict=True)])
+
+
+def _approach(commands: Array) -> Array:
+    """The sign of each joint's last motion; 0 before its first (joints x poses)."""
+    moves = np.sign(np.diff(commands, axis=1, prepend=commands[:, :1]))
+    for column in range(1, moves.shape[1]):
+        still = moves[:, column] == 0
+        moves[still, column] = moves[still, column - 1]
+    return np.asarray(moves)
+
+
+def _with_truth(request: SimulationRequest, settings: ElasticArmSettings) -> SimulationRequest:
+    source = load_config(settings.truth)
+    parameters = with_values(request.parameters, source.data, source, ())
+    return SimulationRequest(request.arms, request.measurements, parameters, request.environment)
+
+
+def _with_outliers(
+    measured: Mapping[str, Array], outliers: OutlierSettings, random: np.random.Generator
+) -> dict[str, Array]:
+    count = len(next(iter(measured.values())))
+    wrong = random.random(count) < outliers.fraction
+    push = random.normal(size=(len(measured), count))
+    push *= outliers.size * (1 + random.random(count)) / np.linalg.norm(push, axis=0)
+    return {
+        channel: values + np.where(wrong, push[row], 0.0) for row, (channel, values) in enumerate(measured.items())
+    }

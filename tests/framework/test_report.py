@@ -1,0 +1,390 @@
+"""The report: complete, safe, offline, and quick, whatever a run left behind."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import struct
+import subprocess
+import sys
+import time
+import zlib
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+from armcal.base.dataset import Dataset, SetAside
+from armcal.base.domains import Interval, Pose, Semidefinite
+from armcal.base.parameters import ParameterBlock, Parameters, scalar
+from armcal.report import render
+from armcal.run.result import ErrorTable, RecordErrors, RunResult
+from armcal.solve.estimator import Estimate, SolverVerdict
+from armcal.solve.identifiability import analyse
+from armcal.solve.validation import Split, hold_out, summarise
+from armcal.solve.verdict import judge
+
+SECTIONS = (
+    "verdict",
+    "accuracy",
+    "distribution",
+    "records",
+    "parameters",
+    "compliances",
+    "correlations",
+    "determined",
+    "data",
+    "reproduce",
+)
+CHROMIUM = shutil.which("chromium")
+FLAGS = (
+    "--headless",
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+    "--hide-scrollbars",
+)
+VOID = {"meta", "link", "br", "hr", "img", "input"}
+
+
+def blocks(count: int = 28, springs: int = 7) -> Parameters:
+    """``count`` free scalars, the last ``springs`` of them compliances, and three fixed ones."""
+    made = []
+    for i in range(count - springs):
+        joint, kind = i // 4 + 1, ("alpha", "a", "theta", "d")[i % 4]
+        angular = kind in ("alpha", "theta")
+        nominal = (np.pi / 2, 0.0963, 0.0, 0.1035)[i % 4]
+        unit, scale = ("rad", 0.05) if angular else ("m", 0.01)
+        made.append(replace(scalar(f"arm.mdh.{kind}{joint}", unit, nominal, scale), free=True))
+    for i in range(springs):
+        block = scalar(f"arm.spring.k{i}", "rad_per_Nm", 0.0, 0.05, Interval(lower=0.0))
+        made.append(replace(block, free=True))
+    made += [scalar(f"arm.mdh.base_{a}", "m", 0.01 * i, 0.01) for i, a in enumerate("xyz")]
+    return Parameters(tuple(made))
+
+
+def estimate_of(parameters: Parameters, freedom: int = 700, undetermined: int = 0, seed: int = 1) -> Estimate:
+    """Synthetic values and a covariance with one strongly correlated pair; the last compliance at its bound."""
+    rng = np.random.default_rng(seed)
+    free, scales = parameters.free_entries, parameters.scales()
+    count = len(scales)
+    design = rng.normal(size=(4 * count + 4, count)) * np.geomspace(1, 30, count) if count else np.zeros((1, 0))
+    if count > 3:
+        design[:, 2] = 0.99 * design[:, 1] / np.linalg.norm(design[:, 1]) + 0.002 * design[:, 2]
+        design[:, 1] /= np.linalg.norm(design[:, 1])
+    design[:, count - undetermined : count] = 0.0
+    triangle = np.linalg.qr(design / scales)[1] if count else np.zeros((0, 0))
+    known = analyse(triangle, scales, parameters.increment_names)
+    chain = parameters.retract_jacobian(np.zeros(count))
+    inverse = np.linalg.pinv((triangle * scales).T @ (triangle * scales), rcond=1e-16, hermitian=True)
+    covariance = 2e-3 * chain @ (scales[:, None] * inverse * scales) @ chain.T
+    values = parameters.retract(rng.normal(size=count) * scales / 2)
+    unconstrained = values[list(free)].copy()
+    for i, name in enumerate(parameters.entry_names[j] for j in free):
+        if ".k" in name:
+            values[free[i]] = unconstrained[i] = abs(values[free[i]]) + 0.004
+    if count and parameters.free[-1].domain == Interval(lower=0.0):
+        values[free[-1]], unconstrained[-1] = 0.0, -0.001
+    told = SolverVerdict("ipopt", "Solve_Succeeded", True, 23, 0.412, 8, 8)
+    free_names = [parameters.entry_names[i] for i in free]
+    determined = tuple(i < len(free_names) - undetermined for i in range(len(free_names)))
+    return Estimate(
+        parameters=parameters,
+        values=values,
+        free_entries=free,
+        covariance=covariance,
+        unconstrained=unconstrained,
+        square_root_information=triangle,
+        noise_scale=1.4,
+        degrees_of_freedom=freedom,
+        identifiability=known,
+        determined=determined,
+        verdict=told,
+    )
+
+
+def result_of(
+    count: int = 313,
+    parameters: Parameters | None = None,
+    holdout: float = 0.2,
+    crossed: bool = False,
+    undetermined: int = 0,
+    name: str = "picobot laser tracker",
+    ids: tuple[str, ...] | None = None,
+) -> RunResult:
+    rng = np.random.default_rng(7)
+    azimuth, reach = rng.uniform(-2.2, 2.2, count), rng.uniform(0.15, 0.42, count)
+    position = 1000 * np.vstack([reach * np.cos(azimuth), reach * np.sin(azimuth), 0.05 + rng.uniform(0, 0.35, count)])
+    after = rng.normal(size=(3, count)) * (0.25 + reach) * 0.9
+    before = after + np.vstack([6 * np.cos(azimuth), 5 * np.sin(azimuth), -4 - 12 * reach])
+    if count > 100:
+        after[:, 41] *= 4
+    split = hold_out(count, holdout, 3)
+    errors = RecordErrors(
+        np.linalg.norm(before, axis=0),
+        np.linalg.norm(after, axis=0),
+        np.linalg.norm(after, axis=0) * 1.06 if crossed else np.full(count, np.nan),
+        before,
+        after,
+        position,
+    )
+    found = estimate_of(parameters or blocks(), freedom=max(3 * count - 28, 1), undetermined=undetermined)
+    return RunResult(
+        name=name,
+        command="armcal calibrate configs/picobot.yaml --out runs/picobot",
+        dataset=_dataset(count, position, ids),
+        split=split,
+        estimate=found,
+        errors=errors,
+        table=_table(errors, split),
+        verdict=judge(found, after / 0.4, errors.calibrated_mm, split.train, errors.calibrated_mm[split.holdout], "held out"),
+        warnings=("arm.mdh.d2 and arm.mdh.d3 are nearly parallel: a prior holds their difference.",),
+        backend="casadi, generated C (gcc -O2)",
+        seconds={"read": 0.021, "compile": 1.312, "solve": 0.412, "report": 0.2, "total": 1.945},
+        provenance={
+            "config": "configs/picobot.yaml",
+            "config_sha256": "5c1f" * 16,
+            "versions": {"armcal": "0.1.0", "python": "3.11.2", "casadi": "3.6.5", "numpy": "1.26.4"},
+        },
+    )
+
+
+def _dataset(count: int, position: np.ndarray, ids: tuple[str, ...] | None) -> Dataset:
+    return Dataset(
+        ids=ids or tuple(f"p{i:04d}" for i in range(count)),
+        channels={f"tracker.{axis}": position[i] / 1000 for i, axis in enumerate("xyz")},
+        rows=tuple(range(2, count + 2)),
+        source="data/picobot_2024-03-11.csv",
+        sha256="9f" * 32,
+        set_aside=(SetAside(17, "p0016", "tracker lost the target"), SetAside(99, "p0098", "x_mm is empty")),
+        warnings=("the column temperature has no unit and is not used",),
+    )
+
+
+def _table(errors: RecordErrors, split: Split) -> ErrorTable:
+    held = np.isfinite(errors.cross_validated_mm)
+    return ErrorTable(
+        nominal={
+            "train": summarise(errors.nominal_mm[split.train]),
+            "holdout": summarise(errors.nominal_mm[split.holdout]),
+            "cross_validated": summarise(errors.nominal_mm[held]),
+        },
+        calibrated={
+            "train": summarise(errors.calibrated_mm[split.train]),
+            "holdout": summarise(errors.calibrated_mm[split.holdout]),
+            "cross_validated": summarise(errors.cross_validated_mm[held]),
+        },
+    )
+
+
+class Page(HTMLParser):
+    """Balanced tags, section ids, attributes, and the text of each element."""
+
+    def __init__(self, html: str) -> None:
+        super().__init__(convert_charrefs=True)
+        self.open: list[str] = []
+        self.ids: list[str] = []
+        self.tags: set[str] = set()
+        self.references: list[str] = []
+        self.words: list[str] = []
+        self.header_cells_without_scope = 0
+        self.feed(html)
+        self.close()
+        assert not self.open, f"never closed: {self.open}"
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.add(tag)
+        given = dict(attrs)
+        if given.get("id"):
+            self.ids.append(str(given["id"]))
+        self.references += [str(v) for k, v in attrs if k in ("src", "href", "xlink:href", "action", "data", "srcset")]
+        assert not [k for k, _ in attrs if k.startswith("on")]
+        self.header_cells_without_scope += tag == "th" and "scope" not in given
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.handle_starttag(tag, attrs)
+        self.open.pop()
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open, f"</{tag}> closes nothing"
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        if not self.open or self.open[-1] != "style":
+            self.words.append(data)
+
+    @property
+    def text(self) -> str:
+        return " ".join(" ".join(self.words).split())
+
+
+def checked(html: str) -> Page:
+    """What holds for every report."""
+    page = Page(html)
+    assert [i for i in page.ids if i in SECTIONS] == list(SECTIONS)
+    assert len(page.ids) == len(set(page.ids))
+    assert all(r.startswith("#") or r == "data:," for r in page.references), page.references
+    assert {r[1:] for r in page.references if r.startswith("#")} <= set(page.ids)
+    assert not page.tags & {"script", "iframe", "object", "embed", "img", "base", "form"}
+    assert "url(" not in html and "@import" not in html and "@font-face" not in html
+    assert "default-src 'none'" in html
+    assert page.header_cells_without_scope == 0
+    drawn = [m for path in re.findall(r'<(?:path|rect|text|circle|svg) [^>]*>', html) for m in (path,)]
+    assert not [m for m in drawn if re.search(r'="[^"]*\b(nan|inf)\b', m) and "aria" not in m]
+    return page
+
+
+def test_a_usual_run_is_complete() -> None:
+    result = result_of(crossed=True)
+    page = checked(render(result))
+    assert result.verdict.headline in page.text
+    for finding in result.verdict.findings:
+        assert " ".join(finding.text.split()) in page.text
+    for words in ("arm.mdh.alpha1", "at bound", "Holdout: 63 records", "Cross-validated: 313 records", "p0041"):
+        assert words in page.text
+    for words in ("tracker lost the target", "no unit and is not used", "9f" * 32, "casadi, generated C", "ipopt"):
+        assert words in page.text
+    assert result.command in page.text
+    assert "≤" in page.text and "rad/Nm" in page.text
+
+
+def test_every_figure_has_words_for_those_who_hear_it() -> None:
+    html = render(result_of())
+    figures = re.findall(r"<svg .*?</svg>", html, re.DOTALL)
+    assert len(figures) >= 9
+    for figure in figures:
+        named = re.search(r'aria-labelledby="(\S+) (\S+)"', figure)
+        assert named and all(f'id="{ident}"' in figure for ident in named.groups())
+
+
+def test_what_users_write_is_escaped() -> None:
+    bad = "<script>alert(1)</script>\"'&<b>"
+    ids = (bad, *(f"p{i}" for i in range(39)))
+    parameters = Parameters(tuple(replace(b, name=b.name + "<i>'\"") for b in blocks().blocks))
+    result = result_of(40, parameters, ids=ids, name=bad)
+    result.errors.calibrated_mm[0] = 50.0
+    data = replace(result.dataset, source=bad, set_aside=(SetAside(1, bad, bad),), warnings=(bad,))
+    hostile = replace(result, dataset=data, command=bad, backend=bad, warnings=(bad,), provenance={bad: {bad: bad}})
+    html = render(hostile)
+    checked(html)
+    assert "<script" not in html and "<i>" not in html and "<b>" not in html
+    assert "&lt;script&gt;alert(1)&lt;/script&gt;" in html
+
+
+def test_no_holdout_and_no_cross_validation() -> None:
+    page = checked(render(result_of(holdout=0.0)))
+    assert "Holdout:" not in page.text and "Cross-validated" not in page.text
+    assert "which flatter the model" in page.text
+
+
+@pytest.mark.parametrize("count", [0, 1, 3])
+def test_few_records(count: int) -> None:
+    result = result_of(max(count, 1), holdout=0.0)
+    if not count:
+        none = np.zeros(0)
+        wide = np.zeros((3, 0))
+        errors = RecordErrors(none, none, none, wide, wide, wide)
+        split = Split(np.zeros(0, dtype=np.intp), np.zeros(0, dtype=np.intp))
+        data = Dataset((), {})
+        result = replace(result, errors=errors, split=split, dataset=data, table=_table(errors, split))
+    checked(render(result))
+
+
+def test_no_free_parameter_and_nothing_known() -> None:
+    fixed = Parameters(tuple(replace(b, free=False) for b in blocks().blocks))
+    result = replace(result_of(parameters=fixed), table=ErrorTable({}, {}), provenance={}, seconds={}, warnings=())
+    page = checked(render(result))
+    assert "No parameter was free" in page.text
+    assert "No compliance was free" in page.text
+
+
+def test_undetermined_parameters_and_numbers_that_are_none() -> None:
+    result = result_of(undetermined=2)
+    result.errors.calibrated_mm[:3] = (np.nan, np.inf, 1e9)
+    result.errors.nominal_mm[5] = np.inf
+    page = checked(render(result))
+    assert "not determined" in page.text
+    assert "rest on priors alone" in page.text and "arm.spring.k6 alone" in page.text
+    checked(render(replace(result, estimate=replace(result.estimate, degrees_of_freedom=0, noise_scale=float("nan")))))
+
+
+def test_blocks_of_several_entries() -> None:
+    pose = ParameterBlock("tracker.frame", "m", (1, 0, 0, 0, 0.1, 0.2, 0.3), Pose(), 0.01, True)
+    spring = ParameterBlock("arm.spring.c3", "rad_per_Nm", (0.1, 0, 0, 0.1, 0, 0.1), Semidefinite(), 0.05, True)
+    page = checked(render(result_of(parameters=Parameters((pose, spring)))))
+    assert "tracker.frame[qw]" in page.text and "arm.spring.c3[xy]" in page.text
+
+
+def test_two_hundred_parameters() -> None:
+    page = checked(render(result_of(parameters=blocks(200, 60))))
+    assert "200 parameters are too many for a map" in page.text
+    assert "The strongest" in page.text
+    assert "The 40 largest of 60" in page.text
+
+
+def test_a_hundred_thousand_records_stay_small_and_quick() -> None:
+    result = result_of(100_000, crossed=True)
+    started = time.perf_counter()
+    html = render(result)
+    took = time.perf_counter() - started
+    checked(html)
+    assert len(html.encode()) < 5e6
+    assert took < 3.0
+    assert "too many to draw one by one" in html and "evenly chosen" in html
+
+
+def test_matplotlib_is_not_needed() -> None:
+    code = "import sys, armcal.report; assert 'matplotlib' not in sys.modules and 'jinja2' not in sys.modules"
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_numbers_as_people_read_them() -> None:
+    from armcal.report.numbers import fixed, ratio, shown_unit, significant
+
+    assert fixed(-0.0001, 2) == "0.00" and fixed(-1.5, 1) == "−1.5" and fixed(None, 2) == "–"
+    assert fixed(float("-inf"), 2) == "−∞" and fixed(3e9, 2) == "3.00e+09" and fixed(0.5, 1, signed=True) == "+0.5"
+    assert significant(1234.5) == "1234" and significant(2e-7) == "2.00e−07" and significant(0.01234) == "0.0123"
+    assert ratio(10.0, 0.5) == "20.0 ×" and ratio(1.0, 0.0) == "–"
+    assert shown_unit("m") == (1000.0, "mm") and shown_unit("furlong") == (1.0, "furlong")
+
+
+def _pixels(png: Path) -> tuple[int, int, set[bytes]]:
+    """Width, height and the distinct rows of an 8-bit PNG."""
+    raw, place, packed = png.read_bytes(), 8, b""
+    width, height, _, colour = struct.unpack(">IIBB", raw[16:26])
+    while place < len(raw):
+        length, kind = struct.unpack(">I4s", raw[place : place + 8])
+        packed += raw[place + 8 : place + 8 + length] if kind == b"IDAT" else b""
+        place += 12 + length
+    stride = 1 + width * {2: 3, 6: 4}[colour]
+    data = zlib.decompress(packed)
+    return width, height, {data[i : i + stride] for i in range(0, len(data), stride)}
+
+
+def _browse(page: Path, home: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    command = [str(CHROMIUM), *FLAGS, f"--user-data-dir={home}", *arguments, page.as_uri()]
+    return subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")
+def test_a_browser_shows_it(tmp_path: Path) -> None:
+    page, shot = tmp_path / "report.html", tmp_path / "report.png"
+    page.write_text(render(result_of(crossed=True)), encoding="utf-8")
+    seen = _browse(
+        page, tmp_path / "home", "--enable-logging=stderr", "--dump-dom", f"--screenshot={shot}", "--window-size=1200,5200"
+    )
+    assert "CONSOLE" not in seen.stderr, [x for x in seen.stderr.splitlines() if "CONSOLE" in x]
+    if not seen.stdout:
+        seen = _browse(page, tmp_path / "home", "--dump-dom")
+    for section in SECTIONS:
+        assert f'id="{section}"' in seen.stdout
+    width, height, rows = _pixels(shot)
+    assert (width, height) == (1200, 5200)
+    assert len(rows) > 500
