@@ -7,6 +7,56 @@ The names below are the public Python interface; each is imported when it is fir
 from __future__ import annotations
 
 from importlib import import_module
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from armcal.base.dataset import Dataset
+    from armcal.base.parameters import ParameterBlock, Parameters
+    from armcal.base.settings import Settings
+    from armcal.errors import ArmcalError, InputError, NotConvergedError
+    from armcal.hooks import hookimpl
+    from armcal.run.experiment import Experiment
+    from armcal.run.pipeline import run
+    from armcal.run.result import RunResult
+    from armcal.solve.estimator import Estimate
+    from armcal.use.calibration import Calibration
 
 __version__ = "0.1.0"
+
+__all__ = [
+    "ArmcalError",
+    "Calibration",
+    "Dataset",
+    "Estimate",
+    "Experiment",
+    "InputError",
+    "NotConvergedError",
+    "ParameterBlock",
+    "Parameters",
+    "RunResult",
+    "Settings",
+    "__version__",
+    "hookimpl",
+    "run",
+]
+
+_HOMES = {
+    "ArmcalError": "armcal.errors",
+    "Calibration": "armcal.use.calibration",
+    "Dataset": "armcal.base.dataset",
+    "Estimate": "armcal.solve.estimator",
+    "Experiment": "armcal.run.experiment",
+    "InputError": "armcal.errors",
+    "NotConvergedError": "armcal.errors",
+    "ParameterBlock": "armcal.base.parameters",
+    "Parameters": "armcal.base.parameters",
+    "RunResult": "armcal.run.result",
+    "Settings": "armcal.base.settings",
+    "hookimpl": "armcal.hooks",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name in _HOMES:
+        return getattr(import_module(_HOMES[name]), name)
+    raise AttributeError(f"module 'armcal' has no attribute {name!r}")

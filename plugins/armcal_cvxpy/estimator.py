@@ -50,7 +50,11 @@ class CvxpyEstimator:
         self._settings = settings
 
     def solve(
-        self, problem: Problem, records: Sequence[FactorRecords], start: Array, progress: Progress = no_progress
+        self,
+        problem: Problem,
+        records: Sequence[FactorRecords],
+        start: Array,
+        progress: Progress = no_progress,
     ) -> Solution:
         """From ``start`` until no step saves anything."""
         began = time.perf_counter()
@@ -125,7 +129,10 @@ class _ConvexStep:
         size = len(lower)
         self._step = cp.Variable(size)
         self._root, self._target = cp.Parameter((size, size)), cp.Parameter(size)
-        self._to_low, self._to_high = cp.Parameter(int(self._has_low.sum())), cp.Parameter(int(self._has_high.sum()))
+        self._to_low, self._to_high = (
+            cp.Parameter(int(self._has_low.sum())),
+            cp.Parameter(int(self._has_high.sum())),
+        )
         bounds = []
         if self._has_low.any():
             bounds.append(self._step[np.flatnonzero(self._has_low)] >= self._to_low)

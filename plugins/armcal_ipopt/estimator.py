@@ -42,7 +42,11 @@ class IpoptEstimator:
         self._settings = settings
 
     def solve(
-        self, problem: Problem, records: Sequence[FactorRecords], start: Array, progress: Progress = no_progress
+        self,
+        problem: Problem,
+        records: Sequence[FactorRecords],
+        start: Array,
+        progress: Progress = no_progress,
     ) -> Solution:
         """The best of one or several starts; the first is ``start`` itself."""
         began = time.perf_counter()
@@ -56,7 +60,13 @@ class IpoptEstimator:
         agreeing = sum(abs(c - cost) <= _SAME_COST * max(1.0, cost) for c, _ in converged)
         told = best.verdict
         verdict = SolverVerdict(
-            "ipopt", told.status, told.converged, told.iterations, time.perf_counter() - began, len(found), agreeing
+            "ipopt",
+            told.status,
+            told.converged,
+            told.iterations,
+            time.perf_counter() - began,
+            len(found),
+            agreeing,
         )
         return Solution(best.values, verdict)
 
@@ -85,7 +95,12 @@ class IpoptEstimator:
 
     def _solver(self, callbacks: list[_Callback], size: int) -> Any:
         cost, gradient, hessian = callbacks
-        x, parameters, factor, multipliers = ca.MX.sym("x", size), ca.MX(0, 1), ca.MX.sym("s"), ca.MX.sym("l", 0)
+        x, parameters, factor, multipliers = (
+            ca.MX.sym("x", size),
+            ca.MX(0, 1),
+            ca.MX.sym("s"),
+            ca.MX.sym("l", 0),
+        )
         inputs = [x, parameters]
         value = cost(x)
         options = {
@@ -171,7 +186,9 @@ class _Objective:
                 self._equations = canonical.chained(self._chain(x))
             except NotConvergedError:
                 size = len(x)
-                self._equations = NormalEquations(np.nan, np.full(size, np.nan), np.full((size, size), np.nan))
+                self._equations = NormalEquations(
+                    np.nan, np.full(size, np.nan), np.full((size, size), np.nan)
+                )
         return self._equations
 
 

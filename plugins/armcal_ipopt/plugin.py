@@ -6,4 +6,8 @@ from armcal.hooks import Register, hookimpl
 @hookimpl
 def armcal_register_estimators(register: Register) -> None:
     """Announce the estimator."""
-    register("ipopt", "armcal_ipopt.estimator:IpoptEstimator", "interior point, bounds and priors, Gauss-Newton or exact")
+    register(
+        "ipopt",
+        "armcal_ipopt.estimator:IpoptEstimator",
+        "interior point, bounds and priors, Gauss-Newton or exact",
+    )

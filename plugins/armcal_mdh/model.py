@@ -37,7 +37,9 @@ class Step(Settings):
     def _one_thing(self) -> Step:
         given = [name for name in (*_MOTIONS, "frame") if getattr(self, name) is not None]
         if len(given) != 1:
-            raise ValueError(f"a step is one transform or one frame name, found {given or 'none'}; write several steps")
+            raise ValueError(
+                f"a step is one transform or one frame name, found {given or 'none'}; write several steps"
+            )
         return self
 
     @property
@@ -157,7 +159,9 @@ class MdhModel:
                 continue
             kind, value = step.motion[0], values[next(names)[0]]
             turns = kind.startswith("r")
-            here = here @ (se3.rotation_about(kind[1], value) if turns else se3.translation_along(kind, value))
+            here = here @ (
+                se3.rotation_about(kind[1], value) if turns else se3.translation_along(kind, value)
+            )
         return here
 
 
@@ -170,4 +174,6 @@ def _places(settings: MdhSettings) -> Iterator[tuple[str, tuple[Step, ...]]]:
 
 def _block(name: str, value: float) -> ParameterBlock:
     angular = name.startswith(("alpha", "theta")) or "_r" in name
-    return scalar(name, "rad", value, ANGLE_SCALE_RAD) if angular else scalar(name, "m", value, LENGTH_SCALE_M)
+    return (
+        scalar(name, "rad", value, ANGLE_SCALE_RAD) if angular else scalar(name, "m", value, LENGTH_SCALE_M)
+    )

@@ -118,7 +118,8 @@ def _poses(poses: PoseSettings, joints: tuple[str, ...], random: np.random.Gener
     total = int(np.prod([len(level) for level in levels]))
     if poses.count > total:
         raise ConfigError(
-            f"simulation.poses.count: found {poses.count}, the grid has {total} poses.", hint="Give more levels."
+            f"simulation.poses.count: found {poses.count}, the grid has {total} poses.",
+            hint="Give more levels.",
         )
     chosen = np.sort(random.choice(total, poses.count, replace=False))
     indices = np.unravel_index(chosen, [len(level) for level in levels])
@@ -148,5 +149,6 @@ def _with_outliers(
     push = random.normal(size=(len(measured), count))
     push *= outliers.size * (1 + random.random(count)) / np.linalg.norm(push, axis=0)
     return {
-        channel: values + np.where(wrong, push[row], 0.0) for row, (channel, values) in enumerate(measured.items())
+        channel: values + np.where(wrong, push[row], 0.0)
+        for row, (channel, values) in enumerate(measured.items())
     }

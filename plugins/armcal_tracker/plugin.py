@@ -6,7 +6,7 @@ from armcal.hooks import Register, hookimpl
 @hookimpl
 def armcal_register_measurements(register: Register) -> None:
     """Announce the measurement."""
-    register("tip_position", "armcal_tracker.position:TipPosition", "position of a target on the tool, in the base frame")
+    register("tip_position", "armcal_tracker.position:TipPosition", "position of a target on the tool")
 
 
 @hookimpl

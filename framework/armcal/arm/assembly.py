@@ -118,7 +118,8 @@ class Arm:
         chain, springs = self.chain(values), self.springs(values)
         along, rotations = split_deflection(chain, springs, inputs.deflection)
         displacements = [
-            joint.offset + along[i] + self._commanded(values, inputs, i) for i, joint in enumerate(chain.joints)
+            joint.offset + along[i] + self._commanded(values, inputs, i)
+            for i, joint in enumerate(chain.joints)
         ]
         frames = forward(chain, displacements, rotations)
         acting = wrenches(chain, frames, self._masses(values), inputs.load)

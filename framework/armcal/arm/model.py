@@ -117,9 +117,7 @@ class Frames:
     named: Mapping[str, Transform]
 
 
-def forward(
-    chain: Chain, displacements: Sequence[Expression], rotations: Mapping[int, Expression]
-) -> Frames:
+def forward(chain: Chain, displacements: Sequence[Expression], rotations: Mapping[int, Expression]) -> Frames:
     """Forward kinematics with deflections.
 
     Args:

@@ -110,7 +110,9 @@ class Rotation:
 
     def retract_jacobian(self, base: Array, delta: Array) -> Array:
         """Half of the quaternion product's matrix, after the right Jacobian of the exponential [Murray1994]."""
-        return np.asarray(0.5 * _quaternion_matrix(self.retract(base, delta))[:, 1:] @ _left_jacobian(delta).T)
+        return np.asarray(
+            0.5 * _quaternion_matrix(self.retract(base, delta))[:, 1:] @ _left_jacobian(delta).T
+        )
 
 
 @dataclass(frozen=True)
@@ -299,7 +301,7 @@ def _left_jacobian(vector: Array) -> Array:
     x, y, z = vector
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     if angle < 1e-4:
-        return np.eye(3) + (0.5 - angle**2 / 24) * cross + (1 / 6 - angle**2 / 120) * cross @ cross
+        return np.asarray(np.eye(3) + (0.5 - angle**2 / 24) * cross + (1 / 6 - angle**2 / 120) * cross @ cross)
     first, second = (1 - math.cos(angle)) / angle**2, (angle - math.sin(angle)) / angle**3
     return np.asarray(np.eye(3) + first * cross + second * cross @ cross)
 

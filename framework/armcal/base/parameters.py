@@ -51,7 +51,9 @@ class ParameterBlock:
         return len(self.domain.entries)
 
 
-def scalar(name: str, unit: str, nominal: float, scale: float, domain: Interval | None = None) -> ParameterBlock:
+def scalar(
+    name: str, unit: str, nominal: float, scale: float, domain: Interval | None = None
+) -> ParameterBlock:
     """A block of one number."""
     return ParameterBlock(name, unit, (float(nominal),), domain or Interval(), scale)
 
@@ -69,7 +71,9 @@ class Parameters:
         names = [block.name for block in self.blocks]
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
-            raise ConfigError(f"parameter names stand twice: {', '.join(twice)}.", hint="Rename one of the instances.")
+            raise ConfigError(
+                f"parameter names stand twice: {', '.join(twice)}.", hint="Rename one of the instances."
+            )
 
     @cached_property
     def names(self) -> tuple[str, ...]:
@@ -175,7 +179,11 @@ class Parameters:
         """Lower and upper bound of each increment from the nominal values; infinite for all but intervals."""
         lower, upper = {}, {}
         for block in self.free:
-            ends = (block.domain.lower, block.domain.upper) if isinstance(block.domain, Interval) else _EVERYWHERE
+            ends = (
+                (block.domain.lower, block.domain.upper)
+                if isinstance(block.domain, Interval)
+                else _EVERYWHERE
+            )
             lower[block.name], upper[block.name] = (end - block.nominal[0] for end in ends)
         return self._per_increment(lower), self._per_increment(upper)
 

@@ -8,6 +8,7 @@ from dataclasses import replace
 from typing import Literal
 
 import numpy as np
+from pydantic import Field
 
 from armcal.base.parameters import ParameterBlock, Parameters
 from armcal.base.settings import Settings
@@ -30,8 +31,8 @@ class ParameterSettings(Settings):
     free: tuple[str, ...] = ()
     fixed: tuple[str, ...] = ()
     bounds: Literal["physical", "none"] | bool = "physical"
-    values: dict[str, str | float] = {}
-    priors: dict[str, str | float] = {}
+    values: dict[str, str | float] = Field(default_factory=dict)
+    priors: dict[str, str | float] = Field(default_factory=dict)
 
 
 def select(parameters: Parameters, settings: ParameterSettings, source: ConfigSource) -> Parameters:
@@ -81,7 +82,9 @@ def quantity(block: ParameterBlock, text: str | float, source: ConfigSource | No
     """A text with a unit as SI, for a scalar block."""
     where = source.where(at) if source else None
     if block.size != 1:
-        raise ConfigError(f"{block.name} has {block.size} entries and cannot be set by one number.", where=where)
+        raise ConfigError(
+            f"{block.name} has {block.size} entries and cannot be set by one number.", where=where
+        )
     dimension = DIMENSION_OF_UNIT.get(block.unit)
     if dimension is None:
         if isinstance(text, str):
@@ -89,7 +92,9 @@ def quantity(block: ParameterBlock, text: str | float, source: ConfigSource | No
         return float(text)
     if not isinstance(text, str):
         raise ConfigError(
-            f"found {text} without a unit for {block.name}.", where=where, hint=f"Write it as text: {text} {block.unit}."
+            f"found {text} without a unit for {block.name}.",
+            where=where,
+            hint=f"Write it as text: {text} {block.unit}.",
         )
     try:
         return parse_quantity(text, dimension)

@@ -6,6 +6,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Literal, TypeVar
 
+from pydantic import Field
+
 from armcal.arm.assembly import Arm, MassSpec, prefixed
 from armcal.arm.statics import frame_names
 from armcal.base.parameters import ParameterBlock, Parameters
@@ -38,8 +40,8 @@ class ArmSettings(Settings):
     """One arm: its model, its joint effects and its masses, each by name."""
 
     model: dict[str, Any]
-    effects: dict[str, dict[str, Any]] = {}
-    links: dict[str, LinkSettings] = {}
+    effects: dict[str, dict[str, Any]] = Field(default_factory=dict)
+    links: dict[str, LinkSettings] = Field(default_factory=dict)
 
 
 class StaticsSettings(Settings):
@@ -110,7 +112,9 @@ def build_system(source: ConfigSource, registry: PluginRegistry) -> System:
     measurements, described = {}, {}
     for name in settings.measurements:
         at: Path = ("measurements", name)
-        measurements[name], described[name] = build_component(source, registry, "measurement", at, tuple(arms))
+        measurements[name], described[name] = build_component(
+            source, registry, "measurement", at, tuple(arms)
+        )
     description = {"arms": described_arms, "measurements": described, "statics": settings.statics.to_config()}
     return System(arms, measurements, settings.statics, description)
 
@@ -127,7 +131,9 @@ def build_component(
     section = _at(source.data, at)
     if not isinstance(section, dict) or not isinstance(section.get("type"), str):
         raise ConfigError(
-            f"found no type for this {kind}.", where=source.where(at), hint="Write type: NAME; see armcal plugins list."
+            f"found no type for this {kind}.",
+            where=source.where(at),
+            hint="Write type: NAME; see armcal plugins list.",
         )
     name = str(section["type"])
     component = registry.find(kind, name).load()
@@ -144,7 +150,9 @@ def _arm(source: ConfigSource, registry: PluginRegistry, name: str) -> tuple[Arm
     effects, described_effects = {}, {}
     for effect in settings.effects:
         place: Path = (*at, "effects", effect)
-        built, described_effects[effect] = build_component(source, registry, "effect", place, model.joint_names)
+        built, described_effects[effect] = build_component(
+            source, registry, "effect", place, model.joint_names
+        )
         effects[effect] = built
     masses = tuple(
         MassSpec(link, s.mass, s.com, s.frame, s.loads_up_to_joint) for link, s in settings.links.items()
@@ -157,7 +165,9 @@ def _arm(source: ConfigSource, registry: PluginRegistry, name: str) -> tuple[Arm
     return arm, {"model": described_model, "effects": described_effects, "links": links}
 
 
-def _check_link(source: ConfigSource, at: Path, link: LinkSettings, known: Mapping[str, int], joints: int) -> None:
+def _check_link(
+    source: ConfigSource, at: Path, link: LinkSettings, known: Mapping[str, int], joints: int
+) -> None:
     if link.frame not in known:
         raise ConfigError(
             f"no frame is called {link.frame!r}.",
@@ -165,7 +175,9 @@ def _check_link(source: ConfigSource, at: Path, link: LinkSettings, known: Mappi
             hint=f"The frames are {', '.join(known)}.",
         )
     if link.mass < 0:
-        raise ConfigError("found a mass below zero.", where=source.where((*at, "mass")), hint="Give the mass.")
+        raise ConfigError(
+            "found a mass below zero.", where=source.where((*at, "mass")), hint="Give the mass."
+        )
     if link.loads_up_to_joint is not None and not 0 <= link.loads_up_to_joint <= joints:
         raise ConfigError(
             f"found joint {link.loads_up_to_joint}, expected 0 to {joints}.",

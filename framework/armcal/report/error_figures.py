@@ -149,7 +149,7 @@ def _one_by_one(result: RunResult, x: Axis, y: Axis) -> list[str]:
     for chosen, css in ((above & ~holdout, "fill-train"), (above & holdout, "fill-holdout")):
         parts.append(svg.marks(x.at(place[chosen]), y.at(errors[chosen]), _TRIANGLE, css))
     if np.isfinite(errors).all() and len(errors) >= 30:
-        window = max(9, len(errors) // 40)
+        window = max(15, len(errors) // 12)
         middle = np.median(np.lib.stride_tricks.sliding_window_view(errors, window), axis=1)
         centre = place[: len(middle)] + (window - 1) / 2
         parts.append(svg.polyline(x.at(centre), y.at(middle), "running"))

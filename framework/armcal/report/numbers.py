@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterable
 
 from armcal.base.domains import Pose, Rotation, ScrewAxis
@@ -12,7 +13,7 @@ from armcal.base.units import UNITS, display_unit
 NONE = "–"
 _MINUS = "−"
 _MOST_DECIMALS = 8
-_WORDS = {"deg": "°", "rad_per_Nm": "rad/Nm", "deg_per_Nm": "°/Nm", "m_s2": "m/s²", "1": ""}
+_WORDS = {"rad_per_Nm": "rad/Nm", "deg_per_Nm": "deg/Nm", "m_s2": "m/s²", "1": ""}
 
 
 def fixed(value: float | None, decimals: int, signed: bool = False) -> str:
@@ -37,6 +38,8 @@ def significant(value: float, digits: int = 3) -> str:
         return "0"
     if not 1e-4 <= abs(value) < 1e6:
         return f"{value:.{digits - 1}e}".replace("-", _MINUS)
+    if abs(value) >= 1000:
+        return count(int(float(f"{value:.{digits - 1}e}"))).replace("-", _MINUS)
     return fixed(value, decimals_for(value, digits))
 
 
@@ -47,7 +50,7 @@ def decimals_for(size: float, digits: int = 2) -> int:
     return min(max(digits - 1 - math.floor(math.log10(abs(size))), 0), _MOST_DECIMALS)
 
 
-def common_decimals(values: Iterable[float | None], least: int = 1, most: int = 4) -> int:
+def common_decimals(values: Iterable[float | None], least: int = 2, most: int = 4) -> int:
     """Decimals that show two digits of the smallest of the values."""
     sizes = [abs(v) for v in values if v is not None and math.isfinite(v) and v != 0]
     return min(max(decimals_for(min(sizes)), least), most) if sizes else 2
@@ -61,6 +64,11 @@ def count(number: int) -> str:
 def plural(number: int, noun: str) -> str:
     """``1 record``, ``2 records``."""
     return f"{count(number)} {noun}{'' if number == 1 else 's'}"
+
+
+def unbroken(words: str) -> str:
+    """Numbers kept together with their units at the end of a line."""
+    return re.sub(r"(\d) (mm|%|times)", "\\1\u00a0\\2", words)
 
 
 def duration(seconds: float) -> str:

@@ -10,7 +10,7 @@ import numpy as np
 
 import armcal
 from armcal.report import error_figures, parameter_figures, workspace
-from armcal.report.numbers import NONE, common_decimals, count, duration, fixed, plural, ratio, significant
+from armcal.report.numbers import NONE, common_decimals, count, duration, fixed, plural, ratio, significant, unbroken
 from armcal.report.tables import (
     Fact,
     ParameterRow,
@@ -40,18 +40,20 @@ def render(result: RunResult) -> str:
     loader = FileSystemLoader(Path(__file__).parent)
     environment = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True)
     environment.lstrip_blocks = True
-    environment.filters.update(count=count, plural=plural)
+    environment.filters.update(count=count, plural=plural, unbroken=unbroken)
     return environment.get_template("template.html.j2").render(_content(result))
 
 
 def _content(result: RunResult) -> dict[str, Any]:
     rows = parameter_rows(result.estimate)
+    grades = [finding.grade for finding in result.verdict.findings]
     return {
         "result": result,
         "version": armcal.__version__,
         "words": _WORDS,
         "symbols": _SYMBOLS,
-        "grade": result.verdict.findings[0].grade if result.verdict.findings else "note",
+        "worst_grade": next((g for g in _WORDS if g in grades), "note"),
+        "grades": [(g, grades.count(g)) for g in _WORDS if g in grades],
         **_accuracy(result),
         **_poses(result),
         **_parameters(result.estimate, rows),
@@ -101,6 +103,7 @@ def _correlations(estimate: Estimate) -> dict[str, Any]:
         return {"map": None, "pairs": (), "more_pairs": 0, "too_many": False, "strongest": ()}
     with np.errstate(invalid="ignore"):
         matrix = correlations(estimate.covariance)
+    matrix = np.where(np.outer(estimate.determined, estimate.determined), matrix, 0.0)
     pairs = correlated_pairs(matrix, names, CORRELATED)
     strongest = _strongest(matrix, names) if not pairs or len(names) > parameter_figures.MOST_MAPPED else ()
     return {

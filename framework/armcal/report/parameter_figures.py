@@ -27,17 +27,14 @@ def compliances(rows: Sequence[ParameterRow]) -> Figure | None:
         return None
     shown = sorted(rows, key=lambda r: -abs(r.raw.value))[:MOST_WHISKERS] if len(rows) > MOST_WHISKERS else list(rows)
     unit = shown[0].unit
-    caption = "Dot: value; whisker: 95 % interval; hollow dot: at its bound; dashed whisker: not determined; "
-    caption += "small bar: nominal."
-    if len(shown) < len(rows):
-        caption += f" The {len(shown)} largest of {len(rows)}."
+    caption = _whisker_words(shown, len(rows))
     said = "; ".join(f"{r.name} {r.value} {unit}, {r.interval}" for r in shown[:12])
     low, high = _range(shown)
 
     def draw(width: float) -> tuple[float, list[str]]:
         most = 14 if width == svg.NARROW else 26
         left = MONO * max(len(svg.shorten(r.name, most)) for r in shown) + 18
-        beside = 190 if width > svg.NARROW else 14
+        beside = (6.9 * max(len(_beside(r)) for r in shown) + 16) if width > svg.NARROW else 14
         box = Box(left, 8, width - beside, 8 + _ROW * len(shown))
         x = Axis(low, high, box.left, box.right)
         parts = svg.frame(box, x, None, (f"compliance, {unit}", ""), (8 if width > svg.NARROW else 4, 0))
@@ -48,10 +45,22 @@ def compliances(rows: Sequence[ParameterRow]) -> Figure | None:
             parts.append(svg.text(left - 9, y + 4, svg.shorten(row.name, most), "mono", "end"))
             parts += _whisker(row, x, y)
             if width > svg.NARROW:
-                parts.append(svg.text(box.right + 12, y + 4, f"{row.value.strip()}   ({row.interval.strip()})", "tick"))
+                parts.append(svg.text(box.right + 12, y + 4, _beside(row), "tick"))
         return box.bottom + 44, parts
 
     return svg.both("compliance", ("Compliances and their bounds", said, caption), draw)
+
+
+def _beside(row: ParameterRow) -> str:
+    return f"{row.value.strip()}   ({row.interval if row.determined else 'not determined'})"
+
+
+def _whisker_words(shown: Sequence[ParameterRow], total: int) -> str:
+    words = "Dot: value; whisker: 95 % interval; dark line at 0: the physical bound"
+    words += "; hollow dot: ended at its bound" if any(r.at_bound for r in shown) else ""
+    words += "; dashed: not determined" if not all(r.determined for r in shown) else ""
+    words += "; small bar: nominal, where it is not 0" if any(r.raw.nominal for r in shown) else ""
+    return f"{words}. The {len(shown)} largest of {total}." if len(shown) < total else f"{words}."
 
 
 def _range(rows: Sequence[ParameterRow]) -> tuple[float, float]:
@@ -73,7 +82,8 @@ def _whisker(row: ParameterRow, x: Axis, y: float) -> list[str]:
     parts = [svg.line(left, y, right, y, "whisker" if known else "whisker unknown")]
     if known:
         parts += [svg.line(end, y - 5, end, y + 5, "whisker") for end in (left, right)]
-    parts.append(svg.line(x.of(raw.nominal), y - 9, x.of(raw.nominal), y + 9, "nominal"))
+    if raw.nominal:
+        parts.append(svg.line(x.of(raw.nominal), y - 9, x.of(raw.nominal), y + 9, "nominal"))
     parts.append(svg.circle(x.of(raw.value), y, 5, "hollow" if row.at_bound else "solid"))
     return parts
 
@@ -97,7 +107,8 @@ def correlation_map(correlation: Array, names: tuple[str, ...], known: Sequence[
     said = f"Lower triangle of the correlation matrix of {number} parameters; pairs above 0.95 are listed beside it."
     title = "Correlations of the parameters' estimates"
     drawn = svg.document("correlation-map", (width, height), title, said, parts)
-    caption = "Dark cells: the data tells the two apart badly. Grey: not determined, so no correlation is known."
+    caption = "Dark cells: the data tells the two apart badly."
+    caption += "" if all(known) else " Grey: not determined, so no correlation is known."
     return Figure(title, caption, drawn)
 
 

@@ -128,10 +128,10 @@ def parameter_rows(estimate: Estimate) -> tuple[ParameterRow, ...]:
         numbers = (nominal[entry], estimate.values[entry], estimate.deviations[i], interval.lower, interval.upper)
         raw.append(RawParameter(*(float(n) * factor for n in numbers)))
         decimals.append(_decimals(raw[-1]))
-    widest = {u: max(d for d, v in zip(decimals, units, strict=True) if v == u) for u in units}
+    widest = max(decimals, default=0)
     bounds = set(estimate.at_bound)
     return tuple(
-        _row(names[i], units[i], raw[i], estimate.intervals[i], decimals[i], widest[units[i]], names[i] in bounds)
+        _row(names[i], units[i], raw[i], estimate.intervals[i], decimals[i], widest, names[i] in bounds)
         for i in range(len(names))
     )
 

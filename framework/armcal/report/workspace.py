@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from armcal.base.domains import Array
 from armcal.report import svg
-from armcal.report.numbers import count, fixed, plural, significant
+from armcal.report.numbers import count, decimals_for, fixed, plural, significant
 from armcal.report.svg import Axis, Box, Figure
 from armcal.run.result import RunResult
 
@@ -58,7 +58,7 @@ def _view(
 ) -> Figure:
     shown = position[list(axes)][:, chosen]
     across, up = (_NAMES[i] for i in axes)
-    step = svg.nice_step(float(np.percentile(errors[chosen], 98)) / len(_COLOURS))
+    step = _colour_step(float(np.percentile(errors[chosen], 98)) / len(_COLOURS))
     enlarged = _enlargement(shown, vectors)
     caption = _caption(len(chosen), total, enlarged)
     worst = chosen[-1]
@@ -80,7 +80,7 @@ def _view(
             here = level == number
             parts.append(svg.dots(x.at(shown[0, here]), y.at(shown[1, here]), css, colour))
         parts += _colour_key(box, step)
-        return box.bottom + 92, parts
+        return box.bottom + 104, parts
 
     title = "Workspace from above (x, y)" if up == "y" else "Workspace from the side (x, z)"
     return svg.both(f"workspace-{across}{up}", (title, said, caption), draw, svg.HALF)
@@ -122,7 +122,16 @@ def _colour_key(box: Box, step: float) -> list[str]:
     left = (box.left + box.right - width * len(_COLOURS)) / 2
     y = box.bottom + 50
     parts = [svg.rect(left + i * width, y, width, 10, colour) for i, colour in enumerate(_COLOURS)]
-    decimals = max(0, -int(np.floor(np.log10(step) + 1e-9)))
+    decimals = decimals_for(step, 2 if round(step / 10 ** np.floor(np.log10(step)), 6) % 1 else 1)
     for i in range(len(_COLOURS)):
         parts.append(svg.text(left + i * width, y + 24, fixed(i * step, decimals), "tick", "middle"))
-    return [*parts, svg.text(left + width * len(_COLOURS), y + 24, "more, mm", "tick", "middle")]
+    words = "calibrated error, mm; the darkest: and more"
+    return [*parts, svg.text((box.left + box.right) / 2, y + 44, words, "tick", "middle")]
+
+
+def _colour_step(rough: float) -> float:
+    """A round step with finer choices than an axis needs, so that all colours are used."""
+    if not np.isfinite(rough) or rough <= 0:
+        return 1.0
+    power = 10.0 ** np.floor(np.log10(rough))
+    return float(next(s * power for s in (1, 1.5, 2, 2.5, 3, 4, 5, 6, 8, 10, 20) if s * power >= rough * (1 - 1e-9)))

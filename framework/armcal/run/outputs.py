@@ -47,7 +47,9 @@ def check_folder(folder: Path) -> None:
         )
 
 
-def write(result: RunResult, experiment: Experiment, folder: Path, render: Callable[[RunResult], str]) -> None:
+def write(
+    result: RunResult, experiment: Experiment, folder: Path, render: Callable[[RunResult], str]
+) -> None:
     """Write all files; those of an earlier run in the same place move to ``earlier/``.
 
     A run that did not converge leaves ``calibration.yaml.not-converged``, which nothing loads.
@@ -77,7 +79,9 @@ def write(result: RunResult, experiment: Experiment, folder: Path, render: Calla
         shutil.rmtree(staging)
     except OSError as fault:
         raise InputError(
-            f"it cannot be written ({fault}).", where=Location(str(folder)), hint="Give --out a writable directory."
+            f"it cannot be written ({fault}).",
+            where=Location(str(folder)),
+            hint="Give --out a writable directory.",
         ) from fault
 
 
@@ -134,7 +138,11 @@ def calibration_content(result: RunResult, experiment: Experiment) -> dict[str, 
         experiment=result.name,
         converged=estimate.verdict.converged,
         software=dict(provenance["versions"]),
-        identity={"arm": provenance["arm_sha256"], "data": provenance["data_sha256"], "source": provenance["data"]},
+        identity={
+            "arm": provenance["arm_sha256"],
+            "data": provenance["data_sha256"],
+            "source": provenance["data"],
+        },
         noise={"scale": estimate.noise_scale, "degrees_of_freedom": estimate.degrees_of_freedom},
         quality_mm=result.table.as_dict(),
         verdict={"headline": result.verdict.headline, "findings": [f.text for f in result.verdict.findings]},
@@ -161,7 +169,9 @@ def residuals_text(result: RunResult) -> str:
     axes = ["dx_mm", "dy_mm", "dz_mm"] if rows == 3 else [f"residual{i}_mm" for i in range(1, rows + 1)]
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["pose_id", "source_row", "set", "nominal_mm", "calibrated_mm", "cross_validated_mm", *axes])
+    writer.writerow(
+        ["pose_id", "source_row", "set", "nominal_mm", "calibrated_mm", "cross_validated_mm", *axes]
+    )
     for i, record in enumerate(dataset.ids):
         numbers = [errors.nominal_mm[i], errors.calibrated_mm[i], errors.cross_validated_mm[i]]
         numbers += list(errors.calibrated_residual_mm[:, i])
@@ -173,7 +183,11 @@ def residuals_text(result: RunResult) -> str:
 
 def log_text(result: RunResult) -> str:
     """What happened, in sentences."""
-    lines = [f"experiment: {result.name}", f"command: {result.command}", f"verdict: {result.verdict.headline}"]
+    lines = [
+        f"experiment: {result.name}",
+        f"command: {result.command}",
+        f"verdict: {result.verdict.headline}",
+    ]
     lines += [f"{finding.grade}: {finding.text}" for finding in result.verdict.findings]
     lines += [f"warning: {text}" for text in result.warnings]
     lines += [f"set aside: row {a.row}, record {a.record_id}: {a.reason}" for a in result.dataset.set_aside]
@@ -204,5 +218,3 @@ def _keep_earlier(folder: Path) -> None:
 
 def _finite(number: float) -> float | None:
     return float(number) if np.isfinite(number) else None
-
-

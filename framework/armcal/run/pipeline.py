@@ -101,7 +101,10 @@ def prepare(experiment: Experiment, watch: Stopwatch) -> Prepared:
 
 
 def run(
-    experiment: Experiment, command: str = "", progress: Progress = no_progress, watch: Stopwatch | None = None
+    experiment: Experiment,
+    command: str = "",
+    progress: Progress = no_progress,
+    watch: Stopwatch | None = None,
 ) -> RunResult:
     """Calibrate; see ``outputs.write`` for what is left behind.
 
@@ -224,5 +227,7 @@ def _provenance(experiment: Experiment, dataset: Dataset) -> dict[str, Any]:
             "python": sys.version.split()[0],
             **{name: version(name) for name in packages},
         },
-        "plugins": {p.name: f"{p.distribution} {p.version}" for p in experiment.registry.plugins if not p.fault},
+        "plugins": {
+            p.name: f"{p.distribution} {p.version}" for p in experiment.registry.plugins if not p.fault
+        },
     }

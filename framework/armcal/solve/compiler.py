@@ -60,7 +60,9 @@ def load_cached(key: str) -> ctypes.CDLL | None:
     try:
         for place in (path, path.parent):
             seen = place.stat()
-            if hasattr(os, "getuid") and (seen.st_uid != os.getuid() or seen.st_mode & (stat.S_IWGRP | stat.S_IWOTH)):
+            if hasattr(os, "getuid") and (
+                seen.st_uid != os.getuid() or seen.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
+            ):
                 return None
         os.utime(path)
         return ctypes.CDLL(str(path))
@@ -87,7 +89,9 @@ def compile_in_background(key: str, source: Callable[[], str]) -> None:
     def wait() -> None:
         with suppress(OSError, subprocess.SubprocessError):
             silent = subprocess.DEVNULL
-            subprocess.run(command, start_new_session=True, stdin=silent, stdout=silent, stderr=silent, check=False)
+            subprocess.run(
+                command, start_new_session=True, stdin=silent, stdout=silent, stderr=silent, check=False
+            )
 
     threading.Thread(target=wait, name="armcal-compile", daemon=True).start()
 
@@ -105,7 +109,9 @@ def _prepare(key: str, source: Callable[[], str]) -> list[str] | None:
         (build / "kernel.c").write_text(source(), encoding="utf-8")
     except OSError:
         return None
-    compile_it = shlex.join([compiler, *FLAGS, "-o", str(build / "kernel.so"), str(build / "kernel.c"), "-lm"])
+    compile_it = shlex.join(
+        [compiler, *FLAGS, "-o", str(build / "kernel.so"), str(build / "kernel.c"), "-lm"]
+    )
     into_place = shlex.join(["mv", "-f", str(build / "kernel.so"), str(directory / f"{key}.so")])
     remove = shlex.join(["rm", "-rf", str(build)])
     private = "umask 077"
@@ -137,5 +143,7 @@ def _processor() -> str:
     """What ``-march=native`` depends on."""
     with suppress(OSError):
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
-        return "\n".join(sorted({line for line in lines if line.startswith(("flags", "Features", "model name"))}))
+        return "\n".join(
+            sorted({line for line in lines if line.startswith(("flags", "Features", "model name"))})
+        )
     return f"{platform.machine()} {platform.processor()} {platform.node()}"

@@ -14,7 +14,7 @@ from armcal.base.domains import Array
 from armcal.base.parameters import Parameters
 from armcal.errors import ProblemError
 from armcal.solve.identifiability import POOR_CONDITION, Identifiability, analyse
-from armcal.solve.problem import FactorRecords, Problem
+from armcal.solve.problem import FactorRecords, Problem, triangular
 
 CONFIDENCE = 0.95
 NEAR_A_BOUND_SD = 3.0
@@ -55,7 +55,11 @@ class Estimator(Protocol):
     """What a plugin provides to solve a problem on all records at once."""
 
     def solve(
-        self, problem: Problem, records: Sequence[FactorRecords], start: Array, progress: Progress = no_progress
+        self,
+        problem: Problem,
+        records: Sequence[FactorRecords],
+        start: Array,
+        progress: Progress = no_progress,
     ) -> Solution:
         """Minimise half the squared whitened residuals plus priors, within bounds, from ``start``.
 
@@ -149,7 +153,9 @@ def estimate(problem: Problem, records: Sequence[FactorRecords], solution: Solut
     equations = problem.normal_equations(solution.values, records).chained(chain)
     triangle = problem.triangular_factor(solution.values, records)
     known = analyse(triangle, scales, parameters.increment_names)
-    count = sum(each.count * len(kernel.factor.noise) for kernel, each in zip(problem.kernels, records, strict=True))
+    count = sum(
+        each.count * len(kernel.factor.noise) for kernel, each in zip(problem.kernels, records, strict=True)
+    )
     freedom = count - known.rank
     noise_scale = float(np.sqrt(2 * equations.cost / freedom)) if freedom > 0 else 1.0
     held = np.diag(scales * np.sqrt(prior)) * noise_scale
@@ -169,7 +175,9 @@ def estimate(problem: Problem, records: Sequence[FactorRecords], solution: Solut
         free_entries=parameters.free_entries,
         covariance=chain @ covariance @ chain.T,
         unconstrained=solution.values[free] + chain @ step,
-        square_root_information=np.linalg.qr(stacked / scales / noise_scale, mode="r") if len(values) else triangle,
+        square_root_information=triangular(stacked / scales / noise_scale)
+        if len(values)
+        else triangle,
         noise_scale=noise_scale,
         degrees_of_freedom=freedom,
         identifiability=known,
@@ -188,16 +196,22 @@ def require_solvable(problem: Problem, records: Sequence[FactorRecords], start: 
         ProblemError: fewer equations than parameters, or undetermined combinations, without priors on them.
     """
     parameters = problem.parameters
-    count = sum(each.count * len(kernel.factor.noise) for kernel, each in zip(problem.kernels, records, strict=True))
+    count = sum(
+        each.count * len(kernel.factor.noise) for kernel, each in zip(problem.kernels, records, strict=True)
+    )
     unknown = problem.increments
     has_prior = parameters.prior_information() > 0
     warnings = []
     if count < unknown:
         text = f"{count} equations ({_poses(records)} records) for {unknown} free parameters"
         if not has_prior.all():
-            raise ProblemError(f"{text}.", hint="Measure more poses, fix parameters, or give every one a prior.")
+            raise ProblemError(
+                f"{text}.", hint="Measure more poses, fix parameters, or give every one a prior."
+            )
         warnings.append(f"{text}: what the data does not say comes from the priors.")
-    known = analyse(problem.triangular_factor(start, records), parameters.scales(), parameters.increment_names)
+    known = analyse(
+        problem.triangular_factor(start, records), parameters.scales(), parameters.increment_names
+    )
     if known.undetermined:
         listed = "; ".join(str(combination) for combination in known.undetermined)
         text = f"the data does not determine {len(known.undetermined)} combinations: {listed}"
@@ -205,11 +219,14 @@ def require_solvable(problem: Problem, records: Sequence[FactorRecords], start: 
         null = known.directions[known.rank :]
         if np.linalg.matrix_rank(held @ null.T) < len(null):
             raise ProblemError(
-                f"{text}.", hint="Fix one parameter of each, give it a prior, or measure poses that tell them apart."
+                f"{text}.",
+                hint="Fix one parameter of each, give it a prior, or measure poses that tell them apart.",
             )
         warnings.append(f"{text}; their priors hold them.")
     if known.condition > POOR_CONDITION:
-        warnings.append(f"the scaled condition is {known.condition:.1e}: {known.weakest} is hardly determined.")
+        warnings.append(
+            f"the scaled condition is {known.condition:.1e}: {known.weakest} is hardly determined."
+        )
     return tuple(warnings)
 
 

@@ -91,16 +91,16 @@ class _Mapped:
 
     def __call__(self, values: Array, inputs: Sequence[Array], outputs: Sequence[Array]) -> None:
         count = inputs[0].shape[1]
-        buffer, evaluate = self._function.buffer()
+        buffer, evaluate = _buffer(self._function)
         given = [np.zeros((_BLOCK, size)) for size in self._in_sizes]
         taken = [np.zeros((_BLOCK, size)) for size in self._out_sizes]
         shared = np.ascontiguousarray(values)
         for position, array in enumerate([shared, *given]):
             if array.size:
-                buffer.set_arg(position, memoryview(array))
+                buffer.set_arg(position, array.data)
         for position, array in enumerate(taken):
             if array.size:
-                buffer.set_res(position, memoryview(array))
+                buffer.set_res(position, array.data)
         for start in range(0, count, _BLOCK):
             stop = min(start + _BLOCK, count)
             for block, source in zip(given, inputs, strict=True):
@@ -112,6 +112,12 @@ class _Mapped:
     @staticmethod
     def _by_rows(block: Array, rows: int) -> Array:
         return block.reshape(len(block), rows).T
+
+
+def _buffer(function: ca.Function) -> tuple[Any, Callable[[], None]]:
+    """Direct access to a function's memory."""
+    buffer, evaluate = function.buffer()
+    return buffer, evaluate
 
 
 class Compiled:
@@ -190,7 +196,9 @@ class Kernel:
             if moved <= REST_RAD:
                 return shown
         if not self.settle_by_newton(values, record, state):
-            raise NotConvergedError("the elastic equilibrium did not settle.", hint="Check compliances and masses.")
+            raise NotConvergedError(
+                "the elastic equilibrium did not settle.", hint="Check compliances and masses."
+            )
         mapped(values, (record, state), (following, shown))
         return shown
 

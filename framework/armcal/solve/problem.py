@@ -74,7 +74,9 @@ class Problem:
         """Compile for datasets with the channels of this one."""
         available = frozenset(dataset.channels)
         kernels = [
-            build_kernel(build_factor(n, m, arms, parameters, environment, available), len(dataset), evaluator)
+            build_kernel(
+                build_factor(n, m, arms, parameters, environment, available), len(dataset), evaluator
+            )
             for n, m in measurements.items()
         ]
         return cls(parameters, tuple(kernels), environment)
@@ -114,7 +116,9 @@ class Problem:
     def subset(records: Sequence[FactorRecords], chosen: NDArray[np.intp]) -> tuple[FactorRecords, ...]:
         """Some records of all."""
         padded = -(-len(chosen) // LANES) * LANES
-        fill = np.concatenate([chosen, np.full(padded - len(chosen), chosen[-1] if len(chosen) else 0)]).astype(np.intp)
+        fill = np.concatenate(
+            [chosen, np.full(padded - len(chosen), chosen[-1] if len(chosen) else 0)]
+        ).astype(np.intp)
         parts = []
         for each in records:
             weight = each.weight[fill]
@@ -143,7 +147,9 @@ class Problem:
     def cost(self, values: Array, records: Sequence[FactorRecords]) -> float:
         """Half the weighted squared whitened residuals."""
         total = 0.0
-        for kernel, each, residual in zip(self.kernels, records, self.residuals(values, records), strict=True):
+        for kernel, each, residual in zip(
+            self.kernels, records, self.residuals(values, records), strict=True
+        ):
             whitened = residual / np.array(kernel.factor.noise)[:, None]
             total += 0.5 * float(np.sum(whitened**2 * each.weight[: each.count]))
         return total
@@ -163,7 +169,7 @@ class Problem:
         triangle = np.zeros((0, self.increments))
         for jacobian, _ in self._blocks(values, records):
             rows = np.concatenate([chain.T @ part for part in jacobian], axis=1).T
-            triangle = np.linalg.qr(np.vstack([triangle, rows]), mode="r")
+            triangle = triangular(np.vstack([triangle, rows]))
         return triangle
 
     def exact_hessian(self, values: Array, records: Sequence[FactorRecords]) -> Array:
@@ -207,6 +213,11 @@ class Problem:
         if not np.array_equal(values[fixed], self.parameters.nominal()[fixed]):
             raise ValueError("a fixed parameter differs from the value the problem was compiled with")
         return np.ascontiguousarray(values[self._free])
+
+
+def triangular(rows: Array) -> Array:
+    """R of a QR decomposition."""
+    return np.asarray(np.linalg.qr(rows, mode="r"))
 
 
 def _in_order(

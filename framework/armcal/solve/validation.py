@@ -55,7 +55,7 @@ def summarise(errors: Array) -> ErrorSummary:
 def record_errors(problem: Problem, values: Array, records: Sequence[FactorRecords]) -> Array:
     """The length of each record's residual, over all factors (N)."""
     squared = [np.sum(residual**2, axis=0) for residual in problem.residuals(values, records)]
-    return np.sqrt(np.sum(squared, axis=0))
+    return np.asarray(np.sqrt(np.sum(squared, axis=0)))
 
 
 def hold_out(count: int, fraction: float, seed: int) -> Split:
@@ -85,7 +85,9 @@ def split_by_id(ids: Sequence[str], train_ids: Sequence[str]) -> Split:
 def folds(count: int, number: int, seed: int) -> tuple[Split, ...]:
     """Random folds of nearly equal size; every record judges once."""
     if not 2 <= number <= count:
-        raise ProblemError(f"{number} folds of {count} records.", hint="Take at least 2 folds and no more than records.")
+        raise ProblemError(
+            f"{number} folds of {count} records.", hint="Take at least 2 folds and no more than records."
+        )
     order = np.random.default_rng(seed).permutation(count)
     parts = [np.sort(part).astype(np.intp) for part in np.array_split(order, number)]
     return tuple(Split(np.setdiff1d(order, part).astype(np.intp), part) for part in parts)

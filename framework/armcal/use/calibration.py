@@ -125,7 +125,12 @@ class Calibration:
         """
         fixed = self.parameters.with_free(())
         problem = Problem.build(
-            self.system.arms, self.system.measurements, fixed, self.system.environment, commands, "interpreted"
+            self.system.arms,
+            self.system.measurements,
+            fixed,
+            self.system.environment,
+            commands,
+            "interpreted",
         )
         shown = problem.predict(fixed.nominal(), problem.records(commands))
         channels = {
@@ -146,12 +151,15 @@ class Calibration:
         joints = self.system.arms[name].joint_names
         angles = np.atleast_2d(np.asarray(joint_angles, dtype=float))
         if angles.shape[1] != len(joints):
-            raise ValueError(f"found {angles.shape[1]} joint angles a row, the arm {name} has {len(joints)} joints")
+            raise ValueError(
+                f"found {angles.shape[1]} joint angles a row, the arm {name} has {len(joints)} joints"
+            )
         channels = {f"{name}.{joint}": angles[:, i] for i, joint in enumerate(joints)}
         commands = Dataset(tuple(str(i) for i in range(len(angles))), channels)
         measured = next(n for n, m in self.system.measurements.items() if m.arms == (name,))
         alone = replace(self.system, measurements={measured: self.system.measurements[measured]})
-        return replace(self, system=alone).predict(commands)[1][0]
+        poses = replace(self, system=alone).predict(commands)[1]
+        return np.asarray(poses[0])
 
 
 def identity_of(description: Mapping[str, Any]) -> str:
