@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from armcal.errors import ArmcalError, InputError, NotConvergedError
     from armcal.hooks import hookimpl
     from armcal.run.experiment import Experiment
-    from armcal.run.pipeline import run
+    from armcal.run.pipeline import calibrate
     from armcal.run.result import RunResult
     from armcal.solve.estimator import Estimate
     from armcal.use.calibration import Calibration
@@ -36,8 +36,8 @@ __all__ = [
     "RunResult",
     "Settings",
     "__version__",
+    "calibrate",
     "hookimpl",
-    "run",
 ]
 
 _HOMES = {
@@ -52,6 +52,7 @@ _HOMES = {
     "Parameters": "armcal.base.parameters",
     "RunResult": "armcal.run.result",
     "Settings": "armcal.base.settings",
+    "calibrate": "armcal.run.pipeline",
     "hookimpl": "armcal.hooks",
 }
 

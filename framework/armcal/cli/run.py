@@ -11,11 +11,10 @@ from armcal.cli.common import Voice, command_line, overrides, speaking
 from armcal.cli.tables import show_run
 from armcal.errors import EXIT_NOT_CONVERGED
 from armcal.plugins import discover
-from armcal.report import page
+from armcal.report import render
 from armcal.run import outputs
 from armcal.run.experiment import Experiment
-from armcal.run.pipeline import Stopwatch
-from armcal.run.pipeline import run as run_experiment
+from armcal.run.pipeline import Stopwatch, calibrate
 
 
 @click.command()
@@ -33,11 +32,11 @@ def run(voice: Voice, config: Path, data: Path | None, out: Path | None, overrid
     voice.plugin_faults(registry)
     experiment = Experiment.load(config, overrides, data, registry)
     with voice.progress() as progress:
-        result = run_experiment(experiment, command_line(), progress, watch)
+        result = calibrate(experiment, command_line(), progress, watch)
     for text in result.warnings:
         voice.warn(text)
     result.seconds["total"] = watch.total()
-    outputs.write(result, experiment, folder, page.render)
+    outputs.write(result, experiment, folder, render)
     converged = result.estimate.verdict.converged
     registry.manager.hook.armcal_run_ended(name=result.name, folder=str(folder), converged=converged)
     voice.result({**outputs.metrics(result), "folder": str(folder)})

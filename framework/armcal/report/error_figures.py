@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from armcal.base.domains import Array
 from armcal.report import svg
-from armcal.report.numbers import plural, significant
+from armcal.report.numbers import count, plural, significant
 from armcal.report.svg import Axis, Box, Figure
 from armcal.run.result import RunResult
 
@@ -38,12 +38,14 @@ def distribution(result: RunResult) -> Figure | None:
     values = np.concatenate([errors for _, _, errors in curves])
     medians = [float(np.median(errors)) for _, _, errors in curves]
     log = min(medians) > 0 and max(medians) / min(medians) > _LOG_FROM and float(values.min()) > 0
-    said = "; ".join(f"{name}: median {significant(m)} mm" for (_, name, _), m in zip(curves, medians, strict=True))
-    scale = " The error axis is logarithmic." if log else ""
-    caption = f"The further left a curve, the better. The dashed lines mark half and 95 % of the records.{scale}"
+    named = zip(curves, medians, strict=True)
+    said = "; ".join(f"{name}: median {significant(middle)} mm" for (_, name, _), middle in named)
+    caption = "The further left a curve, the better. The dashed lines mark half and 95 % of the records."
+    caption += " The error axis is logarithmic." if log else ""
+    entries = [(f'<path class="curve {css}" d="M0 0h22"/>', name) for css, name, _ in curves]
 
     def draw(width: float) -> tuple[float, list[str]]:
-        top, parts = svg.legend(52, 12, width - 60, [(f'<path class="curve {c}" d="M0 0h22"/>', n) for c, n, _ in curves])
+        top, parts = svg.legend(52, 12, width - 60, entries)
         box = Box(52, top + 2, width - 16, top + (270 if width > svg.NARROW else 220))
         x = _error_axis(values, box, log)
         y = Axis(0, 100, box.bottom, box.top)
@@ -66,7 +68,7 @@ def _curves(result: RunResult) -> list[tuple[str, str, Array]]:
         ("crossed", "calibrated, cross-validated", errors.cross_validated_mm),
     ]
     finite = [(css, name, values[np.isfinite(values)]) for css, name, values in found]
-    return [(css, f"{name} ({len(values)})", values) for css, name, values in finite if len(values)]
+    return [(css, f"{name} ({count(len(values))})", values) for css, name, values in finite if len(values)]
 
 
 def _error_axis(values: Array, box: Box, log: bool) -> Axis:
@@ -108,7 +110,8 @@ def in_order(result: RunResult, worst: NDArray[np.intp]) -> Figure | None:
         parts += svg.frame(box, x, y, labels, (10 if width > svg.NARROW else 5, 5))
         parts.append(svg.line(box.left, y.of(ninety_five), box.right, y.of(ninety_five), "guide"))
         parts += _banded(result, x, y) if thinned else _one_by_one(result, x, y)
-        parts += [svg.circle(x.of(i + 1), y.of(float(errors[i])), 6, "ring") for i in worst if np.isfinite(errors[i])]
+        ringed = worst[np.isfinite(errors[worst])]
+        parts += [svg.circle(x.of(i + 1), y.of(float(errors[i])), 6, "ring") for i in ringed]
         return box.bottom + 44, parts
 
     return svg.both("order", ("Error of each record in recorded order", said, words), draw)
@@ -117,10 +120,10 @@ def in_order(result: RunResult, worst: NDArray[np.intp]) -> Figure | None:
 def _order_words(number: int, thinned: bool, beyond: int) -> str:
     words = "The dashed line marks 95 % of all records; rings mark the ten worst. "
     if thinned:
-        words += f"{plural(number, 'record')} are too many to draw one by one: bands over stretches of records. "
+        words += f"{plural(number, 'record')} are too many to draw one by one: drawn as bands. "
     else:
-        words += "The dark line is the running median: where it wanders, the arm or the tracker changed on the way. "
-    return words + (f"{plural(beyond, 'record')} beyond the axis drawn as triangles at its top." if beyond else "")
+        words += "The dark line is the running median: where it wanders, the setup changed on the way. "
+    return words + (f"Triangles: {plural(beyond, 'record')} beyond the axis." if beyond else "")
 
 
 def _order_legend(result: RunResult, thinned: bool) -> list[tuple[str, str]]:

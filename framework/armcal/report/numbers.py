@@ -10,24 +10,25 @@ from armcal.base.domains import Pose, Rotation, ScrewAxis
 from armcal.base.parameters import ParameterBlock
 from armcal.base.units import UNITS, display_unit
 
-NONE = "–"
-_MINUS = "−"
+NONE = "\u2013"
+MINUS = "\u2212"
+_TIMES = "\u00d7"
 _MOST_DECIMALS = 8
 _WORDS = {"rad_per_Nm": "rad/Nm", "deg_per_Nm": "deg/Nm", "m_s2": "m/s²", "1": ""}
 
 
 def fixed(value: float | None, decimals: int, signed: bool = False) -> str:
-    """A number with so many decimals; scientific where that would be unreadable; a dash where there is none."""
+    """A number with so many decimals; scientific where too large to read; a dash for none."""
     if value is None or math.isnan(value):
         return NONE
     if math.isinf(value):
-        return "∞" if value > 0 else f"{_MINUS}∞"
+        return "∞" if value > 0 else f"{MINUS}∞"
     if abs(value) >= 1e7:
-        return f"{value:{'+' if signed else ''}.2e}".replace("-", _MINUS)
+        return f"{value:{'+' if signed else ''}.2e}".replace("-", MINUS)
     text = f"{value:{'+' if signed else ''}.{decimals}f}"
     if not any(digit in text for digit in "123456789"):
         return text.lstrip("+-")
-    return text.replace("-", _MINUS)
+    return text.replace("-", MINUS)
 
 
 def significant(value: float, digits: int = 3) -> str:
@@ -37,9 +38,9 @@ def significant(value: float, digits: int = 3) -> str:
     if value == 0:
         return "0"
     if not 1e-4 <= abs(value) < 1e6:
-        return f"{value:.{digits - 1}e}".replace("-", _MINUS)
+        return f"{value:.{digits - 1}e}".replace("-", MINUS)
     if abs(value) >= 1000:
-        return count(int(float(f"{value:.{digits - 1}e}"))).replace("-", _MINUS)
+        return count(int(float(f"{value:.{digits - 1}e}"))).replace("-", MINUS)
     return fixed(value, decimals_for(value, digits))
 
 
@@ -57,7 +58,7 @@ def common_decimals(values: Iterable[float | None], least: int = 2, most: int = 
 
 
 def count(number: int) -> str:
-    """A whole number with thin spaces between thousands."""
+    """A whole number with narrow spaces between thousands."""
     return f"{number:,}".replace(",", "\u202f")
 
 
@@ -80,7 +81,7 @@ def ratio(before: float | None, after: float | None) -> str:
     """How many times smaller ``after`` is."""
     if before is None or after is None or not (math.isfinite(before) and math.isfinite(after)) or after <= 0:
         return NONE
-    return f"{significant(before / after, 3 if before >= after else 2)} ×"
+    return f"{significant(before / after, 3 if before >= after else 2)} {_TIMES}"
 
 
 def entry_unit(block: ParameterBlock, suffix: str) -> str:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 import armcal
+from armcal.base.domains import Array
 from armcal.report import error_figures, parameter_figures, workspace
 from armcal.report.numbers import NONE, common_decimals, count, duration, fixed, plural, ratio, significant, unbroken
 from armcal.report.tables import (
@@ -69,8 +70,8 @@ def _accuracy(result: RunResult) -> dict[str, Any]:
     tiles = []
     if from_set:
         before, after = from_set.nominal, from_set.calibrated
-        pairs = (("Mean error", before.mean, after.mean), ("95 % below", before.p95, after.p95))
-        pairs += (("Largest error", before.max, after.max),)
+        pairs = [("Mean error", before.mean, after.mean), ("95 % below", before.p95, after.p95)]
+        pairs.append(("Largest error", before.max, after.max))
         decimals = common_decimals([v for _, b, a in pairs for v in (b, a)], most=3)
         tiles = [(name, fixed(b, decimals), fixed(a, decimals), ratio(b, a)) for name, b, a in pairs]
     return {"judged": from_set, "tiles": tiles, "error_rows": error_rows(result)}
@@ -115,7 +116,7 @@ def _correlations(estimate: Estimate) -> dict[str, Any]:
     }
 
 
-def _strongest(matrix: np.ndarray[Any, np.dtype[np.float64]], names: tuple[str, ...]) -> list[tuple[str, str, str]]:
+def _strongest(matrix: Array, names: tuple[str, ...]) -> list[tuple[str, str, str]]:
     """The strongest pairs whatever their size, zeros left out."""
     rows, columns = np.triu_indices(len(names), 1)
     sizes = np.abs(matrix[rows, columns])
@@ -149,16 +150,16 @@ def _records(result: RunResult) -> dict[str, Any]:
 def _origin(result: RunResult) -> dict[str, Any]:
     told, data = result.estimate.verdict, result.dataset
     answer = "converged" if told.converged else "did not converge"
-    solver = f"{told.name}: {told.status} ({answer}; {plural(told.iterations, 'iteration')}, {duration(told.seconds)})"
+    effort = f"{plural(told.iterations, 'iteration')}, {duration(told.seconds)}"
     starts = f"{told.agreeing_starts} of {told.starts} came to the same answer" if told.starts > 1 else "one"
     facts = [
         Fact("data", data.source or NONE),
         Fact("data sha256", data.sha256 or NONE),
         Fact("records", f"{len(result.split.train)} train, {len(result.split.holdout)} holdout"),
-        Fact("solver", solver),
+        Fact("solver", f"{told.name}: {told.status} ({answer}; {effort})"),
         Fact("starts", starts),
         Fact("backend", result.backend or NONE),
-        Fact("noise scale", f"residuals are {significant(result.estimate.noise_scale)} times the declared noise"),
+        Fact("noise scale", f"{significant(result.estimate.noise_scale)} times the declared noise"),
         Fact("degrees of freedom", count(result.estimate.degrees_of_freedom)),
     ]
     facts += provenance_facts(result.provenance)

@@ -9,7 +9,7 @@ import numpy as np
 
 from armcal.base.domains import Array
 from armcal.report import svg
-from armcal.report.numbers import plural, significant
+from armcal.report.numbers import fixed, plural, significant
 from armcal.report.svg import MONO, Axis, Box, Figure
 from armcal.report.tables import ParameterRow
 from armcal.solve.identifiability import Identifiability
@@ -18,6 +18,7 @@ MOST_WHISKERS = 40
 MOST_MAPPED = 40
 """More free parameters than this are no longer readable in a map."""
 _ROW = 27.0
+_DIAGONAL, _UNKNOWN = "#e9ecf0", "#c9ced6"
 _BLUE, _ORANGE = (0, 68, 136), (187, 85, 0)
 
 
@@ -25,7 +26,8 @@ def compliances(rows: Sequence[ParameterRow]) -> Figure | None:
     """Dot and whisker of each compliance against its bound; None without compliances."""
     if not rows:
         return None
-    shown = sorted(rows, key=lambda r: -abs(r.raw.value))[:MOST_WHISKERS] if len(rows) > MOST_WHISKERS else list(rows)
+    ranked = sorted(range(len(rows)), key=lambda i: (not rows[i].at_bound, -abs(rows[i].raw.value)))
+    shown = [rows[i] for i in sorted(ranked[:MOST_WHISKERS])]
     unit = shown[0].unit
     caption = _whisker_words(shown, len(rows))
     said = "; ".join(f"{r.name} {r.value} {unit}, {r.interval}" for r in shown[:12])
@@ -60,7 +62,7 @@ def _whisker_words(shown: Sequence[ParameterRow], total: int) -> str:
     words += "; hollow dot: ended at its bound" if any(r.at_bound for r in shown) else ""
     words += "; dashed: not determined" if not all(r.determined for r in shown) else ""
     words += "; small bar: nominal, where it is not 0" if any(r.raw.nominal for r in shown) else ""
-    return f"{words}. The {len(shown)} largest of {total}." if len(shown) < total else f"{words}."
+    return f"{words}. {len(shown)} of {total}: at a bound, or the largest." if len(shown) < total else f"{words}."
 
 
 def _range(rows: Sequence[ParameterRow]) -> tuple[float, float]:
@@ -89,7 +91,7 @@ def _whisker(row: ParameterRow, x: Axis, y: float) -> list[str]:
 
 
 def correlation_map(correlation: Array, names: tuple[str, ...], known: Sequence[bool]) -> Figure | None:
-    """The correlations of all free parameters as coloured cells; None for fewer than two or too many to read."""
+    """The correlations of all free parameters as cells; None if fewer than two or too many."""
     number = len(names)
     if not 2 <= number <= MOST_MAPPED:
         return None
@@ -104,7 +106,7 @@ def correlation_map(correlation: Array, names: tuple[str, ...], known: Sequence[
         parts.append(svg.text(margin + at + 4, 6 + side + 8, name, "mono", "end", -90))
     width, height = margin + side + 12, 6 + side + margin + 8
     parts += _correlation_key(margin + side - 176, 14)
-    said = f"Lower triangle of the correlation matrix of {number} parameters; pairs above 0.95 are listed beside it."
+    said = f"Lower triangle of the correlations of {number} parameters; pairs above 0.95 are listed beside it."
     title = "Correlations of the parameters' estimates"
     drawn = svg.document("correlation-map", (width, height), title, said, parts)
     caption = "Dark cells: the data tells the two apart badly."
@@ -116,11 +118,13 @@ def _cells(correlation: Array, names: tuple[str, ...], known: Sequence[bool], ma
     parts = []
     for i in range(len(names)):
         for j in range(i + 1):
-            both_known = known[i] and known[j]
-            colour = _colour(float(correlation[i, j])) if both_known else "#d9dce1"
-            value = f"{correlation[i, j]:+.2f}" if both_known else "not known"
-            title = f"{names[i]}, {names[j]}: {value}" if i != j else ""
-            parts.append(svg.rect(margin + j * cell, 6 + i * cell, cell - 1, cell - 1, "#e9ecf0" if i == j else colour, title))
+            colour, title = _DIAGONAL, ""
+            if i != j:
+                both_known = known[i] and known[j]
+                colour = _colour(float(correlation[i, j])) if both_known else _UNKNOWN
+                value = f"{correlation[i, j]:+.2f}" if both_known else "not known"
+                title = f"{names[i]}, {names[j]}: {value}"
+            parts.append(svg.rect(margin + j * cell, 6 + i * cell, cell - 1, cell - 1, colour, title))
     return parts
 
 
@@ -133,7 +137,8 @@ def _colour(value: float) -> str:
 def _correlation_key(x: float, y: float) -> list[str]:
     steps = np.linspace(-1, 1, 11)
     parts = [svg.rect(x + i * 16, y, 16, 10, _colour(float(v))) for i, v in enumerate(steps)]
-    parts += [svg.text(x + at, y + 24, words, "tick", "middle") for at, words in ((8, "−1"), (88, "0"), (168, "+1"))]
+    for at, value in ((8, -1), (88, 0), (168, 1)):
+        parts.append(svg.text(x + at, y + 24, fixed(value, 0, signed=True), "tick", "middle"))
     return [*parts, svg.text(x + 88, y - 4, "correlation", "tick", "middle")]
 
 
@@ -146,16 +151,19 @@ def singular_values(known: Identifiability) -> Figure | None:
     largest = float(positive.max())
     low = max(float(positive.min()), largest * 1e-18)
     low, high = 10.0 ** math.floor(math.log10(low) - 0.01), 10.0 ** math.ceil(math.log10(largest) + 0.01)
-    said = f"{plural(len(values), 'singular value')} from {significant(largest)} down to {significant(float(values.min()))}."
-    caption = "Each value tells how sharply the data sees one combination of parameters, in ordinary sizes of each."
+    smallest = significant(float(values.min()))
+    said = f"{plural(len(values), 'singular value')} from {significant(largest)} down to {smallest}."
+    caption = "How sharply the data sees each combination of parameters, in ordinary sizes of each."
     if known.rank < len(values):
         caption += f" Hollow: the {plural(len(values) - known.rank, 'combination')} that it does not see."
 
     def draw(width: float) -> tuple[float, list[str]]:
         box = Box(64, 10, width - 16, 200)
-        x, y = Axis(0.3, len(values) + 0.7, box.left, box.right), Axis(low, high, box.bottom, box.top, log=True)
-        parts = svg.frame(box, x, y, ("combination, the best seen first", "singular value"), (min(10, len(values)), 5))
-        place = x.at(np.arange(1, len(values) + 1))
+        x = Axis(0.3, len(values) + 0.7, box.left, box.right)
+        y = Axis(low, high, box.bottom, box.top, log=True)
+        labels = ("combination, the best seen first", "singular value")
+        parts = svg.frame(box, x, y, labels, (min(10, len(values)), 5))
+        place = x.at(np.arange(1.0, len(values) + 1))
         height = y.at(np.nan_to_num(values))
         seen = min(known.rank, len(values))
         parts.append(svg.segments(place, np.full(len(values), box.bottom), place, height, "stem"))

@@ -10,23 +10,24 @@ import numpy as np
 from markupsafe import Markup, escape
 
 from armcal.base.domains import Array
-from armcal.report.numbers import decimals_for, fixed, significant
+from armcal.report.numbers import MINUS, count, decimals_for, fixed, significant
 
 WIDE, HALF, NARROW = 1040, 504, 344
 MONO = 6.7
 """Width of a character of the monospaced labels."""
+_GROUPED = 10_000
 _LOG_ALL_STEPS = 2.2
 _LOG_SOME_STEPS = 4.0
 
 
 @dataclass(frozen=True)
 class Figure:
-    """A figure for wide and for narrow pages; the page shows the one that fits (empty narrow: it scrolls)."""
+    """A figure for wide and for narrow pages; the page shows the one that fits (without a narrow one it scrolls)."""
 
     title: str
     caption: str
     wide: Markup
-    narrow: Markup = Markup("")
+    narrow: Markup | None = None
 
 
 @dataclass(frozen=True)
@@ -68,6 +69,8 @@ class Axis:
             return [(v, significant(v, 1)) for v in values]
         step = values[1] - values[0] if len(values) > 1 else abs(values[0]) if values else 1.0
         decimals = decimals_for(step, 1)
+        if decimals == 0 and max(abs(self.low), abs(self.high)) >= _GROUPED:
+            return [(v, count(round(v)).replace("-", MINUS)) for v in values]
         return [(v, fixed(v, decimals)) for v in values]
 
 

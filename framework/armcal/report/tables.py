@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armcal.report.numbers import (
+    MINUS,
     NONE,
     common_decimals,
     decimals_for,
@@ -137,9 +138,9 @@ def parameter_rows(estimate: Estimate) -> tuple[ParameterRow, ...]:
 
 
 def _decimals(raw: RawParameter) -> int:
-    """Two digits of the standard deviation; five of the value where there is none."""
+    """Two digits of the standard deviation; five of the value where there is none, three decimals of a zero."""
     size = raw.sd if math.isfinite(raw.sd) and raw.sd > 0 else max(abs(raw.value), abs(raw.nominal)) / 1000
-    return min(decimals_for(size), _MOST_DECIMALS)
+    return min(decimals_for(size), _MOST_DECIMALS) if size else 3
 
 
 def _row(
@@ -194,7 +195,7 @@ def fixed_rows(estimate: Estimate) -> tuple[FixedRow, ...]:
         for name, suffix, value in zip(block.entry_names, block.domain.entries, values, strict=True):
             factor, unit = shown_unit(entry_unit(block, suffix))
             shown = float(value) * factor
-            rows.append(FixedRow(name, f"{shown:.7g}".replace("-", "−"), unit))
+            rows.append(FixedRow(name, f"{shown:.7g}".replace("-", MINUS), unit))
     return tuple(rows)
 
 

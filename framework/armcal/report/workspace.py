@@ -16,6 +16,7 @@ MOST_POINTS = 4000
 _MOST_VECTORS = 500
 _COLOURS = ("#9bd93c", "#4ac16d", "#1fa187", "#277f8e", "#365c8d", "#46327e", "#440154")
 """Light to dark, told apart with any colour vision."""
+_STEPS = (1, 1.5, 2, 2.5, 3, 4, 5, 6, 8, 10, 20)
 _NAMES = "xyz"
 
 
@@ -133,5 +134,5 @@ def _colour_step(rough: float) -> float:
     """A round step with finer choices than an axis needs, so that all colours are used."""
     if not np.isfinite(rough) or rough <= 0:
         return 1.0
-    power = 10.0 ** np.floor(np.log10(rough))
-    return float(next(s * power for s in (1, 1.5, 2, 2.5, 3, 4, 5, 6, 8, 10, 20) if s * power >= rough * (1 - 1e-9)))
+    power = float(10.0 ** np.floor(np.log10(rough)))
+    return next(step * power for step in _STEPS if step * power >= rough * (1 - 1e-9))

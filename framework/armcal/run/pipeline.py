@@ -100,7 +100,7 @@ def prepare(experiment: Experiment, watch: Stopwatch) -> Prepared:
     return Prepared(dataset, problem, records, split, (*experiment.warnings, *dataset.warnings, *found))
 
 
-def run(
+def calibrate(
     experiment: Experiment,
     command: str = "",
     progress: Progress = no_progress,

@@ -130,13 +130,18 @@ class Estimate:
 
     @cached_property
     def intervals(self) -> tuple[Interval95, ...]:
-        """95 % intervals of the free entries, by Student's t; one-sided within 3 deviations of a bound."""
+        """95 % intervals of the free entries, by Student's t.
+
+        Within 3 deviations of a bound an interval reaches from the bound to the two-sided one's other end. A
+        one-sided quantile there would be shorter, but choosing between the two kinds by the estimate itself
+        would then hold the truth in less than 95 % of cases [Feldman1998].
+        """
         lower, upper = _entry_bounds(self.parameters)
         freedom = max(self.degrees_of_freedom, 1)
-        two_sided, one_sided = t.ppf(0.5 + CONFIDENCE / 2, freedom), t.ppf(CONFIDENCE, freedom)
+        quantile = float(t.ppf(0.5 + CONFIDENCE / 2, freedom))
         value = self.values[list(self.free_entries)]
         rows = zip(value, self.unconstrained, self.deviations, lower, upper, strict=True)
-        return tuple(_interval(*row, two_sided, one_sided) for row in rows)
+        return tuple(_interval(*row, quantile) for row in rows)
 
 
 def estimate(problem: Problem, records: Sequence[FactorRecords], solution: Solution) -> Estimate:
@@ -235,15 +240,16 @@ def _poses(records: Sequence[FactorRecords]) -> int:
 
 
 def _interval(
-    value: float, free_value: float, sd: float, lower: float, upper: float, two_sided: float, one_sided: float
+    value: float, unconstrained: float, sd: float, lower: float, upper: float, quantile: float
 ) -> Interval95:
     if not np.isfinite(sd):
         return Interval95(lower, upper, False)
-    if free_value - lower < NEAR_A_BOUND_SD * sd and free_value - lower <= upper - free_value:
-        return Interval95(lower, float(min(max(free_value + one_sided * sd, lower), upper)), True)
-    if upper - free_value < NEAR_A_BOUND_SD * sd:
-        return Interval95(float(max(min(free_value - one_sided * sd, upper), lower)), upper, True)
-    return Interval95(float(value - two_sided * sd), float(value + two_sided * sd), False)
+    low, high = unconstrained - quantile * sd, unconstrained + quantile * sd
+    if unconstrained - lower < NEAR_A_BOUND_SD * sd and unconstrained - lower <= upper - unconstrained:
+        return Interval95(lower, float(np.clip(high, lower, upper)), True)
+    if upper - unconstrained < NEAR_A_BOUND_SD * sd:
+        return Interval95(float(np.clip(low, lower, upper)), upper, True)
+    return Interval95(float(value - quantile * sd), float(value + quantile * sd), False)
 
 
 def _entry_bounds(parameters: Parameters) -> tuple[Array, Array]:

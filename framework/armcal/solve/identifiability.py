@@ -28,6 +28,8 @@ class Combination:
     terms: tuple[tuple[str, float], ...]
 
     def __str__(self) -> str:
+        if not self.terms:
+            return "nothing"
         if len(self.terms) == 1:
             return f"{self.terms[0][0]} alone"
         first, *others = self.terms
@@ -70,6 +72,8 @@ class Identifiability:
     @property
     def condition(self) -> float:
         """Largest over smallest singular value among the determined ones."""
+        if not len(self):
+            return 1.0
         if not self.rank:
             return float("inf")
         return float(self.singular_values[0] / self.singular_values[self.rank - 1])
@@ -77,7 +81,9 @@ class Identifiability:
     @property
     def weakest(self) -> Combination:
         """The combination that the data determines least, undetermined ones aside."""
-        return _named(self.directions[max(self.rank - 1, 0)], self.names, at_least=0.2)
+        if not self.rank:
+            return Combination(())
+        return _named(self.directions[self.rank - 1], self.names, at_least=0.2)
 
 
 def analyse(triangle: Array, scales: Array, names: tuple[str, ...]) -> Identifiability:

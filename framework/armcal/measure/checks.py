@@ -1,0 +1,387 @@
+"""Checks of records that hold for every source: what is refused, what is set aside, what a user is warned of.
+
+Each check takes a dataset (SI) and the layout that says which channel is what. It gives the dataset back, with
+records set aside or a warning added, or raises `DataError`. ``check_dataset`` runs them all.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armcal.base.dataset import Dataset
+from armcal.base.units import UNITS, split_suffix, to_unit
+from armcal.errors import DataError, Location
+from armcal.measure.reader import WantedChannel
+
+FROZEN_RECORDS = 5
+"""So many identical measurements in a row, while the joints moved, and the instrument has stopped."""
+MAX_BACKWARD_FRACTION = 0.01
+"""Of the records; more of them out of order in time, and the time itself is not to be trusted."""
+
+_APPROACH = ".approach."
+_DIGITS = "0123456789"
+_FULL_TURN = 2 * math.pi
+_SMALL_DEGREES = (0.5, 6.3)
+"""A largest joint angle between these, in degrees, is more likely one in radians (6.3 is one turn)."""
+_MAX_DEGREES = 720.0
+_VARIES_AT_REST = ("time", "temperature")
+"""Channels that may differ between a record and its copy."""
+
+
+@dataclass(frozen=True)
+class Layout:
+    """What the channels of a dataset are, and what they were called in its source.
+
+    Attributes:
+        joints: channels of commanded joint displacements, revolute (angle) and prismatic (length).
+        revolute: those of ``joints`` that turn.
+        approach: channels of approach directions.
+        measured: channels of measured values, ``instance.name``.
+        columns: channel to its column in the source, for messages.
+        units: channel to the unit that its column declares; absent or SI means SI.
+        by_line: whether ``Dataset.rows`` are lines of a text file; otherwise they are row numbers.
+    """
+
+    joints: tuple[str, ...] = ()
+    revolute: tuple[str, ...] = ()
+    approach: tuple[str, ...] = ()
+    measured: tuple[str, ...] = ()
+    columns: Mapping[str, str] = field(default_factory=dict)
+    units: Mapping[str, str] = field(default_factory=dict)
+    by_line: bool = False
+
+    def column(self, channel: str) -> str:
+        """What a channel is called in the source."""
+        return self.columns.get(channel, channel)
+
+    def row(self, dataset: Dataset, index: int) -> int:
+        """Where a record stood in its source, from 1."""
+        return dataset.rows[index] if dataset.rows else index + 1
+
+    def place(self, dataset: Dataset, index: int) -> str:
+        """Where a record stood, in words."""
+        return f"{'line' if self.by_line else 'row'} {self.row(dataset, index)}"
+
+    def where(self, dataset: Dataset, index: int, channel: str | None = None) -> Location:
+        """A record's place, for an error."""
+        at = self.row(dataset, index)
+        column = self.column(channel) if channel else None
+        if self.by_line:
+            return Location(dataset.source or None, line=at, field=column)
+        return Location(dataset.source or None, row=at, field=column)
+
+    def shown(self, channel: str, si_value: float) -> str:
+        """A value in the unit its source declares."""
+        unit = self.units.get(channel, "1")
+        value = to_unit(si_value, unit) if unit in UNITS else si_value
+        return f"{value:.10g}" + ("" if unit == "1" else f" {unit}")
+
+
+def layout_of(
+    wanted: Sequence[WantedChannel],
+    dataset: Dataset,
+    columns: Mapping[str, str],
+    units: Mapping[str, str],
+    *,
+    by_line: bool,
+) -> Layout:
+    """The layout of a dataset that was read for some wanted channels.
+
+    A channel that has an approach (``arm.approach.q1``) is a joint (``arm.q1``); any other channel that belongs
+    to an instance is measured; one that belongs to none (``payload``) describes the surroundings.
+    """
+    approach = [w.channel for w in wanted if _APPROACH in w.channel]
+    moved = {joint.channel for joints in _joints_by_arm(wanted).values() for joint in joints}
+    joints = [w for w in wanted if w.channel in moved and dataset.has(w.channel)]
+    measured = [w.channel for w in wanted if "." in w.channel and w.channel not in {*moved, *approach}]
+    return Layout(
+        joints=tuple(w.channel for w in joints),
+        revolute=tuple(w.channel for w in joints if w.dimension == "angle"),
+        approach=tuple(name for name in approach if dataset.has(name)),
+        measured=tuple(name for name in measured if dataset.has(name)),
+        columns=columns,
+        units=units,
+        by_line=by_line,
+    )
+
+
+def check_dataset(dataset: Dataset, layout: Layout) -> Dataset:
+    """All checks, in the order in which one relies on another.
+
+    Raises:
+        DataError: the dataset is refused, or no record is left.
+    """
+    dataset = set_aside_not_finite(dataset, layout)
+    refuse_approaches(dataset, layout)
+    refuse_joint_units(dataset, layout)
+    dataset = warn_small_degrees(dataset, layout)
+    refuse_conflicting_ids(dataset, layout)
+    dataset = set_aside_backward_time(dataset, layout)
+    dataset = set_aside_frozen(dataset, layout)
+    dataset = set_aside_duplicates(dataset, layout)
+    return warn_repeated_poses(require_records(dataset), layout)
+
+
+def refuse_joint_count(names: Sequence[str], wanted: Sequence[WantedChannel], where: Location) -> None:
+    """Columns of another arm: it has more or fewer joints than the one that is wanted.
+
+    Args:
+        names: every column of the source, with its unit suffix if it has one.
+        wanted: the channels; each arm's joints are those with an approach.
+        where: the header.
+
+    Raises:
+        DataError: with both counts; not if no column at all is a joint's, which is a matter of names.
+    """
+    for arm, joints in _joints_by_arm(wanted).items():
+        own = {name for joint in joints for name in joint.columns}
+        prefixes = {name.rstrip(_DIGITS) for name in own if name[-1:].isdigit()} - {""}
+        found: dict[str, str] = {}
+        for name in names:
+            stem, unit = split_suffix(name) or (name, None)
+            is_numbered = stem[-1:].isdigit() and stem.rstrip(_DIGITS) in prefixes
+            is_motion = unit is not None and unit.dimension in ("angle", "length")
+            if stem in own or (is_numbered and is_motion):
+                found[stem] = name
+        if found and len(found) != len(joints):
+            missing = [joint.columns[-1] for joint in joints if found.keys().isdisjoint(joint.columns)]
+            beyond = [name for stem, name in found.items() if stem not in own]
+            raise DataError(
+                f"the file has {len(found)} joint columns, the arm has {len(joints)} (arm {arm}; "
+                f"{'missing' if missing else 'not its own'}: {', '.join(missing or beyond or found.values())}).",
+                where=replace(where, field=next(iter(missing or beyond), None)),
+                hint="Use this arm's file, or add or remove columns; one that is no joint needs another name.",
+            )
+
+
+def _joints_by_arm(wanted: Sequence[WantedChannel]) -> dict[str, list[WantedChannel]]:
+    moved = {w.channel.replace(_APPROACH, ".", 1) for w in wanted if _APPROACH in w.channel}
+    arms: dict[str, list[WantedChannel]] = {}
+    for w in wanted:
+        if w.channel in moved:
+            arms.setdefault(w.channel.rpartition(".")[0], []).append(w)
+    return arms
+
+
+def require_records(dataset: Dataset) -> Dataset:
+    """The dataset, if it has a record.
+
+    Raises:
+        DataError: every record was set aside, or there was none.
+    """
+    if len(dataset):
+        return dataset
+    first = dataset.set_aside[0] if dataset.set_aside else None
+    why = f"all {len(dataset.set_aside)} were set aside, the first because {first.reason}" if first else "it is empty"
+    raise DataError(
+        f"found no usable record: {why}.",
+        where=Location(dataset.source or None),
+        hint="Correct the values, or remove an optional column that is empty.",
+    )
+
+
+def set_aside_not_finite(dataset: Dataset, layout: Layout) -> Dataset:
+    """Set aside records with a value that is missing (NaN) or infinite."""
+    faults: dict[int, list[str]] = {}
+    for channel, values in dataset.channels.items():
+        for index in np.flatnonzero(~np.isfinite(values)):
+            kind = "is empty or NaN" if np.isnan(values[index]) else "is infinite"
+            faults.setdefault(int(index), []).append(f"{layout.column(channel)} {kind}")
+    faulty = {index: ", ".join(reasons) for index, reasons in faults.items()}
+    return _set_aside(dataset, layout, faulty, "a value is missing or not finite", "Measure these again.")
+
+
+def refuse_approaches(dataset: Dataset, layout: Layout) -> None:
+    """An approach is the sign of a motion.
+
+    Raises:
+        DataError: it is not -1, 0 or 1.
+    """
+    for channel in layout.approach:
+        values = dataset.channels[channel]
+        wrong = np.flatnonzero((values != 0) & (np.abs(values) != 1))
+        if wrong.size:
+            first = int(wrong[0])
+            raise DataError(
+                f"found the approach {values[first]:g}, expected -1, 0 or 1.",
+                where=layout.where(dataset, first, channel),
+                hint="Write the sign of the joint's last motion before the pose, 0 if it is not known.",
+            )
+
+
+def refuse_joint_units(dataset: Dataset, layout: Layout) -> None:
+    """Angles of revolute joints that cannot be in the unit they declare.
+
+    Raises:
+        DataError: radians beyond one turn, or degrees that look like whole tenths of a degree.
+    """
+    for channel in layout.revolute if len(dataset) else ():
+        values, unit, column = dataset.channels[channel], layout.units.get(channel, "rad"), layout.column(channel)
+        first = int(np.argmax(np.abs(values)))
+        where = layout.where(dataset, first, channel)
+        largest = float(np.abs(values[first]))
+        if unit != "deg" and largest > _FULL_TURN * (1 + 1e-9):
+            raise DataError(
+                f"found {layout.shown(channel, values[first])}, more than one turn (2 pi rad): are these degrees?",
+                where=where,
+                hint=f"If so, rename the column {column} to end in _deg; if not, write angles within one turn.",
+            )
+        degrees = to_unit(values, "deg")
+        whole = np.abs(degrees - np.round(degrees)).max() < 1e-9 * max(1.0, float(np.abs(degrees).max()))
+        if unit == "deg" and whole and np.abs(degrees).max() > _MAX_DEGREES:
+            raise DataError(
+                f"found {layout.shown(channel, values[first])} in a column of whole numbers, expected degrees: "
+                "are these tenths of a degree?",
+                where=where,
+                hint=f"If so, divide {column} by 10; if not, bring the angles within two turns.",
+            )
+
+
+def warn_small_degrees(dataset: Dataset, layout: Layout) -> Dataset:
+    """Warn of joints called degrees that hardly move, all of them together."""
+    called = [channel for channel in layout.revolute if layout.units.get(channel) == "deg"]
+    if not called or not len(dataset):
+        return dataset
+    largest = float(np.abs(to_unit(dataset.stacked(called), "deg")).max())
+    if not _SMALL_DEGREES[0] < largest <= _SMALL_DEGREES[1]:
+        return dataset
+    names = f"{layout.column(called[0])} to {layout.column(called[-1])}" if len(called) > 1 else called[0]
+    return _warned(
+        dataset,
+        f"no joint angle in {names} is beyond {largest:.3g} deg: are these radians? "
+        "If so, end the columns' names in _rad.",
+    )
+
+
+def refuse_conflicting_ids(dataset: Dataset, layout: Layout) -> None:
+    """An id names one record.
+
+    Raises:
+        DataError: two records with different contents share an id.
+    """
+    if len(set(dataset.ids)) == len(dataset):
+        return
+    contents = _first_alike(dataset, tuple(dataset.channels))
+    first: dict[str, int] = {}
+    for index, name in enumerate(dataset.ids):
+        other = first.setdefault(name, index)
+        if contents[other] != contents[index]:
+            raise DataError(
+                f"the id {name[:40]!r} was given to another record before, at {layout.place(dataset, other)}, "
+                "with other values.",
+                where=layout.where(dataset, index),
+                hint="Give each record its own id, or remove one of the two.",
+            )
+
+
+def set_aside_backward_time(dataset: Dataset, layout: Layout) -> Dataset:
+    """Set aside records that are earlier than one before them.
+
+    Raises:
+        DataError: that is more than 1 % of the records.
+    """
+    if not dataset.has("time") or not len(dataset):
+        return dataset
+    time = dataset.channels["time"]
+    latest = np.maximum.accumulate(time)
+    wrong = np.flatnonzero(time < latest)
+    faulty = {
+        int(i): f"its time {layout.shown('time', time[i])} is before {layout.shown('time', latest[i])} "
+        "of an earlier record"
+        for i in wrong
+    }
+    if wrong.size > MAX_BACKWARD_FRACTION * len(dataset):
+        raise DataError(
+            f"found {wrong.size} of {len(dataset)} records out of order in time (more than 1 %), the first: "
+            f"{faulty[int(wrong[0])]}.",
+            where=layout.where(dataset, int(wrong[0]), "time"),
+            hint="Sort the records by time, or correct the clock.",
+        )
+    return _set_aside(dataset, layout, faulty, "the time goes backwards", "Check the clock.")
+
+
+def set_aside_frozen(dataset: Dataset, layout: Layout) -> Dataset:
+    """Set aside what an instrument repeats while the joints move: all but the first record of such a run."""
+    faulty: dict[int, str] = {}
+    if not layout.joints or len(dataset) < FROZEN_RECORDS:
+        return dataset
+    joints = dataset.stacked(layout.joints)
+    for instance, channels in _instances(layout.measured).items():
+        for start, stop in _runs(dataset.stacked(channels)):
+            if np.ptp(joints[:, start:stop], axis=1).any():
+                since = layout.place(dataset, start)
+                reason = f"{instance} repeats the values of {since} while the joints moved: it had frozen"
+                faulty.update(dict.fromkeys(range(start + 1, stop), reason))
+    return _set_aside(dataset, layout, faulty, "the instrument had frozen", "Measure these poses again.")
+
+
+def set_aside_duplicates(dataset: Dataset, layout: Layout) -> Dataset:
+    """Set aside copies: records that agree with an earlier one in everything but id, time and temperature."""
+    if not layout.measured:  # poses to predict may repeat
+        return dataset
+    alike = _first_alike(dataset, [name for name in dataset.channels if name not in _VARIES_AT_REST])
+    faulty = {
+        int(i): f"it is an exact duplicate of {layout.place(dataset, int(alike[i]))}"
+        for i in np.flatnonzero(alike != np.arange(len(dataset)))
+    }
+    return _set_aside(dataset, layout, faulty, "they are exact duplicates", "A copy is not another measurement.")
+
+
+def warn_repeated_poses(dataset: Dataset, layout: Layout) -> Dataset:
+    """Warn of poses that were measured more than once: they count for less than as many different ones."""
+    if not layout.measured or not layout.joints:
+        return dataset
+    ignored = {*layout.measured, *_VARIES_AT_REST}
+    alike = _first_alike(dataset, [name for name in dataset.channels if name not in ignored])
+    repeats = np.flatnonzero(alike != np.arange(len(dataset)))
+    if not repeats.size:
+        return dataset
+    again, before = layout.place(dataset, int(repeats[0])), layout.place(dataset, int(alike[repeats[0]]))
+    return _warned(
+        dataset,
+        f"{repeats.size} of {len(dataset)} records repeat a pose (the first: {again} that of {before}): "
+        f"there are effectively {len(dataset) - repeats.size} distinct poses. Measure more different ones.",
+    )
+
+
+def _set_aside(dataset: Dataset, layout: Layout, faulty: Mapping[int, str], why: str, mend: str) -> Dataset:
+    if not faulty:
+        return dataset
+    first = layout.place(dataset, min(faulty))
+    count = f"{len(faulty)} of {len(dataset)} records {'was' if len(faulty) == 1 else 'were'} set aside"
+    return _warned(dataset.without(faulty), f"{count} because {why} (the first: {first}). {mend}")
+
+
+def _warned(dataset: Dataset, text: str) -> Dataset:
+    place = f"{dataset.source}: " if dataset.source else ""
+    return replace(dataset, warnings=(*dataset.warnings, place + text))
+
+
+def _instances(channels: Sequence[str]) -> dict[str, list[str]]:
+    """Measured channels by the instrument they come from."""
+    grouped: dict[str, list[str]] = {}
+    for channel in channels:
+        grouped.setdefault(channel.rpartition(".")[0], []).append(channel)
+    return grouped
+
+
+def _runs(values: NDArray[np.float64]) -> list[tuple[int, int]]:
+    """Runs of identical columns (start, stop) that are long enough to mean a frozen instrument."""
+    changes = np.flatnonzero((values[:, 1:] != values[:, :-1]).any(axis=0)) + 1
+    edges = np.concatenate([[0], changes, [values.shape[1]]])
+    long = np.flatnonzero(np.diff(edges) >= FROZEN_RECORDS)
+    return [(int(edges[i]), int(edges[i + 1])) for i in long]
+
+
+def _first_alike(dataset: Dataset, channels: Sequence[str]) -> NDArray[np.intp]:
+    """For each record the first that agrees with it, to the last bit, in these channels."""
+    table = np.ascontiguousarray(dataset.stacked(channels).T) + 0.0  # -0.0 and 0.0 are one value
+    data, step = table.tobytes(), table.itemsize * table.shape[1]
+    first: dict[bytes, int] = {}
+    found = (first.setdefault(data[i * step : (i + 1) * step], i) for i in range(len(dataset)))
+    return np.fromiter(found, dtype=np.intp, count=len(dataset))

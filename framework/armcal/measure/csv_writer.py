@@ -1,0 +1,128 @@
+"""Writing a dataset as a CSV that reads back to the same SI values."""
+
+from __future__ import annotations
+
+import csv
+import os
+import secrets
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from types import MappingProxyType
+from typing import TextIO
+
+from armcal.base.dataset import Dataset
+from armcal.base.domains import Array
+from armcal.base.units import DIMENSIONLESS, display_unit, to_unit, units_of
+from armcal.errors import DataError, Location
+from armcal.measure.reader import WantedChannel
+
+ID_COLUMN = "pose_id"
+_CUSTOMARY: Mapping[str, str] = MappingProxyType({})
+
+
+def write_csv(
+    path: str | Path,
+    dataset: Dataset,
+    wanted: Sequence[WantedChannel],
+    units: Mapping[str, str] = _CUSTOMARY,
+) -> None:
+    """Write all records: ``pose_id``, the channels in the order of ``wanted``, then the extra columns.
+
+    The file appears whole or not at all; one that is there already is replaced. Numbers are written in full, so
+    that reading them back gives the same SI values within one unit in the last place.
+
+    Args:
+        path: where to; its folder must exist.
+        dataset: SI values; records set aside on reading are not in it and so are not written.
+        wanted: what the columns of each channel may be called; the shortest name that only one has is used.
+        units: of a column by its dimension; by default deg, mm, g, and otherwise the SI unit.
+
+    Raises:
+        DataError: a channel of the dataset is not in ``wanted``, two columns would have one name, or the file
+            cannot be written.
+        ValueError: a unit is not one of its dimension.
+    """
+    path = Path(path)
+    columns = _columns(path, dataset, wanted, units)
+    with _replacing(path) as stream:
+        writer = csv.writer(stream, lineterminator="\n")
+        writer.writerow(columns)
+        writer.writerows(zip(*columns.values(), strict=True))
+
+
+def _columns(
+    path: Path, dataset: Dataset, wanted: Sequence[WantedChannel], units: Mapping[str, str]
+) -> dict[str, Sequence[str]]:
+    unknown = sorted(set(dataset.channels) - {w.channel for w in wanted})
+    if unknown:
+        raise DataError(
+            f"no column is known for the channel {unknown[0]}.",
+            where=Location(str(path)),
+            hint="Name it among the wanted channels, or leave it out of the dataset.",
+        )
+    columns: dict[str, Sequence[str]] = {ID_COLUMN: dataset.ids}
+    names = column_names([w for w in wanted if dataset.has(w.channel)], units)
+    written = [(column, _texts(dataset.channels[channel], unit)) for channel, (column, unit) in names.items()]
+    for name, texts in [*written, *dataset.extra.items()]:
+        if name in columns:
+            raise DataError(
+                f"two columns would be called {name}.",
+                where=Location(str(path), field=name),
+                hint="Rename the extra column.",
+            )
+        columns[name] = texts
+    return columns
+
+
+def column_names(wanted: Sequence[WantedChannel], units: Mapping[str, str] = _CUSTOMARY) -> dict[str, tuple[str, str]]:
+    """The column of each channel, with its unit as suffix, and the unit (``"1"``: none).
+
+    Raises:
+        ValueError: a unit is not one of its dimension.
+    """
+    taken = [name for w in wanted for name in set(w.columns)]
+    found = {}
+    for w in wanted:
+        own = [name for name in w.columns if taken.count(name) == 1] or [w.columns[0]]
+        unit = _unit(w.dimension, units)
+        name = min(own, key=len)
+        found[w.channel] = (name if unit == "1" else f"{name}_{unit}", unit)
+    return found
+
+
+def _unit(dimension: str, units: Mapping[str, str]) -> str:
+    if dimension in ("1", DIMENSIONLESS):
+        return "1"
+    unit = units.get(dimension) or display_unit(dimension).name
+    known = [u.name for u in units_of(dimension)]
+    if unit not in known:
+        raise ValueError(f"{unit!r} is not a unit of {dimension}; expected one of {', '.join(known)}.")
+    return unit
+
+
+def _texts(values: Array, unit: str) -> list[str]:
+    numbers = to_unit(values, unit).tolist()
+    if unit == "1":
+        return [str(int(x)) if x.is_integer() else repr(x) for x in numbers]
+    return [repr(x) for x in numbers]
+
+
+@contextmanager
+def _replacing(path: Path) -> Iterator[TextIO]:
+    """A stream beside ``path`` that takes its place once all is written; on any fault nothing is left of it."""
+    beside = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
+    try:
+        with beside.open("x", encoding="utf-8", newline="") as stream:
+            yield stream
+            stream.flush()
+            os.fsync(stream.fileno())
+        beside.replace(path)
+    except OSError as fault:
+        raise DataError(
+            f"it cannot be written ({fault.strerror or fault}).",
+            where=Location(str(path)),
+            hint="Check that its folder is there and may be written to.",
+        ) from fault
+    finally:
+        beside.unlink(missing_ok=True)
