@@ -40,10 +40,9 @@ class Component:
         module, _, attribute = self.target.partition(":")
         try:
             return getattr(import_module(module), attribute)
-        except Exception as fault:  # a plugin may fail in any way; the user is told which and how
+        except (Exception, SystemExit) as fault:  # a plugin may fail in any way; the user is told which and how
             raise PluginError(
-                f"the {self.kind} {self.name!r} of the plugin {self.plugin!r} does not load: "
-                f"{type(fault).__name__}: {fault}.",
+                f"the {self.kind} {self.name!r} of the plugin {self.plugin!r} does not load: {_said(fault)}.",
                 hint="Repair or update that plugin.",
             ) from fault
 
@@ -135,11 +134,26 @@ def _load(manager: pluggy.PluginManager, point: EntryPoint) -> tuple[str, list[C
         alone.add_hookspecs(hooks)
         alone.register(module, name)
         alone.check_pending()
+        _require_marks(module)
         announced = _announced(alone, point.name)
         manager.register(module, name)
-    except Exception as fault:  # whatever a third party's module does, the others must work
-        return f"{type(fault).__name__}: {fault}", []
+    except (Exception, SystemExit) as fault:  # whatever a third party's module does, the others must work
+        return _said(fault), []
     return "", announced
+
+
+def _said(fault: BaseException) -> str:
+    """A fault in one line."""
+    return " ".join(f"{type(fault).__name__}: {fault}".split())
+
+
+def _require_marks(module: Any) -> None:
+    """Refuse a hook that would be passed over without a word."""
+    for name in vars(hooks):
+        if name.startswith(f"{hooks.PROJECT}_") and callable(getattr(module, name, None)):
+            marked = hasattr(getattr(module, name), f"{hooks.PROJECT}_impl")
+            if not marked:
+                raise ValueError(f"{name} is not marked: put @hookimpl before it")
 
 
 def _announced(alone: pluggy.PluginManager, plugin: str) -> list[Component]:

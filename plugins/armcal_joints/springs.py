@@ -40,6 +40,7 @@ class TorsionalSprings:
     """
 
     Settings: ClassVar[type[TorsionalSpringSettings]] = TorsionalSpringSettings
+    EXAMPLE: ClassVar[Mapping[str, Any]] = {"base_axis": "y", "compliance_rad_per_Nm": 0.01}
 
     def __init__(self, settings: TorsionalSpringSettings, joint_names: Sequence[str]) -> None:
         self._settings = settings

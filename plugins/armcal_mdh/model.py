@@ -87,6 +87,16 @@ class MdhModel:
     """The arm model ``mdh``: parameters ``alpha1 a1 theta1 d1 ...``, ``base_x``, ``after2_z``, ``tool_ry``, ..."""
 
     Settings: ClassVar[type[MdhSettings]] = MdhSettings
+    EXAMPLE: ClassVar[Mapping[str, Any]] = {
+        "convention": "standard",
+        "base": [{"z_mm": 80}, {"ry_deg": 60}],
+        "rows": [
+            {"alpha_deg": 90, "d_mm": 47},
+            {"alpha_deg": -90, "a_mm": 100, "after": [{"frame": "upper_arm"}, {"z_mm": 20}]},
+            {"kind": "prismatic", "theta_deg": 30, "before": [{"rx_deg": 5}]},
+        ],
+        "tool": [{"z_mm": 73}],
+    }
 
     def __init__(self, settings: MdhSettings) -> None:
         self._settings = settings

@@ -6,7 +6,7 @@ The recorded command is the one asked for; the arm stands at the nearest one its
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from armcal.base.dataset import Dataset
@@ -16,6 +16,7 @@ from armcal.config.selection import with_values
 from armcal.config.yaml_source import load_config
 from armcal.errors import ConfigError
 from armcal.solve.simulation import SimulationRequest, measured_without_noise, with_channels
+from armcal.testing import EXAMPLE_TRUTH
 from pydantic import Field, model_validator
 
 
@@ -59,6 +60,13 @@ class ElasticArmSimulator:
     """The simulator ``elastic_arm``."""
 
     Settings: ClassVar[type[ElasticArmSettings]] = ElasticArmSettings
+    EXAMPLE: ClassVar[Mapping[str, Any]] = {
+        "truth": str(EXAMPLE_TRUTH),
+        "poses": {"count": 20, "levels_deg": {"q1": [-60, -20, 20, 60], "q2": [-90, -45, 0, 45, 90]}},
+        "seed": 1,
+        "quantisation_deg": 0.2,
+        "outliers": {"fraction": 0.1},
+    }
 
     def __init__(self, settings: ElasticArmSettings) -> None:
         self._settings = settings

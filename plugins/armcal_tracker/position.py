@@ -32,6 +32,7 @@ class TipPosition:
     """The measurement ``tip_position``: channels x, y, z; parameters target_x, target_y, target_z in the tool frame."""
 
     Settings: ClassVar[type[TipPositionSettings]] = TipPositionSettings
+    EXAMPLE: ClassVar[Mapping[str, Any]] = {"noise_mm": 0.5, "target_mm": [10, 0, 25]}
 
     def __init__(self, settings: TipPositionSettings, arm_names: Sequence[str]) -> None:
         self._settings = settings

@@ -35,6 +35,14 @@ class LazyGroup(click.Group):
         command: click.Command = getattr(import_module(module), attribute)
         return command
 
+    def invoke(self, ctx: click.Context) -> object:
+        """Armcal's own errors become one message and an exit code, never a traceback."""
+        try:
+            return super().invoke(ctx)
+        except ArmcalError as fault:
+            _report(fault)
+            ctx.exit(fault.exit_code)
+
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Help from the table, without importing anything."""
         with formatter.section("Commands"):
@@ -48,15 +56,12 @@ def cli() -> None:
 
 
 def main() -> None:
-    """Entry point: armcal's own errors become one message and an exit code, never a traceback."""
+    """Entry point."""
     # One BLAS thread: sums come out the same to the last bit whatever the number of processors.
     for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(variable, "1")
     try:
         cli.main(prog_name="armcal", standalone_mode=True)
-    except ArmcalError as fault:
-        _report(fault)
-        sys.exit(fault.exit_code)
     except BrokenPipeError:
         sys.stderr.close()
         sys.exit(EXIT_FAULT)

@@ -203,7 +203,7 @@ def refuse_approaches(dataset: Dataset, layout: Layout) -> None:
         DataError: it is not -1, 0 or 1.
     """
     for channel in layout.approach:
-        values = dataset.channels[channel]
+        values = dataset.column(channel)
         wrong = np.flatnonzero((values != 0) & (np.abs(values) != 1))
         if wrong.size:
             first = int(wrong[0])
@@ -221,7 +221,7 @@ def refuse_joint_units(dataset: Dataset, layout: Layout) -> None:
         DataError: radians beyond one turn, or degrees that look like whole tenths of a degree.
     """
     for channel in layout.revolute if len(dataset) else ():
-        values, unit, column = dataset.channels[channel], layout.units.get(channel, "rad"), layout.column(channel)
+        values, unit, column = dataset.column(channel), layout.units.get(channel, "rad"), layout.column(channel)
         first = int(np.argmax(np.abs(values)))
         where = layout.where(dataset, first, channel)
         largest = float(np.abs(values[first]))

@@ -161,13 +161,7 @@ def build_factor(
     """
     symbols, values = _value_expressions(parameters)
     records = _Records(available)
-    load = Load(
-        gravity=records.vector("gravity", environment.gravity),
-        payload_mass=records.optional("payload", environment.payload_mass),
-        payload_com=records.vector("payload", environment.payload_com),
-        force=records.vector("force", environment.force),
-        torque=records.vector("torque", environment.torque),
-    )
+    load = _load(records, environment)
     states, deflections = {}, []
     for arm_name in measurement.arms:
         deflection = ca.SX.sym(f"deflection_{arm_name}", arms[arm_name].deflection_size)
@@ -193,6 +187,16 @@ def build_factor(
         outputs=outputs,
         tools=tools,
         noise=tuple(measurement.noise()),
+    )
+
+
+def _load(records: _Records, environment: Environment) -> Load:
+    return Load(
+        gravity=records.vector("gravity", environment.gravity),
+        payload_mass=records.optional("payload", environment.payload_mass),
+        payload_com=records.vector("payload", environment.payload_com),
+        force=records.vector("force", environment.force),
+        torque=records.vector("torque", environment.torque),
     )
 
 

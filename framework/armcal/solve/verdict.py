@@ -97,15 +97,22 @@ def _condition(estimate: Estimate) -> list[Finding]:
 
 
 def _bounds(estimate: Estimate) -> list[Finding]:
-    if not estimate.at_bound:
-        return []
-    return [
-        Finding(
-            "warning",
-            f"Ended at a bound: {', '.join(estimate.at_bound)}. The data does not ask for an elasticity there, or "
-            "asks for an unphysical one: something else in the model is missing.",
-        )
-    ]
+    """Is a bound that holds compatible with the data? One-sided, at 5 %, by the step that ignores bounds."""
+    agreeing, pushing = [], []
+    for i, name in enumerate(estimate.names):
+        if name not in estimate.at_bound:
+            continue
+        value, sd = estimate.values[estimate.free_entries[i]], estimate.deviations[i]
+        beyond = abs(float(estimate.unconstrained[i] - value)) / sd if sd > 0 else 0.0
+        (pushing if beyond > norm.ppf(1 - LEVEL) else agreeing).append(f"{name} ({beyond:.1f} sd beyond)")
+    findings = []
+    if pushing:
+        text = f"The data pushes against a bound: {', '.join(pushing)}. Something else in the model is missing."
+        findings.append(Finding("warning", text))
+    if agreeing:
+        text = f"At a bound, and the data agrees (5 %): {', '.join(agreeing)}. Its upper limit is what was learned."
+        findings.append(Finding("note", text))
+    return findings
 
 
 def _noise(whitened: Array) -> Finding:

@@ -100,6 +100,12 @@ class Calibration:
                 hint="Give the calibration.yaml of a run, or run the calibration again with this version.",
             )
         record = validate(CalibrationFile, source)
+        if not record.converged:
+            raise ConfigError(
+                "the solver did not converge: these values are no calibration.",
+                where=Location(str(path)),
+                hint="Run the calibration again with better start values or more data.",
+            )
         description = {key: plain(source.data[key]) for key in ("arms", "measurements", "statics")}
         if identity_of(description) != record.identity.get("arm"):
             raise ConfigError(

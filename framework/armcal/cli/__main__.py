@@ -1,0 +1,8 @@
+"""``python -m armcal.cli``: the same as ``armcal``."""
+
+from __future__ import annotations
+
+from armcal.cli.main import main
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,79 @@
+"""The plugin contract as checks: what every component must do before a configuration may name it."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+
+from armcal.plugins import Component, PluginInfo, PluginRegistry
+from armcal.testing.estimator_checks import check_estimator
+from armcal.testing.model_checks import check_model
+from armcal.testing.part_checks import check_effect, check_measurement
+from armcal.testing.results import CheckResult, ContractError, Recorder, expect
+from armcal.testing.settings_checks import Subject, check_settings
+from armcal.testing.source_checks import check_reader, check_simulator
+
+__all__ = ["CheckResult", "check_component", "check_plugin"]
+
+HEAVY = ("numpy", "scipy", "casadi", "cvxpy", "matplotlib", "pydantic")
+"""What a registration module must not import: ``armcal --help`` and ``plugins list`` run every one of them."""
+_LONGEST_IMPORT_S = 60
+
+_CHECKS: Mapping[str, Callable[[Recorder, Subject], None]] = MappingProxyType(
+    {
+        "model": check_model,
+        "effect": check_effect,
+        "measurement": check_measurement,
+        "reader": check_reader,
+        "estimator": check_estimator,
+        "simulator": check_simulator,
+    }
+)
+
+
+def check_component(component: Component) -> list[CheckResult]:
+    """Every check of the component's kind; what the component raises becomes a fault, never an exception."""
+    record = Recorder(f"{component.kind} {component.name}")
+    record.guard(lambda: _check(record, component))
+    return record.results
+
+
+def check_plugin(plugin: PluginInfo, registry: PluginRegistry) -> list[CheckResult]:
+    """The plugin's registration, then every component that it announced."""
+    record = Recorder(f"plugin {plugin.name}")
+    record.check("it loads, with no hook that armcal does not know", lambda: expect(not plugin.fault, plugin.fault))
+    if plugin.fault:
+        return record.results
+    record.check("its registration imports nothing heavy", lambda: _light(plugin.module))
+    own = [component for component in registry.components if component.plugin == plugin.name]
+    for component in own:
+        name = f"the {component.kind} {component.name!r} is offered once"
+        record.check(name, lambda c=component: registry.find(c.kind, c.name))  # type: ignore[misc]
+    return record.results + [result for component in own for result in check_component(component)]
+
+
+def _check(record: Recorder, component: Component) -> None:
+    made = record.check("it imports", component.load)
+    subject = None if made is None else check_settings(record, component.kind, made)
+    if subject is not None:
+        _CHECKS[component.kind](record, subject)
+
+
+def _light(target: str) -> None:
+    """Import the registration module in a fresh interpreter and see what came with it."""
+    module = target.partition(":")[0]
+    code = f"import sys, {module}; print(*[name for name in {HEAVY!r} if name in sys.modules])"
+    path = f"import sys; sys.path[:] = {sys.path!r}; "
+    ran = subprocess.run(
+        [sys.executable, "-c", path + code], capture_output=True, text=True, timeout=_LONGEST_IMPORT_S, check=False
+    )
+    if ran.returncode:
+        raise ContractError(f"{module} does not import by itself: {ran.stderr.strip().splitlines()[-1:]}")
+    found = ran.stdout.split()
+    expect(
+        not found,
+        f"found {', '.join(found)} imported by {module}, expected only armcal.hooks: "
+        "components are imported when they are used",
+    )

@@ -1,0 +1,124 @@
+"""Checks on estimators: a small problem whose answer is known."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from armcal.base.domains import Array, Interval
+from armcal.base.parameters import Parameters
+from armcal.solve.estimator import Estimator, Solution
+from armcal.solve.problem import FactorRecords, Problem
+from armcal.solve.simulation import SimulationRequest, measured_without_noise
+from armcal.testing.planar import ARM, GRAVITY, NOISE_M, TRACKER, Tip, all_parameters, commands, dataset, planar_arms
+from armcal.testing.results import NotRun, Recorder, expect
+from armcal.testing.settings_checks import Subject
+
+POSES = 12
+TOLERANCE = 1e-6
+TRUTH = {"a1": 0.31, "a2": 0.243, "theta1": 0.05, "theta2": -0.08, "side": 0.02}
+UPPER_SIDE_M, PRIOR_SD_M = 0.015, 4e-4
+_SIDE = f"{ARM}.planar.side"
+
+
+@dataclass(frozen=True)
+class _Case:
+    """A problem, its records, and the values that solve it."""
+
+    problem: Problem
+    records: tuple[FactorRecords, ...]
+    answer: Array
+
+    @property
+    def parameters(self) -> Parameters:
+        """Of the problem."""
+        return self.problem.parameters
+
+
+def check_estimator(record: Recorder, subject: Subject) -> None:
+    """Truth, bounds, priors, verdict; and an honest verdict when it is cut short."""
+    estimator: Any = record.check("it builds", lambda: subject.made(subject.settings))
+    if estimator is None:
+        return
+    bounded = _case(Interval(upper=UPPER_SIDE_M), None, UPPER_SIDE_M)
+    name = "it gives a value for every entry, and a verdict"
+    solution = record.check(name, lambda: _solve(estimator, bounded))
+    if solution is None:
+        return
+    record.check("it reports that it converged", lambda: _converged(solution))
+    record.check("it keeps to the bounds", lambda: _inside(bounded, solution))
+    record.check("it finds the truth, one bound active", lambda: _near(bounded, solution))
+    record.check("it does the same twice", lambda: _repeats(estimator, bounded, solution))
+    told = _case(Interval(), PRIOR_SD_M, _with_prior())
+    record.check("it weighs priors", lambda: _near(told, _solve(estimator, told)))
+    record.check("cut short, it reports that it did not converge", lambda: _cut_short(subject, bounded))
+
+
+def _case(side: Interval, prior_sd: float | None, side_answer: float) -> _Case:
+    """Exact tip positions; ``side`` moves y alone, so neither its bound nor its prior disturbs the rest."""
+    arms, measurements = planar_arms([ARM]), {TRACKER: Tip()}
+    parameters = all_parameters(arms)
+    true = parameters.with_nominal(np.array([TRUTH[n.rpartition(".")[2]] for n in parameters.names]))
+    moved = dataset(commands(arms, POSES, np.random.default_rng(5)))
+    exact = measured_without_noise(SimulationRequest(arms, measurements, true, GRAVITY), moved)
+    records = dataset({**moved.channels, **exact})
+    block = replace(parameters[_SIDE], domain=side, prior_sd=prior_sd)
+    parameters = parameters.replaced({_SIDE: block}).with_free(parameters.names)
+    problem = Problem.build(arms, measurements, parameters, GRAVITY, records, "interpreted")
+    answer = true.nominal()
+    answer[parameters.entries_of(_SIDE)] = side_answer
+    return _Case(problem, problem.records(records), answer)
+
+
+def _with_prior() -> float:
+    """The mean of the data's ``side`` and the prior's zero, each by its information."""
+    data, prior = POSES / NOISE_M**2, 1 / PRIOR_SD_M**2
+    return TRUTH["side"] * data / (data + prior)
+
+
+def _solve(estimator: Estimator, case: _Case) -> Solution:
+    start = case.parameters.nominal()
+    solution = estimator.solve(case.problem, case.records, start)
+    values = np.asarray(solution.values)
+    expect(values.shape == start.shape, f"found {values.size} values, expected {start.size}")
+    expect(bool(np.isfinite(values).all()), f"found the values {values}")
+    expect(
+        isinstance(solution.verdict.converged, bool) and bool(solution.verdict.name),
+        f"found the verdict {solution.verdict}, expected a name and converged true or false",
+    )
+    expect(bool(np.array_equal(start, case.parameters.nominal())), "it changed the start that it was given")
+    return solution
+
+
+def _converged(solution: Solution) -> None:
+    expect(solution.verdict.converged, f"found the verdict {solution.verdict.status!r}, expected convergence")
+
+
+def _inside(case: _Case, solution: Solution) -> None:
+    case.parameters.check(solution.values)
+
+
+def _near(case: _Case, solution: Solution) -> None:
+    off = np.abs(solution.values - case.answer)
+    worst = int(np.argmax(off))
+    expect(
+        float(off[worst]) <= TOLERANCE,
+        f"{case.parameters.entry_names[worst]}: found {solution.values[worst]:.9g}, "
+        f"expected {case.answer[worst]:.9g} within {TOLERANCE:g}",
+    )
+
+
+def _repeats(estimator: Estimator, case: _Case, solution: Solution) -> None:
+    again = estimator.solve(case.problem, case.records, case.parameters.nominal())
+    off = float(np.abs(again.values - solution.values).max())
+    expect(off == 0.0, f"found values that differ by {off:.1e} from the first time")
+
+
+def _cut_short(subject: Subject, case: _Case) -> None:
+    if "max_iterations" not in type(subject.settings).model_fields:
+        raise NotRun("its settings have no max_iterations")
+    settings = subject.made.Settings.model_validate({**subject.example, "max_iterations": 1})
+    solution = _solve(subject.made(settings), case)
+    expect(not solution.verdict.converged, "found converged after one iteration, expected not converged")

@@ -1,0 +1,159 @@
+"""Checks on arm models: names, parameters, chain, kinematics, derivatives, statics."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+from armcal.arm.assembly import Arm, MassSpec
+from armcal.arm.model import ArmModel, Chain, Joint, forward
+from armcal.arm.statics import BASE_FRAME, TOOL_FRAME
+from armcal.base.domains import Array
+from armcal.base.parameters import ParameterBlock
+from armcal.base.se3 import Expression, Transform
+from armcal.solve.factor import Environment
+from armcal.solve.problem import Problem
+from armcal.testing.expressions import (
+    check_parameters,
+    expect_derivatives,
+    expect_no_choice,
+    expect_only,
+    near_nominal,
+    stacked,
+    symbols,
+)
+from armcal.testing.planar import ARM, TRACKER, Springs, Tip, all_parameters, commands, dataset
+from armcal.testing.results import Recorder, expect
+from armcal.testing.settings_checks import Subject
+
+POSES = 20
+ROTATION_TOLERANCE = 1e-9
+_LOADED = Environment((0.0, 1.0, -9.5), payload_mass=0.1, payload_com=(0.01, 0.0, 0.02))
+
+
+@dataclass(frozen=True)
+class _Kinematics:
+    """A model's poses (tool, sites, named frames) as a function of all entries and displacements."""
+
+    blocks: tuple[ParameterBlock, ...]
+    chain: Chain
+    poses: ca.Function
+
+    def point(self, random: np.random.Generator) -> Array:
+        """Random parameters near the nominal ones, and random displacements."""
+        reach = [2.0 if joint.is_revolute else 0.2 for joint in self.chain.joints]
+        return np.concatenate([near_nominal(self.blocks, random), random.uniform(-1, 1, len(reach)) * reach])
+
+
+def check_model(record: Recorder, subject: Subject) -> None:
+    """Everything that a problem asks of an arm model."""
+    model: ArmModel | None = record.check("it builds", lambda: subject.made(subject.settings))
+    if model is None:
+        return
+    names = record.check("its joints are named, each once", lambda: _joint_names(model))
+    blocks = check_parameters(record, model.parameters)
+    if names is None or blocks is None:
+        return
+    values = symbols(blocks)
+    chain = record.check("its chain has one joint for each name", lambda: _chain(model.chain(values), names))
+    if chain is None:
+        return
+    parts = stacked(_parts(chain))
+    record.check("the chain depends on its parameters alone", lambda: expect_only(parts, list(values.values())))
+    record.check(
+        "the chain does not branch on a parameter",
+        lambda: expect_no_choice(parts, ca.SX(0, 1), stacked(list(values.values()))),
+    )
+    known = record.check("its kinematics can be evaluated", lambda: _kinematics(blocks, values, chain))
+    if known is None:
+        return
+    record.check(f"{POSES} random poses are rigid motions", lambda: _rigid(known))
+    record.check("derivatives agree with differences", lambda: _derivatives(known))
+    record.check("springs on it settle under gravity", lambda: _settles(model, chain))
+
+
+def _joint_names(model: ArmModel) -> tuple[str, ...]:
+    names = tuple(model.joint_names)
+    expect(len(names) > 0, "found no joints, expected at least one")
+    for name in names:
+        expect(isinstance(name, str) and bool(name), f"found the joint name {name!r}, expected text")
+        expect("." not in name, f"found the joint name {name!r}, expected one without a dot")
+    expect(len(set(names)) == len(names), f"found {', '.join(names)}, expected every name once")
+    return names
+
+
+def _chain(chain: Chain, names: Sequence[str]) -> Chain:
+    expect(isinstance(chain, Chain), f"found a chain of type {type(chain).__name__}, expected Chain")
+    found = tuple(joint.name for joint in chain.joints)
+    expect(found == tuple(names), f"found the joints {found}, expected {tuple(names)}")
+    for joint in chain.joints:
+        _axis(joint)
+    for name, at in {TOOL_FRAME: chain.tool, **chain.frames}.items():
+        expect(0 <= at.joint <= len(names), f"the frame {name} hangs on joint {at.joint}, expected 0 to {len(names)}")
+    taken = sorted({BASE_FRAME, TOOL_FRAME} & set(chain.frames))
+    expect(not taken, f"found a frame called {', '.join(taken)}, which armcal uses itself")
+    return chain
+
+
+def _axis(joint: Joint) -> None:
+    turns, slides = (float(np.linalg.norm(axis)) for axis in (joint.angular, joint.linear))
+    expect(
+        sorted((turns, slides)) == [0.0, max(turns, slides)] and abs(max(turns, slides) - 1) <= 1e-9,
+        f"joint {joint.name}: found angular {joint.angular} and linear {joint.linear}, "
+        "expected a unit vector for one and zeros for the other",
+    )
+
+
+def _parts(chain: Chain) -> list[Expression]:
+    transforms = [chain.root_T_base, chain.tool.joint_T_frame]
+    transforms += [joint.parent_T_joint for joint in chain.joints]
+    transforms += [at.joint_T_frame for at in chain.frames.values()]
+    return [*(t.matrix() for t in transforms), *(joint.offset for joint in chain.joints)]
+
+
+def _kinematics(blocks: tuple[ParameterBlock, ...], values: dict[str, Expression], chain: Chain) -> _Kinematics:
+    moved = ca.SX.sym("displacement", len(chain.joints))
+    frames = forward(chain, [joint.offset + moved[i] for i, joint in enumerate(chain.joints)], {})
+    shown = [frames.root_T_tool, *frames.named.values()]
+    shown += [Transform(site.rotation, site.origin) for site in frames.sites]
+    inputs = stacked([*values.values(), moved])
+    poses = ca.Function("poses", [inputs], [stacked([pose.matrix()[:3, :] for pose in shown])])
+    return _Kinematics(blocks, chain, poses)
+
+
+def _rigid(known: _Kinematics) -> None:
+    random = np.random.default_rng(1)
+    for _ in range(POSES):
+        shown = np.asarray(known.poses(known.point(random))).reshape(-1, 4, 3).transpose(0, 2, 1)
+        expect(bool(np.isfinite(shown).all()), "found a pose that is not finite")
+        rotation = shown[:, :, :3]
+        off = float(np.abs(rotation @ rotation.transpose(0, 2, 1) - np.eye(3)).max())
+        expect(off <= ROTATION_TOLERANCE, f"found a rotation off orthonormal by {off:.1e}")
+        handed = float(np.abs(np.linalg.det(rotation) - 1).max())
+        expect(handed <= ROTATION_TOLERANCE, f"found a rotation with determinant off 1 by {handed:.1e}")
+
+
+def _derivatives(known: _Kinematics) -> None:
+    expect_derivatives(known.poses, known.point(np.random.default_rng(2)), "the poses")
+
+
+def _settles(model: ArmModel, chain: Chain) -> None:
+    """Gravity on a small mass in every frame, springs at the base and every joint."""
+    frames = [BASE_FRAME, *chain.frames, TOOL_FRAME]
+    masses = tuple(MassSpec(f"m{i}", 0.02, (0.0, 0.01, 0.0), frame) for i, frame in enumerate(frames))
+    arm = Arm(ARM, "model", model, {"spring": Springs(len(chain.joints))}, masses)
+    arms, parameters = {ARM: arm}, all_parameters({ARM: arm})
+    parameters = parameters.with_free(parameters.names)
+    moved = commands(arms, POSES, np.random.default_rng(3))
+    measured = {f"{TRACKER}.{axis}": np.zeros(POSES) for axis in "xyz"}
+    records = dataset({**moved, **measured})
+    problem = Problem.build(arms, {TRACKER: Tip()}, parameters, _LOADED, records, "interpreted")
+    read = problem.records(records)
+    equations = problem.normal_equations(parameters.nominal(), read)
+    expect(bool(np.isfinite(equations.hessian).all()), "found derivatives in equilibrium that are not finite")
+    loaded = problem.residuals(parameters.nominal(), read)[0]
+    expect(bool(np.isfinite(loaded).all()), "found tip positions in equilibrium that are not finite")
+    expect(bool(np.abs(read[0].state).max() > 0), "found no deflection under a load, expected some")

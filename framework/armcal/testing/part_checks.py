@@ -1,0 +1,253 @@
+"""Checks on joint effects and measurements."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import casadi as ca
+import numpy as np
+
+from armcal.arm.assembly import Arm, prefixed
+from armcal.arm.effects import JointCommand, JointEffect, Spring
+from armcal.base.domains import Array
+from armcal.base.parameters import ParameterBlock, Parameters
+from armcal.base.se3 import Expression
+from armcal.base.units import units_of
+from armcal.measure.measurement import Channel, Measurement
+from armcal.solve.factor import Factor, build_factor
+from armcal.testing.expressions import (
+    check_parameters,
+    expect_derivatives,
+    expect_no_choice,
+    expect_only,
+    near_nominal,
+    stacked,
+    symbols,
+)
+from armcal.testing.planar import ARM, GRAVITY, planar_arms
+from armcal.testing.results import PLUGIN_FAULTS, ContractError, NotRun, Recorder, expect
+from armcal.testing.settings_checks import Subject
+
+JOINTS = ("q1", "q2", "q3")
+ARM_NAMES = ((ARM,), ("left", "right"))
+"""The arms that a measurement is built for: one, or if it refuses that, two."""
+_RATIO = "1"
+_INSTRUMENT = "instrument"
+
+
+def check_effect(record: Recorder, subject: Subject) -> None:
+    """Everything that an arm asks of a joint effect, on joints q1, q2 and q3."""
+    effect: JointEffect | None = record.check(
+        f"it builds for the joints {', '.join(JOINTS)}", lambda: subject.made(subject.settings, JOINTS)
+    )
+    blocks = None if effect is None else check_parameters(record, effect.parameters)
+    if effect is None or blocks is None:
+        return
+    values = symbols(blocks)
+    given = stacked(list(values.values()))
+    added = record.check("it gives a displacement for every joint", lambda: _displacement(effect, values))
+    if added is not None:
+        recorded, moved = added
+        record.check("displacements depend on what is given", lambda: expect_only(moved, [recorded, given]))
+        record.check("displacements do not branch on a parameter", lambda: expect_no_choice(moved, recorded, given))
+        record.check("displacements are finite", lambda: _finite_displacement(blocks, given, recorded, moved))
+    springs = record.check("its springs have a site and unit directions", lambda: _springs(effect, values))
+    if not springs:
+        return
+    loads = ca.SX.sym("loads", sum(spring.size for spring in springs))
+    laws = record.check("every law gives one deflection a coordinate", lambda: _laws(springs, loads))
+    if laws is None:
+        return
+    record.check("laws depend on what is given", lambda: expect_only(laws, [loads, given]))
+    record.check(
+        "laws branch neither on a parameter nor on a load",
+        lambda: expect_no_choice(laws, ca.SX(0, 1), stacked([loads, given])),
+    )
+    record.check("laws are finite and smooth, at zero load too", lambda: _smooth(blocks, given, loads, laws))
+
+
+def _displacement(effect: JointEffect, values: Mapping[str, Expression]) -> tuple[Expression, Expression]:
+    recorded = ca.SX.sym("recorded", 2 * len(JOINTS))
+    parts = []
+    for i, joint in enumerate(JOINTS):
+        part = ca.SX(effect.displacement(JointCommand(i, recorded[2 * i], recorded[2 * i + 1]), values))
+        expect(part.numel() == 1, f"found {part.numel()} numbers for {joint}, expected one (rad or m)")
+        parts.append(part)
+    return recorded, stacked(parts)
+
+
+def _finite_displacement(
+    blocks: Sequence[ParameterBlock], given: Expression, recorded: Expression, moved: Expression
+) -> None:
+    function = ca.Function("displacement", [given, recorded], [moved])
+    random = np.random.default_rng(1)
+    for approach in (-1.0, 0.0, 1.0):
+        for command in (0.0, 0.3, -1.2):
+            found = np.asarray(function(near_nominal(blocks, random), [command, approach] * len(JOINTS)))
+            expect(
+                bool(np.isfinite(found).all()),
+                f"found {found.ravel()} for the command {command} from approach {approach:+.0f}",
+            )
+
+
+def _springs(effect: JointEffect, values: Mapping[str, Expression]) -> tuple[Spring, ...]:
+    springs = tuple(effect.springs(values))
+    for spring in springs:
+        expect(isinstance(spring, Spring), f"found {type(spring).__name__} among the springs, expected Spring")
+        expect(0 <= spring.site <= len(JOINTS), f"found the site {spring.site}, expected 0 to {len(JOINTS)}")
+        expect(
+            spring.site > 0 or len(spring.directions) > 0,
+            "found a spring at the base without directions; the base has no axis of its own",
+        )
+        for direction in spring.directions:
+            length = float(np.linalg.norm(direction))
+            expect(
+                len(direction) == 3 and abs(length - 1) <= 1e-9,
+                f"found the direction {direction} of length {length:g}, expected a unit vector",
+            )
+    return springs
+
+
+def _laws(springs: Sequence[Spring], loads: Expression) -> Expression:
+    parts, start = [], 0
+    for spring in springs:
+        part = ca.SX(spring.law(loads[start : start + spring.size]))
+        start += spring.size
+        expect(
+            part.shape == (spring.size, 1),
+            f"the spring at site {spring.site} gives {part.shape}, expected {spring.size} x 1",
+        )
+        parts.append(part)
+    return stacked(parts)
+
+
+def _smooth(blocks: Sequence[ParameterBlock], given: Expression, loads: Expression, laws: Expression) -> None:
+    function = ca.Function("laws", [stacked([loads, given])], [laws])
+    random = np.random.default_rng(2)
+    entries = near_nominal(blocks, random)
+    for load in (np.zeros(loads.numel()), random.uniform(-2, 2, loads.numel())):
+        at = np.concatenate([load, entries])
+        found = np.asarray(function(at)).ravel()
+        expect(bool(np.isfinite(found).all()), f"found the deflections {found} under the loads {load}")
+        expect_derivatives(function, at, "the deflections")
+
+
+def check_measurement(record: Recorder, subject: Subject) -> None:
+    """Everything that a factor asks of a measurement, on planar arms."""
+    built = record.check("it builds for one arm, or for two", lambda: _build(subject))
+    if built is None:
+        return
+    measurement, arms = built
+    blocks = check_parameters(record, measurement.parameters)
+    channels = record.check("its channels have names and dimensions", lambda: _channels(measurement))
+    if blocks is None or channels is None:
+        return
+    factor = record.check("it makes a residual", lambda: _factor(measurement, arms, blocks, channels))
+    if factor is None:
+        return
+    record.check("noise is positive, one number a residual", lambda: _noise(factor))
+    record.check("residuals depend on what is given", lambda: _closed(factor))
+    measured = [f"{_INSTRUMENT}.{channel.name}" for channel in channels]
+    record.check("outputs are channels", lambda: _outputs(factor, measured))
+    record.check("the residual is zero where outputs are measured", lambda: _zero(factor, arms, blocks, measured))
+    record.check("its Jacobian is finite and agrees with differences", lambda: _jacobian(factor, arms, blocks))
+
+
+def _build(subject: Subject) -> tuple[Measurement, dict[str, Arm]]:
+    refused = []
+    for names in ARM_NAMES:
+        try:
+            measurement: Measurement = subject.made(subject.settings, names)
+        except PLUGIN_FAULTS as fault:
+            refused.append(f"{', '.join(names)}: {fault}")
+            continue
+        unknown = [name for name in measurement.arms if name not in names]
+        expect(
+            len(measurement.arms) > 0 and not unknown,
+            f"found the arms {tuple(measurement.arms)}, expected some of {names}",
+        )
+        return measurement, planar_arms(names)
+    raise ContractError("it refuses every choice of arms; " + "; ".join(refused))
+
+
+def _channels(measurement: Measurement) -> tuple[Channel, ...]:
+    channels = tuple(measurement.channels())
+    names = [channel.name for channel in channels]
+    expect(len(set(names)) == len(names), f"found the channels {', '.join(names)}, expected every name once")
+    for channel in channels:
+        expect(
+            channel.name.isidentifier(), f"found the channel {channel.name!r}, expected letters, digits, underscores"
+        )
+        if channel.dimension != _RATIO:
+            units_of(channel.dimension)
+    return channels
+
+
+def _factor(
+    measurement: Measurement,
+    arms: Mapping[str, Arm],
+    blocks: Sequence[ParameterBlock],
+    channels: Sequence[Channel],
+) -> Factor:
+    parameters = _parameters(arms, blocks)
+    available = frozenset(f"{_INSTRUMENT}.{channel.name}" for channel in channels)
+    factor = build_factor(_INSTRUMENT, measurement, arms, parameters, GRAVITY, available)
+    rows, columns = factor.residual.shape
+    expect(rows > 0 and columns == 1, f"found a residual of {rows} x {columns}, expected n x 1")
+    return factor
+
+
+def _parameters(arms: Mapping[str, Arm], blocks: Sequence[ParameterBlock]) -> Parameters:
+    own = prefixed(f"{_INSTRUMENT}.", blocks)
+    all_blocks = Parameters((*(block for arm in arms.values() for block in arm.parameters()), *own))
+    return all_blocks.with_free(all_blocks.names)
+
+
+def _noise(factor: Factor) -> None:
+    count = factor.residual.numel()
+    expect(len(factor.noise) == count, f"found {len(factor.noise)} noises for {count} residuals")
+    expect(
+        all(np.isfinite(noise) and noise > 0 for noise in factor.noise),
+        f"found the noise {factor.noise}, expected standard deviations above zero",
+    )
+
+
+def _closed(factor: Factor) -> None:
+    shown = stacked([factor.residual, factor.outputs])
+    expect_only(shown, [factor.values, factor.record])
+
+
+def _outputs(factor: Factor, measured: Sequence[str]) -> None:
+    unknown = [name for name in factor.output_channels if name not in measured]
+    expect(not unknown, f"found the outputs {', '.join(unknown)}, expected names of channels")
+
+
+def _point(factor: Factor, arms: Mapping[str, Arm], blocks: Sequence[ParameterBlock]) -> tuple[Array, Array]:
+    """Values, and a record with random joint angles whose measured channels say what would be read."""
+    random = np.random.default_rng(1)
+    values = near_nominal(_parameters(arms, blocks).blocks, random)
+    record = random.uniform(-1, 1, factor.record.numel())
+    shown = np.asarray(_function(factor, factor.outputs)(np.concatenate([values, record]))).ravel()
+    read = dict(zip(factor.output_channels, shown, strict=True))
+    return values, np.array([read.get(name, record[i]) for i, name in enumerate(factor.channels)])
+
+
+def _function(factor: Factor, expression: Expression) -> ca.Function:
+    return ca.Function("shown", [stacked([factor.values, factor.record])], [stacked([expression])])
+
+
+def _zero(factor: Factor, arms: Mapping[str, Arm], blocks: Sequence[ParameterBlock], measured: Sequence[str]) -> None:
+    if not factor.output_channels:
+        raise NotRun("it reads nothing")
+    if set(factor.output_channels) != set(measured):
+        raise NotRun("it has channels without an output")
+    found = np.asarray(_function(factor, factor.residual)(np.concatenate(_point(factor, arms, blocks)))).ravel()
+    worst = float(np.abs(found).max())
+    expect(worst <= 1e-9, f"found a residual of {worst:.1e}, expected zero")
+
+
+def _jacobian(factor: Factor, arms: Mapping[str, Arm], blocks: Sequence[ParameterBlock]) -> None:
+    values, record = _point(factor, arms, blocks)
+    disturbed = record + 0.01 * np.random.default_rng(2).uniform(-1, 1, len(record))
+    at = np.concatenate([values, disturbed])
+    expect_derivatives(_function(factor, factor.residual), at, "the residual")

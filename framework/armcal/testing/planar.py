@@ -1,0 +1,143 @@
+"""The arm, springs and instrument of the contract's own checks: two links in a vertical plane, and their tip."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+from armcal.arm.assembly import Arm, ArmState
+from armcal.arm.effects import JointCommand, Spring
+from armcal.arm.model import Attachment, Chain, Joint
+from armcal.base import se3
+from armcal.base.dataset import Dataset
+from armcal.base.domains import Array
+from armcal.base.parameters import ParameterBlock, Parameters, scalar
+from armcal.base.se3 import Expression
+from armcal.measure.measurement import Channel
+from armcal.solve.factor import Environment
+
+ARM, TRACKER = "arm", "tracker"
+GRAVITY = Environment((0.0, 0.0, -9.81))
+NOISE_M = 1e-3
+_Y_AXIS = (0.0, 1.0, 0.0)
+_TIP = "xyz"
+
+
+class PlanarArm:
+    """Joints q1 and q2 about y; links a1 and a2 along x; ``side`` shifts the arm along y, across its plane."""
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Two."""
+        return ("q1", "q2")
+
+    def parameters(self) -> tuple[ParameterBlock, ...]:
+        """Link lengths, zero angles and the shift."""
+        return (
+            scalar("a1", "m", 0.3, 0.01),
+            scalar("a2", "m", 0.25, 0.01),
+            scalar("theta1", "rad", 0.0, 0.05),
+            scalar("theta2", "rad", 0.0, 0.05),
+            scalar("side", "m", 0.0, 0.01),
+        )
+
+    def chain(self, values: Mapping[str, Expression]) -> Chain:
+        """Base, two joints, and the frame ``elbow`` between them."""
+        upper, fore = (se3.translation_along("x", values[name]) for name in ("a1", "a2"))
+        joints = (
+            Joint("q1", se3.identity(), _Y_AXIS, offset=values["theta1"]),
+            Joint("q2", upper, _Y_AXIS, offset=values["theta2"]),
+        )
+        base = se3.translation_along("y", values["side"])
+        return Chain(base, joints, Attachment(2, fore), {"elbow": Attachment(1, upper)})
+
+
+@dataclass(frozen=True)
+class Springs:
+    """A spring on every joint's own axis, and one about x and y at the base; all of one compliance."""
+
+    joints: int
+    compliance: float = 1e-3
+
+    def parameters(self) -> tuple[ParameterBlock, ...]:
+        """The compliance (rad/(N m), or m/N on a sliding joint)."""
+        return (scalar("k", "rad_per_Nm", self.compliance, 1e-3),)
+
+    def displacement(self, command: JointCommand, values: Mapping[str, Expression]) -> Expression:
+        """Nothing."""
+        return 0
+
+    def springs(self, values: Mapping[str, Expression]) -> tuple[Spring, ...]:
+        """The base's first."""
+
+        def law(load: Expression) -> Expression:
+            return values["k"] * load
+
+        base = Spring(0, ((1.0, 0.0, 0.0), _Y_AXIS), law)
+        return (base, *(Spring(site, (), law) for site in range(1, self.joints + 1)))
+
+
+@dataclass(frozen=True)
+class Tip:
+    """The tool's position, without parameters of its own."""
+
+    arm: str = ARM
+
+    @property
+    def arms(self) -> tuple[str, ...]:
+        """One."""
+        return (self.arm,)
+
+    def parameters(self) -> tuple[ParameterBlock, ...]:
+        """None."""
+        return ()
+
+    def channels(self) -> tuple[Channel, ...]:
+        """Three coordinates."""
+        return tuple(Channel(axis, "length") for axis in _TIP)
+
+    def outputs(self, arms: Mapping[str, ArmState], values: Mapping[str, Expression]) -> dict[str, Expression]:
+        """In the root frame (m)."""
+        return {axis: arms[self.arm].root_T_tool.translation[i] for i, axis in enumerate(_TIP)}
+
+    def residual(
+        self,
+        arms: Mapping[str, ArmState],
+        measured: Mapping[str, Expression],
+        values: Mapping[str, Expression],
+    ) -> Expression:
+        """Measured minus predicted (m)."""
+        predicted = self.outputs(arms, values)
+        return ca.vertcat(*[measured[axis] - predicted[axis] for axis in _TIP])
+
+    def noise(self) -> tuple[float, ...]:
+        """One millimetre a coordinate."""
+        return (NOISE_M,) * 3
+
+
+def planar_arms(names: Sequence[str]) -> dict[str, Arm]:
+    """A planar arm under each of these names, without springs."""
+    return {name: Arm(name, "planar", PlanarArm(), {}, ()) for name in names}
+
+
+def all_parameters(arms: Mapping[str, Arm]) -> Parameters:
+    """Every block of the arms."""
+    return Parameters(tuple(block for arm in arms.values() for block in arm.parameters()))
+
+
+def commands(arms: Mapping[str, Arm], count: int, random: np.random.Generator) -> dict[str, Array]:
+    """Random commands of every joint: up to 2 rad, or 0.2 m, to either side."""
+    return {
+        f"{arm.name}.{joint}": random.uniform(-1, 1, count) * (2.0 if dimension == "angle" else 0.2)
+        for arm in arms.values()
+        for joint, dimension in zip(arm.joint_names, arm.joint_dimensions, strict=True)
+    }
+
+
+def dataset(channels: Mapping[str, Array]) -> Dataset:
+    """Channels as records."""
+    count = len(next(iter(channels.values())))
+    return Dataset(tuple(str(i) for i in range(1, count + 1)), dict(channels), source="contract check")

@@ -1,0 +1,98 @@
+"""Checks on what every component has: checked settings, and an example of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from pydantic import ValidationError
+
+from armcal.base.settings import Settings
+from armcal.testing.results import NotRun, Recorder, expect
+
+MISSING_FILE = "/no/such/folder/measurements"
+_UNKNOWN_KEY = "no_component_has_this_key"
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A component under check: its class, its example as a configuration would have it, and as settings."""
+
+    made: Any
+    example: Mapping[str, Any]
+    settings: Settings
+
+
+def check_settings(record: Recorder, kind: str, made: Any) -> Subject | None:
+    """The component with settings to build it from, if it has any that hold."""
+    found = record.check("it has checked settings", lambda: _settings_class(made))
+    if found is None:
+        return None
+    record.check("every setting is typed or documented", lambda: _described(found))
+    example = record.check("its EXAMPLE is a mapping", lambda: _example(kind, made, found))
+    if example is None:
+        return None
+    settings = record.check("its example settings are accepted", lambda: _accepted(kind, made, found, example))
+    record.check("an unknown key is refused", lambda: _refuses_unknown(found, example))
+    if settings is None:
+        return None
+    record.check("its settings survive to_config()", lambda: _survives(settings))
+    return Subject(made, example, settings)
+
+
+def _settings_class(made: Any) -> type[Settings]:
+    found = getattr(made, "Settings", None)
+    expect(
+        isinstance(found, type) and issubclass(found, Settings),
+        f"found Settings = {found!r}, expected a class attribute that is a subclass of armcal.base.settings.Settings",
+    )
+    result: type[Settings] = made.Settings
+    return result
+
+
+def _described(found: type[Settings]) -> None:
+    bare = [
+        name
+        for name, info in found.model_fields.items()
+        if info.annotation in (None, Any, object) and not info.description
+    ]
+    expect(not bare, f"found {', '.join(bare)} without a type, expected a type or Field(description=...)")
+
+
+def _example(kind: str, made: Any, found: type[Settings]) -> Mapping[str, Any]:
+    given = getattr(made, "EXAMPLE", {})
+    expect(isinstance(given, Mapping), f"found EXAMPLE of type {type(given).__name__}, expected a mapping of settings")
+    example = dict(given)
+    path = found.model_fields.get("path")
+    if kind == "reader" and path is not None and path.is_required():
+        example.setdefault("path", MISSING_FILE)
+    return example
+
+
+def _accepted(kind: str, made: Any, found: type[Settings], example: Mapping[str, Any]) -> Settings:
+    try:
+        return found.model_validate(example)
+    except ValidationError as fault:
+        if hasattr(made, "EXAMPLE"):
+            raise
+        reason = "it has no EXAMPLE and needs settings"
+        if kind == "simulator":
+            raise NotRun(reason) from fault
+        expect(False, f"{reason}: add the class attribute EXAMPLE, a mapping as a configuration would have it")
+        raise
+
+
+def _refuses_unknown(found: type[Settings], example: Mapping[str, Any]) -> None:
+    try:
+        found.model_validate({**example, _UNKNOWN_KEY: 1})
+    except ValidationError as fault:
+        named = any(_UNKNOWN_KEY in map(str, error["loc"]) for error in fault.errors())
+        expect(named, "found an unknown key refused without being named, expected its name in the error")
+    else:
+        expect(False, "found an unknown key accepted, expected it refused: keep extra='forbid'")
+
+
+def _survives(settings: Settings) -> None:
+    again = type(settings).model_validate(settings.to_config())
+    expect(again == settings, f"found {again!r} after to_config(), expected {settings!r}")

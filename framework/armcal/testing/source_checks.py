@@ -1,0 +1,82 @@
+"""Checks on readers and simulators."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from pydantic import ValidationError
+
+from armcal.base.dataset import Dataset
+from armcal.errors import InputError
+from armcal.measure.reader import Reader, ReadRequest, wanted_channels
+from armcal.solve.simulation import SimulationRequest, Simulator
+from armcal.testing.planar import ARM, GRAVITY, TRACKER, Tip, all_parameters, planar_arms
+from armcal.testing.results import ContractError, NotRun, Recorder, expect
+from armcal.testing.settings_checks import MISSING_FILE, Subject
+
+
+def check_reader(record: Recorder, subject: Subject) -> None:
+    """That it can be asked, and refuses a missing file as a user's fault."""
+    reader: Any = record.check("it builds", lambda: subject.made(subject.settings))
+    if reader is None:
+        return
+    record.check("it reads", lambda: _has(reader, "read"))
+    record.check("a missing file is refused by an armcal error", lambda: _misses(subject))
+
+
+def _has(component: Any, method: str) -> None:
+    found = getattr(component, method, None)
+    expect(callable(found), f"found {method} = {found!r}, expected a method")
+
+
+def _misses(subject: Subject) -> None:
+    if "path" not in type(subject.settings).model_fields:
+        raise NotRun("its settings have no path")
+    arms, measurements = planar_arms([ARM]), {TRACKER: Tip()}
+    request = ReadRequest(arms, measurements, wanted_channels(arms, measurements, measured=True))
+    try:
+        settings = subject.made.Settings.model_validate({**subject.example, "path": MISSING_FILE})
+        reader: Reader = subject.made(settings)
+        reader.read(request)
+    except (InputError, ValidationError):
+        return
+    except Exception as fault:
+        raise ContractError(
+            f"found {type(fault).__name__} ({fault}), expected armcal.errors.DataError with the file's name"
+        ) from fault
+    raise ContractError("found a dataset read from a file that is not there")
+
+
+def check_simulator(record: Recorder, subject: Subject) -> None:
+    """That the same request gives the same records."""
+    simulator: Any = record.check("it builds", lambda: subject.made(subject.settings))
+    if simulator is None:
+        return
+    record.check("it simulates", lambda: _has(simulator, "simulate"))
+    name = "it gives what every instrument reads, the same each time"
+    record.check(name, lambda: _repeats(subject, simulator))
+
+
+def _repeats(subject: Subject, simulator: Simulator) -> None:
+    arms, measurements = planar_arms([ARM]), {TRACKER: Tip()}
+    request = SimulationRequest(arms, measurements, all_parameters(arms), GRAVITY)
+    try:
+        first = simulator.simulate(request)
+    except InputError as fault:
+        raise NotRun(f"its EXAMPLE does not suit the arm of the check: {fault}") from fault
+    for wanted in wanted_channels(arms, measurements, measured=True):
+        expect(
+            first.has(wanted.channel) or not wanted.required,
+            f"found no {wanted.channel} in the records, expected every required channel",
+        )
+    _same(first, simulator.simulate(request), "the second time")
+    _same(first, subject.made(subject.settings).simulate(request), "from a second simulator of equal settings")
+
+
+def _same(first: Dataset, again: Dataset, when: str) -> None:
+    expect(first.ids == again.ids, f"found other record ids {when}")
+    expect(set(first.channels) == set(again.channels), f"found other channels {when}")
+    for name, values in first.channels.items():
+        expect(bool(np.isfinite(values).all()), f"found numbers in {name} that are not finite")
+        expect(bool(np.array_equal(values, again.channels[name])), f"found other numbers in {name} {when}")

@@ -1,0 +1,93 @@
+"""What several test files share: the shipped LRM arm as experiments, datasets and problems."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT / "tests"))  # for `import oracle`
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Compiled kernels go to a directory of this session, never to the user's cache."""
+    kept = os.environ.get("ARMCAL_CACHE_DIR")
+    place = tmp_path_factory.mktemp("armcal-cache")
+    place.chmod(0o700)
+    os.environ["ARMCAL_CACHE_DIR"] = str(place)
+    yield
+    if kept is None:
+        os.environ.pop("ARMCAL_CACHE_DIR", None)
+    else:
+        os.environ["ARMCAL_CACHE_DIR"] = kept
+
+
+@pytest.fixture(scope="session")
+def repository() -> Path:
+    """The root of the checkout."""
+    return ROOT
+
+
+@pytest.fixture(scope="session")
+def shared_data() -> Path:
+    """The measured data beside the checkout; tests that need it are skipped where it is not there."""
+    place = ROOT.parent / "shared" / "data"
+    if not place.is_dir():
+        pytest.skip(f"no measured data at {place}")
+    return place
+
+
+@dataclass(frozen=True)
+class LrmArm:
+    """The shipped configurations of the LRM arm, with datasets made of plain arrays."""
+
+    configs: Path
+
+    def experiment(self, name="option1", *overrides):
+        """A shipped experiment by its file name."""
+        from armcal.run.experiment import Experiment
+
+        return Experiment.load(self.configs / f"{name}.yaml", overrides)
+
+    @staticmethod
+    def dataset(q, measured=None, **channels):
+        """Joint angles (N x 6), measured points (N x 3; zeros by default) and further channels."""
+        from armcal.base.dataset import Dataset
+
+        measured = np.zeros((len(q), 3)) if measured is None else measured
+        columns = {f"arm.q{i + 1}": q[:, i] for i in range(q.shape[1])}
+        columns |= {f"tracker.{axis}": measured[:, i] for i, axis in enumerate("xyz")}
+        columns |= {name: np.asarray(values, dtype=float) for name, values in channels.items()}
+        return Dataset(tuple(str(i) for i in range(len(q))), columns)
+
+    @staticmethod
+    def problem(experiment, dataset, evaluator="interpreted", parameters=None):
+        """The compiled problem of an experiment, perhaps with other parameters."""
+        from armcal.solve.problem import Problem
+
+        system = experiment.system
+        chosen = experiment.parameters if parameters is None else parameters
+        return Problem.build(system.arms, system.measurements, chosen, system.environment, dataset, evaluator)
+
+    @staticmethod
+    def vector(parameters, values):
+        """A value vector: the nominal one with some of the oracle's values in it."""
+        import oracle
+
+        vector = parameters.nominal()
+        for name, value in values.items():
+            vector[parameters.entries_of(oracle.armcal_name(name))] = value
+        return vector
+
+
+@pytest.fixture(scope="session")
+def lrm() -> LrmArm:
+    """The LRM arm as it ships."""
+    return LrmArm(ROOT / "configs" / "lrm_arm")

@@ -1,0 +1,1 @@
+"""SCARA arms for armcal."""

@@ -1,0 +1,219 @@
+"""The command line as a user meets it: exit codes, JSON, what a run leaves behind, interrupted runs."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from armcal.cli.main import cli
+from click.testing import CliRunner, Result
+
+ROOT = Path(__file__).resolve().parents[2]
+DEMO = str(ROOT / "configs" / "lrm_arm" / "demo.yaml")
+FAST = ["--set", "validation.folds=0", "--set", "evaluator=interpreted"]
+
+
+def armcal(*arguments: str) -> Result:
+    """One command in this process."""
+    return CliRunner().invoke(cli, list(arguments))
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished run of the shipped demonstration."""
+    folder = tmp_path_factory.mktemp("demo") / "run"
+    result = armcal("run", DEMO, "--out", str(folder), "--json")
+    assert result.exit_code == 0, result.output
+    return folder
+
+
+def test_a_run_leaves_every_file_and_says_the_same_in_json(demo: Path) -> None:
+    names = {path.name for path in demo.iterdir()}
+    assert names == {
+        "calibration.yaml",
+        "experiment.yaml",
+        "log.txt",
+        "metrics.json",
+        "report.html",
+        "residuals.csv",
+    }
+    metrics = json.loads((demo / "metrics.json").read_text())
+    for model in ("nominal", "calibrated"):
+        for records in ("train", "holdout", "cross_validated"):
+            assert set(metrics["error_mm"][model][records]) == {"mean", "rms", "p95", "max", "count"}
+    assert metrics["parameters"]["free"] == metrics["parameters"]["determined"] == 28
+    assert {"name", "status", "iterations", "seconds"} <= set(metrics["solver"])
+    assert metrics["seconds"]["total"] > 0
+
+
+def test_the_demonstration_finds_its_truth_within_its_intervals(demo: Path) -> None:
+    """Judged by the shipped truth, which the fit never sees; 28 intervals of 95 %."""
+    truth = yaml.safe_load((ROOT / "configs" / "lrm_arm" / "truth.yaml").read_text())
+    found = {p["name"]: p for p in yaml.safe_load((demo / "calibration.yaml").read_text())["parameters"] if p["free"]}
+    assert set(found) == set(truth)
+    inside = [found[n]["lower"] <= float(text.split()[0]) <= found[n]["upper"] for n, text in truth.items()]
+    assert sum(inside) >= 24
+    assert all(p["sd"] > 0 for p in found.values())
+
+
+def test_residuals_csv_agrees_with_the_metrics(demo: Path) -> None:
+    rows = list(csv.DictReader((demo / "residuals.csv").open()))
+    metrics = json.loads((demo / "metrics.json").read_text())["error_mm"]["calibrated"]
+    for name in ("train", "holdout"):
+        errors = [float(r["calibrated_mm"]) for r in rows if r["set"] == name]
+        assert len(errors) == metrics[name]["count"]
+        assert np.mean(errors) == pytest.approx(metrics[name]["mean"], abs=1e-5)
+    lengths = [np.hypot(np.hypot(float(r["dx_mm"]), float(r["dy_mm"])), float(r["dz_mm"])) for r in rows]
+    assert np.allclose(lengths, [float(r["calibrated_mm"]) for r in rows], atol=2e-6)
+
+
+def test_the_experiment_that_was_run_can_be_run_again(demo: Path, tmp_path: Path) -> None:
+    again = armcal(
+        "run",
+        str(demo / "experiment.yaml"),
+        "--data",
+        str(ROOT / "configs" / "lrm_arm" / "demo.csv"),
+        "--out",
+        str(tmp_path / "again"),
+        "--json",
+    )
+    assert again.exit_code == 0, again.output
+    first = json.loads((demo / "metrics.json").read_text())["error_mm"]
+    second = json.loads(again.stdout)["error_mm"]
+    for model in first:
+        for records in first[model]:
+            assert second[model][records] == pytest.approx(first[model][records], rel=1e-9)
+
+
+def test_predictions_are_what_the_residuals_were_taken_from(demo: Path, tmp_path: Path) -> None:
+    poses, out = ROOT / "configs" / "lrm_arm" / "demo.csv", tmp_path / "predicted.csv"
+    result = armcal("predict", str(demo / "calibration.yaml"), "--poses", str(poses), "--out", str(out))
+    assert result.exit_code == 0, result.output
+    predicted = {r["pose_id"]: r for r in csv.DictReader(out.open())}
+    measured = {r["pose_id"]: r for r in csv.DictReader(poses.open())}
+    assert list(predicted) == list(measured)
+    for row in csv.DictReader((demo / "residuals.csv").open()):
+        for axis in "xyz":
+            left = float(measured[row["pose_id"]][f"{axis}_mm"]) - float(predicted[row["pose_id"]][f"{axis}_mm"])
+            assert left == pytest.approx(float(row[f"d{axis}_mm"]), abs=1e-6)
+
+
+def test_the_shipped_measurements_are_what_the_shipped_simulation_makes(tmp_path: Path) -> None:
+    out = tmp_path / "made.csv"
+    assert armcal("simulate", DEMO, "--out", str(out)).exit_code == 0
+    made = np.genfromtxt(out, delimiter=",", names=True)
+    shipped = np.genfromtxt(ROOT / "configs" / "lrm_arm" / "demo.csv", delimiter=",", names=True)
+    assert made.dtype.names == shipped.dtype.names
+    for name in made.dtype.names:
+        assert np.allclose(made[name], shipped[name], rtol=0, atol=1e-9), name
+
+
+def test_check_solves_nothing_and_tells_rank_and_excitation() -> None:
+    result = armcal("check", DEMO, "--json")
+    assert result.exit_code == 0, result.output
+    told = json.loads(result.stdout)
+    assert told["parameters"]["rank"] == 28 and told["equations"] == 450
+    assert told["excitation_rad_or_m"]["arm.q2"]["levels"] == 3
+
+
+def test_an_earlier_run_is_kept_and_foreign_files_are_not_touched(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    for _ in range(2):
+        assert armcal("run", DEMO, "--out", str(folder), "-q", *FAST).exit_code == 0
+    assert (folder / "earlier" / "1" / "calibration.yaml").is_file()
+    (folder / "measured_in_march.csv").write_text("mine")
+    refused = armcal("run", DEMO, "--out", str(folder), *FAST)
+    assert refused.exit_code == 2 and "measured_in_march.csv" in refused.output
+    assert (folder / "measured_in_march.csv").read_text() == "mine"
+
+
+def test_a_fit_that_does_not_converge_ends_with_3_and_leaves_no_calibration(tmp_path: Path) -> None:
+    for solver in ("ipopt", "cvxpy"):
+        folder = tmp_path / solver
+        few = ["--set", f"estimator.type={solver}", "--set", "estimator.max_iterations=1"]
+        result = armcal("run", DEMO, "--out", str(folder), *FAST, *few)
+        assert result.exit_code == 3, result.output
+        assert "did not converge" in result.output
+        assert not (folder / "calibration.yaml").exists()
+        assert (folder / "calibration.yaml.not-converged").is_file()
+
+
+def test_what_did_not_converge_cannot_be_used(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    armcal("run", DEMO, "--out", str(folder), *FAST, "--set", "estimator.max_iterations=1")
+    poses, out = ROOT / "configs" / "lrm_arm" / "demo.csv", tmp_path / "p.csv"
+    kept = str(folder / "calibration.yaml.not-converged")
+    result = armcal("predict", kept, "--poses", str(poses), "--out", str(out))
+    assert result.exit_code == 2 and not out.exists()
+    assert "converge" in result.output
+
+
+def test_a_calibration_that_was_edited_or_is_of_another_schema_is_refused_and_kept(demo: Path, tmp_path: Path) -> None:
+    text = (demo / "calibration.yaml").read_text()
+    poses, out = str(ROOT / "configs" / "lrm_arm" / "demo.csv"), str(tmp_path / "p.csv")
+    broken = {
+        "edited": text.replace("mass_kg: 0.1234", "mass_kg: 0.2234", 1),
+        "schema": text.replace("armcal_calibration: 1", "armcal_calibration: 99", 1),
+        "cut": text[: len(text) // 2],
+        "other": "name: not a calibration\n",
+    }
+    for name, content in broken.items():
+        path = tmp_path / f"{name}.yaml"
+        assert content != text
+        path.write_text(content)
+        result = armcal("predict", str(path), "--poses", poses, "--out", out)
+        assert result.exit_code == 2, (name, result.output)
+        assert path.name in result.output and path.read_text() == content
+
+
+def test_quiet_says_nothing_and_json_is_one_document(tmp_path: Path) -> None:
+    quiet = armcal("run", DEMO, "--out", str(tmp_path / "q"), "-q", *FAST)
+    assert (quiet.exit_code, quiet.stdout) == (0, "")
+    loud = armcal("run", DEMO, "--out", str(tmp_path / "j"), "--json", *FAST)
+    assert json.loads(loud.stdout)["folder"].endswith("j")
+
+
+def test_errors_are_json_too_where_json_was_asked_for() -> None:
+    done = _process("check", "nowhere.yaml", "--json")
+    assert done.returncode == 2 and "Traceback" not in done.stderr
+    assert "nowhere.yaml" in json.loads(done.stdout)["error"]["message"]
+
+
+@pytest.mark.parametrize("moment", [0.3, 0.7, 0.9, 1.1, 1.3])
+def test_a_killed_run_leaves_the_earlier_calibration_whole(demo: Path, tmp_path: Path, moment: float) -> None:
+    folder = tmp_path / "run"
+    assert armcal("run", DEMO, "--out", str(folder), "-q", *FAST).exit_code == 0
+    before = (folder / "calibration.yaml").read_bytes()
+    process = subprocess.Popen([sys.executable, "-m", "armcal.cli", "run", DEMO, "--out", str(folder), "-q"])
+    time.sleep(moment)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    present = [p for p in (folder / "calibration.yaml", folder / "earlier" / "1" / "calibration.yaml") if p.exists()]
+    assert any(p.read_bytes() == before for p in present)
+    for path in present:
+        assert yaml.safe_load(path.read_text())["armcal_calibration"] == 1
+    assert armcal("run", DEMO, "--out", str(folder), "-q", *FAST).exit_code == 0
+
+
+def test_a_missing_library_is_named_and_only_hurts_who_asks_for_it(tmp_path: Path) -> None:
+    (tmp_path / "cvxpy.py").write_text("raise ImportError('no cvxpy on this machine')\n")
+    with_cvxpy = _process("run", DEMO, "--out", str(tmp_path / "a"), "--set", "estimator.type=cvxpy", path=tmp_path)
+    assert with_cvxpy.returncode == 2 and "no cvxpy on this machine" in with_cvxpy.stderr
+    assert "Traceback" not in with_cvxpy.stderr
+    assert _process("run", DEMO, "--out", str(tmp_path / "b"), *FAST, path=tmp_path).returncode == 0
+
+
+def _process(*arguments: str, path: Path | None = None) -> subprocess.CompletedProcess[str]:
+    """One command in a process of its own, perhaps with a folder that hides installed modules."""
+    environment = {**os.environ, **({"PYTHONPATH": str(path)} if path else {})}
+    command = [sys.executable, "-m", "armcal.cli", *arguments]
+    return subprocess.run(command, capture_output=True, text=True, env=environment, timeout=120, check=False)

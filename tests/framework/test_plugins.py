@@ -1,0 +1,341 @@
+"""Plugins: light registration, the contract's checks, a third party's arm from pip to result, broken plugins."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import shutil
+import subprocess
+import sys
+from importlib.metadata import EntryPoint
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from armcal.errors import PluginError
+from armcal.plugins import Component, PluginRegistry, discover
+from armcal.testing.contract import CheckResult, check_component
+
+ROOT = Path(__file__).parents[2]
+DATA = ROOT / "tests" / "data"
+SCARA = DATA / "scara_plugin"
+OURS = ("cvxpy", "ipopt", "joints", "mdh", "simulation", "tracker")
+HEAVY = ("numpy", "casadi", "matplotlib", "pydantic", "scipy", "cvxpy")
+Ran = subprocess.CompletedProcess[str]
+
+
+def python(*arguments: str, path: Path | None = None, cwd: Path | None = None) -> Ran:
+    environment = {**os.environ, "PYTHONPATH": str(path or ""), "COLUMNS": "80", "ARMCAL_CC": "none"}
+    return subprocess.run(
+        [sys.executable, *arguments], capture_output=True, text=True, env=environment, cwd=cwd, check=False
+    )
+
+
+def armcal(*arguments: str, path: Path | None = None, cwd: Path | None = None) -> Ran:
+    return python("-m", "armcal.cli", *arguments, path=path, cwd=cwd)
+
+
+# Light registration
+
+
+@pytest.mark.parametrize("arguments", [("plugins", "list"), ("--help",)])
+def test_listing_and_help_import_nothing_heavy(arguments: tuple[str, ...]) -> None:
+    code = (
+        "import sys\nfrom armcal.cli.main import cli\n"
+        f"cli.main(args={list(arguments)!r}, prog_name='armcal', standalone_mode=False)\n"
+        f"print('heavy:', [name for name in {HEAVY!r} if name in sys.modules])"
+    )
+    ran = python("-c", code)
+    assert ran.returncode == 0, ran.stderr
+    assert ran.stdout.splitlines()[-1] == "heavy: []"
+
+
+def test_our_plugins_load() -> None:
+    registry = discover()
+    assert not [p for p in registry.plugins if p.distribution == "armcal" and p.fault]
+    assert set(OURS) <= {p.name for p in registry.plugins}
+
+
+@pytest.mark.parametrize("plugin", OURS)
+def test_our_plugins_keep_the_contract(plugin: str) -> None:
+    ran = armcal("plugins", "check", plugin, "-v")
+    assert ran.returncode == 0, ran.stdout + ran.stderr
+    passed, _, total = ran.stdout.splitlines()[-1].removeprefix(f"{plugin}: ").split()[:3]
+    assert passed == total
+    assert int(total) > 10
+    assert "not run" not in ran.stdout or plugin == "tracker"
+
+
+# The checks find faults
+
+
+def checked(monkeypatch: pytest.MonkeyPatch, kind: str, name: str) -> list[CheckResult]:
+    monkeypatch.syspath_prepend(str(DATA / "faulty_components"))
+    return check_component(Component(kind, name, f"faulty_components:{name}", "", "faulty"))
+
+
+FAULTS = [
+    ("model", "NoSuchClass", "it imports"),
+    ("model", "NoSettings", "checked settings"),
+    ("model", "LooseSettings", "unknown key"),
+    ("model", "ForgetfulSettings", "to_config"),
+    ("model", "UntypedSettings", "typed or documented"),
+    ("model", "NeedsExample", "example settings are accepted"),
+    ("model", "WrongExample", "example settings are accepted"),
+    ("model", "ListExample", "EXAMPLE is a mapping"),
+    ("model", "ExitsWhenBuilt", "it builds"),
+    ("model", "NoJoints", "joints are named"),
+    ("model", "TwinJoints", "joints are named"),
+    ("model", "OtherJoints", "one joint for each name"),
+    ("model", "DottedParameter", "parameters are named"),
+    ("model", "GlobbedParameter", "parameters are named"),
+    ("model", "TwinParameter", "parameters are named"),
+    ("model", "NoParameter", "parameters are named"),
+    ("model", "EndlessParameter", "nominal values"),
+    ("model", "OutsideParameter", "nominal values"),
+    ("model", "ShortParameter", "nominal values"),
+    ("model", "UnscaledParameter", "scales"),
+    ("model", "SingularParameter", "scales"),
+    ("model", "MillimetreParameter", "units are SI"),
+    ("model", "FurlongParameter", "units are SI"),
+    ("model", "ForeignSymbol", "its parameters alone"),
+    ("model", "Branching", "does not branch"),
+    ("model", "SlantedAxis", "one joint for each name"),
+    ("model", "LostFrame", "one joint for each name"),
+    ("model", "Shearing", "rigid motions"),
+    ("model", "Mirrored", "rigid motions"),
+    ("model", "Kinked", "derivatives agree"),
+    ("effect", "TwoDisplacements", "a displacement for every joint"),
+    ("effect", "BranchingDisplacement", "displacements do not branch"),
+    ("effect", "SingularDisplacement", "displacements are finite"),
+    ("effect", "FarSite", "site and unit directions"),
+    ("effect", "AxislessBase", "site and unit directions"),
+    ("effect", "LongDirection", "site and unit directions"),
+    ("effect", "WideLaw", "one deflection a coordinate"),
+    ("effect", "SingularLaw", "zero load"),
+    ("effect", "DeadZoneLaw", "branch neither"),
+    ("measurement", "UnknownDimension", "channels have names"),
+    ("measurement", "ManyNoises", "noise is positive"),
+    ("measurement", "NoNoise", "noise is positive"),
+    ("measurement", "Biased", "residual is zero"),
+    ("measurement", "UnknownOutput", "outputs are channels"),
+    ("measurement", "UnknownArm", "it builds"),
+    ("measurement", "RefusesArms", "it builds"),
+    ("measurement", "SingularMeasurement", "Jacobian"),
+    ("reader", "Unreadable", "it reads"),
+    ("reader", "CarelessReader", "missing file"),
+    ("reader", "InventiveReader", "missing file"),
+    ("simulator", "Simulator", "the same each time"),
+    ("simulator", "SilentSimulator", "the same each time"),
+    ("estimator", "Estimator", "finds the truth"),
+    ("estimator", "Unconverged", "reports that it converged"),
+    ("estimator", "BoundBreaker", "keeps to the bounds"),
+    ("estimator", "Raising", "a value for every entry"),
+    ("estimator", "Boastful", "cut short"),
+]
+
+
+@pytest.mark.parametrize(("kind", "name", "check"), FAULTS, ids=[name for _, name, _ in FAULTS])
+def test_a_fault_is_found(monkeypatch: pytest.MonkeyPatch, kind: str, name: str, check: str) -> None:
+    failed = [result for result in checked(monkeypatch, kind, name) if result.fault]
+    assert any(check in result.check for result in failed), failed
+    assert all("\n" not in result.fault for result in failed)
+
+
+SOUND = [
+    ("model", "Model"),
+    ("effect", "Effect"),
+    ("effect", "RecordedDisplacement"),
+    ("measurement", "Measurement"),
+    ("measurement", "TwoArms"),
+    ("reader", "Reader"),
+    ("simulator", "UnconfiguredSimulator"),
+]
+
+
+@pytest.mark.parametrize(("kind", "name"), SOUND, ids=[name for _, name in SOUND])
+def test_what_is_sound_passes(monkeypatch: pytest.MonkeyPatch, kind: str, name: str) -> None:
+    results = checked(monkeypatch, kind, name)
+    assert [result for result in results if result.fault] == []
+    assert len(results) > 4
+
+
+def test_a_check_that_cannot_run_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
+    results = checked(monkeypatch, "simulator", "UnconfiguredSimulator")
+    assert any(result.check.endswith("(not run: it has no EXAMPLE and needs settings)") for result in results)
+
+
+# A third party's plugin
+
+
+@pytest.fixture(scope="module")
+def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The example plugin of docs/plugins.md, installed by pip where only PYTHONPATH finds it."""
+    for needed in ("pip", "hatchling"):
+        if importlib.util.find_spec(needed) is None:
+            pytest.skip(f"{needed} is not installed here, and the example plugin is built with it")
+    source, target = tmp_path_factory.mktemp("source") / "scara", tmp_path_factory.mktemp("site")
+    shutil.copytree(SCARA, source)
+    options = ("--quiet", "--no-deps", "--no-build-isolation", "--no-index", "--disable-pip-version-check")
+    ran = python("-m", "pip", "install", *options, "--target", str(target), str(source))
+    assert ran.returncode == 0, ran.stderr
+    return target
+
+
+def test_an_installed_plugin_is_listed_and_checked(installed: Path) -> None:
+    assert "scara" not in armcal("plugins", "list").stdout
+    listed = armcal("plugins", "list", path=installed)
+    assert "scara  (armcal-scara 1.0.0, armcal_scara.plugin)" in listed.stdout
+    found = armcal("plugins", "check", "scara", "-v", path=installed)
+    assert found.returncode == 0, found.stdout + found.stderr
+    assert "springs on it settle under gravity" in found.stdout
+
+
+def test_an_installed_arm_is_calibrated_from_yaml(installed: Path, tmp_path: Path) -> None:
+    for name in ("experiment.yaml", "truth.yaml"):
+        shutil.copy(SCARA / name, tmp_path)
+    exact = ("--set", "simulation.noise_mm=0")
+    simulated = armcal(
+        "simulate", "experiment.yaml", "--out", "measurements.csv", *exact, path=installed, cwd=tmp_path
+    )
+    assert simulated.returncode == 0, simulated.stderr
+    ran = armcal("run", "experiment.yaml", "--out", "result", path=installed, cwd=tmp_path)
+    assert ran.returncode == 0, ran.stdout + ran.stderr
+    content = yaml.safe_load((tmp_path / "result" / "calibration.yaml").read_text(encoding="utf-8"))
+    found = {entry["name"]: entry["value"] for entry in content["parameters"] if entry["free"]}
+    degree = 0.017453292519943295
+    assert found == pytest.approx(
+        {
+            "arm.scara.upper": 0.2513,
+            "arm.scara.fore": 0.1992,
+            "arm.scara.height": 0.302,
+            "arm.scara.shoulder_zero": 1.5 * degree,
+            "arm.scara.elbow_zero": -0.8 * degree,
+            "arm.spring.k1": 0.004,
+            "arm.spring.k2": 0.007,
+        },
+        abs=1e-8,
+    )
+
+
+def test_the_guide_quotes_the_example_in_full() -> None:
+    guide = (ROOT / "docs" / "plugins.md").read_text(encoding="utf-8")
+    for file in sorted(path for path in SCARA.rglob("*") if path.suffix in (".py", ".toml", ".yaml")):
+        if file.name != "__init__.py":
+            assert file.read_text(encoding="utf-8").strip() in guide, file
+
+
+def test_the_framework_knows_no_third_party_arm() -> None:
+    texts = [path.read_text(encoding="utf-8") for path in (ROOT / "framework").rglob("*.py")]
+    assert not any("scara" in text.lower() for text in texts)
+
+
+# Broken plugins
+
+GOOD = """
+from armcal.hooks import hookimpl
+
+@hookimpl
+def armcal_register_models(register):
+    register("NAME", "TARGET")
+"""
+BROKEN = {
+    "import": ("import no_such_module_of_anybody", "ModuleNotFoundError"),
+    "syntax": ("def broken(:\n    pass", "SyntaxError"),
+    "misspelt": (GOOD.replace("models", "modells"), "unknown hook 'armcal_register_modells'"),
+    "unmarked": (GOOD.replace("@hookimpl", ""), "armcal_register_models is not marked"),
+    "raises": (GOOD.replace('register("NAME", "TARGET")', "1 / 0"), "ZeroDivisionError"),
+    "exits": ("raise SystemExit(4)", "SystemExit"),
+    "no_colon": (GOOD.replace("TARGET", "some.module"), "expected module:attribute"),
+    "lines": ("raise RuntimeError('one\\ntwo')", "one two"),
+}
+
+
+def write_plugin(site: Path, name: str, text: str) -> EntryPoint:
+    """A plugin as an installed distribution: a module and its metadata."""
+    module = f"broken_{name}"
+    (site / f"{module}.py").write_text(text, encoding="utf-8")
+    folder = site / f"{module}-1.0.dist-info"
+    folder.mkdir()
+    (folder / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {module}\nVersion: 1.0\n", encoding="utf-8")
+    (folder / "entry_points.txt").write_text(f"[armcal]\n{name} = {module}\n", encoding="utf-8")
+    return EntryPoint(name, module, "armcal")
+
+
+@pytest.fixture
+def experiment(tmp_path: Path) -> Path:
+    """A configuration of our own components that simulates."""
+    folder = tmp_path / "experiment"
+    folder.mkdir()
+    content: dict[str, Any] = yaml.safe_load((SCARA / "experiment.yaml").read_text(encoding="utf-8"))
+    rows = [{"a_mm": 200, "alpha_deg": 90}, {"a_mm": 100}]
+    content["arms"] = {"arm": {"model": {"type": "mdh", "convention": "standard", "rows": rows}}}
+    content["simulation"]["poses"] = {"count": 4, "levels_deg": {"q1": [0, 10], "q2": [0, 20]}}
+    content["parameters"] = {}
+    (folder / "experiment.yaml").write_text(yaml.safe_dump(content), encoding="utf-8")
+    (folder / "truth.yaml").write_text("arm.mdh.a1: 201 mm\n", encoding="utf-8")
+    return folder
+
+
+@pytest.mark.parametrize("name", BROKEN)
+def test_a_broken_plugin_warns_once_and_breaks_nothing(name: str, tmp_path: Path, experiment: Path) -> None:
+    text, fault = BROKEN[name]
+    write_plugin(tmp_path, name, text)
+    listed = armcal("plugins", "list", path=tmp_path)
+    assert listed.returncode == 0, listed.stderr
+    assert f"does not load: {fault.partition(' ')[0]}" in listed.stdout or fault in listed.stdout
+    assert "mdh" in listed.stdout
+    ran = armcal("simulate", "experiment.yaml", "--out", "data.csv", path=tmp_path, cwd=experiment)
+    assert ran.returncode == 0, ran.stderr
+    assert len(ran.stderr.splitlines()) == 1, ran.stderr
+    assert ran.stderr.startswith(f"warning: plugin {name} (broken_{name}) is left out: ")
+    assert fault in ran.stderr
+    assert armcal("plugins", "check", name, path=tmp_path).returncode == 2
+
+
+def test_asking_for_a_broken_plugins_component_is_refused(tmp_path: Path, experiment: Path) -> None:
+    write_plugin(tmp_path, "import", BROKEN["import"][0])
+    asked = ("--set", "arms.arm.model.type=lost")
+    ran = armcal("simulate", "experiment.yaml", "--out", "data.csv", *asked, path=tmp_path, cwd=experiment)
+    assert ran.returncode == 2
+    refusal = ran.stderr[ran.stderr.index("armcal: ") :]
+    assert "no plugin offers a model called 'lost'" in refusal
+    assert "import: ModuleNotFoundError: No module named 'no_such_module_of_anybody'" in refusal
+    assert "Traceback" not in ran.stderr
+
+
+def test_a_component_that_does_not_import_is_refused(tmp_path: Path, experiment: Path) -> None:
+    text = GOOD.replace("NAME", "lost").replace("TARGET", "no_such_module_of_anybody:Model")
+    write_plugin(tmp_path, "late", text)
+    asked = ("--set", "arms.arm.model.type=lost")
+    ran = armcal("simulate", "experiment.yaml", "--out", "data.csv", *asked, path=tmp_path, cwd=experiment)
+    assert ran.returncode == 2
+    assert "the model 'lost' of the plugin 'late' does not load: ModuleNotFoundError" in ran.stderr
+    assert armcal("plugins", "check", "late", path=tmp_path).returncode == 2
+
+
+def registry_of(monkeypatch: pytest.MonkeyPatch, site: Path, **texts: str) -> PluginRegistry:
+    monkeypatch.syspath_prepend(str(site))
+    return discover([write_plugin(site, name, text) for name, text in texts.items()])
+
+
+def test_two_plugins_of_one_name_are_both_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    one, two = (GOOD.replace("NAME", "arm").replace("TARGET", f"{n}_module:Arm") for n in ("one", "two"))
+    registry = registry_of(monkeypatch, tmp_path, one=one, two=two)
+    with pytest.raises(PluginError, match=r"one \(one_module:Arm\) and two \(two_module:Arm\)"):
+        registry.find("model", "arm")
+
+
+def test_an_unknown_type_gives_the_nearest_name() -> None:
+    with pytest.raises(PluginError, match="Did you mean 'mdh'"):
+        discover().find("model", "mhd")
+    with pytest.raises(PluginError, match="Known: mdh"):
+        discover().find("model", "zzzzzz")
+
+
+def test_an_unknown_plugin_lists_the_installed_ones() -> None:
+    ran = armcal("plugins", "check", "nothing")
+    assert ran.returncode == 2
+    assert "no plugin is called 'nothing'" in ran.stderr
+    assert "mdh" in ran.stderr
