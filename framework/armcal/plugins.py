@@ -22,7 +22,7 @@ GROUP = "armcal"
 class Component:
     """Something a configuration can name.
 
-    ``target`` is ``module:attribute``; ``plugin`` the entry point that registered it.
+    ``target`` is ``module:attribute``; ``plugin`` the entry point that registered it, and ``module`` what that names.
     """
 
     kind: str
@@ -30,6 +30,7 @@ class Component:
     target: str
     summary: str
     plugin: str
+    module: str = ""
 
     def load(self) -> Any:
         """The component's class.
@@ -70,6 +71,10 @@ class PluginRegistry:
     def faults(self) -> tuple[PluginInfo, ...]:
         """Plugins that failed to load."""
         return tuple(plugin for plugin in self.plugins if plugin.fault)
+
+    def announced_by(self, plugin: PluginInfo) -> tuple[Component, ...]:
+        """The components of one plugin, also where two plugins share a name."""
+        return tuple(c for c in self.components if (c.plugin, c.module) == (plugin.name, plugin.module))
 
     @cached_property
     def _by_name(self) -> Mapping[tuple[str, str], list[Component]]:
@@ -135,7 +140,7 @@ def _load(manager: pluggy.PluginManager, point: EntryPoint) -> tuple[str, list[C
         alone.register(module, name)
         alone.check_pending()
         _require_marks(module)
-        announced = _announced(alone, point.name)
+        announced = _announced(alone, point)
         manager.register(module, name)
     except (Exception, SystemExit) as fault:  # whatever a third party's module does, the others must work
         return _said(fault), []
@@ -149,21 +154,20 @@ def _said(fault: BaseException) -> str:
 
 def _require_marks(module: Any) -> None:
     """Refuse a hook that would be passed over without a word."""
-    for name in vars(hooks):
-        if name.startswith(f"{hooks.PROJECT}_") and callable(getattr(module, name, None)):
-            marked = hasattr(getattr(module, name), f"{hooks.PROJECT}_impl")
-            if not marked:
-                raise ValueError(f"{name} is not marked: put @hookimpl before it")
+    for name, specified in vars(hooks).items():
+        own = getattr(module, name, None) if name.startswith(f"{hooks.PROJECT}_") else None
+        if callable(own) and own is not specified and not hasattr(own, f"{hooks.PROJECT}_impl"):
+            raise ValueError(f"{name} is not marked: put @hookimpl before it")
 
 
-def _announced(alone: pluggy.PluginManager, plugin: str) -> list[Component]:
+def _announced(alone: pluggy.PluginManager, point: EntryPoint) -> list[Component]:
     components: list[Component] = []
     for kind, hook in hooks.KINDS.items():
 
         def register(name: str, target: str, summary: str = "", kind: str = kind) -> None:
             if ":" not in target:
                 raise ValueError(f"the target of {name!r} is {target!r}; expected module:attribute")
-            components.append(Component(kind, name, target, summary, plugin))
+            components.append(Component(kind, name, target, summary, point.name, point.value))
 
         getattr(alone.hook, hook)(register=register)
     return components

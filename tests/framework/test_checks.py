@@ -1,9 +1,9 @@
-"""Checks of records that hold for every source."""
+"""Checks of records that hold for every source, and the CSV writer on its own."""
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,12 +12,14 @@ from armcal.base.units import from_unit
 from armcal.errors import EXIT_BAD_INPUT, DataError, Location
 from armcal.measure import checks
 from armcal.measure.checks import Layout, check_dataset, layout_of, refuse_joint_count
+from armcal.measure.csv_writer import column_names, write_csv
 from armcal.measure.reader import WantedChannel
 from numpy.typing import NDArray
 
 Values = NDArray[np.float64]
 JOINTS = ("arm.q1", "arm.q2")
 POSITION = ("tracker.x", "tracker.y", "tracker.z")
+WANTED = [WantedChannel("arm.q1", ("arm.q1", "q1"), "angle", True)]
 
 
 def layout(unit: str = "deg", by_line: bool = True) -> Layout:
@@ -254,12 +256,25 @@ def test_joint_counts(names: list[str], counts: str | None, field: str | None) -
     assert found.startswith(f"poses.csv:1, {field}: the file has {counts}") and "Use this arm's file" in found
 
 
-def test_all_checks_are_fast() -> None:
-    random_ = np.random.default_rng(0)
-    channels = {name: random_.uniform(-1, 1, 100_000) for name in (*JOINTS, *POSITION)}
-    channels["time"] = np.arange(100_000.0)
-    start = time.perf_counter()
-    check_dataset(
-        Dataset(tuple(map(str, range(100_000))), channels), Layout(joints=JOINTS, revolute=JOINTS, measured=POSITION)
-    )
-    assert time.perf_counter() - start < 3  # about 0.15 s on an idle machine
+
+def test_writing_replaces_whole_or_not_at_all(tmp_path: Path) -> None:
+    target = tmp_path / "out.csv"
+    target.write_text("old")
+    dataset = Dataset(("1",), {"arm.q1": np.array([1.0])}, extra={"q1_deg": ("x",)})
+    with pytest.raises(DataError, match=r"out\.csv, q1_deg: two columns would be called q1_deg\. Rename"):
+        write_csv(target, dataset, WANTED)
+    with pytest.raises(DataError, match=r"no column is known for the channel arm\.q1"):
+        write_csv(target, dataset, [])
+    assert target.read_text() == "old"
+    write_csv(target, Dataset(("1",), {"arm.q1": np.array([1.0])}), WANTED, {"angle": "rad"})
+    assert target.read_text() == "pose_id,q1_rad\n1,1.0\n"
+    assert [path.name for path in tmp_path.iterdir()] == ["out.csv"]
+    with pytest.raises(DataError, match=r"cannot be written.*Check that its folder"):
+        write_csv(tmp_path / "none" / "out.csv", Dataset((), {}), WANTED)
+    with pytest.raises(ValueError, match="expected one of rad, deg, mrad"):
+        column_names(WANTED, {"angle": "mm"})
+
+
+def test_two_arms_keep_their_own_names() -> None:
+    both = [WantedChannel(f"{arm}.q1", (f"{arm}.q1", "q1"), "angle", True) for arm in ("left", "right")]
+    assert column_names(both) == {"left.q1": ("left.q1_deg", "deg"), "right.q1": ("right.q1_deg", "deg")}

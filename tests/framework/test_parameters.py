@@ -24,7 +24,6 @@ MIXED = Parameters(
     )
 )
 ALL_FREE = MIXED.with_free(MIXED.names)
-DOF = {"arm.mdh.theta1": 1, "arm.base": 6, "arm.spring.k1": 1, "arm.axis2": 4, "arm.joint3.C": 6, "arm.mdh.d1": 1}
 
 
 def random_increment(parameters, seed=0):

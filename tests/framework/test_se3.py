@@ -38,7 +38,7 @@ def test_a_turn_about_a_coordinate_axis_is_scipys(axis):
     for angle in np.random.default_rng(0).uniform(-7, 7, 50):
         found = evaluated(lambda a: se3.rotation_about(axis, a).rotation, angle)
         expected = Rotation.from_rotvec(angle * UNITS[axis]).as_matrix()
-        np.testing.assert_allclose(found, expected, rtol=0, atol=4e-16)
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-15)
 
 
 @pytest.mark.parametrize("axis", AXES)

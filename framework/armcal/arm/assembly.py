@@ -17,7 +17,7 @@ from armcal.base.se3 import Expression, Transform
 
 @dataclass(frozen=True)
 class MassSpec:
-    """A mass as it is stated: kg, centre in m in a named frame, and the last joint it loads (None: the physical one)."""
+    """A mass as stated: kg, centre in m in a named frame, and the last joint it loads (None: the physical one)."""
 
     name: str
     mass: float

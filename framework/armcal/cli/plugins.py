@@ -39,10 +39,9 @@ def _show(plugin: PluginInfo, registry: PluginRegistry, quiet: bool, verbose: bo
     click.echo(f"{plugin.name}  ({plugin.distribution} {plugin.version}, {plugin.module})")
     if plugin.fault:
         click.echo(f"  does not load: {plugin.fault}")
-    for component in registry.components:
-        if component.plugin == plugin.name:
-            place = f"  [{component.target}]" if verbose else ""
-            click.echo(f"  {component.kind:<12} {component.name:<18} {component.summary}{place}")
+    for component in registry.announced_by(plugin):
+        place = f"  [{component.target}]" if verbose else ""
+        click.echo(f"  {component.kind:<12} {component.name:<18} {component.summary}{place}")
 
 
 def _content(registry: PluginRegistry) -> dict[str, Any]:
@@ -57,8 +56,7 @@ def _content(registry: PluginRegistry) -> dict[str, Any]:
                 "fault": plugin.fault or None,
                 "components": [
                     {"kind": c.kind, "name": c.name, "target": c.target, "summary": c.summary}
-                    for c in registry.components
-                    if c.plugin == plugin.name
+                    for c in registry.announced_by(plugin)
                 ],
             }
             for plugin in registry.plugins
@@ -76,15 +74,16 @@ def check_plugin(name: str, as_json: bool, quiet: bool, verbose: bool) -> None:
     from armcal.testing.contract import check_plugin as checks_of
 
     registry = discover()
-    plugin = next((p for p in registry.plugins if p.name == name), None)
-    if plugin is None:
+    chosen = [plugin for plugin in registry.plugins if plugin.name == name]
+    if not chosen:
         known = ", ".join(p.name for p in registry.plugins)
         raise PluginError(f"no plugin is called {name!r}.", hint=f"Installed: {known}.")
-    results = checks_of(plugin, registry)
+    results = [result for plugin in chosen for result in checks_of(plugin, registry)]
+    broken = "; ".join(plugin.fault for plugin in chosen if plugin.fault)
     failed = [result for result in results if result.fault]
     if as_json:
         rows = [{"component": r.component, "check": r.check, "fault": r.fault or None} for r in results]
-        click.echo(json.dumps({"plugin": name, "fault": plugin.fault or None, "checks": rows}, indent=2))
+        click.echo(json.dumps({"plugin": name, "fault": broken or None, "checks": rows}, indent=2))
     elif not quiet:
         for result in results:
             if verbose or result.fault:
@@ -92,5 +91,5 @@ def check_plugin(name: str, as_json: bool, quiet: bool, verbose: bool) -> None:
                 click.echo(f"{mark} {result.component}: {result.check}{fault}")
         click.echo(f"{name}: {len(results) - len(failed)} of {len(results)} checks passed.")
     if failed:
-        click.echo(f"armcal: {name}: {plugin.fault or 'it breaks the plugin contract'}", err=True)
+        click.echo(f"armcal: {name}: {broken or 'it breaks the plugin contract'}", err=True)
         sys.exit(EXIT_BAD_INPUT)

@@ -29,14 +29,15 @@ def predict(voice: Voice, calibration: Path, poses: Path, out: Path) -> None:
     system = loaded.system
     reader_class = registry.find("reader", "csv").load()
     reader = reader_class(reader_class.Settings(path=ConfigText(str(poses))))
-    wanted = wanted_channels(system.arms, system.measurements, measured=False)
-    commands = reader.read(ReadRequest(system.arms, system.measurements, wanted))
+    # Measured columns, if there are any, are not read: every row of commands gets its prediction.
+    commands = reader.read(ReadRequest(system.arms, {}, wanted_channels(system.arms, {}, measured=False)))
     for text in commands.warnings:
         voice.warn(text)
     channels, _ = loaded.predict(commands)
     if out.resolve() == poses.resolve():
         raise DataError("it is the file of poses itself.", where=Location(str(out)), hint="Give another --out.")
     predicted = replace(commands, channels=channels, extra={})
+    wanted = wanted_channels(system.arms, system.measurements, measured=False)
     write_csv(out, predicted, [channel for channel in wanted if channel.channel in channels])
     voice.result({"poses": len(commands), "set_aside": len(commands.set_aside), "out": str(out)})
     voice.out.print(f"{len(commands)} poses predicted: {out}", markup=False)

@@ -13,7 +13,7 @@ from armcal.base.se3 import Expression
 
 @dataclass(frozen=True)
 class Channel:
-    """One measured number of a record: its local name (``x``) and dimension (``length``, ``angle``, ``1``)."""
+    """One measured number: its local name (``x``) and dimension (``length``, ``angle``, ``dimensionless``)."""
 
     name: str
     dimension: str

@@ -8,6 +8,7 @@ from typing import Protocol
 
 from armcal.arm.assembly import Arm
 from armcal.base.dataset import Dataset
+from armcal.base.units import DIMENSIONLESS
 from armcal.measure.measurement import Measurement
 
 
@@ -84,7 +85,7 @@ def _arm_channels(arm: Arm, alone: bool) -> Iterator[WantedChannel]:
         yield WantedChannel(own, _names(own, (joint,), alone), arm.joint_dimensions[index - 1], True)
         approach = (f"approach{index}", f"approach_{joint}")
         yield WantedChannel(
-            f"{arm.name}.approach.{joint}", _names(f"{arm.name}.{approach[0]}", approach, alone), "1", False
+            f"{arm.name}.approach.{joint}", _names(f"{arm.name}.{approach[0]}", approach, alone), DIMENSIONLESS, False
         )
 
 

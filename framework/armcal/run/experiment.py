@@ -17,6 +17,7 @@ from armcal.config.system import System, build_component, build_system
 from armcal.config.validate import validate
 from armcal.config.yaml_source import ConfigSource, load_config
 from armcal.errors import ConfigError
+from armcal.measure.environment import noticed
 from armcal.measure.reader import Reader, ReadRequest, wanted_channels
 from armcal.plugins import PluginRegistry, discover
 from armcal.run.settings import ExperimentSettings
@@ -101,7 +102,7 @@ class Experiment:
         reader, _ = build_component(self.source, self.registry, "reader", ("data",))
         dataset = reader.read(self.request(measured=True))
         self._require_payload(dataset)
-        return dataset
+        return noticed(dataset)
 
     def request(self, *, measured: bool) -> ReadRequest:
         """What a reader should look for; with ``measured`` the measured values are required."""

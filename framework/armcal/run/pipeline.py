@@ -20,8 +20,9 @@ from armcal.errors import DataError, Location
 from armcal.measure.id_list import read_ids
 from armcal.run.experiment import Experiment
 from armcal.run.result import ErrorTable, RecordErrors, RunResult
-from armcal.solve.estimator import Progress, estimate, no_progress, require_solvable
+from armcal.solve.estimator import Estimate, Progress, estimate, no_progress, require_solvable
 from armcal.solve.problem import FactorRecords, Problem
+from armcal.solve.suggestion import suggest
 from armcal.solve.validation import (
     Split,
     cross_validate,
@@ -31,7 +32,7 @@ from armcal.solve.validation import (
     split_by_id,
     summarise,
 )
-from armcal.solve.verdict import judge
+from armcal.solve.verdict import Verdict, judge
 from armcal.use.calibration import identity_of
 
 _MM = 1000.0
@@ -133,7 +134,7 @@ def calibrate(
         estimate=found,
         errors=errors,
         table=table,
-        verdict=_verdict(ready, found, errors),
+        verdict=_verdict(experiment, ready, found, errors),
         warnings=ready.warnings,
         backend=ready.problem.backend,
         seconds=watch.seconds,
@@ -187,13 +188,21 @@ def _table(errors: RecordErrors, split: Split) -> ErrorTable:
     )
 
 
-def _verdict(ready: Prepared, found: Any, errors: RecordErrors) -> Any:
+def _verdict(experiment: Experiment, ready: Prepared, found: Estimate, errors: RecordErrors) -> Verdict:
     noise = np.concatenate([kernel.factor.noise for kernel in ready.problem.kernels])
     whitened = errors.calibrated_residual_mm / _MM / noise[:, None]
     held, crossed = errors.calibrated_mm[ready.split.holdout], errors.cross_validated_mm
     crossed = crossed[np.isfinite(crossed)]
     judged, words = (held, f"{len(held)} held-out records") if len(held) else (crossed, "cross-validation")
-    return judge(found, whitened, errors.calibrated_mm, ready.split.train, judged, words)
+    angles = [
+        f"{name}.{joint}"
+        for name, arm in experiment.system.arms.items()
+        for joint, dimension in zip(arm.joint_names, arm.joint_dimensions, strict=True)
+        if dimension == "angle"
+    ]
+    training = ready.dataset.subset(ready.split.train)
+    suggestions = suggest(ready.problem, training, found, tuple(angles)) if found.names and angles else ()
+    return judge(found, whitened, errors.calibrated_mm, ready.split.train, judged, words, suggestions)
 
 
 def _check_reach(problem: Problem, records: Sequence[FactorRecords], dataset: Dataset) -> None:

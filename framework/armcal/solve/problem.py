@@ -172,6 +172,10 @@ class Problem:
             triangle = triangular(np.vstack([triangle, rows]))
         return triangle
 
+    def jacobians(self, values: Array, records: Sequence[FactorRecords]) -> Iterator[Array]:
+        """Whitened Jacobians by free canonical entries, in blocks of records (n_r x n_v x B), factor by factor."""
+        return (jacobian for jacobian, _ in self._blocks(values, records))
+
     def exact_hessian(self, values: Array, records: Sequence[FactorRecords]) -> Array:
         """The Hessian of ``cost`` by free canonical entries with the curvature of the residuals (n x n)."""
         free = self._free_values(values)

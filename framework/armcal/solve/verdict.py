@@ -13,6 +13,7 @@ from scipy.stats import chi2, norm
 from armcal.base.domains import Array
 from armcal.solve.estimator import Estimate
 from armcal.solve.identifiability import POOR_CONDITION, correlated_pairs
+from armcal.solve.suggestion import CANDIDATES, Suggestion
 
 LEVEL = 0.05
 Grade = Literal["good", "note", "warning", "bad"]
@@ -41,6 +42,7 @@ def judge(
     train: NDArray[np.intp],
     judged_mm: Array,
     judged_on: str,
+    suggestions: Sequence[Suggestion] = (),
 ) -> Verdict:
     """Judge a calibration.
 
@@ -51,10 +53,11 @@ def judge(
         train: which records trained.
         judged_mm: errors of the records that did not train, or of cross-validation; empty if there are none.
         judged_on: what these are, in words.
+        suggestions: poses that would tell most next.
     """
     findings = [_convergence(estimate), _determined(estimate), *_condition(estimate), *_bounds(estimate)]
     findings += [_noise(whitened[:, train]), *_neighbours(whitened[:, train]), *_correlated(estimate)]
-    findings += [*_outliers(errors_mm[train]), _next(estimate)]
+    findings += [*_outliers(errors_mm[train]), *_next(estimate, suggestions)]
     order = {"bad": 0, "warning": 1, "note": 2, "good": 3}
     if len(judged_mm):
         ninety_five = float(np.percentile(judged_mm, 95))
@@ -98,7 +101,8 @@ def _condition(estimate: Estimate) -> list[Finding]:
 
 def _bounds(estimate: Estimate) -> list[Finding]:
     """Is a bound that holds compatible with the data? One-sided, at 5 %, by the step that ignores bounds."""
-    agreeing, pushing = [], []
+    agreeing: list[str] = []
+    pushing: list[str] = []
     for i, name in enumerate(estimate.names):
         if name not in estimate.at_bound:
             continue
@@ -170,15 +174,22 @@ def _outliers(errors_mm: Array) -> list[Finding]:
     return [Finding("warning", f"{suspicious} records lie beyond five robust deviations: see residuals.csv.")]
 
 
-def _next(estimate: Estimate) -> Finding:
-    """The parameter whose uncertainty is largest in its own ordinary size."""
-    scales: Sequence[float] = [b.scale for b in estimate.parameters.free for _ in range(b.size)]
-    if not len(estimate.names):
-        return Finding("note", "No parameter was free.")
+def _next(estimate: Estimate, suggestions: Sequence[Suggestion]) -> list[Finding]:
+    """The parameter whose uncertainty is largest in its own ordinary size, and the poses that would tell most."""
+    if not estimate.names:
+        return [Finding("note", "No parameter was free.")]
+    scales = [b.scale for b in estimate.parameters.free for _ in range(b.size)]
     relative = np.nan_to_num(estimate.deviations / np.array(scales), nan=np.inf)
-    weakest = estimate.names[int(np.argmax(relative))]
-    return Finding(
-        "note",
-        f"Least certain: {weakest}. Poses that change its effect most would help most: vary the joints on either side "
-        f"of it together ({estimate.identifiability.weakest}).",
-    )
+    text = f"Least certain, in its ordinary size: {estimate.names[int(np.argmax(relative))]}."
+    if suggestions:
+        poses = "; ".join(_pose(suggestion) for suggestion in suggestions)
+        shrink = 100 * (1 - suggestions[-1].shrink)
+        text += (
+            f" Of {CANDIDATES} poses like the recorded ones these would tell most (they shrink standard deviations "
+            f"by {shrink:.1f} % on average; clearance was not checked): {poses}."
+        )
+    return [Finding("note", text)]
+
+
+def _pose(suggestion: Suggestion) -> str:
+    return "(" + ", ".join(f"{np.rad2deg(angle):.0f}" for angle in suggestion.commands.values()) + ") deg"

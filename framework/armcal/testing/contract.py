@@ -8,9 +8,10 @@ from collections.abc import Callable, Mapping
 from types import MappingProxyType
 
 from armcal.plugins import Component, PluginInfo, PluginRegistry
+from armcal.testing.effect_checks import check_effect
 from armcal.testing.estimator_checks import check_estimator
+from armcal.testing.measurement_checks import check_measurement
 from armcal.testing.model_checks import check_model
-from armcal.testing.part_checks import check_effect, check_measurement
 from armcal.testing.results import CheckResult, ContractError, Recorder, expect
 from armcal.testing.settings_checks import Subject, check_settings
 from armcal.testing.source_checks import check_reader, check_simulator
@@ -47,7 +48,7 @@ def check_plugin(plugin: PluginInfo, registry: PluginRegistry) -> list[CheckResu
     if plugin.fault:
         return record.results
     record.check("its registration imports nothing heavy", lambda: _light(plugin.module))
-    own = [component for component in registry.components if component.plugin == plugin.name]
+    own = registry.announced_by(plugin)
     for component in own:
         name = f"the {component.kind} {component.name!r} is offered once"
         record.check(name, lambda c=component: registry.find(c.kind, c.name))  # type: ignore[misc]

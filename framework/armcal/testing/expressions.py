@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import casadi as ca
@@ -108,6 +108,11 @@ def near_nominal(blocks: Sequence[ParameterBlock], random: np.random.Generator) 
     return parameters.retract(_within(parameters, delta))
 
 
+def entry_names(blocks: Sequence[ParameterBlock]) -> tuple[str, ...]:
+    """The names of all canonical entries."""
+    return Parameters(tuple(blocks)).entry_names
+
+
 def symbols(blocks: Sequence[ParameterBlock]) -> dict[str, Expression]:
     """A symbol for every block, as a component is given its values."""
     return {block.name: ca.SX.sym(block.name, block.size) for block in blocks}
@@ -120,7 +125,7 @@ def stacked(parts: Sequence[Expression]) -> Expression:
 
 def expect_only(expression: Expression, given: Sequence[Expression]) -> None:
     """Raise ContractError if an expression has symbols that it was not given."""
-    known = {ca.vec(each)[i].element_hash() for each in given for i in range(each.numel())}
+    known = {symbol.element_hash() for each in given for symbol in ca.symvar(each)}
     foreign = sorted({str(s) for s in ca.symvar(ca.SX(expression)) if s.element_hash() not in known})
     expect(not foreign, f"found the symbols {', '.join(foreign)}, expected only those that were given")
 
@@ -147,11 +152,11 @@ def expect_no_choice(expression: Expression, recorded: Expression, estimated: Ex
             (tainted.add if depends else tainted.discard)(place)
 
 
-def expect_derivatives(function: ca.Function, at: Array, what: str) -> None:
+def expect_derivatives(function: ca.Function, at: Array, what: str, inputs: Sequence[str]) -> None:
     """Raise ContractError unless CasADi's Jacobian of a function of one vector is what differences say."""
     exact = np.asarray(function.jacobian()(at, function(at)), dtype=float)
     expect(bool(np.isfinite(exact).all()), f"the derivative of {what} is not finite")
-    for column in range(len(at)):
+    for column, name in enumerate(inputs):
         step = np.zeros(len(at))
         step[column] = _STEP * max(1.0, abs(float(at[column])))
         rise = np.asarray(function(at + step)).ravel() - np.asarray(function(at - step)).ravel()
@@ -160,11 +165,5 @@ def expect_derivatives(function: ca.Function, at: Array, what: str) -> None:
         worst = float(np.abs(exact[:, column] - slope).max(initial=0.0))
         expect(
             worst <= allowed,
-            f"the derivative of {what} by input {column + 1} is off by {worst:.1e}, expected {allowed:.1e}",
+            f"the derivative of {what} by {name} is off by {worst:.1e}, expected {allowed:.1e}",
         )
-
-
-def values_at(blocks: Sequence[ParameterBlock], entries: Array) -> Mapping[str, Expression]:
-    """Numbers for every block."""
-    parameters = Parameters(tuple(blocks))
-    return {block.name: ca.SX(ca.DM(entries[parameters.entries_of(block.name)])) for block in blocks}

@@ -18,6 +18,7 @@ from armcal.solve.factor import Environment
 from armcal.solve.problem import Problem
 from armcal.testing.expressions import (
     check_parameters,
+    entry_names,
     expect_derivatives,
     expect_no_choice,
     expect_only,
@@ -137,7 +138,8 @@ def _rigid(known: _Kinematics) -> None:
 
 
 def _derivatives(known: _Kinematics) -> None:
-    expect_derivatives(known.poses, known.point(np.random.default_rng(2)), "the poses")
+    names = (*entry_names(known.blocks), *(joint.name for joint in known.chain.joints))
+    expect_derivatives(known.poses, known.point(np.random.default_rng(2)), "the poses", names)
 
 
 def _settles(model: ArmModel, chain: Chain) -> None:

@@ -148,11 +148,11 @@ class Mirrored(Model):
         return replace(super().chain(values), root_T_base=mirror)
 
 
-class Kinked(Model):
-    """Its derivative at the nominal value is not finite."""
+class Stepped(Model):
+    """Its derivative is zero everywhere, and it rises all the same."""
 
     def chain(self, values: Any) -> Any:
-        return super().chain({"length": ca.sqrt(values["length"] - values["length"])})
+        return super().chain({"length": ca.floor(values["length"] * 1e7) / 1e7})
 
 
 class Effect:
@@ -287,7 +287,7 @@ class UnknownArm(Measurement):
 class SingularMeasurement(Measurement):
     def residual(self, arms: Any, measured: Any, values: Any) -> Any:
         difference = super().residual(arms, measured, values)
-        return difference * ca.sqrt(difference - difference)
+        return difference * ca.sqrt(-1 - difference**2)
 
 
 class RefusesArms(Measurement):

@@ -1,0 +1,93 @@
+"""The elastic fit, 28 parameters, 313 poses: armcal against scipy with finite differences."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+import numpy as np
+from armcal.base.domains import Array
+from scipy.optimize import least_squares
+
+from benchmarks import lrm, lrm_numpy
+from benchmarks.report import Row
+from benchmarks.timing import best_times
+
+NAME = "fit, elastic, 28"
+RECORDS = 313
+SAME_COST = 1e-6
+"""Relative; finite differences do not come nearer."""
+
+
+def run() -> Iterator[Row]:
+    """Rows of this benchmark."""
+    case = lrm.simulated(RECORDS)
+    problems = {name: case.problem(choice) for name, choice in (("compiled", "compiled"), ("interpreted", "interpreted"))}
+    compiled = problems["compiled"]
+    by_kernel, by_hand = _kernel_residuals(case), _numpy_residuals(case)
+    found: dict[str, float] = {}
+
+    def ours(name: str) -> None:
+        values = case.solve(problems[name]).values
+        found[name] = compiled.cost(values, compiled.records(case.dataset))
+
+    def scipys(name: str, residuals: Callable[[Array], Array]) -> None:
+        found[name] = _scipy_fit(case, residuals)
+
+    times = best_times(
+        {
+            "compiled": lambda: ours("compiled"),
+            "interpreted": lambda: ours("interpreted"),
+            "kernel": lambda: scipys("kernel", by_kernel),
+            "numpy": lambda: scipys("numpy", by_hand),
+        },
+        repeats=3,
+    )
+    peers = {"kernel": "scipy, differences of armcal's residuals", "numpy": "scipy, differences of a numpy model"}
+    for ours_by in problems:
+        backend = problems[ours_by].backend
+        for peer, label in peers.items():
+            note = _agreement(found[ours_by], found[peer])
+            if ours_by == "compiled" and backend != "compiled":
+                note += "; no C compiler: apt-get install gcc"
+            yield Row(NAME, f"IPOPT, {backend}", times[ours_by], label, times[peer], note)
+
+
+def _kernel_residuals(case: lrm.Case) -> Callable[[Array], Array]:
+    problem = case.problem("compiled")
+    records = problem.records(case.dataset)
+    noise = np.array(problem.kernels[0].factor.noise)[:, None]
+
+    def residuals(increment: Array) -> Array:
+        return (problem.residuals(case.parameters.retract(increment), records)[0] / noise).ravel()
+
+    return residuals
+
+
+def _numpy_residuals(case: lrm.Case) -> Callable[[Array], Array]:
+    column = case.dataset.column
+    angles = np.column_stack([column(f"arm.q{i}") for i in range(1, 7)])
+    measured = np.column_stack([column(f"tracker.{axis}") for axis in "xyz"])
+    names = [name.rpartition(".")[2] for name in case.parameters.increment_names]
+    deflection = np.zeros((len(angles), 7))
+    start = np.array([lrm_numpy.NOMINAL[name] for name in names])
+
+    def residuals(increment: Array) -> Array:
+        numbers = {**lrm_numpy.NOMINAL, **dict(zip(names, start + increment, strict=True))}
+        return ((measured - lrm_numpy.tip(numbers, angles, deflection)) / 0.5e-3).ravel()
+
+    return residuals
+
+
+def _scipy_fit(case: lrm.Case, residuals: Callable[[Array], Array]) -> float:
+    """The obvious call, with the bounds and the scales that armcal uses; gives the cost."""
+    scales = case.parameters.scales()
+    bounds = case.parameters.increment_bounds()
+    answer = least_squares(residuals, np.zeros(len(scales)), x_scale=scales, bounds=bounds, ftol=1e-12, xtol=1e-12)
+    return float(answer.cost)
+
+
+def _agreement(ours: float, peers: float) -> str:
+    apart = abs(ours - peers) / peers
+    if apart < SAME_COST:
+        return f"same cost (to {apart:.0e})"
+    return f"cost {ours:.6g}, the peer's {peers:.6g}"

@@ -1,0 +1,103 @@
+"""The real arm: published figures of the measurements beside the checkout."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from armcal.cli.main import cli
+from armcal.run.experiment import Experiment
+from armcal.solve.estimator import estimate
+from armcal.solve.problem import Problem
+from armcal.solve.validation import record_errors
+from click.testing import CliRunner
+
+pytestmark = pytest.mark.shared
+
+PUBLISHED_MEAN_MM = {1: 5.886, 2: 15.143, 3: 16.437, 4: 6.600, 5: 16.777}
+FREE = {1: 28, 2: 20, 3: 7, 4: 27, 5: 6}
+PUBLISHED_COMPLIANCE = (0.01832, 0.07149, 0.06617, 0.07887, 0.07902, 0.37994, 0.01614)
+
+
+def run(repository: Path, data: Path, option: int, out: Path, *settings: str) -> dict:
+    """``armcal run`` of one option; its metrics."""
+    config = repository / "configs" / "lrm_arm" / f"option{option}.yaml"
+    arguments = ["run", str(config), "--data", str(data / "poses.csv"), "--out", str(out), "--json"]
+    result = CliRunner().invoke(cli, arguments + [x for s in settings for x in ("--set", s)])
+    assert result.exit_code == 0, result.output
+    return json.loads(result.stdout)
+
+
+@pytest.fixture(scope="module")
+def lrm_data(shared_data: Path) -> Path:
+    return shared_data / "lrm_arm"
+
+
+@pytest.mark.parametrize("option", [1, 2, 3, 4, 5])
+def test_mean_errors_over_all_poses_are_the_published_ones(
+    repository: Path, lrm_data: Path, tmp_path: Path, option: int
+) -> None:
+    told = run(repository, lrm_data, option, tmp_path / "out", "validation.folds=0")
+    assert told["error_mm"]["nominal"]["train"]["mean"] == pytest.approx(27.949, abs=0.001)
+    assert told["error_mm"]["nominal"]["train"]["max"] == pytest.approx(60.30, abs=0.01)
+    assert told["error_mm"]["calibrated"]["train"]["mean"] == pytest.approx(PUBLISHED_MEAN_MM[option], abs=0.01)
+    assert told["parameters"]["free"] == told["parameters"]["determined"] == FREE[option]
+
+
+def test_the_published_training_set_gives_the_published_compliances(
+    repository: Path, lrm_data: Path, tmp_path: Path
+) -> None:
+    ids = f"validation.train_ids={lrm_data / 'published_50.csv'}"
+    told = run(repository, lrm_data, 1, tmp_path / "out", ids, "parameters.bounds=none", "validation.folds=0")
+    kept = yaml.safe_load((tmp_path / "out" / "calibration.yaml").read_text())["parameters"]
+    found = [p["value"] for p in kept if p["name"].startswith("arm.spring.k")]
+    assert found == pytest.approx(PUBLISHED_COMPLIANCE, abs=1e-5)
+    train, held = (told["error_mm"]["calibrated"][name] for name in ("train", "holdout"))
+    assert (train["count"], held["count"]) == (50, 263)
+    assert (50 * train["mean"] + 263 * held["mean"]) / 313 == pytest.approx(6.204, abs=0.001)
+    assert max(train["max"], held["max"]) == pytest.approx(16.99, abs=0.01)
+
+
+@pytest.fixture(scope="module")
+def loaded(repository: Path, lrm_data: Path):
+    experiment = Experiment.load(
+        repository / "configs" / "lrm_arm" / "option1.yaml", data=lrm_data / "poses.csv"
+    )
+    dataset, system = experiment.read(), experiment.system
+    problem = Problem.build(
+        system.arms, system.measurements, experiment.parameters, system.environment, dataset, "compiled"
+    )
+    return experiment, problem, problem.records(dataset)
+
+
+def test_no_training_set_gives_a_negative_compliance(loaded) -> None:
+    """200 random sets of 50 poses; many of them want one."""
+    experiment, problem, records = loaded
+    places = [experiment.parameters.entries_of(f"arm.spring.k{i}").start for i in range(7)]
+    rng, held = np.random.default_rng(0), 0
+    for _ in range(200):
+        chosen = np.sort(rng.choice(313, 50, replace=False))
+        subset = problem.subset(records, chosen)
+        solution = experiment.estimator.solve(problem, subset, experiment.parameters.nominal())
+        assert solution.verdict.converged, solution.verdict
+        assert np.all(solution.values[places] >= 0)
+        held += bool(estimate(problem, subset, solution).at_bound)
+    assert held > 20, "the bounds were hardly ever needed: this test shows nothing"
+
+
+def test_ipopt_and_cvxpy_agree_on_the_real_arm(repository: Path, loaded) -> None:
+    experiment, problem, records = loaded
+    other = Experiment.load(experiment.source.path, ["estimator.type=cvxpy"]).estimator
+    start, free = experiment.parameters.nominal(), list(experiment.parameters.free_entries)
+    rng = np.random.default_rng(1)
+    for chosen in [np.arange(313), *(np.sort(rng.choice(313, 50, replace=False)) for _ in range(15))]:
+        subset = problem.subset(records, chosen)
+        one = experiment.estimator.solve(problem, subset, start)
+        two = other.solve(problem, subset, start)
+        deviations = estimate(problem, subset, one).deviations
+        assert np.max(np.abs(one.values - two.values)[free] / deviations) < 1e-4
+        errors = [record_errors(problem, s.values, subset).mean() * 1000 for s in (one, two)]
+        assert errors[0] == pytest.approx(errors[1], abs=1e-4)
