@@ -11,8 +11,8 @@ import numpy as np
 import pinocchio as pin
 import yaml
 from armcal.base.domains import Array
-from figaroh.calibration import BaseCalibration
-from figaroh.calibration.calibration_tools import calc_updated_fkm
+from figaroh.calibration import BaseCalibration  # type: ignore[import-not-found]
+from figaroh.calibration.calibration_tools import calc_updated_fkm  # type: ignore[import-not-found]
 
 from benchmarks import rigid_arm
 

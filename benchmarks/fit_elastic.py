@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from functools import partial
 
 import numpy as np
 from armcal.base.domains import Array
+from armcal.solve.kernel import EvaluatorChoice
+from armcal.solve.problem import Problem
 from scipy.optimize import least_squares
 
 from benchmarks import lrm, lrm_numpy
@@ -14,6 +17,7 @@ from benchmarks.timing import best_times
 
 NAME = "fit, elastic, 28"
 RECORDS = 313
+CHOICES: tuple[EvaluatorChoice, ...] = ("compiled", "interpreted")
 SAME_COST = 1e-6
 """Relative; finite differences do not come nearer."""
 
@@ -21,44 +25,41 @@ SAME_COST = 1e-6
 def run() -> Iterator[Row]:
     """Rows of this benchmark."""
     case = lrm.simulated(RECORDS)
-    problems = {name: case.problem(choice) for name, choice in (("compiled", "compiled"), ("interpreted", "interpreted"))}
-    compiled = problems["compiled"]
-    by_kernel, by_hand = _kernel_residuals(case), _numpy_residuals(case)
+    problems = {choice: case.problem(choice) for choice in CHOICES}
+    by_hand = _numpy_residuals(case)
     found: dict[str, float] = {}
 
-    def ours(name: str) -> None:
+    def ours(name: EvaluatorChoice) -> None:
         values = case.solve(problems[name]).values
-        found[name] = compiled.cost(values, compiled.records(case.dataset))
+        found[name] = problems[name].cost(values, problems[name].records(case.dataset))
 
     def scipys(name: str, residuals: Callable[[Array], Array]) -> None:
         found[name] = _scipy_fit(case, residuals)
 
-    times = best_times(
-        {
-            "compiled": lambda: ours("compiled"),
-            "interpreted": lambda: ours("interpreted"),
-            "kernel": lambda: scipys("kernel", by_kernel),
-            "numpy": lambda: scipys("numpy", by_hand),
-        },
-        repeats=3,
-    )
-    peers = {"kernel": "scipy, differences of armcal's residuals", "numpy": "scipy, differences of a numpy model"}
-    for ours_by in problems:
-        backend = problems[ours_by].backend
-        for peer, label in peers.items():
-            note = _agreement(found[ours_by], found[peer])
-            if ours_by == "compiled" and backend != "compiled":
-                note += "; no C compiler: apt-get install gcc"
-            yield Row(NAME, f"IPOPT, {backend}", times[ours_by], label, times[peer], note)
+    contenders: dict[str, Callable[[], object]] = {"numpy": partial(scipys, "numpy", by_hand)}
+    for choice, problem in problems.items():
+        contenders[choice] = partial(ours, choice)
+        contenders[f"differences, {choice}"] = partial(
+            scipys, f"differences, {choice}", _kernel_residuals(case, problem)
+        )
+    times = best_times(contenders, repeats=3)
+    for choice, problem in problems.items():
+        lacking = "; no C compiler: apt-get install gcc" if choice == "compiled" != problem.backend else ""
+        for peer, label in (
+            (f"differences, {choice}", "scipy, differences of armcal's own residuals"),
+            ("numpy", "scipy, differences of a numpy model"),
+        ):
+            note = _agreement(found[choice], found[peer]) + lacking
+            yield Row(NAME, f"IPOPT, {problem.backend}", times[choice], label, times[peer], note)
 
 
-def _kernel_residuals(case: lrm.Case) -> Callable[[Array], Array]:
-    problem = case.problem("compiled")
+def _kernel_residuals(case: lrm.Case, problem: Problem) -> Callable[[Array], Array]:
     records = problem.records(case.dataset)
     noise = np.array(problem.kernels[0].factor.noise)[:, None]
 
     def residuals(increment: Array) -> Array:
-        return (problem.residuals(case.parameters.retract(increment), records)[0] / noise).ravel()
+        raw = problem.residuals(case.parameters.retract(increment), records)[0]
+        return np.asarray((raw / noise).ravel())
 
     return residuals
 

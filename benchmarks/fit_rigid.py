@@ -26,16 +26,14 @@ def run() -> Iterator[Row]:
     random = np.random.default_rng(0)
     truth = _true_arm(random)
     angles = random.uniform(-2, 2, (RECORDS + FRESH, len(rigid_arm.ROWS)))
-    tips = _tips(truth, angles)
+    tips = rigid_arm.tips(truth, angles)
     fresh, fresh_tips = angles[RECORDS:], tips[RECORDS:]
     angles, measured = angles[:RECORDS], tips[:RECORDS] + random.normal(0, rigid_arm.NOISE_M, (RECORDS, 3))
 
     experiment = rigid_arm.experiment(rigid_arm.RIGID)
     parameters, system = experiment.parameters, experiment.system
     data = rigid_arm.dataset(angles, measured)
-    problem = Problem.build(
-        system.arms, system.measurements, parameters, system.environment, data, "compiled"
-    )
+    problem = Problem.build(system.arms, system.measurements, parameters, system.environment, data, "compiled")
     found: dict[str, Array] = {}
 
     def ours() -> None:
@@ -73,16 +71,6 @@ def _true_arm(random: np.random.Generator) -> Array:
         at[:3, :3] = at[:3, :3] @ np.linalg.solve(np.eye(3) - skew / 2, np.eye(3) + skew / 2)
         at[:3, 3] += random.normal(0, 0.002, 3)
     return truth
-
-
-def _tips(placements: Array, angles: Array) -> Array:
-    here = np.tile(np.eye(4), (len(angles), 1, 1))
-    for at, q in zip(placements, angles.T, strict=False):
-        turn = np.tile(np.eye(4), (len(q), 1, 1))
-        turn[:, 0, 0] = turn[:, 1, 1] = np.cos(q)
-        turn[:, 1, 0], turn[:, 0, 1] = np.sin(q), -np.sin(q)
-        here = here @ at @ turn
-    return np.asarray((here @ placements[-1])[:, :3, 3])
 
 
 def _rms_mm(apart: Array) -> float:

@@ -23,7 +23,9 @@ NOMINAL = {
     "tool_rx": -np.pi / 2, "tool_ry": 0.0, "tool_y": 0.0, "tool_z": 0.07327,
 }  # fmt: skip
 LENGTHS = {2: ("upper_arm", "after2_z"), 4: ("forearm", "after4_z")}
-MASSES = {  # kg, centre (m) in the frame of that name, last joint that it loads
+MASSES: dict[
+    str, list[tuple[float, tuple[float, float, float], int]]
+] = {  # kg, centre (m) in the frame of that name, last joint that it loads
     "base": [(0.1234, (0, 0.002, 0.03732), 1)],
     "upper_arm": [(0.177, (0.01246484, -0.00020331, 0.0476142), 2)],
     "row2": [(0.1016, (0, 0.0025, 0.0319581), 3)],

@@ -68,6 +68,17 @@ def placements() -> Array:
     return result
 
 
+def tips(placements: Array, angles: Array) -> Array:
+    """Where the tip of a rigid arm with these placements goes (N x 3)."""
+    here = np.tile(np.eye(4), (len(angles), 1, 1))
+    for at, q in zip(placements, angles.T, strict=False):
+        turn = np.tile(np.eye(4), (len(q), 1, 1))
+        turn[:, 0, 0] = turn[:, 1, 1] = np.cos(q)
+        turn[:, 1, 0], turn[:, 0, 1] = np.sin(q), -np.sin(q)
+        here = here @ at @ turn
+    return np.asarray((here @ placements[-1])[:, :3, 3])
+
+
 @dataclass(frozen=True)
 class _Joint:
     number: int

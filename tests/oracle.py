@@ -14,7 +14,7 @@ JOINTS = 6
 EARTH = np.array([0.0, 0.0, -9.81])
 
 # name: (last joint it is counted on, last joint that moves it, frame, mass, centre)
-_LINKS = {
+LINKS = {
     "link1": (1, 0, "base", 0.1234, (0.0, 0.002, 0.03732)),
     "link2": (2, 2, "upper_arm", 0.177, (0.01246484, -0.00020331, 0.0476142)),
     "link3": (3, 2, "row2", 0.1016, (0.0, 0.0025, 0.0319581)),
@@ -76,7 +76,7 @@ def nominal() -> dict[str, float]:
     values |= {"tool_rx": -half, "tool_ry": 0.0, "tool_y": 0.0, "tool_z": 0.07327}
     values |= {f"k{i}": 0.0 for i in range(JOINTS + 1)}
     values |= {f"target_{axis}": 0.0 for axis in "xyz"}
-    for name, (_, _, _, mass, centre) in _LINKS.items():
+    for name, (_, _, _, mass, centre) in LINKS.items():
         values |= {f"{name}.mass": mass, **{f"{name}.com_{a}": c for a, c in zip("xyz", centre, strict=True)}}
     return values
 
@@ -160,7 +160,7 @@ def site_moments(
     gravity = np.broadcast_to(loads.gravity, (n, 3))
     tip = frames["tool"][:, :3, 3]
     weights = [(JOINTS, np.broadcast_to(loads.payload_mass, n), point(frames["tool"], loads.payload_com))]
-    for name, (counted, moved, frame, _, _) in _LINKS.items():
+    for name, (counted, moved, frame, _, _) in LINKS.items():
         centre = np.array([v[f"{name}.com_{axis}"] for axis in "xyz"])
         where = point(frames[frame], centre)
         weights.append((moved if loads.physical else counted, np.full(n, v[f"{name}.mass"]), where))

@@ -19,7 +19,7 @@ ORDER = (
     "armcal.measure.measurement armcal.measure.reader armcal.measure.checks armcal.measure.csv_writer "
     "armcal.measure.environment armcal.measure.id_list "
     "armcal.solve.c_source armcal.solve.compiler armcal.solve.factor armcal.solve.kernel armcal.solve.problem "
-    "armcal.solve.identifiability armcal.solve.estimator armcal.solve.validation armcal.solve.suggestion "
+    "armcal.solve.polish armcal.solve.identifiability armcal.solve.estimator armcal.solve.validation armcal.solve.suggestion "
     "armcal.solve.verdict "
     "armcal.solve.simulation "
     "armcal.config.yaml_scalars armcal.config.yaml_nodes armcal.config.yaml_source armcal.config.validate "

@@ -103,6 +103,16 @@ class PluginRegistry:
             hint += f" These plugins failed to load and may have had it: {failed}."
         raise PluginError(f"no plugin offers a {kind} called {name!r}.", hint=hint)
 
+    def notify(self, event: str, **what: Any) -> list[str]:
+        """Tell every observer of an event; gives what went wrong in those that failed, which stops nothing."""
+        faults = []
+        for observer in getattr(self.manager.hook, event).get_hookimpls():
+            try:
+                observer.function(*[what[name] for name in observer.argnames])
+            except Exception as fault:  # an observer must not cost anybody a calibration
+                faults.append(f"plugin {observer.plugin_name}: {event} raised {type(fault).__name__}: {fault}.")
+        return faults
+
 
 def discover(found: Iterable[EntryPoint] | None = None) -> PluginRegistry:
     """Load every registration module.

@@ -17,6 +17,7 @@ from armcal.base.domains import Array
 from armcal.base.settings import Settings
 from armcal.errors import NotConvergedError
 from armcal.solve.estimator import Progress, Solution, SolverVerdict, no_progress
+from armcal.solve.polish import polish
 from armcal.solve.problem import FactorRecords, Problem
 from pydantic import Field
 
@@ -58,10 +59,15 @@ class CvxpyEstimator:
     ) -> Solution:
         """From ``start`` until no step saves anything."""
         began = time.perf_counter()
+        if not problem.increments:
+            return Solution(start, SolverVerdict("cvxpy", "nothing is free", True, 0, 0.0))
         model = _ScaledModel(problem, records)
         lower, upper = (bound / model.scales for bound in problem.parameters.increment_bounds())
         step = _ConvexStep(lower, upper, self._settings.solver)
-        at = model.linearise(np.clip(problem.parameters.local(start) / model.scales, lower, upper))
+        first = np.clip(problem.parameters.local(start) / model.scales, lower, upper)
+        if not np.isfinite(model.try_cost(first)):
+            return Solution(start, SolverVerdict("cvxpy", "no equilibrium at the start", False, 0, 0.0))
+        at = model.linearise(first)
         damping, iterations, status = 1e-6, 0, "iteration limit"
         while iterations < self._settings.max_iterations:
             iterations += 1
@@ -83,9 +89,10 @@ class CvxpyEstimator:
                 continue
             damping = max(damping / 10, _LEAST_DAMPING)
             at = model.linearise(np.clip(at.x + move, lower, upper))
+        converged = status == "optimal"
+        values = polish(problem, records, model.values(at.x)) if converged else model.values(at.x)
         seconds = time.perf_counter() - began
-        verdict = SolverVerdict("cvxpy", status, status == "optimal", iterations, seconds)
-        return Solution(model.values(at.x), verdict)
+        return Solution(values, SolverVerdict("cvxpy", status, converged, iterations, seconds))
 
 
 class _ScaledModel:

@@ -16,6 +16,7 @@ from armcal.base.domains import Array
 from armcal.base.settings import Settings
 from armcal.errors import NotConvergedError
 from armcal.solve.estimator import Progress, Solution, SolverVerdict, no_progress
+from armcal.solve.polish import polish
 from armcal.solve.problem import FactorRecords, NormalEquations, Problem
 from pydantic import Field
 
@@ -50,6 +51,8 @@ class IpoptEstimator:
     ) -> Solution:
         """The best of one or several starts; the first is ``start`` itself."""
         began = time.perf_counter()
+        if not problem.increments:
+            return Solution(start, SolverVerdict("ipopt", "nothing is free", True, 0, 0.0))
         random = np.random.default_rng(self._settings.seed)
         found: list[tuple[float, Solution]] = []
         for number in range(self._settings.starts):
@@ -59,6 +62,7 @@ class IpoptEstimator:
         cost, best = min(converged or found, key=lambda pair: pair[0])
         agreeing = sum(abs(c - cost) <= _SAME_COST * max(1.0, cost) for c, _ in converged)
         told = best.verdict
+        values = polish(problem, records, best.values) if told.converged else best.values
         verdict = SolverVerdict(
             "ipopt",
             told.status,
@@ -68,11 +72,9 @@ class IpoptEstimator:
             len(found),
             agreeing,
         )
-        return Solution(best.values, verdict)
+        return Solution(values, verdict)
 
-    def _solve_once(
-        self, problem: Problem, records: Sequence[FactorRecords], start: Array
-    ) -> tuple[float, Solution]:
+    def _solve_once(self, problem: Problem, records: Sequence[FactorRecords], start: Array) -> tuple[float, Solution]:
         began = time.perf_counter()
         objective = _Objective(problem, records, start, exact=self._settings.hessian == "exact")
         scales = problem.parameters.scales()
@@ -186,9 +188,7 @@ class _Objective:
                 self._equations = canonical.chained(self._chain(x))
             except NotConvergedError:
                 size = len(x)
-                self._equations = NormalEquations(
-                    np.nan, np.full(size, np.nan), np.full((size, size), np.nan)
-                )
+                self._equations = NormalEquations(np.nan, np.full(size, np.nan), np.full((size, size), np.nan))
         return self._equations
 
 

@@ -73,6 +73,8 @@ class MdhSettings(Settings):
     def _consistent(self) -> MdhSettings:
         if self.joints and len(self.joints) != len(self.rows):
             raise ValueError(f"{len(self.joints)} joint names for {len(self.rows)} rows")
+        if len(set(self.joints)) < len(self.joints):
+            raise ValueError(f"a joint name stands twice in {', '.join(self.joints)}")
         if any(step.frame for step in self.base):
             raise ValueError("base: a frame cannot be named here; the frame at its end is called 'base'")
         names = [step.frame for _, steps in _places(self) for step in steps if step.frame]

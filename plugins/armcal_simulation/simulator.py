@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
+from armcal.arm.assembly import Arm
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.base.settings import Angle, InputPath, Length, Settings
@@ -24,12 +25,31 @@ class PoseSettings(Settings):
     """Which poses are visited.
 
     ``grid``: ``count`` distinct combinations of each joint's ``levels``, in lexicographic order as a grid is
-    driven. ``random``: ``count`` poses uniform between the smallest and largest level of each joint.
+    driven. ``random``: ``count`` poses uniform between the smallest and largest level of each joint. The levels of
+    sliding joints stand under ``travel``.
     """
 
     kind: Literal["grid", "random"] = "grid"
     count: Annotated[int, Field(ge=1)]
-    levels: dict[str, Annotated[tuple[Angle, ...], Field(min_length=1)]]
+    levels: dict[str, Annotated[tuple[Angle, ...], Field(min_length=1)]] = Field(default_factory=dict)
+    travel: dict[str, Annotated[tuple[Length, ...], Field(min_length=1)]] = Field(default_factory=dict)
+
+    def of(self, arm: Arm) -> list[Array]:
+        """The levels of each joint, in the arm's order (rad, or m on sliding joints).
+
+        Raises:
+            ConfigError: a joint has none, or a name is not a joint's.
+        """
+        turning = {j for j, kind in zip(arm.joint_names, arm.joint_dimensions, strict=True) if kind == "angle"}
+        sliding = set(arm.joint_names) - turning
+        for given, wanted, key in ((self.levels, turning, "levels"), (self.travel, sliding, "travel")):
+            missing, unknown = sorted(wanted - set(given)), sorted(set(given) - wanted)
+            if missing or unknown:
+                raise ConfigError(
+                    f"simulation.poses.{key}: missing {missing or 'none'}, unknown {unknown or 'none'}.",
+                    hint=f"Give one list for each of {', '.join(sorted(wanted)) or 'no joint'}.",
+                )
+        return [np.array(self.levels.get(j) or self.travel[j]) for j in arm.joint_names]
 
 
 class OutlierSettings(Settings):
@@ -79,16 +99,11 @@ class ElasticArmSimulator:
         """
         settings, random = self._settings, np.random.default_rng(self._settings.seed)
         arm = next(iter(request.arms.values()))
-        missing = [joint for joint in arm.joint_names if joint not in settings.poses.levels]
-        unknown = [joint for joint in settings.poses.levels if joint not in arm.joint_names]
-        if missing or unknown:
-            raise ConfigError(
-                f"simulation.poses.levels: missing {missing or 'none'}, unknown {unknown or 'none'}.",
-                hint=f"Give one list for each of {', '.join(arm.joint_names)}.",
-            )
-        commands = _poses(settings.poses, arm.joint_names, random)
-        step = settings.quantisation
-        reached = np.round(commands / step) * step if step else commands
+        commands = _poses(settings.poses, settings.poses.of(arm), random)
+        reached, step = commands.copy(), settings.quantisation
+        if step:
+            turning = [dimension == "angle" for dimension in arm.joint_dimensions]
+            reached[turning] = np.round(commands[turning] / step) * step
         named = [f"{arm.name}.{joint}" for joint in arm.joint_names]
         approach = _approach(commands)
         channels = {f"{arm.name}.approach.{j}": approach[i] for i, j in enumerate(arm.joint_names)}
@@ -118,9 +133,8 @@ class ElasticArmSimulator:
         return _with_outliers(disturbed, self._settings.outliers, random)
 
 
-def _poses(poses: PoseSettings, joints: tuple[str, ...], random: np.random.Generator) -> Array:
-    """Commands (joints x poses, rad)."""
-    levels = [np.array(poses.levels[joint]) for joint in joints]
+def _poses(poses: PoseSettings, levels: list[Array], random: np.random.Generator) -> Array:
+    """Commands (joints x poses, rad or m)."""
     if poses.kind == "random":
         return np.array([random.uniform(level.min(), level.max(), poses.count) for level in levels])
     total = int(np.prod([len(level) for level in levels]))

@@ -292,7 +292,6 @@ def test_a_broken_plugin_warns_once_and_breaks_nothing(name: str, tmp_path: Path
     assert armcal("plugins", "check", name, path=tmp_path).returncode == 2
 
 
-@pytest.mark.xfail(strict=True, reason="Voice.warn wraps its line at the terminal's width")
 def test_a_warning_is_one_line_on_a_narrow_terminal(tmp_path: Path, experiment: Path) -> None:
     write_plugin(tmp_path, "import", BROKEN["import"][0])
     simulate = ("simulate", "experiment.yaml", "--out", "data.csv")

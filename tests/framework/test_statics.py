@@ -13,7 +13,6 @@ from armcal.arm.effects import Spring
 from armcal.arm.model import forward
 from armcal.arm.statics import Load, Mass, wrenches
 from armcal.base.parameters import Parameters, scalar
-from armcal.measure.measurement import Channel
 from armcal.solve.factor import Environment
 from armcal.solve.problem import Problem
 from armcal_joints.springs import TorsionalSprings, TorsionalSpringSettings
@@ -116,14 +115,12 @@ def pinocchio_lrm(pin):
         parent = model.addJoint(parent, pin.JointModelRZ(), pin.SE3(np.linalg.inv(at) @ pose[0]), f"j{parent}")
         at = pose[0]
     bodies = [np.eye(4), *(pose[0] for pose in before)]
-    for name, (_, moved, frame, mass, centre) in oracle._LINKS.items():
+    for _, moved, frame, mass, centre in oracle.LINKS.values():
         if moved == 0:
             continue
         local = np.linalg.inv(bodies[moved]) @ frames[frame][0] @ [*centre, 1]
         inertia = pin.Inertia(mass, local[:3], np.zeros((3, 3)))
         model.appendBodyToJoint(moved, inertia, pin.SE3.Identity())
-        assert name
-    # The tip's row places theta1 = pi before the joint's own motion: q = 0 is the oracle's zero pose.
     return model
 
 
@@ -187,7 +184,7 @@ def test_without_overrides_the_masses_load_the_joints_that_move_them(lrm):
 
 
 def test_the_tip_moves_with_every_parameter_as_the_independently_iterated_oracles(lrm):
-    """All 78 parameters, masses and centres too: central differences of the oracle against the Jacobian."""
+    """All 77 parameters, masses and centres too: central differences of the oracle against the Jacobian."""
     experiment, q = lrm.experiment(), oracle.random_poses(8, 8)
     free = experiment.parameters.with_free(experiment.parameters.names)
     values = lrm.vector(free, oracle.PUBLISHED)
@@ -213,12 +210,12 @@ def tip_jacobian(problem, values, dataset):
 
 
 def difference(name, q, step=1e-5):
-    """Five-point difference of the oracle's tip."""
+    """Central difference of the oracle's tip."""
 
     def at(factor):
         return oracle.tip({**oracle.published(), name: oracle.published()[name] + factor * step}, q).ravel()
 
-    return (8 * (at(1) - at(-1)) - (at(2) - at(-2))) / (12 * step)
+    return (at(1) - at(-1)) / (2 * step)
 
 
 @pytest.mark.parametrize("evaluator", ["interpreted", "compiled"])
@@ -381,8 +378,8 @@ def small_problem(effects, q, rows=TWO_ROWS, masses=MASSES, **columns):
 
 def by_hand(q, matrix, site, gravity=(0.5, -0.3, -9.7)):
     """The tip of the two-joint arm with a compliance matrix at a site, one record, iterated in numpy."""
-    vector = np.zeros(3)
-    for _ in range(400):
+    vector, one = np.zeros(3), np.zeros(3)
+    for _ in range(100):
         poses, here = [np.eye(4)], np.eye(4)
         if site == 0:
             poses[0] = here = here @ lifted(vector)
@@ -457,11 +454,6 @@ def test_no_gravity_no_deflection(lrm):
     problem = lrm.problem(lrm.experiment(), dataset)
     found = predicted(problem, lrm.vector(problem.parameters, oracle.PUBLISHED), dataset)
     np.testing.assert_allclose(found, oracle.tip({**oracle.published(), **RIGID}, q), rtol=0, atol=1e-14)
-
-
-def test_a_channel_that_this_measurement_does_not_define_is_not_invented():
-    assert [c.name for c in TipPosition(TipPositionSettings.si(noise=1e-3), ("arm",)).channels()] == ["x", "y", "z"]
-    assert Channel("x", "length") == TipPosition(TipPositionSettings.si(noise=1e-3), ("arm",)).channels()[0]
 
 
 @pytest.mark.shared

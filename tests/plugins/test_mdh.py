@@ -240,8 +240,8 @@ def test_an_arm_that_does_not_make_sense_is_refused(change, said):
 def test_a_configuration_without_a_convention_is_refused_before_anything_is_built(tmp_path):
     from armcal.run.experiment import Experiment
 
-    text = "arms: {arm: {model: {type: mdh, rows: [{d_mm: 1}]}}}\nmeasurements: {t: {type: tip_position, noise_mm: 1}}\n"
+    text = "arms: {arm: {model: {type: mdh, rows: [{d_mm: 1}]}}}\nstatics: {gravity_m_s2: [0, 0, -9.81]}\n"
     path = tmp_path / "arm.yaml"
-    path.write_text(text + "statics: {gravity_m_s2: [0, 0, -9.81]}\n", encoding="utf-8")
+    path.write_text(text + "measurements: {t: {type: tip_position, noise_mm: 1}}\n", encoding="utf-8")
     with pytest.raises(ConfigError, match="convention"):
         Experiment.load(path)

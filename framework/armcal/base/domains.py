@@ -64,6 +64,8 @@ class Interval:
 
     def check(self, value: Array) -> str:
         """Within the bounds."""
+        if not math.isfinite(value[0]):
+            return f"{value[0]} is not a finite number"
         inside = self.lower <= value[0] <= self.upper
         return "" if inside else f"{value[0]:g} is outside {self.lower:g} to {self.upper:g}"
 
@@ -110,9 +112,7 @@ class Rotation:
 
     def retract_jacobian(self, base: Array, delta: Array) -> Array:
         """Half of the quaternion product's matrix, after the right Jacobian of the exponential [Murray1994]."""
-        return np.asarray(
-            0.5 * _quaternion_matrix(self.retract(base, delta))[:, 1:] @ _left_jacobian(delta).T
-        )
+        return np.asarray(0.5 * _quaternion_matrix(self.retract(base, delta))[:, 1:] @ _left_jacobian(delta).T)
 
 
 @dataclass(frozen=True)
@@ -130,8 +130,8 @@ class Pose:
         return 6
 
     def check(self, value: Array) -> str:
-        """Unit quaternion."""
-        return Rotation().check(value[:4])
+        """Unit quaternion, finite translation."""
+        return Rotation().check(value[:4]) or ("" if np.isfinite(value).all() else f"{value} is not finite")
 
     def retract(self, base: Array, delta: Array) -> Array:
         """Rotation and translation each moved in the base's own frame."""
@@ -230,24 +230,26 @@ class Semidefinite:
 
     def check(self, value: Array) -> str:
         """No negative eigenvalue."""
+        if not np.isfinite(value).all():
+            return f"{value} is not finite"
         lowest = float(np.linalg.eigvalsh(symmetric(value))[0])
         largest = float(np.abs(value).max())
         return "" if lowest >= -1e-12 * max(1.0, largest) else f"its smallest eigenvalue is {lowest:g}"
 
     def retract(self, base: Array, delta: Array) -> Array:
         """(L + delta)(L + delta)'."""
-        factor = np.linalg.cholesky(symmetric(base))
+        factor = _factor(symmetric(base))
         factor[_LOWER] += delta
         return _entries(factor @ factor.T)
 
     def local(self, base: Array, value: Array) -> Array:
         """The difference of the factors."""
-        difference = np.linalg.cholesky(symmetric(value)) - np.linalg.cholesky(symmetric(base))
+        difference = _factor(symmetric(value)) - _factor(symmetric(base))
         return np.asarray(difference[_LOWER])
 
     def retract_jacobian(self, base: Array, delta: Array) -> Array:
         """6 x 6."""
-        factor = np.linalg.cholesky(symmetric(base))
+        factor = _factor(symmetric(base))
         factor[_LOWER] += delta
         jacobian = np.zeros((6, 6))
         for column, (row, col) in enumerate(zip(*_LOWER, strict=True)):
@@ -263,6 +265,18 @@ def symmetric(entries: Array) -> Array:
     for value, (row, col) in zip(entries, _SYMMETRIC, strict=True):
         matrix[row, col] = matrix[col, row] = value
     return matrix
+
+
+def _factor(matrix: Array) -> Array:
+    """L with L L' = matrix, also where the matrix is singular: a column without a pivot is zero."""
+    factor = np.zeros((3, 3))
+    smallest = 1e-15 * max(float(np.trace(matrix)), 0.0)
+    for j in range(3):
+        pivot = matrix[j, j] - factor[j, :j] @ factor[j, :j]
+        if pivot > smallest:
+            factor[j, j] = math.sqrt(pivot)
+            factor[j + 1 :, j] = (matrix[j + 1 :, j] - factor[j + 1 :, :j] @ factor[j, :j]) / factor[j, j]
+    return factor
 
 
 def _entries(matrix: Array) -> Array:

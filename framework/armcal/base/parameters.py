@@ -51,9 +51,7 @@ class ParameterBlock:
         return len(self.domain.entries)
 
 
-def scalar(
-    name: str, unit: str, nominal: float, scale: float, domain: Interval | None = None
-) -> ParameterBlock:
+def scalar(name: str, unit: str, nominal: float, scale: float, domain: Interval | None = None) -> ParameterBlock:
     """A block of one number."""
     return ParameterBlock(name, unit, (float(nominal),), domain or Interval(), scale)
 
@@ -68,12 +66,13 @@ class Parameters:
     blocks: tuple[ParameterBlock, ...]
 
     def __post_init__(self) -> None:
+        for block in self.blocks:
+            if len(block.nominal) != block.size:
+                raise ConfigError(f"{block.name} has {len(block.nominal)} entries, its domain has {block.size}.")
         names = [block.name for block in self.blocks]
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
-            raise ConfigError(
-                f"parameter names stand twice: {', '.join(twice)}.", hint="Rename one of the instances."
-            )
+            raise ConfigError(f"parameter names stand twice: {', '.join(twice)}.", hint="Rename one of the instances.")
 
     @cached_property
     def names(self) -> tuple[str, ...]:
@@ -125,6 +124,8 @@ class Parameters:
     def with_free(self, names: Iterable[str]) -> Parameters:
         """Exactly these blocks free, all others fixed."""
         wanted = set(names)
+        if unknown := sorted(wanted - set(self.names)):
+            raise ConfigError(f"no parameter is called {unknown[0]!r}.", hint="Take names from `Parameters.select`.")
         return self.replaced({block.name: replace(block, free=block.name in wanted) for block in self.blocks})
 
     def with_nominal(self, values: Array) -> Parameters:
@@ -179,11 +180,7 @@ class Parameters:
         """Lower and upper bound of each increment from the nominal values; infinite for all but intervals."""
         lower, upper = {}, {}
         for block in self.free:
-            ends = (
-                (block.domain.lower, block.domain.upper)
-                if isinstance(block.domain, Interval)
-                else _EVERYWHERE
-            )
+            ends = (block.domain.lower, block.domain.upper) if isinstance(block.domain, Interval) else _EVERYWHERE
             lower[block.name], upper[block.name] = (end - block.nominal[0] for end in ends)
         return self._per_increment(lower), self._per_increment(upper)
 
@@ -214,7 +211,7 @@ class Parameters:
 
     def check(self, values: Array, names: Sequence[str] | None = None) -> None:
         """Raise ConfigError for the first block whose value lies outside its domain."""
-        for name in names or self.names:
+        for name in self.names if names is None else names:
             block, place = self._index[name]
             fault = block.domain.check(values[place])
             if fault:

@@ -37,9 +37,7 @@ class UnitOf:
             raise ValueError("a dimensionless field has no unit to declare: annotate it as a plain float.")
         units_of(self.dimension)
 
-    def __get_pydantic_core_schema__(
-        self, source: Any, handler: GetCoreSchemaHandler
-    ) -> core_schema.CoreSchema:
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> core_schema.CoreSchema:
         """The marked type's own schema, behind a check for a value that was refused already."""
         return core_schema.no_info_before_validator_function(_raise_fault, handler(source))
 

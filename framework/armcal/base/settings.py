@@ -131,9 +131,7 @@ class Settings(BaseModel):
     def keys(cls) -> tuple[str, ...]:
         """The keys of these settings as a config writes them, quantities in a customary unit (``d_mm``)."""
         quantities = cls.quantities()
-        return tuple(
-            spelt(name, quantities[name]) if name in quantities else name for name in cls.model_fields
-        )
+        return tuple(spelt(name, quantities[name]) if name in quantities else name for name in cls.model_fields)
 
     def to_config(self) -> dict[str, Any]:
         """The settings as a config: SI units in the keys; validating it gives equal settings, bit for bit."""
@@ -153,9 +151,7 @@ class Settings(BaseModel):
         return {name: kind_of((info.annotation, *info.metadata)) for name, info in cls.model_fields.items()}
 
     @classmethod
-    def __get_pydantic_core_schema__(
-        cls, source: Any, handler: GetCoreSchemaHandler
-    ) -> core_schema.CoreSchema:
+    def __get_pydantic_core_schema__(cls, source: Any, handler: GetCoreSchemaHandler) -> core_schema.CoreSchema:
         """Strict scalars, while lists still make tuples and texts still make paths and enumerations."""
         schema = handler(source)
         _make_scalars_strict(schema)
@@ -195,9 +191,7 @@ class Settings(BaseModel):
                 return name, convert(name, value, kind, unit.name)
             if kind.dimension is not None:
                 mend = accepted(name, kind.dimension)
-                return name, Fault(
-                    f"found {key} ({unit.dimension}), expected {kind.dimension}: write {mend}."
-                )
+                return name, Fault(f"found {key} ({unit.dimension}), expected {kind.dimension}: write {mend}.")
         return key, Fault(cls._unknown(key)) if cls.model_config.get("extra") == "forbid" else value
 
     @classmethod

@@ -39,7 +39,7 @@ class Voice:
 
     def warn(self, text: str) -> None:
         """One warning line."""
-        self.err.print(f"warning: {text}", style="yellow", markup=False)
+        self.err.print(f"warning: {text}", style="yellow", markup=False, soft_wrap=True)
 
     def detail(self, text: str) -> None:
         """Only with -v."""

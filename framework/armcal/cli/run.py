@@ -38,7 +38,8 @@ def run(voice: Voice, config: Path, data: Path | None, out: Path | None, overrid
     result.seconds["total"] = watch.total()
     outputs.write(result, experiment, folder, render)
     converged = result.estimate.verdict.converged
-    registry.manager.hook.armcal_run_ended(name=result.name, folder=str(folder), converged=converged)
+    for text in registry.notify("armcal_run_ended", name=result.name, folder=str(folder), converged=converged):
+        voice.warn(text)
     voice.result({**outputs.metrics(result), "folder": str(folder)})
     show_run(voice, result, folder, watch.total())
     if not converged:

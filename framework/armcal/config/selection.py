@@ -12,11 +12,11 @@ from pydantic import Field
 
 from armcal.base.parameters import ParameterBlock, Parameters
 from armcal.base.settings import Settings
-from armcal.base.units import parse_quantity
+from armcal.base.units import DIMENSIONLESS, UNITS, parse_quantity, si_unit
 from armcal.config.yaml_source import ConfigSource
 from armcal.errors import ConfigError
 
-DIMENSION_OF_UNIT = {"m": "length", "rad": "angle", "rad_per_Nm": "compliance", "kg": "mass"}
+DIMENSION_OF_UNIT = {unit.name: unit.dimension for unit in UNITS.values() if unit == si_unit(unit.dimension)}
 Path = tuple[str | int, ...]
 
 
@@ -82,11 +82,9 @@ def quantity(block: ParameterBlock, text: str | float, source: ConfigSource | No
     """A text with a unit as SI, for a scalar block."""
     where = source.where(at) if source else None
     if block.size != 1:
-        raise ConfigError(
-            f"{block.name} has {block.size} entries and cannot be set by one number.", where=where
-        )
+        raise ConfigError(f"{block.name} has {block.size} entries and cannot be set by one number.", where=where)
     dimension = DIMENSION_OF_UNIT.get(block.unit)
-    if dimension is None:
+    if dimension in (None, DIMENSIONLESS):
         if isinstance(text, str):
             raise ConfigError(f"found {text!r}, expected a plain number for {block.name}.", where=where)
         return float(text)

@@ -14,9 +14,9 @@ from armcal.base.parameters import ParameterBlock, Parameters
 from armcal.base.settings import Acceleration3, Force3, Length3, Mass, Settings, Torque3
 from armcal.config.validate import validate
 from armcal.config.yaml_source import ConfigSource
-from armcal.errors import ConfigError
+from armcal.errors import ArmcalError, ConfigError, PluginError
 from armcal.measure.measurement import Measurement
-from armcal.plugins import PluginRegistry
+from armcal.plugins import Component, PluginRegistry
 from armcal.solve.factor import Environment
 
 T = TypeVar("T")
@@ -112,9 +112,7 @@ def build_system(source: ConfigSource, registry: PluginRegistry) -> System:
     measurements, described = {}, {}
     for name in settings.measurements:
         at: Path = ("measurements", name)
-        measurements[name], described[name] = build_component(
-            source, registry, "measurement", at, tuple(arms)
-        )
+        measurements[name], described[name] = build_component(source, registry, "measurement", at, tuple(arms))
     description = {"arms": described_arms, "measurements": described, "statics": settings.statics.to_config()}
     return System(arms, measurements, settings.statics, description)
 
@@ -136,11 +134,30 @@ def build_component(
             hint="Write type: NAME; see armcal plugins list.",
         )
     name = str(section["type"])
-    component = registry.find(kind, name).load()
+    try:
+        found = registry.find(kind, name)
+    except PluginError as fault:
+        raise PluginError(fault.message, where=source.where((*at, "type")), hint=fault.hint) from fault
+    component = found.load()
+    settings_class = getattr(component, "Settings", None)
+    if not (isinstance(settings_class, type) and issubclass(settings_class, Settings)):
+        raise _broken(found, "it has no class attribute Settings derived from armcal.Settings")
     stripped = {key: value for key, value in section.items() if key != "type"}
-    settings = validate(component.Settings, _with(source, at, stripped), at)
-    built = _refusable(source, at, lambda: component(settings, *context))
+    settings = validate(settings_class, _with(source, at, stripped), at)
+    try:
+        built = _refusable(source, at, lambda: component(settings, *context))
+    except ArmcalError:
+        raise
+    except Exception as fault:  # a plugin may fail in any way; the user is told which and how
+        raise _broken(found, f"building it raised {type(fault).__name__}: {fault}") from fault
     return built, {"type": name, **settings.to_config()}
+
+
+def _broken(component: Component, fault: str) -> PluginError:
+    return PluginError(
+        f"the {component.kind} {component.name!r} of the plugin {component.plugin!r} is broken: {fault}.",
+        hint=f"See armcal plugins check {component.plugin}.",
+    )
 
 
 def _arm(source: ConfigSource, registry: PluginRegistry, name: str) -> tuple[Arm, dict[str, Any]]:
@@ -150,13 +167,9 @@ def _arm(source: ConfigSource, registry: PluginRegistry, name: str) -> tuple[Arm
     effects, described_effects = {}, {}
     for effect in settings.effects:
         place: Path = (*at, "effects", effect)
-        built, described_effects[effect] = build_component(
-            source, registry, "effect", place, model.joint_names
-        )
+        built, described_effects[effect] = build_component(source, registry, "effect", place, model.joint_names)
         effects[effect] = built
-    masses = tuple(
-        MassSpec(link, s.mass, s.com, s.frame, s.loads_up_to_joint) for link, s in settings.links.items()
-    )
+    masses = tuple(MassSpec(link, s.mass, s.com, s.frame, s.loads_up_to_joint) for link, s in settings.links.items())
     arm = _refusable(source, at, lambda: Arm(name, described_model["type"], model, effects, masses))
     known = _refusable(source, at, lambda: frame_names(arm.nominal_chain))
     for link, stated in settings.links.items():
@@ -165,9 +178,7 @@ def _arm(source: ConfigSource, registry: PluginRegistry, name: str) -> tuple[Arm
     return arm, {"model": described_model, "effects": described_effects, "links": links}
 
 
-def _check_link(
-    source: ConfigSource, at: Path, link: LinkSettings, known: Mapping[str, int], joints: int
-) -> None:
+def _check_link(source: ConfigSource, at: Path, link: LinkSettings, known: Mapping[str, int], joints: int) -> None:
     if link.frame not in known:
         raise ConfigError(
             f"no frame is called {link.frame!r}.",
@@ -175,9 +186,7 @@ def _check_link(
             hint=f"The frames are {', '.join(known)}.",
         )
     if link.mass < 0:
-        raise ConfigError(
-            "found a mass below zero.", where=source.where((*at, "mass")), hint="Give the mass."
-        )
+        raise ConfigError("found a mass below zero.", where=source.where((*at, "mass")), hint="Give the mass.")
     if link.loads_up_to_joint is not None and not 0 <= link.loads_up_to_joint <= joints:
         raise ConfigError(
             f"found joint {link.loads_up_to_joint}, expected 0 to {joints}.",

@@ -165,9 +165,7 @@ class _Builder:
     def _alias(self, anchor: str, line: int) -> None:
         self._refuse_as_key(line)
         if anchor not in self._anchors:
-            self.refuse(
-                f"the alias *{anchor} names no anchor.", f"Write &{anchor} before the value it means.", line
-            )
+            self.refuse(f"the alias *{anchor} names no anchor.", f"Write &{anchor} before the value it means.", line)
         node = self._anchors[anchor]
         if node is None:
             self.refuse(f"the alias *{anchor} stands inside what it names.", "Write the value out.", line)
@@ -201,9 +199,7 @@ class _Builder:
                 self.refuse(f"the key {text} is not plain text: {fault}.", f'Quote it: "{text}".', line)
             if not isinstance(read, str):
                 meaning = "nothing" if read is None else f"the {type(read).__name__} {read}"
-                self.refuse(
-                    f"the key {text!r} is read as {meaning}, expected text.", f'Quote it: "{text}".', line
-                )
+                self.refuse(f"the key {text!r} is read as {meaning}, expected text.", f'Quote it: "{text}".', line)
         if not text:
             self.refuse("found an empty key, expected a name.", "Name the key.", line)
         if text in parent.entries:
@@ -245,9 +241,7 @@ class _Builder:
             self._refuse_depth(node.line)
         if parent.size > MAX_NODES:
             hint = "Expand no aliases of aliases; keep measured data in a CSV file."
-            self.refuse(
-                f"the file holds more than {MAX_NODES} values with its aliases expanded.", hint, node.line
-            )
+            self.refuse(f"the file holds more than {MAX_NODES} values with its aliases expanded.", hint, node.line)
         if parent.key is None:
             parent.items.append(node)
         else:
@@ -259,9 +253,7 @@ class _Builder:
 
     def _refuse_as_key(self, line: int) -> None:
         if self._stack and self._stack[-1].is_mapping and self._stack[-1].key is None:
-            self.refuse(
-                "found a list, mapping or alias as a key, expected text.", "Write a plain name.", line
-            )
+            self.refuse("found a list, mapping or alias as a key, expected text.", "Write a plain name.", line)
 
     def _refuse_tag(self, tag: str, line: int) -> NoReturn:
         shown = tag.replace("tag:yaml.org,2002:", "!!")

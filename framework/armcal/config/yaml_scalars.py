@@ -70,9 +70,7 @@ def _finite(text: str) -> float:
 def _refuse_surprises(text: str) -> None:
     quoted = f'or "{text}" if it is text'
     if _NOT_FINITE.fullmatch(text):
-        raise ScalarError(
-            f"{text} is not a finite number", f"Write a finite number, leave the key out, {quoted}."
-        )
+        raise ScalarError(f"{text} is not a finite number", f"Write a finite number, leave the key out, {quoted}.")
     if match := _LOOSE_EXPONENT.fullmatch(text):
         sign, digits, exponent_sign, exponent = match.groups()
         digits = digits if "." in digits else f"{digits}.0"

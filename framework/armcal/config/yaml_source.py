@@ -95,9 +95,7 @@ def load_config(path: str | Path, overrides: Sequence[str] = (), root: Path | No
     try:
         limit = (path.parent if root is None else root).resolve()
     except (OSError, RuntimeError, ValueError) as fault:
-        _refuse_file(
-            path, f"this path cannot be followed ({fault}).", "Check its spelling and its symbolic links."
-        )
+        _refuse_file(path, f"this path cannot be followed ({fault}).", "Check its spelling and its symbolic links.")
     reader = _Reader(limit)
     tree = reader.tree(path, ())
     for text in overrides:
@@ -116,9 +114,7 @@ def _read_text(path: Path) -> str:
             _refuse_file(path, "this is a directory, expected a YAML file.", "Name the file in it.")
         if not path.exists():
             near = difflib.get_close_matches(path.name, _neighbours(path), n=1)
-            hint = (
-                f"Did you mean {path.parent / near[0]}?" if near else "Check the spelling and the directory."
-            )
+            hint = f"Did you mean {path.parent / near[0]}?" if near else "Check the spelling and the directory."
             _refuse_file(path, "there is no such file.", hint)
         if not path.is_file():
             _refuse_file(path, "this is a device or pipe, expected a YAML file.", "Save it to a file.")
@@ -180,11 +176,7 @@ class _Reader:
         try:
             return self.tree(text.base_dir / text, chain)
         except ConfigError as fault:
-            if (
-                fault.where is not None
-                and fault.where.line is None
-                and text.location.file != fault.where.file
-            ):
+            if fault.where is not None and fault.where.line is None and text.location.file != fault.where.file:
                 hint = f"{fault.hint} It is named by 'extends' in {text.location.file}:{text.location.line}."
                 raise ConfigError(fault.message, where=fault.where, hint=hint) from fault
             raise
@@ -250,9 +242,7 @@ def _override(tree: Node, text: str) -> Node:
         raise ConfigError(f"found {text!r}, expected a dotted name, '=' and a value.", where=where, hint=hint)
     origin = replace(origin, prefix=steps)
     if steps[0] == "extends":
-        raise ConfigError(
-            "'extends' is read from files only.", where=origin.at(None), hint="Write it in the config."
-        )
+        raise ConfigError("'extends' is read from files only.", where=origin.at(None), hint="Write it in the config.")
     value = read_nodes(written, origin) or Node(origin, 1, None)
     return _set(tree, steps, value)
 

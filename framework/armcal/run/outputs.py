@@ -47,9 +47,7 @@ def check_folder(folder: Path) -> None:
         )
 
 
-def write(
-    result: RunResult, experiment: Experiment, folder: Path, render: Callable[[RunResult], str]
-) -> None:
+def write(result: RunResult, experiment: Experiment, folder: Path, render: Callable[[RunResult], str]) -> None:
     """Write all files; those of an earlier run in the same place move to ``earlier/``.
 
     A run that did not converge leaves ``calibration.yaml.not-converged``, which nothing loads.
@@ -169,9 +167,7 @@ def residuals_text(result: RunResult) -> str:
     axes = ["dx_mm", "dy_mm", "dz_mm"] if rows == 3 else [f"residual{i}_mm" for i in range(1, rows + 1)]
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(
-        ["pose_id", "source_row", "set", "nominal_mm", "calibrated_mm", "cross_validated_mm", *axes]
-    )
+    writer.writerow(["pose_id", "source_row", "set", "nominal_mm", "calibrated_mm", "cross_validated_mm", *axes])
     for i, record in enumerate(dataset.ids):
         numbers = [errors.nominal_mm[i], errors.calibrated_mm[i], errors.cross_validated_mm[i]]
         numbers += list(errors.calibrated_residual_mm[:, i])

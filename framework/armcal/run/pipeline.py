@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 
-from armcal import __version__
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.errors import DataError, Location
@@ -114,15 +113,16 @@ def calibrate(
     """
     watch = watch or Stopwatch()
     ready = prepare(experiment, watch)
-    hook = experiment.registry.manager.hook
-    hook.armcal_run_started(name=experiment.name, records=len(ready.dataset))
+    registry = experiment.registry
+    faults = registry.notify("armcal_run_started", name=experiment.name, records=len(ready.dataset))
     for aside in ready.dataset.set_aside:
-        hook.armcal_record_rejected(row=aside.row, record_id=aside.record_id, reason=aside.reason)
+        told = {"row": aside.row, "record_id": aside.record_id, "reason": aside.reason}
+        faults += registry.notify("armcal_record_rejected", **told)
     start = experiment.parameters.nominal()
     with watch.stage("fit"):
         solution = experiment.estimator.solve(ready.problem, ready.training, start, progress)
         found = estimate(ready.problem, ready.training, solution)
-    hook.armcal_estimate_changed(estimate=found)
+    faults += registry.notify("armcal_estimate_changed", estimate=found)
     with watch.stage("validate"):
         errors = _errors(experiment, ready, solution.values, progress)
         table = _table(errors, ready.split)
@@ -135,7 +135,7 @@ def calibrate(
         errors=errors,
         table=table,
         verdict=_verdict(experiment, ready, found, errors),
-        warnings=ready.warnings,
+        warnings=(*ready.warnings, *dict.fromkeys(faults)),
         backend=ready.problem.backend,
         seconds=watch.seconds,
         provenance=_provenance(experiment, ready.dataset),
@@ -224,7 +224,7 @@ def _check_reach(problem: Problem, records: Sequence[FactorRecords], dataset: Da
 
 
 def _provenance(experiment: Experiment, dataset: Dataset) -> dict[str, Any]:
-    packages = ("numpy", "scipy", "casadi", "cvxpy")
+    packages = ("armcal", "numpy", "scipy", "casadi", "cvxpy")
     return {
         "config": str(experiment.source.path),
         "config_files": [Path(file).name for file in experiment.source.files],
@@ -232,11 +232,8 @@ def _provenance(experiment: Experiment, dataset: Dataset) -> dict[str, Any]:
         "data_sha256": dataset.sha256,
         "arm_sha256": identity_of(experiment.system.description),
         "versions": {
-            "armcal": __version__,
             "python": sys.version.split()[0],
             **{name: version(name) for name in packages},
         },
-        "plugins": {
-            p.name: f"{p.distribution} {p.version}" for p in experiment.registry.plugins if not p.fault
-        },
+        "plugins": {p.name: f"{p.distribution} {p.version}" for p in experiment.registry.plugins if not p.fault},
     }

@@ -7,6 +7,7 @@ parameters alone hoisted out of the loop over records. The virtual machine stays
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
@@ -72,9 +73,7 @@ class _Writer:
         """Write every instruction."""
         f = self._function
         for k in range(f.n_instructions()):
-            self._instruction(
-                _operations()[f.instruction_id(k)], f.instruction_input(k), f.instruction_output(k), k
-            )
+            self._instruction(_operations()[f.instruction_id(k)], f.instruction_input(k), f.instruction_output(k), k)
 
     def _instruction(self, operation: str, i: list[int], o: list[int], k: int) -> None:
         if operation == "INPUT":
@@ -168,9 +167,13 @@ def _definition(name: str, arguments: list[str], lines: list[str]) -> str:
 
 
 def _number(value: float) -> str:
+    if math.isnan(value):
+        return "NAN"
+    if math.isinf(value):
+        return "INFINITY" if value > 0 else "(-INFINITY)"
     text = float(value).hex()
     return f"({text})" if value < 0 else text
 
 
 def _is_number(text: str) -> bool:
-    return text.startswith(("0x", "(-0x"))
+    return text.startswith(("0x", "(-0x", "NAN", "INFINITY", "(-INFINITY"))

@@ -23,6 +23,7 @@ from functools import cache
 from pathlib import Path
 
 FLAGS = ("-O1", "-march=native", "-ffp-contract=off", "-fPIC", "-shared", "-w")
+ENTRY_POINTS = ("armcal_residuals", "armcal_linearise")
 KEPT_LIBRARIES = 64
 _COMPILE_LIMIT_S = 120
 
@@ -44,7 +45,7 @@ def cache_directory() -> Path:
     """Where compiled kernels are kept."""
     asked = os.environ.get("ARMCAL_CACHE_DIR")
     if asked:
-        return Path(asked)
+        return Path(asked).absolute()
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "armcal"
 
 
@@ -60,14 +61,13 @@ def load_cached(key: str) -> ctypes.CDLL | None:
     try:
         for place in (path, path.parent):
             seen = place.stat()
-            if hasattr(os, "getuid") and (
-                seen.st_uid != os.getuid() or seen.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
-            ):
+            if hasattr(os, "getuid") and (seen.st_uid != os.getuid() or seen.st_mode & (stat.S_IWGRP | stat.S_IWOTH)):
                 return None
         os.utime(path)
-        return ctypes.CDLL(str(path))
+        library = ctypes.CDLL(str(path))
     except OSError:
         return None
+    return library if all(hasattr(library, name) for name in ENTRY_POINTS) else None
 
 
 def compile_now(key: str, source: Callable[[], str]) -> ctypes.CDLL | None:
@@ -89,9 +89,7 @@ def compile_in_background(key: str, source: Callable[[], str]) -> None:
     def wait() -> None:
         with suppress(OSError, subprocess.SubprocessError):
             silent = subprocess.DEVNULL
-            subprocess.run(
-                command, start_new_session=True, stdin=silent, stdout=silent, stderr=silent, check=False
-            )
+            subprocess.run(command, start_new_session=True, stdin=silent, stdout=silent, stderr=silent, check=False)
 
     threading.Thread(target=wait, name="armcal-compile", daemon=True).start()
 
@@ -105,13 +103,12 @@ def _prepare(key: str, source: Callable[[], str]) -> list[str] | None:
     try:
         directory.mkdir(parents=True, exist_ok=True, mode=0o700)
         _forget_old(directory)
+        text = source()
         build = Path(tempfile.mkdtemp(prefix=".build-", dir=directory))
-        (build / "kernel.c").write_text(source(), encoding="utf-8")
+        (build / "kernel.c").write_text(text, encoding="utf-8")
     except OSError:
         return None
-    compile_it = shlex.join(
-        [compiler, *FLAGS, "-o", str(build / "kernel.so"), str(build / "kernel.c"), "-lm"]
-    )
+    compile_it = shlex.join([compiler, *FLAGS, "-o", str(build / "kernel.so"), str(build / "kernel.c"), "-lm"])
     into_place = shlex.join(["mv", "-f", str(build / "kernel.so"), str(directory / f"{key}.so")])
     remove = shlex.join(["rm", "-rf", str(build)])
     private = "umask 077"
@@ -143,7 +140,5 @@ def _processor() -> str:
     """What ``-march=native`` depends on."""
     with suppress(OSError):
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
-        return "\n".join(
-            sorted({line for line in lines if line.startswith(("flags", "Features", "model name"))})
-        )
+        return "\n".join(sorted({line for line in lines if line.startswith(("flags", "Features", "model name"))}))
     return f"{platform.machine()} {platform.processor()} {platform.node()}"

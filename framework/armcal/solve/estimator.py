@@ -158,9 +158,7 @@ def estimate(problem: Problem, records: Sequence[FactorRecords], solution: Solut
     equations = problem.normal_equations(solution.values, records).chained(chain)
     triangle = problem.triangular_factor(solution.values, records)
     known = analyse(triangle, scales, parameters.increment_names)
-    count = sum(
-        each.count * len(kernel.factor.noise) for kernel, each in zip(problem.kernels, records, strict=True)
-    )
+    count = problem.equations(records)
     freedom = count - known.rank
     noise_scale = float(np.sqrt(2 * equations.cost / freedom)) if freedom > 0 else 1.0
     held = np.diag(scales * np.sqrt(prior)) * noise_scale
@@ -180,9 +178,7 @@ def estimate(problem: Problem, records: Sequence[FactorRecords], solution: Solut
         free_entries=parameters.free_entries,
         covariance=chain @ covariance @ chain.T,
         unconstrained=solution.values[free] + chain @ step,
-        square_root_information=triangular(stacked / scales / noise_scale)
-        if len(values)
-        else triangle,
+        square_root_information=triangular(stacked / scales / noise_scale) if len(values) else triangle,
         noise_scale=noise_scale,
         degrees_of_freedom=freedom,
         identifiability=known,
@@ -201,22 +197,16 @@ def require_solvable(problem: Problem, records: Sequence[FactorRecords], start: 
         ProblemError: fewer equations than parameters, or undetermined combinations, without priors on them.
     """
     parameters = problem.parameters
-    count = sum(
-        each.count * len(kernel.factor.noise) for kernel, each in zip(problem.kernels, records, strict=True)
-    )
+    count = problem.equations(records)
     unknown = problem.increments
     has_prior = parameters.prior_information() > 0
     warnings = []
     if count < unknown:
         text = f"{count} equations ({_poses(records)} records) for {unknown} free parameters"
         if not has_prior.all():
-            raise ProblemError(
-                f"{text}.", hint="Measure more poses, fix parameters, or give every one a prior."
-            )
+            raise ProblemError(f"{text}.", hint="Measure more poses, fix parameters, or give every one a prior.")
         warnings.append(f"{text}: what the data does not say comes from the priors.")
-    known = analyse(
-        problem.triangular_factor(start, records), parameters.scales(), parameters.increment_names
-    )
+    known = analyse(problem.triangular_factor(start, records), parameters.scales(), parameters.increment_names)
     if known.undetermined:
         listed = "; ".join(str(combination) for combination in known.undetermined)
         text = f"the data does not determine {len(known.undetermined)} combinations: {listed}"
@@ -229,9 +219,7 @@ def require_solvable(problem: Problem, records: Sequence[FactorRecords], start: 
             )
         warnings.append(f"{text}; their priors hold them.")
     if known.condition > POOR_CONDITION:
-        warnings.append(
-            f"the scaled condition is {known.condition:.1e}: {known.weakest} is hardly determined."
-        )
+        warnings.append(f"the scaled condition is {known.condition:.1e}: {known.weakest} is hardly determined.")
     return tuple(warnings)
 
 
@@ -239,9 +227,7 @@ def _poses(records: Sequence[FactorRecords]) -> int:
     return max((each.count for each in records), default=0)
 
 
-def _interval(
-    value: float, unconstrained: float, sd: float, lower: float, upper: float, quantile: float
-) -> Interval95:
+def _interval(value: float, unconstrained: float, sd: float, lower: float, upper: float, quantile: float) -> Interval95:
     if not np.isfinite(sd):
         return Interval95(lower, upper, False)
     low, high = unconstrained - quantile * sd, unconstrained + quantile * sd

@@ -72,9 +72,7 @@ class Factor:
 
     def pass_function(self) -> ca.Function:
         """(values, record, state) -> (next state, residual)."""
-        return ca.Function(
-            "single_pass", self._inputs, [self.next_state, ca.densify(self.residual)], {"cse": True}
-        )
+        return ca.Function("single_pass", self._inputs, [self.next_state, ca.densify(self.residual)], {"cse": True})
 
     def output_function(self) -> ca.Function:
         """(values, record, state) -> (next state, outputs and tools)."""

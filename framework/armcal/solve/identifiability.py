@@ -33,9 +33,7 @@ class Combination:
         if len(self.terms) == 1:
             return f"{self.terms[0][0]} alone"
         first, *others = self.terms
-        return f"{first[0]} trades with " + ", ".join(
-            f"{name} ({weight / first[1]:+.3g})" for name, weight in others
-        )
+        return f"{first[0]} trades with " + ", ".join(f"{name} ({weight / first[1]:+.3g})" for name, weight in others)
 
 
 @dataclass(frozen=True)
@@ -60,11 +58,7 @@ class Identifiability:
     def determined(self) -> tuple[bool, ...]:
         """Whether each increment is free of undetermined combinations."""
         null = self.directions[self.rank :]
-        return (
-            tuple(bool(x < _NEGLIGIBLE) for x in np.linalg.norm(null, axis=0))
-            if len(null)
-            else (True,) * len(self)
-        )
+        return tuple(bool(x < _NEGLIGIBLE) for x in np.linalg.norm(null, axis=0)) if len(null) else (True,) * len(self)
 
     def __len__(self) -> int:
         return len(self.names)

@@ -24,8 +24,12 @@ EvaluatorChoice = Literal["auto", "compiled", "interpreted"]
 
 REST_RAD = 1e-13
 """A residual is taken when no deflection moves more than this in a pass: below 1e-6 mm on any arm."""
-REST_BEFORE_LINEARISING_RAD = 1e-8
+NEAR_REST_RAD = 1e-8
 """The linearisation corrects to second order, so it may start from here."""
+AS_IT_STANDS = 1e300
+"""Any state is at rest: take the one given, to which repeated passes might not lead."""
+MOST_DEFLECTION = 1.0
+"""rad, or m: a spring that gives more does not hold the arm, and more than one equilibrium may be near."""
 MOST_PASSES = 100
 WORTH_COMPILING_RECORDS = 5000
 """From this many records on, waiting for the compiler costs less than the virtual machine does."""
@@ -38,10 +42,12 @@ class Backend(Protocol):
 
     name: str
 
-    def residuals(self, values: Array, record: Array, state: Array, residual: Array) -> int:
-        """Fill ``residual``; give how many records (at least) did not settle."""
+    def residuals(self, values: Array, record: Array, state: Array, residual: Array, rest: float = REST_RAD) -> int:
+        """Fill ``residual`` once no deflection moves more than ``rest``; give how many records did not settle."""
 
-    def linearise(self, values: Array, record: Array, state: Array, residual: Array, jacobian: Array) -> int:
+    def linearise(
+        self, values: Array, record: Array, state: Array, residual: Array, jacobian: Array, rest: float = NEAR_REST_RAD
+    ) -> int:
         """Fill ``residual``, and ``jacobian`` (n_r * n_v x records, residual entry by residual entry)."""
 
 
@@ -55,15 +61,17 @@ class VirtualMachine:
         self._linearise = _Mapped(factor.linearise_function())
         self._has_state = factor.state.numel() > 0
 
-    def residuals(self, values: Array, record: Array, state: Array, residual: Array) -> int:
+    def residuals(self, values: Array, record: Array, state: Array, residual: Array, rest: float = REST_RAD) -> int:
         """As the protocol says."""
-        return self._settle(values, record, state, residual, REST_RAD)
+        return self._settle(values, record, state, residual, rest)
 
-    def linearise(self, values: Array, record: Array, state: Array, residual: Array, jacobian: Array) -> int:
+    def linearise(
+        self, values: Array, record: Array, state: Array, residual: Array, jacobian: Array, rest: float = NEAR_REST_RAD
+    ) -> int:
         """As the protocol says."""
         unsettled = 0
         if self._has_state:
-            unsettled = self._settle(values, record, state, residual, REST_BEFORE_LINEARISING_RAD)
+            unsettled = self._settle(values, record, state, residual, rest)
         following = np.empty_like(state)
         self._linearise(values, (record, state), (following, residual, jacobian))
         state[:] = following
@@ -129,17 +137,18 @@ class Compiled:
         self._residuals = _signature(library.armcal_residuals, outputs=1)
         self._linearise = _signature(library.armcal_linearise, outputs=2)
 
-    def residuals(self, values: Array, record: Array, state: Array, residual: Array) -> int:
+    def residuals(self, values: Array, record: Array, state: Array, residual: Array, rest: float = REST_RAD) -> int:
         """As the protocol says."""
         pointers = [*_pointers(values, record, state), residual.ctypes.data, _stride(residual)]
-        return int(self._residuals(record.shape[1], _stride(record), *pointers, REST_RAD, MOST_PASSES))
+        return int(self._residuals(record.shape[1], _stride(record), *pointers, rest, MOST_PASSES))
 
-    def linearise(self, values: Array, record: Array, state: Array, residual: Array, jacobian: Array) -> int:
+    def linearise(
+        self, values: Array, record: Array, state: Array, residual: Array, jacobian: Array, rest: float = NEAR_REST_RAD
+    ) -> int:
         """As the protocol says."""
         pointers = [*_pointers(values, record, state), residual.ctypes.data, _stride(residual)]
         pointers += [jacobian.ctypes.data, _stride(jacobian)]
-        rest = REST_BEFORE_LINEARISING_RAD, MOST_PASSES
-        return int(self._linearise(record.shape[1], _stride(record), *pointers, *rest))
+        return int(self._linearise(record.shape[1], _stride(record), *pointers, rest, MOST_PASSES))
 
 
 @dataclass(frozen=True)
@@ -164,21 +173,43 @@ class Kernel:
         """The exact Hessian of one record."""
         return self.factor.hessian_function()
 
-    def settle_by_newton(self, values: Array, record: Array, state: Array) -> bool:
-        """Bring every record that has not settled to its equilibrium, in place; False where there is none nearby."""
+    def residuals(self, values: Array, record: Array, state: Array, residual: Array) -> None:
+        """Residuals in equilibrium.
+
+        Raises:
+            NotConvergedError: a record has none.
+        """
+        if self.backend.residuals(values, record, state, residual, REST_RAD) or _out_of_hand(state):
+            self._settle_by_newton(values, record, state)
+            self.backend.residuals(values, record, state, residual, AS_IT_STANDS)
+
+    def linearise(self, values: Array, record: Array, state: Array, residual: Array, jacobian: Array) -> None:
+        """Residuals and Jacobian in equilibrium.
+
+        Raises:
+            NotConvergedError: a record has none.
+        """
+        if self.backend.linearise(values, record, state, residual, jacobian, NEAR_REST_RAD) or _out_of_hand(state):
+            self._settle_by_newton(values, record, state)
+            self.backend.linearise(values, record, state, residual, jacobian, AS_IT_STANDS)
+
+    def _settle_by_newton(self, values: Array, record: Array, state: Array) -> None:
+        """Bring every record to an equilibrium in place, where repeated passes lead away from it."""
         for column in range(record.shape[1]):
             at = np.nan_to_num(state[:, column], nan=0.0, posinf=0.0, neginf=0.0)
-            at = at if np.abs(at).max(initial=0.0) < 1 else np.zeros_like(at)
+            at = np.zeros_like(at) if _out_of_hand(at) else at
             for _ in range(MOST_PASSES):
                 moved, step = (np.asarray(m).ravel() for m in self.newton(values, record[:, column], at))
                 length = float(np.abs(step).max(initial=0.0))
                 at = moved if length < 0.3 else at + step * (0.3 / length)
                 if not np.isfinite(length) or length < REST_RAD:
                     break
-            if not length < REST_BEFORE_LINEARISING_RAD:
-                return False
+            if not length < NEAR_REST_RAD or _out_of_hand(at):
+                raise NotConvergedError(
+                    "the elastic equilibrium of a record did not settle.",
+                    hint="Bound the compliances, or check masses and units: springs this soft do not hold the arm.",
+                )
             state[:, column] = at
-        return True
 
     def predict(self, values: Array, record: Array, state: Array) -> Array:
         """Outputs and tool poses in equilibrium (n_o + 12 an arm x records).
@@ -193,14 +224,15 @@ class Kernel:
             mapped(values, (record, state), (following, shown))
             moved = np.abs(following - state).max(initial=0.0)
             state[:] = following
-            if moved <= REST_RAD:
+            if moved <= REST_RAD and not _out_of_hand(state):
                 return shown
-        if not self.settle_by_newton(values, record, state):
-            raise NotConvergedError(
-                "the elastic equilibrium did not settle.", hint="Check compliances and masses."
-            )
+        self._settle_by_newton(values, record, state)
         mapped(values, (record, state), (following, shown))
         return shown
+
+
+def _out_of_hand(state: Array) -> bool:
+    return bool(np.abs(state).max(initial=0.0) > MOST_DEFLECTION)
 
 
 def build_kernel(factor: Factor, records: int, choice: EvaluatorChoice = "auto") -> Kernel:
@@ -214,6 +246,7 @@ def build_kernel(factor: Factor, records: int, choice: EvaluatorChoice = "auto")
         return Kernel(factor, machine)
     functions = (factor.pass_function(), factor.linearise_function())
     text = "".join(f.serialize() for f in functions) + c_source.support_source() + c_source.driver_source()
+    text += f"{c_source.LANES} lanes"
     key = compiler.library_key(text)
 
     def source() -> str:
@@ -267,7 +300,7 @@ def _agree(factor: Factor, machine: Backend, compiled: Backend) -> bool:
         state = np.zeros((factor.state.numel(), count))
         residual = np.zeros((factor.residual.numel(), count))
         jacobian = np.zeros((factor.residual.numel() * factor.values.numel(), count))
-        backend.linearise(values, record, state, residual, jacobian)
+        backend.linearise(values, record, state, residual, jacobian, NEAR_REST_RAD)
         results.append((residual, jacobian))
     for one, two in zip(*results, strict=True):
         scale = max(1.0, float(np.nanmax(np.abs(one), initial=0.0)))

@@ -3,13 +3,14 @@
    Arrays are stored channel by channel: entry k of record i is at [k * stride + i]; n is a multiple of LANES. */
 #define AT_LEAST_ONE(n) ((n) > 0 ? (n) : 1)
 
-/* The largest change of any state; not a number if any change is none, so that a broken record is never at rest. */
+/* The largest change of any state; infinite if any is not a number, so that a broken record is never at rest. */
 static double furthest(const V *a, const V *b) {
   double largest = 0;
   for (int k = 0; k < N_STATE; ++k)
     for (int i = 0; i < LANES; ++i) {
       double change = fabs(a[k][i] - b[k][i]);
-      if (!(change <= largest)) largest = change;
+      if (isnan(change)) return INFINITY;
+      if (change > largest) largest = change;
     }
   return largest;
 }

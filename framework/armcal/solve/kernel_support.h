@@ -12,7 +12,7 @@ BOTH V load(const double *from) { V x; memcpy(&x, from, sizeof x); return x; }
 BOTH void store(double *to, V x) { memcpy(to, &x, sizeof x); }
 BOTH V choose(I mask, V a, V b) { return (V)((mask & (I)a) | (~mask & (I)b)); }
 
-BOTH double s_sign_of(double x) { return (x > 0) - (x < 0); }
+BOTH double s_sign_of(double x) { return x < 0 ? -1 : x > 0 ? 1 : x; }
 BOTH double s_less(double a, double b) { return a < b; }
 BOTH double s_less_equal(double a, double b) { return a <= b; }
 BOTH double s_equal(double a, double b) { return a == b; }
@@ -56,11 +56,14 @@ BOTH void v_sincos(V x, V *sine, V *cosine) {
   V shifted = x * 0x1.45f306dc9c883p-1 + shift;
   I quadrant = (I)shifted;
   V turns = shifted - shift;
-  V r = x - turns * 0x1.921fb54400000p+0;
-  V low = turns * 0x1.0b4611a626331p-34;
+  V first = x - turns * 0x1.921fb54400000p+0;
+  V second = turns * 0x1.0b4611a600000p-34;
+  V r = first - second;
+  V low = turns * 0x1.3198a2e037073p-69 - ((first - r) - second);
   V reduced = r - low;
   V z = reduced * reduced;
-  V s = broadcast(-0x1.ae7f3e733b81fp-41);
+  V s = broadcast(0x1.952c77030ad4ap-49);
+  s = s * z - 0x1.ae7f3e733b81fp-41;
   s = s * z + 0x1.6124613a86d09p-33;
   s = s * z - 0x1.ae64567f544e4p-26;
   s = s * z + 0x1.71de3a556c734p-19;
@@ -68,13 +71,15 @@ BOTH void v_sincos(V x, V *sine, V *cosine) {
   s = s * z + 0x1.1111111111111p-7;
   s = s * z - 0x1.5555555555555p-3;
   s = reduced + reduced * z * s;
-  V c = broadcast(-0x1.93974a8c07c9dp-37);
+  V c = broadcast(0x1.ae7f3e733b81fp-45);
+  c = c * z - 0x1.93974a8c07c9dp-37;
   c = c * z + 0x1.1eed8eff8d898p-29;
   c = c * z - 0x1.27e4fb7789f5cp-22;
   c = c * z + 0x1.a01a01a01a01ap-16;
   c = c * z - 0x1.6c16c16c16c17p-10;
   c = c * z + 0x1.5555555555555p-5;
-  c = 1.0 - 0.5 * z + z * z * c;
+  V half = 0.5 * z, w = 1.0 - half;
+  c = w + (((1.0 - w) - half) + z * z * c);
   I swap = (quadrant & 1) != 0;
   I flip_sine = (quadrant & 2) << 62;
   I flip_cosine = ((quadrant + 1) & 2) << 62;

@@ -14,7 +14,6 @@ from armcal.arm.assembly import Arm
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.base.parameters import Parameters
-from armcal.errors import NotConvergedError
 from armcal.measure.measurement import Measurement
 from armcal.solve.c_source import LANES
 from armcal.solve.factor import Environment, build_factor
@@ -74,9 +73,7 @@ class Problem:
         """Compile for datasets with the channels of this one."""
         available = frozenset(dataset.channels)
         kernels = [
-            build_kernel(
-                build_factor(n, m, arms, parameters, environment, available), len(dataset), evaluator
-            )
+            build_kernel(build_factor(n, m, arms, parameters, environment, available), len(dataset), evaluator)
             for n, m in measurements.items()
         ]
         return cls(parameters, tuple(kernels), environment)
@@ -116,9 +113,7 @@ class Problem:
     def subset(records: Sequence[FactorRecords], chosen: NDArray[np.intp]) -> tuple[FactorRecords, ...]:
         """Some records of all."""
         padded = -(-len(chosen) // LANES) * LANES
-        fill = np.concatenate(
-            [chosen, np.full(padded - len(chosen), chosen[-1] if len(chosen) else 0)]
-        ).astype(np.intp)
+        fill = np.concatenate([chosen, np.full(padded - len(chosen), chosen[-1] if len(chosen) else 0)]).astype(np.intp)
         parts = []
         for each in records:
             weight = each.weight[fill]
@@ -126,6 +121,13 @@ class Problem:
             record, state = np.take(each.record, fill, axis=1), np.take(each.state, fill, axis=1)
             parts.append(replace(each, count=len(chosen), record=record, weight=weight, state=state))
         return tuple(parts)
+
+    def equations(self, records: Sequence[FactorRecords]) -> int:
+        """How many residual numbers the records give; those of weight zero are no evidence."""
+        return sum(
+            int(np.count_nonzero(each.weight)) * len(kernel.factor.noise)
+            for kernel, each in zip(self.kernels, records, strict=True)
+        )
 
     def residuals(self, values: Array, records: Sequence[FactorRecords]) -> tuple[Array, ...]:
         """Raw residuals in equilibrium, one (n_r x N) matrix a factor.
@@ -137,19 +139,14 @@ class Problem:
         result = []
         for kernel, each in zip(self.kernels, records, strict=True):
             residual = np.empty((kernel.factor.residual.numel(), each.record.shape[1]))
-            unsettled = kernel.backend.residuals(free, each.record, each.state, residual)
-            if unsettled:
-                _rescue(kernel, free, each.record, each.state)
-                kernel.backend.residuals(free, each.record, each.state, residual)
+            kernel.residuals(free, each.record, each.state, residual)
             result.append(residual[:, : each.count])
         return tuple(result)
 
     def cost(self, values: Array, records: Sequence[FactorRecords]) -> float:
         """Half the weighted squared whitened residuals."""
         total = 0.0
-        for kernel, each, residual in zip(
-            self.kernels, records, self.residuals(values, records), strict=True
-        ):
+        for kernel, each, residual in zip(self.kernels, records, self.residuals(values, records), strict=True):
             whitened = residual / np.array(kernel.factor.noise)[:, None]
             total += 0.5 * float(np.sum(whitened**2 * each.weight[: each.count]))
         return total
@@ -240,11 +237,9 @@ def _linearised_block(kernel: Kernel, free: Array, each: FactorRecords, part: sl
     n_residual, n_values = kernel.factor.residual.numel(), len(free)
     jacobian = np.empty((n_residual * n_values, record.shape[1]))
     residual = np.empty((n_residual, record.shape[1]))
-    if kernel.backend.linearise(free, record, state, residual, jacobian):
-        _rescue(kernel, free, record, state)
-        kernel.backend.linearise(free, record, state, residual, jacobian)
+    kernel.linearise(free, record, state, residual, jacobian)
     scale = np.sqrt(weight) / np.array(kernel.factor.noise)[:, None]
-    shaped = jacobian.reshape(n_residual, n_values, -1)
+    shaped = jacobian.reshape(n_residual, n_values, record.shape[1])
     shaped *= scale[:, None, :]
     return shaped, residual * scale
 
@@ -253,11 +248,3 @@ def _block_sums(jacobian: Array, residual: Array) -> tuple[float, Array, Array]:
     hessian = sum((part @ part.T for part in jacobian), np.zeros((jacobian.shape[1],) * 2))
     gradient = np.einsum("kvb,kb->v", jacobian, residual)
     return 0.5 * float(np.sum(residual**2)), gradient, hessian
-
-
-def _rescue(kernel: Kernel, free: Array, record: Array, state: Array) -> None:
-    if not kernel.settle_by_newton(free, record, state):
-        raise NotConvergedError(
-            "the elastic equilibrium of a record did not settle.",
-            hint="Bound the compliances, or check masses and units: springs this soft do not hold the arm.",
-        )

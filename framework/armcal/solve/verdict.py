@@ -73,9 +73,7 @@ def judge(
 def _convergence(estimate: Estimate) -> Finding:
     told = estimate.verdict
     if not told.converged:
-        return Finding(
-            "bad", f"{told.name} did not converge ({told.status}): these values are no calibration."
-        )
+        return Finding("bad", f"{told.name} did not converge ({told.status}): these values are no calibration.")
     text = f"{told.name} converged in {told.iterations} iterations"
     if told.starts > 1:
         text += f"; {told.agreeing_starts} of {told.starts} starts came to the same answer"
@@ -94,9 +92,7 @@ def _condition(estimate: Estimate) -> list[Finding]:
     known = estimate.identifiability
     if known.condition <= POOR_CONDITION:
         return []
-    return [
-        Finding("warning", f"Hardly determined (scaled condition {known.condition:.1e}): {known.weakest}.")
-    ]
+    return [Finding("warning", f"Hardly determined (scaled condition {known.condition:.1e}): {known.weakest}.")]
 
 
 def _bounds(estimate: Estimate) -> list[Finding]:
@@ -131,9 +127,7 @@ def _noise(whitened: Array) -> Finding:
             "error, not the tracker's. Intervals are widened to the residuals.",
         )
     if ratio < 0.5:
-        return Finding(
-            "note", f"Residuals are only {ratio:.2f} times the declared noise: was it stated too large?"
-        )
+        return Finding("note", f"Residuals are only {ratio:.2f} times the declared noise: was it stated too large?")
     return Finding("good", "Residuals are as large as the declared noise: the model explains the data.")
 
 

@@ -157,9 +157,7 @@ class Calibration:
         joints = self.system.arms[name].joint_names
         angles = np.atleast_2d(np.asarray(joint_angles, dtype=float))
         if angles.shape[1] != len(joints):
-            raise ValueError(
-                f"found {angles.shape[1]} joint angles a row, the arm {name} has {len(joints)} joints"
-            )
+            raise ValueError(f"found {angles.shape[1]} joint angles a row, the arm {name} has {len(joints)} joints")
         channels = {f"{name}.{joint}": angles[:, i] for i, joint in enumerate(joints)}
         commands = Dataset(tuple(str(i) for i in range(len(angles))), channels)
         measured = next(n for n, m in self.system.measurements.items() if m.arms == (name,))
