@@ -15,7 +15,7 @@ EARTH = np.array([0.0, 0.0, -9.81])
 
 # name: (last joint it is counted on, last joint that moves it, frame, mass, centre)
 LINKS = {
-    "link1": (1, 0, "base", 0.1234, (0.0, 0.002, 0.03732)),
+    "link1": (1, 0, "mount", 0.1234, (0.0, 0.002, 0.03732)),
     "link2": (2, 2, "upper_arm", 0.177, (0.01246484, -0.00020331, 0.0476142)),
     "link3": (3, 2, "row2", 0.1016, (0.0, 0.0025, 0.0319581)),
     "link4": (4, 4, "forearm", 0.1328, (0.0045466, 0.0, 0.053125)),
@@ -139,7 +139,7 @@ def poses(v: dict[str, float], q: np.ndarray, deflection: np.ndarray) -> tuple[l
     n = len(q)
     base = shift(v["base_x"], v["base_y"], v["base_z"], n) @ turn("x", v["base_rx"], n)
     here = base = base @ turn("y", v["base_ry"] + deflection[:, 0], n)
-    before, frames = [], {"base": base}
+    before, frames = [], {"mount": base}
     for i in range(1, JOINTS + 1):
         before.append(here)
         here = here @ turn("z", q[:, i - 1] + v[f"theta{i}"] + deflection[:, i], n) @ shift(0, 0, v[f"d{i}"], n)
@@ -181,7 +181,7 @@ def elastic_pass(
     """The measured point at a deflection (N x 3), and the deflection that the springs answer with (N x 7)."""
     before, frames = poses(v, q, deflection)
     moments = site_moments(v, before, frames, loads)
-    axes = [frames["base"][:, :3, 1], *(pose[:, :3, 2] for pose in before)]
+    axes = [frames["mount"][:, :3, 1], *(pose[:, :3, 2] for pose in before)]
     answer = [v[f"k{i}"] * np.einsum("ni,ni->n", moments[i], axes[i]) for i in range(JOINTS + 1)]
     target = np.array([v["target_x"], v["target_y"], v["target_z"]])
     return point(frames["tool"], target), np.stack(answer, axis=1)

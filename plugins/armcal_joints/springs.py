@@ -26,9 +26,7 @@ class TorsionalSpringSettings(Settings):
     @classmethod
     def _physical(cls, value: float) -> float:
         if value < 0:
-            raise ValueError(
-                f"a compliance of {value:g} rad/(N m) is below zero: no spring pushes with its load"
-            )
+            raise ValueError(f"a compliance of {value:g} rad/(N m) is below zero: no spring pushes with its load")
         return value
 
 
@@ -56,8 +54,7 @@ class TorsionalSprings:
         physical = Interval(lower=0.0)
         nominal = self._settings.compliance
         return tuple(
-            scalar(f"k{site}", "rad_per_Nm", nominal, COMPLIANCE_SCALE_RAD_PER_NM, physical)
-            for site in self._sites
+            scalar(f"k{site}", "rad_per_Nm", nominal, COMPLIANCE_SCALE_RAD_PER_NM, physical) for site in self._sites
         )
 
     def displacement(self, command: JointCommand, values: Mapping[str, Any]) -> Any:

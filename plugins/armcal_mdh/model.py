@@ -37,9 +37,7 @@ class Step(Settings):
     def _one_thing(self) -> Step:
         given = [name for name in (*_MOTIONS, "frame") if getattr(self, name) is not None]
         if len(given) != 1:
-            raise ValueError(
-                f"a step is one transform or one frame name, found {given or 'none'}; write several steps"
-            )
+            raise ValueError(f"a step is one transform or one frame name, found {given or 'none'}; write several steps")
         return self
 
     @property
@@ -76,9 +74,9 @@ class MdhSettings(Settings):
         if len(set(self.joints)) < len(self.joints):
             raise ValueError(f"a joint name stands twice in {', '.join(self.joints)}")
         if any(step.frame for step in self.base):
-            raise ValueError("base: a frame cannot be named here; the frame at its end is called 'base'")
+            raise ValueError("base: a frame cannot be named here; the frame at its end is called 'mount'")
         names = [step.frame for _, steps in _places(self) for step in steps if step.frame]
-        reserved = {"base", "tool", *(f"row{i}" for i in range(1, len(self.rows) + 1))}
+        reserved = {"mount", "tool", *(f"row{i}" for i in range(1, len(self.rows) + 1))}
         taken = [n for n in names if names.count(n) > 1 or n in reserved]
         if taken:
             raise ValueError(f"frame name {taken[0]!r} is taken; choose another")
@@ -171,9 +169,7 @@ class MdhModel:
                 continue
             kind, value = step.motion[0], values[next(names)[0]]
             turns = kind.startswith("r")
-            here = here @ (
-                se3.rotation_about(kind[1], value) if turns else se3.translation_along(kind, value)
-            )
+            here = here @ (se3.rotation_about(kind[1], value) if turns else se3.translation_along(kind, value))
         return here
 
 
@@ -186,6 +182,4 @@ def _places(settings: MdhSettings) -> Iterator[tuple[str, tuple[Step, ...]]]:
 
 def _block(name: str, value: float) -> ParameterBlock:
     angular = name.startswith(("alpha", "theta")) or "_r" in name
-    return (
-        scalar(name, "rad", value, ANGLE_SCALE_RAD) if angular else scalar(name, "m", value, LENGTH_SCALE_M)
-    )
+    return scalar(name, "rad", value, ANGLE_SCALE_RAD) if angular else scalar(name, "m", value, LENGTH_SCALE_M)

@@ -170,7 +170,4 @@ def _with_outliers(
     wrong = random.random(count) < outliers.fraction
     push = random.normal(size=(len(measured), count))
     push *= outliers.size * (1 + random.random(count)) / np.linalg.norm(push, axis=0)
-    return {
-        channel: values + np.where(wrong, push[row], 0.0)
-        for row, (channel, values) in enumerate(measured.items())
-    }
+    return {channel: values + np.where(wrong, push[row], 0.0) for row, (channel, values) in enumerate(measured.items())}

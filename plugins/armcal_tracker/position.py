@@ -1,4 +1,4 @@
-"""The position of a target on the tool, measured in the arm's root frame."""
+"""The position of a target on the tool, measured in the arm's base frame."""
 
 from __future__ import annotations
 
@@ -58,9 +58,9 @@ class TipPosition:
         return tuple(Channel(axis, "length") for axis in "xyz")
 
     def outputs(self, arms: Mapping[str, ArmState], values: Mapping[str, Any]) -> dict[str, Any]:
-        """The target's position in the root frame (m)."""
+        """The target's position in the base frame (m)."""
         target = ca.sparsify(ca.vertcat(*[values[f"target_{axis}"] for axis in "xyz"]))
-        position = arms[self._arm].root_T_tool.apply(target)
+        position = arms[self._arm].base_T_tool.apply(target)
         return {axis: position[i] for i, axis in enumerate("xyz")}
 
     def residual(self, arms: Mapping[str, ArmState], measured: Mapping[str, Any], values: Mapping[str, Any]) -> Any:

@@ -256,7 +256,6 @@ def test_joint_counts(names: list[str], counts: str | None, field: str | None) -
     assert found.startswith(f"poses.csv:1, {field}: the file has {counts}") and "Use this arm's file" in found
 
 
-
 def test_writing_replaces_whole_or_not_at_all(tmp_path: Path) -> None:
     target = tmp_path / "out.csv"
     target.write_text("old")

@@ -63,9 +63,7 @@ def test_the_published_training_set_gives_the_published_compliances(
 
 @pytest.fixture(scope="module")
 def loaded(repository: Path, lrm_data: Path):
-    experiment = Experiment.load(
-        repository / "configs" / "lrm_arm" / "option1.yaml", data=lrm_data / "poses.csv"
-    )
+    experiment = Experiment.load(repository / "configs" / "lrm_arm" / "option1.yaml", data=lrm_data / "poses.csv")
     dataset, system = experiment.read(), experiment.system
     problem = Problem.build(
         system.arms, system.measurements, experiment.parameters, system.environment, dataset, "compiled"

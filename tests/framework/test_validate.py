@@ -9,9 +9,9 @@ from typing import Annotated, Literal
 
 import pytest
 from armcal.base.settings import Acceleration3, Angle, Compliance, InputPath, Length, Length3, Mass, Settings
-from armcal.errors import ConfigError
 from armcal.config.validate import validate
 from armcal.config.yaml_source import ConfigSource, load_config
+from armcal.errors import ConfigError
 from pydantic import Field, model_validator
 
 
@@ -175,9 +175,7 @@ def test_all_faults_are_reported_together_in_the_order_of_their_lines(tmp_path: 
 
 def test_a_fault_from_the_command_line_is_placed_there(tmp_path: Path) -> None:
     message = refusal(tmp_path, GOOD, "model.rows.1.d=5")
-    assert message.startswith(
-        "command line (--set model.rows.1.d), model.rows.1.d: found 5 with its unit missing"
-    )
+    assert message.startswith("command line (--set model.rows.1.d), model.rows.1.d: found 5 with its unit missing")
 
 
 def test_a_part_below_a_path_keeps_its_full_place(tmp_path: Path) -> None:
@@ -187,9 +185,7 @@ def test_a_part_below_a_path_keeps_its_full_place(tmp_path: Path) -> None:
     assert validate(Row, source, ("model", "rows", 1)).com == (0.0, 0.002, 0.03)
     with pytest.raises(ConfigError, match=r"c\.yaml:1, arm\.row: found no 'arm\.row'.*d_mm"):
         validate(Row, source, ("arm", "row"))
-    with pytest.raises(
-        ConfigError, match=r"c\.yaml:3, model\.rows: found a list of 2 values, expected keys and"
-    ):
+    with pytest.raises(ConfigError, match=r"c\.yaml:3, model\.rows: found a list of 2 values, expected keys and"):
         validate(Row, source, ("model", "rows"))
 
 
@@ -218,9 +214,7 @@ def test_a_check_of_the_plugin_itself_is_placed_at_its_part(tmp_path: Path) -> N
     class Holder(Settings):
         span: Range
 
-    with pytest.raises(
-        ConfigError, match=r"c\.yaml:2, span: low 2\.0 is not below high 1\.0: exchange them\.$"
-    ):
+    with pytest.raises(ConfigError, match=r"c\.yaml:2, span: low 2\.0 is not below high 1\.0: exchange them\.$"):
         validate(Holder, load(tmp_path, "# a range\nspan: {low: 2.0, high: 1}\n"))
 
 

@@ -7,9 +7,9 @@ from typing import Any
 
 import pytest
 import yaml
-from armcal.errors import ConfigError
 from armcal.config.yaml_nodes import Origin, read_nodes
 from armcal.config.yaml_source import ConfigSource, ConfigText, load_config
+from armcal.errors import ConfigError
 
 SAMPLE = """\
 # an arm with two rows
@@ -54,9 +54,7 @@ def refusal(folder: Path, text: str | bytes) -> str:
 
 
 @pytest.mark.parametrize("loader", [yaml.SafeLoader, getattr(yaml, "CSafeLoader", yaml.SafeLoader)])
-def test_both_parsers_of_yaml_read_the_sample_alike_and_as_safe_load_does(
-    loader: Any, tmp_path: Path
-) -> None:
+def test_both_parsers_of_yaml_read_the_sample_alike_and_as_safe_load_does(loader: Any, tmp_path: Path) -> None:
     def flat(node: Any) -> Any:
         if isinstance(node.value, dict):
             return {key: flat(entry) for key, entry in node.value.items()}

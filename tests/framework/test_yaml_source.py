@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 import yaml
-from armcal.errors import ConfigError
 from armcal.config.yaml_source import ConfigSource, ConfigText, load_config, resolve_path
+from armcal.errors import ConfigError
 
 SAMPLE = """\
 # an arm with two rows
@@ -324,9 +324,7 @@ def mutate(rng: random.Random, text: bytes) -> bytes:
             case 2:
                 raw[start:start] = raw[start : start + size] * rng.randint(1, 5)
             case _:
-                raw[start:start] = rng.choice(
-                    [b"\t", b": ", b"- ", b"*m", b"&m", b"{", b"]", b"!!x", b"1e3", b"\n"]
-                )
+                raw[start:start] = rng.choice([b"\t", b": ", b"- ", b"*m", b"&m", b"{", b"]", b"!!x", b"1e3", b"\n"])
         raw = raw or bytearray(b" ")
     return bytes(raw)
 

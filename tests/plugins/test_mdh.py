@@ -80,7 +80,7 @@ def armcal_frames(model):
     chain = model.chain({block.name: values[i] for i, block in enumerate(blocks)})
     q = ca.SX.sym("q", len(chain.joints))
     frames = forward(chain, [joint.offset + q[i] for i, joint in enumerate(chain.joints)], {})
-    outputs = {"tool": frames.root_T_tool.matrix(), **{n: t.matrix() for n, t in frames.named.items()}}
+    outputs = {"tool": frames.base_T_tool.matrix(), **{n: t.matrix() for n, t in frames.named.items()}}
     function = ca.Function("f", [values, q], [ca.densify(m) for m in outputs.values()], ["v", "q"], list(outputs))
     nominal = np.array([block.nominal[0] for block in blocks])
     return lambda q, v=nominal: {k: np.array(m) for k, m in function(v=v, q=q).items()}

@@ -41,9 +41,7 @@ def truth(loaded: Experiment) -> np.ndarray:
 def problem_for(loaded: Experiment, dataset) -> Problem:
     """The experiment's problem on a dataset."""
     system = loaded.system
-    return Problem.build(
-        system.arms, system.measurements, loaded.parameters, system.environment, dataset, "compiled"
-    )
+    return Problem.build(system.arms, system.measurements, loaded.parameters, system.environment, dataset, "compiled")
 
 
 @pytest.mark.parametrize("solver", ["ipopt", "cvxpy"])

@@ -43,7 +43,7 @@ class ArmState:
     In equilibrium ``next_deflection`` equals the deflection that was put in.
     """
 
-    root_T_tool: Transform
+    base_T_tool: Transform
     frames: Mapping[str, Transform]
     next_deflection: Expression
 
@@ -118,12 +118,11 @@ class Arm:
         chain, springs = self.chain(values), self.springs(values)
         along, rotations = split_deflection(chain, springs, inputs.deflection)
         displacements = [
-            joint.offset + along[i] + self._commanded(values, inputs, i)
-            for i, joint in enumerate(chain.joints)
+            joint.offset + along[i] + self._commanded(values, inputs, i) for i, joint in enumerate(chain.joints)
         ]
         frames = forward(chain, displacements, rotations)
         acting = wrenches(chain, frames, self._masses(values), inputs.load)
-        return ArmState(frames.root_T_tool, frames.named, deflections(chain, frames, acting, springs))
+        return ArmState(frames.base_T_tool, frames.named, deflections(chain, frames, acting, springs))
 
     def _commanded(self, values: Mapping[str, Expression], inputs: ArmInputs, index: int) -> Expression:
         command = JointCommand(index, inputs.joint_angles[index], inputs.approach[index])

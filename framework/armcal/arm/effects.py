@@ -28,7 +28,7 @@ class Spring:
     """An elastic deflection at a site.
 
     Attributes:
-        site: 0 for the base, i for joint i (from 1).
+        site: 0 for the mount, i for joint i (from 1).
         directions: unit vectors in the site's frame (after the joint's motion), one a coordinate; empty for the
             joint's own axis.
         law: generalised loads (N m, or N on a prismatic joint's own axis; one a coordinate) to deflections (rad or m).

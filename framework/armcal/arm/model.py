@@ -58,7 +58,7 @@ class Joint:
 
 @dataclass(frozen=True)
 class Attachment:
-    """A frame fixed to the chain: which joint moves it last (0: none, it stands on the base), and where it sits."""
+    """A frame fixed to the chain: which joint moves it last (0: none, it stands on the mount), and where it sits."""
 
     joint: int
     joint_T_frame: Transform
@@ -69,14 +69,14 @@ class Chain:
     """A serial chain in the form that statics and effects work on.
 
     Attributes:
-        root_T_base: from the frame in which the arm is measured to the base, the frame that carries joint 1. A
+        base_T_mount: from the base frame, in which the arm is measured, to the mount, which carries joint 1. A
             base spring deflects about its origin.
         joints: from the base to the tip.
         tool: the last frame, as an attachment.
         frames: further named frames, for masses and measurements.
     """
 
-    root_T_base: Transform
+    base_T_mount: Transform
     joints: tuple[Joint, ...]
     tool: Attachment
     frames: Mapping[str, Attachment] = field(default_factory=dict)
@@ -102,7 +102,7 @@ class ArmModel(Protocol):
 
 @dataclass(frozen=True)
 class Site:
-    """Where a deflection can happen: the base or a joint, in the root frame, after the joint's motion."""
+    """Where a deflection can happen: the mount or a joint, in the base frame, after the joint's motion."""
 
     origin: Expression
     rotation: Expression
@@ -110,10 +110,10 @@ class Site:
 
 @dataclass(frozen=True)
 class Frames:
-    """The pose of everything, in the root frame: sites (0 the base, i joint i), the tool, the named frames."""
+    """The pose of everything, in the base frame: sites (0 the mount, i joint i), the tool, the named frames."""
 
     sites: tuple[Site, ...]
-    root_T_tool: Transform
+    base_T_tool: Transform
     named: Mapping[str, Transform]
 
 
@@ -123,15 +123,15 @@ def forward(chain: Chain, displacements: Sequence[Expression], rotations: Mappin
     Args:
         chain: the arm.
         displacements: of each joint (rad or m), effects and offsets included.
-        rotations: a further rotation (3x3) at a site (0 the base), after the joint's motion.
+        rotations: a further rotation (3x3) at a site (0 the mount), after the joint's motion.
     """
-    moving = [_deflected(chain.root_T_base, rotations.get(0))]
+    moving = [_deflected(chain.base_T_mount, rotations.get(0))]
     for index, (joint, displacement) in enumerate(zip(chain.joints, displacements, strict=True), start=1):
         here = moving[-1] @ joint.parent_T_joint @ joint.motion(displacement)
         moving.append(_deflected(here, rotations.get(index)))
     return Frames(
         sites=tuple(Site(pose.translation, pose.rotation) for pose in moving),
-        root_T_tool=moving[chain.tool.joint] @ chain.tool.joint_T_frame,
+        base_T_tool=moving[chain.tool.joint] @ chain.tool.joint_T_frame,
         named={name: moving[at.joint] @ at.joint_T_frame for name, at in chain.frames.items()},
     )
 

@@ -1,4 +1,4 @@
-"""Statics: gravity and load to moments at the base and the joints, and what the springs make of them.
+"""Statics: gravity and load to moments at the mount and the joints, and what the springs make of them.
 
 The moment of every weight beyond a site is the cross product of one first moment with gravity, so the
 cost does not grow with the number of masses. [Conenna2024]
@@ -17,7 +17,7 @@ from armcal.arm.model import Chain, Frames
 from armcal.base import se3
 from armcal.base.se3 import Expression
 
-BASE_FRAME, TOOL_FRAME = "base", "tool"
+MOUNT_FRAME, TOOL_FRAME = "mount", "tool"
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class Mass:
         name: what it is.
         mass: kg.
         com: centre of mass in its frame (3x1, m).
-        frame: a named frame of the chain, ``base`` or ``tool``.
+        frame: a named frame of the chain, ``mount`` or ``tool``.
         loads_up_to: the last joint it loads (from 1); None for the physical one, the joint that moves it.
     """
 
@@ -44,11 +44,11 @@ class Load:
     """What acts on the arm in one record.
 
     Attributes:
-        gravity: acceleration in the root frame (3x1, m/s^2).
+        gravity: acceleration in the base frame (3x1, m/s^2).
         payload_mass: kg, on top of the arm's own masses.
         payload_com: its centre in the tool frame (3x1, m).
-        force: external force at the tool frame's origin, in the root frame's axes (3x1, N).
-        torque: external torque, in the root frame's axes (3x1, N m).
+        force: external force at the tool frame's origin, in the base frame's axes (3x1, N).
+        torque: external torque, in the base frame's axes (3x1, N m).
     """
 
     gravity: Expression
@@ -60,14 +60,14 @@ class Load:
 
 @dataclass(frozen=True)
 class SiteWrench:
-    """What a site carries, in the root frame: moment about its origin (N m) and force (N)."""
+    """What a site carries, in the base frame: moment about its origin (N m) and force (N)."""
 
     moment: Expression
     force: Expression
 
 
 def wrenches(chain: Chain, frames: Frames, masses: Sequence[Mass], load: Load) -> tuple[SiteWrench, ...]:
-    """The wrench that everything beyond it puts on each site (0 the base, i joint i)."""
+    """The wrench that everything beyond it puts on each site (0 the mount, i joint i)."""
     last = len(chain.joints)
     weight_at: dict[int, Expression] = defaultdict(lambda: ca.SX(0))
     moment_at: dict[int, Expression] = defaultdict(lambda: ca.SX(3, 1))
@@ -77,21 +77,19 @@ def wrenches(chain: Chain, frames: Frames, masses: Sequence[Mass], load: Load) -
         weight_at[up_to] += mass.mass
         moment_at[up_to] += mass.mass * pose.apply(mass.com)
     weight_at[last] += load.payload_mass
-    moment_at[last] += load.payload_mass * frames.root_T_tool.apply(load.payload_com)
+    moment_at[last] += load.payload_mass * frames.base_T_tool.apply(load.payload_com)
     result: list[SiteWrench] = []
     weight, first_moment = ca.SX(0), ca.SX(3, 1)
     for index in reversed(range(last + 1)):
         weight, first_moment = weight + weight_at[index], first_moment + moment_at[index]
         origin = frames.sites[index].origin
         moment = _cross(first_moment - weight * origin, load.gravity) + load.torque
-        moment += _cross(frames.root_T_tool.translation - origin, load.force)
+        moment += _cross(frames.base_T_tool.translation - origin, load.force)
         result.append(SiteWrench(moment, weight * load.gravity + load.force))
     return tuple(reversed(result))
 
 
-def deflections(
-    chain: Chain, frames: Frames, acting: Sequence[SiteWrench], springs: Sequence[Spring]
-) -> Expression:
+def deflections(chain: Chain, frames: Frames, acting: Sequence[SiteWrench], springs: Sequence[Spring]) -> Expression:
     """What each spring coordinate deflects under the wrenches, stacked in the order of the springs."""
     parts = []
     for spring in springs:
@@ -146,8 +144,8 @@ def _rotation(axis: Expression, angle: Expression) -> Expression:
 
 def _frame(chain: Chain, frames: Frames, name: str) -> tuple[se3.Transform, int]:
     if name == TOOL_FRAME:
-        return frames.root_T_tool, chain.tool.joint
-    if name == BASE_FRAME:
+        return frames.base_T_tool, chain.tool.joint
+    if name == MOUNT_FRAME:
         site = frames.sites[0]
         return se3.Transform(site.rotation, site.origin), 0
     return frames.named[name], chain.frames[name].joint
@@ -160,4 +158,4 @@ def _cross(a: Expression, b: Expression) -> Expression:
 def frame_names(chain: Chain) -> Mapping[str, int]:
     """Every frame a mass may be given in, and the joint that moves it."""
     moved_by = {name: at.joint for name, at in chain.frames.items()}
-    return {BASE_FRAME: 0, **moved_by, TOOL_FRAME: chain.tool.joint}
+    return {MOUNT_FRAME: 0, **moved_by, TOOL_FRAME: chain.tool.joint}

@@ -51,9 +51,7 @@ def _content(experiment: Experiment, ready: Prepared, known: Identifiability) ->
             "used": len(ready.dataset),
             "train": len(ready.split.train),
             "holdout": len(ready.split.holdout),
-            "set_aside": [
-                {"row": a.row, "id": a.record_id, "reason": a.reason} for a in ready.dataset.set_aside
-            ],
+            "set_aside": [{"row": a.row, "id": a.record_id, "reason": a.reason} for a in ready.dataset.set_aside],
         },
         "equations": equations,
         "parameters": {

@@ -24,10 +24,10 @@ Path = tuple[str | int, ...]
 
 
 class LinkSettings(Settings):
-    """A mass: where its centre is, in a named frame of the model, ``base`` or ``tool``.
+    """A mass: where its centre is, in a named frame of the model, ``mount`` or ``tool``.
 
     ``loads_up_to_joint`` overrides the physical loading where a source counted a link on a joint that does not
-    carry it (from 1; 0 for the base alone).
+    carry it (from 1; 0 for the mount alone).
     """
 
     mass: Mass
@@ -45,7 +45,7 @@ class ArmSettings(Settings):
 
 
 class StaticsSettings(Settings):
-    """Gravity and load in the arm's root frame, where a record does not say otherwise.
+    """Gravity and load in the arm's base frame, where a record does not say otherwise.
 
     ``payload`` is what hangs on the tool beyond the links (0 g has to be said); ``body`` lets gravity be checked.
     """
@@ -191,7 +191,7 @@ def _check_link(source: ConfigSource, at: Path, link: LinkSettings, known: Mappi
         raise ConfigError(
             f"found joint {link.loads_up_to_joint}, expected 0 to {joints}.",
             where=source.where((*at, "loads_up_to_joint")),
-            hint="Joints count from 1; 0 is the base.",
+            hint="Joints count from 1; 0 is the mount.",
         )
 
 

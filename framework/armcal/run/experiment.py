@@ -161,5 +161,5 @@ def _gravity_warnings(settings: ExperimentSettings) -> list[str]:
         if abs(size - expected) > _GRAVITY_TOLERANCE * expected:
             found.append(f"gravity is {size:.3f} m/s^2, on the {statics.body} it is {expected:.3f}.")
     if statics.gravity[2] > 0:
-        found.append("gravity points up along the root frame's z axis: right only for an arm that hangs.")
+        found.append("gravity points up along the base frame's z axis: right only for an arm that hangs.")
     return found

@@ -216,7 +216,7 @@ def _check_reach(problem: Problem, records: Sequence[FactorRecords], dataset: Da
         found = float(np.median(np.linalg.norm(dataset.stacked(channels), axis=0)))
         if found > _REACH_RATIO * expected or expected > _REACH_RATIO * found:
             raise DataError(
-                f"{kernel.factor.name}: positions are typically {found:.4g} m from the root frame, the model's tip "
+                f"{kernel.factor.name}: positions are typically {found:.4g} m from the base frame, the model's tip "
                 f"{expected:.4g} m.",
                 where=Location(dataset.source),
                 hint="Check the unit in the column names (x_mm or x_m) and the frame of the measurements.",

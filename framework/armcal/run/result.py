@@ -22,7 +22,7 @@ class RecordErrors:
         cross_validated_mm: by the fold that did not train on it (N; nan outside of cross-validation).
         nominal_residual_mm: measured minus predicted, all factors stacked (n_r x N).
         calibrated_residual_mm: the same after calibration.
-        position_mm: predicted tool position of the first arm in its root frame (3 x N).
+        position_mm: predicted tool position of the first arm in its base frame (3 x N).
     """
 
     nominal_mm: Array

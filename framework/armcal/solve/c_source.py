@@ -161,6 +161,11 @@ def driver_source() -> str:
     return resources.files("armcal.solve").joinpath("kernel_driver.h").read_text(encoding="utf-8")
 
 
+def generator_source() -> str:
+    """This module's own text: part of what a compiled library depends on."""
+    return resources.files("armcal.solve").joinpath("c_source.py").read_text(encoding="utf-8")
+
+
 def _definition(name: str, arguments: list[str], lines: list[str]) -> str:
     body = "\n".join("  " + line for line in lines)
     return f"static void {name}({', '.join(arguments)}) {{\n{body}\n}}\n"

@@ -8,7 +8,7 @@ from functools import cached_property
 from typing import Protocol
 
 import numpy as np
-from scipy.stats import t
+from scipy.special import stdtrit
 
 from armcal.base.domains import Array
 from armcal.base.parameters import Parameters
@@ -138,7 +138,7 @@ class Estimate:
         """
         lower, upper = _entry_bounds(self.parameters)
         freedom = max(self.degrees_of_freedom, 1)
-        quantile = float(t.ppf(0.5 + CONFIDENCE / 2, freedom))
+        quantile = float(stdtrit(freedom, 0.5 + CONFIDENCE / 2))
         value = self.values[list(self.free_entries)]
         rows = zip(value, self.unconstrained, self.deviations, lower, upper, strict=True)
         return tuple(_interval(*row, quantile) for row in rows)

@@ -50,7 +50,7 @@ class Factor:
         next_state: one elastic pass from ``state``.
         residual: m or rad (n_r).
         outputs: what the instrument would read (n_o), named by ``output_channels``.
-        tools: each arm's root_T_tool without its last row, column by column (12 an arm; m).
+        tools: each arm's base_T_tool without its last row, column by column (12 an arm; m).
         noise: standard deviation of each residual entry.
     """
 
@@ -171,7 +171,7 @@ def build_factor(
     residual = measurement.residual(states, measured, local)
     next_state = ca.densify(ca.vertcat(*[states[a].next_deflection for a in measurement.arms]))
     outputs = ca.vertcat(*predicted.values())
-    tools = ca.vertcat(*[ca.vec(states[a].root_T_tool.matrix()[:3, :]) for a in measurement.arms])
+    tools = ca.vertcat(*[ca.vec(states[a].base_T_tool.matrix()[:3, :]) for a in measurement.arms])
     used = records.used_by(ca.vertcat(residual, next_state, outputs, tools))
     return Factor(
         name=name,

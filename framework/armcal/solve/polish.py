@@ -7,55 +7,61 @@ these steps an answer depends on the problem alone. [Nocedal2006]
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.optimize import lsq_linear
 
 from armcal.base.domains import Array
+from armcal.base.parameters import Parameters
 from armcal.errors import NotConvergedError
-from armcal.solve.problem import FactorRecords, Problem
+from armcal.solve.problem import FactorRecords, NormalEquations, Problem
 
 MOST_STEPS = 25
 AT_REST = 1e-10
-"""A step this many standard deviations long (of the declared noise) changes nothing anybody can see."""
-FARTHEST = 1e-2
-"""A first step longer than this, in standard deviations, means that the solver had not arrived: it is left alone."""
-_NEAR_A_BOUND = 1e-6
+"""A step this many standard deviations long (of the noise found) changes nothing anybody can see."""
+_ROUNDING = 1e-12
 
 
 def polish(problem: Problem, records: Sequence[FactorRecords], values: Array) -> Array:
-    """A converged solution to its last digits; unchanged where these steps would not improve it."""
+    """A converged solution to its last digits; steps that would raise the cost are not taken."""
     parameters = problem.parameters
-    scales, prior = parameters.scales(), parameters.prior_information()
-    lower, upper = parameters.increment_bounds()
-    increment, length_before = parameters.local(values), np.inf
-    for turn in range(MOST_STEPS):
+    prior = parameters.prior_information()
+    increment, best = parameters.local(values), np.inf
+    for _ in range(MOST_STEPS):
+        candidate = parameters.retract(increment)
         try:
-            chain = parameters.retract_jacobian(increment)
-            here = problem.normal_equations(parameters.retract(increment), records).chained(chain)
+            here = problem.normal_equations(candidate, records).chained(parameters.retract_jacobian(increment))
         except NotConvergedError:
             return values
-        gradient = (here.gradient + prior * increment) * scales
-        hessian = (here.hessian + np.diag(prior)) * np.outer(scales, scales)
-        pushed = ((increment - lower < _NEAR_A_BOUND * scales) & (gradient > 0)) | (
-            (upper - increment < _NEAR_A_BOUND * scales) & (gradient < 0)
-        )
-        target = np.where(gradient > 0, lower, upper)
-        step = np.where(pushed, np.where(pushed, target, 0.0) - increment, 0.0) / scales
-        step[~pushed] = _newton(hessian, gradient + hessian @ step, ~pushed)
-        length = float(np.sqrt(max(step @ hessian @ step, 0.0)))
-        if not length < (FARTHEST if turn == 0 else length_before):
+        cost = here.cost + 0.5 * float(prior @ increment**2)
+        if cost > best * (1 + _ROUNDING):
             return values
-        increment = np.clip(increment + step * scales, lower, upper)
-        values, length_before = parameters.retract(increment), length
-        if length <= AT_REST:
+        values, best = candidate, min(cost, best)
+        model = NormalEquations(cost, here.gradient + prior * increment, here.hessian + np.diag(prior))
+        step = _bounded_step(parameters, increment, model)
+        if step is None:
             return values
+        length = math.sqrt(max(float(step @ model.hessian @ step), 0.0))
+        if length <= AT_REST * max(1.0, math.sqrt(2 * cost / max(1, problem.equations(records)))):
+            return values
+        increment = increment + step
     return values
 
 
-def _newton(hessian: Array, gradient: Array, moving: Array) -> Array:
-    """The step of the moving entries; none along directions that nothing determines."""
-    inside = hessian[np.ix_(moving, moving)]
-    size = np.sqrt(np.maximum(np.diag(inside), 1e-300))
-    step = np.linalg.lstsq(inside / np.outer(size, size), -gradient[moving] / size, rcond=1e-13)[0]
-    return np.asarray(step / size)
+def _bounded_step(parameters: Parameters, increment: Array, model: NormalEquations) -> Array | None:
+    """The Gauss-Newton model's minimum within the bounds, by an active-set method; None if it has no single one."""
+    lower, upper = parameters.increment_bounds()
+    size = np.sqrt(np.maximum(np.diag(model.hessian), 1e-300))
+    try:
+        root = np.linalg.cholesky(model.hessian / np.outer(size, size)).T
+    except np.linalg.LinAlgError:
+        return None
+    target = -np.linalg.solve(root.T, model.gradient / size)
+    bounds = ((lower - increment) * size, (upper - increment) * size)
+    found = lsq_linear(root, target, bounds, method="bvls", tol=1e-14)
+    at_lower, at_upper = found.active_mask < 0, found.active_mask > 0
+    step = found.x / size
+    step[at_lower], step[at_upper] = (lower - increment)[at_lower], (upper - increment)[at_upper]
+    return np.asarray(np.clip(increment + step, lower, upper) - increment)

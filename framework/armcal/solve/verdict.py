@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2, norm
+from scipy.special import chdtri, ndtri
 
 from armcal.base.domains import Array
 from armcal.solve.estimator import Estimate
@@ -104,7 +104,7 @@ def _bounds(estimate: Estimate) -> list[Finding]:
             continue
         value, sd = estimate.values[estimate.free_entries[i]], estimate.deviations[i]
         beyond = abs(float(estimate.unconstrained[i] - value)) / sd if sd > 0 else 0.0
-        (pushing if beyond > norm.ppf(1 - LEVEL) else agreeing).append(f"{name} ({beyond:.1f} sd beyond)")
+        (pushing if beyond > ndtri(1 - LEVEL) else agreeing).append(f"{name} ({beyond:.1f} sd beyond)")
     findings = []
     if pushing:
         text = f"The data pushes against a bound: {', '.join(pushing)}. Something else in the model is missing."
@@ -120,7 +120,7 @@ def _noise(whitened: Array) -> Finding:
     count = whitened.size
     total = float(np.sum(whitened**2))
     ratio = float(np.sqrt(total / count))
-    if total > chi2.ppf(1 - LEVEL / 2, count):
+    if total > chdtri(count, LEVEL / 2):
         return Finding(
             "warning",
             f"Residuals are {ratio:.1f} times the declared noise (chi-square, 5 %): what is left is the model's "
@@ -138,7 +138,7 @@ def _neighbours(whitened: Array) -> list[Finding]:
     if count < 10 or not spread:
         return []
     lag_one = float(np.sum(whitened[:, 1:] * whitened[:, :-1])) / spread
-    if abs(lag_one) < norm.ppf(1 - LEVEL / 2) / np.sqrt(whitened[:, 1:].size):
+    if abs(lag_one) < ndtri(1 - LEVEL / 2) / np.sqrt(whitened[:, 1:].size):
         return [Finding("good", "Residuals of neighbouring records do not correlate (5 %).")]
     return [
         Finding(

@@ -77,6 +77,11 @@ def _movable(blocks: tuple[ParameterBlock, ...]) -> bool:
             f"{block.name}: found the scale {block.scale}, expected the size of an ordinary correction",
         )
         parameters = Parameters((replace(block, free=True),))
+        moves = np.linalg.matrix_rank(parameters.retract_jacobian(np.zeros(block.domain.dof)))
+        expect(
+            moves == block.domain.dof,
+            f"{block.name}: only {moves} of {block.domain.dof} increments move its nominal value; start elsewhere",
+        )
         delta = _within(parameters, 0.5 * parameters.scales())
         back = parameters.local(parameters.retract(delta))
         expect(

@@ -10,7 +10,7 @@ import numpy as np
 
 from armcal.arm.assembly import Arm, MassSpec
 from armcal.arm.model import ArmModel, Chain, Joint, forward
-from armcal.arm.statics import BASE_FRAME, TOOL_FRAME
+from armcal.arm.statics import MOUNT_FRAME, TOOL_FRAME
 from armcal.base.domains import Array
 from armcal.base.parameters import ParameterBlock
 from armcal.base.se3 import Expression, Transform
@@ -94,7 +94,7 @@ def _chain(chain: Chain, names: Sequence[str]) -> Chain:
         _axis(joint)
     for name, at in {TOOL_FRAME: chain.tool, **chain.frames}.items():
         expect(0 <= at.joint <= len(names), f"the frame {name} hangs on joint {at.joint}, expected 0 to {len(names)}")
-    taken = sorted({BASE_FRAME, TOOL_FRAME} & set(chain.frames))
+    taken = sorted({MOUNT_FRAME, TOOL_FRAME} & set(chain.frames))
     expect(not taken, f"found a frame called {', '.join(taken)}, which armcal uses itself")
     return chain
 
@@ -109,7 +109,7 @@ def _axis(joint: Joint) -> None:
 
 
 def _parts(chain: Chain) -> list[Expression]:
-    transforms = [chain.root_T_base, chain.tool.joint_T_frame]
+    transforms = [chain.base_T_mount, chain.tool.joint_T_frame]
     transforms += [joint.parent_T_joint for joint in chain.joints]
     transforms += [at.joint_T_frame for at in chain.frames.values()]
     return [*(t.matrix() for t in transforms), *(joint.offset for joint in chain.joints)]
@@ -118,7 +118,7 @@ def _parts(chain: Chain) -> list[Expression]:
 def _kinematics(blocks: tuple[ParameterBlock, ...], values: dict[str, Expression], chain: Chain) -> _Kinematics:
     moved = ca.SX.sym("displacement", len(chain.joints))
     frames = forward(chain, [joint.offset + moved[i] for i, joint in enumerate(chain.joints)], {})
-    shown = [frames.root_T_tool, *frames.named.values()]
+    shown = [frames.base_T_tool, *frames.named.values()]
     shown += [Transform(site.rotation, site.origin) for site in frames.sites]
     inputs = stacked([*values.values(), moved])
     poses = ca.Function("poses", [inputs], [stacked([pose.matrix()[:3, :] for pose in shown])])
@@ -144,7 +144,7 @@ def _derivatives(known: _Kinematics) -> None:
 
 def _settles(model: ArmModel, chain: Chain) -> None:
     """Gravity on a small mass in every frame, springs at the base and every joint."""
-    frames = [BASE_FRAME, *chain.frames, TOOL_FRAME]
+    frames = [MOUNT_FRAME, *chain.frames, TOOL_FRAME]
     masses = tuple(MassSpec(f"m{i}", 0.02, (0.0, 0.01, 0.0), frame) for i, frame in enumerate(frames))
     arm = Arm(ARM, "model", model, {"spring": Springs(len(chain.joints))}, masses)
     arms, parameters = {ARM: arm}, all_parameters({ARM: arm})

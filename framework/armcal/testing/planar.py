@@ -100,8 +100,8 @@ class Tip:
         return tuple(Channel(axis, "length") for axis in _TIP)
 
     def outputs(self, arms: Mapping[str, ArmState], values: Mapping[str, Expression]) -> dict[str, Expression]:
-        """In the root frame (m)."""
-        return {axis: arms[self.arm].root_T_tool.translation[i] for i, axis in enumerate(_TIP)}
+        """In the base frame (m)."""
+        return {axis: arms[self.arm].base_T_tool.translation[i] for i, axis in enumerate(_TIP)}
 
     def residual(
         self,

@@ -124,7 +124,7 @@ class Calibration:
             commands: records with joint angles; load and gravity where they differ from the configured ones.
 
         Returns:
-            values (N) by channel (SI), and root_T_tool (arms x N x 4 x 4).
+            values (N) by channel (SI), and base_T_tool (arms x N x 4 x 4).
 
         Raises:
             NotConvergedError: a record has no equilibrium.
@@ -147,7 +147,7 @@ class Calibration:
         return channels, _poses(shown[0][len(problem.kernels[0].factor.output_channels) :])
 
     def forward(self, joint_angles: Array, arm: str | None = None) -> Array:
-        """root_T_tool (N x 4 x 4) at commanded joint angles (N x n; rad, or m on sliding joints).
+        """base_T_tool (N x 4 x 4) at commanded joint angles (N x n; rad, or m on sliding joints).
 
         Raises:
             ValueError: the number of joints differs.

@@ -139,13 +139,13 @@ class LostFrame(Model):
 class Shearing(Model):
     def chain(self, values: Any) -> Any:
         sheared = se3.Transform(ca.SX.eye(3) * (1 + values["length"]), ca.SX(3, 1))
-        return replace(super().chain(values), root_T_base=sheared)
+        return replace(super().chain(values), base_T_mount=sheared)
 
 
 class Mirrored(Model):
     def chain(self, values: Any) -> Any:
         mirror = se3.Transform(ca.diag(ca.SX([1, 1, -1])), ca.SX(3, 1))
-        return replace(super().chain(values), root_T_base=mirror)
+        return replace(super().chain(values), base_T_mount=mirror)
 
 
 class Stepped(Model):
@@ -246,7 +246,7 @@ class Measurement:
         return (Channel("x", self.dimension),)
 
     def outputs(self, arms: Any, values: Any) -> Any:
-        return {"x": arms[self.arms[0]].root_T_tool.translation[0]}
+        return {"x": arms[self.arms[0]].base_T_tool.translation[0]}
 
     def residual(self, arms: Any, measured: Any, values: Any) -> Any:
         return measured["x"] - self.outputs(arms, values)["x"] + self.offset
