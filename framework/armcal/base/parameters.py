@@ -116,7 +116,7 @@ class Parameters:
                 near = difflib.get_close_matches(pattern, self.names, n=3, cutoff=0.5) or list(self.names[:3])
                 raise ConfigError(
                     f"no parameter is called {pattern!r}.",
-                    hint=f"Nearest: {', '.join(near)}. `armcal check` lists all {len(self.names)} names.",
+                    hint=f"Nearest: {', '.join(near)}. `armcal check -v` lists all {len(self.names)} names.",
                 )
             chosen.update(found)
         return tuple(name for name in self.names if name in chosen)

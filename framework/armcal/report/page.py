@@ -162,7 +162,8 @@ def _origin(result: RunResult) -> dict[str, Any]:
         Fact("noise scale", f"{significant(result.estimate.noise_scale)} times the declared noise"),
         Fact("degrees of freedom", count(result.estimate.degrees_of_freedom)),
     ]
-    facts += provenance_facts(result.provenance)
+    said = {fact.name for fact in facts}
+    facts += [fact for fact in provenance_facts(result.provenance) if fact.name not in said]
     return {
         "facts": [f for f in facts if not f.long],
         "long_facts": [f for f in facts if f.long],
