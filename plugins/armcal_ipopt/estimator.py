@@ -28,7 +28,7 @@ class IpoptSettings(Settings):
     """How to solve."""
 
     hessian: Literal["gauss-newton", "exact"] = "gauss-newton"
-    tolerance: Annotated[float, Field(gt=0, lt=1)] = 1e-10
+    tolerance: Annotated[float, Field(gt=0, lt=1)] = 1e-9
     max_iterations: Annotated[int, Field(ge=1)] = 200
     starts: Annotated[int, Field(ge=1)] = 1
     seed: int = 0
