@@ -1,4 +1,4 @@
-"""Run every command that the documentation shows: lines that begin with ``$`` in ``console`` blocks."""
+"""Run what the documentation shows: lines that begin with ``$`` in ``console`` blocks, and ``python run`` blocks."""
 
 from __future__ import annotations
 
@@ -7,14 +7,19 @@ import sys
 from pathlib import Path
 
 
-def commands(text: str) -> list[str]:
-    """The commands of one document, in order."""
-    found, inside = [], False
+def runnable(text: str) -> list[list[str]]:
+    """The commands of one document, in order, as argument lists."""
+    found: list[list[str]] = []
+    kind, block = "", []
     for line in text.splitlines():
         if line.startswith("```"):
-            inside = line.strip() == "```console"
-        elif inside and line.startswith("$ "):
-            found.append(line[2:])
+            if kind == "python run":
+                found.append([sys.executable, "-c", "\n".join(block)])
+            kind, block = ("" if kind else line[3:].strip() or "text"), []
+        elif kind == "console" and line.startswith("$ "):
+            found.append(["bash", "-ec", line[2:]])
+        else:
+            block.append(line)
     return found
 
 
@@ -23,10 +28,10 @@ def main(places: list[str]) -> int:
     files = [f for place in map(Path, places) for f in (sorted(place.rglob("*.md")) if place.is_dir() else [place])]
     failed = count = 0
     for file in files:
-        for command in commands(file.read_text(encoding="utf-8")):
+        for command in runnable(file.read_text(encoding="utf-8")):
             count += 1
-            done = subprocess.run(["bash", "-ec", command], capture_output=True, text=True, timeout=300, check=False)
-            print(f"{'ok  ' if done.returncode == 0 else 'FAIL'} {file}: {command}")
+            done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+            print(f"{'ok  ' if done.returncode == 0 else 'FAIL'} {file}: {command[2].splitlines()[0]}")
             if done.returncode:
                 failed += 1
                 print(done.stdout, done.stderr, sep="\n")
