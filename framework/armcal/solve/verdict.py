@@ -56,7 +56,7 @@ def judge(
         suggestions: poses that would tell most next.
     """
     findings = [_convergence(estimate), _determined(estimate), *_condition(estimate), *_bounds(estimate)]
-    findings += [_noise(whitened[:, train]), *_neighbours(whitened[:, train]), *_correlated(estimate)]
+    findings += [_noise(estimate), *_neighbours(whitened[:, train]), *_correlated(estimate)]
     findings += [*_outliers(errors_mm[train]), *_next(estimate, suggestions)]
     order = {"bad": 0, "warning": 1, "note": 2, "good": 3}
     if len(judged_mm):
@@ -115,12 +115,11 @@ def _bounds(estimate: Estimate) -> list[Finding]:
     return findings
 
 
-def _noise(whitened: Array) -> Finding:
+def _noise(estimate: Estimate) -> Finding:
     """Are the residuals as large as the declared noise? Chi-square, two-sided, at 5 %."""
-    count = whitened.size
-    total = float(np.sum(whitened**2))
-    ratio = float(np.sqrt(total / count))
-    if total > chdtri(count, LEVEL / 2):
+    freedom, ratio = max(1, estimate.degrees_of_freedom), estimate.noise_scale
+    total = ratio**2 * freedom
+    if total > chdtri(freedom, LEVEL / 2):
         return Finding(
             "warning",
             f"Residuals are {ratio:.1f} times the declared noise (chi-square, 5 %): what is left is the model's "
