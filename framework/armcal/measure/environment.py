@@ -1,18 +1,23 @@
-"""Columns of load and gravity: whole vectors, and no misspelt ones."""
+"""Columns of load, gravity and time: whole vectors, no misspelt names, no jump unnoticed."""
 
 from __future__ import annotations
 
 import difflib
 from dataclasses import replace
 
+import numpy as np
+
 from armcal.base.dataset import Dataset
 from armcal.base.units import split_suffix
 from armcal.errors import DataError, Location
 from armcal.measure.reader import ENVIRONMENT
 
+JUMP_RATIO = 50.0
+SHORTEST_JUMP_S = 600.0
+
 
 def noticed(dataset: Dataset) -> Dataset:
-    """The dataset, with a warning for each unused column that looks like a misspelt one.
+    """The dataset, with a warning for each unused column that looks like a misspelt one, and for a jump in time.
 
     Raises:
         DataError: a vector has some of its components only; the missing ones are not guessed.
@@ -33,4 +38,17 @@ def noticed(dataset: Dataset) -> Dataset:
         near = difflib.get_close_matches(split[0], known, n=1, cutoff=0.8) if split else []
         if near:
             found.append(f"the column {column} is kept but not used: was {near[0]} meant?")
-    return replace(dataset, warnings=(*dataset.warnings, *found))
+    return replace(dataset, warnings=(*dataset.warnings, *found, *_jumps(dataset)))
+
+
+def _jumps(dataset: Dataset) -> list[str]:
+    """Pauses so long that arm or tracker may have been touched, or a clock set."""
+    if not dataset.has("time") or len(dataset) < 3:
+        return []
+    steps = np.diff(dataset.column("time"))
+    limit = max(JUMP_RATIO * float(np.median(steps)), SHORTEST_JUMP_S)
+    return [
+        f"{steps[i]:.0f} s pass between the records {dataset.ids[i]} and {dataset.ids[i + 1]}: if anything was moved "
+        "there, calibrate the parts on their own."
+        for i in np.flatnonzero(steps > limit)[:5]
+    ]
