@@ -38,6 +38,7 @@ ORDER = [
     "armcal.solve.factor",
     "armcal.solve.kernel",
     "armcal.solve.problem",
+    "armcal.solve.posed",
     "armcal.solve.polish",
     "armcal.solve.identifiability",
     "armcal.solve.estimator",

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Literal
 
 import casadi as ca
@@ -17,11 +18,13 @@ from armcal.base.settings import Settings
 from armcal.errors import NotConvergedError
 from armcal.solve.estimator import Progress, Solution, SolverVerdict, no_progress
 from armcal.solve.polish import polish
+from armcal.solve.posed import PosedProblem
 from armcal.solve.problem import FactorRecords, NormalEquations, Problem
 from pydantic import Field
 
 _SAME_COST = 1e-6
 _BARRIER_START = 1e-8
+_SMALLEST_UNIT = 1e-9
 
 
 class IpoptSettings(Settings):
@@ -53,47 +56,39 @@ class IpoptEstimator:
         began = time.perf_counter()
         if not problem.increments:
             return Solution(start, SolverVerdict("ipopt", "nothing is free", True, 0, 0.0))
-        random = np.random.default_rng(self._settings.seed)
-        found: list[tuple[float, Solution]] = []
+        posed, random = PosedProblem(problem, records), np.random.default_rng(self._settings.seed)
+        found: list[_Run] = []
         for number in range(self._settings.starts):
             progress("fit", number / self._settings.starts)
-            found.append(self._solve_once(problem, records, _start(problem, start, random, number)))
-        converged = [pair for pair in found if pair[1].verdict.converged]
-        cost, best = min(converged or found, key=lambda pair: pair[0])
-        agreeing = sum(abs(c - cost) <= _SAME_COST * max(1.0, cost) for c, _ in converged)
-        told = best.verdict
-        values = polish(problem, records, best.values) if told.converged else best.values
+            found.append(self._solve_once(posed, _start(posed, start, random, number)))
+        converged = [run for run in found if run.converged]
+        best = min(converged or found, key=lambda run: run.cost)
+        agreeing = sum(abs(run.cost - best.cost) <= _SAME_COST * max(1.0, best.cost) for run in converged)
+        x = polish(posed, best.x) if best.converged else best.x
         verdict = SolverVerdict(
             "ipopt",
-            told.status,
-            told.converged,
-            told.iterations,
+            best.status,
+            best.converged,
+            best.iterations,
             time.perf_counter() - began,
             len(found),
             agreeing,
         )
-        return Solution(values, verdict)
+        return Solution(posed.values(x), verdict)
 
-    def _solve_once(self, problem: Problem, records: Sequence[FactorRecords], start: Array) -> tuple[float, Solution]:
-        began = time.perf_counter()
-        objective = _Objective(problem, records, start, exact=self._settings.hessian == "exact")
-        scales = problem.parameters.scales()
-        lower, upper = (bound / scales for bound in problem.parameters.increment_bounds())
+    def _solve_once(self, posed: PosedProblem, start: Array) -> _Run:
+        objective = _Objective(posed, start, exact=self._settings.hessian == "exact")
+        lower, upper = posed.bounds()
         # CasADi holds callbacks weakly: they must outlive the solve here.
         callbacks = [_Callback(name, objective) for name in ("cost", "gradient", "hessian")]
-        solver = self._solver(callbacks, len(scales))
-        answer = solver(x0=problem.parameters.local(start) / scales, lbx=lower, ubx=upper)
+        solver = self._solver(callbacks, len(start))
+        answer = solver(x0=start, lbx=lower, ubx=upper)
         told = solver.stats()
         # IPOPT stays inside its bounds by a rounding error; the model's domain wants it exactly.
-        values = objective.values(np.clip(np.asarray(answer["x"]).ravel(), lower, upper))
-        verdict = SolverVerdict(
-            "ipopt",
-            str(told["return_status"]),
-            bool(told["success"]) and bool(np.isfinite(values).all()),
-            int(told["iter_count"]),
-            time.perf_counter() - began,
-        )
-        return float(answer["f"]) * objective.unit, Solution(values, verdict)
+        x = np.clip(np.asarray(answer["x"]).ravel(), lower, upper)
+        converged = bool(told["success"]) and bool(np.isfinite(x).all())
+        cost = float(answer["f"]) * objective.unit
+        return _Run(x, cost, converged, str(told["return_status"]), int(told["iter_count"]))
 
     def _solver(self, callbacks: list[_Callback], size: int) -> Any:
         cost, gradient, hessian = callbacks
@@ -132,64 +127,59 @@ class IpoptEstimator:
         return ca.nlpsol("armcal", "ipopt", {"x": x, "f": value}, options)
 
 
-def _start(problem: Problem, start: Array, random: np.random.Generator, number: int) -> Array:
+@dataclass(frozen=True)
+class _Run:
+    """One start's end: where, at what cost, and in IPOPT's words why it stopped."""
+
+    x: Array
+    cost: float
+    converged: bool
+    status: str
+    iterations: int
+
+
+def _start(posed: PosedProblem, start: Array, random: np.random.Generator, number: int) -> Array:
     """The given start, then random ones an ordinary correction away from the nominal values."""
     if number == 0:
-        return start
-    parameters = problem.parameters
-    lower, upper = parameters.increment_bounds()
-    return parameters.retract(np.clip(random.normal(0.0, parameters.scales()), lower, upper))
+        return posed.x(start)
+    return np.clip(random.normal(size=len(posed.scales)), *posed.bounds())
 
 
 class _Objective:
-    """Cost, gradient and Hessian in scaled increments from the nominal values; one evaluation for each point.
+    """Cost, gradient and Hessian, one evaluation for each point.
 
     All are divided by the cost at the start, so that IPOPT's tolerances mean the same for any noise and any data.
     """
 
-    def __init__(self, problem: Problem, records: Sequence[FactorRecords], start: Array, exact: bool) -> None:
-        self._problem, self._records, self._exact = problem, records, exact
-        self.scales = problem.parameters.scales()
-        self._prior = problem.parameters.prior_information() * self.scales**2
+    def __init__(self, posed: PosedProblem, start: Array, exact: bool) -> None:
+        self._posed, self._exact = posed, exact
         self._at: Array | None = None
-        self._equations = NormalEquations(np.nan, np.zeros(0), np.zeros((0, 0)))
-        self.unit = 1.0
-        at_start = float(self.cost(problem.parameters.local(start) / self.scales))
-        self.unit = at_start if np.isfinite(at_start) and at_start > 1 else 1.0
-
-    def values(self, x: Array) -> Array:
-        """The value vector at a scaled increment."""
-        return self._problem.parameters.retract(x * self.scales)
+        self._model = NormalEquations(np.nan, np.zeros(0), np.zeros((0, 0)))
+        self.size, self.unit = len(start), 1.0
+        at_start = float(self.cost(start))
+        self.unit = at_start if np.isfinite(at_start) and at_start > _SMALLEST_UNIT else 1.0
 
     def cost(self, x: Array) -> Array:
-        """Residuals and priors; not a number where the arm has no equilibrium, so that IPOPT steps back."""
-        return np.array(self._evaluate(x).cost + 0.5 * float(self._prior @ x**2)) / self.unit
+        """Not a number where the arm has no equilibrium, so that IPOPT steps back."""
+        return np.array(self._evaluate(x).cost / self.unit)
 
     def gradient(self, x: Array) -> Array:
         """By scaled increments."""
-        return (self._evaluate(x).gradient * self.scales + self._prior * x) / self.unit
+        return self._evaluate(x).gradient / self.unit
 
     def hessian(self, x: Array) -> Array:
         """Gauss-Newton, or exact for the residuals."""
-        inner = self._evaluate(x).hessian
-        if self._exact:
-            chain = self._chain(x)
-            inner = chain.T @ self._problem.exact_hessian(self.values(x), self._records) @ chain
-        return (inner * np.outer(self.scales, self.scales) + np.diag(self._prior)) / self.unit
-
-    def _chain(self, x: Array) -> Array:
-        return self._problem.parameters.retract_jacobian(x * self.scales)
+        return (self._posed.exact_hessian(x) if self._exact else self._evaluate(x).hessian) / self.unit
 
     def _evaluate(self, x: Array) -> NormalEquations:
         if self._at is None or not np.array_equal(x, self._at):
             self._at = x.copy()
             try:
-                canonical = self._problem.normal_equations(self.values(x), self._records)
-                self._equations = canonical.chained(self._chain(x))
+                self._model = self._posed.model(x)
             except NotConvergedError:
-                size = len(x)
-                self._equations = NormalEquations(np.nan, np.full(size, np.nan), np.full((size, size), np.nan))
-        return self._equations
+                nowhere = np.full((len(x), len(x)), np.nan)
+                self._model = NormalEquations(np.nan, nowhere[0], nowhere)
+        return self._model
 
 
 class _Callback(ca.Callback):  # type: ignore[misc]
@@ -198,7 +188,7 @@ class _Callback(ca.Callback):  # type: ignore[misc]
     def __init__(self, what: Literal["cost", "gradient", "hessian"], objective: _Objective) -> None:
         super().__init__()
         self._function = getattr(objective, what)
-        size = len(objective.scales)
+        size = objective.size
         self._shape = {"cost": (1, 1), "gradient": (size, 1), "hessian": (size, size)}[what]
         self._size = size
         self.construct(what, {})
