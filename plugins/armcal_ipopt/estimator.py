@@ -84,6 +84,8 @@ class IpoptEstimator:
         solver = self._solver(callbacks, len(start))
         answer = solver(x0=start, lbx=lower, ubx=upper)
         told = solver.stats()
+        if objective.interrupted or told["return_status"] == "User_Requested_Stop":
+            raise KeyboardInterrupt  # CasADi keeps it to itself, and the next start would go on
         # IPOPT stays inside its bounds by a rounding error; the model's domain wants it exactly.
         x = np.clip(np.asarray(answer["x"]).ravel(), lower, upper)
         converged = bool(told["success"]) and bool(np.isfinite(x).all())
@@ -155,7 +157,7 @@ class _Objective:
         self._posed, self._exact = posed, exact
         self._at: Array | None = None
         self._model = NormalEquations(np.nan, np.zeros(0), np.zeros((0, 0)))
-        self.size, self.unit = len(start), 1.0
+        self.size, self.unit, self.interrupted = len(start), 1.0, False
         at_start = float(self.cost(start))
         self.unit = at_start if np.isfinite(at_start) and at_start > _SMALLEST_UNIT else 1.0
 
@@ -176,6 +178,9 @@ class _Objective:
             self._at = x.copy()
             try:
                 self._model = self._posed.model(x)
+            except KeyboardInterrupt:
+                self.interrupted = True
+                raise
             except NotConvergedError:
                 nowhere = np.full((len(x), len(x)), np.nan)
                 self._model = NormalEquations(np.nan, nowhere[0], nowhere)

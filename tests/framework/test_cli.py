@@ -204,6 +204,23 @@ def test_a_killed_run_leaves_the_earlier_calibration_whole(demo: Path, tmp_path:
     assert armcal("run", DEMO, "--out", str(folder), "-q", *FAST).exit_code == 0
 
 
+def test_ctrl_c_ends_a_long_fit_and_leaves_nothing_half_done(tmp_path: Path) -> None:
+    """The solver's own library must not swallow the interrupt and let the next start go on."""
+    long = ["run", DEMO, "--out", str(tmp_path / "run"), "--set", "estimator.starts=2000", *FAST]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "armcal.cli", *long],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    )
+    time.sleep(4)
+    process.send_signal(signal.SIGINT)
+    _, told = process.communicate(timeout=60)
+    assert process.returncode == 1 and "Aborted" in told and "Traceback" not in told
+    assert not (tmp_path / "run" / "calibration.yaml").exists()
+
+
 def test_a_missing_library_is_named_and_only_hurts_who_asks_for_it(tmp_path: Path) -> None:
     (tmp_path / "cvxpy.py").write_text("raise ImportError('no cvxpy on this machine')\n")
     with_cvxpy = _process("run", DEMO, "--out", str(tmp_path / "a"), "--set", "estimator.type=cvxpy", path=tmp_path)
