@@ -105,6 +105,25 @@ def test_compliances_without_a_stated_payload_are_refused(tmp_path: Path) -> Non
     refused(check("statics.payload_g=null"), "payload", "payload_g: 0")
 
 
+def test_a_prediction_without_the_payload_its_calibration_had_is_refused(tmp_path: Path) -> None:
+    lines = (CONFIGS / "demo.csv").read_text().splitlines()
+    loaded = tmp_path / "loaded.csv"
+    loaded.write_text("\n".join([lines[0] + ",payload_g", *(line + ",10" for line in lines[1:])]) + "\n")
+    settings = ("statics.payload_g=null", "validation.folds=0", "evaluator=interpreted")
+    flags = [x for s in settings for x in ("--set", s)]
+    out = tmp_path / "run"
+    run = CliRunner().invoke(cli, ["run", DEMO, "--data", str(loaded), "--out", str(out), *flags])
+    assert run.exit_code == 0, run.output
+
+    def predict(poses: Path) -> Result:
+        arguments = ["--poses", str(poses), "--out", str(tmp_path / "predicted.csv")]
+        return CliRunner().invoke(cli, ["predict", str(out / "calibration.yaml"), *arguments])
+
+    refused(predict(CONFIGS / "demo.csv"), "demo.csv", "payload is not stated", "payload_g")
+    assert predict(loaded).exit_code == 0
+    refused(check("statics.payload_g=-5"), "payload", "below zero")
+
+
 def test_millimetres_called_metres_and_the_reverse_are_refused(tmp_path: Path) -> None:
     metres = {f"{axis}_mm": f"{axis}_m" for axis in "xyz"}
     refused(check(data=some_rows(tmp_path, 60, metres)), "typically", "Check the unit", "rows.csv")

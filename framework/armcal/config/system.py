@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Literal, TypeVar
 
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from armcal.arm.assembly import Arm, MassSpec, prefixed
 from armcal.arm.statics import frame_names
@@ -56,6 +56,13 @@ class StaticsSettings(Settings):
     payload_com: Length3 = (0.0, 0.0, 0.0)
     force: Force3 = (0.0, 0.0, 0.0)
     torque: Torque3 = (0.0, 0.0, 0.0)
+
+    @field_validator("payload")
+    @classmethod
+    def _not_negative(cls, value: float | None) -> float | None:
+        if value is not None and value < 0:
+            raise ValueError(f"a payload of {value * 1000:g} g is below zero")
+        return value
 
 
 class SystemSettings(Settings):

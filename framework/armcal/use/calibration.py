@@ -20,7 +20,7 @@ from armcal.base.settings import Settings
 from armcal.config.system import System, build_system
 from armcal.config.validate import validate
 from armcal.config.yaml_source import load_config
-from armcal.errors import ConfigError, Location
+from armcal.errors import ConfigError, DataError, Location
 from armcal.plugins import PluginRegistry, discover
 from armcal.solve.estimator import Estimate
 from armcal.solve.problem import Problem
@@ -127,8 +127,16 @@ class Calibration:
             values (N) by channel (SI), and base_T_tool (arms x N x 4 x 4).
 
         Raises:
+            DataError: the arm is elastic and neither records nor calibration say what hangs on the tool.
             NotConvergedError: a record has no equilibrium.
         """
+        elastic = any(arm.deflection_size for arm in self.system.arms.values())
+        if elastic and self.system.statics.payload is None and not commands.has("payload"):
+            raise DataError(
+                "the arm is elastic and its payload is not stated.",
+                where=Location(commands.source or None),
+                hint="Add a column payload_g; the calibration was made with one.",
+            )
         fixed = self.parameters.with_free(())
         problem = Problem.build(
             self.system.arms,
