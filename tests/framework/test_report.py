@@ -132,7 +132,13 @@ def result_of(
         errors=errors,
         table=_table(errors, split),
         verdict=judge(
-            found, after / 0.4, errors.calibrated_mm, split.train, errors.calibrated_mm[split.holdout], words
+            found,
+            after / 0.4,
+            errors.calibrated_mm,
+            split.train,
+            errors.calibrated_mm[split.holdout],
+            words,
+            _dataset(count, position, ids).ids,
         ),
         warnings=("arm.mdh.d2 and arm.mdh.d3 are nearly parallel: a prior holds their difference.",),
         backend="casadi, generated C (gcc -O2)",

@@ -65,7 +65,7 @@ def test_gross_errors_are_counted(tmp_path: Path) -> None:
         return points
 
     told = sentences(tmp_path / "run", "validation.holdout=0", data=disturbed(tmp_path, spoil))
-    assert "3 records lie beyond five robust deviations" in told
+    assert "five robust deviations of the training errors: 3 records, the worst" in told
 
 
 def test_data_that_wants_a_negative_compliance_pushes_against_its_bound(tmp_path: Path) -> None:
@@ -91,7 +91,7 @@ def test_suggested_poses_tell_more_than_random_ones() -> None:
     )
     records = problem.records(dataset)
     found = estimate(problem, records, experiment.estimator.solve(problem, records, experiment.parameters.nominal()))
-    joints = tuple(f"arm.q{i}" for i in range(1, 7))
+    joints = {f"arm.q{i}": "angle" for i in range(1, 7)}
     chosen = suggest(problem, dataset, found, joints, count=3)
     assert len({tuple(s.commands.values()) for s in chosen}) == 3
     assert chosen[2].shrink < chosen[0].shrink < 1

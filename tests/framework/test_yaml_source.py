@@ -254,7 +254,7 @@ def test_overrides_set_replace_create_and_remove(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("override", "says"),
     [
-        ("a.b", ["expected a dotted name, '=' and a value", "--set arm.rows.2.d_mm=46.9"]),
+        ("a.b", ["expected a dotted name, '=' and a value", "--set parameters.bounds=none"]),
         ("=3", ["expected a dotted name"]),
         ("a.b=", ["null as the value removes"]),
         ("a..b=1", ["expected a dotted name"]),

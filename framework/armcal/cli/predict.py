@@ -11,6 +11,7 @@ from armcal.base.config_text import ConfigText
 from armcal.cli.common import Voice, speaking
 from armcal.errors import DataError, Location
 from armcal.measure.csv_writer import write_csv
+from armcal.measure.environment import noticed
 from armcal.measure.reader import ReadRequest, wanted_channels
 from armcal.plugins import discover
 from armcal.use.calibration import Calibration
@@ -30,7 +31,10 @@ def predict(voice: Voice, calibration: Path, poses: Path, out: Path) -> None:
     reader_class = registry.find("reader", "csv").load()
     reader = reader_class(reader_class.Settings(path=ConfigText(str(poses))))
     # Measured columns, if there are any, are not read: every row of commands gets its prediction.
-    commands = reader.read(ReadRequest(system.arms, {}, wanted_channels(system.arms, {}, measured=False)))
+    commands = noticed(reader.read(ReadRequest(system.arms, {}, wanted_channels(system.arms, {}, measured=False))))
+    missing = [name for name in loaded.record.environment_columns if not commands.has(name) and name != "time"]
+    if missing:
+        voice.warn(f"the calibration's records had {', '.join(missing)}; these poses take the configured values.")
     for text in commands.warnings:
         voice.warn(text)
     channels, _ = loaded.predict(commands)

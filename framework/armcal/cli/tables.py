@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 from rich.table import Table
 
-from armcal.base.units import to_unit
 from armcal.cli.common import Voice
 from armcal.run.result import RunResult
 from armcal.solve.validation import ErrorSummary
@@ -53,8 +53,17 @@ def _compliances(result: RunResult) -> Table:
     for i, name in enumerate(estimate.names):
         if estimate.parameters[name.partition("[")[0]].unit != "rad_per_Nm":
             continue
-        value, interval = estimate.values[estimate.free_entries[i]], estimate.intervals[i]
-        span = f"up to {interval.upper:.5f}" if interval.one_sided else f"{interval.lower:.5f} to {interval.upper:.5f}"
+        value, interval, sd = estimate.values[estimate.free_entries[i]], estimate.intervals[i], estimate.deviations[i]
+        digits = _digits(float(sd))
+        ends = f"{interval.lower:.{digits}f} to {interval.upper:.{digits}f}"
+        span = f"up to {interval.upper:.{digits}f}" if interval.one_sided else ends
         flag = "at its bound" if name in estimate.at_bound else ("" if estimate.determined[i] else "not determined")
-        table.add_row(name, f"{to_unit(value, 'rad_per_Nm'):.5f}", f"{estimate.deviations[i]:.5f}", span, flag)
+        table.add_row(name, f"{value:.{digits}f}", f"{sd:.{digits}f}", span, flag)
     return table
+
+
+def _digits(deviation: float) -> int:
+    """Decimals that show a standard deviation to two significant digits."""
+    if not math.isfinite(deviation) or deviation <= 0:
+        return 5
+    return min(12, max(3, 1 - math.floor(math.log10(deviation))))

@@ -12,7 +12,7 @@ from pydantic import Field
 
 from armcal.base.parameters import ParameterBlock, Parameters
 from armcal.base.settings import Settings
-from armcal.base.units import DIMENSIONLESS, UNITS, parse_quantity, si_unit
+from armcal.base.units import DIMENSIONLESS, UNITS, display_unit, parse_quantity, si_unit
 from armcal.config.yaml_source import ConfigSource
 from armcal.errors import ConfigError
 
@@ -92,7 +92,7 @@ def quantity(block: ParameterBlock, text: str | float, source: ConfigSource | No
         raise ConfigError(
             f"found {text} without a unit for {block.name}.",
             where=where,
-            hint=f"Write it as text: {text} {block.unit}.",
+            hint=f"Write its unit as well, such as {text} {display_unit(dimension).name} or {text} {block.unit}.",
         )
     try:
         return parse_quantity(text, dimension)

@@ -237,7 +237,7 @@ def _override(tree: Node, text: str) -> Node:
     steps = tuple(match[1] or match[2] for match in matches)
     whole = "".join(match[0] for match in matches) == name.strip() and not name.strip().endswith(".")
     if not equals or not steps or not whole or not written.strip() or len(steps) > MAX_DEPTH:
-        hint = "Write for example --set arm.rows.2.d_mm=46.9; null as the value removes a key."
+        hint = "Write for example --set parameters.bounds=none; null as the value removes a key."
         where = Location(f"command line (--set {text})")
         raise ConfigError(f"found {text!r}, expected a dotted name, '=' and a value.", where=where, hint=hint)
     origin = replace(origin, prefix=steps)

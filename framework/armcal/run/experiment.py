@@ -11,6 +11,7 @@ import numpy as np
 
 from armcal.base.config_text import ConfigText
 from armcal.base.dataset import Dataset
+from armcal.base.domains import Array
 from armcal.base.parameters import Parameters
 from armcal.config.selection import select
 from armcal.config.system import System, build_component, build_system
@@ -82,7 +83,7 @@ class Experiment:
         parameters = select(system.parameters(), settings.parameters, source)
         estimator = _estimator(source, registry)
         name = settings.name or Path(path).stem
-        found = tuple(_gravity_warnings(settings))
+        found = tuple(_gravity_warnings(settings, np.array(settings.statics.gravity)))
         return cls(str(name), source, settings, system, parameters, estimator, registry, found)
 
     def read(self) -> Dataset:
@@ -102,7 +103,12 @@ class Experiment:
         reader, _ = build_component(self.source, self.registry, "reader", ("data",))
         dataset = reader.read(self.request(measured=True))
         self._require_payload(dataset)
-        return noticed(dataset)
+        dataset = noticed(dataset)
+        if not dataset.has("gravity_z"):
+            return dataset
+        typical = np.median(dataset.stacked(["gravity_x", "gravity_y", "gravity_z"]), axis=1)
+        told = [f"by its columns, {text}" for text in _gravity_warnings(self.settings, typical)]
+        return replace(dataset, warnings=(*dataset.warnings, *told))
 
     def request(self, *, measured: bool) -> ReadRequest:
         """What a reader should look for; with ``measured`` the measured values are required."""
@@ -138,8 +144,10 @@ class Experiment:
 
 
 def _estimator(source: ConfigSource, registry: PluginRegistry) -> Estimator:
-    if "estimator" not in source.data:
-        source = replace(source, data={**source.data, "estimator": {"type": "ipopt"}})
+    """The configured estimator; ipopt where none is named."""
+    section = source.data.get("estimator") or {}
+    if "type" not in section:
+        source = replace(source, data={**source.data, "estimator": {"type": "ipopt", **section}})
     built: Estimator
     built, _ = build_component(source, registry, "estimator", ("estimator",))
     return built
@@ -152,14 +160,14 @@ def _with_data(source: ConfigSource, data: str | Path) -> ConfigSource:
     return replace(source, data={**source.data, "data": section})
 
 
-def _gravity_warnings(settings: ExperimentSettings) -> list[str]:
-    statics = settings.statics
-    size = float(np.linalg.norm(statics.gravity))
+def _gravity_warnings(settings: ExperimentSettings, gravity: Array) -> list[str]:
+    """Is gravity (3, m/s^2) what the declared body has (or any known one, if none is), and does it pull down?"""
+    size, body = float(np.linalg.norm(gravity)), settings.statics.body
+    bodies = STANDARD_GRAVITY if body is None else {body: STANDARD_GRAVITY[body]}
     found = []
-    if statics.body is not None:
-        expected = STANDARD_GRAVITY[statics.body]
-        if abs(size - expected) > _GRAVITY_TOLERANCE * expected:
-            found.append(f"gravity is {size:.3f} m/s^2, on the {statics.body} it is {expected:.3f}.")
-    if statics.gravity[2] > 0:
+    if all(abs(size - expected) > _GRAVITY_TOLERANCE * expected for expected in bodies.values()):
+        known = ", ".join(f"on the {name} {expected:.3f}" for name, expected in bodies.items())
+        found.append(f"gravity is {size:.3f} m/s^2; it is {known}.")
+    if gravity[2] > 0:
         found.append("gravity points up along the base frame's z axis: right only for an arm that hangs.")
     return found

@@ -17,6 +17,7 @@ import numpy as np
 
 from armcal.config.yaml_source import ConfigSource
 from armcal.errors import InputError, Location
+from armcal.measure.reader import ENVIRONMENT
 from armcal.run.experiment import Experiment
 from armcal.run.result import RunResult
 from armcal.use.calibration import SCHEMA, CalibrationFile, InformationRecord, dump, parameter_records
@@ -141,6 +142,7 @@ def calibration_content(result: RunResult, experiment: Experiment) -> dict[str, 
             "data": provenance["data_sha256"],
             "source": provenance["data"],
         },
+        environment_columns=tuple(name for name, _ in ENVIRONMENT if result.dataset.has(name)),
         noise={"scale": estimate.noise_scale, "degrees_of_freedom": estimate.degrees_of_freedom},
         quality_mm=result.table.as_dict(),
         verdict={"headline": result.verdict.headline, "findings": [f.text for f in result.verdict.findings]},

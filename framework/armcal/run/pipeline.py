@@ -135,7 +135,7 @@ def calibrate(
         errors=errors,
         table=table,
         verdict=_verdict(experiment, ready, found, errors),
-        warnings=(*ready.warnings, *dict.fromkeys(faults)),
+        warnings=(*ready.warnings, *_fold_warnings(errors, experiment), *dict.fromkeys(faults)),
         backend=ready.problem.backend,
         seconds=watch.seconds,
         provenance=_provenance(experiment, ready.dataset),
@@ -152,13 +152,14 @@ def _split(experiment: Experiment, dataset: Dataset) -> Split:
 def _errors(experiment: Experiment, ready: Prepared, values: Array, progress: Progress) -> RecordErrors:
     problem, records = ready.problem, ready.records
     nominal = problem.parameters.nominal()
-    crossed = np.full(len(ready.dataset), np.nan)
+    crossed, failed = np.full(len(ready.dataset), np.nan), 0
     validation = experiment.settings.validation
     if validation.folds:
         train = ready.split.train
         splits = folds(len(train), validation.folds, validation.seed)
         judged = cross_validate(problem, ready.training, splits, experiment.estimator, nominal, progress)
         crossed[train] = judged.errors * _MM
+        failed = judged.failed_folds
     shown = problem.predict(values, records)[0]
     first = len(problem.kernels[0].factor.output_channels)
     return RecordErrors(
@@ -168,7 +169,15 @@ def _errors(experiment: Experiment, ready: Prepared, values: Array, progress: Pr
         nominal_residual_mm=np.vstack(problem.residuals(nominal, records)) * _MM,
         calibrated_residual_mm=np.vstack(problem.residuals(values, records)) * _MM,
         position_mm=shown[first + 9 : first + 12] * _MM,
+        failed_folds=failed,
     )
+
+
+def _fold_warnings(errors: RecordErrors, experiment: Experiment) -> list[str]:
+    if not errors.failed_folds:
+        return []
+    folds_asked = experiment.settings.validation.folds
+    return [f"{errors.failed_folds} of {folds_asked} folds did not converge; their records are not cross-validated."]
 
 
 def _table(errors: RecordErrors, split: Split) -> ErrorTable:
@@ -194,15 +203,16 @@ def _verdict(experiment: Experiment, ready: Prepared, found: Estimate, errors: R
     held, crossed = errors.calibrated_mm[ready.split.holdout], errors.cross_validated_mm
     crossed = crossed[np.isfinite(crossed)]
     judged, words = (held, f"{len(held)} held-out records") if len(held) else (crossed, "cross-validation")
-    angles = [
-        f"{name}.{joint}"
+    joints = {
+        f"{name}.{joint}": dimension
         for name, arm in experiment.system.arms.items()
         for joint, dimension in zip(arm.joint_names, arm.joint_dimensions, strict=True)
-        if dimension == "angle"
-    ]
+    }
     training = ready.dataset.subset(ready.split.train)
-    suggestions = suggest(ready.problem, training, found, tuple(angles)) if found.names and angles else ()
-    return judge(found, whitened, errors.calibrated_mm, ready.split.train, judged, words, suggestions)
+    suggestions = suggest(ready.problem, training, found, joints) if found.names else ()
+    return judge(
+        found, whitened, errors.calibrated_mm, ready.split.train, judged, words, ready.dataset.ids, suggestions
+    )
 
 
 def _check_reach(problem: Problem, records: Sequence[FactorRecords], dataset: Dataset) -> None:

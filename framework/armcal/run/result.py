@@ -23,6 +23,7 @@ class RecordErrors:
         nominal_residual_mm: measured minus predicted, all factors stacked (n_r x N).
         calibrated_residual_mm: the same after calibration.
         position_mm: predicted tool position of the first arm in its base frame (3 x N).
+        failed_folds: how many folds of the cross-validation did not converge.
     """
 
     nominal_mm: Array
@@ -31,6 +32,7 @@ class RecordErrors:
     nominal_residual_mm: Array
     calibrated_residual_mm: Array
     position_mm: Array
+    failed_folds: int = 0
 
 
 @dataclass(frozen=True)

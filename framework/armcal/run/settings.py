@@ -26,7 +26,7 @@ class ValidationSettings(Settings):
     @model_validator(mode="after")
     def _one_split(self) -> ValidationSettings:
         if self.holdout and self.train_ids is not None:
-            raise ValueError("found both holdout and train_ids, expected one of them")
+            raise ValueError("found both holdout and train_ids, expected one of them: set holdout: 0")
         if self.folds == 1:
             raise ValueError("found folds: 1, expected 0 (none) or at least 2")
         return self

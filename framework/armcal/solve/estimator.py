@@ -148,8 +148,9 @@ def estimate(problem: Problem, records: Sequence[FactorRecords], solution: Solut
     """Covariance, intervals and identifiability at a solution.
 
     The declared noise is scaled to the residuals found (the a posteriori variance factor [Mikhail1976]): with a
-    model that is wrong by more than the noise the intervals widen accordingly. A parameter at a bound keeps its
-    full covariance: the bound is not evidence.
+    model that is wrong by more than the noise the intervals widen accordingly. Priors weigh in the estimate as they
+    were stated against the declared noise, so its covariance is the sandwich H^-1 (s^2 J'J + P) H^-1 with H = J'J + P.
+    A parameter at a bound keeps its full covariance: the bound is not evidence.
     """
     parameters = problem.parameters
     scales, prior = parameters.scales(), parameters.prior_information()
@@ -161,13 +162,14 @@ def estimate(problem: Problem, records: Sequence[FactorRecords], solution: Solut
     count = problem.equations(records)
     freedom = count - known.rank
     noise_scale = float(np.sqrt(2 * equations.cost / freedom)) if freedom > 0 else 1.0
-    held = np.diag(scales * np.sqrt(prior)) * noise_scale
-    stacked = np.vstack([triangle * scales, held])
+    stacked = np.vstack([triangle * scales, np.diag(scales * np.sqrt(prior))])
     _, values, directions = np.linalg.svd(stacked, full_matrices=False)
     seen = values > 1e-9 * max(values[0], 1e-300) if len(values) else np.zeros(0, dtype=bool)
     inverse = np.where(seen, 1 / np.where(seen, values, 1.0), 0.0)
     half = scales[:, None] * directions.T * inverse
-    covariance = noise_scale**2 * half @ half.T
+    by_data = noise_scale * half @ (half.T @ triangle.T)
+    by_priors = half @ (half.T * np.sqrt(prior))
+    covariance = by_data @ by_data.T + by_priors @ by_priors.T
     gradient = equations.gradient + prior * increment
     step = -(half @ (half.T @ gradient))
     unseen = np.linalg.norm(directions[~seen], axis=0) if len(values) else np.zeros(0)
@@ -178,7 +180,7 @@ def estimate(problem: Problem, records: Sequence[FactorRecords], solution: Solut
         free_entries=parameters.free_entries,
         covariance=chain @ covariance @ chain.T,
         unconstrained=solution.values[free] + chain @ step,
-        square_root_information=triangular(stacked / scales / noise_scale) if len(values) else triangle,
+        square_root_information=triangular(np.vstack([triangle / noise_scale, np.diag(np.sqrt(prior))])),
         noise_scale=noise_scale,
         degrees_of_freedom=freedom,
         identifiability=known,

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armcal.base.domains import Array
-from armcal.errors import ProblemError
-from armcal.solve.estimator import Estimator, Progress, Solution, no_progress
+from armcal.errors import NotConvergedError, ProblemError
+from armcal.solve.estimator import Estimator, Progress, no_progress
 from armcal.solve.problem import FactorRecords, Problem
 
 Indices = NDArray[np.intp]
@@ -53,9 +53,9 @@ def summarise(errors: Array) -> ErrorSummary:
 
 
 def record_errors(problem: Problem, values: Array, records: Sequence[FactorRecords]) -> Array:
-    """The length of each record's residual, over all factors (N)."""
+    """How far each record's measurement lies from the prediction; root mean square over several measurements (N)."""
     squared = [np.sum(residual**2, axis=0) for residual in problem.residuals(values, records)]
-    return np.asarray(np.sqrt(np.sum(squared, axis=0)))
+    return np.asarray(np.sqrt(np.mean(squared, axis=0)))
 
 
 def hold_out(count: int, fraction: float, seed: int) -> Split:
@@ -95,10 +95,10 @@ def folds(count: int, number: int, seed: int) -> tuple[Split, ...]:
 
 @dataclass(frozen=True)
 class CrossValidation:
-    """Errors of each record, judged by the fold that did not train on it (nan if a fold did not converge)."""
+    """Errors of each record, judged by the fold that did not train on it (nan if that fold did not converge)."""
 
     errors: Array
-    converged: bool
+    failed_folds: int
 
 
 def cross_validate(
@@ -111,17 +111,17 @@ def cross_validate(
 ) -> CrossValidation:
     """Fit on each fold's training records, judge on its others; the same compiled functions throughout."""
     errors = np.full(records[0].count, np.nan)
-    converged = True
+    failed = 0
     for number, split in enumerate(splits):
         progress("cross-validation", number / len(splits))
-        solution = _fit(problem, records, split, estimator, start)
-        converged &= solution.verdict.converged
-        held = problem.subset(records, split.holdout)
-        errors[split.holdout] = record_errors(problem, solution.values, held)
-    return CrossValidation(errors, converged)
-
-
-def _fit(
-    problem: Problem, records: Sequence[FactorRecords], split: Split, estimator: Estimator, start: Array
-) -> Solution:
-    return estimator.solve(problem, problem.subset(records, split.train), start)
+        try:
+            solution = estimator.solve(problem, problem.subset(records, split.train), start)
+            judged = record_errors(problem, solution.values, problem.subset(records, split.holdout))
+        except NotConvergedError:
+            failed += 1
+            continue
+        if solution.verdict.converged:
+            errors[split.holdout] = judged
+        else:
+            failed += 1
+    return CrossValidation(errors, failed)

@@ -16,6 +16,7 @@ from armcal.solve.identifiability import POOR_CONDITION, correlated_pairs
 from armcal.solve.suggestion import CANDIDATES, Suggestion
 
 LEVEL = 0.05
+_SMALLEST_SPREAD_MM = 1e-6
 Grade = Literal["good", "note", "warning", "bad"]
 
 
@@ -42,6 +43,7 @@ def judge(
     train: NDArray[np.intp],
     judged_mm: Array,
     judged_on: str,
+    ids: Sequence[str],
     suggestions: Sequence[Suggestion] = (),
 ) -> Verdict:
     """Judge a calibration.
@@ -53,16 +55,17 @@ def judge(
         train: which records trained.
         judged_mm: errors of the records that did not train, or of cross-validation; empty if there are none.
         judged_on: what these are, in words.
+        ids: of all records (N).
         suggestions: poses that would tell most next.
     """
     findings = [_convergence(estimate), _determined(estimate), *_condition(estimate), *_bounds(estimate)]
-    findings += [_noise(estimate), *_neighbours(whitened[:, train]), *_correlated(estimate)]
-    findings += [*_outliers(errors_mm[train]), *_next(estimate, suggestions)]
+    findings += [_noise(estimate), *_neighbours(whitened, train), *_correlated(estimate)]
+    findings += [*_outliers(errors_mm[train], [ids[i] for i in train]), *_next(estimate, suggestions)]
     order = {"bad": 0, "warning": 1, "note": 2, "good": 3}
     if len(judged_mm):
         ninety_five = float(np.percentile(judged_mm, 95))
         headline = (
-            f"Good for {float(np.mean(judged_mm)):.2f} mm on average and {ninety_five:.2f} mm in 95 % of poses, "
+            f"Tip error {float(np.mean(judged_mm)):.2f} mm on average, 95 % of poses below {ninety_five:.2f} mm, "
             f"judged on {judged_on}."
         )
     else:
@@ -85,6 +88,8 @@ def _determined(estimate: Estimate) -> Finding:
     if known.undetermined:
         listed = "; ".join(str(combination) for combination in known.undetermined)
         return Finding("bad", f"Not determined by the data, held by priors alone: {listed}.")
+    if not len(known):
+        return Finding("warning", "No parameter was free: the nominal model was judged, nothing was calibrated.")
     return Finding("good", f"The data determines all {known.rank} free parameters.")
 
 
@@ -130,14 +135,15 @@ def _noise(estimate: Estimate) -> Finding:
     return Finding("good", "Residuals are as large as the declared noise: the model explains the data.")
 
 
-def _neighbours(whitened: Array) -> list[Finding]:
-    """Do residuals of neighbouring records correlate? Against independence, two-sided, at 5 %."""
-    count = whitened.shape[1]
-    spread = float(np.sum(whitened**2))
-    if count < 10 or not spread:
+def _neighbours(whitened: Array, train: NDArray[np.intp]) -> list[Finding]:
+    """Do training records that follow one another correlate? Against independence, two-sided, at 5 %."""
+    first = train[:-1][np.diff(train) == 1]
+    spread = float(np.mean(whitened[:, train] ** 2))
+    if len(first) < 10 or not spread:
         return []
-    lag_one = float(np.sum(whitened[:, 1:] * whitened[:, :-1])) / spread
-    if abs(lag_one) < ndtri(1 - LEVEL / 2) / np.sqrt(whitened[:, 1:].size):
+    products = whitened[:, first] * whitened[:, first + 1]
+    lag_one = float(np.mean(products)) / spread
+    if abs(lag_one) < ndtri(1 - LEVEL / 2) / np.sqrt(products.size):
         return [Finding("good", "Residuals of neighbouring records do not correlate (5 %).")]
     return [
         Finding(
@@ -157,32 +163,35 @@ def _correlated(estimate: Estimate) -> list[Finding]:
     return [Finding("note", f"Hard to tell apart (correlation above 0.95): {listed}{more}.")]
 
 
-def _outliers(errors_mm: Array) -> list[Finding]:
+def _outliers(errors_mm: Array, ids: Sequence[str]) -> list[Finding]:
     """Records beyond five robust standard deviations of the errors."""
     middle = float(np.median(errors_mm))
     spread = 1.4826 * float(np.median(np.abs(errors_mm - middle)))
-    suspicious = int(np.sum(errors_mm > middle + 5 * spread)) if spread > 0 else 0
-    if not suspicious:
+    suspicious = np.flatnonzero(errors_mm > middle + 5 * max(spread, _SMALLEST_SPREAD_MM))
+    if not len(suspicious):
         return []
-    return [Finding("warning", f"{suspicious} records lie beyond five robust deviations: see residuals.csv.")]
+    worst = [ids[i] for i in suspicious[np.argsort(-errors_mm[suspicious])][:5]]
+    return [
+        Finding(
+            "warning",
+            f"Beyond five robust deviations of the training errors: {len(suspicious)} records, the worst "
+            f"{', '.join(worst)}. Look at them, and at residuals.csv.",
+        )
+    ]
 
 
 def _next(estimate: Estimate, suggestions: Sequence[Suggestion]) -> list[Finding]:
     """The parameter whose uncertainty is largest in its own ordinary size, and the poses that would tell most."""
     if not estimate.names:
-        return [Finding("note", "No parameter was free.")]
+        return []
     scales = [b.scale for b in estimate.parameters.free for _ in range(b.size)]
     relative = np.nan_to_num(estimate.deviations / np.array(scales), nan=np.inf)
     text = f"Least certain, in its ordinary size: {estimate.names[int(np.argmax(relative))]}."
     if suggestions:
-        poses = "; ".join(_pose(suggestion) for suggestion in suggestions)
+        poses = "; ".join(suggestion.text for suggestion in suggestions)
         shrink = 100 * (1 - suggestions[-1].shrink)
         text += (
             f" Of {CANDIDATES} poses like the recorded ones these would tell most (they shrink standard deviations "
             f"by {shrink:.1f} % on average; clearance was not checked): {poses}."
         )
     return [Finding("note", text)]
-
-
-def _pose(suggestion: Suggestion) -> str:
-    return "(" + ", ".join(f"{np.rad2deg(angle):.0f}" for angle in suggestion.commands.values()) + ") deg"

@@ -59,6 +59,7 @@ class CalibrationFile(Settings):
     converged: bool
     software: dict[str, str]
     identity: dict[str, str]
+    environment_columns: tuple[str, ...] = ()
     noise: dict[str, Any]
     quality_mm: dict[str, Any]
     verdict: dict[str, Any]
@@ -158,10 +159,12 @@ class Calibration:
         """base_T_tool (N x 4 x 4) at commanded joint angles (N x n; rad, or m on sliding joints).
 
         Raises:
-            ValueError: the number of joints differs.
+            ValueError: no such arm, or the number of joints differs.
             NotConvergedError: a record has no equilibrium.
         """
         name = arm or next(iter(self.system.arms))
+        if name not in self.system.arms:
+            raise ValueError(f"no arm is called {name!r}; the arms are {', '.join(self.system.arms)}")
         joints = self.system.arms[name].joint_names
         angles = np.atleast_2d(np.asarray(joint_angles, dtype=float))
         if angles.shape[1] != len(joints):
