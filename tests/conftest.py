@@ -17,7 +17,7 @@ sys.path.insert(0, str(ROOT / "tests"))  # for `import oracle`
 
 @pytest.fixture(scope="session", autouse=True)
 def _own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """Compiled kernels go to a directory of this session, never to the user's cache."""
+    """Compiled kernels go to a directory of this test run, never to the user's cache."""
     kept = os.environ.get("ARMCAL_CACHE_DIR")
     place = tmp_path_factory.mktemp("armcal-cache")
     place.chmod(0o700)

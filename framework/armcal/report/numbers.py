@@ -13,7 +13,7 @@ from armcal.base.units import UNITS, display_unit
 NONE = "\u2013"
 MINUS = "\u2212"
 _TIMES = "\u00d7"
-_MOST_DECIMALS = 8
+_MOST_DECIMALS = 9
 _WORDS = {"rad_per_Nm": "rad/Nm", "deg_per_Nm": "deg/Nm", "m_s2": "m/s²", "1": ""}
 
 
