@@ -182,6 +182,13 @@ def test_quiet_says_nothing_and_json_is_one_document(tmp_path: Path) -> None:
     assert json.loads(loud.stdout)["folder"].endswith("j")
 
 
+def test_verbose_says_how_long_each_stage_took_and_plain_does_not(tmp_path: Path) -> None:
+    plain = armcal("run", DEMO, "--out", str(tmp_path / "p"), *FAST)
+    verbose = armcal("run", DEMO, "--out", str(tmp_path / "v"), "-v", *FAST)
+    for word in ("fit: ", "build: ", "evaluated by: virtual machine"):
+        assert word in verbose.stderr and word not in plain.stderr
+
+
 def test_errors_are_json_too_where_json_was_asked_for() -> None:
     done = _process("check", "nowhere.yaml", "--json")
     assert done.returncode == 2 and "Traceback" not in done.stderr

@@ -44,7 +44,6 @@ def _content(experiment: Experiment, ready: Prepared, known: Identifiability) ->
         for name, arm in experiment.system.arms.items()
         for joint in arm.joint_names
     }
-    equations = sum(len(kernel.factor.noise) for kernel in ready.problem.kernels) * len(ready.split.train)
     return {
         "experiment": experiment.name,
         "records": {
@@ -53,7 +52,7 @@ def _content(experiment: Experiment, ready: Prepared, known: Identifiability) ->
             "holdout": len(ready.split.holdout),
             "set_aside": [{"row": a.row, "id": a.record_id, "reason": a.reason} for a in ready.dataset.set_aside],
         },
-        "equations": equations,
+        "equations": ready.problem.equations(ready.training),
         "parameters": {
             "all": list(experiment.parameters.names),
             "free": list(known.names),

@@ -44,7 +44,7 @@ class Voice:
     def detail(self, text: str) -> None:
         """Only with -v."""
         if self.verbose:
-            self.err.print(text, style="dim", markup=False)
+            self.err.print(text, style="dim", markup=False, soft_wrap=True)
 
     def result(self, content: Mapping[str, Any]) -> None:
         """The machine-readable result, with --json."""

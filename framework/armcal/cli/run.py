@@ -35,6 +35,11 @@ def run(voice: Voice, config: Path, data: Path | None, out: Path | None, overrid
         result = calibrate(experiment, command_line(), progress, watch)
     for text in result.warnings:
         voice.warn(text)
+    for aside in result.dataset.set_aside:
+        voice.detail(f"set aside: row {aside.row}, record {aside.record_id}: {aside.reason}")
+    for stage, seconds in result.seconds.items():
+        voice.detail(f"{stage}: {seconds:.3f} s")
+    voice.detail(f"evaluated by: {result.backend}")
     result.seconds["total"] = watch.total()
     outputs.write(result, experiment, folder, render)
     converged = result.estimate.verdict.converged
