@@ -7,24 +7,30 @@ with the data. Bounds are kept exactly: its bound relaxation is off.
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
 import casadi as ca
 import numpy as np
-from armcal.base.domains import Array
+from armcal.base.domains import Array, Semidefinite, symmetric
+from armcal.base.parameters import Parameters
 from armcal.base.settings import Settings
 from armcal.errors import NotConvergedError
 from armcal.solve.estimator import Progress, Solution, SolverVerdict, no_progress
+from armcal.solve.parallel import Executor, Sequential
 from armcal.solve.polish import polish
 from armcal.solve.posed import PosedProblem
 from armcal.solve.problem import FactorRecords, NormalEquations, Problem
 from pydantic import Field
 
+T = TypeVar("T")
+
 _SAME_COST = 1e-6
 _BARRIER_START = 1e-8
 _SMALLEST_UNIT = 1e-9
+_LEAST_START = 2e-2
+"""Of a semidefinite matrix's ordinary size: its smallest eigenvalue at the start."""
 
 
 class IpoptSettings(Settings):
@@ -32,7 +38,7 @@ class IpoptSettings(Settings):
 
     hessian: Literal["gauss-newton", "exact"] = "gauss-newton"
     tolerance: Annotated[float, Field(gt=0, lt=1)] = 1e-9
-    max_iterations: Annotated[int, Field(ge=1)] = 200
+    max_iterations: Annotated[int, Field(ge=1)] = 500
     starts: Annotated[int, Field(ge=1)] = 1
     seed: int = 0
 
@@ -42,8 +48,12 @@ class IpoptEstimator:
 
     Settings: ClassVar[type[IpoptSettings]] = IpoptSettings
 
-    def __init__(self, settings: IpoptSettings) -> None:
-        self._settings = settings
+    def __init__(self, settings: IpoptSettings, executor: Executor | None = None) -> None:
+        self._settings, self._executor = settings, executor or Sequential()
+
+    def spread(self, executor: Executor) -> IpoptEstimator:
+        """The same, its starts done by an executor."""
+        return IpoptEstimator(self._settings, executor)
 
     def solve(
         self,
@@ -57,10 +67,9 @@ class IpoptEstimator:
         if not problem.increments:
             return Solution(start, SolverVerdict("ipopt", "nothing is free", True, 0, 0.0))
         posed, random = PosedProblem(problem, records), np.random.default_rng(self._settings.seed)
-        found: list[_Run] = []
-        for number in range(self._settings.starts):
-            progress("fit", number / self._settings.starts)
-            found.append(self._solve_once(posed, _start(posed, start, random, number)))
+        starts = [_start(posed, start, random, number) for number in range(self._settings.starts)]
+        tasks = [_Start(self._settings, problem, tuple(records), x) for x in starts]
+        found = self._executor.map(_solve_once, tasks, lambda done: progress("fit", done))
         converged = [run for run in found if run.converged]
         best = min(converged or found, key=lambda run: run.cost)
         agreeing = sum(abs(run.cost - best.cost) <= _SAME_COST * max(1.0, best.cost) for run in converged)
@@ -76,57 +85,72 @@ class IpoptEstimator:
         )
         return Solution(posed.values(x), verdict)
 
-    def _solve_once(self, posed: PosedProblem, start: Array) -> _Run:
-        objective = _Objective(posed, start, exact=self._settings.hessian == "exact")
-        lower, upper = posed.bounds()
-        # CasADi holds callbacks weakly: they must outlive the solve here.
-        callbacks = [_Callback(name, objective) for name in ("cost", "gradient", "hessian")]
-        solver = self._solver(callbacks, len(start))
-        answer = solver(x0=start, lbx=lower, ubx=upper)
-        told = solver.stats()
-        if objective.interrupted or told["return_status"] == "User_Requested_Stop":
-            raise KeyboardInterrupt  # CasADi keeps it to itself, and the next start would go on
-        # IPOPT stays inside its bounds by a rounding error; the model's domain wants it exactly.
-        x = np.clip(np.asarray(answer["x"]).ravel(), lower, upper)
-        converged = bool(told["success"]) and bool(np.isfinite(x).all())
-        cost = float(answer["f"]) * objective.unit
-        return _Run(x, cost, converged, str(told["return_status"]), int(told["iter_count"]))
 
-    def _solver(self, callbacks: list[_Callback], size: int) -> Any:
-        cost, gradient, hessian = callbacks
-        x, parameters, factor, multipliers = (
-            ca.MX.sym("x", size),
-            ca.MX(0, 1),
-            ca.MX.sym("s"),
-            ca.MX.sym("l", 0),
-        )
-        inputs = [x, parameters]
-        value = cost(x)
-        options = {
-            "print_time": False,
-            "show_eval_warnings": False,
-            "no_nlp_grad": True,
-            "calc_lam_p": False,
-            "grad_f": ca.Function("grad_f", inputs, [value, gradient(x)], ["x", "p"], ["f", "grad_f_x"]),
-            "hess_lag": ca.Function(
-                "hess_lag",
-                [x, parameters, factor, multipliers],
-                [ca.triu(factor * hessian(x))],
-                ["x", "p", "lam_f", "lam_g"],
-                ["triu_hess_gamma_x_x"],
-            ),
-            "ipopt": {
-                "print_level": 0,
-                "sb": "yes",
-                "tol": self._settings.tolerance,
-                "max_iter": self._settings.max_iterations,
-                "bound_relax_factor": 0.0,
-                "honor_original_bounds": "yes",
-                "mu_init": _BARRIER_START,
-                "nlp_scaling_method": "none",
-            },
-        }
-        return ca.nlpsol("armcal", "ipopt", {"x": x, "f": value}, options)
+@dataclass(frozen=True)
+class _Start:
+    """One start: where from, on what."""
+
+    settings: IpoptSettings
+    problem: Problem
+    records: tuple[FactorRecords, ...]
+    x: Array
+
+
+def _solve_once(task: _Start) -> _Run:
+    """From one start; on a copy of the records, so that no start warms another's equilibria."""
+    records = task.problem.subset(task.records, np.arange(task.records[0].count))
+    posed = PosedProblem(task.problem, records)
+    objective = _Objective(posed, task.x, exact=task.settings.hessian == "exact")
+    lower, upper = posed.bounds()
+    # CasADi holds callbacks weakly: they must outlive the solve here.
+    callbacks = [_Callback(name, objective) for name in ("cost", "gradient", "hessian")]
+    solver = _solver(task.settings, callbacks, len(task.x))
+    answer = solver(x0=task.x, lbx=lower, ubx=upper)
+    told = solver.stats()
+    if objective.interrupted or told["return_status"] == "User_Requested_Stop":
+        raise KeyboardInterrupt  # CasADi keeps it to itself, and the next start would go on
+    # IPOPT stays inside its bounds by a rounding error; the model's domain wants it exactly.
+    x = np.clip(np.asarray(answer["x"]).ravel(), lower, upper)
+    converged = bool(told["success"]) and bool(np.isfinite(x).all())
+    cost = float(answer["f"]) * objective.unit
+    return _Run(x, cost, converged, str(told["return_status"]), int(told["iter_count"]))
+
+
+def _solver(settings: IpoptSettings, callbacks: list[_Callback], size: int) -> Any:
+    cost, gradient, hessian = callbacks
+    x, parameters, factor, multipliers = (
+        ca.MX.sym("x", size),
+        ca.MX(0, 1),
+        ca.MX.sym("s"),
+        ca.MX.sym("l", 0),
+    )
+    inputs = [x, parameters]
+    value = cost(x)
+    options = {
+        "print_time": False,
+        "show_eval_warnings": False,
+        "no_nlp_grad": True,
+        "calc_lam_p": False,
+        "grad_f": ca.Function("grad_f", inputs, [value, gradient(x)], ["x", "p"], ["f", "grad_f_x"]),
+        "hess_lag": ca.Function(
+            "hess_lag",
+            [x, parameters, factor, multipliers],
+            [ca.triu(factor * hessian(x))],
+            ["x", "p", "lam_f", "lam_g"],
+            ["triu_hess_gamma_x_x"],
+        ),
+        "ipopt": {
+            "print_level": 0,
+            "sb": "yes",
+            "tol": settings.tolerance,
+            "max_iter": settings.max_iterations,
+            "bound_relax_factor": 0.0,
+            "honor_original_bounds": "yes",
+            "mu_init": _BARRIER_START,
+            "nlp_scaling_method": "none",
+        },
+    }
+    return ca.nlpsol("armcal", "ipopt", {"x": x, "f": value}, options)
 
 
 @dataclass(frozen=True)
@@ -143,19 +167,33 @@ class _Run:
 def _start(posed: PosedProblem, start: Array, random: np.random.Generator, number: int) -> Array:
     """The given start, then random ones an ordinary correction away from the nominal values."""
     if number == 0:
-        return posed.x(start)
+        return posed.x(_definite(posed.problem.parameters, start))
     return np.clip(random.normal(size=len(posed.scales)), *posed.bounds())
+
+
+def _definite(parameters: Parameters, values: Array) -> Array:
+    """The values, with no semidefinite matrix so near its cone's boundary that the gradient of its root vanishes."""
+    moved = values.copy()
+    for block in parameters.free:
+        if isinstance(block.domain, Semidefinite):
+            place = parameters.entries_of(block.name)
+            sizes, directions = np.linalg.eigh(symmetric(values[place]))
+            lifted = (directions * np.maximum(sizes, _LEAST_START * block.scale)) @ directions.T
+            moved[place] = lifted[np.triu_indices(3)]
+    return moved
 
 
 class _Objective:
     """Cost, gradient and Hessian, one evaluation for each point.
 
-    All are divided by the cost at the start, so that IPOPT's tolerances mean the same for any noise and any data.
+    All are divided by the cost at the start, so that IPOPT's tolerances mean the same for any noise and any data. A
+    trial point of the line search wants the cost alone, which needs no derivatives.
     """
 
     def __init__(self, posed: PosedProblem, start: Array, exact: bool) -> None:
         self._posed, self._exact = posed, exact
         self._at: Array | None = None
+        self._tried: tuple[Array, float] | None = None
         self._model = NormalEquations(np.nan, np.zeros(0), np.zeros((0, 0)))
         self.size, self.unit, self.interrupted = len(start), 1.0, False
         at_start = float(self.cost(start))
@@ -163,7 +201,12 @@ class _Objective:
 
     def cost(self, x: Array) -> Array:
         """Not a number where the arm has no equilibrium, so that IPOPT steps back."""
-        return np.array(self._evaluate(x).cost / self.unit)
+        if self._at is not None and np.array_equal(x, self._at):
+            return np.array(self._model.cost / self.unit)
+        if self._tried is None or not np.array_equal(x, self._tried[0]):
+            cost = self._interruptible(lambda: self._posed.cost(x))
+            self._tried = x.copy(), cost if np.isfinite(cost) else np.nan
+        return np.array(self._tried[1] / self.unit)
 
     def gradient(self, x: Array) -> Array:
         """By scaled increments."""
@@ -177,14 +220,18 @@ class _Objective:
         if self._at is None or not np.array_equal(x, self._at):
             self._at = x.copy()
             try:
-                self._model = self._posed.model(x)
-            except KeyboardInterrupt:
-                self.interrupted = True
-                raise
+                self._model = self._interruptible(lambda: self._posed.model(x))
             except NotConvergedError:
                 nowhere = np.full((len(x), len(x)), np.nan)
                 self._model = NormalEquations(np.nan, nowhere[0], nowhere)
         return self._model
+
+    def _interruptible(self, evaluate: Callable[[], T]) -> T:
+        try:
+            return evaluate()
+        except KeyboardInterrupt:
+            self.interrupted = True
+            raise
 
 
 class _Callback(ca.Callback):  # type: ignore[misc]

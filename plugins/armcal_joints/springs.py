@@ -1,4 +1,4 @@
-"""Linear torsional springs: a compliance times the moment about an axis adds to the angle about it. [Conenna2024]"""
+"""Springs about joint axes: linear, and with a cubic term. [Conenna2024]"""
 
 from __future__ import annotations
 
@@ -11,14 +11,17 @@ from armcal.base.parameters import ParameterBlock, scalar
 from armcal.base.settings import Compliance, Settings
 from pydantic import field_validator
 
+from armcal_joints.joints import JointChoice, chosen
+
 COMPLIANCE_SCALE_RAD_PER_NM = 0.05
+CUBIC_SCALE_RAD_PER_NM3 = 0.05
 _AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
 
 class TorsionalSpringSettings(Settings):
     """Which joints have a spring about their axis, and whether the base has one."""
 
-    joints: Literal["all"] | tuple[str, ...] = "all"
+    joints: JointChoice = "all"
     base_axis: Literal["x", "y", "z"] | None = None
     compliance: Compliance = 0.0
 
@@ -42,12 +45,8 @@ class TorsionalSprings:
 
     def __init__(self, settings: TorsionalSpringSettings, joint_names: Sequence[str]) -> None:
         self._settings = settings
-        wanted = joint_names if settings.joints == "all" else settings.joints
-        unknown = [name for name in wanted if name not in joint_names]
-        if unknown:
-            raise ValueError(f"no joint is called {unknown[0]!r}; the joints are {', '.join(joint_names)}")
-        self._sites = [0] if settings.base_axis else []
-        self._sites += [i for i, name in enumerate(joint_names, start=1) if name in wanted]
+        base = (0,) if settings.base_axis else ()
+        self._sites = (*base, *chosen(settings.joints, joint_names))
 
     def parameters(self) -> tuple[ParameterBlock, ...]:
         """One compliance a site."""
@@ -68,3 +67,36 @@ class TorsionalSprings:
     def _spring(self, site: int, compliance: Any) -> Spring:
         directions = (_AXES[str(self._settings.base_axis)],) if site == 0 else ()
         return Spring(site, directions, lambda load: compliance * load)
+
+
+class CubicSpringSettings(Settings):
+    """Which joints' springs soften, or stiffen, under load."""
+
+    joints: JointChoice = "all"
+
+
+class CubicSprings:
+    """The effect ``cubic_spring``: ``c1`` to ``cn`` (rad/(N m)^3) times the third power of the torque about the axis.
+
+    It stands beside a linear spring. A negative value is a spring that stiffens; alone it would push back.
+    """
+
+    Settings: ClassVar[type[CubicSpringSettings]] = CubicSpringSettings
+
+    def __init__(self, settings: CubicSpringSettings, joint_names: Sequence[str]) -> None:
+        self._joints = chosen(settings.joints, joint_names)
+
+    def parameters(self) -> tuple[ParameterBlock, ...]:
+        """One number a joint, zero at first."""
+        return tuple(scalar(f"c{joint}", "rad_per_Nm3", 0.0, CUBIC_SCALE_RAD_PER_NM3) for joint in self._joints)
+
+    def displacement(self, command: JointCommand, values: Mapping[str, Any]) -> Any:
+        """Nothing: a spring acts through its load alone."""
+        return 0
+
+    def springs(self, values: Mapping[str, Any]) -> tuple[Spring, ...]:
+        """One coordinate a joint."""
+        return tuple(self._spring(joint, values[f"c{joint}"]) for joint in self._joints)
+
+    def _spring(self, site: int, cubic: Any) -> Spring:
+        return Spring(site, (), lambda load: cubic * load * load * load)

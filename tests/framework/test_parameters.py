@@ -27,7 +27,7 @@ ALL_FREE = MIXED.with_free(MIXED.names)
 
 
 def random_increment(parameters, seed=0):
-    return np.random.default_rng(seed).uniform(-0.3, 0.3, len(parameters.increment_names))
+    return np.random.default_rng(seed).uniform(-0.3, 0.3, len(parameters.coordinate_names))
 
 
 @pytest.mark.parametrize(
@@ -102,7 +102,7 @@ def test_free_entries_stand_at_the_places_of_the_free_blocks():
         *(f"arm.axis2[{e}]" for e in ("wx", "wy", "wz", "vx", "vy", "vz")),
         "arm.mdh.d1",
     ]
-    assert some.increment_names == ("arm.mdh.theta1", *(f"arm.axis2<{i}>" for i in range(4)), "arm.mdh.d1")
+    assert some.coordinate_names == ("arm.mdh.theta1", *(f"arm.axis2<{i}>" for i in range(4)), "arm.mdh.d1")
 
 
 def test_increments_of_mixed_domains_go_to_their_own_blocks():

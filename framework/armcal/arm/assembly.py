@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import casadi as ca
 
-from armcal.arm.effects import JointCommand, JointEffect, Spring
+from armcal.arm.effects import JointCommand, JointEffect, ShapeEffect, Spring
+from armcal.arm.elastic import deflections, elastic_sites, split_deflection
 from armcal.arm.model import ArmModel, Chain, forward
-from armcal.arm.statics import Load, Mass, deflections, split_deflection, wrenches
+from armcal.arm.statics import Load, Mass, wrenches
 from armcal.base.parameters import ParameterBlock, scalar
 from armcal.base.se3 import Expression, Transform
 
@@ -28,12 +29,17 @@ class MassSpec:
 
 @dataclass(frozen=True)
 class ArmInputs:
-    """What one record says of one arm: commands and approaches (n x 1), the load, the deflection to start from."""
+    """What one record says of one arm.
+
+    Commands and approaches (n x 1), the load, the deflection to start from, and what effects ask to know of the
+    surroundings.
+    """
 
     joint_angles: Expression
     approach: Expression
     load: Load
     deflection: Expression
+    conditions: Mapping[str, Expression] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -111,18 +117,32 @@ class Arm:
     @cached_property
     def deflection_size(self) -> int:
         """How many numbers an elastic state of this arm has."""
-        return sum(spring.size for spring in self.springs(self._nominal))
+        return sum(site.size for site in elastic_sites(self.nominal_chain, self.springs(self._nominal)))
 
     def state(self, values: Mapping[str, Expression], inputs: ArmInputs) -> ArmState:
         """One elastic pass: the arm's frames at a deflection, and the deflection these frames lead to."""
-        chain, springs = self.chain(values), self.springs(values)
-        along, rotations = split_deflection(chain, springs, inputs.deflection)
+        chain = self._shaped(values, inputs)
+        sites = elastic_sites(chain, self.springs(values))
+        along, rotations = split_deflection(chain.joints, sites, inputs.deflection)
         displacements = [
             joint.offset + along[i] + self._commanded(values, inputs, i) for i, joint in enumerate(chain.joints)
         ]
         frames = forward(chain, displacements, rotations)
         acting = wrenches(chain, frames, self._masses(values), inputs.load)
-        return ArmState(frames.base_T_tool, frames.named, deflections(chain, frames, acting, springs))
+        return ArmState(frames.base_T_tool, frames.named, deflections(chain, frames, acting, sites))
+
+    @property
+    def conditions(self) -> tuple[str, ...]:
+        """What its effects ask to know of the surroundings."""
+        asking = [effect for effect in self.effects.values() if isinstance(effect, ShapeEffect)]
+        return tuple(dict.fromkeys(name for effect in asking for name in effect.conditions))
+
+    def _shaped(self, values: Mapping[str, Expression], inputs: ArmInputs) -> Chain:
+        chain = self.chain(values)
+        for name, effect in self.effects.items():
+            if isinstance(effect, ShapeEffect):
+                chain = effect.shaped(chain, inputs.conditions, scoped(values, self._scope(name)))
+        return chain
 
     def _commanded(self, values: Mapping[str, Expression], inputs: ArmInputs, index: int) -> Expression:
         command = JointCommand(index, inputs.joint_angles[index], inputs.approach[index])

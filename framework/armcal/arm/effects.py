@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
-from armcal.arm.model import Vector3
+from armcal.arm.model import Chain, Vector3
 from armcal.base.parameters import ParameterBlock
 from armcal.base.se3 import Expression
 
@@ -59,3 +59,15 @@ class JointEffect(Protocol):
 
     def springs(self, values: Mapping[str, Expression]) -> Sequence[Spring]:
         """The effect's elastic deflections."""
+
+
+@runtime_checkable
+class ShapeEffect(JointEffect, Protocol):
+    """A joint effect that also changes the arm's shape with what is recorded of its surroundings."""
+
+    @property
+    def conditions(self) -> Sequence[str]:
+        """The recorded numbers it reads, each a column that any record may carry (``temperature``, in C)."""
+
+    def shaped(self, chain: Chain, conditions: Mapping[str, Expression], values: Mapping[str, Expression]) -> Chain:
+        """The chain under these conditions."""

@@ -1,4 +1,4 @@
-"""Statics: gravity and load to moments at the mount and the joints, and what the springs make of them.
+"""Statics: gravity and load to moments and forces at the mount and the joints.
 
 The moment of every weight beyond a site is the cross product of one first moment with gravity, so the
 cost does not grow with the number of masses. [Conenna2024]
@@ -12,7 +12,6 @@ from dataclasses import dataclass
 
 import casadi as ca
 
-from armcal.arm.effects import Spring
 from armcal.arm.model import Chain, Frames
 from armcal.base import se3
 from armcal.base.se3 import Expression
@@ -87,59 +86,6 @@ def wrenches(chain: Chain, frames: Frames, masses: Sequence[Mass], load: Load) -
         moment += _cross(frames.base_T_tool.translation - origin, load.force)
         result.append(SiteWrench(moment, weight * load.gravity + load.force))
     return tuple(reversed(result))
-
-
-def deflections(chain: Chain, frames: Frames, acting: Sequence[SiteWrench], springs: Sequence[Spring]) -> Expression:
-    """What each spring coordinate deflects under the wrenches, stacked in the order of the springs."""
-    parts = []
-    for spring in springs:
-        site, wrench = frames.sites[spring.site], acting[spring.site]
-        joint = chain.joints[spring.site - 1] if spring.site else None
-        slides = joint is not None and not spring.directions and not joint.is_revolute
-        generalised = wrench.force if slides else wrench.moment
-        axes = spring.directions or ((joint.axis,) if joint else ())
-        along = [ca.dot(ca.mtimes(site.rotation, ca.SX(list(axis))), generalised) for axis in axes]
-        parts.append(spring.law(ca.vertcat(*along)))
-    return ca.vertcat(*parts) if parts else ca.SX(0, 1)
-
-
-def split_deflection(
-    chain: Chain, springs: Sequence[Spring], deflection: Expression
-) -> tuple[list[Expression], dict[int, Expression]]:
-    """A stacked deflection as displacements on joints' own axes and rotations at sites.
-
-    Returns:
-        what to add to each joint's displacement, and the rotation matrices by site.
-    """
-    along = [ca.SX(0) for _ in chain.joints]
-    vectors: dict[int, Expression] = {}
-    single: dict[int, tuple[Expression, Expression]] = {}
-    start = 0
-    for spring in springs:
-        part = deflection[start : start + spring.size]
-        start += spring.size
-        if not spring.directions:
-            along[spring.site - 1] += part
-            continue
-        directions = ca.horzcat(*[ca.SX(list(axis)) for axis in spring.directions])
-        if spring.site in vectors or spring.size > 1:
-            single.pop(spring.site, None)
-        else:
-            single[spring.site] = (directions, part)
-        vectors[spring.site] = vectors.get(spring.site, ca.SX(3, 1)) + ca.mtimes(directions, part)
-    rotations = {
-        site: _rotation(*single[site]) if site in single else se3.small_rotation(vector)
-        for site, vector in vectors.items()
-    }
-    return along, rotations
-
-
-def _rotation(axis: Expression, angle: Expression) -> Expression:
-    """About one constant axis: exact, and cheap for a coordinate axis."""
-    for index, name in enumerate("xyz"):
-        if all(float(axis[i]) == (i == index) for i in range(3)):
-            return se3.rotation_about(name, angle).rotation
-    return se3.rotation_about_unit(axis, angle)
 
 
 def _frame(chain: Chain, frames: Frames, name: str) -> tuple[se3.Transform, int]:

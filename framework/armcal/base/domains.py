@@ -4,6 +4,9 @@ A block stores one canonical value whatever the solver; a solver sees an increme
 ``value = retract(base, delta)``. Residuals are differentiated with respect to the canonical entries,
 and ``retract_jacobian`` carries that over to increments, so a model's expression never knows how a
 solver moves its parameters.
+
+Priors and covariances are stated in ``coordinates`` about the base: the increment itself, except where an
+increment is no fair measure of the value (a factor of a semidefinite matrix).
 """
 
 from __future__ import annotations
@@ -17,7 +20,6 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-_LOWER = np.tril_indices(3)
 _SYMMETRIC = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 
@@ -44,9 +46,55 @@ class Domain(Protocol):
     def retract_jacobian(self, base: Array, delta: Array) -> Array:
         """d retract / d delta at ``delta`` (entries x dof)."""
 
+    def increment_scale(self, scale: float) -> float:
+        """The ordinary size of an increment, from that of a coordinate."""
+
+    def coordinates(self, base: Array, delta: Array) -> Array:
+        """Where ``delta`` leads, in the coordinates of priors and covariances (dof)."""
+
+    def from_coordinates(self, base: Array, coordinates: Array) -> Array:
+        """The increment (dof) that leads there, or to the nearest value of the domain."""
+
+    def coordinates_jacobian(self, base: Array, delta: Array) -> Array:
+        """d coordinates / d delta (dof x dof)."""
+
+    def entries_jacobian(self, base: Array, delta: Array) -> Array:
+        """d canonical entries / d coordinates (entries x dof)."""
+
+    def curvature(self, gradient: Array) -> Array | None:
+        """The convex part of sum over entries of gradient * d2 entry / d delta2 (dof x dof); None to neglect it."""
+
+
+class _ByIncrement:
+    """A domain whose coordinates are its increments."""
+
+    def increment_scale(self, scale: float) -> float:
+        """The same."""
+        return scale
+
+    def coordinates(self, base: Array, delta: Array) -> Array:
+        """The increment."""
+        return delta
+
+    def from_coordinates(self, base: Array, coordinates: Array) -> Array:
+        """The increment."""
+        return coordinates
+
+    def coordinates_jacobian(self, base: Array, delta: Array) -> Array:
+        """One."""
+        return np.eye(len(delta))
+
+    def entries_jacobian(self: Domain, base: Array, delta: Array) -> Array:
+        """That of the retraction."""
+        return self.retract_jacobian(base, delta)
+
+    def curvature(self, gradient: Array) -> Array | None:
+        """Neglected: small against that of the residuals, and zero for a number."""
+        return None
+
 
 @dataclass(frozen=True)
-class Interval:
+class Interval(_ByIncrement):
     """A number between two bounds, both allowed."""
 
     lower: float = -math.inf
@@ -83,7 +131,7 @@ class Interval:
 
 
 @dataclass(frozen=True)
-class Rotation:
+class Rotation(_ByIncrement):
     """A rotation: unit quaternion (w, x, y, z); increments are rotation vectors (rad) in the moved frame."""
 
     @property
@@ -116,7 +164,7 @@ class Rotation:
 
 
 @dataclass(frozen=True)
-class Pose:
+class Pose(_ByIncrement):
     """A rigid motion: quaternion then translation (m); increments: rotation vector (rad), translation, both in the moved frame."""  # noqa: E501
 
     @property
@@ -152,7 +200,7 @@ class Pose:
 
 
 @dataclass(frozen=True)
-class ScrewAxis:
+class ScrewAxis(_ByIncrement):
     """The axis of a revolute joint as a twist (w, v = -w x q), |w| = 1, w.v = 0; four degrees of freedom.
 
     An increment is two turns (rad) and two shifts (m), about and along two directions across the axis at
@@ -212,10 +260,11 @@ class ScrewAxis:
 
 @dataclass(frozen=True)
 class Semidefinite:
-    """A symmetric positive semidefinite 3x3 matrix: xx, xy, xz, yy, yz, zz; increments move a factor of it.
+    """A symmetric positive semidefinite 3x3 matrix: xx, xy, xz, yy, yz, zz; increments move its symmetric root.
 
-    C = L L' with L lower triangular, so every increment gives a semidefinite matrix. At L = 0 the
-    gradient vanishes: a start must be definite.
+    C = S S, so every increment gives a semidefinite matrix. (A triangular factor would do so too, but is not unique
+    where a matrix is singular, as many a fitted one is, and a solver then goes astray.) At S = 0 the gradient
+    vanishes: a start must be definite. Coordinates are differences of the canonical entries.
     """
 
     @property
@@ -237,26 +286,45 @@ class Semidefinite:
         return "" if lowest >= -1e-12 * max(1.0, largest) else f"its smallest eigenvalue is {lowest:g}"
 
     def retract(self, base: Array, delta: Array) -> Array:
-        """(L + delta)(L + delta)'."""
-        factor = _factor(symmetric(base))
-        factor[_LOWER] += delta
-        return _entries(factor @ factor.T)
+        """(S + delta)(S + delta)."""
+        root = _root(base) + symmetric(delta)
+        return _entries(root @ root)
 
     def local(self, base: Array, value: Array) -> Array:
-        """The difference of the factors."""
-        difference = _factor(symmetric(value)) - _factor(symmetric(base))
-        return np.asarray(difference[_LOWER])
+        """The difference of the roots; that of the nearest semidefinite matrix, if the value is none."""
+        return _entries(_root(value) - _root(base))
 
     def retract_jacobian(self, base: Array, delta: Array) -> Array:
         """6 x 6."""
-        factor = _factor(symmetric(base))
-        factor[_LOWER] += delta
-        jacobian = np.zeros((6, 6))
-        for column, (row, col) in enumerate(zip(*_LOWER, strict=True)):
-            unit = np.zeros((3, 3))
-            unit[row, col] = 1
-            jacobian[:, column] = _entries(unit @ factor.T + factor @ unit.T)
-        return jacobian
+        root = _root(base) + symmetric(delta)
+        return np.column_stack([_entries(root @ unit + unit @ root) for unit in _UNITS])
+
+    def increment_scale(self, scale: float) -> float:
+        """A root's unit is the root of the unit."""
+        return math.sqrt(scale)
+
+    def coordinates(self, base: Array, delta: Array) -> Array:
+        """The difference of the entries."""
+        return self.retract(base, delta) - base
+
+    def from_coordinates(self, base: Array, coordinates: Array) -> Array:
+        """To the nearest semidefinite matrix."""
+        return self.local(base, base + coordinates)
+
+    def coordinates_jacobian(self, base: Array, delta: Array) -> Array:
+        """6 x 6."""
+        return self.retract_jacobian(base, delta)
+
+    def entries_jacobian(self, base: Array, delta: Array) -> Array:
+        """One: on the cone's boundary too, a covariance reaches to both sides."""
+        return np.eye(6)
+
+    def curvature(self, gradient: Array) -> Array | None:
+        """Without it, what belongs at zero has no curvature there at all."""
+        halves = np.array([1.0, 0.5, 0.5, 1.0, 0.5, 1.0])
+        size, directions = np.linalg.eigh(symmetric(gradient * halves))
+        convex = (directions * np.maximum(size, 0.0)) @ directions.T
+        return np.array([[2 * np.sum(convex * (one @ two)) for two in _UNITS] for one in _UNITS])
 
 
 def symmetric(entries: Array) -> Array:
@@ -267,20 +335,17 @@ def symmetric(entries: Array) -> Array:
     return matrix
 
 
-def _factor(matrix: Array) -> Array:
-    """L with L L' = matrix, also where the matrix is singular: a column without a pivot is zero."""
-    factor = np.zeros((3, 3))
-    smallest = 1e-15 * max(float(np.trace(matrix)), 0.0)
-    for j in range(3):
-        pivot = matrix[j, j] - factor[j, :j] @ factor[j, :j]
-        if pivot > smallest:
-            factor[j, j] = math.sqrt(pivot)
-            factor[j + 1 :, j] = (matrix[j + 1 :, j] - factor[j + 1 :, :j] @ factor[j, :j]) / factor[j, j]
-    return factor
+def _root(entries: Array) -> Array:
+    """The symmetric root of six canonical entries' matrix, or of the nearest semidefinite one."""
+    size, directions = np.linalg.eigh(symmetric(entries))
+    return np.asarray((directions * np.sqrt(np.maximum(size, 0.0))) @ directions.T)
 
 
 def _entries(matrix: Array) -> Array:
     return np.array([matrix[row, col] for row, col in _SYMMETRIC])
+
+
+_UNITS = tuple(symmetric(unit) for unit in np.eye(6))
 
 
 def _across(direction: Array) -> Array:

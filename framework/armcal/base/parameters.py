@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import fnmatch
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -15,6 +15,18 @@ from armcal.base.domains import Array, Domain, Interval
 from armcal.errors import ConfigError
 
 _EVERYWHERE = (-math.inf, math.inf)
+
+
+@dataclass(frozen=True)
+class Drift:
+    """How a parameter may move over a recording: standard deviation (in its unit) of a stationary process.
+
+    Its correlation falls by e over the distance ``over``, in units of the channel (``sequence``: records, ``time``: s).
+    """
+
+    sd: float
+    over: float
+    channel: str = "sequence"
 
 
 @dataclass(frozen=True)
@@ -29,7 +41,8 @@ class ParameterBlock:
         scale: the size of a correction one would call ordinary, in ``unit``; conditions the solver and the rank
             decision, never the answer.
         free: whether the fit may move it.
-        prior_sd: standard deviation of a Gaussian prior about the nominal value, per increment; None for no prior.
+        prior_sd: standard deviation of a Gaussian prior about the nominal value, per coordinate; None for no prior.
+        drift: how it moves over a recording; None if it does not.
     """
 
     name: str
@@ -39,6 +52,7 @@ class ParameterBlock:
     scale: float = 1.0
     free: bool = False
     prior_sd: float | None = None
+    drift: Drift | None = None
 
     @property
     def entry_names(self) -> tuple[str, ...]:
@@ -155,23 +169,27 @@ class Parameters:
         return tuple(i for block in self.free for i in range(*self.entries_of(block.name).indices(1 << 30)))
 
     @cached_property
-    def increment_names(self) -> tuple[str, ...]:
-        """A name for each number of an increment."""
+    def coordinate_names(self) -> tuple[str, ...]:
+        """A name for each number of an increment: the entry's, where coordinates are entries."""
         names: list[str] = []
         for block in self.free:
-            single = block.domain.dof == 1
-            names += [block.name if single else f"{block.name}<{i}>" for i in range(block.domain.dof)]
+            by_entry = block.domain.dof == block.size
+            names += block.entry_names if by_entry else [f"{block.name}<{i}>" for i in range(block.domain.dof)]
         return tuple(names)
 
     def _per_increment(self, of: Mapping[str, float]) -> Array:
         return np.array([of[block.name] for block in self.free for _ in range(block.domain.dof)])
 
     def scales(self) -> Array:
-        """The ordinary size of each increment."""
+        """The ordinary size of each coordinate."""
         return self._per_increment({block.name: block.scale for block in self.free})
 
+    def increment_scales(self) -> Array:
+        """The ordinary size of each increment."""
+        return self._per_increment({b.name: b.domain.increment_scale(b.scale) for b in self.free})
+
     def prior_information(self) -> Array:
-        """1/sd^2 of each increment's prior, 0 where there is none."""
+        """1/sd^2 of each coordinate's prior, 0 where there is none."""
         return self._per_increment(
             {block.name: 0.0 if block.prior_sd is None else block.prior_sd**-2 for block in self.free}
         )
@@ -200,14 +218,53 @@ class Parameters:
 
     def retract_jacobian(self, delta: Array) -> Array:
         """d free canonical entries / d increment, at an increment from the nominal values."""
-        jacobian = np.zeros((len(self.free_entries), len(delta)))
-        row = column = 0
+        return self._diagonal(delta, lambda block, base, part: block.domain.retract_jacobian(base, part))
+
+    def coordinates(self, delta: Array) -> Array:
+        """Where an increment leads, in the coordinates of priors and covariances."""
+        parts = [b.domain.coordinates(np.array(b.nominal), part) for b, part in self._parts(delta)]
+        return np.concatenate(parts) if parts else np.zeros(0)
+
+    def from_coordinates(self, coordinates: Array) -> Array:
+        """The increment that leads there, or to the nearest value of each domain."""
+        parts = [b.domain.from_coordinates(np.array(b.nominal), part) for b, part in self._parts(coordinates)]
+        return np.concatenate(parts) if parts else np.zeros(0)
+
+    def coordinates_jacobian(self, delta: Array) -> Array:
+        """d coordinates / d increment."""
+        return self._diagonal(delta, lambda block, base, part: block.domain.coordinates_jacobian(base, part))
+
+    def entries_jacobian(self, values: Array) -> Array:
+        """d free canonical entries / d coordinates, at a value vector."""
+        delta = self.local(values)
+        return self._diagonal(delta, lambda block, base, part: block.domain.entries_jacobian(base, part))
+
+    def curvature(self, gradient: Array) -> Array:
+        """What the retraction's curvature adds to a Hessian by increments; ``gradient`` is by free entries."""
+        size = sum(block.domain.dof for block in self.free)
+        total, row, column = np.zeros((size, size)), 0, 0
         for block in self.free:
-            size, dof = block.size, block.domain.dof
-            part = block.domain.retract_jacobian(np.array(block.nominal), delta[column : column + dof])
-            jacobian[row : row + size, column : column + dof] = part
-            row, column = row + size, column + dof
-        return jacobian
+            end = column + block.domain.dof
+            part = block.domain.curvature(gradient[row : row + block.size])
+            if part is not None:
+                total[column:end, column:end] = part
+            row, column = row + block.size, end
+        return total
+
+    def _parts(self, delta: Array) -> Iterator[tuple[ParameterBlock, Array]]:
+        start = 0
+        for block in self.free:
+            yield block, delta[start : start + block.domain.dof]
+            start += block.domain.dof
+
+    def _diagonal(self, delta: Array, of: Callable[[ParameterBlock, Array, Array], Array]) -> Array:
+        parts = [of(block, np.array(block.nominal), part) for block, part in self._parts(delta)]
+        whole = np.zeros((sum(part.shape[0] for part in parts), sum(part.shape[1] for part in parts)))
+        row = column = 0
+        for part in parts:
+            whole[row : row + part.shape[0], column : column + part.shape[1]] = part
+            row, column = row + part.shape[0], column + part.shape[1]
+        return whole
 
     def check(self, values: Array, names: Sequence[str] | None = None) -> None:
         """Raise ConfigError for the first block whose value lies outside its domain."""

@@ -49,14 +49,17 @@ _ALL = (
     Unit("g", "mass", 1.0, 1000.0),
     Unit("s", "time"),
     Unit("ms", "time", 1.0, 1000.0),
+    Unit("us", "time", 1.0, 1e6),
     Unit("min", "time", 60.0),
     Unit("h", "time", 3600.0),
     Unit("m_s2", "acceleration"),
     Unit("rad_per_Nm", "compliance"),
     Unit("deg_per_Nm", "compliance", _DEGREE),
+    Unit("rad_per_Nm3", "cubic compliance"),
     Unit("N", "force"),
     Unit("Nm", "torque"),
     Unit("C", "temperature"),
+    Unit("per_K", "expansion"),
     Unit("1", DIMENSIONLESS),
 )
 
@@ -74,9 +77,11 @@ _SPELLINGS: Mapping[str, str] = MappingProxyType(
         "m/s²": "m_s2",
         "rad/Nm": "rad_per_Nm",
         "rad/(Nm)": "rad_per_Nm",
+        "rad/Nm^3": "rad_per_Nm3",
         "deg/Nm": "deg_per_Nm",
         "deg/(Nm)": "deg_per_Nm",
         "°C": "C",
+        "1/K": "per_K",
     }
 )
 _LONGEST_FIRST = tuple(sorted((n for n in UNITS if n != "1"), key=len, reverse=True))

@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 from pydantic import Field
 
-from armcal.base.parameters import ParameterBlock, Parameters
+from armcal.base.parameters import Drift, ParameterBlock, Parameters
 from armcal.base.settings import Settings
 from armcal.base.units import DIMENSIONLESS, UNITS, display_unit, parse_quantity, si_unit
 from armcal.config.yaml_source import ConfigSource
@@ -20,12 +20,24 @@ DIMENSION_OF_UNIT = {unit.name: unit.dimension for unit in UNITS.values() if uni
 Path = tuple[str | int, ...]
 
 
+class DriftSettings(Settings):
+    """How far a parameter drifts over a recording (standard deviation, with its unit), and how fast.
+
+    ``over`` is the distance over which it forgets: records (``10``; a column ``sequence`` says their order) or time
+    (``20 min``; a column ``time_s``).
+    """
+
+    sd: str | float
+    over: str | float
+
+
 class ParameterSettings(Settings):
     """What the fit may change.
 
     ``free`` and ``fixed`` are globs over parameter names (fixed wins); ``values`` replaces nominal values,
     ``priors`` gives standard deviations about them, both as text with a unit (``0.5 deg``). ``bounds: physical``
-    keeps every compliance non-negative; ``none`` (or false) takes all bounds away.
+    keeps every compliance non-negative; ``none`` (or false) takes all bounds away. ``drift`` names free parameters
+    that move slowly over the recording.
     """
 
     free: tuple[str, ...] = ()
@@ -33,6 +45,7 @@ class ParameterSettings(Settings):
     bounds: Literal["physical", "none"] | bool = "physical"
     values: dict[str, str | float] = Field(default_factory=dict)
     priors: dict[str, str | float] = Field(default_factory=dict)
+    drift: dict[str, DriftSettings] = Field(default_factory=dict)
 
 
 def select(parameters: Parameters, settings: ParameterSettings, source: ConfigSource) -> Parameters:
@@ -50,39 +63,82 @@ def select(parameters: Parameters, settings: ParameterSettings, source: ConfigSo
     for glob, text in settings.priors.items():
         place = (*at, "priors", glob)
         for name in _matching(parameters, glob, source, place):
-            deviation = quantity(parameters[name], text, source, place)
-            if not deviation > 0 or not math.isfinite(deviation):
-                raise ConfigError(
-                    f"found a prior of {text}, expected a standard deviation above zero.",
-                    where=source.where(place),
-                    hint="Give how far from the nominal value the parameter may well be.",
-                )
+            deviation = _deviation(parameters[name], text, source, place)
             parameters = parameters.replaced({name: replace(parameters[name], prior_sd=deviation)})
     free = set(parameters.select(settings.free)) - set(parameters.select(settings.fixed))
-    return parameters.with_free(free)
+    return _with_drift(parameters.with_free(free), settings.drift, source, (*at, "drift"))
+
+
+def _with_drift(
+    parameters: Parameters, drifting: Mapping[str, DriftSettings], source: ConfigSource, at: Path
+) -> Parameters:
+    for glob, stated in drifting.items():
+        for name in _matching(parameters, glob, source, (*at, glob)):
+            block = parameters[name]
+            if not block.free or block.size != 1:
+                raise ConfigError(
+                    f"{name} cannot drift: it is {'a matrix' if block.size != 1 else 'not free'}.",
+                    where=source.where((*at, glob)),
+                    hint="Let free numbers drift: add it to parameters.free, under a prior if need be.",
+                )
+            deviation = _deviation(block, stated.sd, source, (*at, glob, "sd"))
+            over, channel = _distance(stated.over, source, (*at, glob, "over"))
+            parameters = parameters.replaced({name: replace(block, drift=Drift(deviation, over, channel))})
+    return parameters
+
+
+def _distance(text: str | float, source: ConfigSource, at: Path) -> tuple[float, str]:
+    """A number of records, or a time in s; and the channel that counts it."""
+    try:
+        over, channel = (parse_quantity(text, "time"), "time") if isinstance(text, str) else (float(text), "sequence")
+    except ValueError as fault:
+        raise ConfigError(f"{fault}", where=source.where(at), hint="Write records (10) or a time (20 min).") from fault
+    if not over > 0 or not math.isfinite(over):
+        raise ConfigError(f"found {text}, expected a distance above zero.", where=source.where(at))
+    return over, channel
+
+
+def _deviation(block: ParameterBlock, text: str | float, source: ConfigSource, at: Path) -> float:
+    deviation = quantity(block, text, source, at)
+    if not deviation > 0 or not math.isfinite(deviation):
+        raise ConfigError(
+            f"found {text}, expected a standard deviation above zero.",
+            where=source.where(at),
+            hint="Give how far from the nominal value the parameter may well be.",
+        )
+    return deviation
 
 
 def with_values(
     parameters: Parameters, values: Mapping[str, str | float], source: ConfigSource | None, at: Path
 ) -> Parameters:
-    """Other nominal values by exact name, as text with a unit."""
+    """Other nominal values by exact name, as text with a unit; a matrix by its entries (``arm.flex.C3[xx]``)."""
+    changed: dict[str, Path] = {}
     for name, text in values.items():
         place = (*at, name)
-        if name not in parameters.names:
+        owner = name.partition("[")[0]
+        if owner not in parameters.names:
             _matching(parameters, name, source, place)
-        block = parameters[name]
-        value = quantity(block, text, source, place)
-        if fault := block.domain.check(np.array([value])):
-            raise ConfigError(f"{name}: {fault}.", where=source.where(place) if source else None)
-        parameters = parameters.replaced({name: replace(block, nominal=(value,))})
+        block = parameters[owner]
+        if name not in block.entry_names:
+            raise ConfigError(
+                f"{name} is no single number.",
+                where=source.where(place) if source else None,
+                hint=f"Give its entries, each on its own: {', '.join(block.entry_names)}.",
+            )
+        numbers = list(block.nominal)
+        numbers[block.entry_names.index(name)] = quantity(block, text, source, place)
+        parameters = parameters.replaced({owner: replace(block, nominal=tuple(numbers))})
+        changed[owner] = place
+    for owner, place in changed.items():
+        if fault := parameters[owner].domain.check(np.array(parameters[owner].nominal)):
+            raise ConfigError(f"{owner}: {fault}.", where=source.where(place) if source else None)
     return parameters
 
 
 def quantity(block: ParameterBlock, text: str | float, source: ConfigSource | None, at: Path) -> float:
-    """A text with a unit as SI, for a scalar block."""
+    """A text with a unit as SI, in the unit of a block's entries."""
     where = source.where(at) if source else None
-    if block.size != 1:
-        raise ConfigError(f"{block.name} has {block.size} entries and cannot be set by one number.", where=where)
     dimension = DIMENSION_OF_UNIT.get(block.unit)
     if dimension in (None, DIMENSIONLESS):
         if isinstance(text, str):

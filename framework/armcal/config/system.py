@@ -17,7 +17,7 @@ from armcal.config.yaml_source import ConfigSource
 from armcal.errors import ArmcalError, ConfigError, PluginError
 from armcal.measure.measurement import Measurement
 from armcal.plugins import Component, PluginRegistry
-from armcal.solve.factor import Environment
+from armcal.solve.factor import STATICS, Environment, gravity_tilt
 
 T = TypeVar("T")
 Path = tuple[str | int, ...]
@@ -100,6 +100,7 @@ class System:
         blocks: list[ParameterBlock] = [block for arm in self.arms.values() for block in arm.parameters()]
         for name, measurement in self.measurements.items():
             blocks += prefixed(f"{name}.", measurement.parameters())
+        blocks += gravity_tilt()
         return Parameters(tuple(blocks))
 
 
@@ -206,7 +207,7 @@ def _instance_names(source: ConfigSource, names: list[str]) -> None:
     """Names head parameter names and columns, so they must not collide or hold a dot or a glob."""
     for name in names:
         section: Path = ("arms", name) if name in source.data.get("arms", {}) else ("measurements", name)
-        if names.count(name) > 1:
+        if names.count(name) > 1 or name == STATICS:
             raise ConfigError(f"{name!r} names two things.", where=source.where(section), hint="Rename one.")
         if not name.isidentifier():
             raise ConfigError(

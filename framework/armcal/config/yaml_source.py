@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import difflib
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -13,15 +12,14 @@ import yaml
 
 from armcal.base.config_text import ConfigText, resolve_path
 from armcal.base.units import split_suffix
-from armcal.config.yaml_nodes import MAX_DEPTH, Node, Origin, Step, dotted, read_nodes
+from armcal.config.yaml_nodes import Node, Origin, Step, dotted, read_nodes
+from armcal.config.yaml_tree import entries_of, merge, override
 from armcal.errors import ConfigError, Location
 
 __all__ = ["ConfigSource", "ConfigText", "find_key", "load_config", "resolve_path"]
 
 MAX_BYTES = 1 << 20
 MAX_FILES = 32
-
-_STEPS = re.compile(r'(?:"([^"]+)"|([^."\s]+))(?:\.|$)')
 
 
 def _as_plain_text(dumper: Any, text: ConfigText) -> Any:
@@ -92,16 +90,25 @@ def load_config(path: str | Path, overrides: Sequence[str] = (), root: Path | No
         ConfigError: what was found, where, and the mend.
     """
     path = Path(path)
-    try:
-        limit = (path.parent if root is None else root).resolve()
-    except (OSError, RuntimeError, ValueError) as fault:
-        _refuse_file(path, f"this path cannot be followed ({fault}).", "Check its spelling and its symbolic links.")
-    reader = _Reader(limit)
+    reader = Reader(root_of(path, root))
     tree = reader.tree(path, ())
     for text in overrides:
-        tree = _override(tree, text)
+        tree = override(tree, text)
+    return as_source(tree, path, reader)
+
+
+def root_of(path: Path, root: Path | None) -> Path:
+    """What no path in a config may leave, resolved: the directory of the config unless given."""
+    try:
+        return (path.parent if root is None else root).resolve()
+    except (OSError, RuntimeError, ValueError) as fault:
+        _refuse_file(path, f"this path cannot be followed ({fault}).", "Check its spelling and its symbolic links.")
+
+
+def as_source(tree: Node, path: Path, reader: Reader) -> ConfigSource:
+    """A tree as a configuration."""
     marks: dict[tuple[Step, ...], Location] = {}
-    return ConfigSource(_build(tree, (), marks), marks, path, limit, tuple(reader.files))
+    return ConfigSource(_build(tree, (), marks), marks, path, reader.root, tuple(reader.files))
 
 
 def _refuse_file(path: Path, message: str, hint: str) -> NoReturn:
@@ -137,7 +144,7 @@ def _neighbours(path: Path) -> list[str]:
 
 
 @dataclass
-class _Reader:
+class Reader:
     """Reads a config and what it extends, each file once."""
 
     root: Path
@@ -156,15 +163,16 @@ class _Reader:
         origin = Origin(str(path), path.parent, self.root)
         own = _mapping(read_nodes(text, origin), origin)
         merged: Node | None = None
-        for parent in _parents(own):
-            base = self._parent(parent, (*chain, resolved))
-            merged = base if merged is None else _merge(merged, base)
-        entries = {key: node for key, node in _entries(own).items() if key != "extends"}
+        for parent in parents_of(own):
+            base = self.parent(parent, (*chain, resolved))
+            merged = base if merged is None else merge(merged, base)
+        entries = {key: node for key, node in entries_of(own).items() if key != "extends"}
         own = replace(own, value=entries)
-        self.done[resolved] = own if merged is None else _merge(merged, own)
+        self.done[resolved] = own if merged is None else merge(merged, own)
         return self.done[resolved]
 
-    def _parent(self, text: ConfigText, chain: tuple[Path, ...]) -> Node:
+    def parent(self, text: ConfigText, chain: tuple[Path, ...]) -> Node:
+        """The merged tree of a file that ``extends`` names."""
         resolved = resolve_path(text)
         if resolved in chain:
             circle = " -> ".join(p.name for p in (*chain[chain.index(resolved) :], resolved))
@@ -196,12 +204,9 @@ def _mapping(node: Node | None, origin: Origin) -> Node:
     return node
 
 
-def _entries(node: Node) -> dict[str, Node]:
-    return node.value if isinstance(node.value, dict) else {}
-
-
-def _parents(node: Node) -> list[ConfigText]:
-    named = _entries(node).get("extends")
+def parents_of(node: Node) -> list[ConfigText]:
+    """The names under ``extends``."""
+    named = entries_of(node).get("extends")
     if named is None:
         return []
     nodes = named.value if isinstance(named.value, tuple) else (named,)
@@ -213,71 +218,6 @@ def _parents(node: Node) -> list[ConfigText]:
             hint="Write for example 'extends: base.yaml'.",
         )
     return texts
-
-
-def _merge(parent: Node, child: Node) -> Node:
-    """The child over the parent: mappings merge, null removes the parent's key, anything else replaces."""
-    if not (isinstance(parent.value, dict) and isinstance(child.value, dict)):
-        return child
-    entries = dict(parent.value)
-    for key, node in child.value.items():
-        if key not in entries:
-            entries[key] = node
-        elif node.value is None:
-            del entries[key]
-        else:
-            entries[key] = _merge(entries[key], node)
-    return replace(child, value=entries)
-
-
-def _override(tree: Node, text: str) -> Node:
-    name, equals, written = text.partition("=")
-    origin = Origin(f"command line (--set {name.strip()})", Path.cwd(), numbered=False)
-    matches = list(_STEPS.finditer(name.strip()))
-    steps = tuple(match[1] or match[2] for match in matches)
-    whole = "".join(match[0] for match in matches) == name.strip() and not name.strip().endswith(".")
-    if not equals or not steps or not whole or not written.strip() or len(steps) > MAX_DEPTH:
-        hint = "Write for example --set parameters.bounds=none; null as the value removes a key."
-        where = Location(f"command line (--set {text})")
-        raise ConfigError(f"found {text!r}, expected a dotted name, '=' and a value.", where=where, hint=hint)
-    origin = replace(origin, prefix=steps)
-    if steps[0] == "extends":
-        raise ConfigError("'extends' is read from files only.", where=origin.at(None), hint="Write it in the config.")
-    value = read_nodes(written, origin) or Node(origin, 1, None)
-    return _set(tree, steps, value)
-
-
-def _set(node: Node, steps: tuple[str, ...], value: Node) -> Node:
-    if not steps:
-        return value
-    step, rest = steps[0], steps[1:]
-    if isinstance(node.value, tuple):
-        index = _index(node.value, step, value.origin)
-        items = list(node.value)
-        items[index] = _set(items[index], rest, value)
-        return replace(node, value=tuple(items))
-    if node.value is not None and not isinstance(node.value, dict):
-        raise ConfigError(
-            f"the key above {step!r} holds {str(node.value)[:60]!r}, expected a mapping or a list.",
-            where=value.origin.at(None),
-            hint="Override that key itself, or correct the name.",
-        )
-    entries = dict(_entries(node))
-    if not rest and value.value is None and step in entries:
-        del entries[step]
-    else:
-        entries[step] = _set(entries.get(step, Node(value.origin, 1, None)), rest, value)
-    return replace(node, value=entries)
-
-
-def _index(items: tuple[Node, ...], step: str, origin: Origin) -> int:
-    if step.isascii() and step.isdecimal() and len(step) < 10 and int(step) < len(items):
-        return int(step)
-    raise ConfigError(
-        f"found the index {step!r} into a list of {len(items)} values.",
-        where=origin.at(None),
-        hint=f"Write an index from 0 to {len(items) - 1}." if items else "Override the whole list.",
-    )
 
 
 def _build(node: Node, path: tuple[Step, ...], marks: dict[tuple[Step, ...], Location]) -> Any:

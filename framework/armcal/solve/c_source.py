@@ -21,7 +21,8 @@ _BINARY = {"ADD": "{} + {}", "SUB": "{} - {}", "MUL": "{} * {}", "DIV": "{} / {}
 _UNARY = {"NEG": "-{}", "SQ": "{0} * {0}", "TWICE": "{0} + {0}", "INV": "1.0 / {}", "ASSIGN": "{}"}
 _LIBRARY = {
     "SQRT": "sqrt", "TAN": "tan", "ASIN": "asin", "ACOS": "acos", "ATAN": "atan", "EXP": "exp", "LOG": "log",
-    "SINH": "sinh", "COSH": "cosh", "TANH": "tanh", "FABS": "fabs", "ERF": "erf", "ATAN2": "atan2", "POW": "pow",
+    "SINH": "sinh", "COSH": "cosh", "TANH": "tanh", "FABS": "fabs", "ERF": "erf", "FLOOR": "floor",
+    "CEIL": "ceil", "ATAN2": "atan2", "POW": "pow",
     "CONSTPOW": "pow", "FMIN": "fmin", "FMAX": "fmax", "COPYSIGN": "copysign", "SIGN": "sign_of", "LT": "less",
     "LE": "less_equal", "EQ": "equal", "NE": "unequal", "NOT": "negation", "AND": "both", "OR": "either",
     "IF_ELSE_ZERO": "if_else_zero", "SIN": "sine", "COS": "cosine",

@@ -35,7 +35,7 @@ BOTH double s_cosine(double x) { return cos(x); }
 #define LANEWISE2(name) \
   BOTH V v_##name(V x, V y) { for (int i = 0; i < LANES; ++i) x[i] = s_##name(x[i], y[i]); return x; }
 LIBRARY1(sqrt) LIBRARY1(tan) LIBRARY1(asin) LIBRARY1(acos) LIBRARY1(atan) LIBRARY1(exp) LIBRARY1(log)
-LIBRARY1(sinh) LIBRARY1(cosh) LIBRARY1(tanh) LIBRARY1(fabs) LIBRARY1(erf)
+LIBRARY1(sinh) LIBRARY1(cosh) LIBRARY1(tanh) LIBRARY1(fabs) LIBRARY1(erf) LIBRARY1(floor) LIBRARY1(ceil)
 LIBRARY2(atan2) LIBRARY2(pow) LIBRARY2(fmin) LIBRARY2(fmax) LIBRARY2(copysign)
 LANEWISE1(sign_of) LANEWISE1(negation)
 LANEWISE2(less) LANEWISE2(less_equal) LANEWISE2(equal) LANEWISE2(unequal) LANEWISE2(both) LANEWISE2(either)

@@ -1,0 +1,115 @@
+"""The elastic state of an arm: what its springs give at each site, as few numbers as they need.
+
+Springs that share a site share its coordinates: their deflections add up.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import casadi as ca
+
+from armcal.arm.effects import Spring
+from armcal.arm.model import Chain, Frames, Joint, Vector3
+from armcal.arm.statics import SiteWrench
+from armcal.base import se3
+from armcal.base.se3 import Expression
+
+_XYZ: tuple[Vector3, ...] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+
+
+@dataclass(frozen=True)
+class ElasticSite:
+    """The coordinates of one site's deflection.
+
+    Attributes:
+        site: 0 for the mount, i for joint i (from 1).
+        directions: rotations about these unit vectors of the site's frame; empty for a displacement on the joint's
+            own axis.
+        springs: what deflects there.
+    """
+
+    site: int
+    directions: tuple[Vector3, ...]
+    springs: tuple[Spring, ...]
+
+    @property
+    def size(self) -> int:
+        """How many coordinates it has."""
+        return max(1, len(self.directions))
+
+
+def elastic_sites(chain: Chain, springs: Sequence[Spring]) -> tuple[ElasticSite, ...]:
+    """Sites in the order in which the springs name them first.
+
+    A sliding joint's own axis is a site of its own: what gives along it is no rotation.
+    """
+    grouped: dict[tuple[int, bool], list[Spring]] = defaultdict(list)
+    for spring in springs:
+        slides = spring.site > 0 and not spring.directions and not chain.joints[spring.site - 1].is_revolute
+        grouped[spring.site, slides].append(spring)
+    return tuple(ElasticSite(site, _directions(group), tuple(group)) for (site, _), group in grouped.items())
+
+
+def _directions(springs: Sequence[Spring]) -> tuple[Vector3, ...]:
+    different = {spring.directions for spring in springs}
+    return springs[0].directions if len(different) == 1 else _XYZ
+
+
+def deflections(chain: Chain, frames: Frames, acting: Sequence[SiteWrench], sites: Sequence[ElasticSite]) -> Expression:
+    """What each site's coordinates deflect under the wrenches (rad, or m on a sliding joint's axis), stacked."""
+    parts = []
+    for site in sites:
+        pose, wrench = frames.sites[site.site], acting[site.site]
+        joint = chain.joints[site.site - 1] if site.site else None
+        total = ca.SX(site.size, 1)
+        for spring in site.springs:
+            slides = joint is not None and not spring.directions and not joint.is_revolute
+            load = wrench.force if slides else wrench.moment
+            axes = spring.directions or ((joint.axis,) if joint else ())
+            along = [ca.dot(ca.mtimes(pose.rotation, ca.SX(list(axis))), load) for axis in axes]
+            given = spring.law(ca.vertcat(*along))
+            total += given if spring.directions == site.directions else ca.mtimes(_matrix(axes), given)
+        parts.append(total)
+    return ca.vertcat(*parts) if parts else ca.SX(0, 1)
+
+
+def split_deflection(
+    joints: Sequence[Joint], sites: Sequence[ElasticSite], deflection: Expression
+) -> tuple[list[Expression], dict[int, Expression]]:
+    """A stacked deflection as displacements on joints' own axes and rotations at sites.
+
+    Returns:
+        what to add to each joint's displacement, and the rotation matrices by site.
+    """
+    along = [ca.SX(0) for _ in joints]
+    rotations: dict[int, Expression] = {}
+    for site, part in _parts(sites, deflection):
+        if not site.directions:
+            along[site.site - 1] = part
+        elif site.size == 1:
+            rotations[site.site] = _about(site.directions[0], part)
+        else:
+            rotations[site.site] = se3.small_rotation(ca.mtimes(_matrix(site.directions), part))
+    return along, rotations
+
+
+def _parts(sites: Sequence[ElasticSite], deflection: Expression) -> Iterator[tuple[ElasticSite, Expression]]:
+    start = 0
+    for site in sites:
+        yield site, deflection[start : start + site.size]
+        start += site.size
+
+
+def _matrix(directions: Sequence[Vector3]) -> Expression:
+    return ca.sparsify(ca.horzcat(*[ca.SX(list(axis)) for axis in directions]))
+
+
+def _about(axis: Vector3, angle: Expression) -> Expression:
+    """About one constant axis: exact, and cheap for a coordinate axis."""
+    named: Mapping[Vector3, str] = dict(zip(_XYZ, "xyz", strict=True))
+    if axis in named:
+        return se3.rotation_about(named[axis], angle).rotation
+    return se3.rotation_about_unit(ca.SX(list(axis)), angle)

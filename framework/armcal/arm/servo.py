@@ -1,0 +1,108 @@
+"""Pulse tables of hobby servos, and the angles that a pulse generator of finite resolution can set.
+
+The board counts ticks of an oscillator, divided by ``prescale + 1``, and takes a whole number of them. [PCA9685]
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from itertools import pairwise
+
+import casadi as ca
+
+from armcal.base.se3 import Expression
+
+COUNTS = 4096
+"""In one period."""
+PRESCALES = (3, 255)
+"""The smallest and the largest."""
+
+
+@dataclass(frozen=True)
+class PulseTable:
+    """Pulse lengths at known angles, linear between them and beyond the ends.
+
+    Attributes:
+        angles: rad, rising.
+        pulses: s, above zero, rising or falling.
+
+    Raises:
+        ValueError: it is no such table.
+    """
+
+    angles: tuple[float, ...]
+    pulses: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        if len(self.angles) != len(self.pulses) or len(self.angles) < 2:
+            found = f"{len(self.angles)} angles and {len(self.pulses)} pulses"
+            raise ValueError(f"found {found}, expected as many of both, two at least")
+        if not _rising(self.angles):
+            raise ValueError("the angles do not rise from each to the next")
+        if not (_rising(self.pulses) or _rising(tuple(-pulse for pulse in self.pulses))):
+            raise ValueError("the pulses neither rise nor fall from each to the next: a servo would turn back")
+        if min(self.pulses) <= 0:
+            raise ValueError(f"a pulse of {min(self.pulses):g} s is not above zero")
+
+    def pulse(self, angle: Expression) -> Expression:
+        """The pulse (s) that sets an angle (rad)."""
+        return _interpolated(angle, self.angles, self.pulses)
+
+    def angle(self, pulse: Expression) -> Expression:
+        """The angle (rad) that a pulse (s) sets."""
+        order = slice(None) if self.pulses[0] < self.pulses[-1] else slice(None, None, -1)
+        return _interpolated(pulse, self.pulses[order], self.angles[order])
+
+
+@dataclass(frozen=True)
+class PulseClock:
+    """A pulse generator: its measured oscillator (Hz) and its prescale.
+
+    Raises:
+        ValueError: no board has this prescale.
+    """
+
+    oscillator_hz: float
+    prescale: int
+
+    def __post_init__(self) -> None:
+        least, most = PRESCALES
+        if not least <= self.prescale <= most:
+            raise ValueError(f"the prescale is {self.prescale}, a board has {least} to {most}: choose another rate")
+
+    @property
+    def longest_pulse(self) -> float:
+        """All counts of a period but one (s)."""
+        return (COUNTS - 1) * self.tick
+
+    @property
+    def tick(self) -> float:
+        """The length of one count (s)."""
+        return (self.prescale + 1) / self.oscillator_hz
+
+    @staticmethod
+    def prescale_for(oscillator_hz: float, rate_hz: float) -> int:
+        """The prescale nearest to a pulse rate. [PCA9685]"""
+        return round(oscillator_hz / (COUNTS * rate_hz)) - 1
+
+    def counts(self, pulse: Expression) -> Expression:
+        """The whole number of counts nearest to a pulse (s), halves up."""
+        return ca.floor(pulse / self.tick + 0.5)
+
+
+def quantised(angle: Expression, table: PulseTable, clock: PulseClock) -> Expression:
+    """The angle (rad) at which a servo stands that was told another."""
+    return table.angle(clock.counts(table.pulse(angle)) * clock.tick)
+
+
+def _interpolated(x: Expression, at: tuple[float, ...], values: tuple[float, ...]) -> Expression:
+    slopes = [(v1 - v0) / (a1 - a0) for a0, a1, v0, v1 in zip(at, at[1:], values, values[1:], strict=False)]
+    result = values[0] + slopes[0] * (x - at[0])
+    for knot, before, after in zip(at[1:-1], slopes, slopes[1:], strict=False):
+        result = result + (after - before) * ca.fmax(x - knot, 0)
+    return result
+
+
+def _rising(numbers: tuple[float, ...]) -> bool:
+    return all(math.isfinite(n) for n in numbers) and all(a < b for a, b in pairwise(numbers))
