@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,10 +12,13 @@ import numpy as np
 from rich.table import Table
 
 from armcal.cli.common import Voice, overrides, speaking
+from armcal.errors import ProblemError
 from armcal.plugins import discover
 from armcal.run.experiment import Experiment
-from armcal.run.pipeline import Prepared, Stopwatch, prepare
-from armcal.solve.identifiability import Identifiability, analyse
+from armcal.run.pipeline import Prepared, Stopwatch, assemble
+from armcal.solve.estimator import require_solvable
+from armcal.solve.identifiability import Identifiability
+from armcal.solve.structure import identify
 
 
 @click.command()
@@ -26,16 +31,25 @@ def check(voice: Voice, config: Path, data: Path | None, overrides: tuple[str, .
     registry = discover()
     voice.plugin_faults(registry)
     experiment = Experiment.load(config, overrides, data, registry)
-    ready = prepare(experiment, Stopwatch())
-    problem = ready.problem
+    ready = assemble(experiment, Stopwatch())
     start = experiment.parameters.nominal()
-    triangle = problem.triangular_factor(start, ready.training)
-    known = analyse(triangle, experiment.parameters.scales(), experiment.parameters.increment_names)
+    known = identify(ready.problem, start, ready.training)
+    refused: ProblemError | None = None
+    try:
+        ready = replace(ready, warnings=(*ready.warnings, *require_solvable(ready.problem, ready.training, start)))
+    except ProblemError as fault:
+        refused = fault
     for text in ready.warnings:
         voice.warn(text)
     content = _content(experiment, ready, known)
+    if refused:
+        content["error"] = {"message": str(refused), "exit_code": refused.exit_code}
     voice.result(content)
     _show(voice, experiment, content)
+    if refused:
+        click.echo(f"armcal: {refused}", err=True)
+        sys.exit(refused.exit_code)
+    voice.out.print("Ready to run.", style="green")
 
 
 def _content(experiment: Experiment, ready: Prepared, known: Identifiability) -> dict[str, Any]:
@@ -96,4 +110,3 @@ def _show(voice: Voice, experiment: Experiment, content: dict[str, Any]) -> None
     if voice.verbose:
         for name in parameters["all"]:
             out.print(f"  {'free ' if name in parameters['free'] else 'fixed'} {name}", markup=False)
-    out.print("Ready to run.", style="green")

@@ -1,11 +1,13 @@
 """Which parameter combinations the data determines, by name.
 
-Rank is judged on the whitened Jacobian with each column scaled by the ordinary size of its parameter, by
-singular values [Golub2013]; undetermined combinations are reduced to as few parameters each as possible.
+Rank is judged on the whitened Jacobian with each column scaled by the ordinary size of its parameter, by singular
+values and by QR with pivoting [Golub2013]; undetermined combinations are reduced to as few parameters each as
+possible.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -13,27 +15,19 @@ import numpy as np
 from scipy.linalg import qr
 
 from armcal.base.domains import Array
+from armcal.base.parameters import Parameters
+from armcal.solve.combination import Combination, Measure, named
+from armcal.solve.null_space import sparse_basis
 
 RANK_TOLERANCE = 1e-9
 """Relative to the largest singular value: far above rounding, far below anything a real experiment determines."""
 POOR_CONDITION = 1e6
-_NEGLIGIBLE = 1e-6
+HARDLY = 1.0
+"""A singular value below this: the declared noise leaves the combination more than its ordinary size uncertain."""
 CORRELATED = 0.95
-
-
-@dataclass(frozen=True)
-class Combination:
-    """A direction in parameter space: (name, coefficient) pairs, in ordinary sizes of each parameter."""
-
-    terms: tuple[tuple[str, float], ...]
-
-    def __str__(self) -> str:
-        if not self.terms:
-            return "nothing"
-        if len(self.terms) == 1:
-            return f"{self.terms[0][0]} alone"
-        first, *others = self.terms
-        return f"{first[0]} trades with " + ", ".join(f"{name} ({weight / first[1]:+.3g})" for name, weight in others)
+_NEGLIGIBLE = 1e-6
+_NAMED = 1e-4
+_LARGE_SHARE = 0.2
 
 
 @dataclass(frozen=True)
@@ -41,11 +35,13 @@ class Identifiability:
     """What the data says of the free parameters.
 
     Attributes:
-        names: of the increments.
+        names: of the coordinates.
         singular_values: of the scaled whitened Jacobian, largest first.
         directions: right singular vectors, one a row.
         rank: how many are determined.
         undetermined: combinations the data does not see.
+        rank_by_qr: how many are determined by the diagonal of a QR decomposition with pivoting.
+        measures: how each coordinate is told; empty for coefficients in ordinary sizes.
     """
 
     names: tuple[str, ...]
@@ -53,15 +49,22 @@ class Identifiability:
     directions: Array
     rank: int
     undetermined: tuple[Combination, ...]
+    rank_by_qr: int = 0
+    measures: tuple[Measure, ...] = ()
 
     @cached_property
     def determined(self) -> tuple[bool, ...]:
-        """Whether each increment is free of undetermined combinations."""
-        null = self.directions[self.rank :]
+        """Whether each coordinate is free of undetermined combinations."""
+        null = self.null
         return tuple(bool(x < _NEGLIGIBLE) for x in np.linalg.norm(null, axis=0)) if len(null) else (True,) * len(self)
 
     def __len__(self) -> int:
         return len(self.names)
+
+    @property
+    def null(self) -> Array:
+        """Orthonormal rows that span the undetermined combinations (in ordinary sizes)."""
+        return self.directions[self.rank :]
 
     @property
     def condition(self) -> float:
@@ -70,27 +73,66 @@ class Identifiability:
             return 1.0
         if not self.rank:
             return float("inf")
-        return float(self.singular_values[0] / self.singular_values[self.rank - 1])
+        return float(self.singular_values[0] / max(self.singular_values[self.rank - 1], np.finfo(float).tiny))
 
     @property
     def weakest(self) -> Combination:
         """The combination that the data determines least, undetermined ones aside."""
         if not self.rank:
             return Combination(())
-        return _named(self.directions[self.rank - 1], self.names, at_least=0.2)
+        return named(self.directions[self.rank - 1], self.names, self.measures, _LARGE_SHARE)
+
+    @cached_property
+    def hardly(self) -> tuple[tuple[Combination, float], ...]:
+        """Combinations that are determined, but poorly, and the standard deviation of each in ordinary sizes.
+
+        Those that stay uncertain by more than an ordinary size, lie beyond a poor condition, or are determined by
+        one of the two rank decisions alone; the worst first.
+        """
+        found = []
+        for i in reversed(range(self.rank)):
+            value = float(self.singular_values[i])
+            doubtful = i >= min(self.rank_by_qr, _count_above(self.singular_values))
+            if value < HARDLY or value * POOR_CONDITION < self.singular_values[0] or doubtful:
+                told = named(self.directions[i], self.names, self.measures, _LARGE_SHARE)
+                found.append((told, 1 / value if value > 0 else float("inf")))
+        return tuple(found)
 
 
-def analyse(triangle: Array, scales: Array, names: tuple[str, ...]) -> Identifiability:
-    """Identifiability from R (n x n) with R'R = J'J of the whitened residuals."""
-    count = len(names)
+def measures_of(parameters: Parameters) -> tuple[Measure, ...]:
+    """How each coordinate of the free blocks is told."""
+    return tuple(Measure(block.unit, block.scale) for block in parameters.free for _ in range(block.domain.dof))
+
+
+def analyse(
+    triangle: Array, scales: Array, names: tuple[str, ...], measures: Sequence[Measure] = ()
+) -> Identifiability:
+    """Identifiability from R (m x n, m <= n) with R'R = J'J of the whitened residuals.
+
+    A combination is undetermined if both the singular values and the QR decomposition say so.
+    """
+    count, told = len(names), tuple(measures)
     if not count:
         return Identifiability(names, np.zeros(0), np.zeros((0, 0)), 0, ())
     square = np.zeros((count, count))
     square[: len(triangle)] = triangle * scales
     _, values, directions = np.linalg.svd(square)
-    rank = int(np.sum(values > RANK_TOLERANCE * values[0])) if values[0] > 0 else 0
-    undetermined = tuple(_named(v, names, 1e-4) for v in _sparse_basis(directions[rank:]))
-    return Identifiability(names, values, directions, rank, undetermined)
+    diagonal = np.abs(np.diag(qr(square, pivoting=True, mode="r")[0]))
+    by_qr = _count_above(diagonal)
+    rank = max(_count_above(values), by_qr)
+    undetermined = tuple(named(v, names, told, _NAMED) for v in sparse_basis(directions[rank:]))
+    return Identifiability(names, values, directions, rank, undetermined, by_qr, told)
+
+
+def expected_covariance(triangle: Array, parameters: Parameters) -> Array:
+    """Covariance by coordinates (n x n, SI) that the declared noise and the priors leave; zero where undetermined."""
+    scales = parameters.scales()
+    prior = np.sqrt(parameters.prior_information()) * scales
+    _, values, directions = np.linalg.svd(np.vstack([triangle * scales, np.diag(prior)]), full_matrices=False)
+    rank = _count_above(values)
+    half = scales[:, None] * directions[:rank].T / values[:rank]
+    known = np.linalg.norm(directions[rank:], axis=0) < _NEGLIGIBLE
+    return np.asarray(half @ half.T * np.outer(known, known))
 
 
 def correlated_pairs(
@@ -114,16 +156,7 @@ def correlations(covariance: Array) -> Array:
         return np.asarray(np.nan_to_num(covariance / np.outer(deviation, deviation)))
 
 
-def _sparse_basis(null: Array) -> Array:
-    """A basis of the same space whose vectors name few parameters: reduced row echelon form with pivoting."""
-    if not len(null):
-        return null
-    _, _, pivots = qr(null, pivoting=True, mode="economic")
-    return np.asarray(np.linalg.solve(null[:, pivots[: len(null)]], null))
-
-
-def _named(vector: Array, names: tuple[str, ...], at_least: float) -> Combination:
-    largest = float(np.abs(vector).max(initial=0.0)) or 1.0
-    order = np.argsort(-np.abs(vector), kind="stable")
-    kept = [(names[i], float(vector[i] / largest)) for i in order if abs(vector[i]) > at_least * largest]
-    return Combination(tuple(kept))
+def _count_above(values: Array) -> int:
+    """How many stand above the rank tolerance."""
+    largest = float(values.max(initial=0.0))
+    return int(np.sum(values > RANK_TOLERANCE * largest)) if largest > 0 else 0

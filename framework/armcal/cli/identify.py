@@ -1,0 +1,207 @@
+"""``armcal identify``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+
+from armcal.base.domains import Array
+from armcal.cli.common import Voice, overrides, speaking
+from armcal.errors import ConfigError, Location
+from armcal.plugins import discover
+from armcal.run.experiment import Experiment
+from armcal.run.pipeline import Prepared, Stopwatch, assemble
+from armcal.solve.combination import Combination
+from armcal.solve.identifiability import CORRELATED, Identifiability, correlated_pairs, expected_covariance
+from armcal.solve.minimal import Dropped, MinimalSet, minimal_set
+from armcal.solve.observability import observability
+from armcal.solve.projection import factor_at_zero
+from armcal.solve.structure import SAID, explain, held_by_nothing, identify_from
+
+
+@click.command()
+@click.argument("config", type=click.Path(path_type=Path))
+@click.option("--data", type=click.Path(path_type=Path), help="A dataset to read instead of the configured one.")
+@click.option("--minimal", is_flag=True, help="Also choose a minimal set of the free parameters.")
+@click.option("--prefer", multiple=True, metavar="GLOB", help="Keep these in the minimal set if possible; repeatable.")
+@click.option("--most", type=click.IntRange(min=0), help="Keep no more than so many in the minimal set.")
+@click.option(
+    "--max-sd",
+    type=click.FloatRange(min=0, min_open=True),
+    help="Leave out of the minimal set what stays more uncertain than so many ordinary sizes.",
+)
+@overrides
+@speaking
+def identify(
+    voice: Voice,
+    config: Path,
+    data: Path | None,
+    minimal: bool,
+    prefer: tuple[str, ...],
+    most: int | None,
+    max_sd: float | None,
+    overrides: tuple[str, ...],
+) -> None:
+    """Tell which combinations of CONFIG's free parameters its poses determine. Refuses no rank, solves nothing."""
+    registry = discover()
+    voice.plugin_faults(registry)
+    experiment = Experiment.load(config, overrides, data, registry)
+    parameters = experiment.parameters
+    if not parameters.free:
+        raise ConfigError("no parameter is free.", where=Location(str(config)), hint="Name some under parameters.free.")
+    preferred = [_preferred(experiment, glob) for glob in prefer]
+    ready = assemble(experiment, Stopwatch())
+    triangle = factor_at_zero(ready.problem, parameters.nominal(), ready.training)
+    known = identify_from(triangle, parameters)
+    content = _content(experiment, ready, triangle, known)
+    if minimal or prefer or most is not None or max_sd is not None:
+        found = minimal_set(triangle, parameters, preferred, most, np.inf if max_sd is None else max_sd)
+        content["minimal"] = _minimal_content(found)
+    for text in ready.warnings:
+        voice.warn(text)
+    voice.result(content)
+    _show(voice, content)
+    if "minimal" in content:
+        _show_minimal(voice, content["minimal"])
+
+
+def _preferred(experiment: Experiment, glob: str) -> tuple[str, ...]:
+    names = experiment.parameters.select([glob])
+    free = {block.name for block in experiment.parameters.free}
+    if not free.intersection(names):
+        raise ConfigError(
+            f"--prefer {glob}: none of the parameters it names is free.",
+            hint="Name them under parameters.free as well; a minimal set is chosen from the free ones.",
+        )
+    return names
+
+
+def _content(experiment: Experiment, ready: Prepared, triangle: Array, known: Identifiability) -> dict[str, Any]:
+    parameters, problem = experiment.parameters, ready.problem
+    equations = problem.equations(ready.training)
+    covariance = expected_covariance(triangle, parameters)
+    deviation = np.sqrt(np.diag(covariance))
+    indices = observability(known.singular_values[: known.rank], equations).as_dict() if known.rank else None
+    explained = explain(problem, parameters.nominal(), ready.training, known)
+    return {
+        "experiment": experiment.name,
+        "records": len(ready.split.train),
+        "equations": equations,
+        "free": list(known.names),
+        "rank": known.rank,
+        "rank_by_qr": known.rank_by_qr,
+        "singular_values": [float(value) for value in known.singular_values],
+        "scaled_condition": known.condition if np.isfinite(known.condition) else None,
+        "observability_of_the_determined": indices,
+        "undetermined": [
+            {**_told(each.combination), "cause": each.cause, "priors": list(each.priors)} for each in explained
+        ],
+        "held_by_nothing": [_told(each) for each in held_by_nothing(parameters, known)],
+        "hardly_determined": [{**_told(each), "sd_ordinary_sizes": _finite(sd)} for each, sd in known.hardly],
+        "correlated": [
+            {"one": one, "other": other, "correlation": r}
+            for one, other, r in correlated_pairs(covariance, parameters.coordinate_names)
+        ],
+        "expected_sd": {n: float(sd) if sd > 0 else None for n, sd in zip(known.names, deviation, strict=True)},
+        "warnings": list(ready.warnings),
+    }
+
+
+def _told(combination: Combination) -> dict[str, Any]:
+    return {
+        "text": str(combination),
+        "terms": [
+            {"name": name, "ordinary_sizes": weight, "amount": amount}
+            for (name, weight), amount in zip(combination.terms, combination.amounts, strict=True)
+        ],
+    }
+
+
+def _finite(number: float) -> float | None:
+    return number if np.isfinite(number) else None
+
+
+def _minimal_content(found: MinimalSet) -> dict[str, Any]:
+    return {
+        "kept": list(found.kept),
+        "redundant": [_dropped(each) for each in found.redundant],
+        "left_out": [_dropped(each) for each in found.left_out],
+        "sd_ordinary_sizes": {name: _finite(sd) for name, sd in found.deviations.items()},
+    }
+
+
+def _dropped(dropped: Dropped) -> dict[str, Any]:
+    return {"name": dropped.name, "effect_left": dropped.left, **_told(dropped.absorbed_by)}
+
+
+def _show(voice: Voice, content: dict[str, Any]) -> None:
+    free, rank = len(content["free"]), content["rank"]
+    condition = content["scaled_condition"]
+    _line(
+        voice,
+        f"{content['experiment']}: {content['records']} records, {content['equations']} equations, {free} free "
+        f"parameters.",
+    )
+    by_qr = f" ({content['rank_by_qr']} by QR)" if content["rank_by_qr"] != rank else ""
+    told = f", scaled condition {condition:.3g}" if condition is not None else ""
+    _line(voice, f"rank {rank} of {free}{by_qr}{told}.")
+    if content["observability_of_the_determined"]:
+        shown = ", ".join(f"{n.upper()} {v:.3g}" for n, v in content["observability_of_the_determined"].items())
+        _line(voice, f"observability of {'them' if rank == free else f'the {rank} determined combinations'}: {shown}.")
+    _show_undetermined(voice, content)
+    hardly = [
+        f"{each['text']}: sd {each['sd_ordinary_sizes'] or np.inf:.3g} ordinary sizes"
+        for each in content["hardly_determined"]
+    ]
+    _section(voice, "Hardly determined (worse than an ordinary size of correction, by the declared noise):", hardly)
+    pairs = [f"{each['one']} and {each['other']} ({each['correlation']:+.3f})" for each in content["correlated"]]
+    _section(voice, f"Correlated above {CORRELATED:g}:", pairs)
+    if voice.verbose:
+        deviations = content["expected_sd"].items()
+        shown_sd = [f"{name}: {'undetermined' if sd is None else f'{sd:.3g}'}" for name, sd in deviations]
+        _section(voice, "Expected standard deviations by the declared noise and the priors (SI):", shown_sd)
+
+
+def _show_undetermined(voice: Voice, content: dict[str, Any]) -> None:
+    for cause, said in SAID.items():
+        found = [
+            each["text"] + (f", held by the prior of {' and '.join(each['priors'])}" if each["priors"] else "")
+            for each in content["undetermined"]
+            if each["cause"] == cause
+        ]
+        _section(voice, f"Undetermined, {said} ({len(found)}):", found)
+    free = content["held_by_nothing"]
+    if not content["undetermined"]:
+        _line(voice, "No combination is undetermined.", "green")
+    elif not free:
+        _line(voice, "Priors hold every undetermined combination: what they say of it is all that will be known.")
+    else:
+        _section(voice, f"Held by nothing, so that armcal run refuses ({len(free)}):", [each["text"] for each in free])
+
+
+def _show_minimal(voice: Voice, found: dict[str, Any]) -> None:
+    redundant = [each["text"] for each in found["redundant"]]
+    _section(voice, f"Not needed, the kept ones do the same ({len(redundant)}):", redundant)
+    left_out = [
+        f"{each['name']} ({100 * each['effect_left']:.0f} % of its effect is its own)" for each in found["left_out"]
+    ]
+    _section(voice, f"Left out as asked, though determined ({len(left_out)}):", left_out)
+    within = sorted({name for name, sd in found["sd_ordinary_sizes"].items() if sd is None})
+    _section(voice, "Kept, and undetermined in part (these need priors):", within)
+    _line(voice, f"A minimal set of {len(found['kept'])}:", "bold")
+    for text in ("parameters:", "  free:", *(f"    - {name}" for name in found["kept"])):
+        _line(voice, text)
+
+
+def _section(voice: Voice, title: str, lines: list[str]) -> None:
+    if lines:
+        _line(voice, title, "bold")
+        for text in lines:
+            _line(voice, f"  {text}")
+
+
+def _line(voice: Voice, text: str, style: str = "") -> None:
+    voice.out.print(text, style=style, markup=False, soft_wrap=True)

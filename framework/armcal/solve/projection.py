@@ -1,0 +1,146 @@
+"""Records projected onto the model: what would have been measured had the values at hand been the truth.
+
+Rank is judged there. Where a Jacobian depends on measured numbers (a bearing, a contact, a closed chain) their errors
+turn undetermined directions into seemingly determined ones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from armcal.base.domains import Array
+from armcal.solve.factor import Factor
+from armcal.solve.kernel import Kernel
+from armcal.solve.problem import FactorRecords, Problem
+
+_STEP = 1e-6
+_MOST_STEPS = 12
+_AT_ZERO = 1e-6
+"""In units of the noise: a residual below this is none."""
+
+
+def projected(problem: Problem, values: Array, records: Sequence[FactorRecords]) -> tuple[FactorRecords, ...]:
+    """Records whose residuals are zero at these values, for judging rank.
+
+    Measured numbers become what the model predicts; where nothing is measured but the joints (a contact), the joint
+    angles move to the nearest ones that fit. A record that no angles fit is left as it is. Records that a Jacobian
+    does not depend on that way are returned as they are, the same objects.
+
+    Raises:
+        NotConvergedError: a record has no elastic equilibrium at these values.
+    """
+    result = tuple(records)
+    if any(_bilinear(kernel.factor) for kernel in problem.kernels):
+        shown = problem.predict(values, records)
+        result = tuple(
+            _as_predicted(kernel.factor, each, outputs) if _bilinear(kernel.factor) else each
+            for kernel, each, outputs in zip(problem.kernels, records, shown, strict=True)
+        )
+    free = np.ascontiguousarray(values[list(problem.parameters.free_entries)])
+    return tuple(
+        _fitting_joints(kernel, free, each) if _measures_nothing(kernel.factor) else each
+        for kernel, each in zip(problem.kernels, result, strict=True)
+    )
+
+
+def factor_at_zero(problem: Problem, values: Array, records: Sequence[FactorRecords]) -> Array:
+    """R (m x n) with R'R = J'J of the whitened residuals by coordinates, of the records projected onto the model.
+
+    Raises:
+        NotConvergedError: a record has no elastic equilibrium at these values.
+    """
+    return problem.triangular_factor(values, projected(problem, values, records))
+
+
+def fits(problem: Problem, values: Array, records: Sequence[FactorRecords]) -> tuple[NDArray[np.bool_], ...]:
+    """Which records a contact can be in at these values, one mask a factor; all of any other measurement."""
+    residuals = problem.residuals(values, records)
+    return tuple(
+        _whitened(kernel.factor, residual) < _AT_ZERO
+        if _measures_nothing(kernel.factor)
+        else np.ones(residual.shape[1], dtype=bool)
+        for kernel, residual in zip(problem.kernels, residuals, strict=True)
+    )
+
+
+def joint_channels(factor: Factor) -> tuple[int, ...]:
+    """Which rows of a record are commanded joint angles: those of an arm, approaches aside."""
+    own = f"{factor.name}."
+    return tuple(
+        i for i, c in enumerate(factor.channels) if "." in c and not c.startswith(own) and ".approach." not in c
+    )
+
+
+def approach_channels(factor: Factor) -> tuple[int, ...]:
+    """Which rows of a record are directions of approach."""
+    return tuple(i for i, c in enumerate(factor.channels) if ".approach." in c)
+
+
+def _measured(factor: Factor) -> tuple[int, ...]:
+    return tuple(i for i, c in enumerate(factor.channels) if c in factor.output_channels)
+
+
+def _measures_nothing(factor: Factor) -> bool:
+    return not _measured(factor)
+
+
+def _bilinear(factor: Factor) -> bool:
+    """Whether the derivative by values or deflections depends on what was measured."""
+    rows = _measured(factor)
+    if not rows:
+        return False
+    by_measured = ca.jacobian(factor.residual, factor.record)[:, list(rows)]
+    return bool(ca.depends_on(by_measured, ca.vertcat(factor.values, factor.state)))
+
+
+def _as_predicted(factor: Factor, each: FactorRecords, outputs: Array) -> FactorRecords:
+    record = each.record.copy()
+    for row in _measured(factor):
+        predicted = outputs[factor.output_channels.index(factor.channels[row])]
+        record[row, : each.count] = predicted
+        record[row, each.count :] = predicted[-1] if each.count else 0.0
+    return replace(each, record=record)
+
+
+def _fitting_joints(kernel: Kernel, free: Array, each: FactorRecords) -> FactorRecords:
+    """Joint angles moved by Gauss-Newton steps of least length until the residual is gone."""
+    rows = joint_channels(kernel.factor)
+    moved = each.record.copy()
+    if not rows or not each.count:
+        return each
+    for _ in range(_MOST_STEPS):
+        residual = _residual(kernel, free, moved, each)
+        if (_whitened(kernel.factor, residual) < _AT_ZERO * 1e-3).all():
+            break
+        slopes = np.stack([_slope(kernel, free, moved, each, row) for row in rows], axis=-1)
+        step = np.einsum("nqr,rn->qn", np.linalg.pinv(slopes.transpose(1, 0, 2), rcond=1e-9), residual)
+        longest = np.abs(step).max(axis=0)
+        moved[list(rows)] -= step * np.minimum(1.0, 0.3 / np.maximum(longest, 1e-300))
+    reached = _whitened(kernel.factor, _residual(kernel, free, moved, each)) < _AT_ZERO
+    return replace(each, record=np.where(reached, moved, each.record))
+
+
+def _slope(kernel: Kernel, free: Array, record: Array, each: FactorRecords, row: int) -> Array:
+    """d residual / d one joint angle, by central differences (n_r x N)."""
+    sides = []
+    for sign in (1.0, -1.0):
+        aside = record.copy()
+        aside[row] += sign * _STEP
+        sides.append(_residual(kernel, free, aside, each))
+    return np.asarray((sides[0] - sides[1]) / (2 * _STEP))
+
+
+def _residual(kernel: Kernel, free: Array, record: Array, each: FactorRecords) -> Array:
+    residual = np.empty((kernel.factor.residual.numel(), record.shape[1]))
+    kernel.residuals(free, record, each.state.copy(), residual)
+    return residual
+
+
+def _whitened(factor: Factor, residual: Array) -> Array:
+    """The largest entry of each record's residual in units of the noise."""
+    return np.asarray(np.abs(residual / np.array(factor.noise)[:, None]).max(axis=0, initial=0.0))
