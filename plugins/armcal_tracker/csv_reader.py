@@ -256,7 +256,9 @@ def _plan(header: _Header, wanted: Sequence[WantedChannel]) -> _Plan:
     for w in wanted:
         if w.required and w.channel not in channels:
             _refuse_missing(header, w, list(unused))
-    lower = {name.lower(): column for name, column in reversed(unused.items())}
+    # An id that counts the records in order may serve as a channel as well: columns: {sequence: pose_id}.
+    lower = {column.name.lower(): column for column in reversed(header.columns) if column.known_as in claimed}
+    lower |= {name.lower(): column for name, column in reversed(unused.items())}
     record_id = next((lower[name] for name in _ID_NAMES if name in lower), None)
     extra = tuple(column for column in unused.values() if column is not record_id)
     vain = next((column for column in extra if column.known_as != column.name), None)

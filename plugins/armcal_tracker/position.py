@@ -14,17 +14,21 @@ from pydantic import field_validator
 
 
 class TipPositionSettings(Settings):
-    """Which arm, how noisy the tracker is (standard deviation a coordinate), where the target sits on the tool."""
+    """Which arm, how noisy the tracker is (standard deviation of each coordinate), where the target sits on the tool.
 
-    noise: Length
+    A record's own columns ``noise_x``, ``noise_y``, ``noise_z``, or ``noise`` for all three, stand above ``noise``.
+    """
+
+    noise: Length | Length3
     arm: str | None = None
     target: Length3 = (0.0, 0.0, 0.0)
 
     @field_validator("noise")
     @classmethod
-    def _positive(cls, value: float) -> float:
-        if value <= 0:
-            raise ValueError(f"a noise of {value * 1000:g} mm is not above zero: give the tracker's standard deviation")
+    def _positive(cls, value: float | tuple[float, ...]) -> float | tuple[float, ...]:
+        worst = min(value) if isinstance(value, tuple) else value
+        if worst <= 0:
+            raise ValueError(f"a noise of {worst * 1000:g} mm is not above zero: give the tracker's standard deviation")
         return value
 
 
@@ -69,5 +73,10 @@ class TipPosition:
         return ca.vertcat(*[measured[axis] - predicted[axis] for axis in "xyz"])
 
     def noise(self) -> tuple[float, ...]:
-        """The same on each coordinate (m)."""
-        return (self._settings.noise,) * 3
+        """Of each coordinate (m)."""
+        noise = self._settings.noise
+        return noise if isinstance(noise, tuple) else (noise,) * 3
+
+    def noise_channels(self) -> tuple[tuple[Channel, ...], ...]:
+        """Each coordinate's own, or one for all three."""
+        return tuple((Channel(f"noise_{axis}", "length"), Channel("noise", "length")) for axis in "xyz")

@@ -42,6 +42,7 @@ class Layout:
         revolute: those of ``joints`` that turn.
         approach: channels of approach directions.
         measured: channels of measured values, ``instance.name``.
+        deviations: channels of their standard deviations.
         columns: channel to its column in the source, for messages.
         units: channel to the unit that its column declares; absent or SI means SI.
         by_line: whether ``Dataset.rows`` are lines of a text file; otherwise they are row numbers.
@@ -54,6 +55,7 @@ class Layout:
     columns: Mapping[str, str] = field(default_factory=dict)
     units: Mapping[str, str] = field(default_factory=dict)
     by_line: bool = False
+    deviations: tuple[str, ...] = ()
 
     def column(self, channel: str) -> str:
         """What a channel is called in the source."""
@@ -98,7 +100,8 @@ def layout_of(
     approach = [w.channel for w in wanted if _APPROACH in w.channel]
     moved = {joint.channel for joints in _joints_by_arm(wanted).values() for joint in joints}
     joints = [w for w in wanted if w.channel in moved and dataset.has(w.channel)]
-    measured = [w.channel for w in wanted if "." in w.channel and w.channel not in {*moved, *approach}]
+    deviations = [w.channel for w in wanted if w.is_deviation]
+    measured = [w.channel for w in wanted if "." in w.channel and w.channel not in {*moved, *approach, *deviations}]
     return Layout(
         joints=tuple(w.channel for w in joints),
         revolute=tuple(w.channel for w in joints if w.dimension == "angle"),
@@ -107,6 +110,7 @@ def layout_of(
         columns=columns,
         units=units,
         by_line=by_line,
+        deviations=tuple(name for name in deviations if dataset.has(name)),
     )
 
 
@@ -116,14 +120,13 @@ def check_dataset(dataset: Dataset, layout: Layout) -> Dataset:
     Raises:
         DataError: the dataset is refused, or no record is left.
     """
-    dataset = set_aside_not_finite(dataset, layout)
+    dataset = set_aside_without_noise(set_aside_not_finite(dataset, layout), layout)
     refuse_approaches(dataset, layout)
     refuse_joint_units(dataset, layout)
     dataset = warn_small_degrees(dataset, layout)
     refuse_conflicting_ids(dataset, layout)
     dataset = set_aside_backward_time(dataset, layout)
-    dataset = set_aside_frozen(dataset, layout)
-    dataset = set_aside_duplicates(dataset, layout)
+    dataset = set_aside_duplicates(set_aside_frozen(dataset, layout), layout)
     return warn_repeated_poses(require_records(dataset), layout)
 
 
@@ -194,6 +197,16 @@ def set_aside_not_finite(dataset: Dataset, layout: Layout) -> Dataset:
             faults.setdefault(int(index), []).append(f"{layout.column(channel)} {kind}")
     faulty = {index: ", ".join(reasons) for index, reasons in faults.items()}
     return _set_aside(dataset, layout, faulty, "a value is missing or not finite", "Measure these again.")
+
+
+def set_aside_without_noise(dataset: Dataset, layout: Layout) -> Dataset:
+    """Set aside records that state a standard deviation of zero or less: none could weigh that much."""
+    faulty = {
+        int(i): f"{layout.column(channel)} is {layout.shown(channel, dataset.column(channel)[i])}, not above zero"
+        for channel in layout.deviations
+        for i in np.flatnonzero(dataset.column(channel) <= 0)
+    }
+    return _set_aside(dataset, layout, faulty, "their noise is not above zero", "State the standard deviation.")
 
 
 def refuse_approaches(dataset: Dataset, layout: Layout) -> None:
@@ -336,7 +349,7 @@ def warn_repeated_poses(dataset: Dataset, layout: Layout) -> Dataset:
     """Warn of poses that were measured more than once: they count for less than as many different ones."""
     if not layout.measured or not layout.joints:
         return dataset
-    ignored = {*layout.measured, *_VARIES_AT_REST}
+    ignored = {*layout.measured, *layout.deviations, *_VARIES_AT_REST}
     alike = _first_alike(dataset, [name for name in dataset.channels if name not in ignored])
     repeats = np.flatnonzero(alike != np.arange(len(dataset)))
     if not repeats.size:

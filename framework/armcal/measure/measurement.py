@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from armcal.arm.assembly import ArmState
 from armcal.base.parameters import ParameterBlock
@@ -45,3 +45,18 @@ class Measurement(Protocol):
 
     def noise(self) -> Sequence[float]:
         """Standard deviation of each entry of the residual (m or rad)."""
+
+
+@runtime_checkable
+class RecordNoise(Protocol):
+    """What a measurement may provide beside the rest: where a record says its own noise."""
+
+    def noise_channels(self) -> Sequence[Sequence[Channel]]:
+        """Of each entry of the residual, the channels that may carry its standard deviation, the nearest first."""
+
+
+def noise_channels(measurement: Measurement) -> tuple[tuple[Channel, ...], ...]:
+    """Of each entry of the residual; empty if the measurement takes no noise from records."""
+    if not isinstance(measurement, RecordNoise):
+        return ()
+    return tuple(tuple(own) for own in measurement.noise_channels())

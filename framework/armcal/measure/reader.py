@@ -9,7 +9,7 @@ from typing import Protocol
 from armcal.arm.assembly import Arm
 from armcal.base.dataset import Dataset
 from armcal.base.units import DIMENSIONLESS
-from armcal.measure.measurement import Measurement
+from armcal.measure.measurement import Measurement, noise_channels
 
 
 @dataclass(frozen=True)
@@ -21,12 +21,14 @@ class WantedChannel:
         columns: names it may have in a file, without the unit suffix, the most specific first.
         dimension: of its unit.
         required: whether a record without it is useless.
+        is_deviation: whether it is the standard deviation of a measured number.
     """
 
     channel: str
     columns: tuple[str, ...]
     dimension: str
     required: bool
+    is_deviation: bool = False
 
 
 @dataclass(frozen=True)
@@ -56,6 +58,7 @@ ENVIRONMENT: tuple[tuple[str, str], ...] = (
     *((f"force_{axis}", "force") for axis in "xyz"),
     *((f"torque_{axis}", "torque") for axis in "xyz"),
     ("time", "time"),
+    ("sequence", DIMENSIONLESS),
     ("temperature", "temperature"),
 )
 """Columns that any record may carry, and their dimensions."""
@@ -69,14 +72,29 @@ def wanted_channels(
     ``measured`` says whether measured values are required (a calibration) or may be absent (a prediction).
     """
     wanted = [channel for arm in arms.values() for channel in _arm_channels(arm, len(arms) == 1)]
-    wanted += [WantedChannel(name, (name,), dimension, False) for name, dimension in ENVIRONMENT]
+    needed = {name for arm in arms.values() for name in arm.conditions} if measured else set()
+    wanted += [WantedChannel(name, (name,), dimension, name in needed) for name, dimension in ENVIRONMENT]
     local = [c.name for m in measurements.values() for c in m.channels()]
     for instance, measurement in measurements.items():
         for channel in measurement.channels():
             own = f"{instance}.{channel.name}"
             names = (own, channel.name) if local.count(channel.name) == 1 else (own,)
             wanted.append(WantedChannel(own, names, channel.dimension, measured))
-    return tuple(wanted)
+    return (*wanted, *_deviations(measurements)) if measured else tuple(wanted)
+
+
+def _deviations(measurements: Mapping[str, Measurement]) -> Iterator[WantedChannel]:
+    """What records may say of their own noise; a prediction has no use for it."""
+    by_instance = {
+        instance: {channel.name: channel for own in noise_channels(measurement) for channel in own}
+        for instance, measurement in measurements.items()
+    }
+    local: list[str] = [name for channels in by_instance.values() for name in channels]
+    for instance, channels in by_instance.items():
+        for channel in channels.values():
+            own = f"{instance}.{channel.name}"
+            names = (own, channel.name) if local.count(channel.name) == 1 else (own,)
+            yield WantedChannel(own, names, channel.dimension, required=False, is_deviation=True)
 
 
 def _arm_channels(arm: Arm, alone: bool) -> Iterator[WantedChannel]:

@@ -1,0 +1,95 @@
+"""What a run says of noise: how records weighed, which are suspicious, whose the scatter is."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from armcal.base.dataset import Dataset
+from armcal.base.domains import Array
+from armcal.solve.validation import Split
+from armcal.solve.variance import VarianceComponents
+from armcal.solve.weighing import WeighedFit
+
+
+@dataclass(frozen=True)
+class SuspiciousRecord:
+    """A training record beyond its limit: where it stood, how many standard deviations off, what became of it.
+
+    ``row`` is that of the source (0 if it has none); ``weight`` 0 means that it was set aside.
+    """
+
+    row: int
+    record_id: str
+    measurement: str
+    deviations: float
+    limit: float
+    weight: float
+    error_mm: float
+
+    @property
+    def reason(self) -> str:
+        """Why it is suspicious."""
+        return f"{self.deviations:.1f} standard deviations from the fit (limit {self.limit:.1f})"
+
+    @property
+    def fate(self) -> str:
+        """In words."""
+        return "set aside" if self.weight == 0 else f"weight {self.weight:.2g}"
+
+
+@dataclass(frozen=True)
+class NoiseResult:
+    """How the records of a run weighed.
+
+    Attributes:
+        loss: ``none``, ``huber``, ``cauchy`` or ``reject``.
+        weights: of each record of the dataset in the fit, its least one if it has several (N; nan: not trained on).
+        suspicious: the farthest first; not sought in plain least squares.
+        components: estimated variances, or None.
+        rounds: solves beyond the first.
+    """
+
+    loss: str = "none"
+    weights: Array | None = None
+    suspicious: tuple[SuspiciousRecord, ...] = ()
+    components: VarianceComponents | None = None
+    rounds: int = 0
+
+    @property
+    def set_aside(self) -> tuple[SuspiciousRecord, ...]:
+        """Those that took no part in the fit."""
+        return tuple(record for record in self.suspicious if record.weight == 0)
+
+    def as_dict(self) -> dict[str, Any]:
+        """For metrics.json and calibration.yaml."""
+        told: dict[str, Any] = {"loss": self.loss}
+        if self.loss != "none":
+            told["rounds"] = self.rounds
+            told["suspicious_records"] = [asdict(record) for record in self.suspicious]
+        if self.components is not None:
+            told["components"] = [
+                {key: _finite(value) for key, value in asdict(c).items()} for c in self.components.components
+            ]
+            told["inseparable"] = [list(pair) for pair in self.components.inseparable]
+            told["unseen_joints"] = list(self.components.unseen)
+        return told
+
+
+def noise_result(fit: WeighedFit, dataset: Dataset, split: Split, errors_mm: Array) -> NoiseResult:
+    """From a fit on the training records; errors are of all records (N)."""
+    weights = np.full(len(dataset), np.nan)
+    weights[split.train] = np.min(np.array(fit.weights), axis=0)
+    suspicious = []
+    for suspect in fit.suspects:
+        i = int(split.train[suspect.record])
+        row = dataset.rows[i] if dataset.rows else 0
+        numbers = (suspect.distance, suspect.limit, suspect.weight, float(errors_mm[i]))
+        suspicious.append(SuspiciousRecord(row, dataset.ids[i], suspect.measurement, *numbers))
+    return NoiseResult(fit.loss, weights, tuple(suspicious), fit.components, len(fit.rounds))
+
+
+def _finite(value: Any) -> Any:
+    return None if isinstance(value, float) and not np.isfinite(value) else value

@@ -1,0 +1,197 @@
+"""Noise and outliers as a user meets them: through the configuration, the outputs and the command line."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import yaml
+from armcal.cli.main import cli
+from armcal.report import render
+from armcal.run import outputs
+from armcal.run.experiment import Experiment
+from armcal.run.pipeline import calibrate
+from armcal.use.calibration import Calibration
+from click.testing import CliRunner
+
+OFF_MM = 20.0
+EVERY = 20
+
+
+@pytest.fixture(scope="module")
+def spoilt(repository, tmp_path_factory):
+    """The shipped simulated measurements with every twentieth one 20 mm off; and the ids of these."""
+    with (repository / "configs" / "lrm_arm" / "demo.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    rng, wrong = np.random.default_rng(0), []
+    for row in rows[7::EVERY]:
+        push = rng.normal(size=3)
+        push *= OFF_MM / np.linalg.norm(push)
+        for axis, x in zip("xyz", push, strict=True):
+            row[f"{axis}_mm"] = repr(float(row[f"{axis}_mm"]) + float(x))
+        wrong.append(row["pose_id"])
+    path = tmp_path_factory.mktemp("spoilt") / "spoilt.csv"
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, rows[0])
+        writer.writeheader()
+        writer.writerows(rows)
+    return path, set(wrong)
+
+
+def run(repository, data, out, *overrides):
+    """`armcal run` on the demo's configuration; its metrics."""
+    given = [part for override in overrides for part in ("--set", override)]
+    config = str(repository / "configs" / "lrm_arm" / "demo.yaml")
+    done = CliRunner().invoke(cli, ["run", config, "--data", str(data), "--out", str(out), *given, "-v"])
+    assert done.exit_code == 0, done.output
+    return json.loads((out / "metrics.json").read_text()), done.output
+
+
+def compliances(out):
+    """Values and stated deviations of the springs away from their bound."""
+    kept = yaml.safe_load((out / "calibration.yaml").read_text())["parameters"]
+    springs = [p for p in kept if p["name"].startswith("arm.spring.k") and not p["at_bound"]]
+    return {p["name"]: (p["value"], p["sd"]) for p in springs}
+
+
+@pytest.mark.parametrize("loss", ["huber", "cauchy", "reject"])
+def test_every_output_tells_of_the_wrong_records(repository, spoilt, tmp_path, loss):
+    data, wrong = spoilt
+    told, shown = run(repository, data, tmp_path / "out", f"noise.loss={loss}", "validation.folds=3")
+    plain, _ = run(repository, data, tmp_path / "plain", "validation.folds=0")
+    with (tmp_path / "out" / "residuals.csv").open() as file:
+        rows = {row["pose_id"]: row for row in csv.DictReader(file)}
+    held = {name for name, row in rows.items() if row["set"] == "holdout"}
+    listed = {s["record_id"]: s for s in told["noise"]["suspicious_records"]}
+    assert held & wrong, "no wrong record was held out: this test shows less than it should"
+    assert set(listed) == wrong - held
+    assert told["records"]["rejected"] == (len(listed) if loss == "reject" else 0)
+    for name, row in rows.items():
+        if name in wrong:
+            assert float(row["calibrated_mm"]) > 0.9 * OFF_MM, "the residual of a wrong record is shown as it is"
+        if name in held:
+            assert row["weight"] == ""
+        else:
+            assert float(row["weight"]) < 0.1 if name in wrong else float(row["weight"]) > 0.2
+            assert float(row["cross_validated_mm"]) == pytest.approx(float(row["calibrated_mm"]), abs=2)
+    assert told["error_mm"]["calibrated"]["train"]["count"] == 150
+    assert told["error_mm"]["calibrated"]["holdout"]["max"] > 0.9 * OFF_MM
+    assert all(re.search(rf"suspicious: row \d+, record {name}:", shown) for name in listed)
+    text = (tmp_path / "out" / "report.html").read_text()
+    heading = "<h3>Suspicious records</h3>"
+    assert heading in text and heading not in (tmp_path / "plain" / "report.html").read_text()
+    kept = yaml.safe_load((tmp_path / "out" / "calibration.yaml").read_text())["noise"]
+    assert kept == told["noise"]
+    assert plain["noise"]["scale"] > 3 and told["noise"]["scale"] == pytest.approx(1, abs=0.1)
+    Calibration.load(tmp_path / "out" / "calibration.yaml")
+
+
+def test_robust_compliances_are_the_simulated_truths(repository, spoilt, tmp_path):
+    truth = dict(
+        re.findall(r"^(arm\.spring\.k\d): (\S+) rad/Nm$", (repository / "configs/lrm_arm/truth.yaml").read_text(), re.M)
+    )
+    for loss in ("huber", "cauchy", "reject"):
+        run(repository, spoilt[0], tmp_path / loss, f"noise.loss={loss}", "validation.folds=0")
+        for name, (value, sd) in compliances(tmp_path / loss).items():
+            assert abs(value - float(truth[name])) < 4 * sd, (loss, name)
+            assert sd < 0.2 * float(truth[name])
+
+
+def test_plugins_hear_of_records_that_were_set_aside(repository, spoilt, monkeypatch):
+    data, wrong = spoilt
+    config = repository / "configs" / "lrm_arm" / "demo.yaml"
+    given = ["noise.loss=reject", "validation.folds=0", "validation.holdout=0"]
+    experiment = Experiment.load(config, given, data)
+    heard = []
+
+    def notify(self, event, **told):
+        heard.append((event, told))
+        return []
+
+    monkeypatch.setattr(type(experiment.registry), "notify", notify)
+    calibrate(experiment)
+    assert {told["record_id"] for event, told in heard if event == "armcal_record_rejected"} == wrong
+
+
+def test_components_reach_every_output(repository, tmp_path):
+    data = repository / "configs" / "lrm_arm" / "demo.csv"
+    told, shown = run(repository, data, tmp_path / "out", "noise.estimate=true", "validation.folds=0")
+    found = {c["name"]: c for c in told["noise"]["components"]}
+    assert set(found) == {"tracker", *(f"arm.q{i}" for i in range(1, 7))}
+    assert found["tracker"]["sd"] == pytest.approx(1, abs=0.15), "the simulated noise is the declared one"
+    assert sum(c["share"] for c in found.values()) == pytest.approx(1)
+    assert "The scatter is mostly the instruments'" in " ".join(shown.split())
+    assert "Whose the scatter is" in (tmp_path / "out" / "report.html").read_text()
+    assert yaml.safe_load((tmp_path / "out" / "calibration.yaml").read_text())["noise"] == told["noise"]
+    Calibration.load(tmp_path / "out" / "calibration.yaml")
+
+
+def test_noise_for_each_axis_is_one_number_thrice_or_a_list(repository, tmp_path):
+    data = repository / "configs" / "lrm_arm" / "demo.csv"
+    one, _ = run(repository, data, tmp_path / "one", "validation.folds=0")
+    same, _ = run(
+        repository, data, tmp_path / "same", "measurements.tracker.noise_mm=[0.5, 0.5, 0.5]", "validation.folds=0"
+    )
+    other, _ = run(
+        repository, data, tmp_path / "other", "measurements.tracker.noise_mm=[0.5, 0.5, 5]", "validation.folds=0"
+    )
+    assert same["error_mm"] == one["error_mm"] and same["noise"] == one["noise"]
+    assert other["error_mm"]["calibrated"]["train"]["rms"] > one["error_mm"]["calibrated"]["train"]["rms"]
+
+
+@pytest.mark.parametrize(
+    ("override", "said"),
+    [
+        ("noise.loss=hubr", "did you mean huber?"),
+        ("noise.most_rejected=0.5", "expected less than 0.5"),
+        ("noise.most_rejected=0", "expected greater than 0"),
+        ("noise.estimate=maybe", "expected true or false"),
+        ("noise.axes=alone", "expected 'together' or 'apart'"),
+        ("noise.los=huber", "did you mean loss?"),
+        ("measurements.tracker.noise_mm=[0.5, 0.5]", "expected at least 3"),
+        ("measurements.tracker.noise_mm=[0.5, 0, 0.5]", "is not above zero"),
+    ],
+)
+def test_bad_settings_are_refused_at_their_place(repository, override, said):
+    config = str(repository / "configs" / "lrm_arm" / "demo.yaml")
+    done = CliRunner().invoke(cli, ["run", config, "--set", override])
+    assert done.exit_code == 2, done.output
+    assert said in done.output and override.partition("=")[0] in done.output
+
+
+def test_the_report_escapes_what_a_suspicious_record_is_called(repository, spoilt):
+    data, _ = spoilt
+    config = repository / "configs" / "lrm_arm" / "demo.yaml"
+    experiment = Experiment.load(config, ["noise.loss=reject", "validation.folds=0", "validation.holdout=0"], data)
+    result = calibrate(experiment)
+    odd = replace(result.noise.suspicious[0], record_id="<b>x</b>")
+    page = render(replace(result, noise=replace(result.noise, suspicious=(odd,))))
+    assert "&lt;b&gt;x&lt;/b&gt;" in page and "<b>x</b>" not in page
+    assert json.dumps(outputs.metrics(result))
+
+
+def test_the_real_arm_under_every_loss(repository, shared_data, tmp_path):
+    """No loss makes the real arm's errors worse than least squares by much; its folds all converge."""
+    config, data = repository / "configs" / "lrm_arm" / "option1.yaml", shared_data / "lrm_arm" / "poses.csv"
+    errors = {}
+    for loss in ("none", "huber", "cauchy", "reject"):
+        done = calibrate(Experiment.load(config, [f"noise.loss={loss}"], data))
+        assert done.estimate.verdict.converged and done.errors.failed_folds == 0
+        errors[loss] = done.table.calibrated["cross_validated"].mean
+    assert max(errors.values()) < 1.02 * errors["none"]
+    assert errors["huber"] < errors["none"]
+
+
+def test_the_real_arm_is_noisier_in_its_joints_than_its_tracker(repository, shared_data):
+    """The tracker is good to 0.5 mm along x and z; the servos step by 0.53 deg."""
+    config, data = repository / "configs" / "lrm_arm" / "option1.yaml", shared_data / "lrm_arm" / "poses.csv"
+    given = ["noise.estimate=true", "noise.axes=apart", "validation.folds=0"]
+    found = calibrate(Experiment.load(config, given, data)).noise.components
+    assert found is not None and found.share("joint") > 0.8
+    sd = {c.name: c.sd for c in found.components}
+    assert sd["tracker.x"] < 1 and sd["tracker.z"] < 1
+    assert 0.5 < np.degrees(sd["arm.q2"]) < 2.5
