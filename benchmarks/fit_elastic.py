@@ -68,7 +68,7 @@ def _numpy_residuals(case: lrm.Case) -> Callable[[Array], Array]:
     column = case.dataset.column
     angles = np.column_stack([column(f"arm.q{i}") for i in range(1, 7)])
     measured = np.column_stack([column(f"tracker.{axis}") for axis in "xyz"])
-    names = [name.rpartition(".")[2] for name in case.parameters.increment_names]
+    names = [name.rpartition(".")[2] for name in case.parameters.coordinate_names]
     deflection = np.zeros((len(angles), 7))
     start = np.array([lrm_numpy.NOMINAL[name] for name in names])
 

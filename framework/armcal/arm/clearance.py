@@ -1,0 +1,284 @@
+"""How far an arm's parts keep from each other and from what stands around it, pose by pose.
+
+Parts are capsules (a segment between two points of the arm, and a radius); surroundings are also boxes and half
+spaces in the base frame. Distances are exact [Ericson2005] and negative where bodies meet. The arm is taken at its
+nominal parameters and rigid: what springs give is to be left in the margins.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from armcal.arm.assembly import Arm
+from armcal.arm.model import Vector3, forward
+from armcal.arm.statics import MOUNT_FRAME, TOOL_FRAME, frame_names
+from armcal.base.domains import Array
+
+Mask = NDArray[np.bool_]
+BASE_FRAME = "base"
+EVERYTHING = "everything"
+_AT_ONCE = 4096
+_NO_LENGTH = 1e-18
+
+
+@dataclass(frozen=True)
+class Point:
+    """A point fixed in a frame (m): ``base``, ``mount``, ``tool`` or a named frame of the arm."""
+
+    frame: str
+    at: Vector3 = (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class Capsule:
+    """All that lies within ``radius`` (m) of a segment; a ball where both ends are one."""
+
+    start: Point
+    end: Point
+    radius: float
+
+    @property
+    def frames(self) -> tuple[str, ...]:
+        """Those that its ends are fixed in."""
+        return (self.start.frame, self.end.frame)
+
+
+@dataclass(frozen=True)
+class Box:
+    """A box along the axes of the base frame, between two corners (m)."""
+
+    low: Vector3
+    high: Vector3
+
+    @property
+    def frames(self) -> tuple[str, ...]:
+        """The base."""
+        return (BASE_FRAME,)
+
+
+@dataclass(frozen=True)
+class HalfSpace:
+    """Everything behind a plane of the base frame, such as a table: ``normal`` points out of it."""
+
+    point: Vector3
+    normal: Vector3
+
+    @property
+    def frames(self) -> tuple[str, ...]:
+        """The base."""
+        return (BASE_FRAME,)
+
+
+Shape = Capsule | Box | HalfSpace
+
+
+@dataclass(frozen=True)
+class Rule:
+    """Parts that match ``between`` (globs, or ``everything``) keep at least ``at_least`` (m) apart.
+
+    Parts that one joint or none lies between do not count, nor pairs with a part that matches ``besides``.
+    """
+
+    between: tuple[str, str]
+    at_least: float
+    besides: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Clearance:
+    """Parts by name, the rules they keep, and regions that the tool point stays out of (boxes and balls)."""
+
+    parts: Mapping[str, tuple[Shape, ...]]
+    rules: tuple[Rule, ...]
+    forbidden: tuple[Box | Capsule, ...] = ()
+
+    def pairs(self, rule: Rule, moved_by: Mapping[str, int]) -> tuple[tuple[str, str], ...]:
+        """The pairs of parts that a rule is about; ``moved_by`` gives each frame's joint (0: none)."""
+        found = {
+            (min(a, b), max(a, b))
+            for a in self._matching(rule.between[0], rule)
+            for b in self._matching(rule.between[1], rule)
+            if a != b and not self._adjacent(a, b, moved_by)
+        }
+        return tuple(sorted(found))
+
+    def _matching(self, glob: str, rule: Rule) -> list[str]:
+        kept = [name for name in self.parts if not any(fnmatchcase(name, other) for other in rule.besides)]
+        return kept if glob == EVERYTHING else [name for name in kept if fnmatchcase(name, glob)]
+
+    def _adjacent(self, first: str, second: str, moved_by: Mapping[str, int]) -> bool:
+        (low, high), (other_low, other_high) = (self._joints(name, moved_by) for name in (first, second))
+        return max(low, other_low) - min(high, other_high) <= 1
+
+    def _joints(self, part: str, moved_by: Mapping[str, int]) -> tuple[int, int]:
+        joints = [moved_by[frame] for shape in self.parts[part] for frame in shape.frames]
+        return min(joints), max(joints)
+
+
+@dataclass(frozen=True)
+class Checked:
+    """What a check found.
+
+    Attributes:
+        margins: how much farther apart than asked, the worst pair of each rule and then the forbidden regions
+            (rules + 1 x N, m; infinite where there is nothing to check).
+    """
+
+    margins: Array
+
+    @property
+    def allowed(self) -> Mask:
+        """Poses in which nothing is too near (N)."""
+        return np.asarray(np.all(self.margins >= 0, axis=0))
+
+
+def joints_of_frames(arm: Arm) -> dict[str, int]:
+    """Every frame that a point may be fixed in, and the joint that moves it."""
+    return {BASE_FRAME: 0, **frame_names(arm.nominal_chain)}
+
+
+class ClearanceCheck:
+    """A clearance, compiled for an arm."""
+
+    def __init__(self, arm: Arm, clearance: Clearance) -> None:
+        self._clearance = clearance
+        moved_by = joints_of_frames(arm)
+        self._pairs = [clearance.pairs(rule, moved_by) for rule in clearance.rules]
+        points = {p for shapes in clearance.parts.values() for s in shapes if isinstance(s, Capsule) for p in _ends(s)}
+        self._points = [Point(TOOL_FRAME), *sorted(points, key=repr)]
+        self._function = _point_function(arm, self._points)
+
+    @property
+    def pairs(self) -> tuple[tuple[tuple[str, str], ...], ...]:
+        """The pairs of each rule."""
+        return tuple(self._pairs)
+
+    def __call__(self, joint_angles: Array) -> Checked:
+        """Check commands (joints x N; rad or m)."""
+        starts = range(0, joint_angles.shape[1], _AT_ONCE)
+        parts = [self._margins(joint_angles[:, start : start + _AT_ONCE]) for start in starts]
+        return Checked(np.concatenate(parts, axis=1) if parts else np.zeros((len(self._pairs) + 1, 0)))
+
+    def _margins(self, joint_angles: Array) -> Array:
+        count = joint_angles.shape[1]
+        stacked = np.asarray(self._function.map(count)(joint_angles).full()).T.reshape(count, -1, 3)
+        where = {point: stacked[:, i] for i, point in enumerate(self._points)}
+        margins = np.full((len(self._pairs) + 1, count), np.inf)
+        known: dict[tuple[str, str], Array] = {}
+        for row, (rule, pairs) in enumerate(zip(self._clearance.rules, self._pairs, strict=True)):
+            for pair in pairs:
+                if pair not in known:
+                    known[pair] = self._apart(pair, where, count)
+                margins[row] = np.minimum(margins[row], known[pair] - rule.at_least)
+        tool = where[Point(TOOL_FRAME)]
+        for region in self._clearance.forbidden:
+            margins[-1] = np.minimum(margins[-1], distance(Capsule(*(Point(TOOL_FRAME),) * 2, 0.0), region, where))
+        inside = np.zeros(len(tool), dtype=bool)
+        for region in self._clearance.forbidden:
+            inside |= _holds(region, tool)
+        margins[-1] = np.where(inside, np.minimum(margins[-1], -_NO_LENGTH), margins[-1])
+        return margins
+
+    def _apart(self, pair: tuple[str, str], where: Mapping[Point, Array], count: int) -> Array:
+        least = np.full(count, np.inf)
+        for first in self._clearance.parts[pair[0]]:
+            for second in self._clearance.parts[pair[1]]:
+                if isinstance(first, Capsule) or isinstance(second, Capsule):
+                    least = np.minimum(least, distance(first, second, where))
+        return least
+
+
+def distance(first: Shape, second: Shape, where: Mapping[Point, Array]) -> Array:
+    """The distance of two shapes in every pose (N, m), given their points in the base frame (N x 3).
+
+    One of them must be a capsule.
+    """
+    if not isinstance(first, Capsule):
+        first, second = second, first
+    if not isinstance(first, Capsule):
+        raise ValueError("two fixed bodies need no check")
+    start, end = (where[p] if p in where else np.array([p.at]) for p in _ends(first))
+    if isinstance(second, Capsule):
+        others = (where[p] if p in where else np.array([p.at]) for p in _ends(second))
+        return segment_to_segment(start, end, *others) - first.radius - second.radius
+    if isinstance(second, Box):
+        return segment_to_box(start, end, np.array(second.low), np.array(second.high)) - first.radius
+    normal = np.array(second.normal) / np.linalg.norm(second.normal)
+    heights = [(points - np.array(second.point)) @ normal for points in (start, end)]
+    return np.asarray(np.minimum(*heights) - first.radius)
+
+
+def segment_to_segment(p1: Array, q1: Array, p2: Array, q2: Array) -> Array:
+    """The distance of segments p1 q1 and p2 q2 (each N x 3); either may be a point. [Ericson2005]"""
+    p1, q1, p2, q2 = np.broadcast_arrays(p1, q1, p2, q2)
+    u, v, w = q1 - p1, q2 - p2, p1 - p2
+    a, e, b = (np.einsum("ni,ni->n", x, y) for x, y in ((u, u), (v, v), (u, v)))
+    c, f = np.einsum("ni,ni->n", u, w), np.einsum("ni,ni->n", v, w)
+    cross = a * e - b * b
+    slanted = cross > _NO_LENGTH
+    s = np.where(slanted, np.clip((b * f - c * e) / np.where(slanted, cross, 1.0), 0.0, 1.0), 0.0)
+    t = np.where(e > _NO_LENGTH, np.clip((b * s + f) / np.where(e > _NO_LENGTH, e, 1.0), 0.0, 1.0), 0.0)
+    s = np.where(a > _NO_LENGTH, np.clip((b * t - c) / np.where(a > _NO_LENGTH, a, 1.0), 0.0, 1.0), 0.0)
+    return np.asarray(np.linalg.norm(w + s[:, None] * u - t[:, None] * v, axis=1))
+
+
+def segment_to_box(p: Array, q: Array, low: Array, high: Array) -> Array:
+    """The distance of segments p q (N x 3) to a box along the axes; 0 where they meet.
+
+    Along the segment the squared distance is convex, and its slope piecewise linear with kinks where the segment
+    crosses a side's plane: between the two kinks about its zero, the zero is found exactly.
+    """
+    direction = q - p
+    still = np.abs(direction) < np.sqrt(_NO_LENGTH)
+    safe = np.where(still, 1.0, direction)
+    crossings = [np.where(still, 0.0, np.clip((side - p) / safe, 0.0, 1.0)) for side in (low, high)]
+    ends = np.stack([np.zeros(len(p)), np.ones(len(p))], axis=1)
+    kinks = np.sort(np.concatenate([*crossings, ends], axis=1), axis=1)
+    slopes = np.einsum("nki,ni->nk", _outside(p[:, None] + kinks[..., None] * direction[:, None], low, high), direction)
+    after = np.clip(np.sum(slopes < 0, axis=1), 1, kinks.shape[1] - 1)
+    row = np.arange(len(p))
+    t0, t1, s0, s1 = kinks[row, after - 1], kinks[row, after], slopes[row, after - 1], slopes[row, after]
+    rising = s1 - s0 > 0
+    part = np.where(rising, np.clip(-s0 / np.where(rising, s1 - s0, 1.0), 0.0, 1.0), 0.0)
+    nearest = p + (t0 + part * (t1 - t0))[:, None] * direction
+    return np.asarray(np.linalg.norm(_outside(nearest, low, high), axis=-1))
+
+
+def _outside(points: Array, low: Array, high: Array) -> Array:
+    """From the nearest point of the box to each point."""
+    return np.asarray(points - np.clip(points, low, high))
+
+
+def _holds(region: Box | Capsule, tool: Array) -> Mask:
+    if isinstance(region, Box):
+        return np.asarray(np.all((tool >= region.low) & (tool <= region.high), axis=1))
+    return np.asarray(np.linalg.norm(tool - np.array(region.start.at), axis=1) <= region.radius)
+
+
+def _ends(capsule: Capsule) -> tuple[Point, Point]:
+    return capsule.start, capsule.end
+
+
+def _point_function(arm: Arm, points: Sequence[Point]) -> ca.Function:
+    """Joint commands to the points in the base frame, stacked."""
+    chain = arm.nominal_chain
+    commands = ca.SX.sym("commands", len(chain.joints))
+    frames = forward(chain, [joint.offset + commands[i] for i, joint in enumerate(chain.joints)], {})
+    mount = frames.sites[0]
+    stacked = []
+    for point in points:
+        at = ca.SX(list(point.at))
+        if point.frame == BASE_FRAME:
+            stacked.append(at)
+        elif point.frame == MOUNT_FRAME:
+            stacked.append(ca.mtimes(mount.rotation, at) + mount.origin)
+        else:
+            pose = frames.base_T_tool if point.frame == TOOL_FRAME else frames.named[point.frame]
+            stacked.append(pose.apply(at))
+    return ca.Function("points", [commands], [ca.densify(ca.vertcat(*stacked))], {"cse": True})

@@ -1,0 +1,172 @@
+"""``armcal plan``."""
+
+from __future__ import annotations
+
+import math
+import time
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+from rich.markup import escape
+from rich.table import Table
+
+from armcal.base.units import display_unit, to_unit
+from armcal.cli.common import Voice, overrides, speaking
+from armcal.config.selection import DIMENSION_OF_UNIT
+from armcal.errors import ConfigError
+from armcal.measure.csv_writer import write_csv
+from armcal.plugins import discover
+from armcal.run.experiment import Experiment
+from armcal.run.plan import PlanRequest, PlanResult, make_plan
+from armcal.run.plan_poses import told
+from armcal.run.plan_settings import PlanSettings
+from armcal.solve.criterion import GOALS
+
+_SHOWN = 8
+_FILE = click.Path(path_type=Path)
+
+
+@click.command()
+@click.argument("config", type=_FILE)
+@click.option("--poses", "count", type=click.IntRange(min=1), required=True, help="How many poses to plan.")
+@click.option("--out", required=True, type=_FILE, help="The CSV to write, in the order of visit.")
+@click.option("--data", type=_FILE, help="A dataset to choose from instead of the configured one.")
+@click.option("--candidates", type=_FILE, help="A CSV of poses to choose from.")
+@click.option("--given", type=_FILE, help="Records that are there already: a CSV of them, or of their ids.")
+@click.option("--calibration", type=_FILE, help="Plan about the values of this calibration.yaml.")
+@click.option("--goal", type=click.Choice(GOALS), help="D, A, E, or O1 to O5 [default: D, or the configured one].")
+@click.option("--order", type=click.Choice(["travel", "torque", "none"]), help="Order of visit [default: travel].")
+@overrides
+@speaking
+def plan(voice: Voice, config: Path, count: int, out: Path, overrides: tuple[str, ...], **given: Any) -> None:
+    """Choose the poses that determine the free parameters of CONFIG best, and say how good any could be."""
+    began = time.perf_counter()
+    _check_out(out)
+    registry = discover()
+    voice.plugin_faults(registry)
+    chosen = [f"plan.{key}={given[key]}" for key in ("goal", "order") if given[key]]
+    experiment = Experiment.load(config, (*overrides, *chosen), given["data"], registry)
+    request = PlanRequest(count, given["candidates"], given["given"], given["calibration"])
+    with voice.progress() as progress:
+        result = make_plan(experiment, request, progress)
+    write_csv(out, result.dataset, experiment.request(measured=False).wanted)
+    content = {**_content(experiment, result), "out": str(out), "seconds": time.perf_counter() - began}
+    voice.result(content)
+    for text in experiment.warnings:
+        voice.warn(text)
+    _show(voice, content)
+
+
+def _check_out(out: Path) -> None:
+    if out.is_dir() or not out.absolute().parent.is_dir():
+        found = "it is a directory" if out.is_dir() else "its directory is not there"
+        raise ConfigError(f"--out {out}: {found}.", hint="Give the path of a CSV in a directory that is there.")
+
+
+def _content(experiment: Experiment, result: PlanResult) -> dict[str, Any]:
+    settings, found = experiment.settings.plan or PlanSettings(), result.certificate
+    certificate = found and {
+        "upper": found.bound,
+        "gap": found.bound - result.value,
+        "efficiency": found.efficiency,
+        "by": found.how,
+    }
+    return {
+        "experiment": experiment.name,
+        "goal": settings.goal,
+        "poses": len(result.dataset),
+        "ids": list(result.dataset.ids),
+        "given_records": result.given,
+        "candidates": {
+            "kind": result.pool.kind,
+            "count": len(result.pool.dataset),
+            "left_out": dict(result.pool.left_out),
+            "refined": result.refined,
+        },
+        "starts": result.starts,
+        "value": result.value,
+        "log_det": result.log_det,
+        "bound": certificate,
+        "observability": result.observability.as_dict(),
+        "equations": result.equations,
+        "parameters": _parameters(experiment, result),
+        "weakest": str(result.identifiability.weakest),
+        "visit": {"order": settings.order, "travel_s": result.travel_s, "peak_squared_torque": result.peak},
+    }
+
+
+def _parameters(experiment: Experiment, result: PlanResult) -> list[dict[str, Any]]:
+    blocks = experiment.parameters.free
+    units = [block.unit for block in blocks for _ in range(block.domain.dof)]
+    scales = experiment.parameters.scales()
+    before, after = result.deviations
+    return [
+        {
+            "name": name,
+            "unit": unit,
+            "sd_before": float(before[i]) if math.isfinite(before[i]) else None,
+            "sd_after": float(after[i]),
+            "sd_in_ordinary_sizes": float(after[i] / scales[i]),
+        }
+        for i, (name, unit) in enumerate(zip(result.names, units, strict=True))
+    ]
+
+
+def _show(voice: Voice, content: dict[str, Any]) -> None:
+    out, pool = voice.out, content["candidates"]
+    left = f" ({told(pool['left_out'])} left out)" if pool["left_out"] else ""
+    given = f" after {content['given_records']} given records" if content["given_records"] else ""
+    moved = f"; {pool['refined']} of the plan moved on from there" if pool["refined"] else ""
+    kinds = {"continuous": "spread through joint space", "grid": "of a grid", "listed": "listed"}
+    out.print(
+        f"{content['experiment']}: {content['poses']} of {pool['count']} candidates "
+        f"{kinds.get(pool['kind'], pool['kind'])}{left}{moved}{given}, goal {content['goal']}, for "
+        f"{len(content['parameters'])} parameters; {content['starts']} starts.",
+        markup=False,
+        soft_wrap=True,
+    )
+    out.print(f"log determinant {content['log_det']:.4f}" + _goal_text(content), markup=False, soft_wrap=True)
+    out.print(_bound_text(content), markup=False, soft_wrap=True)
+    indices = "  ".join(f"{name.upper()} {value:.4g}" for name, value in content["observability"].items())
+    out.print(f"observability: {indices}", markup=False, soft_wrap=True)
+    out.print(_table(content["parameters"]))
+    out.print(f"least determined: {content['weakest']}.", markup=False, soft_wrap=True)
+    visit = content["visit"]
+    hot = visit["peak_squared_torque"]
+    told_hot = f", squared torque averaged over 5 poses at most {hot:.2f} of the largest" if hot is not None else ""
+    out.print(
+        f"visited by {visit['order']}: {visit['travel_s']:.0f} s on the way{told_hot}.", markup=False, soft_wrap=True
+    )
+    out.print(f"plan: {content['out']}  ({content['seconds']:.1f} s)", markup=False, soft_wrap=True)
+
+
+def _goal_text(content: dict[str, Any]) -> str:
+    return "" if content["goal"] in ("D", "O1") else f", goal's value {content['value']:.6g}"
+
+
+def _bound_text(content: dict[str, Any]) -> str:
+    bound = content["bound"]
+    if bound is None:
+        return "upper bound: none is known for this goal"
+    whole = " (over the candidates listed here, not all of joint space)"
+    return (
+        f"upper bound {bound['upper']:.4f}, gap {bound['gap']:.4f}, {content['goal']}-efficiency at least "
+        f"{100 * bound['efficiency']:.2f} % (certified; {bound['by']})"
+        + (whole if content["candidates"]["kind"] == "continuous" else "")
+    )
+
+
+def _table(parameters: list[dict[str, Any]]) -> Table:
+    """The least determined parameters, in their ordinary sizes."""
+    table = Table(title="Predicted standard deviations, the largest first", title_justify="left")
+    for column in ("parameter", "before", "after", "unit"):
+        table.add_column(column, justify="left" if column in ("parameter", "unit") else "right")
+    worst = np.argsort([-p["sd_in_ordinary_sizes"] for p in parameters], kind="stable")[:_SHOWN]
+    for p in (parameters[i] for i in worst):
+        dimension = DIMENSION_OF_UNIT.get(p["unit"])
+        unit = display_unit(dimension).name if dimension else p["unit"]
+        texts = ["-" if p[k] is None else f"{to_unit(p[k], unit):.3g}" for k in ("sd_before", "sd_after")]
+        table.add_row(escape(p["name"]), *texts, unit)
+    return table

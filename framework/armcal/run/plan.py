@@ -1,0 +1,225 @@
+"""A pose plan: which poses to measure, how good they are, how good any could be, and in which order to visit them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from armcal.base.dataset import Dataset
+from armcal.base.domains import Array
+from armcal.base.parameters import Parameters
+from armcal.errors import ProblemError
+from armcal.run.experiment import Experiment
+from armcal.run.plan_clearance import clearance_check
+from armcal.run.plan_ground import Ground, draws_of, ground_of, parameters_of, problem_of
+from armcal.run.plan_poses import JointSpace, Pool, dataset_of, given_records, pool_of, same_poses, told
+from armcal.run.plan_settings import PlanSettings
+from armcal.run.plan_visit import visit
+from armcal.solve.bound import bounded
+from armcal.solve.candidates import Candidates, Indices, deviations, over_draws
+from armcal.solve.criterion import criterion
+from armcal.solve.estimator import Progress, no_progress
+from armcal.solve.identifiability import Identifiability, analyse, measures_of
+from armcal.solve.observability import Observability, observability
+from armcal.solve.planning import Plan, choose, value_of
+from armcal.solve.refinement import Allowed, refine
+from armcal.solve.relaxation import Relaxation, Task
+
+_MORE = "Plan more poses, give the records that are there already (--given), or give priors."
+
+
+@dataclass(frozen=True)
+class PlanRequest:
+    """What is asked for: how many poses, of which candidates (None: as configured), after which records."""
+
+    count: int
+    listed: Path | None = None
+    given: Path | None = None
+    calibration: Path | None = None
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """The bound on the criterion of every plan from these candidates, and how near the plan comes."""
+
+    bound: float
+    efficiency: float
+    how: str
+
+
+@dataclass(frozen=True)
+class PlanResult:
+    """A plan and what is known of it.
+
+    Attributes:
+        dataset: the poses in the order of visit, each with the approach that this order gives.
+        pool: the candidates.
+        given: how many records were there before.
+        equations: how many residual numbers the plan and the records before give.
+        value: of the criterion.
+        log_det: log determinant of the information by coordinates in their ordinary sizes, at the nominal values.
+        certificate: None where the goal has none.
+        observability: O1 to O5, of plan, records before and priors.
+        names: of the coordinates.
+        deviations: standard deviations before and after (2 x n, SI; infinite where undetermined).
+        identifiability: after the plan.
+        travel_s: of the whole visit.
+        peak: of the moving average of squared holding torque beside the plan's largest; None where nothing is held.
+        starts: of the exchange.
+        refined: poses that were moved through joint space.
+    """
+
+    dataset: Dataset
+    pool: Pool
+    given: int
+    equations: int
+    value: float
+    log_det: float
+    certificate: Certificate | None
+    observability: Observability
+    names: tuple[str, ...]
+    deviations: Array
+    identifiability: Identifiability
+    travel_s: float
+    peak: float | None
+    starts: int
+    refined: int
+
+
+def make_plan(experiment: Experiment, request: PlanRequest, progress: Progress = no_progress) -> PlanResult:
+    """Plan poses.
+
+    Raises:
+        InputError: settings, candidates or records are refused, or so many poses cannot determine the parameters.
+    """
+    settings = experiment.settings.plan or PlanSettings()
+    space = JointSpace.of(experiment)
+    parameters = parameters_of(experiment, request.calibration)
+    check = None
+    if settings.clearance is not None:
+        check = clearance_check(settings.clearance, experiment.system.arms, experiment.source)
+    progress("candidates", 0.0)
+    pool = pool_of(experiment, settings, space, request.listed, check)
+    given = None if request.given is None else given_records(experiment, request.given)
+    if given is not None and settings.repeats == 1 and pool.kind != "continuous":
+        again = same_poses(pool.dataset.stacked(space.channels), given.stacked(space.channels))
+        pool = pool.without(again, "measured already")
+    if len(pool.dataset) * settings.repeats < request.count:
+        raise ProblemError(
+            f"{request.count} poses of {len(pool.dataset)} candidates ({told(pool.left_out)}).",
+            hint="Ask for fewer poses, give more candidates, or allow plan.repeats.",
+        )
+    ground = ground_of(experiment, settings, space, parameters, given)
+    if settings.robust is not None:
+        ground = ground.about(draws_of(experiment, settings.robust, parameters))
+    progress("planning", 0.2)
+    rows = ground.rows(pool.dataset)
+    task = Task(Candidates(ground.base, rows), criterion(settings.goal), request.count, settings.repeats)
+    _require_enough(task, parameters)
+    plan = choose(task, settings.starts, settings.seed)
+    _require_determined(task, plan.chosen, parameters)
+    refined = 0
+    if pool.kind == "continuous" and settings.sweeps:
+        progress("refinement", 0.5)
+        allowed = (lambda q: np.ones(q.shape[1], dtype=bool)) if check is None else (lambda q: check(q).allowed)
+        task, plan, pool, refined = _refined(ground, task, plan, pool, allowed)
+    progress("bound", 0.8)
+    relaxed = bounded(task, settings.bound, plan.relaxation)
+    return _result(ground, task, plan, pool, relaxed, refined)
+
+
+def _analysed(task: Task, chosen: Indices, parameters: Parameters) -> Identifiability:
+    """What a plan determines, with what is known before."""
+    names = parameters.coordinate_names
+    return analyse(task.candidates.triangles(chosen)[0], np.ones(len(names)), names, measures_of(parameters))
+
+
+def _require_enough(task: Task, parameters: Parameters) -> None:
+    """Refuse what no choice could determine: candidates that leave something open, or too few poses."""
+    candidates = task.candidates
+    most = _analysed(task, np.arange(candidates.count), parameters)
+    if most.undetermined:
+        raise ProblemError(
+            f"even all {candidates.count} candidates leave {len(most.undetermined)} combinations undetermined: "
+            f"{'; '.join(str(combination) for combination in most.undetermined)}.",
+            hint="Fix one parameter of each, give it a prior, or give other candidates.",
+        )
+    before = int(np.linalg.matrix_rank(candidates.base[0])) if candidates.base.size else 0
+    numbers = task.count * candidates.rows.shape[1]
+    if numbers < candidates.size - before:
+        raise ProblemError(
+            f"{task.count} poses give {numbers} numbers, and {candidates.size - before} of {candidates.size} "
+            "parameters are open.",
+            hint=_MORE,
+        )
+
+
+def _require_determined(task: Task, chosen: Indices, parameters: Parameters) -> None:
+    """Refuse a plan that leaves combinations open."""
+    known = _analysed(task, chosen, parameters)
+    if known.undetermined:
+        raise ProblemError(
+            f"{task.count} poses leave {len(known.undetermined)} combinations undetermined: "
+            f"{'; '.join(str(combination) for combination in known.undetermined)}.",
+            hint=_MORE,
+        )
+
+
+def _refined(ground: Ground, task: Task, plan: Plan, pool: Pool, allowed: Allowed) -> tuple[Task, Plan, Pool, int]:
+    """The chosen poses moved through joint space, and chosen again from all candidates and these."""
+    channels, limits = ground.space.channels, ground.space.limits(ground.settings)
+    before = pool.dataset.stacked(channels)[:, plan.chosen]
+    problem = problem_of(ground.experiment, ground.parameters, pool.dataset)
+
+    def rows(poses: Array) -> Array:
+        return over_draws(problem, ground.draws, dataset_of(poses, ground.space))
+
+    known, by = task.candidates.known(), task.criterion
+    after = refine(before, limits, known, by, rows, allowed, ground.settings.sweeps)
+    moved = np.flatnonzero(np.any(after != before, axis=0))
+    if not len(moved):
+        return task, plan, pool, 0
+    number = task.candidates.count
+    poses = np.concatenate([pool.dataset.stacked(channels), after[:, moved]], axis=1)
+    pool = replace(pool, dataset=dataset_of(poses, ground.space))
+    together = np.concatenate([task.candidates.rows, rows(after[:, moved])], axis=2)
+    task = replace(task, candidates=Candidates(ground.base, together))
+    begin = plan.chosen.copy()
+    begin[moved] = number + np.arange(len(moved))
+    plan = choose(task, 0, ground.settings.seed, begin)
+    return task, plan, pool, int(np.sum(plan.chosen >= number))
+
+
+def _result(ground: Ground, task: Task, plan: Plan, pool: Pool, relaxed: Relaxation | None, refined: int) -> PlanResult:
+    """What is told of a plan; all but the criterion and its bound at the nominal values."""
+    parameters, chosen = ground.parameters, pool.dataset.subset(plan.chosen)
+    certificate = None
+    if relaxed is not None:
+        efficiency = task.criterion.efficiency(plan.value, relaxed.bound, task.candidates.size)
+        certificate = Certificate(relaxed.bound, efficiency, relaxed.how)
+    nominal = ground.about((parameters.nominal(),))
+    measured = Task(Candidates(nominal.base, nominal.rows(chosen)), criterion("D"), task.count)
+    everything = np.arange(task.count)
+    triangle = measured.candidates.triangles(everything)[0]
+    given = 0 if ground.given is None else len(ground.given)
+    equations = (task.count + given) * measured.candidates.rows.shape[1] + len(ground.priors)
+    dataset, seconds, hottest = visit(ground, chosen)
+    return PlanResult(
+        dataset=dataset,
+        pool=pool,
+        given=given,
+        equations=equations,
+        value=plan.value,
+        log_det=value_of(measured.candidates, measured.criterion, everything),
+        certificate=certificate,
+        observability=observability(np.linalg.svd(triangle, compute_uv=False).astype(float), equations),
+        names=parameters.coordinate_names,
+        deviations=np.array([deviations(part) for part in (nominal.base[0], triangle)]) * parameters.scales(),
+        identifiability=_analysed(measured, everything, parameters),
+        travel_s=seconds,
+        peak=hottest,
+        starts=plan.starts,
+        refined=refined,
+    )

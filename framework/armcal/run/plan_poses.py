@@ -1,0 +1,263 @@
+"""Where a plan's candidates come from: recorded poses, a grid of levels, or joint space between limits."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from armcal.arm.clearance import ClearanceCheck, Mask
+from armcal.base.config_text import ConfigText
+from armcal.base.dataset import Dataset
+from armcal.base.domains import Array
+from armcal.config.system import build_component
+from armcal.errors import ConfigError, DataError, Location, ProblemError
+from armcal.measure.id_list import read_ids
+from armcal.measure.reader import ENVIRONMENT, Reader
+from armcal.run.experiment import Experiment
+from armcal.run.plan_settings import PlanSettings
+
+_OF_THE_MOMENT = ("time", "temperature")
+_MOST_GRID = 2_000_000
+_MOST_TRIED = 64
+_POWER = 12
+_SAME_POSE = 1e-9
+
+
+@dataclass(frozen=True)
+class JointSpace:
+    """The joints of all arms, in order.
+
+    Attributes:
+        channels: of their commands (``arm.q1``).
+        names: as a configuration calls them (``q1``; ``left.q1`` where there are several arms).
+        dimensions: ``angle`` or ``length``.
+    """
+
+    channels: tuple[str, ...]
+    names: tuple[str, ...]
+    dimensions: tuple[str, ...]
+
+    @classmethod
+    def of(cls, experiment: Experiment) -> JointSpace:
+        """That of an experiment's arms."""
+        arms = experiment.system.arms
+        channels = tuple(f"{name}.{joint}" for name, arm in arms.items() for joint in arm.joint_names)
+        names = tuple(c.partition(".")[2] for c in channels) if len(arms) == 1 else channels
+        return cls(channels, names, tuple(d for arm in arms.values() for d in arm.joint_dimensions))
+
+    def by_joint(
+        self, turning: Mapping[str, Sequence[float]], sliding: Mapping[str, Sequence[float]], keys: tuple[str, str]
+    ) -> dict[str, Array]:
+        """What is given of joints, by name.
+
+        Raises:
+            ConfigError: a name is not a joint's, or not one of that kind.
+        """
+        for given, kind, key in ((turning, "angle", keys[0]), (sliding, "length", keys[1])):
+            known = [n for n, dimension in zip(self.names, self.dimensions, strict=True) if dimension == kind]
+            if unknown := sorted(set(given) - set(known)):
+                raise ConfigError(
+                    f"plan.{key}: no such joint is called {unknown[0]!r}.",
+                    hint=f"The joints are {', '.join(known) or 'none of this kind'}.",
+                )
+        return {name: np.array(values) for name, values in {**turning, **sliding}.items()}
+
+    def limits(self, settings: PlanSettings) -> Array:
+        """Lowest and highest command of each joint (joints x 2); infinite where none is given."""
+        given = self.by_joint(settings.limits, settings.travel_limits, ("limits", "travel_limits"))
+        return np.array([given.get(name, np.array([-np.inf, np.inf])) for name in self.names])
+
+
+@dataclass(frozen=True)
+class Pool:
+    """Candidates for a plan.
+
+    Attributes:
+        kind: where they come from.
+        dataset: joint commands, approach, load and gravity.
+        left_out: how many were left out, by reason.
+    """
+
+    kind: str
+    dataset: Dataset
+    left_out: Mapping[str, int]
+
+    def without(self, faulty: Mask, reason: str) -> Pool:
+        """Those that are not faulty (N, bool)."""
+        if not faulty.any():
+            return self
+        told = {**self.left_out, reason: self.left_out.get(reason, 0) + int(faulty.sum())}
+        return replace(self, dataset=self.dataset.subset(np.flatnonzero(~faulty)), left_out=told)
+
+
+def pool_of(
+    experiment: Experiment, settings: PlanSettings, space: JointSpace, listed: Path | None, check: ClearanceCheck | None
+) -> Pool:
+    """Every candidate that lies within limits and keeps its clearance.
+
+    Raises:
+        ConfigError: levels or limits are missing or name no joint.
+        DataError: a list is refused.
+        ProblemError: nothing is left.
+    """
+    limits = space.limits(settings)
+    kind = "listed" if listed is not None else settings.candidates or _usual(experiment, limits)
+    if kind == "continuous":
+        return spread(settings, space, limits, check)
+    if kind == "grid":
+        pool = Pool(kind, _grid(settings, space), {})
+    else:
+        pool = Pool(kind, commands_of(read_poses(experiment, listed), space), {})
+    angles = pool.dataset.stacked(space.channels)
+    outside = np.any((angles < limits[:, :1] - _SAME_POSE) | (angles > limits[:, 1:] + _SAME_POSE), axis=0)
+    pool = pool.without(outside, "beyond joint limits")
+    if check is not None:
+        pool = pool.without(~check(pool.dataset.stacked(space.channels)).allowed, "too little clearance")
+    if not len(pool.dataset):
+        raise ProblemError(
+            f"none of the candidates is left ({told(pool.left_out)}).",
+            hint="Check limits and clearance, or give other candidates.",
+        )
+    return pool
+
+
+def read_poses(experiment: Experiment, path: Path | None) -> Dataset:
+    """Poses from a file, or from the configured data; measured values may be missing.
+
+    Raises:
+        ConfigError: neither is there.
+        DataError: refused by the reader.
+    """
+    source = experiment.source
+    if path is not None:
+        section = {**(source.data.get("data") or {"type": "csv"}), "path": ConfigText(str(path))}
+        source = replace(source, data={**source.data, "data": section})
+    elif experiment.settings.data is None:
+        raise ConfigError(
+            "found no poses to choose from.",
+            where=source.where(("data",)),
+            hint="Give --candidates FILE, --data FILE, or plan: {candidates: continuous, limits: ...}.",
+        )
+    reader: Reader
+    reader, _ = build_component(source, experiment.registry, "reader", ("data",))
+    return reader.read(experiment.request(measured=False))
+
+
+def given_records(experiment: Experiment, path: Path) -> Dataset:
+    """Records that are there already: a table of poses, or a list of ids in the configured data.
+
+    Raises:
+        DataError: refused, or an id is not in the data.
+    """
+    if not _is_id_list(path):
+        return read_poses(experiment, path)
+    wanted = read_ids(path)
+    if experiment.settings.data is None:
+        raise DataError(
+            "it lists ids, and no data is configured that they could belong to.",
+            where=Location(str(path)),
+            hint="Give the data (--data FILE), or the poses themselves.",
+        )
+    recorded = read_poses(experiment, None)
+    place = {record: i for i, record in enumerate(recorded.ids)}
+    if missing := [record for record in wanted if record not in place]:
+        raise DataError(
+            f"{len(missing)} of {len(wanted)} ids are not in the data, the first: {missing[0]}.",
+            where=Location(str(path)),
+            hint="Give the poses themselves, or the data (--data FILE) that the ids belong to.",
+        )
+    return recorded.subset([place[record] for record in wanted])
+
+
+def commands_of(dataset: Dataset, space: JointSpace) -> Dataset:
+    """What is commanded and what acts, without what was measured."""
+    acting = [name for name, _ in ENVIRONMENT if name not in _OF_THE_MOMENT]
+    kept = {n: v for n, v in dataset.channels.items() if n in space.channels or n in acting or ".approach." in n}
+    return replace(dataset, channels=kept, extra={})
+
+
+def same_poses(first: Array, second: Array) -> Mask:
+    """Which of the first (joints x N) are among the second (joints x M); (N, bool)."""
+    keys = {tuple(column) for column in np.round(second.T / _SAME_POSE).astype(np.int64).tolist()}
+    return np.array([tuple(c) in keys for c in np.round(first.T / _SAME_POSE).astype(np.int64).tolist()], dtype=bool)
+
+
+def spread(settings: PlanSettings, space: JointSpace, limits: Array, check: ClearanceCheck | None) -> Pool:
+    """Poses spread evenly between limits, by a scrambled Sobol sequence, after the corners of joint space."""
+    from scipy.stats import qmc
+
+    if not np.isfinite(limits).all():
+        missing = [n for n, row in zip(space.names, limits, strict=True) if not np.isfinite(row).all()]
+        raise ConfigError(
+            f"found no limits for {', '.join(missing)}.",
+            hint="Give plan.limits (plan.travel_limits for sliding joints): {q1: [-100 deg, 100 deg], ...}.",
+        )
+    sequence = qmc.Sobol(len(limits), rng=settings.seed)
+    found: list[Array] = []
+    kept = tried = 0
+    drawn = _corners(limits, settings.count // 2)
+    while kept < settings.count and tried <= _MOST_TRIED * settings.count:
+        poses = (limits[:, 0] + drawn * (limits[:, 1] - limits[:, 0])).T
+        allowed = np.ones(poses.shape[1], dtype=bool) if check is None else check(poses).allowed
+        found.append(poses[:, allowed])
+        kept, tried = kept + int(allowed.sum()), tried + poses.shape[1]
+        drawn = sequence.random_base2(_POWER)
+    poses = np.concatenate(found, axis=1)
+    left_out = {"too little clearance": tried - kept} if tried > kept else {}
+    if not kept:
+        raise ProblemError(f"none of {tried} poses keeps its clearance.", hint="Check plan.clearance.")
+    return Pool("continuous", dataset_of(poses[:, : settings.count], space), left_out)
+
+
+def _corners(limits: Array, most: int) -> Array:
+    """The ends and middles of all joints, or their ends alone, as far as that is not too many (N x joints, 0 to 1)."""
+    for levels in ((0.0, 0.5, 1.0), (0.0, 1.0)):
+        if len(levels) ** len(limits) <= most:
+            axes = np.meshgrid(*[levels] * len(limits), indexing="ij")
+            return np.array([axis.ravel() for axis in axes]).T
+    return np.zeros((0, len(limits)))
+
+
+def dataset_of(poses: Array, space: JointSpace) -> Dataset:
+    """Poses (joints x N) with ids from 1."""
+    ids = tuple(str(i) for i in range(1, poses.shape[1] + 1))
+    return Dataset(ids, dict(zip(space.channels, np.ascontiguousarray(poses), strict=True)), source="plan")
+
+
+def told(left_out: Mapping[str, int]) -> str:
+    """What was left out, in words."""
+    return ", ".join(f"{count} {reason}" for reason, count in left_out.items()) or "none was given"
+
+
+def _usual(experiment: Experiment, limits: Array) -> str:
+    return "continuous" if experiment.settings.data is None and np.isfinite(limits).all() else "recorded"
+
+
+def _is_id_list(path: Path) -> bool:
+    """A file of one column."""
+    try:
+        with path.open(encoding="utf-8-sig") as stream:
+            return not any(mark in stream.readline(1000) for mark in ",;\t|")
+    except (OSError, UnicodeDecodeError):
+        return False
+
+
+def _grid(settings: PlanSettings, space: JointSpace) -> Dataset:
+    given = space.by_joint(settings.levels, settings.travel, ("levels", "travel"))
+    if missing := [name for name in space.names if name not in given]:
+        raise ConfigError(
+            f"found no levels for {', '.join(missing)}.",
+            hint="Give plan.levels (plan.travel for sliding joints): {q1: [-100 deg, 0 deg, 100 deg], ...}.",
+        )
+    total = math.prod(len(given[name]) for name in space.names)
+    if total > _MOST_GRID:
+        raise ConfigError(
+            f"the grid has {total} poses, expected at most {_MOST_GRID}.",
+            hint="Give fewer levels, or plan.candidates: continuous.",
+        )
+    axes = np.meshgrid(*[given[name] for name in space.names], indexing="ij")
+    return dataset_of(np.array([axis.ravel() for axis in axes]), space)

@@ -1,0 +1,83 @@
+"""What makes a set of poses good: functions of the information matrix's eigenvalues.
+
+``D`` maximises the determinant, ``A`` minimises the mean variance, ``E`` maximises the information of the
+least determined direction [Pukelsheim2006]; ``O1`` to ``O5`` are the observability indices [Sun2008]. The
+information is by coordinates in their ordinary sizes, so that metres and radians can be compared.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import numpy as np
+
+from armcal.base.domains import Array
+
+Goal = Literal["D", "A", "E", "O1", "O2", "O3", "O4", "O5"]
+GOALS: tuple[Goal, ...] = get_args(Goal)
+FLOOR = 1e-300
+"""Eigenvalues are kept above it, so that a singular matrix is very bad and not an error."""
+_SAME = 1e-6
+
+
+@dataclass(frozen=True)
+class Criterion:
+    """A goal as something to maximise, a function of eigenvalues (... x n, smallest first).
+
+    Attributes:
+        name: ``D``, ``A``, ``E``, ``O2``, ``O4`` or ``O5``; O1 is D and O3 is E.
+        value: what is maximised.
+        trace: where the criterion is a concave sum over eigenvalues, its derivative and second derivative by one.
+    """
+
+    name: str
+    value: Callable[[Array], Array]
+    trace: tuple[Callable[[Array], Array], Callable[[Array], Array]] | None
+
+    def of(self, information: Array) -> Array:
+        """The value of information matrices (... x n x n)."""
+        return self.value(np.maximum(np.linalg.eigvalsh(information), FLOOR))
+
+    def efficiency(self, value: float, bound: float, size: int) -> float:
+        """How good a plan of this value is beside the best there could be, between 0 and 1.
+
+        For D by the determinant's n-th root: 0.99 means that 1 % more measurements would make up for it.
+        """
+        if self.name == "D":
+            return float(np.exp((value - bound) / size))
+        return float(value / bound if self.name == "E" else bound / value)
+
+
+def _power(p: float) -> tuple[Callable[[Array], Array], Callable[[Array], Array]]:
+    """Derivatives of -x^-p."""
+    return (lambda x: p * x ** (-p - 1)), (lambda x: -p * (p + 1) * x ** (-p - 2))
+
+
+_D = Criterion("D", lambda x: np.sum(np.log(x), axis=-1), ((lambda x: 1 / x), (lambda x: -1 / x**2)))
+_E = Criterion("E", lambda x: x[..., 0], None)
+_CRITERIA: dict[str, Criterion] = {
+    "D": _D,
+    "O1": _D,
+    "A": Criterion("A", lambda x: -np.sum(1 / x, axis=-1), _power(1.0)),
+    "E": _E,
+    "O3": _E,
+    "O2": Criterion("O2", lambda x: np.sqrt(x[..., 0] / x[..., -1]), None),
+    "O4": Criterion("O4", lambda x: x[..., 0] / np.sqrt(x[..., -1]), None),
+    "O5": Criterion("O5", lambda x: -np.sum(x**-0.5, axis=-1), _power(0.5)),
+}
+
+
+def criterion(goal: Goal) -> Criterion:
+    """The criterion of a goal; O1 and D, and O3 and E, order plans of equal size alike."""
+    return _CRITERIA[goal]
+
+
+def spread(slope: Callable[[Array], Array], curvature: Callable[[Array], Array], eigenvalues: Array) -> Array:
+    """First divided differences of ``slope`` between all pairs of eigenvalues (n x n); the derivative of a trace
+    function's gradient in the eigenbasis [Higham2008]."""
+    a, b = eigenvalues[:, None], eigenvalues[None, :]
+    near = np.abs(a - b) <= _SAME * np.maximum(a, b)
+    difference = (slope(a) - slope(b)) / np.where(near, 1.0, a - b)
+    return np.asarray(np.where(near, curvature((a + b) / 2), difference))

@@ -1,0 +1,222 @@
+"""Exchange against plain numpy: every update against a fresh decomposition, every plan against brute force."""
+
+from __future__ import annotations
+
+from itertools import combinations
+
+import numpy as np
+import pytest
+from armcal.base.domains import Interval
+from armcal.base.parameters import ParameterBlock, Parameters
+from armcal.solve.candidates import Candidates, deviations, parameter_draws, whitened_rows
+from armcal.solve.criterion import GOALS, criterion
+from armcal.solve.planning import built_up, choose, detmax, in_order, value_of
+from armcal.solve.relaxation import Task
+from armcal.solve.tally import SHORTLIST, tally
+
+
+def made(count=30, n_rows=3, size=5, draws=1, known=2, seed=0) -> Candidates:
+    """Random candidates, badly scaled by column, after ``known`` rows of earlier information."""
+    random = np.random.default_rng(seed)
+    scale = np.logspace(0, 1.5, size)
+    return Candidates(
+        random.normal(size=(draws, known, size)), random.normal(size=(draws, n_rows, count, size)) * scale
+    )
+
+
+def by_hand(candidates: Candidates, goal: str, chosen) -> float:
+    """The criterion from its definition, averaged over draws."""
+    values = []
+    for base, rows in zip(candidates.base, candidates.rows, strict=True):
+        stacked = np.vstack([base, *(rows[:, i] for i in chosen)])
+        s = np.linalg.svd(stacked, compute_uv=False)
+        values.append(
+            {
+                "D": 2 * np.sum(np.log(s)),
+                "A": -np.trace(np.linalg.inv(stacked.T @ stacked)),
+                "E": s[-1] ** 2,
+                "O2": s[-1] / s[0],
+                "O4": s[-1] ** 2 / s[0],
+                "O5": -np.sum(1 / s),
+            }[{"O1": "D", "O3": "E"}.get(goal, goal)]
+        )
+    return float(np.mean(values))
+
+
+@pytest.mark.parametrize("goal", GOALS)
+@pytest.mark.parametrize("n_rows", [1, 2, 3, 6])
+def test_updates_agree_with_decompositions_after_many_exchanges(goal: str, n_rows: int) -> None:
+    candidates = made(n_rows=n_rows, draws=2)
+    held = tally(candidates, criterion(goal))
+    random = np.random.default_rng(1)
+    chosen = [int(i) for i in random.choice(30, 8, replace=False)]
+    held.restart(np.array(chosen))
+    for step in range(150):  # past the refresh
+        if step % 2:
+            held.remove(chosen.pop(int(random.integers(len(chosen)))))
+        else:
+            chosen.append(int(random.integers(30)))
+            held.add(chosen[-1])
+    now = by_hand(candidates, goal, chosen)
+    scale = max(1.0, abs(now))
+    others = [*range(0, 30, 7)]
+    assert np.allclose(
+        held.if_added()[others],
+        [by_hand(candidates, goal, [*chosen, i]) - now for i in others],
+        rtol=1e-4,
+        atol=1e-5 * scale,
+    )
+    without = [by_hand(candidates, goal, chosen[:i] + chosen[i + 1 :]) - now for i in range(len(chosen))]
+    assert np.allclose(held.if_removed(np.array(chosen)), without, rtol=1e-4, atol=1e-5 * scale)
+    swapped = [by_hand(candidates, goal, [*chosen[1:], i]) - now for i in others]
+    assert np.allclose(held.if_swapped(chosen[0])[others], swapped, rtol=1e-4, atol=1e-5 * scale)
+
+
+@pytest.mark.parametrize("goal", GOALS)
+@pytest.mark.parametrize("draws", [1, 3])
+def test_no_single_swap_improves_a_plan(goal: str, draws: int) -> None:
+    candidates = made(count=25, draws=draws, seed=3)
+    plan = choose(Task(candidates, criterion(goal), 6), starts=2)
+    assert len(set(plan.chosen.tolist())) == 6
+    value = by_hand(candidates, goal, plan.chosen)
+    assert plan.value == pytest.approx(value, rel=1e-8)
+    for leaving in plan.chosen:
+        kept = [i for i in plan.chosen if i != leaving]
+        for entering in set(range(25)) - set(plan.chosen.tolist()):
+            assert by_hand(candidates, goal, [*kept, entering]) <= value + 1e-6 * abs(value), (leaving, entering)
+
+
+@pytest.mark.parametrize("goal", ["D", "A", "E"])
+@pytest.mark.parametrize("seed", range(4))
+def test_of_few_candidates_the_very_best_plan_is_found(goal: str, seed: int) -> None:
+    candidates = made(count=12, size=4, seed=seed)
+    best = max(by_hand(candidates, goal, chosen) for chosen in combinations(range(12), 4))
+    assert choose(Task(candidates, criterion(goal), 4)).value == pytest.approx(best, rel=1e-9)
+
+
+def test_what_is_known_already_changes_the_plan() -> None:
+    candidates = made(known=0, seed=5)
+    first = choose(Task(candidates, criterion("D"), 5)).chosen
+    after = Candidates(np.concatenate([candidates.rows[:, :, i] for i in first], axis=1), candidates.rows)
+    second = choose(Task(after, criterion("D"), 5))
+    assert set(second.chosen.tolist()) != set(first.tolist())
+    assert second.value == pytest.approx(by_hand(after, "D", second.chosen))
+
+
+def test_a_pose_stands_once_unless_repeats_are_allowed() -> None:
+    candidates = made(count=8, seed=2)
+    candidates.rows[:, :, 3] *= 50  # so good that it would be taken every time
+    once = choose(Task(candidates, criterion("D"), 6)).chosen.tolist()
+    thrice = choose(Task(candidates, criterion("D"), 6, limit=3)).chosen.tolist()
+    assert sorted(set(once)) == sorted(once)
+    assert max(thrice.count(i) for i in thrice) == 3
+    assert by_hand(candidates, "D", thrice) > by_hand(candidates, "D", once)
+
+
+def test_the_units_of_parameters_do_not_change_a_d_optimal_plan() -> None:
+    candidates = made(seed=7)
+    other = np.array([3.0, 0.3, 7.0, 1.0, 0.2])
+    scaled = Candidates(candidates.base * other, candidates.rows * other)
+    plans = [choose(Task(c, criterion("D"), 8)) for c in (candidates, scaled)]
+    assert plans[0].chosen.tolist() == plans[1].chosen.tolist()
+    assert plans[1].value - plans[0].value == pytest.approx(2 * np.sum(np.log(other)))
+
+
+def test_the_order_of_candidates_does_not_change_the_value() -> None:
+    candidates = made(count=40, seed=8)
+    shuffled = candidates.subset(np.random.default_rng(0).permutation(40))
+    values = [choose(Task(c, criterion("D"), 8)).value for c in (candidates, shuffled)]
+    assert values[0] == pytest.approx(values[1], rel=1e-9)
+
+
+def test_poses_are_given_in_the_order_of_what_they_add() -> None:
+    candidates = made(seed=9)
+    chosen = choose(Task(candidates, criterion("D"), 6)).chosen
+    task = Task(candidates, criterion("D"), 6)
+    assert in_order(task, chosen[::-1]).tolist() == chosen.tolist()
+    firsts = [by_hand(candidates, "D", [*chosen[:2], i]) for i in chosen[2:]]
+    assert int(np.argmax(firsts)) == 0
+
+
+def test_a_singular_start_is_climbed_out_of() -> None:
+    candidates = made(count=40, known=0, size=6, seed=4)
+    candidates.rows[:, :, :20, 3:] = 0  # half of the candidates see half of the parameters
+    task = Task(candidates, criterion("D"), 8)
+    chosen, _ = detmax(task, np.arange(8))
+    assert np.isfinite(by_hand(candidates, "D", chosen)) and by_hand(candidates, "D", chosen) > 0
+    assert value_of(candidates, criterion("D"), np.arange(8)) < -100
+
+
+def test_a_plan_for_many_candidates_is_a_local_optimum_over_all_of_them() -> None:
+    candidates = made(count=2600, size=4, seed=11)
+    for goal in ("D", "A"):
+        plan = choose(Task(candidates, criterion(goal), 6), starts=1)
+        held = tally(candidates, criterion(goal))
+        held.restart(plan.chosen)
+        for leaving in plan.chosen:
+            gains = np.delete(held.if_swapped(int(leaving)), plan.chosen)
+            assert gains.max() <= 1e-6 * abs(plan.value)
+    assert candidates.count > SHORTLIST
+
+
+def test_a_plan_built_up_is_a_local_optimum() -> None:
+    candidates = made(count=20, seed=12)
+    chosen = built_up(Task(candidates, criterion("D"), 4))
+    value = by_hand(candidates, "D", chosen)
+    others = set(range(20)) - set(chosen.tolist())
+    assert all(by_hand(candidates, "D", [*set(chosen) - {o}, i]) <= value + 1e-9 for o in chosen for i in others)
+
+
+def test_deviations_are_those_of_the_inverse_and_infinite_where_nothing_is_known() -> None:
+    rows = np.random.default_rng(0).normal(size=(9, 4))
+    assert np.allclose(deviations(rows), np.sqrt(np.diag(np.linalg.inv(rows.T @ rows))))
+    rows[:, 3] = rows[:, 2]
+    assert np.isfinite(deviations(rows)).tolist() == [True, True, False, False]
+    assert np.isinf(deviations(np.zeros((0, 4)))).all()
+
+
+def test_rows_are_the_whitened_jacobian_in_ordinary_sizes(lrm) -> None:
+    """Against finite differences of residuals, over more than one block of records."""
+    experiment = lrm.experiment()
+    q = np.random.default_rng(0).uniform(-0.8, 0.8, (1100, 6))
+    dataset = lrm.dataset(q)
+    problem = lrm.problem(experiment, dataset)
+    nominal, scales = experiment.parameters.nominal(), experiment.parameters.scales()
+    rows = whitened_rows(problem, nominal, dataset)
+    assert rows.shape == (3, 1100, 28)
+    few = [0, 500, 1023, 1024, 1099]
+    records = problem.records(dataset.subset(few))
+    for column in (0, 9, 20, 27):
+        delta = np.zeros(28)
+        delta[column] = 1e-6 * scales[column]
+        ends = [problem.residuals(experiment.parameters.retract(s * delta), records)[0] for s in (1, -1)]
+        slope = (ends[0] - ends[1]) / 2e-6 / 0.5e-3
+        assert np.allclose(rows[:, few, column], slope, atol=1e-4 * max(1.0, np.abs(slope).max()))
+
+
+def test_draws_spread_as_their_priors_say_and_stay_within_bounds() -> None:
+    blocks = (
+        ParameterBlock("a", "m", (1.0,), free=True, prior_sd=0.1),
+        ParameterBlock("b", "m", (2.0,), free=True),
+        ParameterBlock("c", "rad_per_Nm", (0.01,), Interval(0.0), free=True, prior_sd=0.1),
+        ParameterBlock("d", "m", (5.0,), prior_sd=1.0),
+    )
+    drawn = np.array(list(parameter_draws(Parameters(blocks), 2000, 0)))
+    assert drawn[:, 0].mean() == pytest.approx(1.0, abs=0.01) and drawn[:, 0].std() == pytest.approx(0.1, rel=0.1)
+    assert (drawn[:, 1] == 2.0).all() and (drawn[:, 3] == 5.0).all()
+    assert drawn[:, 2].min() == 0.0 and drawn[:, 2].max() > 0.2
+
+
+@pytest.mark.slow
+@pytest.mark.shared
+def test_fifty_of_the_measured_poses_beat_fifty_random_starts(lrm, shared_data) -> None:
+    from armcal.run.experiment import Experiment
+
+    experiment = Experiment.load(lrm.configs / "option1.yaml", (), shared_data / "lrm_arm" / "poses.csv")
+    dataset = experiment.read()
+    rows = whitened_rows(lrm.problem(experiment, dataset), experiment.parameters.nominal(), dataset)
+    task = Task(Candidates(np.zeros((1, 0, 28)), rows[None]), criterion("D"), 50)
+    random = np.random.default_rng(2024)
+    starts = [random.choice(313, 50, replace=False) for _ in range(50)]
+    others = [value_of(task.candidates, task.criterion, detmax(task, start)[0]) for start in starts]
+    assert choose(task).value >= max(others)
