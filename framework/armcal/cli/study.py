@@ -1,0 +1,102 @@
+"""``armcal study``."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import click
+from rich.markup import escape
+from rich.table import Table
+
+from armcal.cli.common import Voice, command_line, overrides, parallel, speaking
+from armcal.plugins import discover
+from armcal.report.study_page import conclusions, render_study, render_transfer, transfer_conclusions, transfer_table
+from armcal.run import study_outputs
+from armcal.run.load_transfer import transfer
+from armcal.run.pipeline import Stopwatch
+from armcal.run.study import Study, compare
+from armcal.run.study_result import StudyResult, TransferResult
+from armcal.run.study_settings import LoadTransferSettings
+from armcal.solve.parallel import Executor
+
+
+@click.command()
+@click.argument("config", type=click.Path(path_type=Path))
+@click.option("--data", type=click.Path(path_type=Path), help="A dataset to read instead of the configured one.")
+@click.option("--out", type=click.Path(path_type=Path), help="Where the results go [default: runs/NAME of CONFIG].")
+@overrides
+@parallel
+@speaking
+def study(
+    voice: Voice, config: Path, data: Path | None, out: Path | None, overrides: tuple[str, ...], parallel: Executor
+) -> None:
+    """Compare the variants that CONFIG lists by cross-validated error, or by load transfer."""
+    watch = Stopwatch()
+    folder = out or Path("runs") / config.stem
+    study_outputs.check_folder(folder)
+    registry = discover()
+    voice.plugin_faults(registry)
+    asked = Study.load(config, overrides, data, registry)
+    result: StudyResult | TransferResult
+    with voice.progress() as progress:
+        if isinstance(asked.settings, LoadTransferSettings):
+            result = transfer(asked, parallel, command_line(), progress, watch)
+        else:
+            result = compare(asked, parallel, command_line(), progress, watch)
+    for text in result.warnings:
+        voice.warn(text)
+    for stage, seconds in result.seconds.items():
+        voice.detail(f"{stage}: {seconds:.3f} s")
+    result.seconds["total"] = watch.total()
+    page = render_study(result) if isinstance(result, StudyResult) else render_transfer(result)
+    study_outputs.write(result, asked, folder, page)
+    voice.result({**result.as_dict(), "folder": str(folder)})
+    if isinstance(result, StudyResult):
+        _show_study(voice, result)
+    else:
+        _show_transfer(voice, result)
+    voice.out.print(f"page: {folder / 'study.html'}  ({watch.total():.1f} s)", markup=False, soft_wrap=True)
+
+
+def _show_study(voice: Voice, result: StudyResult) -> None:
+    records = f"{len(result.dataset)} records, {result.folds} folds"
+    records += f" drawn {result.repeats} times" if result.repeats > 1 else ""
+    columns = ("free", "train", "cv", "cv 95 %", "change", "± se", "helps")
+    table = _table(f"{result.name}: mean error, mm; cross-validated (cv): {records}", ("variant",), columns)
+    for v in result.variants:
+        moved = ["", "", ""]
+        if v.change:
+            moved = [f"{v.change.mean:+.3f}", f"{v.change.standard_error:.3f}", f"{v.change.helped:.0%}"]
+        figures = [_number(x) for x in (v.train.mean, v.crossed.mean, v.crossed.p95)]
+        if v.failed_folds:  # over fewer records than the others
+            figures[1:] = [f"({x})" for x in figures[1:]]
+        table.add_row(escape(v.name), str(v.free), *figures, *moved)
+        voice.detail(f"{v.name}: {v.fit_seconds:.2f} s for the fit on all records, {v.seconds:.2f} s for all fits")
+    voice.out.print(table)
+    for text in conclusions(result):
+        voice.out.print(text, markup=False, soft_wrap=True)
+
+
+def _show_transfer(voice: Voice, result: TransferResult) -> None:
+    shown = transfer_table(result)
+    words = [[name for name, number in shown.headings if number is wanted] for wanted in (False, True)]
+    table = _table(f"{result.name}: {shown.caption}", words[0], words[1])
+    for row in shown.rows:
+        table.add_row(*row)
+    voice.out.print(table)
+    for text in transfer_conclusions(result):
+        voice.out.print(text, markup=False, soft_wrap=True)
+
+
+def _table(title: str, words: Sequence[str], numbers: Sequence[str]) -> Table:
+    table = Table(title=title, title_justify="left")
+    for column in words:
+        table.add_column(column, overflow="fold")
+    for column in numbers:
+        table.add_column(column, justify="right")
+    return table
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3f}"

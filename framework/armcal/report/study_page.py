@@ -1,0 +1,180 @@
+"""The page of a study: one table, one figure, what to conclude, and which records gain and lose."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import armcal
+from armcal.report import study_figures
+from armcal.report.numbers import NONE, common_decimals, count, duration, fixed, plural, unbroken
+from armcal.report.svg import Figure
+from armcal.report.tables import provenance_facts
+from armcal.run.study_result import StudyResult, TransferCell, TransferResult, VariantResult
+
+_SAME_MM = 1e-6
+
+
+@dataclass(frozen=True)
+class StudyTable:
+    """Headings (words, whether numbers stand below) and rows of cells."""
+
+    caption: str
+    headings: tuple[tuple[str, bool], ...]
+    rows: tuple[tuple[str, ...], ...]
+
+
+def render_study(result: StudyResult) -> str:
+    """One self-contained HTML file of a comparison."""
+    title = f"{result.name}: {plural(len(result.variants), 'variant')}"
+    listed = [(v.name, v.change) for v in result.variants if v.change]
+    return _render(result, title, conclusions(result), _variants(result), study_figures.ladder(result), listed)
+
+
+def render_transfer(result: TransferResult) -> str:
+    """One self-contained HTML file of a load transfer study."""
+    title = f"{result.name}: trained at one load, judged at another"
+    return _render(
+        result, title, transfer_conclusions(result), transfer_table(result), study_figures.transfers(result), []
+    )
+
+
+def _render(
+    result: StudyResult | TransferResult,
+    title: str,
+    sentences: list[str],
+    table: StudyTable,
+    figure: Figure,
+    changes: list[Any],
+) -> str:
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+    loader = FileSystemLoader(Path(__file__).parent)
+    environment = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True)
+    environment.lstrip_blocks = True
+    environment.filters.update(count=count, plural=plural, unbroken=unbroken, signed=lambda x: fixed(x, 3, signed=True))
+    facts = provenance_facts(result.provenance)
+    return environment.get_template("study.html.j2").render(
+        result=result,
+        title=title,
+        sentences=sentences,
+        table=table,
+        figure=figure,
+        changes=changes,
+        version=armcal.__version__,
+        facts=[f for f in facts if not f.long],
+        seconds=[(name, duration(value)) for name, value in result.seconds.items()],
+    )
+
+
+def conclusions(result: StudyResult) -> list[str]:
+    """What to conclude from a comparison."""
+    best = result.variant(result.best)
+    found = [
+        f"Lowest cross-validated error: {best.name}, {_mm(best.crossed.mean)} on average, 95 % below "
+        f"{_mm(best.crossed.p95)}."
+    ]
+    if result.simplest != result.best:
+        simple = result.variant(result.simplest)
+        found.append(
+            f"Simplest within one standard error of it: {simple.name}, {simple.free} free parameters, "
+            f"{_mm(simple.crossed.mean)}."
+        )
+    found += _nested_words(result, best)
+    for v in result.variants:
+        if abs((v.at_rest.mean or 0.0) - (v.crossed.mean or 0.0)) > _SAME_MM:
+            found.append(
+                f"{v.name} knows the drift at a record from the training records near it; without that, "
+                f"{_mm(v.at_rest.mean)} on average, 95 % below {_mm(v.at_rest.p95)}."
+            )
+    compared = [v.change for v in result.variants if v.change]
+    if compared:
+        against = {c.against for c in compared}
+        words = f"against {compared[0].against}" if len(against) == 1 else "against the variant before"
+        blocks = sorted({c.block for c in compared})
+        span = f"{blocks[0]}" if len(blocks) == 1 else f"{blocks[0]} to {blocks[-1]}"
+        found.append(
+            f"Change: the mean difference of each record's error {words}, ± one standard error from blocks of {span} "
+            "neighbouring records; fits are taken as given."
+        )
+    return found
+
+
+def _nested_words(result: StudyResult, best: VariantResult) -> list[str]:
+    if result.nested is None:
+        if len(result.variants) == 1:
+            return []
+        return ["It was picked by the records that judge it: study.nested: true judges the choice itself."]
+    chosen = result.nested.chosen
+    listed = ", ".join(f"{name} in {chosen.count(name)}" for name in dict.fromkeys(chosen))
+    return [
+        f"The choice itself, made inside each fold's training records and judged outside: "
+        f"{_mm(result.nested.crossed.mean)} on average, 95 % below {_mm(result.nested.crossed.p95)} (picked by the "
+        f"records that judge it: {_mm(best.crossed.mean)}). Chosen: {listed} of {result.folds} folds."
+    ]
+
+
+def transfer_conclusions(result: TransferResult) -> list[str]:
+    """How much an error grows from the load that trained to another."""
+    found = []
+    for name in dict.fromkeys(cell.variant for cell in result.cells):
+        single = [c for c in result.cells if c.variant == name and len(c.trained_g) == 1 and c.errors.mean is not None]
+        own = {c.judged_g: c.errors.mean for c in single if c.seen}
+        pairs = [
+            f"{c.trained_g[0]:g} g to {c.judged_g:g} g {_mm(c.errors.mean)}, against {_mm(own.get(c.judged_g))} there"
+            for c in single
+            if not c.seen
+        ]
+        found.append(f"{name}: from {'; from '.join(pairs)}.")
+    return found
+
+
+def _variants(result: StudyResult) -> StudyTable:
+    numbers = [x for v in result.variants for x in (v.train.mean, v.crossed.mean)]
+    decimals = common_decimals(numbers, most=3)
+    rows = []
+    for v in result.variants:
+        moved = (NONE, NONE)
+        if v.change:
+            spread = f"{fixed(v.change.mean, decimals, signed=True)} ± {fixed(v.change.standard_error, decimals)}"
+            moved = (spread, f"{v.change.helped:.0%}".replace("%", " %"))
+        train = [fixed(x, decimals) for x in (v.train.mean, v.train.p95)]
+        errors = (*train, *(fixed(x, decimals) for x in (v.crossed.mean, v.crossed.rms, v.crossed.p95, v.crossed.max)))
+        failed = v.failed_folds + (not v.converged)
+        remark = f"{plural(failed, 'fit')} failed, {plural(v.crossed.count, 'record')} judged" if failed else ""
+        rows.append((v.name, count(v.free), *errors, *moved, duration(v.fit_seconds), remark))
+    words = (
+        f"Distance between measured and predicted, mm; {plural(len(result.dataset), 'record')}, {result.folds} folds"
+    )
+    words += f" drawn {result.repeats} times" if result.repeats > 1 else ""
+    names = ("Free", "Train mean", "Train 95 %", "Mean", "RMS", "95 %", "Max", "Change", "Helps", "Fit")
+    return StudyTable(words, (("Variant", False), *((n, True) for n in names), ("", False)), tuple(rows))
+
+
+def transfer_table(result: TransferResult) -> StudyTable:
+    """A row for each variant and what it was trained at, errors at each payload beside one another."""
+    decimals = common_decimals([c.errors.mean for c in result.cells], most=3)
+    groups: dict[tuple[str, tuple[float, ...]], list[TransferCell]] = {}
+    for cell in result.cells:
+        groups.setdefault((cell.variant, cell.trained_g), []).append(cell)
+    rows = []
+    for (variant, trained), cells in groups.items():
+        words = " and ".join(f"{g:g} g" for g in trained) or "nominal"
+        words += f" ({plural(cells[0].failed_fits, 'fit')} failed)" if cells[0].failed_fits else ""
+        figures = [
+            fixed(x, decimals) + ("*" if trained and not cell.seen else "")
+            for cell in cells
+            for x in (cell.errors.mean, cell.errors.p95)
+        ]
+        rows.append((variant, words, *figures))
+    headings = [("Variant", False), ("Trained at", False)]
+    headings += [(f"{g:g} g, {name}", True) for g in result.payloads_g for name in ("mean", "95 %")]
+    counts = ", ".join(f"{n} at {g:g} g" for g, n in zip(result.payloads_g, result.counts, strict=True))
+    caption = f"error, mm; {'simulated' if result.simulated else 'measured'} records: {counts}. "
+    caption += "Cross-validated; with *, judged at another load than it trained at"
+    return StudyTable(caption, tuple(headings), tuple(rows))
+
+
+def _mm(value: float | None) -> str:
+    return f"{value:.3f} mm" if value is not None else "not known"

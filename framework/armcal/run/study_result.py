@@ -1,0 +1,186 @@
+"""What a study knows when it ends: everything that its files, its page and the terminal show."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from armcal.base.dataset import Dataset
+from armcal.base.domains import Array
+from armcal.solve.comparison import Change
+from armcal.solve.validation import ErrorSummary
+
+
+@dataclass(frozen=True)
+class VariantResult:
+    """One variant, judged.
+
+    Attributes:
+        name: of the variant.
+        free: how many numbers the fit may change.
+        nominal: errors without calibration (mm).
+        train: errors of a fit on all records, on the same records (mm).
+        crossed: errors of each record by a fit that did not see it (mm), the mean of each figure over the repeats.
+        at_rest: the same if nothing is known of a drift; equal where nothing drifts.
+        errors_mm: ``crossed`` record by record, mean over the repeats (N; nan where a fold did not converge).
+        change: against the variant it is compared with (mm); None for the reference itself.
+        converged: whether the fit on all records did.
+        failed_folds: how many fits of the cross-validation did not converge.
+        fit_seconds: of the fit on all records.
+        seconds: of all fits of this variant.
+    """
+
+    name: str
+    free: int
+    nominal: ErrorSummary
+    train: ErrorSummary
+    crossed: ErrorSummary
+    at_rest: ErrorSummary
+    errors_mm: Array
+    change: Change | None
+    converged: bool
+    failed_folds: int
+    fit_seconds: float
+    seconds: float
+
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {
+            "name": self.name,
+            "free": self.free,
+            "error_mm": {
+                "nominal": self.nominal.as_dict(),
+                "train": self.train.as_dict(),
+                "cross_validated": self.crossed.as_dict(),
+                "cross_validated_at_rest": self.at_rest.as_dict(),
+            },
+            "change_mm": self.change.as_dict() if self.change else None,
+            "converged": self.converged,
+            "failed_folds": self.failed_folds,
+            "seconds": {"fit": self.fit_seconds, "all_fits": self.seconds},
+        }
+
+
+@dataclass(frozen=True)
+class NestedResult:
+    """The choice itself, judged: made inside of each fold's training records, its errors on the fold (mm).
+
+    ``chosen`` is the variant that each fold chose; ``errors_mm`` (N) is nan where the chosen fit did not converge.
+    """
+
+    crossed: ErrorSummary
+    chosen: tuple[str, ...]
+    errors_mm: Array
+
+
+@dataclass(frozen=True)
+class StudyResult:
+    """A finished comparison.
+
+    Attributes:
+        name: of the study.
+        command: how to repeat it.
+        dataset: the records.
+        folds: how many.
+        repeats: how often they were drawn.
+        variants: in the order written.
+        best: the variant with the lowest cross-validated mean error, of those whose fits all converged.
+        simplest: the one with the fewest parameters within one standard error of it.
+        nested: if it was asked for.
+        warnings: of configs, data and problems.
+        seconds: of each stage.
+        provenance: hashes and versions.
+    """
+
+    name: str
+    command: str
+    dataset: Dataset
+    folds: int
+    repeats: int
+    variants: tuple[VariantResult, ...]
+    best: str
+    simplest: str
+    nested: NestedResult | None
+    warnings: tuple[str, ...]
+    seconds: dict[str, float]
+    provenance: dict[str, Any]
+
+    def variant(self, name: str) -> VariantResult:
+        """One by its name."""
+        return next(v for v in self.variants if v.name == name)
+
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        nested = self.nested
+        return {
+            "study": self.name,
+            "kind": "models",
+            "records": len(self.dataset),
+            "folds": self.folds,
+            "repeats": self.repeats,
+            "variants": [variant.as_dict() for variant in self.variants],
+            "lowest": self.best,
+            "simplest_within_one_standard_error": self.simplest,
+            "nested": nested and {"error_mm": nested.crossed.as_dict(), "chosen": list(nested.chosen)},
+            "warnings": list(self.warnings),
+            "seconds": dict(self.seconds),
+            "provenance": self.provenance,
+        }
+
+
+@dataclass(frozen=True)
+class TransferCell:
+    """One variant trained at some payloads and judged at one (mm).
+
+    ``trained_g`` is empty for the nominal model; with ``seen`` the records that judge were at a payload that also
+    trained, and were kept out of the training by folds.
+    """
+
+    variant: str
+    trained_g: tuple[float, ...]
+    judged_g: float
+    errors: ErrorSummary
+    seen: bool
+    failed_fits: int
+
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {
+            "variant": self.variant,
+            "trained_at_g": list(self.trained_g),
+            "judged_at_g": self.judged_g,
+            "error_mm": self.errors.as_dict(),
+            "cross_validated": self.seen,
+            "failed_fits": self.failed_fits,
+        }
+
+
+@dataclass(frozen=True)
+class TransferResult:
+    """A finished load transfer study; ``errors_mm`` by variant and payloads trained at, record by record."""
+
+    name: str
+    command: str
+    dataset: Dataset
+    simulated: bool
+    payloads_g: tuple[float, ...]
+    counts: tuple[int, ...]
+    cells: tuple[TransferCell, ...]
+    errors_mm: dict[tuple[str, tuple[float, ...]], Array]
+    warnings: tuple[str, ...]
+    seconds: dict[str, float]
+    provenance: dict[str, Any]
+
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {
+            "study": self.name,
+            "kind": "load_transfer",
+            "simulated": self.simulated,
+            "payloads_g": list(self.payloads_g),
+            "records": list(self.counts),
+            "cells": [cell.as_dict() for cell in self.cells],
+            "warnings": list(self.warnings),
+            "seconds": dict(self.seconds),
+            "provenance": self.provenance,
+        }

@@ -1,0 +1,201 @@
+"""Independent pieces of work, one after another, in processes, in threads or on a cluster, through joblib.
+
+A piece of work is a function of one picklable task; results come in the order of the tasks and are the same to the
+last bit wherever they were made, as long as BLAS keeps to one thread there (workers and the command line see to it).
+"""
+
+from __future__ import annotations
+
+import pickle
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Protocol, TypeVar
+
+from armcal.errors import ArmcalError, InputError, Location
+
+T = TypeVar("T")
+R = TypeVar("R")
+Told = Callable[[float], None]
+"""Told which fraction of the work is done."""
+
+WORTH_WORKERS_S = 6.0
+"""Starting worker processes takes a second or two: not worth it for less work than this."""
+_DASK_TIMEOUT = "10s"
+_OPTION = Location("--parallel")
+_FORMS = "a number of processes, loky:N, threading:N, dask:ADDRESS, ray or ray:ADDRESS"
+
+
+def untold(fraction: float) -> None:
+    """Tells nobody."""
+
+
+class Executor(Protocol):
+    """Does independent pieces of work."""
+
+    def map(self, work: Callable[[T], R], tasks: Sequence[T], told: Told = untold) -> list[R]:
+        """``work`` of each task, in order; the first exception of any ends it and is raised as it was."""
+
+
+@dataclass(frozen=True)
+class Sequential:
+    """One after another in this process."""
+
+    def map(self, work: Callable[[T], R], tasks: Sequence[T], told: Told = untold) -> list[R]:
+        """As the protocol says."""
+        results = []
+        for number, task in enumerate(tasks):
+            told(number / len(tasks))
+            results.append(work(task))
+        told(1.0)
+        return results
+
+
+@dataclass(frozen=True)
+class Automatic:
+    """One after another as long as that is quick; what is left then goes to a process on each processor."""
+
+    worth_s: float = WORTH_WORKERS_S
+
+    def map(self, work: Callable[[T], R], tasks: Sequence[T], told: Told = untold) -> list[R]:
+        """As the protocol says."""
+        results: list[R] = []
+        began = time.perf_counter()
+        for number, task in enumerate(tasks):
+            told(number / len(tasks))
+            spent = time.perf_counter() - began
+            left = len(tasks) - number
+            worth_it = number and left > 1 and spent / number * left > self.worth_s
+            if worth_it and _picklable((work, task)):
+                rest = partial(_told_of_rest, told, number / len(tasks))
+                return results + Workers().map(work, tasks[number:], rest)
+            results.append(work(task))
+        told(1.0)
+        return results
+
+
+@dataclass(frozen=True)
+class Workers:
+    """A joblib backend.
+
+    Attributes:
+        backend: ``loky`` (processes), ``threading``, ``dask`` or ``ray``.
+        count: how many at once; as many as there are processors, or the cluster's own number, if None.
+        address: of a dask scheduler or ray head.
+    """
+
+    backend: str = "loky"
+    count: int | None = None
+    address: str = ""
+
+    def map(self, work: Callable[[T], R], tasks: Sequence[T], told: Told = untold) -> list[R]:
+        """As the protocol says.
+
+        Raises:
+            InputError: the cluster is not there, or a task cannot be sent to another process.
+            ArmcalError: a worker process ended without an answer.
+        """
+        import joblib
+
+        if not tasks:
+            return []
+        if self.backend != "threading" and not _picklable((work, tasks[0])):
+            raise InputError(
+                "a component of this problem cannot be sent to another process.",
+                where=_OPTION,
+                hint="Use --parallel 1, or --parallel threading:2.",
+            )
+        results: list[R] = []
+        try:
+            with self._configured():
+                told(0.0)
+                # One at a time: a batch might hold all the long ones.
+                at_work = joblib.Parallel(return_as="generator", batch_size=1)
+                for result in at_work(joblib.delayed(work)(task) for task in tasks):
+                    results.append(result)
+                    told(len(results) / len(tasks))
+        except BrokenProcessPool as fault:
+            text = f"a worker process ended without an answer ({str(fault).splitlines()[0]})"
+            raise ArmcalError(text, where=_OPTION, hint="If memory was short, take fewer processes.") from fault
+        return results
+
+    @contextmanager
+    def _configured(self) -> Iterator[None]:
+        import joblib
+
+        count = self.count or (joblib.cpu_count() if self.backend in ("loky", "threading") else -1)
+        options: dict[str, Any] = {"backend": self.backend, "n_jobs": count}
+        if self.backend == "loky":
+            options["inner_max_num_threads"] = 1
+        if self.backend == "ray":
+            _join_ray(self.address)
+        if self.backend != "dask":
+            with joblib.parallel_config(**options):
+                yield
+            return
+        with _dask_client(self.address) as client, joblib.parallel_config(**options, client=client):
+            yield
+
+
+def _told_of_rest(told: Told, before: float, done: float) -> None:
+    told(before + (1 - before) * done)
+
+
+def parse_executor(text: str) -> Executor:
+    """What ``--parallel`` says.
+
+    Raises:
+        InputError: none of the forms.
+    """
+    backend, _, rest = text.strip().partition(":")
+    if text.strip() == "auto":
+        return Automatic()
+    if backend.isdecimal() and not rest:
+        backend, rest = "loky", backend
+    if backend in ("loky", "threading") and rest.isdecimal() and 1 <= int(rest) <= 1024:
+        return Sequential() if int(rest) == 1 else Workers(backend, int(rest))
+    if (backend == "dask" and rest) or backend == "ray":
+        return Workers(backend, address=rest)
+    raise InputError(f"found {text!r}, expected {_FORMS}.", where=_OPTION, hint="For example --parallel 4.")
+
+
+def _picklable(what: object) -> bool:
+    """Whether another process could be told this."""
+    try:
+        pickle.dumps(what)
+    except Exception:  # each library has its own way of refusing
+        return False
+    return True
+
+
+@contextmanager
+def _dask_client(address: str) -> Iterator[Any]:
+    try:
+        from distributed import Client
+    except ImportError as fault:
+        hint = 'Install it: pip install "dask[distributed]".'
+        raise InputError(f"dask's cluster library is not there ({fault}).", where=_OPTION, hint=hint) from fault
+    try:
+        client = Client(address, timeout=_DASK_TIMEOUT, set_as_default=False)
+    except (OSError, ValueError) as fault:
+        hint = "Give the scheduler's address, such as dask:tcp://127.0.0.1:8786."
+        raise InputError(f"no dask scheduler answers at {address} ({fault}).", where=_OPTION, hint=hint) from fault
+    with client:
+        yield client
+
+
+def _join_ray(address: str) -> None:
+    try:
+        import ray
+        from ray.util.joblib import register_ray
+    except ImportError as fault:
+        hint = "Install it: pip install ray."
+        raise InputError(f"ray is not there ({fault}).", where=_OPTION, hint=hint) from fault
+    try:
+        ray.init(address=address or None, ignore_reinit_error=True, log_to_driver=False)
+    except (ConnectionError, ValueError, RuntimeError) as fault:
+        raise InputError(f"no ray cluster answers ({fault}).", where=_OPTION, hint="Check its address.") from fault
+    register_ray()

@@ -1,0 +1,268 @@
+"""Independent work on processes, threads and a dask cluster: the same numbers, the same faults, no leftovers."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import signal
+import subprocess
+import sys
+import threading
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from armcal.cli.main import cli
+from armcal.errors import ArmcalError, ConfigError, InputError, Location
+from armcal.solve import parallel
+from armcal.solve.estimator import spread
+from armcal.solve.parallel import Automatic, Executor, Sequential, Workers, parse_executor
+from armcal.solve.problem import Problem
+from armcal.solve.validation import FitTask, cross_validate, fit_and_judge, folds
+from click.testing import CliRunner
+
+CONFIGS = Path(__file__).resolve().parents[2] / "configs" / "lrm_arm"
+DEMO = str(CONFIGS / "demo.yaml")
+
+
+def _setup(lrm, evaluator="interpreted", *overrides):
+    experiment = lrm.experiment("demo", "parameters.free=[arm.mdh.theta*, arm.spring.k2]", *overrides)
+    dataset = experiment.read()
+    return experiment, lrm.problem(experiment, dataset, evaluator), dataset
+
+
+def _fold_errors(lrm, executor: Executor | None) -> np.ndarray:
+    experiment, problem, dataset = _setup(lrm)
+    start, splits = experiment.parameters.nominal(), folds(len(dataset), 4, 3)
+    records = problem.records(dataset)
+    return cross_validate(problem, records, splits, experiment.estimator, start, executor=executor).errors
+
+
+@pytest.mark.parametrize(
+    "text, expected",
+    [
+        ("auto", Automatic()),
+        ("1", Sequential()),
+        ("loky:1", Sequential()),
+        ("3", Workers("loky", 3)),
+        (" 2 ", Workers("loky", 2)),
+        ("threading:2", Workers("threading", 2)),
+        ("dask:tcp://10.0.0.1:8786", Workers("dask", address="tcp://10.0.0.1:8786")),
+        ("ray", Workers("ray")),
+        ("ray:auto", Workers("ray", address="auto")),
+    ],
+)
+def test_what_the_option_says(text: str, expected: Executor) -> None:
+    assert parse_executor(text) == expected
+
+
+@pytest.mark.parametrize(
+    "text", ["", "0", "-1", "2.5", "two", "loky", "threading:", "threading:0", "dask", "dask:", "3:4"]
+)
+def test_what_the_option_cannot_say_is_bad_input(text: str) -> None:
+    done = CliRunner().invoke(cli, ["run", DEMO, "--parallel", text])
+    assert done.exit_code == 2
+    assert "--parallel" in done.output and "dask:ADDRESS" in done.output
+
+
+@pytest.mark.parametrize("evaluator", ["interpreted", "compiled"])
+def test_a_problem_sent_elsewhere_gives_the_same_bits(lrm, evaluator: str) -> None:
+    _, problem, dataset = _setup(lrm, evaluator)
+    problem.residuals(problem.parameters.nominal(), problem.records(dataset))  # fills what arms keep of expressions
+    sent = pickle.dumps(problem)
+    there = pickle.loads(sent)
+    assert there is not problem and there.backend == problem.backend
+    assert pickle.loads(sent) is there, "compiled again for every task"
+    values = problem.parameters.retract(np.full(problem.increments, 1e-3))
+    ours, theirs = (p.normal_equations(values, p.records(dataset)) for p in (problem, there))
+    assert ours.cost == theirs.cost
+    assert np.array_equal(ours.gradient, theirs.gradient) and np.array_equal(ours.hessian, theirs.hessian)
+
+
+@pytest.mark.parametrize(
+    "executor", [Workers("loky", 2), Workers("loky", 3), Workers("threading", 2), Automatic(worth_s=0.0), Automatic()]
+)
+def test_every_backend_gives_the_same_bits(lrm, executor: Executor) -> None:
+    assert np.array_equal(_fold_errors(lrm, executor), _fold_errors(lrm, None))
+
+
+def test_the_order_of_folds_does_not_change_a_fold(lrm) -> None:
+    """No fit warms another's equilibria."""
+    experiment, problem, dataset = _setup(lrm)
+    records, start = problem.records(dataset), experiment.parameters.nominal()
+    tasks = [FitTask(problem, experiment.estimator, start, records, s) for s in folds(len(dataset), 3, 0)]
+    forth, back = Sequential().map(fit_and_judge, tasks), Sequential().map(fit_and_judge, tasks[::-1])
+    for one, other in zip(forth, back[::-1], strict=True):
+        assert np.array_equal(one.errors, other.errors)
+
+
+def _who(task: float) -> tuple[float, int]:
+    time.sleep(0.15)
+    return task, os.getpid()
+
+
+def test_results_come_in_the_order_of_the_tasks_from_several_processes_and_progress_ends_at_one() -> None:
+    told: list[float] = []
+    found = Workers("loky", 2).map(_who, list(range(8)), told.append)
+    assert [task for task, _ in found] == list(range(8))
+    assert len({pid for _, pid in found}) == 2 and os.getpid() not in {pid for _, pid in found}
+    assert told == sorted(told) and told[-1] == 1.0
+
+
+def test_work_that_lasts_is_handed_over_and_work_that_does_not_stays() -> None:
+    told: list[float] = []
+    shared = Automatic(worth_s=0.3).map(_who, list(range(8)), told.append)
+    assert [task for task, _ in shared] == list(range(8))
+    assert shared[0][1] == os.getpid() != shared[-1][1]
+    assert told == sorted(told) and told[-1] == 1.0
+    assert {pid for _, pid in Automatic(worth_s=60).map(_who, [1, 2])} == {os.getpid()}
+
+
+def test_nothing_to_do_is_done() -> None:
+    for executor in (Sequential(), Automatic(), Workers("loky", 2)):
+        assert executor.map(_who, []) == []
+
+
+def _refuse(task: int) -> int:
+    if task == 3:
+        raise ConfigError("found 3.", where=Location("a.yaml", 7), hint="Give another.")
+    return task
+
+
+@pytest.mark.parametrize("executor", [Sequential(), Workers("loky", 2), Workers("threading", 2)])
+def test_a_fault_arrives_as_it_was_raised(executor: Executor) -> None:
+    with pytest.raises(ConfigError) as caught:
+        executor.map(_refuse, list(range(6)))
+    fault = caught.value
+    assert type(fault) is ConfigError and fault.exit_code == 2
+    assert str(fault) == "a.yaml:7: found 3. Give another."
+    assert (fault.message, fault.where, fault.hint) == ("found 3.", Location("a.yaml", 7), "Give another.")
+
+
+def _die(task: int) -> int:
+    if task == 2:
+        os._exit(9)
+    return task
+
+
+def test_a_worker_that_is_killed_is_said_and_the_next_work_finds_new_ones() -> None:
+    with pytest.raises(ArmcalError, match="worker process ended"):
+        Workers("loky", 2).map(_die, list(range(4)))
+    assert Workers("loky", 2).map(_refuse, [1, 2]) == [1, 2]
+
+
+def test_what_cannot_be_sent_stays_here_or_is_refused() -> None:
+    tasks = [threading.Lock() for _ in range(4)]
+    assert Automatic(worth_s=0.0).map(_locked, tasks) == [False] * 4
+    with pytest.raises(InputError, match="cannot be sent") as caught:
+        Workers("loky", 2).map(_locked, tasks)
+    assert "threading" in caught.value.hint
+    assert Workers("threading", 2).map(_locked, tasks) == [False] * 4
+
+
+def _locked(task: threading.Lock) -> bool:
+    return task.locked()
+
+
+def test_starts_of_one_fit_can_be_spread(lrm) -> None:
+    experiment, problem, dataset = _setup(lrm, "interpreted", "estimator.starts=4", "estimator.seed=2")
+    start = experiment.parameters.nominal()
+    found = [
+        spread(experiment.estimator, executor).solve(problem, problem.records(dataset), start)
+        for executor in (None, Workers("loky", 2))
+    ]
+    assert np.array_equal(found[0].values, found[1].values)
+    assert [replace(each.verdict, seconds=0.0) for each in found].count(replace(found[0].verdict, seconds=0.0)) == 2
+    assert found[0].verdict.starts == 4
+
+
+def test_workers_keep_blas_to_one_thread() -> None:
+    found = Workers("loky", 2).map(_blas, [None])
+    assert found == ["1"]
+
+
+def _blas(task: None) -> str | None:
+    return os.environ.get("OPENBLAS_NUM_THREADS")
+
+
+def test_a_dask_cluster_of_two_processes_gives_the_same_bits(lrm) -> None:
+    distributed = pytest.importorskip("distributed", reason='needs: pip install "dask[distributed]"')
+    local = distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None, host="127.0.0.1"
+    )
+    with local as cluster:
+        cluster.wait_for_workers(2)
+        executor = parse_executor(f"dask:{cluster.scheduler_address}")
+        pids = {pid for _, pid in executor.map(_who, list(range(8)))}
+        assert len(pids) == 2 and os.getpid() not in pids
+        assert np.array_equal(_fold_errors(lrm, executor), _fold_errors(lrm, None))
+        with pytest.raises(ConfigError, match=r"a.yaml:7: found 3\. Give another\."):
+            executor.map(_refuse, list(range(6)))
+
+
+def test_a_cluster_that_is_not_there_is_bad_input(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("distributed", reason='needs: pip install "dask[distributed]"')
+    monkeypatch.setattr(parallel, "_DASK_TIMEOUT", "1s")
+    with pytest.raises(InputError, match="no dask scheduler answers"):
+        parse_executor("dask:tcp://127.0.0.1:1").map(_refuse, [1])
+
+
+@pytest.mark.parametrize("backend, library", [("dask:tcp://127.0.0.1:1", "distributed"), ("ray", "ray")])
+def test_a_cluster_library_that_is_missing_is_named(
+    monkeypatch: pytest.MonkeyPatch, backend: str, library: str
+) -> None:
+    monkeypatch.setitem(sys.modules, library, None)
+    with pytest.raises(InputError, match="pip install"):
+        parse_executor(backend).map(_refuse, [1])
+
+
+def test_ctrl_c_stops_all_workers(tmp_path: Path) -> None:
+    long = ["study", str(CONFIGS / "study_demo.yaml"), "--out", str(tmp_path / "s"), "--parallel", "2"]
+    long += ["--set", "study.repeats=1000", "--set", "evaluator=interpreted"]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "armcal.cli", *long],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    )
+    deadline = time.monotonic() + 60
+    while len(_members(process.pid)) < 3 and time.monotonic() < deadline:
+        time.sleep(0.2)
+    time.sleep(1.0)
+    workers = _members(process.pid)
+    assert len(workers) >= 3, "no workers were started"
+    process.send_signal(signal.SIGINT)
+    _, told = process.communicate(timeout=60)
+    assert process.returncode == 1 and "Aborted" in told and "Traceback" not in told
+    while _members(process.pid) and time.monotonic() < deadline + 30:
+        time.sleep(0.2)
+    assert _members(process.pid) == []
+    assert not (tmp_path / "s" / "study.json").exists()
+
+
+def _members(session: int) -> list[int]:
+    """Processes of a session that are not mere zombies."""
+    found = []
+    for place in Path("/proc").glob("[0-9]*"):
+        try:
+            state, _, _, owner = (place / "stat").read_text().rpartition(")")[2].split()[:4]
+        except OSError:
+            continue
+        if int(owner) == session and state != "Z":
+            found.append(int(place.name))
+    return found
+
+
+def test_a_problem_is_its_own_blueprint(lrm) -> None:
+    """What is compiled anew elsewhere is what was asked for here."""
+    experiment, problem, dataset = _setup(lrm)
+    b = problem.blueprint
+    again = Problem.build(b.arms, b.measurements, b.parameters, b.environment, dataset, "interpreted")
+    assert b.parameters is problem.parameters and b.channels == frozenset(dataset.channels)
+    start = experiment.parameters.nominal()
+    pair = [np.vstack(p.residuals(start, p.records(dataset))) for p in (problem, again)]
+    assert np.array_equal(*pair)
