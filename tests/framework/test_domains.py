@@ -9,6 +9,7 @@ import pytest
 from armcal.base.domains import Interval, Pose, Rotation, ScrewAxis, Semidefinite, symmetric
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.linalg import sqrtm
 from scipy.spatial.transform import Rotation as Reference
 
 DOMAINS = [Interval(), Rotation(), Pose(), ScrewAxis(), Semidefinite()]
@@ -66,8 +67,8 @@ def test_local_gives_back_the_increment_that_retract_was_given(domain, seed):
     random = np.random.default_rng(seed)
     base, delta = made_up(domain, random), increment(domain, random, 0.4)
     if isinstance(domain, Semidefinite):
-        # Only factors with a positive diagonal are Cholesky factors: keep it positive.
-        delta *= 0.5 * np.linalg.cholesky(symmetric(base)).diagonal().min()
+        # Only a semidefinite matrix is the root of its square: keep it so.
+        delta *= 0.5 * math.sqrt(np.linalg.eigvalsh(symmetric(base)).min())
     found = domain.local(base, domain.retract(base, delta))
     np.testing.assert_allclose(found, delta, rtol=0, atol=1e-8 if isinstance(domain, Semidefinite) else 1e-12)
 
@@ -204,6 +205,70 @@ def test_a_semidefinite_value_of_lower_rank_can_be_written_as_an_increment():
     assert Semidefinite().check(edge) == ""
     found = Semidefinite().retract(base, Semidefinite().local(base, edge))
     np.testing.assert_allclose(found, edge, rtol=0, atol=1e-15)
+
+
+@checked
+@given(seed=seeds)
+def test_an_increment_of_a_semidefinite_matrix_is_added_to_its_symmetric_root(seed):
+    random = np.random.default_rng(seed)
+    base, delta = made_up(Semidefinite(), random), random.normal(size=6)
+    root = np.real(sqrtm(symmetric(base))) + symmetric(delta)
+    found = symmetric(Semidefinite().retract(base, delta))
+    np.testing.assert_allclose(found, root @ root, rtol=0, atol=1e-12 * np.abs(found).max())
+
+
+@every_domain
+@checked
+@given(seed=seeds)
+def test_coordinates_lead_to_the_place_they_were_taken_of(domain, seed):
+    random = np.random.default_rng(seed)
+    base, delta = made_up(domain, random), increment(domain, random, 0.1)
+    coordinates = domain.coordinates(base, delta)
+    back = domain.from_coordinates(base, coordinates)
+    same_value(domain, domain.retract(base, delta), domain.retract(base, back), 1e-9)
+
+
+@every_domain
+def test_the_jacobian_of_coordinates_is_that_of_differences(domain):
+    random, step = np.random.default_rng(8), 1e-6
+    for _ in range(10):
+        base, delta = made_up(domain, random), increment(domain, random, 0.1)
+        sides = [
+            [domain.coordinates(base, delta + sign * shift) for shift in step * np.eye(domain.dof)] for sign in (1, -1)
+        ]
+        numeric = (np.array(sides[0]) - np.array(sides[1])).T / (2 * step)
+        found = domain.coordinates_jacobian(base, delta)
+        np.testing.assert_allclose(found, numeric, rtol=0, atol=1e-7 * max(1.0, np.abs(found).max()))
+
+
+@every_domain
+def test_entries_move_with_coordinates_as_differences_say(domain):
+    random, step = np.random.default_rng(9), 1e-6
+    for _ in range(10):
+        base, delta = made_up(domain, random), increment(domain, random, 0.05)
+        at = domain.coordinates(base, delta)
+        sides = []
+        for sign in (1, -1):
+            moved = [domain.from_coordinates(base, at + sign * shift) for shift in step * np.eye(domain.dof)]
+            sides.append(np.array([domain.retract(base, one) for one in moved]))
+        numeric = (sides[0] - sides[1]).T / (2 * step)
+        found = domain.entries_jacobian(base, domain.from_coordinates(base, at))
+        np.testing.assert_allclose(found, numeric, rtol=0, atol=1e-6 * max(1.0, np.abs(found).max()))
+
+
+@checked
+@given(seed=seeds)
+def test_coordinates_outside_the_cone_lead_to_the_nearest_matrix_inside(seed):
+    """Nearest by Frobenius' norm: negative eigenvalues become zero."""
+    random = np.random.default_rng(seed)
+    base = made_up(Semidefinite(), random)
+    matrix = random.normal(size=(3, 3))
+    matrix = matrix + matrix.T
+    outside = matrix[np.triu_indices(3)] - base
+    found = symmetric(Semidefinite().retract(base, Semidefinite().from_coordinates(base, outside)))
+    sizes, directions = np.linalg.eigh(matrix)
+    nearest = directions @ np.diag(np.maximum(sizes, 0)) @ directions.T
+    np.testing.assert_allclose(found, nearest, rtol=0, atol=1e-12 * max(1.0, np.abs(base).max()))
 
 
 @pytest.mark.parametrize(

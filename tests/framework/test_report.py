@@ -67,7 +67,7 @@ def estimate_of(parameters: Parameters, freedom: int = 700, undetermined: int = 
         design[:, 2] = design[:, 1] + 0.2 * design[:, 2]
     design[:, count - undetermined : count] = 0.0
     triangle = np.linalg.qr(design / scales)[1] if count else np.zeros((0, 0))
-    known = analyse(triangle, scales, parameters.increment_names)
+    known = analyse(triangle, scales, parameters.coordinate_names)
     chain = parameters.retract_jacobian(np.zeros(count))
     inverse = np.linalg.pinv((triangle * scales).T @ (triangle * scales), rcond=1e-16, hermitian=True)
     covariance = 0.05 * chain @ (scales[:, None] * inverse * scales) @ chain.T

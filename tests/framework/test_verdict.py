@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from html import escape
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from armcal.solve.estimator import estimate
 from armcal.solve.identifiability import POOR_CONDITION, analyse
 from armcal.solve.problem import Problem
 from armcal.solve.suggestion import suggest
+from armcal.solve.verdict import _good_for
 from click.testing import CliRunner
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs" / "lrm_arm"
@@ -26,7 +28,10 @@ def sentences(folder: Path, *settings: str, data: Path = CONFIGS / "demo.csv") -
     flags = [x for s in (*settings, "validation.folds=0", "evaluator=interpreted") for x in ("--set", s)]
     result = CliRunner().invoke(cli, ["run", DEMO, "--data", str(data), "--out", str(folder), "--json", *flags])
     assert result.exit_code == 0, result.output
-    return "\n".join(f"{f['grade']}: {f['text']}" for f in json.loads(result.stdout)["verdict"]["findings"])
+    findings = json.loads(result.stdout)["verdict"]["findings"]
+    assert all(f["test"] for f in findings if f["grade"] == "good"), "a finding without a test"
+    assert all(f["action"] for f in findings if f["grade"] in ("bad", "warning")), "a warning that tells nothing to do"
+    return "\n".join(f"{f['grade']}: {f['text']}" for f in findings)
 
 
 def disturbed(tmp_path: Path, change) -> Path:
@@ -47,6 +52,7 @@ def test_sound_data_gives_no_warning(tmp_path: Path) -> None:
     assert "warning:" not in told and "bad:" not in told
     assert "good: Residuals are as large as the declared noise" in told
     assert "good: Residuals of neighbouring records do not correlate" in told
+    assert "good: Of" in told and "none explains the error left" in told
 
 
 def test_a_noise_stated_too_small_or_too_large_is_noticed(tmp_path: Path) -> None:
@@ -56,7 +62,9 @@ def test_a_noise_stated_too_small_or_too_large_is_noticed(tmp_path: Path) -> Non
 
 def test_a_drift_of_the_tracker_shows_as_correlated_neighbours(tmp_path: Path) -> None:
     data = disturbed(tmp_path, lambda points: points + 3 * np.sin(np.linspace(0, 9, len(points)))[:, None])
-    assert "warning: Residuals of neighbouring records correlate" in sentences(tmp_path / "run", data=data)
+    told = sentences(tmp_path / "run", data=data)
+    assert "warning: Residuals still depend on the recorded order" in told
+    assert "Residuals of neighbouring records correlate by" in told
 
 
 def test_gross_errors_are_counted(tmp_path: Path) -> None:
@@ -73,6 +81,80 @@ def test_data_that_wants_a_negative_compliance_pushes_against_its_bound(tmp_path
     told = sentences(tmp_path / "run", "statics.gravity_m_s2=[0, 0, 9.81]")
     assert "warning: The data pushes against a bound" in told
     assert "arm.spring.k1" in told.split("pushes against a bound")[1].splitlines()[0]
+
+
+def verdict(folder: Path, *settings: str, data: Path = CONFIGS / "demo.csv") -> dict:
+    """The JSON of a run."""
+    flags = [x for s in (*settings, "evaluator=interpreted") for x in ("--set", s)]
+    result = CliRunner().invoke(cli, ["run", DEMO, "--data", str(data), "--out", str(folder), "--json", *flags])
+    assert result.exit_code == 0, result.output
+    return json.loads(result.stdout)
+
+
+def test_missed_records_are_listed_where_the_limit_says(tmp_path: Path) -> None:
+    """Every judged record beyond the limit, by its held-out error, in the JSON, the verdict and the report."""
+
+    def spoil(points):
+        points[[7, 90]] += 12
+        return points
+
+    data = disturbed(tmp_path, spoil)
+    run = verdict(tmp_path / "run", "validation.holdout=0", "validation.limit_mm=6", data=data)
+    missed = run["structure"]["misses"]
+    assert {m["record_id"] for m in missed["explained"]} == {"8", "91"} and missed["beyond"] == 2
+    assert missed["judged"] == 200 and missed["configured"]
+    assert all(m["error_mm"] > 15 and m["advice"] for m in missed["explained"])
+    finding = next(f for f in run["verdict"]["findings"] if "missed by more than 6.00 mm" in f["text"])
+    assert finding["grade"] == "warning" and "validation.limit_mm" in finding["test"]
+    assert "Missed by more than 6.00 mm" in run["verdict"]["paragraph"]
+    assert "missed by more than 6.00 mm by fits that did not see them" in (tmp_path / "run" / "report.html").read_text()
+    relaxed = verdict(tmp_path / "relaxed", "validation.holdout=0", "validation.limit_mm=60", data=data)
+    assert relaxed["structure"]["misses"]["beyond"] == 0
+
+
+@pytest.mark.parametrize("limit", ["limit_mm=0", "limit_mm=-3", "limit=4"])
+def test_a_limit_that_is_none_is_refused(tmp_path: Path, limit: str) -> None:
+    flags = ["--set", f"validation.{limit}", "--out", str(tmp_path / "run")]
+    result = CliRunner().invoke(cli, ["run", DEMO, *flags])
+    assert result.exit_code == 2 and "limit" in result.output and "mm" in result.output
+
+
+def test_the_tolerance_is_good_for_its_share_with_its_confidence() -> None:
+    """In 95 % of experiments the limit stated lies above the true 95 % quantile; one order statistic less would not."""
+    rng, sure, count = np.random.default_rng(0), 0, 120
+    for _ in range(2000):
+        errors = rng.exponential(size=count)
+        limit = float(_good_for(errors, "x").split("+- ")[1].split(" mm")[0])
+        sure += limit >= -np.log(0.05)
+    assert 0.94 <= sure / 2000 <= 0.99
+    assert "too few" in _good_for(rng.exponential(size=58), "x") and "+-" in _good_for(rng.exponential(size=59), "x")
+    assert "not known" in _good_for(np.zeros(0), "x")
+
+
+def test_what_priors_alone_hold_is_a_note_where_the_tip_does_not_depend_on_it(tmp_path: Path) -> None:
+    """A twist behind the last joint trades with a turn of the tool: a gauge."""
+    freed = "parameters.free=[arm.mdh.alpha6, arm.mdh.tool_rx, arm.mdh.tool_z, arm.mdh.theta2, arm.mdh.base_z]"
+    priors = 'parameters.priors={"*.alpha6": 2 deg, "*.tool_rx": 2 deg}'
+    run = verdict(tmp_path / "run", freed, priors, "validation.folds=0")
+    found = next(f for f in run["verdict"]["findings"] if "held by priors alone" in f["text"])
+    assert found["grade"] == "note" and "does not depend on them" in found["text"]
+    assert len(found["text"]) < 200 and "armcal identify" in found["action"]
+    assert run["structure"]["priors_alone"]["worst_mm"] < 1e-6
+    assert "Not determined" in run["verdict"]["paragraph"]
+
+
+def test_terminal_and_report_say_what_the_json_says(tmp_path: Path) -> None:
+    settings = ["--set", "evaluator=interpreted", "--set", "validation.holdout=0"]
+    run = ["run", DEMO, "--out", str(tmp_path / "run"), *settings]
+    shown = " ".join(CliRunner().invoke(cli, run).stdout.split())
+    page = " ".join((tmp_path / "run" / "report.html").read_text().split())
+    told = json.loads((tmp_path / "run" / "metrics.json").read_text())["verdict"]
+    assert told["paragraph"].startswith("Good for +- ") and told["paragraph"] in shown
+    assert escape(told["paragraph"], quote=False).replace("'", "&#39;") in page
+    for finding in told["findings"]:
+        for part in ("text", "test", "action"):
+            assert escape(finding[part], quote=False).replace("'", "&#39;") in page
+    assert told["findings"][0]["text"].split()[0] in shown
 
 
 def test_a_poor_condition_is_told_and_not_called_undetermined() -> None:

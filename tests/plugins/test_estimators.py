@@ -146,7 +146,7 @@ def test_scipys_trust_region_finds_the_same_on_the_oracles_residual(lrm, bounded
         problem, records, start = posed(lrm, names, q, measured)
         solution = estimator(name).solve(problem, records, start)
         fitted(problem, solution)
-        sd = dict(zip(problem.parameters.increment_names, deviations(problem, records, solution), strict=True))
+        sd = dict(zip(problem.parameters.coordinate_names, deviations(problem, records, solution), strict=True))
         # An interior method stops a little inside its bounds: a hundredth of a deviation, and no lower cost.
         for n, x in zip(names, scipys.x, strict=True):
             mine = solution.values[problem.parameters.entries_of(oracle.armcal_name(n))][0]
@@ -169,7 +169,7 @@ def test_the_answer_satisfies_the_conditions_of_an_optimum_within_bounds(lrm, na
         moved = {**oracle.nominal(), **found, **change}
         return 0.5 * np.sum((oracle.tip(moved, q) - measured) ** 2) / NOISE_M**2
 
-    order = {n: i for i, n in enumerate(problem.parameters.increment_names)}
+    order = {n: i for i, n in enumerate(problem.parameters.coordinate_names)}
     held = 0
     for n in FEW:
         size = sd[order[oracle.armcal_name(n)]]
@@ -406,7 +406,7 @@ def known_of(lrm, names):
     q, measured = simulated(oracle.nominal(), 60, 18)
     problem, records, start = posed(lrm, names, q, measured)
     triangle = problem.triangular_factor(start, records)
-    found = analyse(triangle, problem.parameters.scales(), problem.parameters.increment_names)
+    found = analyse(triangle, problem.parameters.scales(), problem.parameters.coordinate_names)
     return found, problem, records, start
 
 

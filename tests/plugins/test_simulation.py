@@ -54,7 +54,7 @@ def test_without_noise_the_truth_comes_back(solver: str) -> None:
     assert solution.verdict.converged
     free = list(loaded.parameters.free_entries)
     away = np.abs(solution.values - truth(loaded))[free] / loaded.parameters.scales()
-    assert away.max() < 1e-6, loaded.parameters.increment_names[int(np.argmax(away))]
+    assert away.max() < 1e-6, loaded.parameters.coordinate_names[int(np.argmax(away))]
 
 
 def test_intervals_hold_the_truth_as_often_as_they_say() -> None:
@@ -77,7 +77,7 @@ def test_intervals_hold_the_truth_as_often_as_they_say() -> None:
         one_sided.append([i.one_sided for i in intervals])
     share = np.mean(held, axis=0)
     near = np.mean(one_sided, axis=0) > 0
-    names = np.array(loaded.parameters.increment_names)
+    names = np.array(loaded.parameters.coordinate_names)
     assert list(names[near]) == ["arm.spring.k6"]
     assert 0.94 <= share[~near].mean() <= 0.96
     assert share[~near].min() >= 0.90 and share[~near].max() <= 0.99, dict(zip(names, share, strict=True))

@@ -15,6 +15,7 @@ from rich.console import Console
 
 from armcal.plugins import PluginRegistry
 from armcal.solve.estimator import Progress, no_progress
+from armcal.solve.parallel import parse_executor
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -100,6 +101,17 @@ def overrides(command: F) -> F:
     """The option --set."""
     return click.option(
         "--set", "overrides", multiple=True, metavar="KEY=VALUE", help="Change a configured value: --set a.b=value."
+    )(command)
+
+
+def parallel(command: F) -> F:
+    """The option --parallel, handed on as an executor."""
+    return click.option(
+        "--parallel",
+        default="auto",
+        metavar="N|BACKEND",
+        callback=lambda ctx, option, text: parse_executor(text),
+        help="Processes for independent fits: N, threading:N, dask:ADDRESS, ray [default: auto].",
     )(command)
 
 

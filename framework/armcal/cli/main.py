@@ -14,7 +14,10 @@ from armcal.errors import EXIT_FAULT, ArmcalError
 COMMANDS = {
     "run": ("armcal.cli.run:run", "Calibrate: load, check, fit, validate, report."),
     "check": ("armcal.cli.check:check", "Everything that can be known before solving."),
+    "identify": ("armcal.cli.identify:identify", "Which parameters the poses determine; a minimal set of them."),
+    "study": ("armcal.cli.study:study", "Compare model variants by cross-validated error, or by load transfer."),
     "predict": ("armcal.cli.predict:predict", "Where a calibrated arm goes for commanded joint angles."),
+    "plan": ("armcal.cli.plan:plan", "Which poses to measure: the best few, and how good any could be."),
     "simulate": ("armcal.cli.simulate:simulate", "Make measurements up from a stated truth."),
     "plugins": ("armcal.cli.plugins:plugins", "List plugins, or check one."),
 }

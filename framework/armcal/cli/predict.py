@@ -2,46 +2,157 @@
 
 from __future__ import annotations
 
+import csv
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any, Literal
 
 import click
+import numpy as np
 
 from armcal.base.config_text import ConfigText
+from armcal.base.dataset import Dataset
+from armcal.base.domains import Array
+from armcal.base.units import split_suffix, to_unit
 from armcal.cli.common import Voice, speaking
-from armcal.errors import DataError, Location
-from armcal.measure.csv_writer import write_csv
+from armcal.errors import DataError, InputError, Location
+from armcal.measure.csv_writer import column_names, write_csv
 from armcal.measure.environment import noticed
-from armcal.measure.reader import ReadRequest, wanted_channels
-from armcal.plugins import discover
+from armcal.measure.reader import ReadRequest, WantedChannel, wanted_channels
+from armcal.plugins import PluginRegistry, discover
 from armcal.use.calibration import Calibration
+from armcal.use.intervals import PlusMinus
+
+_RECORDINGS: Mapping[str, Literal["same", "new"]] = {"calibrated": "same", "new": "new"}
 
 
 @click.command()
 @click.argument("calibration", type=click.Path(path_type=Path))
 @click.option("--poses", required=True, type=click.Path(path_type=Path), help="A CSV of commanded joint angles.")
 @click.option("--out", required=True, type=click.Path(path_type=Path), help="The CSV to write.")
+@click.option(
+    "--recording",
+    type=click.Choice(list(_RECORDINGS)),
+    default="new",
+    show_default=True,
+    help="Whether the poses belong to the calibration's recording, which tells how parameters drifted.",
+)
+@click.option("--columns", multiple=True, metavar="NAME=COLUMN", help="What the CSV calls a column: sequence=pose_id.")
 @speaking
-def predict(voice: Voice, calibration: Path, poses: Path, out: Path) -> None:
-    """Predict the tip of the arm in CALIBRATION for each row of commanded joint angles."""
+def predict(voice: Voice, calibration: Path, poses: Path, out: Path, recording: str, columns: tuple[str, ...]) -> None:
+    """Predict the tip of the arm in CALIBRATION for each row of commanded joint angles, and how far it may be off."""
     registry = discover()
     voice.plugin_faults(registry)
     loaded = Calibration.load(calibration, registry)
     system = loaded.system
+    commands = _read(registry, loaded, poses, columns)
+    _tell_missing(voice, loaded, commands, recording)
+    channels, _ = loaded.predict(commands)
+    found = None
+    if loaded.record.prediction is None:
+        voice.warn("the calibration keeps nothing about the errors of predictions: run it again to have them.")
+    else:
+        found = loaded.plus_minus(commands, _RECORDINGS[recording])
+        channels = {name: values + found.shift.get(name, 0.0) for name, values in channels.items()}
+    if out.resolve() == poses.resolve():
+        raise DataError("it is the file of poses itself.", where=Location(str(out)), hint="Give another --out.")
+    wanted = wanted_channels(system.arms, system.measurements, measured=False)
+    shown = [channel for channel in wanted if channel.channel in channels]
+    extra = _columns(found, shown) if found else {}
+    write_csv(out, replace(commands, channels=channels, extra=extra), shown)
+    voice.result(
+        {
+            "poses": len(commands),
+            "set_aside": len(commands.set_aside),
+            "out": str(out),
+            "recording": recording,
+            **_typical(found),
+        }
+    )
+    voice.out.print(f"{len(commands)} poses predicted: {out}", markup=False)
+    if found is not None and found.radii:
+        told = _typical(found)
+        voice.out.print(
+            f"+- {told['half_width_90_mm']:.2f} mm a coordinate (90 %), {told['radius_95_mm']:.2f} mm in all (95 %), "
+            "in the median pose",
+            markup=False,
+        )
+
+
+def _read(registry: PluginRegistry, loaded: Calibration, poses: Path, columns: Sequence[str]) -> Dataset:
+    """The commands. Measured columns, if there are any, are not read: every row gets its prediction."""
+    arms = loaded.system.arms
+    wanted = wanted_channels(arms, {}, measured=False)
     reader_class = registry.find("reader", "csv").load()
-    reader = reader_class(reader_class.Settings(path=ConfigText(str(poses))))
-    # Measured columns, if there are any, are not read: every row of commands gets its prediction.
-    commands = noticed(reader.read(ReadRequest(system.arms, {}, wanted_channels(system.arms, {}, measured=False))))
-    missing = [name for name in loaded.record.environment_columns if not commands.has(name) and name != "time"]
+    named = {**_kept(loaded, poses, wanted), **_given(columns)}
+    reader = reader_class(reader_class.Settings(path=ConfigText(str(poses)), columns=named))
+    return noticed(reader.read(ReadRequest(arms, {}, wanted)))
+
+
+def _kept(loaded: Calibration, poses: Path, wanted: Sequence[WantedChannel]) -> dict[str, str]:
+    """What the calibration's data called the columns that a prediction uses, as far as the file has them."""
+    kept = loaded.record.prediction
+    used = {name for channel in wanted for name in channel.columns}
+    try:
+        with poses.open(encoding="utf-8-sig", newline="") as file:
+            header = {cell.strip() for cell in next(csv.reader(file), [])}
+    except (OSError, UnicodeDecodeError, csv.Error):
+        return {}  # the reader says what is wrong
+    columns = kept.columns if kept else {}
+    return {
+        name: own
+        for name, own in columns.items()
+        if own in header and name not in header and (name in used or (split_suffix(name) or (name,))[0] in used)
+    }
+
+
+def _given(columns: Sequence[str]) -> dict[str, str]:
+    for text in columns:
+        name, found, own = text.partition("=")
+        if not (name.strip() and found and own.strip()):
+            raise InputError(
+                f"found {text!r}, expected NAME=COLUMN.",
+                where=Location("--columns"),
+                hint="For example --columns sequence=pose_id.",
+            )
+    return {text.partition("=")[0].strip(): text.partition("=")[2].strip() for text in columns}
+
+
+def _tell_missing(voice: Voice, loaded: Calibration, commands: Dataset, recording: str) -> None:
+    """What the calibration knew and these poses do not say."""
+    order = ("time", "sequence")
+    missing = [name for name in loaded.record.environment_columns if not commands.has(name) and name not in order]
     if missing:
         voice.warn(f"the calibration's records had {', '.join(missing)}; these poses take the configured values.")
     for text in commands.warnings:
         voice.warn(text)
-    channels, _ = loaded.predict(commands)
-    if out.resolve() == poses.resolve():
-        raise DataError("it is the file of poses itself.", where=Location(str(out)), hint="Give another --out.")
-    predicted = replace(commands, channels=channels, extra={})
-    wanted = wanted_channels(system.arms, system.measurements, measured=False)
-    write_csv(out, predicted, [channel for channel in wanted if channel.channel in channels])
-    voice.result({"poses": len(commands), "set_aside": len(commands.set_aside), "out": str(out)})
-    voice.out.print(f"{len(commands)} poses predicted: {out}", markup=False)
+    kept = loaded.record.prediction
+    if kept is not None and kept.recording is None and recording == "calibrated":
+        voice.warn("no parameter drifts in this calibration: all recordings are alike.")
+
+
+def _columns(found: PlusMinus, shown: Sequence[WantedChannel]) -> dict[str, tuple[str, ...]]:
+    """Half widths of 90 % intervals beside each channel, and 95 % radii in mm."""
+    columns = {}
+    for channel, (column, unit) in column_names(shown).items():
+        if channel in found.half_widths:
+            columns[f"plus_minus_{column}"] = _texts(to_unit(found.half_widths[channel], unit))
+    for name, radius in found.radii.items():
+        columns["radius95_mm" if len(found.radii) == 1 else f"{name}.radius95_mm"] = _texts(to_unit(radius, "mm"))
+    return columns
+
+
+def _texts(values: Array) -> tuple[str, ...]:
+    return tuple(f"{value:.6g}" for value in values.tolist())
+
+
+def _typical(found: PlusMinus | None) -> dict[str, Any]:
+    """Medians over the poses (mm)."""
+    if found is None or not found.radii:
+        return {}
+    half = [found.half_widths[f"{name}.{axis}"] for name in found.radii for axis in "xyz"]
+    return {
+        "half_width_90_mm": float(np.median(np.concatenate(half))) * 1000,
+        "radius_95_mm": float(np.median(np.concatenate(list(found.radii.values())))) * 1000,
+    }

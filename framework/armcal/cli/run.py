@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from armcal.cli.common import Voice, command_line, overrides, speaking
+from armcal.cli.common import Voice, command_line, overrides, parallel, speaking
 from armcal.cli.tables import show_run
 from armcal.errors import EXIT_NOT_CONVERGED
 from armcal.plugins import discover
@@ -15,6 +15,7 @@ from armcal.report import render
 from armcal.run import outputs
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import Stopwatch, calibrate
+from armcal.solve.parallel import Executor
 
 
 @click.command()
@@ -22,8 +23,11 @@ from armcal.run.pipeline import Stopwatch, calibrate
 @click.option("--data", type=click.Path(path_type=Path), help="A dataset to read instead of the configured one.")
 @click.option("--out", type=click.Path(path_type=Path), help="Where the results go [default: runs/NAME of CONFIG].")
 @overrides
+@parallel
 @speaking
-def run(voice: Voice, config: Path, data: Path | None, out: Path | None, overrides: tuple[str, ...]) -> None:
+def run(
+    voice: Voice, config: Path, data: Path | None, out: Path | None, overrides: tuple[str, ...], parallel: Executor
+) -> None:
     """Calibrate the arm that CONFIG describes: load, check, fit, validate, report."""
     watch = Stopwatch()
     folder = out or Path("runs") / config.stem
@@ -32,11 +36,16 @@ def run(voice: Voice, config: Path, data: Path | None, out: Path | None, overrid
     voice.plugin_faults(registry)
     experiment = Experiment.load(config, overrides, data, registry)
     with voice.progress() as progress:
-        result = calibrate(experiment, command_line(), progress, watch)
+        result = calibrate(experiment, command_line(), progress, watch, parallel)
     for text in result.warnings:
         voice.warn(text)
     for aside in result.dataset.set_aside:
         voice.detail(f"set aside: row {aside.row}, record {aside.record_id}: {aside.reason}")
+    for record in result.noise.suspicious:
+        voice.detail(
+            f"suspicious: row {record.row}, record {record.record_id}: {record.deviations:.1f} sd "
+            f"(limit {record.limit:.1f}), {record.fate}"
+        )
     for stage, seconds in result.seconds.items():
         voice.detail(f"{stage}: {seconds:.3f} s")
     voice.detail(f"evaluated by: {result.backend}")

@@ -5,10 +5,15 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
+import numpy as np
+from rich.box import HORIZONTALS
+from rich.markup import escape
 from rich.table import Table
 
+from armcal.base.domains import Semidefinite, symmetric
 from armcal.cli.common import Voice
 from armcal.run.result import RunResult
+from armcal.solve.bootstrap import Bootstrap
 from armcal.solve.validation import ErrorSummary
 
 _SETS = {"train": "training", "holdout": "held out", "cross_validated": "cross-validated"}
@@ -19,13 +24,29 @@ def show_run(voice: Voice, result: RunResult, folder: Path, seconds: float) -> N
     """The end of a run: errors, compliances, verdict, where the report is."""
     out = voice.out
     out.print(_errors(result))
-    compliances = _compliances(result)
-    if compliances.row_count:
-        out.print(compliances)
+    for compliances in (_compliances(result), _matrices(result)):
+        if compliances.row_count:
+            out.print(compliances)
+    if result.bootstrap:
+        out.print(_bootstrap(result, result.bootstrap))
+    out.print(_findings(result))
     out.print(result.verdict.headline, style="bold", markup=False)
-    for finding in result.verdict.findings:
-        out.print(f"  {finding.grade}: {finding.text}", style=_STYLES[finding.grade], markup=False)
+    if result.verdict.paragraph:
+        out.print(result.verdict.paragraph, markup=False)
     out.print(f"report: {folder / 'report.html'}  ({seconds:.1f} s)", markup=False, soft_wrap=True)
+
+
+def _findings(result: RunResult) -> Table:
+    """A row a finding; how it was tested stands dimmed behind what it says."""
+    table = Table(title="Verdict", title_justify="left", box=HORIZONTALS, expand=True)
+    table.add_column("", no_wrap=True)
+    table.add_column("what, and how it was tested", ratio=5)
+    table.add_column("what to do", ratio=3)
+    for finding in result.verdict.findings:
+        style = _STYLES[finding.grade]
+        text = escape(finding.text) + (f" [dim]({escape(finding.test)})[/]" if finding.test else "")
+        table.add_row(f"[{style}]{finding.grade}[/]" if style else finding.grade, text, escape(finding.action))
+    return table
 
 
 def _errors(result: RunResult) -> Table:
@@ -37,7 +58,10 @@ def _errors(result: RunResult) -> Table:
         if not after.count:
             continue
         table.add_row(words, str(after.count), "nominal", *_numbers(before))
-        table.add_row("", "", "calibrated", *_numbers(after), end_section=True)
+        at_rest = result.table.at_rest.get(key)
+        table.add_row("", "", "calibrated", *_numbers(after), end_section=at_rest is None)
+        if at_rest is not None:
+            table.add_row("", "", "drift unknown", *_numbers(at_rest), end_section=True)
     return table
 
 
@@ -51,14 +75,44 @@ def _compliances(result: RunResult) -> Table:
     for column in ("parameter", "value", "sd", "95 % interval", ""):
         table.add_column(column, justify="left" if column in ("parameter", "") else "right")
     for i, name in enumerate(estimate.names):
-        if estimate.parameters[name.partition("[")[0]].unit != "rad_per_Nm":
+        block = estimate.parameters[name.partition("[")[0]]
+        if block.unit != "rad_per_Nm" or block.size > 1:
             continue
         value, interval, sd = estimate.values[estimate.free_entries[i]], estimate.intervals[i], estimate.deviations[i]
         digits = _digits(float(sd))
         ends = f"{interval.lower:.{digits}f} to {interval.upper:.{digits}f}"
         span = f"up to {interval.upper:.{digits}f}" if interval.one_sided else ends
         flag = "at its bound" if name in estimate.at_bound else ("" if estimate.determined[i] else "not determined")
-        table.add_row(name, f"{value:.{digits}f}", f"{sd:.{digits}f}", span, flag)
+        table.add_row(escape(name), f"{value:.{digits}f}", f"{sd:.{digits}f}", span, flag)
+    return table
+
+
+def _matrices(result: RunResult) -> Table:
+    """Compliance matrices by their principal values, the softest direction last."""
+    estimate = result.estimate
+    table = Table(title="Compliance matrices, principal values, rad/(N m)", title_justify="left")
+    for column in ("parameter", "stiffest", "", "softest"):
+        table.add_column(column, justify="left" if column == "parameter" else "right")
+    for block in estimate.parameters.free:
+        if isinstance(block.domain, Semidefinite):
+            sizes = np.linalg.eigvalsh(symmetric(estimate.values[estimate.parameters.entries_of(block.name)]))
+            table.add_row(escape(block.name), *(f"{max(size, 0.0):.4f}" for size in sizes))
+    return table
+
+
+def _bootstrap(result: RunResult, found: Bootstrap) -> Table:
+    """How sure each parameter is, in SI, by curvature and by refits."""
+    how = f"blocks of {found.block}" if found.method == "blocks" else "parametric"
+    failed = f", {found.failed} more did not converge" if found.failed else ""
+    table = Table(title=f"Bootstrap, {len(found.values)} refits{failed}; {how}", title_justify="left")
+    for column in ("parameter", "value", "sd", "bootstrap sd", "bootstrap 95 % interval"):
+        table.add_column(column, justify="left" if column == "parameter" else "right")
+    estimate = result.estimate
+    for i, name in enumerate(found.names):
+        sd, low, high = (float(x) for x in (found.deviations[i], *found.intervals[i]))
+        digits = _digits(sd)
+        numbers = [estimate.values[estimate.free_entries[i]], estimate.deviations[i], sd]
+        table.add_row(escape(name), *(f"{x:.{digits}f}" for x in numbers), f"{low:.{digits}f} to {high:.{digits}f}")
     return table
 
 

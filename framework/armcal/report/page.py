@@ -10,7 +10,9 @@ import numpy as np
 
 import armcal
 from armcal.base.domains import Array
-from armcal.report import error_figures, parameter_figures, workspace
+from armcal.report import error_figures, interval_figures, parameter_figures, workspace
+from armcal.report.missed_table import missed_records
+from armcal.report.noise_tables import scatter_rows, suspicious_rows
 from armcal.report.numbers import NONE, common_decimals, count, duration, fixed, plural, ratio, significant, unbroken
 from armcal.report.tables import (
     Fact,
@@ -57,6 +59,7 @@ def _content(result: RunResult) -> dict[str, Any]:
         "grades": [(g, grades.count(g)) for g in _WORDS if g in grades],
         **_accuracy(result),
         **_poses(result),
+        **_intervals(result),
         **_parameters(result.estimate, rows),
         **_correlations(result.estimate),
         **_determined(result.estimate),
@@ -84,7 +87,18 @@ def _poses(result: RunResult) -> dict[str, Any]:
         "workspace": workspace.views(result),
         "order": error_figures.in_order(result, worst),
         "worst": worst_rows(result, worst),
+        "missed": missed_records(result.evidence.misses),
         "crossed": bool(np.isfinite(result.errors.cross_validated_mm).any()),
+    }
+
+
+def _intervals(result: RunResult) -> dict[str, Any]:
+    return {
+        "shares": interval_figures.share_rows(result.intervals),
+        "levels": interval_figures.level_names(),
+        "radii": interval_figures.predicted_against_found(result),
+        "profiles": interval_figures.profile_rows(result),
+        "profile_figures": interval_figures.profile_figures(result),
     }
 
 
@@ -141,6 +155,9 @@ def _determined(estimate: Estimate) -> dict[str, Any]:
 def _records(result: RunResult) -> dict[str, Any]:
     aside = result.dataset.set_aside
     return {
+        "suspicious": suspicious_rows(result.noise, MOST_LISTED),
+        "more_suspicious": max(len(result.noise.suspicious) - MOST_LISTED, 0),
+        "scatter": scatter_rows(result.noise),
         "aside": aside[:MOST_LISTED],
         "more_aside": max(len(aside) - MOST_LISTED, 0),
         "warnings": tuple(dict.fromkeys((*result.warnings, *result.dataset.warnings))),

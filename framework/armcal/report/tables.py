@@ -33,13 +33,14 @@ _MOST_DECIMALS = 6
 
 @dataclass(frozen=True)
 class ErrorRows:
-    """Before, after and ratio over one set of records."""
+    """Before, after and ratio over one set of records; after if nothing is known of a drift, where something drifts."""
 
     name: str
     count: int
     nominal: tuple[str, ...]
     calibrated: tuple[str, ...]
     ratios: tuple[str, ...]
+    at_rest: tuple[str, ...] = ()
 
 
 def error_rows(result: RunResult) -> tuple[ErrorRows, ...]:
@@ -51,7 +52,8 @@ def error_rows(result: RunResult) -> tuple[ErrorRows, ...]:
     sets = [row for row in sets if row[2].count or row[3].count]
     decimals = common_decimals(v for _, _, *pair in sets for s in pair for v in _statistics(s))
     rows = []
-    for _, words, before, after in sets:
+    for key, words, before, after in sets:
+        at_rest = result.table.at_rest.get(key)
         pairs = list(zip(_statistics(before), _statistics(after), strict=True))
         rows.append(
             ErrorRows(
@@ -60,6 +62,7 @@ def error_rows(result: RunResult) -> tuple[ErrorRows, ...]:
                 tuple(fixed(b, decimals) for b, _ in pairs),
                 tuple(fixed(a, decimals) for _, a in pairs),
                 tuple(ratio(b, a) for b, a in pairs),
+                tuple(fixed(v, decimals) for v in _statistics(at_rest)) if at_rest else (),
             )
         )
     return tuple(rows)

@@ -24,6 +24,7 @@ from armcal.plugins import PluginRegistry, discover
 from armcal.run.settings import ExperimentSettings
 from armcal.solve.estimator import Estimator
 from armcal.solve.simulation import Simulator
+from armcal.solve.weighing import weighed
 
 STANDARD_GRAVITY = {"earth": 9.80665, "moon": 1.62, "mars": 3.71}
 """m/s^2; [Williams2024]"""
@@ -74,15 +75,21 @@ class Experiment:
             ConfigError: the configuration is refused.
             PluginError: a component is missing or broken.
         """
+        return cls.of(load_config(path, overrides), data, registry)
+
+    @classmethod
+    def of(
+        cls, source: ConfigSource, data: str | Path | None = None, registry: PluginRegistry | None = None
+    ) -> Experiment:
+        """Check a configuration that was read; else as ``load``."""
         registry = registry or discover()
-        source = load_config(path, overrides)
         if data is not None:
             source = _with_data(source, data)
         settings = validate(ExperimentSettings, source)
         system = build_system(source, registry)
         parameters = select(system.parameters(), settings.parameters, source)
-        estimator = _estimator(source, registry)
-        name = settings.name or Path(path).stem
+        estimator = weighed(_estimator(source, registry), settings.noise)
+        name = settings.name or source.path.stem
         found = tuple(_gravity_warnings(settings, np.array(settings.statics.gravity)))
         return cls(str(name), source, settings, system, parameters, estimator, registry, found)
 

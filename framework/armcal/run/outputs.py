@@ -5,10 +5,8 @@ from __future__ import annotations
 import csv
 import io
 import json
-import os
-import shutil
-import tempfile
 from collections.abc import Callable
+from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -16,16 +14,22 @@ from typing import Any
 import numpy as np
 
 from armcal.config.yaml_source import ConfigSource
-from armcal.errors import InputError, Location
 from armcal.measure.reader import ENVIRONMENT
+from armcal.run import folder as folders
 from armcal.run.experiment import Experiment
 from armcal.run.result import RunResult
+from armcal.solve.bootstrap import Bootstrap
+from armcal.solve.profile import Profile
 from armcal.use.calibration import SCHEMA, CalibrationFile, InformationRecord, dump, parameter_records
 
-EARLIER = "earlier"
 FILES = ("experiment.yaml", "residuals.csv", "metrics.json", "report.html", "log.txt", "calibration.yaml")
 """In the order in which they are put in place: the calibration last."""
 NOT_CONVERGED_SUFFIX = ".not-converged"
+BOOTSTRAP_FILE = "bootstrap.csv"
+"""Only where a bootstrap was asked for."""
+PROFILE_FILE = "profile.json"
+"""Only where profiles were asked for."""
+_OURS = (*FILES, BOOTSTRAP_FILE, PROFILE_FILE, f"calibration.yaml{NOT_CONVERGED_SUFFIX}")
 
 
 def check_folder(folder: Path) -> None:
@@ -34,18 +38,7 @@ def check_folder(folder: Path) -> None:
     Raises:
         InputError: a file, or a directory with anything that is not a run's.
     """
-    where = Location(str(folder))
-    if folder.exists() and not folder.is_dir():
-        raise InputError("it is a file, expected a directory.", where=where, hint="Give another --out.")
-    names = {path.name for path in folder.iterdir()} if folder.is_dir() else set()
-    ours = {*FILES, EARLIER, f"calibration.yaml{NOT_CONVERGED_SUFFIX}"}
-    foreign = sorted(name for name in names if name not in ours and not name.startswith(".armcal-"))
-    if foreign:
-        raise InputError(
-            f"it holds files that are not a run's ({', '.join(foreign[:3])}).",
-            where=where,
-            hint="Give --out a new or empty directory, or one of an earlier run.",
-        )
+    folders.check_folder(folder, _OURS)
 
 
 def write(result: RunResult, experiment: Experiment, folder: Path, render: Callable[[RunResult], str]) -> None:
@@ -64,24 +57,13 @@ def write(result: RunResult, experiment: Experiment, folder: Path, render: Calla
         "log.txt": log_text(result),
         "calibration.yaml": dump(calibration_content(result, experiment)),
     }
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        staging = Path(tempfile.mkdtemp(prefix=".armcal-", dir=folder))
-        for name in FILES:
-            _write_durably(staging / name, texts[name])
-        _keep_earlier(folder)
-        for name in FILES:
-            kept = name
-            if name == "calibration.yaml" and not result.estimate.verdict.converged:
-                kept += NOT_CONVERGED_SUFFIX
-            os.replace(staging / name, folder / kept)
-        shutil.rmtree(staging)
-    except OSError as fault:
-        raise InputError(
-            f"it cannot be written ({fault}).",
-            where=Location(str(folder)),
-            hint="Give --out a writable directory.",
-        ) from fault
+    if result.bootstrap:
+        texts = {BOOTSTRAP_FILE: bootstrap_text(result.bootstrap, result), **texts}
+    if result.profiles:
+        texts = {PROFILE_FILE: profile_text(result.profiles), **texts}
+    if not result.estimate.verdict.converged:
+        texts[f"calibration.yaml{NOT_CONVERGED_SUFFIX}"] = texts.pop("calibration.yaml")
+    folders.place(folder, texts, _OURS)
 
 
 def metrics(result: RunResult) -> dict[str, Any]:
@@ -95,6 +77,7 @@ def metrics(result: RunResult) -> dict[str, Any]:
             "train": len(result.split.train),
             "holdout": len(result.split.holdout),
             "set_aside": len(result.dataset.set_aside),
+            "rejected": len(result.noise.set_aside),
         },
         "parameters": {
             "free": len(estimate.names),
@@ -103,7 +86,7 @@ def metrics(result: RunResult) -> dict[str, Any]:
             "undetermined": [str(combination) for combination in estimate.identifiability.undetermined],
             "scaled_condition": _finite(estimate.identifiability.condition),
         },
-        "noise": {"scale": estimate.noise_scale, "degrees_of_freedom": estimate.degrees_of_freedom},
+        "noise": _noise(result),
         "solver": {
             "name": told.name,
             "status": told.status,
@@ -113,10 +96,11 @@ def metrics(result: RunResult) -> dict[str, Any]:
             "starts": told.starts,
             "agreeing_starts": told.agreeing_starts,
         },
-        "verdict": {
-            "headline": result.verdict.headline,
-            "findings": [{"grade": f.grade, "text": f.text} for f in result.verdict.findings],
-        },
+        "verdict": asdict(result.verdict),
+        "structure": result.evidence.as_dict(),
+        "prediction_intervals": result.intervals.as_dict(),
+        "bootstrap": _bootstrap_metrics(result),
+        "profile": _profile_metrics(result),
         "warnings": list(result.warnings),
         "evaluator": result.backend,
         "seconds": dict(result.seconds),
@@ -128,7 +112,7 @@ def calibration_content(result: RunResult, experiment: Experiment) -> dict[str, 
     """The content of calibration.yaml."""
     estimate, provenance = result.estimate, result.provenance
     information = InformationRecord(
-        increments=estimate.parameters.increment_names,
+        increments=estimate.parameters.coordinate_names,
         square_root=tuple(tuple(float(x) for x in row) for row in estimate.square_root_information),
     )
     record = CalibrationFile(
@@ -143,16 +127,23 @@ def calibration_content(result: RunResult, experiment: Experiment) -> dict[str, 
             "source": provenance["data"],
         },
         environment_columns=tuple(name for name, _ in ENVIRONMENT if result.dataset.has(name)),
-        noise={"scale": estimate.noise_scale, "degrees_of_freedom": estimate.degrees_of_freedom},
+        noise=_noise(result),
         quality_mm=result.table.as_dict(),
         verdict={"headline": result.verdict.headline, "findings": [f.text for f in result.verdict.findings]},
         arms=dict(experiment.system.description["arms"]),
         measurements=dict(experiment.system.description["measurements"]),
         statics=dict(experiment.system.description["statics"]),
         parameters=parameter_records(estimate),
+        prediction=result.prediction,
         information=information,
     )
     return record.to_config()
+
+
+def _noise(result: RunResult) -> dict[str, Any]:
+    estimate = result.estimate
+    told = {"scale": estimate.noise_scale, "degrees_of_freedom": estimate.degrees_of_freedom}
+    return {**told, **result.noise.as_dict()}
 
 
 def experiment_text(source: ConfigSource) -> str:
@@ -169,14 +160,35 @@ def residuals_text(result: RunResult) -> str:
     axes = ["dx_mm", "dy_mm", "dz_mm"] if rows == 3 else [f"residual{i}_mm" for i in range(1, rows + 1)]
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["pose_id", "source_row", "set", "nominal_mm", "calibrated_mm", "cross_validated_mm", *axes])
+    columns = ["pose_id", "source_row", "set", "weight", "nominal_mm", "calibrated_mm", "cross_validated_mm", *axes]
+    writer.writerow(columns)
     for i, record in enumerate(dataset.ids):
         numbers = [errors.nominal_mm[i], errors.calibrated_mm[i], errors.cross_validated_mm[i]]
         numbers += list(errors.calibrated_residual_mm[:, i])
         row = dataset.rows[i] if dataset.rows else ""
         shown = ["" if not np.isfinite(x) else f"{x:.6f}" for x in numbers]
-        writer.writerow([record, row, "holdout" if held[i] else "train", *shown])
+        weight = "" if held[i] or result.noise.weights is None else f"{result.noise.weights[i]:.6g}"
+        writer.writerow([record, row, "holdout" if held[i] else "train", weight, *shown])
     return text.getvalue()
+
+
+def bootstrap_text(resampled: Bootstrap, result: RunResult) -> str:
+    """A row a free canonical entry (SI): by the curvature at the estimate, and by refits to resampled records."""
+    estimate, text = result.estimate, io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    columns = ("sd", "lower", "upper")
+    writer.writerow(["parameter", "value", *columns, *(f"bootstrap_{name}" for name in columns)])
+    for i, name in enumerate(resampled.names):
+        interval, sd = estimate.intervals[i], estimate.deviations[i]
+        numbers = [estimate.values[estimate.free_entries[i]], sd, interval.lower, interval.upper]
+        numbers += [resampled.deviations[i], *resampled.intervals[i]]
+        writer.writerow([name, *("" if not np.isfinite(x) else f"{x:.9g}" for x in numbers)])
+    return text.getvalue()
+
+
+def profile_text(found: tuple[Profile, ...]) -> str:
+    """Each profile by its parameter (SI), with its curve."""
+    return json.dumps({each.name: each.as_dict() for each in found}, indent=2) + "\n"
 
 
 def log_text(result: RunResult) -> str:
@@ -186,32 +198,37 @@ def log_text(result: RunResult) -> str:
         f"command: {result.command}",
         f"verdict: {result.verdict.headline}",
     ]
-    lines += [f"{finding.grade}: {finding.text}" for finding in result.verdict.findings]
+    lines += [f"{finding.grade}: {finding.whole}" for finding in result.verdict.findings]
     lines += [f"warning: {text}" for text in result.warnings]
     lines += [f"set aside: row {a.row}, record {a.record_id}: {a.reason}" for a in result.dataset.set_aside]
+    lines += [
+        f"suspicious: row {s.row}, record {s.record_id}: {s.deviations:.1f} sd (limit {s.limit:.1f}), {s.fate}"
+        for s in result.noise.suspicious
+    ]
     lines += [f"seconds in {stage}: {seconds:.3f}" for stage, seconds in result.seconds.items()]
     return "\n".join(lines) + "\n"
 
 
-def _write_durably(path: Path, text: str) -> None:
-    with path.open("w", encoding="utf-8", newline="") as file:
-        file.write(text)
-        file.flush()
-        os.fsync(file.fileno())
+def _bootstrap_metrics(result: RunResult) -> dict[str, Any] | None:
+    found = result.bootstrap
+    if found is None:
+        return None
+    rows = zip(found.names, found.deviations, found.intervals, strict=True)
+    return {
+        "method": found.method,
+        "refits": len(found.values),
+        "failed": found.failed,
+        "block_records": found.block,
+        "parameters": {
+            name: {"sd": _finite(sd), "lower": _finite(low), "upper": _finite(high)} for name, sd, (low, high) in rows
+        },
+    }
 
 
-def _keep_earlier(folder: Path) -> None:
-    """Nothing is overwritten: an earlier run's files move to ``earlier/N``."""
-    present = [p for n in (*FILES, f"calibration.yaml{NOT_CONVERGED_SUFFIX}") if (p := folder / n).exists()]
-    if not present:
-        return
-    number = 1
-    while (folder / EARLIER / str(number)).exists():
-        number += 1
-    place = folder / EARLIER / str(number)
-    place.mkdir(parents=True)
-    for path in present:
-        os.replace(path, place / path.name)
+def _profile_metrics(result: RunResult) -> dict[str, Any] | None:
+    """Intervals without their curves."""
+    told = {each.name: each.as_dict() for each in result.profiles}
+    return {name: {k: v for k, v in each.items() if k != "curve"} for name, each in told.items()} or None
 
 
 def _finite(number: float) -> float | None:

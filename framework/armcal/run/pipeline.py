@@ -6,7 +6,8 @@ import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -15,14 +16,25 @@ import numpy as np
 
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
-from armcal.errors import DataError, Location
+from armcal.errors import DataError, Location, ProblemError
 from armcal.measure.id_list import read_ids
+from armcal.plugins import PluginRegistry
 from armcal.run.experiment import Experiment
+from armcal.run.intervals import IntervalResult, interval_result
+from armcal.run.judging import FittedRecords, verdict_of
+from armcal.run.noise import noise_result
 from armcal.run.result import ErrorTable, RecordErrors, RunResult
-from armcal.solve.estimator import Estimate, Progress, estimate, no_progress, require_solvable
+from armcal.solve.bootstrap import Bootstrap, bootstrap
+from armcal.solve.coverage import fit_and_predict
+from armcal.solve.drift import residuals, with_drift
+from armcal.solve.estimator import Estimate, Progress, no_progress, require_solvable, spread
+from armcal.solve.evidence import Evidence
+from armcal.solve.parallel import Executor
 from armcal.solve.problem import FactorRecords, Problem
-from armcal.solve.suggestion import suggest
+from armcal.solve.profile import Profile, profiled, profiles
 from armcal.solve.validation import (
+    CrossValidation,
+    ErrorSummary,
     Split,
     cross_validate,
     folds,
@@ -31,8 +43,10 @@ from armcal.solve.validation import (
     split_by_id,
     summarise,
 )
-from armcal.solve.verdict import Verdict, judge
+from armcal.solve.verdict import Verdict
+from armcal.solve.weighing import WeighedFit, fit
 from armcal.use.calibration import identity_of
+from armcal.use.intervals import PredictionRecord, covariance_rows, recording_record, stretch_records
 
 _MM = 1000.0
 _REACH_RATIO = 10.0
@@ -79,6 +93,18 @@ def prepare(experiment: Experiment, watch: Stopwatch) -> Prepared:
     Raises:
         InputError: data, units, counts or rank do not allow a calibration.
     """
+    ready = assemble(experiment, watch)
+    with watch.stage("check"):
+        found = require_solvable(ready.problem, ready.training, experiment.parameters.nominal())
+    return replace(ready, warnings=(*ready.warnings, *found))
+
+
+def assemble(experiment: Experiment, watch: Stopwatch) -> Prepared:
+    """Data read and checked, and the problem that it makes, whether or not it can be solved.
+
+    Raises:
+        InputError: data, units or counts do not allow a calibration.
+    """
     with watch.stage("read"):
         dataset = experiment.read()
     system = experiment.system
@@ -91,13 +117,13 @@ def prepare(experiment: Experiment, watch: Stopwatch) -> Prepared:
             dataset,
             experiment.settings.evaluator,
         )
-        records = problem.records(dataset)
+        records = with_drift(problem, problem.records(dataset), dataset, experiment.parameters.nominal())
     with watch.stage("check"):
         _check_reach(problem, records, dataset)
         split = _split(experiment, dataset)
-        start = experiment.parameters.nominal()
-        found = require_solvable(problem, problem.subset(records, split.train), start)
-    return Prepared(dataset, problem, records, split, (*experiment.warnings, *dataset.warnings, *found))
+        _check_folds(experiment, split)
+        profiled(problem, experiment.settings.uncertainty.profile)
+    return Prepared(dataset, problem, records, split, (*experiment.warnings, *dataset.warnings))
 
 
 def calibrate(
@@ -105,41 +131,112 @@ def calibrate(
     command: str = "",
     progress: Progress = no_progress,
     watch: Stopwatch | None = None,
+    executor: Executor | None = None,
 ) -> RunResult:
-    """Calibrate; see ``outputs.write`` for what is left behind.
+    """Calibrate; see ``outputs.write`` for what is left behind. ``executor`` does starts and folds at the same time.
 
     Raises:
         InputError: something is refused before solving.
     """
-    watch = watch or Stopwatch()
+    watch, registry = watch or Stopwatch(), experiment.registry
     ready = prepare(experiment, watch)
-    registry = experiment.registry
-    faults = registry.notify("armcal_run_started", name=experiment.name, records=len(ready.dataset))
-    for aside in ready.dataset.set_aside:
-        told = {"row": aside.row, "record_id": aside.record_id, "reason": aside.reason}
-        faults += registry.notify("armcal_record_rejected", **told)
-    start = experiment.parameters.nominal()
+    faults = _announce(experiment, ready)
     with watch.stage("fit"):
-        solution = experiment.estimator.solve(ready.problem, ready.training, start, progress)
-        found = estimate(ready.problem, ready.training, solution)
-    faults += registry.notify("armcal_estimate_changed", estimate=found)
+        fitted = _fitted(experiment, ready, progress, executor)
+    faults += registry.notify("armcal_estimate_changed", estimate=fitted.estimate)
+    resampled, profiled_result = _uncertainty(experiment, ready, fitted, progress, executor, watch)
     with watch.stage("validate"):
-        errors = _errors(experiment, ready, solution.values, progress)
-        table = _table(errors, ready.split)
+        crossed = _crossed(experiment, ready, progress, executor)
+        errors, intervals = _errors(ready, fitted, crossed), _intervals(experiment, ready, fitted, crossed)
+    verdict, evidence = _judge(experiment, ready, fitted, errors, intervals, watch)
+    noise = noise_result(fitted, ready.dataset, ready.split, errors.calibrated_mm)
+    faults += _tell_rejected(registry, [(s.row, s.record_id, s.reason) for s in noise.set_aside])
     return RunResult(
         name=experiment.name,
         command=command,
         dataset=ready.dataset,
         split=ready.split,
-        estimate=found,
+        estimate=fitted.estimate,
         errors=errors,
-        table=table,
-        verdict=_verdict(experiment, ready, found, errors),
-        warnings=(*ready.warnings, *_fold_warnings(errors, experiment), *dict.fromkeys(faults)),
+        table=_table(errors, ready.split),
+        verdict=verdict,
+        evidence=evidence,
+        warnings=(*ready.warnings, *fitted.warnings, *_fold_warnings(errors, experiment), *dict.fromkeys(faults)),
         backend=ready.problem.backend,
         seconds=watch.seconds,
-        provenance=_provenance(experiment, ready.dataset),
+        provenance=provenance(experiment, ready.dataset),
+        noise=noise,
+        bootstrap=resampled,
+        intervals=intervals,
+        profiles=profiled_result,
+        prediction=_prediction(experiment, ready, fitted, intervals),
     )
+
+
+def _uncertainty(
+    experiment: Experiment,
+    ready: Prepared,
+    fitted: WeighedFit,
+    progress: Progress,
+    executor: Executor | None,
+    watch: Stopwatch,
+) -> tuple[Bootstrap | None, tuple[Profile, ...]]:
+    """What was asked for beyond the covariance."""
+    with watch.stage("bootstrap"):
+        resampled = _resampled(experiment, ready, fitted.estimate, executor, progress)
+    with watch.stage("profile"):
+        return resampled, _profiles(experiment, ready, fitted, progress, executor)
+
+
+def _resampled(
+    experiment: Experiment, ready: Prepared, found: Estimate, executor: Executor | None, progress: Progress
+) -> Bootstrap | None:
+    """By bootstrap, if it is asked for and there is something to resample."""
+    asked = experiment.settings.uncertainty
+    if not (asked.bootstrap and found.verdict.converged and found.names):
+        return None
+    return bootstrap(ready.problem, ready.training, experiment.estimator, found, asked, executor, progress)
+
+
+def _announce(experiment: Experiment, ready: Prepared) -> list[str]:
+    """Observers hear that a run has started, and which records it sets aside; their faults."""
+    started = experiment.registry.notify("armcal_run_started", name=experiment.name, records=len(ready.dataset))
+    aside = [(a.row, a.record_id, a.reason) for a in ready.dataset.set_aside]
+    return [*started, *_tell_rejected(experiment.registry, aside)]
+
+
+def _fitted(experiment: Experiment, ready: Prepared, progress: Progress, executor: Executor | None) -> WeighedFit:
+    estimator = spread(experiment.estimator, executor)
+    return fit(ready.problem, ready.training, estimator, experiment.parameters.nominal(), progress)
+
+
+def _judge(
+    experiment: Experiment,
+    ready: Prepared,
+    fitted: WeighedFit,
+    errors: RecordErrors,
+    intervals: IntervalResult,
+    watch: Stopwatch,
+) -> tuple[Verdict, Evidence]:
+    run = FittedRecords(ready.problem, ready.records, ready.dataset, ready.split, fitted)
+    with watch.stage("judge"):
+        return verdict_of(run, errors, intervals, experiment.system, experiment.settings.validation.limit)
+
+
+def _profiles(
+    experiment: Experiment, ready: Prepared, fitted: WeighedFit, progress: Progress, executor: Executor | None
+) -> tuple[Profile, ...]:
+    """Of the numbers asked for."""
+    asked = experiment.settings.uncertainty.profile
+    if not (asked and fitted.estimate.verdict.converged):
+        return ()
+    return profiles(ready.problem, fitted, experiment.estimator, asked, executor, progress)
+
+
+def _tell_rejected(registry: PluginRegistry, records: Sequence[tuple[int, str, str]]) -> list[str]:
+    """Observers hear of each record (row, id, reason) that takes no part; their faults."""
+    told = [dict(zip(("row", "record_id", "reason"), record, strict=True)) for record in records]
+    return [fault for one in told for fault in registry.notify("armcal_record_rejected", **one)]
 
 
 def _split(experiment: Experiment, dataset: Dataset) -> Split:
@@ -149,27 +246,79 @@ def _split(experiment: Experiment, dataset: Dataset) -> Split:
     return hold_out(len(dataset), validation.holdout, validation.seed)
 
 
-def _errors(experiment: Experiment, ready: Prepared, values: Array, progress: Progress) -> RecordErrors:
-    problem, records = ready.problem, ready.records
-    nominal = problem.parameters.nominal()
-    crossed, failed = np.full(len(ready.dataset), np.nan), 0
+def _check_folds(experiment: Experiment, split: Split) -> None:
+    """Refused before the fit rather than after it."""
     validation = experiment.settings.validation
+    if not len(split.train):
+        raise ProblemError("no record is left to train on.", hint="Hold fewer out, or measure more poses.")
     if validation.folds:
-        train = ready.split.train
-        splits = folds(len(train), validation.folds, validation.seed)
-        judged = cross_validate(problem, ready.training, splits, experiment.estimator, nominal, progress)
-        crossed[train] = judged.errors * _MM
-        failed = judged.failed_folds
+        folds(len(split.train), validation.folds, validation.seed)
+
+
+def _crossed(
+    experiment: Experiment, ready: Prepared, progress: Progress, executor: Executor | None
+) -> tuple[CrossValidation, tuple[Split, ...]] | None:
+    """Cross-validation over the training records, with what each fold predicted; None where none is asked for."""
+    asked, problem = experiment.settings.validation, ready.problem
+    if not asked.folds:
+        return None
+    splits = folds(len(ready.split.train), asked.folds, asked.seed)
+    judge, start = partial(fit_and_predict, inner=asked.folds, seed=asked.seed), problem.parameters.nominal()
+    parts = (ready.training, splits, experiment.estimator, start, progress, executor, judge)
+    return cross_validate(problem, *parts), splits
+
+
+def _intervals(
+    experiment: Experiment,
+    ready: Prepared,
+    fitted: WeighedFit,
+    crossed: tuple[CrossValidation, tuple[Split, ...]] | None,
+) -> IntervalResult:
+    """Of predictions by the fit; none by one that did not converge."""
+    if not fitted.estimate.verdict.converged:
+        return IntervalResult()
+    return interval_result(ready.problem, fitted, ready.records, ready.split, experiment.estimator, crossed)
+
+
+def _prediction(
+    experiment: Experiment, ready: Prepared, fitted: WeighedFit, intervals: IntervalResult
+) -> PredictionRecord | None:
+    """What predictions need of this run."""
+    if not fitted.estimate.verdict.converged:
+        return None
+    columns = (experiment.source.data.get("data") or {}).get("columns") or {}
+    return PredictionRecord(
+        entries=fitted.estimate.names,
+        covariance=covariance_rows(fitted.estimate.covariance),
+        stretches=stretch_records(intervals.stretches),
+        columns={str(name): str(own) for name, own in columns.items()},
+        recording=recording_record(ready.problem, ready.dataset.subset(ready.split.train), fitted.records),
+    )
+
+
+def _errors(
+    ready: Prepared, fitted: WeighedFit, judged: tuple[CrossValidation, tuple[Split, ...]] | None
+) -> RecordErrors:
+    problem, records, values = ready.problem, ready.records, fitted.estimate.values
+    nominal = problem.parameters.nominal()
+    (crossed, at_rest), failed = np.full((2, len(ready.dataset)), np.nan), 0
+    if judged is not None:
+        train, found = ready.split.train, judged[0]
+        crossed[train], at_rest[train] = found.errors * _MM, found.at_rest * _MM
+        failed = found.failed_folds
+    drifts = any(block.drift for block in problem.parameters.free)
     shown = problem.predict(values, records)[0]
     first = len(problem.kernels[0].factor.output_channels)
     return RecordErrors(
         nominal_mm=record_errors(problem, nominal, records) * _MM,
-        calibrated_mm=record_errors(problem, values, records) * _MM,
+        calibrated_mm=record_errors(problem, values, records, fitted.records) * _MM,
         cross_validated_mm=crossed,
         nominal_residual_mm=np.vstack(problem.residuals(nominal, records)) * _MM,
-        calibrated_residual_mm=np.vstack(problem.residuals(values, records)) * _MM,
+        calibrated_residual_mm=np.vstack(residuals(problem, values, records, fitted.records)) * _MM,
         position_mm=shown[first + 9 : first + 12] * _MM,
         failed_folds=failed,
+        at_rest_mm=record_errors(problem, values, records) * _MM if drifts else None,
+        cross_validated_at_rest_mm=at_rest if drifts else None,
     )
 
 
@@ -181,38 +330,20 @@ def _fold_warnings(errors: RecordErrors, experiment: Experiment) -> list[str]:
 
 
 def _table(errors: RecordErrors, split: Split) -> ErrorTable:
-    nominal, calibrated, crossed = errors.nominal_mm, errors.calibrated_mm, errors.cross_validated_mm
-    judged = np.isfinite(crossed)
-    return ErrorTable(
-        nominal={
-            "train": summarise(nominal[split.train]),
-            "holdout": summarise(nominal[split.holdout]),
-            "cross_validated": summarise(nominal[judged]),
-        },
-        calibrated={
-            "train": summarise(calibrated[split.train]),
-            "holdout": summarise(calibrated[split.holdout]),
+    judged = np.isfinite(errors.cross_validated_mm)
+
+    def summaries(of: Array, crossed: Array) -> dict[str, ErrorSummary]:
+        return {
+            "train": summarise(of[split.train]),
+            "holdout": summarise(of[split.holdout]),
             "cross_validated": summarise(crossed[judged]),
-        },
-    )
+        }
 
-
-def _verdict(experiment: Experiment, ready: Prepared, found: Estimate, errors: RecordErrors) -> Verdict:
-    noise = np.concatenate([kernel.factor.noise for kernel in ready.problem.kernels])
-    whitened = errors.calibrated_residual_mm / _MM / noise[:, None]
-    held, crossed = errors.calibrated_mm[ready.split.holdout], errors.cross_validated_mm
-    crossed = crossed[np.isfinite(crossed)]
-    judged, words = (held, f"{len(held)} held-out records") if len(held) else (crossed, "cross-validation")
-    joints = {
-        f"{name}.{joint}": dimension
-        for name, arm in experiment.system.arms.items()
-        for joint, dimension in zip(arm.joint_names, arm.joint_dimensions, strict=True)
-    }
-    training = ready.dataset.subset(ready.split.train)
-    suggestions = suggest(ready.problem, training, found, joints) if found.names else ()
-    return judge(
-        found, whitened, errors.calibrated_mm, ready.split.train, judged, words, ready.dataset.ids, suggestions
-    )
+    at_rest = {}
+    if errors.at_rest_mm is not None and errors.cross_validated_at_rest_mm is not None:
+        at_rest = summaries(errors.at_rest_mm, errors.cross_validated_at_rest_mm)
+    nominal = summaries(errors.nominal_mm, errors.nominal_mm)
+    return ErrorTable(nominal, summaries(errors.calibrated_mm, errors.cross_validated_mm), at_rest)
 
 
 def _check_reach(problem: Problem, records: Sequence[FactorRecords], dataset: Dataset) -> None:
@@ -233,7 +364,8 @@ def _check_reach(problem: Problem, records: Sequence[FactorRecords], dataset: Da
             )
 
 
-def _provenance(experiment: Experiment, dataset: Dataset) -> dict[str, Any]:
+def provenance(experiment: Experiment, dataset: Dataset) -> dict[str, Any]:
+    """Where the numbers of a run come from: files, hashes, versions."""
     packages = ("armcal", "numpy", "scipy", "casadi", "cvxpy")
     return {
         "config": str(experiment.source.path),

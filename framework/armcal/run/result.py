@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
+from armcal.run.intervals import IntervalResult
+from armcal.run.noise import NoiseResult
+from armcal.solve.bootstrap import Bootstrap
 from armcal.solve.estimator import Estimate
+from armcal.solve.evidence import Evidence
+from armcal.solve.profile import Profile
 from armcal.solve.validation import ErrorSummary, Indices, Split
 from armcal.solve.verdict import Verdict
+from armcal.use.intervals import PredictionRecord
 
 
 @dataclass(frozen=True)
@@ -24,6 +30,8 @@ class RecordErrors:
         calibrated_residual_mm: the same after calibration.
         position_mm: predicted tool position of the first arm in its base frame (3 x N).
         failed_folds: how many folds of the cross-validation did not converge.
+        at_rest_mm: with the calibrated parameters where nothing is known of a drift (N); None if nothing drifts.
+        cross_validated_at_rest_mm: the same by the fold that did not train on it.
     """
 
     nominal_mm: Array
@@ -33,20 +41,28 @@ class RecordErrors:
     calibrated_residual_mm: Array
     position_mm: Array
     failed_folds: int = 0
+    at_rest_mm: Array | None = None
+    cross_validated_at_rest_mm: Array | None = None
 
 
 @dataclass(frozen=True)
 class ErrorTable:
-    """Error summaries (mm) by model (nominal, calibrated) and by records (train, holdout, cross_validated)."""
+    """Error summaries (mm) by model and by records (train, holdout, cross_validated).
+
+    ``calibrated`` counts what neighbouring records tell of a drift; ``at_rest`` is without it, and empty if nothing
+    drifts.
+    """
 
     nominal: dict[str, ErrorSummary]
     calibrated: dict[str, ErrorSummary]
+    at_rest: dict[str, ErrorSummary] = field(default_factory=dict)
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON."""
         return {
             model: {name: summary.as_dict() for name, summary in table.items()}
-            for model, table in (("nominal", self.nominal), ("calibrated", self.calibrated))
+            for model, table in (("nominal", self.nominal), ("calibrated", self.calibrated), ("at_rest", self.at_rest))
+            if table
         }
 
 
@@ -67,6 +83,12 @@ class RunResult:
         backend: what evaluated the model.
         seconds: of each stage, and ``total``.
         provenance: hashes and versions.
+        noise: how the training records weighed.
+        bootstrap: refits to resampled records, if they were asked for.
+        intervals: how wide prediction intervals are, and what they hold.
+        evidence: what residuals still depend on, which records are missed, what priors alone hold.
+        profiles: intervals by profile likelihood, of the numbers asked for.
+        prediction: what predictions need of the run beyond the values; None if it did not converge.
     """
 
     name: str
@@ -81,6 +103,12 @@ class RunResult:
     backend: str
     seconds: dict[str, float]
     provenance: dict[str, Any]
+    noise: NoiseResult = field(default_factory=NoiseResult)
+    bootstrap: Bootstrap | None = None
+    intervals: IntervalResult = field(default_factory=IntervalResult)
+    evidence: Evidence = field(default_factory=Evidence)
+    profiles: tuple[Profile, ...] = ()
+    prediction: PredictionRecord | None = None
 
     @property
     def train(self) -> Indices:

@@ -6,22 +6,27 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
-from armcal.base.settings import InputPath, Settings
+from armcal.base.settings import InputPath, Length, Settings
 from armcal.config.selection import ParameterSettings
 from armcal.config.system import StaticsSettings
+from armcal.run.plan_settings import PlanSettings
+from armcal.solve.bootstrap import BootstrapSettings
+from armcal.solve.weighing import NoiseSettings
 
 
 class ValidationSettings(Settings):
     """Which records judge.
 
     ``holdout`` is a fraction chosen by ``seed``; ``train_ids`` a CSV of record ids to train on (the rest judge);
-    ``folds`` cross-validates over the training records.
+    ``folds`` cross-validates over the training records. Judged records whose error is above ``limit`` are listed and
+    explained; without one, those above three times the median error.
     """
 
     holdout: Annotated[float, Field(ge=0, lt=1)] = 0.0
     folds: Annotated[int, Field(ge=0)] = 0
     seed: Annotated[int, Field(ge=0)] = 0
     train_ids: InputPath | None = None
+    limit: Length | None = None
 
     @model_validator(mode="after")
     def _one_split(self) -> ValidationSettings:
@@ -29,7 +34,15 @@ class ValidationSettings(Settings):
             raise ValueError("found both holdout and train_ids, expected one of them: set holdout: 0")
         if self.folds == 1:
             raise ValueError("found folds: 1, expected 0 (none) or at least 2")
+        if self.limit is not None and self.limit <= 0:
+            raise ValueError(f"found a limit of {1000 * self.limit:g} mm, expected one above zero")
         return self
+
+
+class UncertaintySettings(BootstrapSettings):
+    """How intervals are made beside the curvature at the estimate; ``profile`` are globs over free numbers."""
+
+    profile: tuple[str, ...] = ()
 
 
 class ExperimentSettings(Settings):
@@ -45,3 +58,6 @@ class ExperimentSettings(Settings):
     estimator: dict[str, Any] = Field(default_factory=lambda: {"type": "ipopt"})
     evaluator: Literal["auto", "compiled", "interpreted"] = "auto"
     validation: ValidationSettings = Field(default_factory=ValidationSettings)
+    noise: NoiseSettings = Field(default_factory=NoiseSettings)
+    uncertainty: UncertaintySettings = Field(default_factory=UncertaintySettings)
+    plan: PlanSettings | None = None

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from scipy.special import stdtrit
@@ -13,12 +13,20 @@ from scipy.special import stdtrit
 from armcal.base.domains import Array
 from armcal.base.parameters import Parameters
 from armcal.errors import ProblemError
-from armcal.solve.identifiability import POOR_CONDITION, Identifiability, analyse
+from armcal.solve.identifiability import POOR_CONDITION, Identifiability
+from armcal.solve.parallel import Executor
 from armcal.solve.problem import FactorRecords, Problem, triangular
+from armcal.solve.projection import factor_at_zero
+from armcal.solve.structure import Undetermined, explain, held_by_nothing, identify, identify_from
 
 CONFIDENCE = 0.95
 NEAR_A_BOUND_SD = 3.0
 """Within so many standard deviations of a bound an interval is one-sided."""
+MOST_TOLD = 5
+FEW_HELD = 2
+"""Combinations under priors that are told in full: they do no harm, more of them bury the rest."""
+SMALLEST_SPREAD = 1e-12
+"""So many undetermined combinations are listed in one message."""
 AT_BOUND = 1e-6
 """In ordinary sizes of the parameter: closer than this, a parameter lies on its bound."""
 
@@ -67,6 +75,19 @@ class Estimator(Protocol):
         """
 
 
+@runtime_checkable
+class SpreadableEstimator(Protocol):
+    """An estimator whose own work falls into independent pieces, such as starts."""
+
+    def spread(self, executor: Executor) -> Estimator:
+        """The same estimator, with the same answers, its pieces done by an executor."""
+
+
+def spread(estimator: Estimator, executor: Executor | None) -> Estimator:
+    """An estimator on an executor, if it has pieces to spread."""
+    return estimator.spread(executor) if executor and isinstance(estimator, SpreadableEstimator) else estimator
+
+
 @dataclass(frozen=True)
 class Interval95:
     """A 95 % interval of one canonical entry; ``one_sided`` near a bound, where the bound itself is the other end."""
@@ -87,7 +108,7 @@ class Estimate:
         covariance: of the free canonical entries; directions that neither data nor priors determine are left out.
         unconstrained: free canonical entries after a step that ignores the bounds; equals the values where no
             bound holds.
-        square_root_information: R (n x n) with R'R the information of data and priors on the increments, at the
+        square_root_information: R (n x n) with R'R the information of data and priors on the coordinates, at the
             values; undetermined directions included, as its null space.
         noise_scale: residuals in units of the declared noise (standard deviation).
         degrees_of_freedom: residual numbers less determined parameters.
@@ -144,33 +165,52 @@ class Estimate:
         return tuple(_interval(*row, quantile) for row in rows)
 
 
-def estimate(problem: Problem, records: Sequence[FactorRecords], solution: Solution) -> Estimate:
-    """Covariance, intervals and identifiability at a solution.
+@dataclass(frozen=True)
+class Influence:
+    """How residuals act on an estimate: all alike in least squares, less when large under a robust loss [Huber1981].
+
+    Attributes:
+        weights: of each record, factor by factor (N each); None for ones.
+        spread: root mean square of what a residual number contributes, in units of the declared noise.
+        slope: mean derivative of that by the residual.
+        noise_scale: residuals in units of the declared noise, outliers discounted.
+    """
+
+    weights: tuple[Array, ...] | None
+    spread: float
+    slope: float
+    noise_scale: float
+
+
+def estimate(
+    problem: Problem, records: Sequence[FactorRecords], solution: Solution, influence: Influence | None = None
+) -> Estimate:
+    """Covariance, intervals and identifiability at a solution; without ``influence``, one of least squares.
 
     The declared noise is scaled to the residuals found (the a posteriori variance factor [Mikhail1976]): with a
     model that is wrong by more than the noise the intervals widen accordingly. Priors weigh in the estimate as they
-    were stated against the declared noise, so its covariance is the sandwich H^-1 (s^2 J'J + P) H^-1 with H = J'J + P.
+    were stated against the declared noise, so its covariance is the sandwich H^-1 (s^2 J'J + P) H^-1 with
+    H = b J'J + P; s is the influence's spread and b its slope, 1 in least squares.
     A parameter at a bound keeps its full covariance: the bound is not evidence.
     """
     parameters = problem.parameters
     scales, prior = parameters.scales(), parameters.prior_information()
-    increment = parameters.local(solution.values)
-    chain = parameters.retract_jacobian(increment)
-    equations = problem.normal_equations(solution.values, records).chained(chain)
-    triangle = problem.triangular_factor(solution.values, records)
-    known = analyse(triangle, scales, parameters.increment_names)
-    count = problem.equations(records)
-    freedom = count - known.rank
-    noise_scale = float(np.sqrt(2 * equations.cost / freedom)) if freedom > 0 else 1.0
-    stacked = np.vstack([triangle * scales, np.diag(scales * np.sqrt(prior))])
+    moved = parameters.coordinates(parameters.local(solution.values))
+    chain = parameters.entries_jacobian(solution.values)
+    equations = problem.normal_equations(solution.values, _acting(problem, records, influence)).chained(chain)
+    triangle = factor_at_zero(problem, solution.values, records)
+    known = identify_from(triangle, parameters)
+    freedom = problem.equations(records) - known.rank
+    influence = influence or _of_least_squares(equations.cost, freedom)
+    stacked = np.vstack([np.sqrt(influence.slope) * triangle * scales, np.diag(scales * np.sqrt(prior))])
     _, values, directions = np.linalg.svd(stacked, full_matrices=False)
     seen = values > 1e-9 * max(values[0], 1e-300) if len(values) else np.zeros(0, dtype=bool)
     inverse = np.where(seen, 1 / np.where(seen, values, 1.0), 0.0)
     half = scales[:, None] * directions.T * inverse
-    by_data = noise_scale * half @ (half.T @ triangle.T)
+    by_data = influence.spread * half @ (half.T @ triangle.T)
     by_priors = half @ (half.T * np.sqrt(prior))
     covariance = by_data @ by_data.T + by_priors @ by_priors.T
-    gradient = equations.gradient + prior * increment
+    gradient = equations.gradient + prior * moved
     step = -(half @ (half.T @ gradient))
     unseen = np.linalg.norm(directions[~seen], axis=0) if len(values) else np.zeros(0)
     free = list(parameters.free_entries)
@@ -180,13 +220,28 @@ def estimate(problem: Problem, records: Sequence[FactorRecords], solution: Solut
         free_entries=parameters.free_entries,
         covariance=chain @ covariance @ chain.T,
         unconstrained=solution.values[free] + chain @ step,
-        square_root_information=triangular(np.vstack([triangle / noise_scale, np.diag(np.sqrt(prior))])),
-        noise_scale=noise_scale,
+        square_root_information=_square_root(triangle, prior, influence),
+        noise_scale=influence.noise_scale,
         degrees_of_freedom=freedom,
         identifiability=known,
         determined=tuple(bool(x) for x in ~(np.abs(chain) @ unseen > 1e-6)),
         verdict=solution.verdict,
     )
+
+
+def _acting(problem: Problem, records: Sequence[FactorRecords], influence: Influence | None) -> Sequence[FactorRecords]:
+    """The records with the weights that a loss gave them."""
+    return records if influence is None or influence.weights is None else problem.weighted(records, influence.weights)
+
+
+def _square_root(triangle: Array, prior: Array, influence: Influence) -> Array:
+    by_data = triangle * (influence.slope / max(influence.spread, SMALLEST_SPREAD))
+    return triangular(np.vstack([by_data, np.diag(np.sqrt(prior))]))
+
+
+def _of_least_squares(cost: float, freedom: int) -> Influence:
+    noise_scale = float(np.sqrt(2 * cost / freedom)) if freedom > 0 else 1.0
+    return Influence(None, noise_scale, 1.0, noise_scale)
 
 
 def require_solvable(problem: Problem, records: Sequence[FactorRecords], start: Array) -> tuple[str, ...]:
@@ -208,21 +263,30 @@ def require_solvable(problem: Problem, records: Sequence[FactorRecords], start: 
         if not has_prior.all():
             raise ProblemError(f"{text}.", hint="Measure more poses, fix parameters, or give every one a prior.")
         warnings.append(f"{text}: what the data does not say comes from the priors.")
-    known = analyse(problem.triangular_factor(start, records), parameters.scales(), parameters.increment_names)
+    known = identify(problem, start, records)
     if known.undetermined:
-        listed = "; ".join(str(combination) for combination in known.undetermined)
-        text = f"the data does not determine {len(known.undetermined)} combinations: {listed}"
-        held = np.diag(np.sqrt(parameters.prior_information()) * parameters.scales())
-        null = known.directions[known.rank :]
-        if np.linalg.matrix_rank(held @ null.T) < len(null):
-            raise ProblemError(
-                f"{text}.",
-                hint="Fix one parameter of each, give it a prior, or measure poses that tell them apart.",
-            )
-        warnings.append(f"{text}; their priors hold them.")
-    if known.condition > POOR_CONDITION:
+        explained = explain(problem, start, records, known)
+        listed = "; ".join(str(each) for each in explained[:MOST_TOLD])
+        more = len(explained) - MOST_TOLD
+        listed += f"; and {more} more, which armcal identify lists" if more > 0 else ""
+        text = f"the data does not determine {len(explained)} combinations"
+        if held_by_nothing(parameters, known):
+            raise ProblemError(f"{text}: {listed}.", hint=_mend(explained))
+        told = listed if len(explained) <= FEW_HELD else "armcal identify lists them"
+        warnings.append(f"{text}; their priors hold them: {told}.")
+    if known.condition > POOR_CONDITION and not has_prior.all():
         warnings.append(f"the scaled condition is {known.condition:.1e}: {known.weakest} is hardly determined.")
     return tuple(warnings)
+
+
+def _mend(undetermined: Sequence[Undetermined]) -> str:
+    causes = {each.cause for each in undetermined}
+    ways = ["fix one parameter of each", "give it a prior"]
+    if "values" in causes:
+        ways.append("start from other values")
+    if causes & {"poses", "unknown"}:
+        ways.append("measure poses that tell them apart")
+    return f"{', '.join(ways[:-1])}, or {ways[-1]}.".capitalize()
 
 
 def _poses(records: Sequence[FactorRecords]) -> int:

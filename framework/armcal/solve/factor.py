@@ -12,18 +12,21 @@ parameters, and r* is the residual in equilibrium up to the square of what is le
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import casadi as ca
 
 from armcal.arm.assembly import Arm, ArmInputs, ArmState, scoped
 from armcal.arm.statics import Load
-from armcal.base.parameters import Parameters
+from armcal.base import se3
+from armcal.base.parameters import ParameterBlock, Parameters, scalar
 from armcal.base.se3 import Expression
-from armcal.measure.measurement import Measurement
+from armcal.measure.measurement import Measurement, noise_channels
 
 Vector3 = tuple[float, float, float]
 _ZERO: Vector3 = (0.0, 0.0, 0.0)
+STATICS = "statics"
+"""The instance name of what acts on all arms."""
 
 
 @dataclass(frozen=True)
@@ -52,6 +55,7 @@ class Factor:
         outputs: what the instrument would read (n_o), named by ``output_channels``.
         tools: each arm's base_T_tool without its last row, column by column (12 an arm; m).
         noise: standard deviation of each residual entry.
+        noise_channels: of each residual entry, the channels that may carry a record's own one, the nearest first.
     """
 
     name: str
@@ -65,6 +69,7 @@ class Factor:
     outputs: Expression
     tools: Expression
     noise: tuple[float, ...]
+    noise_channels: tuple[tuple[str, ...], ...] = ()
 
     @property
     def _inputs(self) -> list[Expression]:
@@ -93,33 +98,47 @@ class Factor:
 
     def newton_function(self) -> ca.Function:
         """(values, record, state) -> (state after a Newton step on the equilibrium, how far it moves)."""
-        step = ca.solve(self._one_minus_slope(), self.next_state - self.state)
+        step = se3.solve_near_identity(self._one_minus_slope(), self.next_state - self.state)
         return ca.Function("newton", self._inputs, [self.state + step, step], {"cse": True})
 
     def hessian_function(self) -> ca.Function:
-        """(values, record, state) -> exact Hessian (n_v x n_v) of half the squared weighted residual, in equilibrium.
+        """(values, record, state, W) -> exact Hessian (n_v x n_v) of half of |W residual|^2, in equilibrium.
 
+        W (n_r x n_r) is the whitening.
         The second derivative of the Lagrangian along the equilibrium's tangent. [Griewank2008]
         """
-        weighted = self.residual / ca.SX(list(self.noise))
+        whitening = ca.SX.sym("whitening", self.residual.numel(), self.residual.numel())
+        inputs = [*self._inputs, whitening]
+        weighted = ca.mtimes(whitening, self.residual)
         cost = ca.dot(weighted, weighted) / 2
         if not self.state.numel():
-            return ca.Function("hessian", self._inputs, [ca.densify(ca.hessian(cost, self.values)[0])])
+            return ca.Function("hessian", inputs, [ca.densify(ca.hessian(cost, self.values)[0])])
         both = ca.vertcat(self.values, self.state)
         adjoint = ca.SX.sym("adjoint", 1, self.state.numel())
         lagrangian = ca.hessian(cost + ca.mtimes(adjoint, self.next_state), both)[0]
         lagrangian = ca.substitute(lagrangian, adjoint, self._solve_left(ca.jacobian(cost, self.state)))
-        slope = ca.solve(self._one_minus_slope(), ca.densify(ca.jacobian(self.next_state, self.values)))
+        slope = se3.solve_near_identity(self._one_minus_slope(), ca.densify(ca.jacobian(self.next_state, self.values)))
         tangent = ca.vertcat(ca.SX.eye(self.values.numel()), slope)
         hessian = ca.mtimes(tangent.T, ca.mtimes(lagrangian, tangent))
-        return ca.Function("hessian", self._inputs, [ca.densify(hessian)], {"cse": True})
+        return ca.Function("hessian", inputs, [ca.densify(hessian)], {"cse": True})
+
+    def channel_slope_function(self, channels: tuple[str, ...]) -> ca.Function:
+        """(values, record, state) -> d residual / d record channels, transposed (n_c x n_r), in equilibrium."""
+        places = [self.channels.index(channel) if channel in self.channels else None for channel in channels]
+        slope = ca.jacobian(self.residual, self.record)
+        if self.state.numel():
+            solved = self._solve_left(ca.jacobian(self.residual, self.state))
+            slope = slope + ca.mtimes(solved, ca.jacobian(self.next_state, self.record))
+        none = ca.SX.zeros(self.residual.numel(), 1)
+        chosen = ca.horzcat(*[none if place is None else slope[:, place] for place in places])
+        return ca.Function("channel_slope", self._inputs, [ca.densify(chosen).T], {"cse": True})
 
     def _one_minus_slope(self) -> Expression:
         return ca.SX.eye(self.state.numel()) - ca.densify(ca.jacobian(self.next_state, self.state))
 
     def _solve_left(self, rows: Expression) -> Expression:
         """rows (I - dF/dd)^-1."""
-        return ca.solve(self._one_minus_slope().T, ca.densify(rows).T).T
+        return se3.solve_near_identity(self._one_minus_slope().T, ca.densify(rows).T).T
 
 
 class _Records:
@@ -131,6 +150,10 @@ class _Records:
 
     def number(self, channel: str) -> Expression:
         return self.symbols.setdefault(channel, ca.SX.sym(channel))
+
+    def has(self, channel: str) -> bool:
+        """Whether the records carry a channel."""
+        return channel in self._available
 
     def optional(self, channel: str, default: float) -> Expression:
         return self.number(channel) if channel in self._available else ca.SX(default)
@@ -159,7 +182,7 @@ def build_factor(
     """
     symbols, values = _value_expressions(parameters)
     records = _Records(available)
-    load = _load(records, environment)
+    load = _tilted(_load(records, environment), scoped(values, f"{STATICS}."))
     states, deflections = {}, []
     for arm_name in measurement.arms:
         deflection = ca.SX.sym(f"deflection_{arm_name}", arms[arm_name].deflection_size)
@@ -185,6 +208,7 @@ def build_factor(
         outputs=outputs,
         tools=tools,
         noise=tuple(measurement.noise()),
+        noise_channels=tuple(tuple(f"{name}.{c.name}" for c in own) for own in noise_channels(measurement)),
     )
 
 
@@ -196,6 +220,18 @@ def _load(records: _Records, environment: Environment) -> Load:
         force=records.vector("force", environment.force),
         torque=records.vector("torque", environment.torque),
     )
+
+
+def gravity_tilt() -> tuple[ParameterBlock, ...]:
+    """How the real gravity is turned from the stated one, about the base frame's x and y axes (rad)."""
+    return tuple(scalar(f"{STATICS}.gravity_{axis}", "rad", 0.0, 0.02) for axis in ("rx", "ry"))
+
+
+def _tilted(load: Load, tilt: Mapping[str, Expression]) -> Load:
+    if not tilt:
+        return load
+    about_x, about_y = (se3.rotation_about(axis, tilt[f"gravity_r{axis}"]).rotation for axis in "xy")
+    return replace(load, gravity=ca.mtimes(about_y, ca.mtimes(about_x, load.gravity)))
 
 
 def _value_expressions(parameters: Parameters) -> tuple[Expression, dict[str, Expression]]:
@@ -216,4 +252,5 @@ def _arm_state(
 ) -> ArmState:
     angles = ca.vertcat(*[records.number(f"{arm.name}.{joint}") for joint in arm.joint_names])
     approach = ca.vertcat(*[records.optional(f"{arm.name}.approach.{j}", 0.0) for j in arm.joint_names])
-    return arm.state(values, ArmInputs(angles, approach, load, deflection))
+    conditions = {name: records.number(name) for name in arm.conditions if records.has(name)}
+    return arm.state(values, ArmInputs(angles, approach, load, deflection, conditions))

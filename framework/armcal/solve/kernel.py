@@ -173,6 +173,14 @@ class Kernel:
         """The exact Hessian of one record."""
         return self.factor.hessian_function()
 
+    def channel_slopes(self, values: Array, record: Array, state: Array, channels: Sequence[str]) -> Array:
+        """d residual / d channels (n_r x channels x records) at states in equilibrium."""
+        mapped = _Mapped(self.factor.channel_slope_function(tuple(channels)))
+        slopes = np.empty((self.factor.residual.numel() * len(channels), record.shape[1]))
+        if slopes.size:
+            mapped(values, (record, state), (slopes,))
+        return slopes.reshape(self.factor.residual.numel(), len(channels), record.shape[1])
+
     def residuals(self, values: Array, record: Array, state: Array, residual: Array) -> None:
         """Residuals in equilibrium.
 

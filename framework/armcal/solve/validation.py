@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 
 import numpy as np
@@ -10,7 +11,9 @@ from numpy.typing import NDArray
 
 from armcal.base.domains import Array
 from armcal.errors import NotConvergedError, ProblemError
-from armcal.solve.estimator import Estimator, Progress, no_progress
+from armcal.solve.drift import residuals
+from armcal.solve.estimator import Estimator, Progress, Solution, no_progress
+from armcal.solve.parallel import Executor, Sequential
 from armcal.solve.problem import FactorRecords, Problem
 
 Indices = NDArray[np.intp]
@@ -52,10 +55,15 @@ def summarise(errors: Array) -> ErrorSummary:
     )
 
 
-def record_errors(problem: Problem, values: Array, records: Sequence[FactorRecords]) -> Array:
-    """How far each record's measurement lies from the prediction; root mean square over several measurements (N)."""
-    squared = [np.sum(residual**2, axis=0) for residual in problem.residuals(values, records)]
-    return np.asarray(np.sqrt(np.mean(squared, axis=0)))
+def record_errors(
+    problem: Problem, values: Array, records: Sequence[FactorRecords], told_by: Sequence[FactorRecords] | None = None
+) -> Array:
+    """How far each record's measurement lies from the prediction; root mean square over several measurements (N).
+
+    ``told_by`` are the records that tell how far drifting parameters had drifted; without them they are at rest.
+    """
+    found = problem.residuals(values, records) if told_by is None else residuals(problem, values, records, told_by)
+    return np.asarray(np.sqrt(np.mean([np.sum(residual**2, axis=0) for residual in found], axis=0)))
 
 
 def hold_out(count: int, fraction: float, seed: int) -> Split:
@@ -94,11 +102,81 @@ def folds(count: int, number: int, seed: int) -> tuple[Split, ...]:
 
 
 @dataclass(frozen=True)
-class CrossValidation:
-    """Errors of each record, judged by the fold that did not train on it (nan if that fold did not converge)."""
+class FitTask:
+    """A fit on some records, judged on others; small enough to send to another process."""
+
+    problem: Problem
+    estimator: Estimator
+    start: Array
+    records: tuple[FactorRecords, ...]
+    split: Split
+
+    def parts(self) -> tuple[tuple[FactorRecords, ...], tuple[FactorRecords, ...]]:
+        """The records that train, and those that judge."""
+        train, held = (self.problem.subset(self.records, part) for part in (self.split.train, self.split.holdout))
+        return train, held
+
+
+@dataclass(frozen=True)
+class JudgedFit:
+    """Errors (m) of the records that judge, by a fit on those that train; nan if it did not converge.
+
+    ``at_rest`` are the errors if nothing is known of a drift.
+    """
 
     errors: Array
+    at_rest: Array
+    converged: bool
+    seconds: float
+
+
+@dataclass(frozen=True)
+class CrossValidation:
+    """Errors of each record, judged by the fold that did not train on it (nan if that fold did not converge).
+
+    ``at_rest`` are the errors if nothing is known of a drift; ``fits`` those of the folds, in order.
+    """
+
+    errors: Array
+    at_rest: Array
     failed_folds: int
+    fits: tuple[JudgedFit, ...] = ()
+
+
+def fit_and_judge(task: FitTask) -> JudgedFit:
+    """Fit on the training records of a task, judge on its others."""
+    began = time.perf_counter()
+    try:
+        train, held = task.parts()
+        solution = task.estimator.solve(task.problem, train, task.start)
+        return judged_fit(task, solution, train, held, began)
+    except NotConvergedError:
+        return failed_fit(task, began)
+
+
+def judged_fit(
+    task: FitTask,
+    solution: Solution,
+    train: Sequence[FactorRecords],
+    held: Sequence[FactorRecords],
+    began: float,
+) -> JudgedFit:
+    """What a solution on the training records says of the others.
+
+    Raises:
+        NotConvergedError: a record has no elastic equilibrium there.
+    """
+    judged = record_errors(task.problem, solution.values, held, train)
+    at_rest = record_errors(task.problem, solution.values, held)
+    if not solution.verdict.converged:
+        return failed_fit(task, began)
+    return JudgedFit(judged, at_rest, True, time.perf_counter() - began)
+
+
+def failed_fit(task: FitTask, began: float) -> JudgedFit:
+    """Nothing is known."""
+    nothing = np.full(len(task.split.holdout), np.nan)
+    return JudgedFit(nothing, nothing, False, time.perf_counter() - began)
 
 
 def cross_validate(
@@ -108,20 +186,13 @@ def cross_validate(
     estimator: Estimator,
     start: Array,
     progress: Progress = no_progress,
+    executor: Executor | None = None,
+    judge: Callable[[FitTask], JudgedFit] = fit_and_judge,
 ) -> CrossValidation:
     """Fit on each fold's training records, judge on its others; the same compiled functions throughout."""
-    errors = np.full(records[0].count, np.nan)
-    failed = 0
-    for number, split in enumerate(splits):
-        progress("cross-validation", number / len(splits))
-        try:
-            solution = estimator.solve(problem, problem.subset(records, split.train), start)
-            judged = record_errors(problem, solution.values, problem.subset(records, split.holdout))
-        except NotConvergedError:
-            failed += 1
-            continue
-        if solution.verdict.converged:
-            errors[split.holdout] = judged
-        else:
-            failed += 1
-    return CrossValidation(errors, failed)
+    tasks = [FitTask(problem, estimator, start, tuple(records), split) for split in splits]
+    fits = (executor or Sequential()).map(judge, tasks, lambda done: progress("cross-validation", done))
+    errors, at_rest = np.full((2, records[0].count), np.nan)
+    for split, fit in zip(splits, fits, strict=True):
+        errors[split.holdout], at_rest[split.holdout] = fit.errors, fit.at_rest
+    return CrossValidation(errors, at_rest, sum(not fit.converged for fit in fits), tuple(fits))

@@ -3,37 +3,35 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import chdtri, ndtri
+from scipy.special import bdtr, chdtri, ndtri
 
 from armcal.base.domains import Array
 from armcal.solve.estimator import Estimate
+from armcal.solve.evidence import Evidence
+from armcal.solve.evidence_findings import MOST_TOLD, determined_told, misses_told, neighbours_told, structures_told
 from armcal.solve.identifiability import POOR_CONDITION, correlated_pairs
+from armcal.solve.noise_findings import Finding, components_told, suspects_told
 from armcal.solve.suggestion import CANDIDATES, Suggestion
+from armcal.solve.weighing import WeighedFit
 
 LEVEL = 0.05
+SHARE = 0.95
+DEVIATIONS = 5.0
+_ORDER = {"bad": 0, "warning": 1, "note": 2, "good": 3}
 _SMALLEST_SPREAD_MM = 1e-6
-Grade = Literal["good", "note", "warning", "bad"]
-
-
-@dataclass(frozen=True)
-class Finding:
-    """One sentence of the verdict, and how much it matters."""
-
-    grade: Grade
-    text: str
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """The findings, the worst first, and one line that sums them up."""
+    """The findings, the worst first, one line that sums them up, and a paragraph that a technician can act on."""
 
     headline: str
     findings: tuple[Finding, ...]
+    paragraph: str = ""
 
 
 def judge(
@@ -45,6 +43,9 @@ def judge(
     judged_on: str,
     ids: Sequence[str],
     suggestions: Sequence[Suggestion] = (),
+    fitted: WeighedFit | None = None,
+    predicted: Sequence[Finding] = (),
+    evidence: Evidence | None = None,
 ) -> Verdict:
     """Judge a calibration.
 
@@ -57,47 +58,99 @@ def judge(
         judged_on: what these are, in words.
         ids: of all records (N).
         suggestions: poses that would tell most next.
+        fitted: how the training records weighed; None for plain least squares.
+        predicted: whether prediction intervals hold their share.
+        evidence: what residuals still depend on, which records are missed, what priors alone hold.
     """
-    findings = [_convergence(estimate), _determined(estimate), *_condition(estimate), *_bounds(estimate)]
-    findings += [_noise(estimate), *_neighbours(whitened, train), *_correlated(estimate)]
-    findings += [*_outliers(errors_mm[train], [ids[i] for i in train]), *_next(estimate, suggestions)]
-    order = {"bad": 0, "warning": 1, "note": 2, "good": 3}
-    if len(judged_mm):
-        ninety_five = float(np.percentile(judged_mm, 95))
-        headline = (
-            f"Tip error {float(np.mean(judged_mm)):.2f} mm on average, 95 % of poses below {ninety_five:.2f} mm, "
-            f"judged on {judged_on}."
-        )
-    else:
-        headline = "No record was held out: how good the model is on new poses is not known."
-    return Verdict(headline, tuple(sorted(findings, key=lambda finding: order[finding.grade])))
+    seen = evidence or Evidence()
+    kept = train if fitted is None else train[fitted.kept]
+    typical = float(np.median(judged_mm)) if len(judged_mm) else None
+    determined = determined_told(estimate, seen.priors_alone, typical)
+    own = [ids[i] for i in train]
+    suspicious = _suspicious(errors_mm[train], own, fitted)
+    findings = [_convergence(estimate), determined, *_condition(estimate), *_bounds(estimate)]
+    findings += [*_noise(estimate, fitted), *structures_told(seen.leftover)]
+    findings += neighbours_told(seen.leftover) or _neighbours(whitened, kept)
+    findings += [*_correlated(estimate), *predicted, *misses_told(seen.misses), *_outliers(suspicious, own, fitted)]
+    findings += _next(estimate, suggestions)
+    sentences = [_good_for(judged_mm, judged_on), *_in_short(estimate, determined, seen, suspicious, suggestions)]
+    if not estimate.verdict.converged:
+        sentences = ["The solver did not converge: these values are no calibration."]
+    ranked = tuple(sorted(findings, key=lambda finding: _ORDER[finding.grade]))
+    return Verdict(_headline(judged_mm, judged_on), ranked, " ".join(sentences))
+
+
+def _headline(judged_mm: Array, judged_on: str) -> str:
+    if not len(judged_mm):
+        return "No record was held out: how good the model is on new poses is not known."
+    return (
+        f"Tip error {float(np.mean(judged_mm)):.2f} mm on average, 95 % of poses below "
+        f"{float(np.percentile(judged_mm, 95)):.2f} mm, judged on {judged_on}."
+    )
+
+
+def _good_for(judged_mm: Array, judged_on: str) -> str:
+    """Below what 95 % of unseen poses lie, with 95 % confidence, by order statistics. [Wilks1941]"""
+    if not len(judged_mm):
+        return "How good the model is on unseen poses is not known: hold records out, or cross-validate."
+    below = np.arange(len(judged_mm))
+    enough = np.flatnonzero(bdtr(below, len(judged_mm), SHARE) >= 1 - LEVEL)
+    if not len(enough):
+        largest = float(np.max(judged_mm))
+        return f"The largest error on {judged_on} is {largest:.2f} mm; {len(judged_mm)} are too few to say more."
+    limit = float(np.sort(judged_mm)[enough[0]])
+    return f"Good for +- {limit:.2f} mm on unseen poses like these: 95 % of them, with 95 % confidence ({judged_on})."
+
+
+def _in_short(
+    estimate: Estimate,
+    determined: Finding,
+    seen: Evidence,
+    suspicious: Sequence[str],
+    suggestions: Sequence[Suggestion],
+) -> list[str]:
+    """What is not determined, suspicious, left over, and to be measured next; a sentence each."""
+    sentences = []
+    if estimate.identifiability.undetermined:
+        sentences.append(f"Not determined: {determined.text[:1].lower()}{determined.text[1:]}")
+    missed = seen.misses
+    if missed is not None and missed.beyond:
+        ids = ", ".join(miss.record_id for miss in missed.explained[:MOST_TOLD])
+        more = f" and {missed.beyond - MOST_TOLD} more" if missed.beyond > MOST_TOLD else ""
+        sentences.append(f"Missed by more than {missed.limit_mm:.2f} mm: {ids}{more}.")
+    sentences.append(f"Suspicious records: {_few(suspicious)}." if suspicious else "No training record is suspicious.")
+    if seen.leftover is not None and seen.leftover.worthwhile:
+        listed = "; ".join(f"{s.words} ({s.falls_mm:.2f} mm)" for s in seen.leftover.worthwhile)
+        sentences.append(f"Residuals still depend on {listed}.")
+    elif seen.leftover is not None and seen.leftover.lag_after_p <= seen.leftover.level:
+        after = f"{seen.leftover.lag_after:.2f}"
+        sentences.append(f"No cause that was looked for is left in the residuals, yet neighbours correlate by {after}.")
+    elif seen.leftover is not None:
+        sentences.append("Nothing that was looked for is left in the residuals.")
+    if suggestions:
+        sentences.append(f"Measure these poses next: {'; '.join(suggestion.text for suggestion in suggestions)}.")
+    return sentences
 
 
 def _convergence(estimate: Estimate) -> Finding:
     told = estimate.verdict
     if not told.converged:
-        return Finding("bad", f"{told.name} did not converge ({told.status}): these values are no calibration.")
+        text = f"{told.name} did not converge ({told.status}): these values are no calibration."
+        return Finding("bad", text, "the solver's own", "Check the data and the start values; allow more iterations.")
     text = f"{told.name} converged in {told.iterations} iterations"
     if told.starts > 1:
         text += f"; {told.agreeing_starts} of {told.starts} starts came to the same answer"
-    return Finding("good", text + ".")
-
-
-def _determined(estimate: Estimate) -> Finding:
-    known = estimate.identifiability
-    if known.undetermined:
-        listed = "; ".join(str(combination) for combination in known.undetermined)
-        return Finding("bad", f"Not determined by the data, held by priors alone: {listed}.")
-    if not len(known):
-        return Finding("warning", "No parameter was free: the nominal model was judged, nothing was calibrated.")
-    return Finding("good", f"The data determines all {known.rank} free parameters.")
+    return Finding("good", text + ".", "the solver's own")
 
 
 def _condition(estimate: Estimate) -> list[Finding]:
     known = estimate.identifiability
     if known.condition <= POOR_CONDITION:
         return []
-    return [Finding("warning", f"Hardly determined (scaled condition {known.condition:.1e}): {known.weakest}.")]
+    held = bool(np.all(estimate.parameters.prior_information() > 0))
+    test = f"scaled condition {known.condition:.1e}, limit {POOR_CONDITION:.0e}"
+    action = "Their priors hold them." if held else "Measure what armcal plan asks for, or give them priors."
+    return [Finding("note" if held else "warning", f"Hardly determined: {known.weakest}.", test, action)]
 
 
 def _bounds(estimate: Estimate) -> list[Finding]:
@@ -110,29 +163,42 @@ def _bounds(estimate: Estimate) -> list[Finding]:
         value, sd = estimate.values[estimate.free_entries[i]], estimate.deviations[i]
         beyond = abs(float(estimate.unconstrained[i] - value)) / sd if sd > 0 else 0.0
         (pushing if beyond > ndtri(1 - LEVEL) else agreeing).append(f"{name} ({beyond:.1f} sd beyond)")
-    findings = []
+    findings, test = [], "step without bounds, one-sided, 5 %"
     if pushing:
-        text = f"The data pushes against a bound: {', '.join(pushing)}. Something else in the model is missing."
-        findings.append(Finding("warning", text))
+        text = f"The data pushes against a bound: {_few(pushing)}. Something else in the model is missing."
+        findings.append(Finding("warning", text, test, "Check loads, masses and signs; look for a missing effect."))
     if agreeing:
-        text = f"At a bound, and the data agrees (5 %): {', '.join(agreeing)}. Its upper limit is what was learned."
-        findings.append(Finding("note", text))
+        text = f"At a bound, and the data agrees: {_few(agreeing)}. Its upper limit is what was learned."
+        findings.append(Finding("note", text, test))
     return findings
 
 
-def _noise(estimate: Estimate) -> Finding:
+def _few(listed: Sequence[str], separator: str = ", ") -> str:
+    more = f" and {len(listed) - MOST_TOLD} more" if len(listed) > MOST_TOLD else ""
+    return separator.join(listed[:MOST_TOLD]) + more
+
+
+def _noise(estimate: Estimate, fitted: WeighedFit | None) -> list[Finding]:
+    """Whose the scatter is if that was estimated, else whether it is as large as declared."""
+    if fitted is not None and fitted.components is not None:
+        return components_told(fitted.components)
+    return [_size(estimate)]
+
+
+def _size(estimate: Estimate) -> Finding:
     """Are the residuals as large as the declared noise? Chi-square, two-sided, at 5 %."""
     freedom, ratio = max(1, estimate.degrees_of_freedom), estimate.noise_scale
-    total = ratio**2 * freedom
+    total, test = ratio**2 * freedom, "chi-square, 5 %"
     if total > chdtri(freedom, LEVEL / 2):
-        return Finding(
-            "warning",
-            f"Residuals are {ratio:.1f} times the declared noise (chi-square, 5 %): what is left is the model's "
-            "error, not the tracker's. Intervals are widened to the residuals.",
+        text = (
+            f"Residuals are {ratio:.1f} times the declared noise: what is left is the model's error, not the "
+            "tracker's. Intervals are widened to the residuals."
         )
+        return Finding("warning", text, test, "Model what residuals still depend on.")
     if ratio < 0.5:
-        return Finding("note", f"Residuals are only {ratio:.2f} times the declared noise: was it stated too large?")
-    return Finding("good", "Residuals are as large as the declared noise: the model explains the data.")
+        text = f"Residuals are only {ratio:.2f} times the declared noise: was it stated too large?"
+        return Finding("note", text, "ratio below 0.5", "State the noise as the instrument's data sheet does.")
+    return Finding("good", "Residuals are as large as the declared noise: the model explains the data.", test)
 
 
 def _neighbours(whitened: Array, train: NDArray[np.intp]) -> list[Finding]:
@@ -142,42 +208,42 @@ def _neighbours(whitened: Array, train: NDArray[np.intp]) -> list[Finding]:
     if len(first) < 10 or not spread:
         return []
     products = whitened[:, first] * whitened[:, first + 1]
-    lag_one = float(np.mean(products)) / spread
+    lag_one, test = float(np.mean(products)) / spread, "lag-one correlation, 5 %"
     if abs(lag_one) < ndtri(1 - LEVEL / 2) / np.sqrt(products.size):
-        return [Finding("good", "Residuals of neighbouring records do not correlate (5 %).")]
-    return [
-        Finding(
-            "warning",
-            f"Residuals of neighbouring records correlate by {lag_one:.2f} (5 %): they are no noise, so the "
-            "intervals are too narrow and errors follow the arm's configuration.",
-        )
-    ]
+        return [Finding("good", "Residuals of neighbouring records do not correlate.", test)]
+    text = f"Residuals of neighbouring records correlate by {lag_one:.2f}: they are no noise, so the intervals are too"
+    return [Finding("warning", f"{text} narrow.", test, "Repeat one pose at the start, in the middle and at the end.")]
 
 
 def _correlated(estimate: Estimate) -> list[Finding]:
     pairs = correlated_pairs(estimate.covariance, estimate.names)
     if not pairs:
         return []
-    listed = ", ".join(f"{a} with {b} ({value:+.3f})" for a, b, value in pairs[:5])
-    more = f" and {len(pairs) - 5} more" if len(pairs) > 5 else ""
-    return [Finding("note", f"Hard to tell apart (correlation above 0.95): {listed}{more}.")]
+    listed = _few([f"{a} with {b} ({value:+.3f})" for a, b, value in pairs])
+    return [Finding("note", f"Hard to tell apart: {listed}.", "correlation of estimates above 0.95")]
 
 
-def _outliers(errors_mm: Array, ids: Sequence[str]) -> list[Finding]:
-    """Records beyond five robust standard deviations of the errors."""
+def _suspicious(errors_mm: Array, ids: Sequence[str], fitted: WeighedFit | None) -> list[str]:
+    """Ids of training records beyond their limit, the farthest first."""
+    if fitted is not None and fitted.loss != "none":
+        return list(dict.fromkeys(ids[suspect.record] for suspect in fitted.suspects))
     middle = float(np.median(errors_mm))
     spread = 1.4826 * float(np.median(np.abs(errors_mm - middle)))
-    suspicious = np.flatnonzero(errors_mm > middle + 5 * max(spread, _SMALLEST_SPREAD_MM))
-    if not len(suspicious):
+    beyond = np.flatnonzero(errors_mm > middle + DEVIATIONS * max(spread, _SMALLEST_SPREAD_MM))
+    return [ids[i] for i in beyond[np.argsort(-errors_mm[beyond], kind="stable")]]
+
+
+def _outliers(suspicious: Sequence[str], ids: Sequence[str], fitted: WeighedFit | None) -> list[Finding]:
+    """Records beyond their limits if the loss sought them, else beyond five robust deviations of the errors."""
+    if fitted is not None and fitted.loss != "none":
+        action = "Look at them in residuals.csv, and measure them again."
+        return [replace(f, action=action) if f.grade == "warning" else f for f in suspects_told(fitted, ids)]
+    if not suspicious:
         return []
-    worst = [ids[i] for i in suspicious[np.argsort(-errors_mm[suspicious])][:5]]
-    return [
-        Finding(
-            "warning",
-            f"Beyond five robust deviations of the training errors: {len(suspicious)} records, the worst "
-            f"{', '.join(worst)}. Look at them, and at residuals.csv.",
-        )
-    ]
+    listed = ", ".join(suspicious[:MOST_TOLD])
+    text = f"Beyond five robust deviations of the training errors: {len(suspicious)} records, the worst {listed}."
+    test = "median and median absolute deviation"
+    return [Finding("warning", text, test, "Measure them again, or set noise.loss: reject; residuals.csv has all.")]
 
 
 def _next(estimate: Estimate, suggestions: Sequence[Suggestion]) -> list[Finding]:
@@ -187,11 +253,10 @@ def _next(estimate: Estimate, suggestions: Sequence[Suggestion]) -> list[Finding
     scales = [b.scale for b in estimate.parameters.free for _ in range(b.size)]
     relative = np.nan_to_num(estimate.deviations / np.array(scales), nan=np.inf)
     text = f"Least certain, in its ordinary size: {estimate.names[int(np.argmax(relative))]}."
-    if suggestions:
-        poses = "; ".join(suggestion.text for suggestion in suggestions)
-        shrink = 100 * (1 - suggestions[-1].shrink)
-        text += (
-            f" Of {CANDIDATES} poses like the recorded ones these would tell most (they shrink standard deviations "
-            f"by {shrink:.1f} % on average; clearance was not checked): {poses}."
-        )
-    return [Finding("note", text)]
+    if not suggestions:
+        return [Finding("note", text)]
+    shrink = 100 * (1 - suggestions[-1].shrink)
+    text += f" Three poses more would shrink standard deviations by {shrink:.1f} % on average."
+    test = f"determinant of the information, {CANDIDATES} poses like the recorded ones; clearance was not checked"
+    poses = "; ".join(suggestion.text for suggestion in suggestions)
+    return [Finding("note", text, test, f"Measure next: {poses}.")]

@@ -109,6 +109,8 @@ def _noise(factor: Factor) -> None:
         all(np.isfinite(noise) and noise > 0 for noise in factor.noise),
         f"found the noise {factor.noise}, expected standard deviations above zero",
     )
+    stated = len(factor.noise_channels)
+    expect(stated in (0, count), f"found noise channels for {stated} of {count} residuals, expected all or none")
 
 
 def _closed(factor: Factor) -> None:

@@ -22,8 +22,11 @@ from armcal.config.validate import validate
 from armcal.config.yaml_source import load_config
 from armcal.errors import ConfigError, DataError, Location
 from armcal.plugins import PluginRegistry, discover
+from armcal.solve.coverage import Recording
 from armcal.solve.estimator import Estimate
 from armcal.solve.problem import Problem
+from armcal.solve.variance import Component
+from armcal.use.intervals import PlusMinus, PredictionRecord, Uncertainty
 
 SCHEMA = 1
 
@@ -67,6 +70,7 @@ class CalibrationFile(Settings):
     measurements: dict[str, Any]
     statics: dict[str, Any]
     parameters: tuple[ParameterRecord, ...]
+    prediction: PredictionRecord | None = None
     information: InformationRecord
 
 
@@ -106,6 +110,13 @@ class Calibration:
                 "the solver did not converge: these values are no calibration.",
                 where=Location(str(path)),
                 hint="Run the calibration again with better start values or more data.",
+            )
+        rows = record.information.square_root
+        if [len(row) for row in rows] != [len(record.information.increments)] * len(record.information.increments):
+            raise ConfigError(
+                "its information does not fit its parameters: the file was cut or damaged.",
+                where=Location(str(path)),
+                hint="Take a whole copy, or run the calibration again.",
             )
         description = {key: plain(source.data[key]) for key in ("arms", "measurements", "statics")}
         if identity_of(description) != record.identity.get("arm"):
@@ -154,6 +165,45 @@ class Calibration:
             for row, channel in enumerate(kernel.factor.output_channels)
         }
         return channels, _poses(shown[0][len(problem.kernels[0].factor.output_channels) :])
+
+    @property
+    def uncertainty(self) -> Uncertainty:
+        """How far its predictions may be off.
+
+        Raises:
+            ConfigError: the file does not say, or what it says does not fit its parameters.
+        """
+        kept, noise = self.record.prediction, self.record.noise
+        if kept is None:
+            raise ConfigError(
+                "the calibration keeps nothing about the errors of its predictions.",
+                hint="It was written by an earlier version; run the calibration again.",
+            )
+        entries = self.record.parameters
+        free = {entry.name.partition("[")[0] for entry in entries if entry.free}
+        names = tuple(entry.name for entry in entries if entry.free)
+        if kept.entries != names or [len(row) for row in kept.covariance] != [*range(1, len(names) + 1)]:
+            raise ConfigError(
+                "the covariance in the calibration does not fit its free parameters.",
+                hint="The file was edited or damaged; run the calibration again.",
+            )
+        fitted = self.parameters.with_nominal(np.array([entry.nominal for entry in entries])).with_free(free)
+        components = tuple(_component(each) for each in noise.get("components", ()))
+        measure = (float(noise["scale"]), int(noise["degrees_of_freedom"]))
+        return Uncertainty(self.system, fitted, self.parameters.nominal(), kept, *measure, components)
+
+    def plus_minus(self, commands: Dataset, recording: Recording = "new") -> PlusMinus:
+        """How far measurements at these commands may lie from ``predict``.
+
+        In the ``same`` recording as the calibration's, with the drift that it tells of, which ``shift`` adds to the
+        predicted channels.
+
+        Raises:
+            ConfigError: the calibration does not say.
+            DataError: in the same recording, and the records do not say their place in it.
+            NotConvergedError: a record has no equilibrium.
+        """
+        return self.uncertainty.plus_minus(commands, recording)
 
     def forward(self, joint_angles: Array, arm: str | None = None) -> Array:
         """base_T_tool (N x 4 x 4) at commanded joint angles (N x n; rad, or m on sliding joints).
@@ -218,6 +268,12 @@ def _uncertainty(estimate: Estimate, index: int) -> dict[str, Any]:
         "upper": _finite(interval.upper),
         "determined": estimate.determined[index],
     }
+
+
+def _component(kept: Mapping[str, Any]) -> Component:
+    """One estimated variance; not a number where null is kept."""
+    known: dict[str, Any] = {key: float("nan") if value is None else value for key, value in kept.items()}
+    return Component(**known)
 
 
 def _finite(number: float) -> float | None:

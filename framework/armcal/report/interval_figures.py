@@ -1,0 +1,182 @@
+"""Prediction intervals and profiles on the page: what was claimed beside what was found."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from armcal.base.domains import Array
+from armcal.report import svg
+from armcal.report.error_figures import roles
+from armcal.report.numbers import NONE, count, fixed, plural, shown_unit, significant
+from armcal.report.svg import Axis, Box, Figure
+from armcal.run.intervals import IntervalResult
+from armcal.run.result import RunResult
+from armcal.solve.coverage import Coverage
+from armcal.solve.prediction import LEVELS
+from armcal.solve.profile import Profile
+
+_DIAMOND = "m-3.6 0l3.6-3.6l3.6 3.6l-3.6 3.6z"
+_RECORDINGS = {"same": "calibrated recording", "new": "new recording"}
+_ENDS = {"crossed": "", "bound": "at its bound", "open": "does not end as far as was looked"}
+
+
+@dataclass(frozen=True)
+class ShareRow:
+    """Shares held by the intervals of one set of records, as stated and as computed; one text a level, radii last."""
+
+    name: str
+    records: str
+    stated: tuple[str, ...]
+    raw: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class ProfileRow:
+    """One interval by profile likelihood, in a customary unit."""
+
+    name: str
+    value: str
+    interval: str
+    unit: str
+    remark: str
+
+
+def share_rows(found: IntervalResult) -> tuple[ShareRow, ...]:
+    """Cross-validated and held-out records, each in the calibrated and in a new recording."""
+    sets = (("Cross-validated", found.crossed), ("Held out", found.holdout))
+    rows = []
+    for words, shares in sets:
+        for name, each in shares.items():
+            label = f"{words}, {_RECORDINGS[name]}" if len(shares) > 1 else words
+            rows.append(_row(label, each))
+    return tuple(rows)
+
+
+def _row(label: str, each: Coverage) -> ShareRow:
+    radius = each.stretched_radius if each.stretched else each.raw_radius
+    return ShareRow(
+        label, count(each.records), _percent([*each.stated, radius]), _percent([*each.raw, each.raw_radius])
+    )
+
+
+def _percent(shares: Sequence[float | None]) -> tuple[str, ...]:
+    return tuple(NONE if share is None else f"{100 * share:.1f} %" for share in shares)
+
+
+def level_names() -> tuple[str, ...]:
+    """Of the columns of the table."""
+    return (*(f"{100 * level:g} %" for level in LEVELS), "95 % radius")
+
+
+def predicted_against_found(result: RunResult) -> Figure | None:
+    """Error of each judged record over its 95 % radius; None where no position was judged."""
+    scores = result.intervals.scores.get("same")
+    if scores is None or len(scores.reaches) != 1:
+        return None
+    _, holdout = roles(result)
+    errors = result.errors
+    found = np.where(holdout, errors.calibrated_mm, errors.cross_validated_mm)
+    reach = scores.reaches[0]
+    known = np.isfinite(reach) & np.isfinite(found) & (reach > 0)
+    if not known.any():
+        return None
+    stretch = result.intervals.stretches.get("same")
+    widened = stretch.radius if stretch and stretch.radius is not None else 1.0
+    radius = np.where(known, widened * found / np.where(known, reach, 1.0), np.nan)
+    inside = float(np.mean(found[known] <= radius[known]))
+    said = f"{plural(int(known.sum()), 'record')} judged by a fit that did not see them; {100 * inside:.1f} % inside."
+    caption = "Below the line the error is inside its 95 % radius. Spread along the line: the +- follows the pose."
+
+    def draw(width: float) -> tuple[float, list[str]]:
+        start, parts = svg.legend(52, 12, width - 60, _legend(known & ~holdout, known & holdout))
+        box = Box(52, start + 2, width - 16, start + (270 if width > svg.NARROW else 220))
+        low, high = float(np.nanmin(radius[known])), float(np.nanmax(radius[known]))
+        margin = max(0.05 * (high - low), 0.02 * high)
+        x = Axis(max(low - margin, 0.0), high + margin, box.left, box.right)
+        y = Axis(0, 1.06 * max(float(found[known].max()), high), box.bottom, box.top)
+        labels = ("predicted 95 % radius, mm", "error found, mm")
+        parts += svg.frame(box, x, y, labels, (8 if width > svg.NARROW else 5, 5))
+        parts.append(svg.line(x.start, y.of(x.low), x.end, y.of(x.high), "guide"))
+        crossed, held = known & ~holdout, known & holdout
+        parts.append(svg.dots(x.at(radius[crossed]), y.at(found[crossed]), "dot train"))
+        parts.append(svg.marks(x.at(radius[held]), y.at(found[held]), _DIAMOND, "diamond"))
+        return box.bottom + 44, parts
+
+    return svg.both("radii", ("Predicted and found errors", said, caption), draw)
+
+
+def _legend(crossed: Array, held: Array) -> list[tuple[str, str]]:
+    entries = []
+    if crossed.any():
+        entries.append(('<path class="dot train" d="M11 0h0"/>', "cross-validated"))
+    if held.any():
+        entries.append((f'<path class="diamond" d="M11 0{_DIAMOND}"/>', "held out"))
+    return entries
+
+
+def profile_rows(result: RunResult) -> tuple[ProfileRow, ...]:
+    """Of the numbers asked for."""
+    rows = []
+    for each in result.profiles:
+        factor, unit = _shown(result, each)
+        digits = max(2, 1 - int(np.floor(np.log10(max(factor * _width(each), 1e-12)))))
+        ends = f"{fixed(factor * each.lower, digits)} to {fixed(factor * each.upper, digits)}"
+        remarks = [f"{side} end {_ENDS[end]}" for side, end in _sides(each) if _ENDS[end]]
+        if each.better:
+            remarks.append("a better fit was found on the way: try more starts")
+        rows.append(ProfileRow(each.name, fixed(factor * each.value, digits), ends, unit, "; ".join(remarks)))
+    return tuple(rows)
+
+
+def profile_figures(result: RunResult) -> tuple[Figure, ...]:
+    """The curve of each profile with the parabola of its standard deviation."""
+    return tuple(_curve(result, number, each) for number, each in enumerate(result.profiles))
+
+
+def _curve(result: RunResult, number: int, each: Profile) -> Figure:
+    factor, unit = _shown(result, each)
+    label = f"{each.name}, {unit}" if unit else each.name
+    places, rises = factor * each.curve[0], each.curve[1]
+    top = 1.6 * each.quantile
+    caption = "The interval ends where the curve passes the level line. Dashed: the parabola of the standard deviation."
+    said = f"From {significant(factor * each.lower)} to {significant(factor * each.upper)} {unit}."
+    entries = [('<path class="curve train" d="M0 0h22"/>', "profile")]
+    entries.append(('<path class="curve before" d="M0 0h22"/>', "by the curvature"))
+
+    def draw(width: float) -> tuple[float, list[str]]:
+        start, parts = svg.legend(52, 12, width - 60, entries)
+        box = Box(52, start + 2, width - 16, start + 200)
+        margin = 0.05 * max(float(np.ptp(places)), 1e-12)
+        x = Axis(float(places.min()) - margin, float(places.max()) + margin, box.left, box.right)
+        y = Axis(0, top, box.bottom, box.top)
+        parts += svg.frame(box, x, y, (label, "twice the rise of the cost"), (5, 4))
+        parts.append(svg.line(box.left, y.of(each.quantile), box.right, y.of(each.quantile), "guide"))
+        if np.isfinite(each.deviation) and each.deviation > 0:
+            wide = np.linspace(x.low, x.high, 80)
+            curvature = ((wide / factor - each.value) / each.deviation) ** 2
+            shown = curvature <= top
+            parts.append(svg.polyline(x.at(wide[shown]), y.at(curvature[shown]), "curve before"))
+        fine = np.linspace(float(places.min()), float(places.max()), 120)
+        # Between fits the root of the rise is nearly straight.
+        root = np.interp(fine, places, np.sign(places - factor * each.value) * np.sqrt(np.maximum(rises, 0.0)))
+        parts.append(svg.polyline(x.at(fine), y.at(root**2), "curve train"))
+        parts.append(svg.dots(x.at(places), y.at(rises), "dot train"))
+        return box.bottom + 44, parts
+
+    return svg.both(f"profile{number}", (f"Profile of {each.name}", said, caption), draw, svg.HALF)
+
+
+def _sides(each: Profile) -> tuple[tuple[str, str], tuple[str, str]]:
+    return ("lower", each.lower_end), ("upper", each.upper_end)
+
+
+def _width(each: Profile) -> float:
+    return max(each.upper - each.lower, 1e-12)
+
+
+def _shown(result: RunResult, each: Profile) -> tuple[float, str]:
+    """Factor from SI to a customary unit, and the unit."""
+    return shown_unit(result.estimate.parameters[each.name].unit)

@@ -1,0 +1,40 @@
+"""The report's table of records that judge and are missed by more than the limit."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from armcal.report.numbers import NONE, fixed
+from armcal.solve.misses import Misses
+
+
+@dataclass(frozen=True)
+class MissedRow:
+    """One record in words."""
+
+    record_id: str
+    row: str
+    error: str
+    reasons: str
+    advice: str
+
+
+@dataclass(frozen=True)
+class MissedTable:
+    """The farthest first."""
+
+    beyond: int
+    judged: int
+    limit: str
+    rows: tuple[MissedRow, ...]
+
+
+def missed_records(misses: Misses | None) -> MissedTable | None:
+    """None if no record judged, or none lies beyond the limit."""
+    if misses is None or not misses.beyond:
+        return None
+    rows = tuple(
+        MissedRow(m.record_id, str(m.row) if m.row else NONE, fixed(m.error_mm, 2), "; ".join(m.reasons), m.advice)
+        for m in misses.explained
+    )
+    return MissedTable(misses.beyond, misses.judged, fixed(misses.limit_mm, 2), rows)

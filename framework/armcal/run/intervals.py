@@ -1,0 +1,170 @@
+"""What a run says of its predictions: how wide their intervals are, and whether they hold what they claim."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from armcal.solve.coverage import (
+    Coverage,
+    PredictedFit,
+    Recording,
+    Scores,
+    Stretch,
+    collected,
+    coverage,
+    predictor,
+    score,
+    stretch,
+    told,
+    whitened_like,
+)
+from armcal.solve.estimator import Estimator
+from armcal.solve.noise_findings import Finding
+from armcal.solve.prediction import LEVELS, STATED, Spread, is_position
+from armcal.solve.problem import FactorRecords, Problem
+from armcal.solve.validation import CrossValidation, Indices, Split
+from armcal.solve.weighing import WeighedFit
+
+_MM = 1000.0
+_NAMED: Mapping[Recording, str] = {"same": "same_recording", "new": "new_recording"}
+
+
+@dataclass(frozen=True)
+class IntervalResult:
+    """Prediction intervals of a run, each by recording: the calibration's own, and where something drifts a new one.
+
+    Attributes:
+        stretches: what half widths are multiplied by, from cross-validation; empty without.
+        crossed: shares held of training records, by folds that did not see them; stretched from inner folds.
+        holdout: shares held of held-out records.
+        half_width_mm: of 90 % intervals of a position coordinate, median over all records; stretched.
+        radius_mm: of 95 % radii of positions, likewise.
+        scores: of cross-validated and held-out records, in dataset order; nan elsewhere.
+    """
+
+    stretches: Mapping[Recording, Stretch] = field(default_factory=dict)
+    crossed: Mapping[Recording, Coverage] = field(default_factory=dict)
+    holdout: Mapping[Recording, Coverage] = field(default_factory=dict)
+    half_width_mm: Mapping[Recording, float] = field(default_factory=dict)
+    radius_mm: Mapping[Recording, float] = field(default_factory=dict)
+    scores: Mapping[Recording, Scores] = field(default_factory=dict)
+
+    @property
+    def judged(self) -> tuple[Mapping[Recording, Coverage], str]:
+        """What judges best, and what it is in words: held-out records, else cross-validated ones."""
+        return (self.holdout, "held-out records") if self.holdout else (self.crossed, "cross-validated records")
+
+    def findings(self) -> list[Finding]:
+        """Whether intervals hold their share."""
+        found, words = self.judged
+        typical = [Finding("note", self._typical())] if self.half_width_mm else []
+        return [*typical, *(told(each, words, name) for name, each in found.items())]
+
+    def _typical(self) -> str:
+        """How wide the intervals are."""
+        half, radius = self.half_width_mm, self.radius_mm
+        text = "In the median pose, of poses like the recorded ones, a prediction is good to "
+        text += f"+- {half['same']:.2f} mm a coordinate (90 %), "
+        text += f"{radius['same']:.2f} mm in all (95 %)"
+        if "new" in half:
+            text += f"; in a new recording to +- {half['new']:.2f} mm and {radius['new']:.2f} mm"
+        return text + ", the measurement's noise included."
+
+    def as_dict(self) -> dict[str, Any]:
+        """For metrics.json."""
+        told = {}
+        for name in self.half_width_mm:
+            told[_NAMED[name]] = {
+                "half_width_90_mm": self.half_width_mm[name],
+                "radius_95_mm": self.radius_mm[name],
+                "stretch": self.stretches[name].as_dict() if name in self.stretches else None,
+                "cross_validated": self.crossed[name].as_dict() if name in self.crossed else None,
+                "holdout": self.holdout[name].as_dict() if name in self.holdout else None,
+            }
+        return told
+
+
+def interval_result(
+    problem: Problem,
+    fitted: WeighedFit,
+    records: Sequence[FactorRecords],
+    split: Split,
+    estimator: Estimator,
+    crossed: tuple[CrossValidation, Sequence[Split]] | None,
+) -> IntervalResult:
+    """From the fit on the training records, and the folds (of the training records) that judged them.
+
+    Raises:
+        NotConvergedError: a record has no elastic equilibrium at the values found.
+    """
+    by, alike = predictor(problem, fitted), whitened_like(problem, fitted, records, estimator)
+    scores, shares, stretches = _crossed(crossed, split, records[0].count)
+    holdout: dict[Recording, Coverage] = {}
+    if len(split.holdout):
+        for name, own in score(by, problem.subset(alike, split.holdout)).items():
+            found = coverage(own, [stretches.get(name)] * len(split.holdout))
+            if found is not None:
+                holdout[name] = found
+            scores = {**scores, name: _filled(scores.get(name), own, split.holdout, records[0].count)}
+    spreads: dict[Recording, Sequence[Spread]] = {"same": by.in_recording(alike)}
+    if by.drifts:
+        spreads["new"] = by.in_new_recording(alike)
+    places = [i for i, kernel in enumerate(problem.kernels) if is_position(kernel)]
+    typical = {name: _typical([each[i] for i in places], stretches.get(name)) for name, each in spreads.items()}
+    return IntervalResult(
+        stretches,
+        shares,
+        holdout,
+        {name: half for name, (half, _) in typical.items()} if places else {},
+        {name: radius for name, (_, radius) in typical.items()} if places else {},
+        scores,
+    )
+
+
+def _crossed(
+    crossed: tuple[CrossValidation, Sequence[Split]] | None, split: Split, count: int
+) -> tuple[dict[Recording, Scores], dict[Recording, Coverage], dict[Recording, Stretch]]:
+    """Scores in dataset order, the shares they hold by stretches of inner folds, and the stretches from all of them."""
+    if crossed is None:
+        return {}, {}, {}
+    judged, splits = crossed
+    fits = [fit if isinstance(fit, PredictedFit) else None for fit in judged.fits]
+    found = collected(splits, [fit.scores if fit else {} for fit in fits], len(split.train))
+    shares: dict[Recording, Coverage] = {}
+    for name, own in found.items():
+        inner: list[Stretch | None] = [None] * len(split.train)
+        for part, fit in zip(splits, fits, strict=True):
+            for i in part.holdout:
+                inner[i] = fit.stretches.get(name) if fit else None
+        share = coverage(own, inner)
+        if share is not None:
+            shares[name] = share
+    # Nothing is stretched whose share was not judged.
+    sure = [name for name, share in shares.items() if share.stretched is not None]
+    stretches = {name: s for name in sure if (s := stretch(found[name])) is not None}
+    return {n: _filled(None, own, split.train, count) for n, own in found.items()}, shares, stretches
+
+
+def _filled(before: Scores | None, own: Scores, places: Indices, count: int) -> Scores:
+    """Scores of some records among those of all."""
+    result = before
+    if result is None:
+        errors, reaches = (np.full((len(rows), count), np.nan) for rows in (own.errors, own.reaches))
+        result = Scores(errors, reaches, np.ones(count))
+    result.errors[:, places], result.reaches[:, places], result.freedom[places] = own.errors, own.reaches, own.freedom
+    return result
+
+
+def _typical(spreads: Sequence[Spread], widened: Stretch | None) -> tuple[float, float]:
+    """Median half width of a 90 % interval of a coordinate, and of a 95 % radius (mm)."""
+    if not spreads:
+        return float("nan"), float("nan")
+    factor = widened.coordinates[LEVELS.index(STATED)] if widened else 1.0
+    radius = widened.radius if widened and widened.radius is not None else 1.0
+    half = np.concatenate([spread.half_widths(STATED).ravel() for spread in spreads])
+    radii = np.concatenate([spread.radius() for spread in spreads])
+    return float(np.median(half)) * factor * _MM, float(np.median(radii)) * radius * _MM

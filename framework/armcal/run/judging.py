@@ -1,0 +1,122 @@
+"""How a run comes to its verdict: tests of the residuals, of the records that judge, and of unseen poses."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from armcal.base.dataset import Dataset
+from armcal.base.domains import Array
+from armcal.config.system import System
+from armcal.run.intervals import IntervalResult
+from armcal.run.result import RecordErrors
+from armcal.solve.drift import residuals
+from armcal.solve.evidence import Evidence, priors_alone, unseen_poses
+from armcal.solve.leftover import leftover
+from armcal.solve.misses import Judged, misses
+from armcal.solve.motion import Motion, recorded_position
+from armcal.solve.problem import FactorRecords, Problem
+from armcal.solve.suggestion import suggest
+from armcal.solve.validation import Split
+from armcal.solve.verdict import Verdict, judge
+from armcal.solve.weighing import WeighedFit
+
+_MM = 1000.0
+
+
+@dataclass(frozen=True)
+class FittedRecords:
+    """All records of a run, which of them trained, and the fit to those."""
+
+    problem: Problem
+    records: tuple[FactorRecords, ...]
+    dataset: Dataset
+    split: Split
+    fitted: WeighedFit
+
+
+def verdict_of(
+    run: FittedRecords, errors: RecordErrors, intervals: IntervalResult, system: System, limit: float | None
+) -> tuple[Verdict, Evidence]:
+    """The verdict on a fit, and what it rests on.
+
+    Args:
+        run: the fit and its records.
+        errors: of every record.
+        intervals: whether prediction intervals hold their share.
+        system: the arms.
+        limit: above which the error of a judged record is explained (m); None for the default.
+    """
+    found, held = run.fitted.estimate, len(run.split.holdout)
+    judged = _judged(run, errors)
+    evidence = gather(run, judged, system, limit)
+    joints = {
+        f"{name}.{joint}": dimension
+        for name, arm in system.arms.items()
+        for joint, dimension in zip(arm.joint_names, arm.joint_dimensions, strict=True)
+    }
+    training = run.dataset.subset(run.split.train)
+    verdict = judge(
+        found,
+        _whitened(run),
+        errors.calibrated_mm,
+        run.split.train,
+        judged[np.isfinite(judged)],
+        f"{held} held-out records" if held else "cross-validation",
+        run.dataset.ids,
+        suggest(run.problem, training, found, joints) if found.names else (),
+        run.fitted,
+        intervals.findings(),
+        evidence,
+    )
+    return verdict, evidence
+
+
+def gather(run: FittedRecords, judged_mm: Array, system: System, limit: float | None) -> Evidence:
+    """Tests of the residuals of a fit that converged; nothing of one that did not.
+
+    ``judged_mm`` are errors by fits that did not see the record (N; nan where there is none).
+    """
+    problem, found, dataset = run.problem, run.fitted.estimate, run.dataset
+    if not found.verdict.converged:
+        return Evidence()
+    position, motion = recorded_position(dataset), Motion.of(problem, found.values, run.records, dataset)
+    judged = Judged(judged_mm, residuals(problem, found.values, run.records, run.fitted.records), position)
+    limit_mm = None if limit is None else limit * _MM
+    missed = misses(problem, run.records, found, dataset, motion, judged, limit_mm)
+    training, train = dataset.subset(run.split.train), run.split.train
+    alone = None
+    if len(found.identifiability.null):
+        alone = priors_alone(problem, found, unseen_poses(training, motion.channels))
+    acting = problem.weighted(run.fitted.records, run.fitted.weights)
+    own = (training, motion.subset(train), position[train])
+    return Evidence(leftover(problem, acting, found, *own, modelled=effect_types(system)), missed, alone)
+
+
+def effect_types(system: System) -> frozenset[str]:
+    """The types of all effects of all arms."""
+    arms: Mapping[str, Any] = system.description["arms"]
+    return frozenset(str(effect.get("type")) for arm in arms.values() for effect in (arm.get("effects") or {}).values())
+
+
+def _judged(run: FittedRecords, errors: RecordErrors) -> Array:
+    """Errors of the records that judge: held-out ones, else cross-validated ones (N; nan elsewhere)."""
+    if not len(run.split.holdout):
+        return errors.cross_validated_mm
+    judged = np.full(len(run.dataset), np.nan)
+    judged[run.split.holdout] = errors.calibrated_mm[run.split.holdout]
+    return judged
+
+
+def _whitened(run: FittedRecords) -> Array:
+    """Residuals in units of their noise times the record's weight (n_r x N); not a number outside of training."""
+    problem, fitted = run.problem, run.fitted
+    found = residuals(problem, fitted.solution.values, fitted.records, fitted.records)
+    parts = problem.whitened(found, fitted.records)
+    own = np.vstack([part * weight for part, weight in zip(parts, fitted.weights, strict=True)])
+    whole = np.full((len(own), len(run.dataset)), np.nan)
+    whole[:, run.split.train] = own
+    return whole

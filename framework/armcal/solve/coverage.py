@@ -1,0 +1,310 @@
+"""Whether prediction intervals hold what they claim, and by how much to widen them where they do not.
+
+Residuals of records that took no part in a fit are put in units of what was predicted for them. If the model's own
+error is not Gaussian, or larger in some poses than in others, the shares held differ from the levels claimed. The
+intervals are then stretched by the quantile of these scores (split conformal prediction with scores in units of
+the predicted spread [Lei2018]), level by level. A stretch is never judged by the records it comes from: each fold of
+a cross-validation is judged by the stretch that folds inside of its training records gave.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from scipy.special import ndtri
+
+from armcal.base.domains import Array
+from armcal.errors import NotConvergedError
+from armcal.solve.blocks import automatic_block_length, standard_error_of_mean
+from armcal.solve.estimator import Estimator
+from armcal.solve.noise_findings import Finding
+from armcal.solve.prediction import LEVELS, RADIUS_LEVEL, STATED, Predictor, Spread, ToldDrift, is_position, quantile
+from armcal.solve.problem import FactorRecords, Problem
+from armcal.solve.validation import FitTask, Indices, JudgedFit, Split, failed_fit, folds, judged_fit
+from armcal.solve.variance import apply_components
+from armcal.solve.weighing import WeighedFit, Weighing, fit
+
+Recording = Literal["same", "new"]
+"""Whether what is predicted lies within the recording of the fit, whose drift is told, or in another one."""
+FEWEST = 40
+"""Judged records for a stretch to be found."""
+LEVEL = 0.05
+_MEANT = {"same": "", "new": " without what is told of the drift, as in a new recording,"}
+
+
+@dataclass(frozen=True)
+class Scores:
+    """Residuals of judged records in units of what was predicted; nan where there was no fit to judge.
+
+    Attributes:
+        errors: residual numbers over their standard deviations, all factors stacked (n_r x N).
+        reaches: lengths of position residuals over their 95 % radii, one row a position factor (n_p x N).
+        freedom: degrees of freedom of the fit that judged each record (N).
+    """
+
+    errors: Array
+    reaches: Array
+    freedom: Array
+
+    def of_level(self, level: float) -> Array:
+        """Sizes of residuals over half the widths of their intervals (n_r x N)."""
+        return np.asarray(np.abs(self.errors) / quantile(level, self.freedom))
+
+    @property
+    def judged(self) -> Array:
+        """Whether each record was judged (N)."""
+        return np.asarray(np.isfinite(self.errors).all(axis=0))
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """What half widths are multiplied by, one number a level, and what 95 % radii are (None without positions)."""
+
+    coordinates: tuple[float, ...]
+    radius: float | None
+
+    def as_dict(self) -> dict[str, float | None]:
+        """For YAML and JSON."""
+        named: dict[str, float | None] = {level_name(p): x for p, x in zip(LEVELS, self.coordinates, strict=True)}
+        return {**named, "radius_95": self.radius}
+
+
+@dataclass(frozen=True)
+class PredictedFit(JudgedFit):
+    """A fit that also told how far off it would be.
+
+    Attributes:
+        scores: of the records that judge, by recording (``new`` only where something drifts).
+        stretches: found inside of the training records; empty if there were too few.
+    """
+
+    scores: Mapping[Recording, Scores]
+    stretches: Mapping[Recording, Stretch]
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """Shares held.
+
+    Attributes:
+        records, coordinates: how many records and numbers were judged.
+        raw: share within the intervals as computed, one a level of ``LEVELS``.
+        raw_radius: share of positions within 95 % radii; None without positions.
+        stretched, stretched_radius: the same by stretches of other records; None where there were too few.
+        independent: how many independent numbers the judged ones are worth.
+    """
+
+    records: int
+    coordinates: int
+    raw: tuple[float, ...]
+    raw_radius: float | None
+    stretched: tuple[float, ...] | None
+    stretched_radius: float | None
+    independent: float
+
+    @property
+    def stated(self) -> tuple[float, ...]:
+        """Of the intervals that predictions give."""
+        return self.stretched or self.raw
+
+    def as_dict(self) -> dict[str, object]:
+        """For JSON."""
+
+        def named(shares: tuple[float, ...] | None, radius: float | None) -> dict[str, float | None] | None:
+            if shares is None:
+                return None
+            return {**{level_name(p): x for p, x in zip(LEVELS, shares, strict=True)}, "radius_95": radius}
+
+        return {
+            "records": self.records,
+            "coordinates": self.coordinates,
+            "worth_independent": self.independent,
+            "share": named(self.stated, self.stretched_radius if self.stretched else self.raw_radius),
+            "share_without_stretch": named(self.raw, self.raw_radius),
+            "stretched": self.stretched is not None,
+        }
+
+
+def level_name(level: float) -> str:
+    """Of a level or a share as a key: ``90``."""
+    return f"{100 * level:g}"
+
+
+def predictor(problem: Problem, fitted: WeighedFit) -> Predictor:
+    """What a fit predicts."""
+    found = fitted.estimate
+    drift = ToldDrift.by(problem, found.values, fitted.records)
+    return Predictor(problem, found.values, found.covariance, found.noise_scale, found.degrees_of_freedom, drift)
+
+
+def score(by: Predictor, held: Sequence[FactorRecords]) -> dict[Recording, Scores]:
+    """Residuals of records that a fit did not see, in units of what it predicts for them."""
+    found: dict[Recording, Scores] = {"same": _scores(by.problem, by.residuals(held), by.in_recording(held))}
+    if by.drifts:
+        found["new"] = _scores(by.problem, by.problem.residuals(by.values, held), by.in_new_recording(held))
+    return found
+
+
+def whitened_like(
+    problem: Problem, fitted: WeighedFit, held: Sequence[FactorRecords], estimator: Estimator
+) -> tuple[FactorRecords, ...]:
+    """Records with the noise that the fit estimated, if it did."""
+    if fitted.components is None or not isinstance(estimator, Weighing):
+        return tuple(held)
+    return apply_components(problem, fitted.solution.values, held, fitted.components, estimator.settings.axes)
+
+
+def fit_and_predict(task: FitTask, inner: int, seed: int) -> JudgedFit:
+    """Fit, judge and score; ``inner`` folds of the training records give the stretches. See ``fit_and_judge``."""
+    began = time.perf_counter()
+    try:
+        train, held = task.parts()
+        fitted = fit(task.problem, train, task.estimator, task.start)
+        judged = judged_fit(task, fitted.solution, train, held, began)
+        if not judged.converged:
+            return judged
+        scores = score(predictor(task.problem, fitted), whitened_like(task.problem, fitted, held, task.estimator))
+    except NotConvergedError:
+        return failed_fit(task, began)
+    within = _inner_scores(task, fitted, inner, seed)
+    found = {name: s for name, each in within.items() if (s := stretch(each)) is not None}
+    return PredictedFit(judged.errors, judged.at_rest, True, time.perf_counter() - began, scores, found)
+
+
+def _inner_scores(task: FitTask, fitted: WeighedFit, inner: int, seed: int) -> dict[Recording, Scores]:
+    """Scores of the training records by folds of them; started from the answer on all of them."""
+    train = task.split.train
+    if len(train) < max(FEWEST, inner):
+        return {}
+    splits = folds(len(train), inner, seed)
+    fits = []
+    for split in splits:
+        within = Split(train[split.train], train[split.holdout])
+        fits.append(_scored(FitTask(task.problem, task.estimator, fitted.solution.values, task.records, within)))
+    return collected(splits, fits, len(train))
+
+
+def _scored(task: FitTask) -> Mapping[Recording, Scores]:
+    try:
+        train, held = task.parts()
+        fitted = fit(task.problem, train, task.estimator, task.start)
+        if not fitted.solution.verdict.converged:
+            return {}
+        return score(predictor(task.problem, fitted), whitened_like(task.problem, fitted, held, task.estimator))
+    except NotConvergedError:
+        return {}
+
+
+def collected(
+    splits: Sequence[Split], found: Sequence[Mapping[Recording, Scores]], count: int
+) -> dict[Recording, Scores]:
+    """The scores of all folds in the order of the records; nan where a fold has none."""
+    result: dict[Recording, Scores] = {}
+    for split, scores in zip(splits, found, strict=True):
+        for name, own in scores.items():
+            if name not in result:
+                errors, reaches = (np.full((len(rows), count), np.nan) for rows in (own.errors, own.reaches))
+                result[name] = Scores(errors, reaches, np.ones(count))
+            whole = result[name]
+            whole.errors[:, split.holdout], whole.reaches[:, split.holdout] = own.errors, own.reaches
+            whole.freedom[split.holdout] = own.freedom
+    return result
+
+
+def stretch(scores: Scores) -> Stretch | None:
+    """From the scores of records that no other stretch comes from; None if there are too few.
+
+    Of n scores the ceil((n + 1) p)-th smallest: the finite-sample quantile of [Lei2018].
+    """
+    judged = scores.judged
+    if judged.sum() < FEWEST:
+        return None
+    rank = [_ranked(scores.of_level(level)[:, judged].ravel(), level) for level in LEVELS]
+    radius = _ranked(scores.reaches[:, judged].ravel(), RADIUS_LEVEL) if len(scores.reaches) else None
+    return Stretch(tuple(rank), radius)
+
+
+def coverage(scores: Scores, stretches: Sequence[Stretch | None] | None = None) -> Coverage | None:
+    """Shares held by the intervals of judged records (None if there are none), widened by each record's stretch."""
+    judged = np.flatnonzero(scores.judged)
+    if not len(judged):
+        return None
+    none = [Stretch((1.0,) * len(LEVELS), 1.0)] * len(scores.freedom)
+    raw, raw_radius = _shares(scores, none, judged)
+    own = list(stretches or ())
+    known = bool(own) and all(own[i] is not None for i in judged)
+    shares, radius = _shares(scores, own, judged) if known else (None, None)
+    held = _held(scores, own if known else none, STATED)[:, judged]
+    return Coverage(len(judged), held.size, raw, raw_radius, shares, radius, _worth(held))
+
+
+def told(found: Coverage, of: str, recording: Recording = "same") -> Finding:
+    """Do intervals hold their share? Two-sided, at 5 %, against so many independent numbers as they are worth."""
+    share, raw = found.stated[LEVELS.index(STATED)], found.raw[LEVELS.index(STATED)]
+    error = np.sqrt(STATED * (1 - STATED) / found.independent)
+    off = abs(share - STATED) > ndtri(1 - LEVEL / 2) * error
+    before = f"; {100 * raw:.1f} % before they were stretched" if found.stretched else ""
+    text = (
+        f"90 % prediction intervals{_MEANT[recording]} hold {100 * share:.1f} % of {found.coordinates} coordinates "
+        f"of {of}{before}"
+    )
+    test = f"two-sided, 5 %, as of {found.independent:.0f} independent numbers"
+    if not off:
+        return Finding("good", f"{text}.", test)
+    if share > STATED:
+        return Finding("note", f"{text}: wider than need be.", test)
+    return Finding("warning", f"{text}: too narrow.", test, "Take the shares found for what a +- is worth.")
+
+
+def _scores(problem: Problem, found: Sequence[Array], spreads: Sequence[Spread]) -> Scores:
+    errors = [residual / spread.deviations for residual, spread in zip(found, spreads, strict=True)]
+    reaches = [
+        np.linalg.norm(residual, axis=0) / spread.radius()
+        for kernel, residual, spread in zip(problem.kernels, found, spreads, strict=True)
+        if is_position(kernel)
+    ]
+    count = found[0].shape[1]
+    freedom = np.full(count, max(spreads[0].freedom, 1))
+    return Scores(np.vstack(errors), np.array(reaches).reshape(-1, count), freedom)
+
+
+def _ranked(scores: Array, level: float) -> float:
+    """The ceil((n + 1) p)-th smallest, or the largest."""
+    ordered = np.sort(scores)
+    return float(ordered[min(int(np.ceil((len(ordered) + 1) * level)), len(ordered)) - 1])
+
+
+def _held(scores: Scores, stretches: Sequence[Stretch | None], level: float) -> Array:
+    """Whether each number lies within its interval (n_r x N)."""
+    place = LEVELS.index(level)
+    factors = np.array([np.nan if s is None else s.coordinates[place] for s in stretches])
+    return np.asarray(scores.of_level(level) <= factors)
+
+
+def _shares(
+    scores: Scores, stretches: Sequence[Stretch | None], judged: Indices
+) -> tuple[tuple[float, ...], float | None]:
+    shares = tuple(float(np.mean(_held(scores, stretches, level)[:, judged])) for level in LEVELS)
+    if not len(scores.reaches):
+        return shares, None
+    radii = np.array([np.nan if s is None or s.radius is None else s.radius for s in stretches])
+    return shares, float(np.mean((scores.reaches <= radii)[:, judged]))
+
+
+def _worth(held: Array) -> float:
+    """How many independent numbers (n_r x N, in recorded order) would have a share as uncertain as theirs.
+
+    The standard error of a record's share over circular blocks of neighbours [Politis1992] against that of
+    independent numbers; no more than there are, and where all or none were held no more than the records.
+    """
+    share, by_record = float(np.mean(held)), held.mean(axis=0)
+    if share in (0.0, 1.0):
+        return float(held.shape[1])
+    error = standard_error_of_mean(by_record, automatic_block_length(by_record))
+    if not np.isfinite(error) or error == 0:
+        return float(held.shape[1])
+    return float(np.clip(share * (1 - share) / error**2, 1.0, held.size))

@@ -1,0 +1,146 @@
+"""What is left in residuals, which records are missed, and what priors alone hold, in sentences of the verdict."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from armcal.solve.estimator import Estimate
+from armcal.solve.evidence import PriorsAlone
+from armcal.solve.leftover import Leftover, Structure
+from armcal.solve.misses import MEDIANS, Misses
+from armcal.solve.noise_findings import Finding
+
+MOST_TOLD = 5
+NEGLIGIBLE_SHARE = 0.1
+"""Of the typical error: what moves the tip by less than this does not matter to it."""
+_FOLLOW_UP = 0.025
+"""Two questions are asked why neighbours are alike, at 5 % together."""
+_MM = "mm"
+
+
+def determined_told(estimate: Estimate, alone: PriorsAlone | None, typical_mm: float | None) -> Finding:
+    """What the data determines, and whether what it does not matters to the tip."""
+    known = estimate.identifiability
+    test = "rank of the Jacobian in ordinary sizes"
+    if not len(known):
+        text = "No parameter was free: the nominal model was judged, nothing was calibrated."
+        return Finding("warning", text, test, "Free parameters: parameters.free.")
+    count = len(known.undetermined)
+    if not count:
+        return Finding("good", f"The data determines all {known.rank} free parameters.", test)
+    listed = "; ".join(str(combination) for combination in known.undetermined[:MOST_TOLD])
+    more = f"; and {count - MOST_TOLD} more" if count > MOST_TOLD else ""
+    if alone is None:
+        text = f"Not determined by the data, held by priors alone: {listed}{more}."
+        return Finding("bad", text, test, "Free fewer parameters, or measure what armcal identify asks for.")
+    held = f"{_plural(count, 'combination is', 'combinations are')} held by priors alone"
+    test = f"{test}; the tip at {alone.poses} unseen poses, joints approached as in the records"
+    if typical_mm is None or alone.worst_mm <= NEGLIGIBLE_SHARE * typical_mm:
+        most = f"{alone.worst_mm:.2g}" if alone.worst_mm >= 0.001 else "0.001"
+        text = f"{held}; the tip at unseen poses does not depend on them (at most {most} {_MM}, 1 sd)."
+        return Finding("note", text, test, "Nothing for the tip; armcal identify names them.")
+    text = f"{held}, and the tip at unseen poses depends on them, by up to {alone.worst_mm:.2g} {_MM} (1 sd)."
+    return Finding("warning", text, test, "armcal identify names them, and armcal plan the poses that would tell.")
+
+
+def structures_told(found: Leftover | None) -> list[Finding]:
+    """What residuals still depend on."""
+    if found is None:
+        return []
+    test = _test_of(found)
+    kept = found.worthwhile
+    if not kept:
+        slight = f" {_plural(len(found.structures), 'dependence', 'dependences')} found would not lower it by 1 %."
+        text = f"Of {found.tested} things that residuals might depend on none explains the error left."
+        return [Finding("good", text + (slight if found.structures else ""), test)]
+    findings = [_structure_told(s, found.mean_mm, test) for s in kept]
+    if found.more:
+        text = "Residuals depend on more than these; model them first, then look again."
+        findings.append(Finding("note", text, test))
+    return findings
+
+
+def _structure_told(s: Structure, mean_mm: float, test: str) -> Finding:
+    size = f" ({s.size})" if s.size else ""
+    text = (
+        f"Residuals still depend on {s.words}{size}: modelled, the mean error of {mean_mm:.2f} {_MM} would fall by "
+        f"{s.falls_mm:.2f} {_MM}."
+    )
+    if s.alternatives:
+        text += f" These data hardly tell it from {'; or '.join(s.alternatives)}."
+    model = f"Model it: {s.effect}. " if s.effect else "No effect of armcal says this. "
+    return Finding("warning", text, f"p {_p(s.p_value)}, {test}", f"{model}To be sure: {s.measure}.")
+
+
+def _test_of(found: Leftover) -> str:
+    blocks = f", blocks of {found.block} records" if found.block > 1 else ""
+    return f"score test, {100 * found.level:g} % over all {found.tested} dependences{blocks}"
+
+
+def neighbours_told(found: Leftover | None) -> list[Finding]:
+    """Whether records that follow one another miss alike, and why."""
+    if found is None:
+        return []
+    test = f"lag-one correlation, {100 * found.level:g} % over all dependences and this"
+    if found.lag_p > found.level:
+        return [Finding("good", "Residuals of neighbouring records do not correlate.", test)]
+    text = f"Residuals of neighbouring records correlate by {found.lag_one:.2f}"
+    if found.lag_after_p > found.level:
+        return [Finding("note", f"{text}; what was found above explains it.", test)]
+    after = f", by {found.lag_after:.2f} still beside what was found" if found.structures else ""
+    text += f"{after}: they are no noise, so the intervals are too narrow. {_why(found)}"
+    return [Finding("warning", text, test, _tell_apart(found))]
+
+
+def _why(found: Leftover) -> str:
+    alike = found.alike
+    if alike is None:
+        return "No records far apart in the recording are as alike as neighbours: whether it is time or pose is open."
+    compared = f"{alike.pairs} pairs far apart in the recording with the arm standing as much alike correlate by"
+    if alike.time_p <= _FOLLOW_UP < alike.pose_p:
+        return f"It goes with time: {compared} {alike.far:.2f} only (2.5 %)."
+    if alike.pose_p <= _FOLLOW_UP < alike.time_p:
+        return f"It goes with how the arm stands, not with time: {compared} {alike.far:.2f} too (2.5 %)."
+    if max(alike.pose_p, alike.time_p) <= _FOLLOW_UP:
+        return f"It goes with time and with how the arm stands: {compared} {alike.far:.2f} (2.5 %)."
+    return "Whether it is time or pose these data do not tell (2.5 %)."
+
+
+def _tell_apart(found: Leftover) -> str:
+    alike = found.alike
+    if alike is not None and alike.pose_p <= _FOLLOW_UP < alike.time_p:
+        return "The model lacks an effect of pose; visiting the poses in random order would show it plainly."
+    if alike is not None and alike.time_p <= _FOLLOW_UP < alike.pose_p:
+        return "Let the base drift (parameters.drift); repeat one pose at the start, in the middle and at the end."
+    return "Repeat one pose at the start, in the middle and at the end; visit the others in random order."
+
+
+def misses_told(found: Misses | None) -> list[Finding]:
+    """Records beyond the limit, each with what is unusual about it."""
+    if found is None:
+        return []
+    limit = "validation.limit_mm" if found.configured else f"{MEDIANS:g} times the median"
+    test = f"errors of {found.judged} records by fits that did not see them, limit {limit}"
+    if not found.beyond:
+        return [Finding("good", f"No judged record is missed by more than {found.limit_mm:.2f} {_MM}.", test)]
+    listed = "; ".join(
+        f"{miss.record_id} ({miss.error_mm:.2f} {_MM}: {', '.join(miss.reasons)})"
+        for miss in found.explained[:MOST_TOLD]
+    )
+    more = f"; and {found.beyond - MOST_TOLD} more, in the report" if found.beyond > MOST_TOLD else ""
+    text = f"{_plural(found.beyond, 'record is', 'records are')} missed by more than {found.limit_mm:.2f} {_MM}: "
+    advice = _shared_advice([miss.advice for miss in found.explained[:MOST_TOLD]])
+    return [Finding("warning", f"{text}{listed}{more}.", test, advice)]
+
+
+def _shared_advice(advice: Sequence[str]) -> str:
+    different = list(dict.fromkeys(advice))
+    return "; or ".join(different).capitalize() + "."
+
+
+def _plural(count: int, one: str, many: str) -> str:
+    return f"{count} {one if count == 1 else many}"
+
+
+def _p(p: float) -> str:
+    return f"{p:.3f}" if p >= 0.01 else f"below {0.005 if p < 0.005 else 0.01:g}"

@@ -1,0 +1,300 @@
+"""How far a calibrated arm may be off its predictions: what a calibration keeps for that, and its use.
+
+A drift is not kept as values at knots: with its covariance, and with how both hang on every parameter, they are many
+times larger than the records that tell of it. Those are kept instead, and the drift is told again from them, exactly.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+from pydantic import Field
+
+from armcal.base.dataset import Dataset
+from armcal.base.domains import Array
+from armcal.base.parameters import Drift, Parameters
+from armcal.base.settings import Settings
+from armcal.config.system import System
+from armcal.errors import DataError, Location
+from armcal.solve.coverage import Recording, Stretch, level_name
+from armcal.solve.drift import with_drift
+from armcal.solve.prediction import LEVELS, STATED, Predictor, Spread, ToldDrift, is_position
+from armcal.solve.problem import FactorRecords, Problem
+from armcal.solve.validation import Indices
+from armcal.solve.variance import Axes, Component, VarianceComponents, apply_components
+
+_AT_ONCE = 1000
+"""Records whose slopes are in memory together."""
+_FORGOTTEN = 5.0
+"""So many correlation distances beyond the recording nothing is known of its drift."""
+_DIGITS = 12
+Span = Mapping[str, tuple[float, float]]
+"""First and last place of a recording, by channel."""
+
+
+class DriftRecord(Settings):
+    """How a parameter drifts: standard deviation in its SI unit, distance in units of the channel."""
+
+    sd: float
+    over: float
+    channel: str
+
+
+class RecordingRecord(Settings):
+    """The records that tell of a drift (SI, a row a record), and their weights (a row a measurement; none for ones)."""
+
+    drifts: dict[str, DriftRecord]
+    channels: tuple[str, ...]
+    records: tuple[tuple[float, ...], ...]
+    weights: tuple[tuple[float, ...], ...] = ()
+
+
+class StretchRecord(Settings):
+    """What half widths and radii are multiplied by: one number a level, one for 95 % radii."""
+
+    coordinates: dict[str, float]
+    radius: float | None = None
+
+
+class PredictionRecord(Settings):
+    """What predictions need beyond values: covariance of the free entries (lower triangle), stretches, a recording.
+
+    ``columns`` are what the calibration's data called its columns.
+    """
+
+    entries: tuple[str, ...]
+    covariance: tuple[tuple[float, ...], ...]
+    stretches: dict[Literal["same", "new"], StretchRecord] = Field(default_factory=dict)
+    columns: dict[str, str] = Field(default_factory=dict)
+    recording: RecordingRecord | None = None
+
+
+@dataclass(frozen=True)
+class PlusMinus:
+    """How far measurements may lie from predictions.
+
+    Attributes:
+        shift: what the drift of the recording adds to each predicted channel (N each; zero in a new recording).
+        deviations: standard deviation of each channel (N each; m or rad), not stretched.
+        half_widths: of 90 % intervals, stretched as cross-validation found (N each).
+        radii: of each position measurement by name: of a ball about the prediction that holds 95 % (N each; m).
+    """
+
+    shift: dict[str, Array]
+    deviations: dict[str, Array]
+    half_widths: dict[str, Array]
+    radii: dict[str, Array]
+
+
+def stretch_records(stretches: Mapping[Recording, Stretch]) -> dict[Literal["same", "new"], StretchRecord]:
+    """As they are kept."""
+    return {
+        name: StretchRecord(
+            coordinates={level_name(p): x for p, x in zip(LEVELS, each.coordinates, strict=True)}, radius=each.radius
+        )
+        for name, each in stretches.items()
+    }
+
+
+def covariance_rows(covariance: Array) -> tuple[tuple[float, ...], ...]:
+    """The lower triangle, to twelve digits."""
+    return tuple(tuple(float(f"{x:.{_DIGITS}g}") for x in row[: i + 1]) for i, row in enumerate(covariance))
+
+
+def recording_record(problem: Problem, dataset: Dataset, fitted: Sequence[FactorRecords]) -> RecordingRecord | None:
+    """The training records (a dataset in the order of ``fitted``); None where nothing drifts."""
+    drifts = {b.name: b.drift for b in problem.parameters.free if b.drift is not None}
+    if not drifts:
+        return None
+    weights = [each.weight[: each.count] for each in fitted]
+    weighed = any(np.any(weight != 1) for weight in weights)
+    return RecordingRecord(
+        drifts={name: DriftRecord(sd=d.sd, over=d.over, channel=d.channel) for name, d in drifts.items()},
+        channels=tuple(dataset.channels),
+        records=tuple(tuple(row) for row in dataset.stacked(tuple(dataset.channels)).T.tolist()),
+        weights=tuple(tuple(w.tolist()) for w in weights) if weighed else (),
+    )
+
+
+@dataclass(frozen=True)
+class Uncertainty:
+    """What a calibration knows of its own errors.
+
+    Attributes:
+        system: arms and measurements.
+        parameters: as fitted: free ones free, about the nominal values of the fit.
+        values: found.
+        record: as kept.
+        noise_scale: residuals in units of the declared noise.
+        freedom: degrees of freedom.
+        components: estimated variances, if there were any.
+    """
+
+    system: System
+    parameters: Parameters
+    values: Array
+    record: PredictionRecord
+    noise_scale: float
+    freedom: int
+    components: tuple[Component, ...] = ()
+
+    def plus_minus(self, commands: Dataset, recording: Recording = "new") -> PlusMinus:
+        """How far measurements at these commands may lie from predictions.
+
+        Args:
+            commands: records with joint angles, load, gravity; in the same recording with their place in it.
+            recording: ``same`` as the calibration's, whose drift is told as far as records lie near; or a ``new`` one.
+
+        Raises:
+            DataError: in the same recording, and the records do not say their place in it.
+            NotConvergedError: a record has no equilibrium.
+        """
+        problem, told = self._problem(commands), self.record.recording
+        near = np.zeros(len(commands), dtype=bool)
+        if recording == "same" and told is not None:
+            near = self._near(told, commands)
+        parts = [self._apart(problem, commands.subset(chunk), chunk) for chunk in _chunks(np.flatnonzero(~near))]
+        if told is not None and near.any():
+            span = _span(told, commands.subset(np.flatnonzero(near)))
+            drift = self._told(told, span)
+            for chunk in _chunks(np.flatnonzero(near)):
+                parts.append(self._within(problem, commands.subset(chunk), chunk, drift, span))
+        return _joined(problem, parts, len(commands), self.record.stretches)
+
+    def _apart(self, problem: Problem, commands: Dataset, places: Indices) -> _Part:
+        """Where nothing is told of a drift."""
+        spreads = self._predictor(problem, None).in_new_recording(self._whitened(problem, problem.records(commands)))
+        recording: Recording = "same" if self.record.recording is None else "new"
+        return _Part(places, recording, tuple(np.zeros_like(spread.deviations) for spread in spreads), spreads)
+
+    def _within(self, problem: Problem, commands: Dataset, places: Indices, drift: ToldDrift, span: Span) -> _Part:
+        """In the recording, which tells of a drift."""
+        records = self._drifted(problem, commands, span)
+        spreads = self._predictor(problem, drift).in_recording(records)
+        moved = [each.correlation.moved(i, drift.innovations) for i, each in enumerate(records) if each.correlation]
+        return _Part(places, "same", tuple(-m[:, : len(places)] for m in moved), spreads)
+
+    def _predictor(self, problem: Problem, drift: ToldDrift | None) -> Predictor:
+        return Predictor(problem, self.values, self._covariance, self.noise_scale, self.freedom, drift)
+
+    def _told(self, told: RecordingRecord, span: Span) -> ToldDrift:
+        """The drift of the recording, told by its records, over a span of places."""
+        dataset = _dataset(told)
+        problem = self._problem(dataset)
+        records = self._drifted(problem, dataset, span)
+        if told.weights:
+            records = problem.weighted(records, [np.array(row) for row in told.weights])
+        found = ToldDrift.by(problem, self.values, records)
+        if found is None:
+            raise TypeError("a recording is kept only where something drifts")
+        return found
+
+    def _drifted(self, problem: Problem, dataset: Dataset, span: Span) -> tuple[FactorRecords, ...]:
+        """Records that share the innovations of a span: two more at its ends are put in, and taken out again."""
+        count = len(dataset)
+        both = dataset.subset([*range(count), 0, 0])
+        ends = {name: np.concatenate([dataset.column(name), places]) for name, places in span.items()}
+        both = replace(both, channels={**both.channels, **ends})
+        records = with_drift(problem, problem.records(both), both, self.parameters.nominal())
+        return problem.subset(records, np.arange(count, dtype=np.intp))
+
+    def _problem(self, dataset: Dataset) -> Problem:
+        system = self.system
+        parts = (system.arms, system.measurements, self._drifting, system.environment, dataset)
+        return Problem.build(*parts, "interpreted")
+
+    @cached_property
+    def _drifting(self) -> Parameters:
+        told = self.record.recording
+        drifts = {} if told is None else told.drifts
+        return self.parameters.replaced(
+            {n: replace(self.parameters[n], drift=Drift(d.sd, d.over, d.channel)) for n, d in drifts.items()}
+        )
+
+    @cached_property
+    def _covariance(self) -> Array:
+        rows = self.record.covariance
+        lower = np.zeros((len(rows), len(rows)))
+        for i, row in enumerate(rows):
+            lower[i, : i + 1] = row
+        return lower + np.tril(lower, -1).T
+
+    def _whitened(self, problem: Problem, records: tuple[FactorRecords, ...]) -> tuple[FactorRecords, ...]:
+        """With the noise that the calibration estimated, if it did."""
+        if not self.components:
+            return records
+        instruments = [c.name for c in self.components if c.kind == "instrument"]
+        axes: Axes = "together" if set(instruments) <= set(self.system.measurements) else "apart"
+        found = VarianceComponents(self.components, (), (), 0.0)
+        return apply_components(problem, self.values, records, found, axes)
+
+    def _near(self, told: RecordingRecord, commands: Dataset) -> Array:
+        """Whether the recording says anything of each record's drift (N)."""
+        near = np.ones(len(commands), dtype=bool)
+        recorded = _dataset(told)
+        for name, drift in told.drifts.items():
+            if not commands.has(drift.channel):
+                raise DataError(
+                    f"{name} drifts over {drift.channel}, and the poses do not say theirs.",
+                    where=Location(commands.source or None),
+                    hint=f"Add a column {drift.channel}, name the one that is, or predict in a new recording.",
+                )
+            at, known = commands.column(drift.channel), recorded.column(drift.channel)
+            reach = _FORGOTTEN * drift.over
+            near &= (at > known.min() - reach) & (at < known.max() + reach)
+        return near
+
+
+@dataclass(frozen=True)
+class _Part:
+    """Some records: their places, what is known of their drift, shifts by it (n_r x N) and spreads, by factor."""
+
+    places: Indices
+    recording: Recording
+    shifts: tuple[Array, ...]
+    spreads: tuple[Spread, ...]
+
+
+def _joined(
+    problem: Problem, parts: Sequence[_Part], count: int, stretches: Mapping[Literal["same", "new"], StretchRecord]
+) -> PlusMinus:
+    found = PlusMinus({}, {}, {}, {})
+    for place, kernel in enumerate(problem.kernels):
+        channels, name = kernel.factor.output_channels, kernel.factor.name
+        if len(channels) != kernel.factor.residual.numel():
+            continue
+        rows, radius = np.full((3, len(channels), count), np.nan), np.full(count, np.nan)
+        for part in parts:
+            own, spread = stretches.get(part.recording), part.spreads[place]
+            half = spread.half_widths(STATED) * (own.coordinates[level_name(STATED)] if own else 1.0)
+            rows[:, :, part.places] = part.shifts[place], spread.deviations, half
+            radius[part.places] = spread.radius() * (own.radius if own and own.radius is not None else 1.0)
+        for i, channel in enumerate(channels):
+            found.shift[channel], found.deviations[channel], found.half_widths[channel] = rows[:, i]
+        if is_position(kernel):
+            found.radii[name] = radius
+    return found
+
+
+def _chunks(places: Indices) -> list[Indices]:
+    return [places[start : start + _AT_ONCE] for start in range(0, len(places), _AT_ONCE)]
+
+
+def _span(told: RecordingRecord, commands: Dataset) -> Span:
+    """Over the recording and some records."""
+    recorded, names = _dataset(told), {drift.channel for drift in told.drifts.values()}
+    places = {name: np.concatenate([recorded.column(name), commands.column(name)]) for name in names}
+    return {name: (float(at.min()), float(at.max())) for name, at in places.items()}
+
+
+def _dataset(told: RecordingRecord) -> Dataset:
+    rows = np.array(told.records, dtype=float).reshape(len(told.records), len(told.channels))
+    return Dataset(
+        tuple(str(i) for i in range(1, len(rows) + 1)),
+        {name: np.ascontiguousarray(column) for name, column in zip(told.channels, rows.T, strict=True)},
+        source="the recording that the calibration keeps",
+    )

@@ -1,0 +1,506 @@
+"""Prediction intervals: against dense Gaussian conditioning, planted truths, and from a run to ``armcal predict``."""
+
+from __future__ import annotations
+
+import csv
+import json
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from armcal.cli.main import cli
+from armcal.errors import DataError
+from armcal.measure.reader import ReadRequest, wanted_channels
+from armcal.run.experiment import Experiment
+from armcal.run.pipeline import calibrate
+from armcal.solve.coverage import (
+    FEWEST,
+    Coverage,
+    Scores,
+    coverage,
+    fit_and_predict,
+    predictor,
+    score,
+    stretch,
+    told,
+    whitened_like,
+)
+from armcal.solve.drift import with_drift
+from armcal.solve.prediction import LEVELS, Spread
+from armcal.solve.problem import Problem
+from armcal.solve.simulation import SimulationRequest, measured_without_noise, with_channels
+from armcal.solve.validation import FitTask, folds
+from armcal.solve.weighing import fit
+from armcal.use.calibration import Calibration
+from click.testing import CliRunner, Result
+
+ROOT = Path(__file__).resolve().parents[2]
+CONFIGS = ROOT / "configs" / "lrm_arm"
+DEMO = str(CONFIGS / "demo.yaml")
+POSES = CONFIGS / "demo.csv"
+MEASURED = ROOT.parent / "shared" / "data" / "lrm_arm" / "poses.csv"
+DRIFTING = (
+    "parameters.drift={arm.mdh.base_x: {sd: 2 mm, over: 8}, arm.mdh.theta1: {sd: 0.3 deg, over: 12}}",
+    "data.columns={sequence: pose_id}",
+)
+ONLY_BASE = "parameters.drift={arm.mdh.base_x: {sd: 2 mm, over: 8}}"
+FREE = 'parameters.free=["arm.mdh.base_[xyz]", arm.mdh.theta1, arm.spring.k1]'
+
+
+def setting(*texts: str) -> list[str]:
+    """--set for each."""
+    return [part for text in texts for part in ("--set", text)]
+
+
+def armcal(*arguments: str) -> Result:
+    """One command in this process."""
+    return CliRunner().invoke(cli, list(arguments))
+
+
+def problem_of(loaded: Experiment, dataset):
+    system = loaded.system
+    parts = (system.arms, system.measurements, loaded.parameters, system.environment, dataset, "interpreted")
+    return Problem.build(*parts)
+
+
+@pytest.fixture(scope="module")
+def drifting():
+    """A small drifting problem: which records train, which are new, all with one drift."""
+    loaded = Experiment.load(DEMO, [FREE, 'parameters.priors={"arm.spring.k1": 0.02 rad/Nm}', *DRIFTING])
+    dataset = loaded.read().subset(np.arange(60))
+    problem = problem_of(loaded, dataset)
+    records = with_drift(problem, problem.records(dataset), dataset, loaded.parameters.nominal())
+    train, held = np.setdiff1d(np.arange(60), np.arange(3, 60, 4)), np.arange(3, 60, 4)
+    fitted = fit(problem, problem.subset(records, train), loaded.estimator, loaded.parameters.nominal())
+    return loaded, dataset, problem, records, train, held, fitted
+
+
+def _dense_slopes(problem, values, records, step=1e-7):
+    """Residuals (numbers of all records in a column) by free entries, by differences."""
+    columns = []
+    for entry in problem.parameters.free_entries:
+        ends = []
+        for sign in (1, -1):
+            moved = values.copy()
+            moved[entry] += sign * step
+            ends.append(problem.residuals(moved, records)[0].T.ravel())
+        columns.append((ends[0] - ends[1]) / (2 * step))
+    return np.array(columns).T
+
+
+def _dense_drift(loaded, places, nominal_slopes):
+    """Residuals by knots of both processes times their Cholesky factors, in plain numpy."""
+    parts = []
+    for name, sd, over in (("arm.mdh.base_x", 2e-3, 8.0), ("arm.mdh.theta1", np.deg2rad(0.3), 12.0)):
+        knots = over * np.arange(np.floor(places.min() / over), np.ceil(places.max() / over) + 2)
+        hats = np.maximum(0, 1 - np.abs(places[:, None] - knots) / over)
+        root = sd * np.linalg.cholesky(np.exp(-np.abs(knots[:, None] - knots) / over))
+        free = [b.name for b in loaded.parameters.free]
+        parts.append(nominal_slopes[:, [free.index(name)]] * np.repeat(hats @ root, 3, axis=0))
+    return np.hstack(parts)
+
+
+def test_covariances_are_those_of_dense_gaussian_conditioning(drifting) -> None:
+    """Values and innovations as one Gaussian vector: its posterior after the training, mapped to new records."""
+    loaded, dataset, problem, records, train, held, fitted = drifting
+    found = fitted.estimate
+    by = predictor(problem, fitted)
+    plain = [replace(each, correlation=None) for each in records]
+    slopes = _dense_slopes(problem, found.values, plain)
+    drift = _dense_drift(loaded, dataset.column("sequence"), _dense_slopes(problem, loaded.parameters.nominal(), plain))
+    rows = {name: (3 * chosen[:, None] + np.arange(3)).ravel() for name, chosen in (("t", train), ("h", held))}
+    noise, s = 5e-4, found.noise_scale
+    j, a = slopes[rows["t"]] / noise, drift[rows["t"]] / noise
+    # The estimate's own covariance, and the drift given the values; then both together at the new records.
+    told_of = np.linalg.inv(np.eye(a.shape[1]) + a.T @ a)
+    h = slopes[rows["h"]] - drift[rows["h"]] @ told_of @ a.T @ j
+    g = drift[rows["h"]]
+    whole = h @ found.covariance @ h.T + s**2 * (g @ told_of @ g.T + noise**2 * np.eye(len(g)))
+    (spread,) = by.in_recording(problem.subset(records, held))
+    for i in range(len(held)):
+        block = whole[3 * i : 3 * i + 3, 3 * i : 3 * i + 3]
+        assert np.allclose(spread.covariance[i], block, rtol=2e-4, atol=1e-4 * np.trace(block))
+
+
+def test_without_priors_it_is_the_joint_posterior(drifting) -> None:
+    """The textbook form: invert the information on values and innovations together."""
+    loaded, dataset, problem, records, train, held, _ = drifting
+    loose = loaded.parameters.replaced({"arm.spring.k1": replace(loaded.parameters["arm.spring.k1"], prior_sd=None)})
+    problem = replace(problem, parameters=loose)
+    fitted = fit(problem, problem.subset(records, train), loaded.estimator, loose.nominal())
+    plain = [replace(each, correlation=None) for each in records]
+    slopes = _dense_slopes(problem, fitted.estimate.values, plain)
+    drift = _dense_drift(loaded, dataset.column("sequence"), _dense_slopes(problem, loose.nominal(), plain))
+    rows_t, rows_h = ((3 * chosen[:, None] + np.arange(3)).ravel() for chosen in (train, held))
+    joint = np.hstack([slopes, drift])
+    scale = np.concatenate([loose.scales(), np.ones(drift.shape[1])])
+    known = np.diag(np.concatenate([np.zeros(slopes.shape[1]), np.ones(drift.shape[1])]))
+    scaled = joint[rows_t] / 5e-4 * scale
+    posterior = scale[:, None] * np.linalg.inv(scaled.T @ scaled + known) * scale
+    new = joint[rows_h]
+    whole = fitted.estimate.noise_scale**2 * (new @ posterior @ new.T + 5e-4**2 * np.eye(len(new)))
+    (spread,) = predictor(problem, fitted).in_recording(problem.subset(records, held))
+    assert np.allclose(spread.deviations.T.ravel(), np.sqrt(np.diag(whole)), rtol=2e-2)
+
+
+def test_nothing_told_of_the_drift_counts_all_of_it(drifting) -> None:
+    loaded, _, problem, records, _, held, fitted = drifting
+    by, found = predictor(problem, fitted), fitted.estimate
+    new = problem.subset(records, held)
+    plain = [replace(each, correlation=None) for each in new]
+    slopes = _dense_slopes(problem, found.values, plain)
+    free = [b.name for b in loaded.parameters.free]
+    variance = np.zeros(len(free))
+    variance[free.index("arm.mdh.base_x")] = 4e-6
+    variance[free.index("arm.mdh.theta1")] = np.deg2rad(0.3) ** 2
+    s2 = found.noise_scale**2
+    whole = slopes @ (found.covariance + s2 * np.diag(variance)) @ slopes.T + s2 * 25e-8 * np.eye(len(slopes))
+    (spread,) = by.in_new_recording(new)
+    assert np.allclose(spread.deviations.T.ravel(), np.sqrt(np.diag(whole)), rtol=1e-4)
+    (known,) = by.in_recording(new)
+    assert (known.deviations < spread.deviations * (1 + 1e-9)).all()
+    assert known.deviations[0].mean() < 0.8 * spread.deviations[0].mean()
+
+
+def test_the_order_of_new_records_does_not_matter(drifting) -> None:
+    *_, problem, records, _, held, fitted = drifting
+    by, turned = predictor(problem, fitted), held[::-1]
+    for way in (by.in_recording, by.in_new_recording):
+        (forth,), (back,) = way(problem.subset(records, held)), way(problem.subset(records, turned))
+        assert np.allclose(forth.covariance, back.covariance[::-1], rtol=1e-10)
+
+
+def test_a_record_counts_its_own_noise() -> None:
+    loaded = Experiment.load(DEMO, [FREE])
+    dataset = loaded.read().subset(np.arange(60))
+    noise = np.where(np.arange(60) % 2, 5e-4, 5e-3)
+    dataset = with_channels(dataset, {"tracker.noise": noise})
+    problem = problem_of(loaded, dataset)
+    records = problem.records(dataset)
+    fitted = fit(problem, records, loaded.estimator, loaded.parameters.nominal())
+    (spread,) = predictor(problem, fitted).in_recording(records)
+    deviations = spread.deviations / (fitted.estimate.noise_scale * noise)
+    assert (deviations > 1).all() and (deviations < 1.5).all()
+
+
+@pytest.mark.parametrize("values", [(1, 1, 1), (1, 1, 0), (1, 0, 0), (1, 0.5, 0.1), (1, 0.2, 0.2), (1, 0.03, 0.0)])
+@pytest.mark.parametrize("freedom", [12, 100_000])
+def test_a_radius_holds_its_share(values: tuple[float, ...], freedom: int) -> None:
+    """Against a million draws, the covariance turned about."""
+    random = np.random.default_rng(1)
+    turn, _ = np.linalg.qr(random.normal(size=(3, 3)))
+    covariance = turn @ np.diag(values) @ turn.T
+    drawn = random.normal(size=(1_000_000, 3)) * np.sqrt(values)
+    if freedom < 1000:
+        drawn /= np.sqrt(random.chisquare(freedom, 1_000_000) / freedom)[:, None]
+    (radius,) = Spread(covariance[None], freedom).radius()
+    assert np.mean(np.linalg.norm(drawn, axis=1) < radius) == pytest.approx(0.95, abs=0.004)
+
+
+def _planted(loaded: Experiment, commands, random, noise: float = 5e-4):
+    """Measurements of an arm whose base wanders as stated, along x."""
+    system, parameters = loaded.system, loaded.parameters
+    request = SimulationRequest(system.arms, system.measurements, parameters, system.environment)
+    exact = measured_without_noise(request, commands)
+    places = commands.column("sequence")
+    knots = 8.0 * np.arange(np.floor(places.min() / 8), np.ceil(places.max() / 8) + 2)
+    root = np.linalg.cholesky(4e-6 * np.exp(-np.abs(knots[:, None] - knots) / 8.0))
+    wander = np.interp(places, knots, root @ random.normal(size=len(knots)))
+    noisy = {name: values + random.normal(0, noise, len(values)) for name, values in exact.items()}
+    noisy["tracker.x"] = noisy["tracker.x"] + wander
+    return with_channels(commands, noisy)
+
+
+@pytest.mark.slow
+def test_intervals_hold_their_share_when_the_model_is_true() -> None:
+    """Planted drift and noise; half the records judge, in the recording and as if in another one."""
+    loaded = Experiment.load(DEMO, ['parameters.free=["arm.mdh.base_[xyz]", arm.mdh.theta1]', ONLY_BASE, DRIFTING[1]])
+    commands = loaded.read().subset(np.arange(100))
+    random, scores = np.random.default_rng(3), {"same": [], "new": []}
+    problem = problem_of(loaded, commands)
+    for _ in range(25):
+        dataset = _planted(loaded, commands, random)
+        records = with_drift(problem, problem.records(dataset), dataset, loaded.parameters.nominal())
+        chosen = np.sort(random.permutation(100)[:50])
+        train = problem.subset(records, chosen)
+        fitted = fit(problem, train, loaded.estimator, loaded.parameters.nominal())
+        held = problem.subset(records, np.setdiff1d(np.arange(100), chosen))
+        for name, each in score(predictor(problem, fitted), held).items():
+            scores[name].append(each)
+    for name, tolerance in (("same", 0.03), ("new", 0.05)):
+        for level in LEVELS:
+            share = np.mean([each.of_level(level) <= 1 for each in scores[name]])
+            assert share == pytest.approx(level, abs=tolerance), (name, level)
+        reach = np.mean([each.reaches <= 1 for each in scores[name]])
+        assert reach == pytest.approx(0.95, abs=tolerance), name
+
+
+def _scores(random, count: int, heavy: bool) -> Scores:
+    errors = random.standard_t(2, (3, count)) if heavy else random.normal(size=(3, count))
+    errors = errors / 2 if heavy else errors
+    return Scores(errors, np.linalg.norm(errors, axis=0)[None] / 2.8, np.full(count, 1e6))
+
+
+def test_stretched_intervals_hold_their_share_of_other_records_where_errors_are_heavy_tailed() -> None:
+    random, raw, stretched = np.random.default_rng(4), [], []
+    for _ in range(200):
+        found = stretch(_scores(random, 100, heavy=True))
+        judged = coverage(_scores(random, 100, heavy=True), [found] * 100)
+        raw.append(judged.raw)
+        stretched.append([*judged.stated, judged.stretched_radius])
+    assert np.abs(np.mean(raw, axis=0) - LEVELS).max() > 0.05
+    assert np.abs(np.mean(stretched, axis=0) - [*LEVELS, 0.95]).max() < 0.015
+
+
+def test_a_stretch_needs_enough_records_and_one_for_every_record_judged() -> None:
+    random = np.random.default_rng(5)
+    assert stretch(_scores(random, FEWEST - 1, heavy=False)) is None
+    scores = _scores(random, 60, heavy=False)
+    found = stretch(scores)
+    assert coverage(scores, [*[found] * 59, None]).stretched is None
+    assert coverage(scores, [found] * 60).stretched is not None
+    unjudged = Scores(np.full((3, 5), np.nan), np.full((1, 5), np.nan), np.ones(5))
+    assert coverage(unjudged) is None
+
+
+def test_a_stretch_of_a_level_is_a_rank_of_the_scores() -> None:
+    """Of 99 scores the 50th, 90th and 95th: (n + 1) p."""
+    errors = np.arange(1.0, 100.0)[None]
+    found = stretch(Scores(errors, errors / 7, np.full(99, 1e9)))
+    normal = [0.6744898, 1.6448536, 1.959964]
+    assert np.allclose(np.array(found.coordinates) * normal, [50, 90, 95], rtol=1e-5)
+    assert found.radius == pytest.approx(95 / 7)
+
+
+def test_neighbours_that_err_together_are_worth_less() -> None:
+    random = np.random.default_rng(6)
+    alone = random.normal(size=(3, 400))
+    together = np.repeat(random.normal(size=(1, 40)), 10, axis=1) * np.ones((3, 1))
+    worth = [coverage(Scores(e, np.zeros((0, 400)), np.full(400, 1e6))).independent for e in (alone, together)]
+    assert 700 < worth[0] <= 1200 and worth[1] < 120
+    all_held = coverage(Scores(0.01 * alone, np.zeros((0, 400)), np.full(400, 1e6)))
+    assert all_held.independent == 400
+
+
+@pytest.mark.parametrize(
+    ("share", "worth", "grade"), [(0.9, 100, "good"), (0.84, 50, "good"), (0.84, 500, "warning"), (0.97, 500, "note")]
+)
+def test_the_verdict_on_intervals_is_a_test_at_five_percent(share: float, worth: float, grade: str) -> None:
+    found = told(Coverage(300, 900, (0.5, share, 0.95), None, None, None, worth), "held-out records")
+    assert found.grade == grade and f"{100 * share:.1f} %" in found.text and f"{worth} independent" in found.test
+
+
+def test_the_stretch_that_judges_a_record_does_not_know_it() -> None:
+    """Other measured values of a fold's records change its scores and nothing of its stretch."""
+    loaded = Experiment.load(DEMO, [FREE])
+    dataset = loaded.read().subset(np.arange(80))
+    split = folds(80, 4, 0)[0]
+    spoilt = dict(dataset.channels)
+    spoilt["tracker.x"] = spoilt["tracker.x"].copy()
+    spoilt["tracker.x"][split.holdout] += 0.01
+    problem, found = problem_of(loaded, dataset), []
+    for each in (dataset, replace(dataset, channels=spoilt)):
+        task = FitTask(problem, loaded.estimator, loaded.parameters.nominal(), problem.records(each), split)
+        found.append(fit_and_predict(task, inner=4, seed=0))
+    assert found[0].stretches["same"] == found[1].stretches["same"]
+    assert np.abs(found[0].scores["same"].errors[0] - found[1].scores["same"].errors[0]).min() > 1
+
+
+def test_folds_err_as_they_did_before_they_were_asked_for_intervals() -> None:
+    from armcal.solve.validation import cross_validate
+
+    loaded = Experiment.load(DEMO, [FREE])
+    dataset = loaded.read().subset(np.arange(80))
+    problem, splits = problem_of(loaded, dataset), folds(80, 4, 0)
+    parts = (problem, problem.records(dataset), splits, loaded.estimator, loaded.parameters.nominal())
+    plain, asked = cross_validate(*parts), cross_validate(*parts, judge=partial(fit_and_predict, inner=4, seed=0))
+    assert np.array_equal(plain.errors, asked.errors)
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run on a planted drift of the base, by rejecting outliers so that weights are kept as well."""
+    folder = tmp_path_factory.mktemp("drift")
+    loaded = Experiment.load(DEMO, [FREE, ONLY_BASE, DRIFTING[1]])
+    commands = loaded.read().subset(np.arange(152))
+    commands = with_channels(commands, {"sequence": np.arange(1.0, 153.0)})
+    made = _planted(loaded, commands, np.random.default_rng(9))
+    made.channels["tracker.x"][30] += 0.04
+    rows = list(csv.reader(POSES.open()))[:153]
+    head = rows[0].index("x_mm")
+    for i, row in enumerate(rows[1:]):
+        row[rows[0].index("pose_id")] = str(i + 1)
+        row[head : head + 3] = [str(1000 * float(made.channels[f"tracker.{axis}"][i])) for axis in "xyz"]
+    with (folder / "poses.csv").open("w", newline="") as file:
+        csv.writer(file).writerows(rows)
+    arguments = ("--data", str(folder / "poses.csv"), "--out", str(folder / "run"))
+    settings = setting(FREE, ONLY_BASE, DRIFTING[1], "noise.loss=reject", "evaluator=interpreted", "validation.folds=2")
+    run = armcal("run", DEMO, *arguments, *settings)
+    assert run.exit_code == 0, run.output
+    return folder
+
+
+def predicted(folder: Path, *options: str, calibration: Path | None = None, poses: Path | None = None):
+    """``armcal predict``: the rows by id."""
+    out = folder / "predicted.csv"
+    out.unlink(missing_ok=True)
+    told_of = calibration or folder / "run" / "calibration.yaml"
+    data = str(poses or folder / "poses.csv")
+    result = armcal("predict", str(told_of), "--poses", data, "--out", str(out), *options)
+    return result, {row["pose_id"]: row for row in csv.DictReader(out.open())} if out.exists() else {}
+
+
+def test_the_recording_that_is_kept_gives_the_residuals_of_the_run(recording: Path) -> None:
+    measured = {row["pose_id"]: row for row in csv.DictReader((recording / "poses.csv").open())}
+    result, rows = predicted(recording, "--recording", "calibrated")
+    assert result.exit_code == 0 and len(rows) == len(measured)
+    for row in csv.DictReader((recording / "run" / "residuals.csv").open()):
+        for axis in "xyz":
+            left = float(measured[row["pose_id"]][f"{axis}_mm"]) - float(rows[row["pose_id"]][f"{axis}_mm"])
+            assert left == pytest.approx(float(row[f"d{axis}_mm"]), abs=2e-6)
+
+
+def test_a_new_recording_is_predicted_at_rest_and_with_wider_intervals(recording: Path) -> None:
+    _, within = predicted(recording, "--recording", "calibrated")
+    result, new = predicted(recording)
+    assert result.exit_code == 0
+    moved = [abs(float(within[i]["x_mm"]) - float(new[i]["x_mm"])) for i in new]
+    assert max(moved) > 2
+    wider = [float(new[i]["radius95_mm"]) / float(within[i]["radius95_mm"]) for i in new]
+    assert np.median(wider) > 1.2
+
+
+def test_beyond_the_recording_the_drift_is_forgotten(recording: Path, tmp_path: Path) -> None:
+    """The same pose, at more and more distant places after the last record."""
+    rows = list(csv.reader((recording / "poses.csv").open()))
+    places = [152, 160, 168, 176, 184, 10_152]  # all at knots: between them the process is a little smaller
+    poses = tmp_path / "after.csv"
+    with poses.open("w", newline="") as file:
+        csv.writer(file).writerows([rows[0], *([str(place), *rows[-1][1:]] for place in places)])
+    _, within = predicted(recording, "--recording", "calibrated", poses=poses)
+    _, new = predicted(recording, poses=poses)
+    half = [float(within[str(place)]["plus_minus_x_mm"]) for place in places]
+    kept = yaml.safe_load((recording / "run" / "calibration.yaml").read_text())["prediction"]["stretches"]
+    ratio = kept["new"]["coordinates"]["90"] / kept["same"]["coordinates"]["90"]
+    far = float(new[str(places[-1])]["plus_minus_x_mm"])
+    assert half[:5] == sorted(half[:5]) and half[0] < 0.8 * half[4]
+    assert half[-1] == far and half[4] * ratio == pytest.approx(far, rel=0.05)
+    shifts = [abs(float(within[str(p)]["x_mm"]) - float(new[str(p)]["x_mm"])) for p in places]
+    assert np.allclose(np.divide(shifts[1:5], shifts[:4]), np.exp(-1), rtol=1e-6) and shifts[-1] == 0
+
+
+def test_python_gives_what_the_command_gives(recording: Path) -> None:
+    calibration = Calibration.load(recording / "run" / "calibration.yaml")
+    loaded = Experiment.load(DEMO, [FREE, *DRIFTING], recording / "poses.csv")
+    commands = loaded.read()
+    _, rows = predicted(recording, "--recording", "calibrated")
+    found = calibration.plus_minus(commands, "same")
+    shown, _ = calibration.predict(commands)
+    for i, record in enumerate(commands.ids):
+        assert float(rows[record]["x_mm"]) == pytest.approx(
+            1000 * (shown["tracker.x"][i] + found.shift["tracker.x"][i]), abs=1e-9
+        )
+        assert float(rows[record]["plus_minus_y_mm"]) == pytest.approx(1000 * found.half_widths["tracker.y"][i], 1e-5)
+        assert float(rows[record]["radius95_mm"]) == pytest.approx(1000 * found.radii["tracker"][i], 1e-5)
+
+
+@pytest.mark.parametrize("extra", [(), ("noise.estimate=true",), DRIFTING, (*DRIFTING, "noise.loss=huber")])
+def test_what_is_kept_predicts_as_the_fit_itself(extra: tuple[str, ...], tmp_path: Path) -> None:
+    """Through the file: drift, estimated components, robust weights."""
+    poses = tmp_path / "numbered.csv"
+    rows = list(csv.reader(POSES.open()))
+    with poses.open("w", newline="") as file:
+        csv.writer(file).writerows([rows[0], *([str(i), *row[1:]] for i, row in enumerate(rows[1:], 1))])
+    settings = [FREE, *extra, "evaluator=interpreted", "validation.folds=0"]
+    folder = tmp_path / "run"
+    assert armcal("run", DEMO, "--data", str(poses), "--out", str(folder), *setting(*settings)).exit_code == 0
+    kept = Calibration.load(folder / "calibration.yaml")
+    loaded = Experiment.load(DEMO, settings, poses)
+    dataset = loaded.read()
+    result = calibrate(loaded)
+    problem = problem_of(loaded, dataset)
+    records = with_drift(problem, problem.records(dataset), dataset, loaded.parameters.nominal())
+    train = problem.subset(records, result.split.train)
+    fitted = fit(problem, train, loaded.estimator, loaded.parameters.nominal())
+    by = predictor(problem, fitted)
+    alike = whitened_like(problem, fitted, records, loaded.estimator)
+    for recording, spreads in (("same", by.in_recording(alike)), ("new", by.in_new_recording(alike))):
+        found = kept.plus_minus(dataset, recording)
+        deviations = np.array([found.deviations[f"tracker.{axis}"] for axis in "xyz"])
+        assert np.allclose(deviations, spreads[0].deviations, rtol=1e-6)
+        assert np.allclose(found.radii["tracker"], spreads[0].radius(), rtol=1e-6)
+
+
+def test_the_columns_that_the_run_named_are_known_to_its_predictions(recording: Path, tmp_path: Path) -> None:
+    text = (recording / "poses.csv").read_text().replace("pose_id", "number", 1)
+    other = tmp_path / "other.csv"
+    other.write_text(text)
+    refused, _ = predicted(recording, "--recording", "calibrated", poses=other)
+    assert refused.exit_code == 2 and "drifts over sequence" in refused.output
+    named, rows = predicted(recording, "--recording", "calibrated", "--columns", "sequence=number", poses=other)
+    assert named.exit_code == 0, named.output
+    _, usual = predicted(recording, "--recording", "calibrated")
+    assert [row["x_mm"] for row in rows.values()] == [row["x_mm"] for row in usual.values()]
+
+
+def test_predictions_know_when_they_cannot_say_how_good_they_are(recording: Path, tmp_path: Path) -> None:
+    kept = yaml.safe_load((recording / "run" / "calibration.yaml").read_text())
+    older, damaged = {k: v for k, v in kept.items() if k != "prediction"}, json.loads(json.dumps(kept))
+    damaged["prediction"]["covariance"] = damaged["prediction"]["covariance"][:-1]
+    for name, content in (("older", older), ("damaged", damaged)):
+        (tmp_path / f"{name}.yaml").write_text(yaml.safe_dump(content, sort_keys=False))
+    before, rows = predicted(recording, calibration=tmp_path / "older.yaml")
+    assert before.exit_code == 0 and "keeps nothing about the errors" in " ".join(before.output.split())
+    assert "x_mm" in next(iter(rows.values())) and "plus_minus_x_mm" not in next(iter(rows.values()))
+    text = (recording / "run" / "calibration.yaml").read_text()
+    for share in (0.55, 0.75, 0.95):
+        (tmp_path / "cut.yaml").write_text(text[: int(share * len(text))])
+        assert predicted(recording, calibration=tmp_path / "cut.yaml")[0].exit_code == 2, share
+    broken, _ = predicted(recording, calibration=tmp_path / "damaged.yaml")
+    assert broken.exit_code == 2 and "does not fit its free parameters" in " ".join(broken.output.split())
+    for text in ("sequence", "=pose_id", "sequence="):
+        wrong, _ = predicted(recording, "--columns", text)
+        assert wrong.exit_code == 2 and "NAME=COLUMN" in wrong.output and "Traceback" not in wrong.output
+
+
+def test_a_calibration_without_drift_says_that_recordings_are_alike(tmp_path: Path) -> None:
+    run = armcal("run", DEMO, "--out", str(tmp_path / "run"), *setting("evaluator=interpreted", "validation.folds=0"))
+    assert run.exit_code == 0
+    result, within = predicted(tmp_path, "--recording", "calibrated", poses=POSES)
+    assert result.exit_code == 0 and "no parameter drifts" in " ".join(result.output.split())
+    _, new = predicted(tmp_path, poses=POSES)
+    assert within == new
+
+
+def test_a_dataset_without_places_is_refused_in_the_same_recording(recording: Path) -> None:
+    calibration = Calibration.load(recording / "run" / "calibration.yaml")
+    loaded = Experiment.load(DEMO, [FREE])
+    arms = loaded.system.arms
+    commands = loaded.read().subset(np.arange(3))
+    assert ReadRequest(arms, {}, wanted_channels(arms, {}, measured=False)).wanted
+    with pytest.raises(DataError, match="drifts over sequence"):
+        calibration.plus_minus(commands, "same")
+    assert np.isfinite(calibration.plus_minus(commands).radii["tracker"]).all()
+
+
+def test_a_run_tells_what_its_intervals_hold(recording: Path) -> None:
+    told_of = json.loads((recording / "run" / "metrics.json").read_text())["prediction_intervals"]
+    assert set(told_of) == {"same_recording", "new_recording"}
+    same = told_of["same_recording"]
+    assert same["holdout"]["coordinates"] == 114 and same["cross_validated"]["records"] == 114
+    assert same["radius_95_mm"] < 0.8 * told_of["new_recording"]["radius_95_mm"]
+    page = (recording / "run" / "report.html").read_text()
+    assert "What a +- is worth" in page and "Predicted and found errors" in page
+    assert "90 % prediction intervals" in (recording / "run" / "log.txt").read_text()
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not MEASURED.exists(), reason=f"the arm's measurements are not at {MEASURED}")
+def test_on_the_real_arm_ninety_percent_intervals_hold_ninety_percent() -> None:
+    found = calibrate(Experiment.load(CONFIGS / "option1.yaml", data=MEASURED)).intervals.crossed["same"]
+    assert found.coordinates == 939
+    assert 0.87 <= found.stated[LEVELS.index(0.9)] <= 0.93
+    assert 0.93 <= found.stretched_radius <= 0.97
