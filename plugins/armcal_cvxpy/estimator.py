@@ -7,6 +7,7 @@ does not fall; cvxpy is not told about poses, only about one small triangular ma
 from __future__ import annotations
 
 import time
+import warnings
 from collections.abc import Sequence
 from typing import Annotated, ClassVar
 
@@ -123,7 +124,10 @@ class _ConvexStep:
         self._to_low.value, self._to_high.value = low[self._has_low], high[self._has_high]
         for cone in self._cones:
             cone.set(at, length / size)
-        self._problem.solve(solver=self._solver)
+        with warnings.catch_warnings():
+            # A step of fewer digits is still a step; whether it lowers the cost is checked.
+            warnings.filterwarnings("ignore", message="Solution may be inaccurate", category=UserWarning)
+            self._problem.solve(solver=self._solver)
         move = np.clip(np.asarray(self._step.value) * length / size, self._low - at, self._high - at)
         return move, -float(model.gradient @ move + 0.5 * move @ model.hessian @ move)
 

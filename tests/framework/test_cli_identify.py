@@ -104,7 +104,7 @@ def test_a_gauge_that_priors_hold_is_said_and_can_be_run(tmp_path: Path) -> None
     assert told["held_by_nothing"] == [] and told["undetermined"][0]["priors"] == ["arm.mdh.d6"]
     assert told["expected_sd"]["arm.mdh.d6"] == pytest.approx(0.001, rel=1e-3)
     done = armcal("check", ALL, "--data", DATA, *flags)
-    assert done.exit_code == 0 and "a gauge: no poses would tell; their priors hold them" in done.stderr
+    assert done.exit_code == 0 and "their priors hold them: " in done.stderr
 
 
 def test_what_stays_uncertain_is_left_out_when_asked() -> None:

@@ -23,10 +23,10 @@ CONFIDENCE = 0.95
 NEAR_A_BOUND_SD = 3.0
 """Within so many standard deviations of a bound an interval is one-sided."""
 MOST_TOLD = 5
-FEW_HELD = 2
-"""Combinations under priors that are told in full: they do no harm, more of them bury the rest."""
-SMALLEST_SPREAD = 1e-12
 """So many undetermined combinations are listed in one message."""
+FEW_HELD = 2
+"""Combinations under priors that are told in full: they do no harm, and more of them bury the rest."""
+SMALLEST_SPREAD = 1e-12
 AT_BOUND = 1e-6
 """In ordinary sizes of the parameter: closer than this, a parameter lies on its bound."""
 

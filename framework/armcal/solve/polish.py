@@ -17,32 +17,55 @@ from armcal.errors import NotConvergedError
 from armcal.solve.posed import PosedProblem
 from armcal.solve.problem import NormalEquations
 
-MOST_STEPS = 25
+MOST_STEPS = 50
 AT_REST = 1e-10
 """A step this many standard deviations long (of the noise found) changes nothing anybody can see."""
 _ROUNDING = 1e-12
+_LINEAR, _FLAT = 0.1, 0.9
+"""Of a slope that a step leaves: below the one it did what it should, above the other it says nothing of how far."""
 
 
 def polish(posed: PosedProblem, x: Array) -> Array:
-    """A converged solution to its last digits; steps that would raise the cost are not taken."""
+    """A converged solution to its last digits; steps that would raise the cost are not taken.
+
+    Where residuals curve, Gauss-Newton steps are too long or too short, and alone would come to rest slowly: the
+    slopes at both ends of a step tell how far it should have gone.
+    """
     (lower, upper), best, kept = posed.bounds(), np.inf, x
     equations = max(1, posed.problem.equations(posed.records))
+    tried: tuple[Array, Array, float] | None = None
     for _ in range(MOST_STEPS):
         try:
             model = posed.model(x)
         except NotConvergedError:
             return kept
-        if model.cost > best * (1 + _ROUNDING):
+        raised = model.cost > best * (1 + _ROUNDING)
+        if not raised:
+            kept, best = x, min(model.cost, best)
+        length = None if tried is None else _secant(tried, model.gradient)
+        if tried is not None and length is not None:
+            x, tried = np.clip(tried[0] + length * tried[1], lower, upper), None
+            continue
+        if raised:
             return kept
-        kept, best = x, min(model.cost, best)
         step = bounded_step(model, lower - x, upper - x)
         if step is None:
             return kept
-        length = math.sqrt(max(float(step @ model.hessian @ step), 0.0))
-        if length <= AT_REST * max(1.0, math.sqrt(2 * model.cost / equations)):
+        size = math.sqrt(max(float(step @ model.hessian @ step), 0.0))
+        if size <= AT_REST * max(1.0, math.sqrt(2 * model.cost / equations)):
             return kept
+        tried = x, step, float(model.gradient @ step)
         x = x + step
     return kept
+
+
+def _secant(tried: tuple[Array, Array, float], gradient: Array) -> float | None:
+    """How much of a step leads to where the cost has no slope along it; None if nearly all of it does."""
+    _, step, before = tried
+    if not before < 0:
+        return None
+    ratio = float(gradient @ step) / before
+    return 1 / (1 - ratio) if abs(ratio) > _LINEAR and ratio < _FLAT else None
 
 
 def bounded_step(model: NormalEquations, lower: Array, upper: Array) -> Array | None:

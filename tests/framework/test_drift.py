@@ -1,0 +1,484 @@
+"""Drifting parameters against dense generalised least squares, against planted drifts, and through the command line."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import oracle
+import pytest
+from armcal.base.parameters import Drift
+from armcal.cli.main import cli
+from armcal.solve.drift import residuals, track, with_drift
+from armcal.solve.estimator import estimate
+from armcal.solve.validation import cross_validate, folds, record_errors
+from armcal.solve.weighing import NoiseSettings, Weighing
+from armcal_cvxpy.estimator import CvxpyEstimator
+from armcal_ipopt.estimator import IpoptEstimator
+from click.testing import CliRunner
+
+CONFIGS = Path(__file__).resolve().parents[2] / "configs" / "lrm_arm"
+NOISE_M = 0.0005
+FREE = ("base_x", "base_y", "base_z", "theta1", "theta2", "theta3", "tool_z", "k2", "k3")
+DRIFTS = {"base_x": (0.8e-3, 7.0), "base_z": (0.5e-3, 7.0), "theta1": (2e-3, 12.5)}
+"""Deviation (m or rad) and distance (records)."""
+SOLVER = CvxpyEstimator(CvxpyEstimator.Settings())
+
+
+def parameters_of(lrm, drifts, channel="sequence"):
+    """Few free parameters, some of which drift."""
+    names = [oracle.armcal_name(name) for name in FREE]
+    parameters = lrm.experiment().parameters.with_free(names)
+    drifting = {oracle.armcal_name(name): Drift(sd, over, channel) for name, (sd, over) in drifts.items()}
+    return parameters.replaced({name: replace(parameters[name], drift=drift) for name, drift in drifting.items()})
+
+
+def wandering(at, sd, over, random):
+    """One realisation of the process at these places, from its covariance."""
+    covariance = sd**2 * np.exp(-np.abs(at[:, None] - at) / over)
+    return np.linalg.cholesky(covariance + 1e-18 * np.eye(len(at))) @ random.normal(size=len(at))
+
+
+def recorded(lrm, count, seed, drifts=None, noise=NOISE_M, **channels):
+    """A recording of the published arm while some of its parameters wander."""
+    random = np.random.default_rng(seed)
+    q, sequence = oracle.random_poses(count, seed), np.arange(1.0, count + 1)
+    moved = {
+        name: oracle.published()[name] + wandering(sequence, sd, over, random)
+        for name, (sd, over) in (drifts or {}).items()
+    }
+    v = {**{n: x if n in FREE else oracle.nominal()[n] for n, x in oracle.published().items()}, **moved}
+    measured = oracle.tip(v, q) + noise * random.normal(size=(count, 3))
+    return lrm.dataset(q, measured, sequence=sequence, **channels)
+
+
+def posed(lrm, dataset, drifts=DRIFTS, channel="sequence"):
+    """The problem and its records, correlated as the drifts demand."""
+    parameters = parameters_of(lrm, drifts, channel)
+    problem = lrm.problem(lrm.experiment(), dataset, "interpreted", parameters)
+    return problem, with_drift(problem, problem.records(dataset), dataset, parameters.nominal())
+
+
+# ---------------------------------------------------------------- dense generalised least squares
+
+
+def slopes_of(dataset, v):
+    """Measured minus predicted by every free parameter, by differences of the oracle (N x 3 x n)."""
+    q, columns = np.stack([dataset.column(f"arm.q{i}") for i in range(1, 7)], axis=1), []
+    for name in FREE:
+        step = 1e-6
+        ahead, behind = (oracle.tip({**v, name: v[name] + s}, q) for s in (step, -step))
+        columns.append(-(ahead - behind) / (2 * step))
+    return np.stack(columns, axis=2)
+
+
+def residual_of(dataset, v):
+    q = np.stack([dataset.column(f"arm.q{i}") for i in range(1, 7)], axis=1)
+    return np.stack([dataset.column(f"tracker.{a}") for a in "xyz"], axis=1) - oracle.tip(v, q)
+
+
+def process_covariance(at, other, over, sd):
+    """Of the process between two sets of places: stated at multiples of its distance, linear between them."""
+    low, high = min(at.min(), other.min()), max(at.max(), other.max())
+    knots = over * np.arange(np.floor(low / over) - 1, np.ceil(high / over) + 2)
+    between = sd**2 * np.exp(-np.abs(knots[:, None] - knots) / over)
+
+    def hats(places):
+        return np.stack([np.interp(places, knots, unit) for unit in np.eye(len(knots))], axis=1)
+
+    return hats(at) @ between @ hats(other).T
+
+
+def drift_covariance(one, other, drifts, channel="sequence"):
+    """Of all residuals of one dataset with those of another (3N x 3M), slopes taken at the nominal arm."""
+    slopes = [slopes_of(dataset, oracle.nominal()) for dataset in (one, other)]
+    total = np.zeros((len(one), 3, len(other), 3))
+    for name, (sd, over) in drifts.items():
+        process = process_covariance(one.column(channel), other.column(channel), over, sd)
+        left, right = (each[:, :, FREE.index(name)] for each in slopes)
+        total += np.einsum("ia,ij,jb->iajb", left, process, right)
+    return total.reshape(3 * len(one), 3 * len(other))
+
+
+class Dense:
+    """The whole covariance, inverted."""
+
+    def __init__(self, dataset, drifts, weights=None, channel="sequence"):
+        self.dataset, self.drifts = dataset, drifts
+        self.kept = np.ones(len(dataset), bool) if weights is None else weights > 0
+        variance = NOISE_M**2 / (np.ones(len(dataset)) if weights is None else np.where(self.kept, weights, 1))
+        whole = drift_covariance(dataset, dataset, drifts, channel) + np.diag(np.repeat(variance, 3))
+        rows = np.repeat(self.kept, 3)
+        self.inverse = np.zeros_like(whole)
+        self.inverse[np.ix_(rows, rows)] = np.linalg.inv(whole[np.ix_(rows, rows)])
+
+    def model(self, v):
+        """Cost, gradient, Hessian at these values, in the order of FREE."""
+        r, slopes = residual_of(self.dataset, v).ravel(), slopes_of(self.dataset, v).reshape(-1, len(FREE))
+        weighted = slopes.T @ self.inverse
+        return 0.5 * r @ self.inverse @ r, weighted @ r, weighted @ slopes
+
+    def told(self, v, other):
+        """Residuals of other records of the recording less what these say of the drift (M x 3)."""
+        across = drift_covariance(other, self.dataset, self.drifts)
+        kriged = across @ self.inverse @ residual_of(self.dataset, v).ravel()
+        return residual_of(other, v) - kriged.reshape(-1, 3)
+
+
+def somewhere(seed):
+    """Values off the nominal ones, by the oracle's names."""
+    random, v = np.random.default_rng(seed), oracle.nominal()
+    for name in FREE:
+        v[name] = v[name] + (0.03 * random.random() if name.startswith("k") else 0.004 * random.normal())
+    return v
+
+
+def in_order(problem):
+    """Places of FREE among the problem's entries."""
+    return [problem.free_names.index(oracle.armcal_name(name)) for name in FREE]
+
+
+def compared(lrm, problem, records, dense, v):
+    """Cost, gradient, Hessian and triangular factor against the dense ones."""
+    values, places = lrm.vector(problem.parameters, {name: v[name] for name in FREE}), in_order(problem)
+    cost, gradient, hessian = dense.model(v)
+    found = problem.normal_equations(values, records)
+    size = np.sqrt(np.diag(hessian))
+    assert found.cost == pytest.approx(cost, rel=1e-6)
+    assert problem.cost(values, records) == pytest.approx(cost, rel=1e-6)
+    tolerance = 1e-5 * np.sqrt(2 * cost)
+    np.testing.assert_allclose(found.gradient[places] / size, gradient / size, rtol=0, atol=tolerance)
+    np.testing.assert_allclose(found.hessian[np.ix_(places, places)] / np.outer(size, size),
+                               hessian / np.outer(size, size), rtol=0, atol=1e-6)  # fmt: skip
+    upper = problem.triangular_factor(values, records)
+    np.testing.assert_allclose((upper.T @ upper)[np.ix_(places, places)] / np.outer(size, size),
+                               hessian / np.outer(size, size), rtol=0, atol=1e-6)  # fmt: skip
+
+
+@pytest.mark.parametrize("count", [31, 64])
+@pytest.mark.parametrize("drifts", [DRIFTS, {"theta1": (2e-3, 3.0)}, {"base_y": (1e-3, 200.0)}], ids=len)
+def test_cost_and_derivatives_are_those_of_the_dense_covariance(lrm, count, drifts):
+    dataset = recorded(lrm, count, 1, drifts)
+    compared(lrm, *posed(lrm, dataset, drifts), Dense(dataset, drifts), somewhere(2))
+
+
+def test_a_drift_over_time_is_that_over_records_by_another_clock(lrm):
+    dataset = recorded(lrm, 40, 3, DRIFTS)
+    clock = np.cumsum(np.random.default_rng(1).uniform(5, 60, 40)) + 1.7e9
+    dataset = replace(dataset, channels={**dataset.channels, "time": clock})
+    drifts = {name: (sd, 30 * over) for name, (sd, over) in DRIFTS.items()}
+    problem, records = posed(lrm, dataset, drifts, "time")
+    compared(lrm, problem, records, Dense(dataset, drifts, channel="time"), somewhere(4))
+
+
+def test_weights_act_as_noise_of_its_own_in_each_record(lrm):
+    dataset, weights = recorded(lrm, 30, 5, DRIFTS), np.random.default_rng(2).uniform(0.1, 3, 30)
+    weights[[4, 17]] = 0.0
+    problem, records = posed(lrm, dataset)
+    dense = Dense(dataset, DRIFTS, weights)
+    compared(lrm, problem, problem.weighted(records, [weights]), dense, somewhere(6))
+    in_two = problem.weighted(problem.weighted(records, [np.sqrt(weights)]), [np.sqrt(weights)])
+    compared(lrm, problem, in_two, dense, somewhere(6))
+    parameters = problem.parameters
+    at_once = with_drift(problem, problem.records(dataset, weights), dataset, parameters.nominal())
+    compared(lrm, problem, at_once, dense, somewhere(6))
+
+
+def test_some_of_the_records_are_a_problem_of_their_own(lrm):
+    dataset, chosen = recorded(lrm, 40, 7, DRIFTS), np.array([3, 0, 22, 38, 10, 11, 12, 31, 5])
+    problem, records = posed(lrm, dataset)
+    part = problem.subset(records, chosen)
+    compared(lrm, problem, part, Dense(dataset.subset(chosen), DRIFTS), somewhere(8))
+    weights = np.random.default_rng(3).uniform(0.2, 2, len(chosen))
+    weighted = problem.weighted(part, [weights])
+    compared(lrm, problem, weighted, Dense(dataset.subset(chosen), DRIFTS, weights), somewhere(8))
+
+
+def test_the_order_of_the_records_does_not_matter(lrm):
+    dataset = recorded(lrm, 50, 9, DRIFTS)
+    turned = dataset.subset(np.random.default_rng(4).permutation(50))
+    fits = []
+    for each in (dataset, turned):
+        problem, records = posed(lrm, each)
+        fits.append(SOLVER.solve(problem, records, problem.parameters.nominal()).values)
+    np.testing.assert_allclose(*fits, rtol=0, atol=1e-9)
+
+
+def test_where_a_sequence_starts_at_a_multiple_of_the_distance_does_not_matter(lrm):
+    dataset, drifts = recorded(lrm, 30, 10, DRIFTS), {"base_x": (1e-3, 5.0)}
+    later = replace(dataset, channels={**dataset.channels, "sequence": dataset.column("sequence") + 5000})
+    costs = []
+    for each in (dataset, later):
+        problem, records = posed(lrm, each, drifts)
+        costs.append(problem.cost(problem.parameters.nominal(), records))
+    assert costs[0] == pytest.approx(costs[1], rel=1e-9)
+
+
+@pytest.mark.parametrize("weighted", [False, True])
+def test_residuals_of_other_records_are_kriged_from_those_that_tell(lrm, weighted):
+    dataset, v = recorded(lrm, 48, 11, DRIFTS), somewhere(12)
+    order = np.random.default_rng(5).permutation(48)
+    train, held = np.sort(order[:30]), np.sort(order[30:])
+    problem, records = posed(lrm, dataset)
+    telling, others = problem.subset(records, train), problem.subset(records, held)
+    weights = np.random.default_rng(6).uniform(0, 2, 30) if weighted else None
+    telling = problem.weighted(telling, [weights]) if weighted else telling
+    values = lrm.vector(problem.parameters, {name: v[name] for name in FREE})
+    dense = Dense(dataset.subset(train), DRIFTS, weights)
+    for part, chosen in ((others, held), (problem.subset(records, train), train)):
+        expected = dense.told(v, dataset.subset(chosen))
+        (found,) = residuals(problem, values, part, telling)
+        np.testing.assert_allclose(found.T, expected, rtol=0, atol=1e-9)
+        errors = record_errors(problem, values, part, telling)
+        np.testing.assert_allclose(errors, np.linalg.norm(expected, axis=1), rtol=0, atol=1e-9)
+    at_rest = record_errors(problem, values, others)
+    expected = np.linalg.norm(residual_of(dataset.subset(held), v), axis=1)
+    np.testing.assert_allclose(at_rest, expected, rtol=0, atol=1e-9)
+
+
+def test_records_without_weight_are_told_the_drift_too(lrm):
+    """Set aside before the drift was known: they say nothing, but their own error is that of a neighbour."""
+    dataset, v = recorded(lrm, 30, 13, DRIFTS), somewhere(14)
+    weights = np.ones(30)
+    weights[[7, 20]] = 0.0
+    problem = posed(lrm, dataset)[0]
+    values = lrm.vector(problem.parameters, {name: v[name] for name in FREE})
+    records = with_drift(problem, problem.records(dataset, weights), dataset, problem.parameters.nominal())
+    (found,) = residuals(problem, values, records, records)
+    expected = Dense(dataset, DRIFTS, weights).told(v, dataset)
+    np.testing.assert_allclose(found.T, expected, rtol=0, atol=1e-9)
+
+
+def test_without_drift_nothing_changes(lrm):
+    dataset = recorded(lrm, 20, 16)
+    _, records = posed(lrm, dataset, {})
+    assert all(each.correlation is None for each in records)
+
+
+def test_a_drift_far_smaller_than_the_noise_is_none(lrm):
+    dataset = recorded(lrm, 40, 17)
+    still, drifting = (posed(lrm, dataset, drifts) for drifts in ({}, {"base_x": (1e-12, 5.0)}))
+    one, other = (SOLVER.solve(p, r, p.parameters.nominal()).values for p, r in (still, drifting))
+    np.testing.assert_allclose(one, other, rtol=0, atol=1e-10)
+
+
+def test_a_drift_that_never_forgets_is_a_shift_of_the_whole_recording(lrm):
+    """So it only says less of the parameter itself: its variance grows by that of the drift."""
+    dataset = recorded(lrm, 40, 18)
+    fits = []
+    for drifts in ({}, {"base_x": (2e-3, 1e7)}):
+        problem, records = posed(lrm, dataset, drifts)
+        upper = problem.triangular_factor(problem.parameters.nominal(), records)
+        fits.append(np.linalg.inv(upper.T @ upper))
+    place = problem.free_names.index("arm.mdh.base_x")
+    assert fits[1][place, place] - fits[0][place, place] == pytest.approx((2e-3) ** 2, rel=1e-3)
+
+
+def test_ipopt_and_cvxpy_agree_on_a_drifting_recording(lrm):
+    problem, records = posed(lrm, recorded(lrm, 60, 19, DRIFTS))
+    upper = problem.triangular_factor(problem.parameters.nominal(), records)
+    sd = np.sqrt(np.diag(np.linalg.inv(upper.T @ upper)))
+    ends = []
+    for solver in (SOLVER, IpoptEstimator(IpoptEstimator.Settings())):
+        solution = solver.solve(problem, records, problem.parameters.nominal())
+        assert solution.verdict.converged
+        ends.append(solution.values[list(problem.parameters.free_entries)])
+    assert (np.abs(ends[0] - ends[1]) / sd).max() < 1e-4
+
+
+# ---------------------------------------------------------------- the process
+
+
+@pytest.mark.parametrize("over", [1.0, 7.0, 30.0])
+def test_the_track_has_the_deviation_stated_at_its_knots_and_forgets_by_e_from_each_to_the_next(lrm, over):
+    dataset = lrm.dataset(np.zeros((100, 6)), sequence=np.arange(3.0, 103))
+    block = parameters_of(lrm, {"base_x": (0.4e-3, over)})["arm.mdh.base_x"]
+    path = track(block, dataset)
+    covariance = path.spread @ path.spread.T
+    assert np.diff(path.knots) == pytest.approx(over)
+    assert path.knots[0] <= 3 and path.knots[-1] >= 102
+    np.testing.assert_allclose(np.sqrt(np.diag(covariance)), 0.4e-3, rtol=1e-12)
+    np.testing.assert_allclose(np.diag(covariance, 1) / 0.4e-3**2, np.exp(-1), rtol=1e-12)
+    np.testing.assert_allclose(path.weights(path.knots) @ np.ones(len(path.knots)), path.spread.sum(axis=1))
+    middle = path.weights((path.knots[:-1] + path.knots[1:]) / 2)
+    np.testing.assert_allclose(middle, (path.spread[:-1] + path.spread[1:]) / 2, rtol=0, atol=1e-18)
+    assert not path.weights(np.array([path.knots[0] - 2 * over, path.knots[-1] + 2 * over])).any()
+
+
+@pytest.mark.parametrize("at", [[10.0] * 4, [0.0, -20.0, 35.5, 1e6], [7.0, 14.0, 21.0, 28.0]])
+def test_every_record_lies_between_knots(lrm, at):
+    dataset = lrm.dataset(np.zeros((4, 6)), sequence=np.array(at))
+    block = parameters_of(lrm, {"base_x": (1.0, 1000.0 if max(at) > 100 else 7.0)})["arm.mdh.base_x"]
+    path = track(block, dataset)
+    hats = path.weights(np.array(at)) @ np.linalg.inv(path.spread)
+    np.testing.assert_allclose(hats.sum(axis=1), 1, rtol=1e-9)
+
+
+# ---------------------------------------------------------------- planted drifts
+
+PLANTED = dict.fromkeys(("base_x", "base_y", "base_z"), (0.6e-3, 10.0))
+
+
+def scores(lrm, seeds, drifts, count=80):
+    """(found - truth) / deviation of every free parameter while PLANTED drifts, and whether 95 % intervals hold."""
+    held, ratios, noise = [], [], []
+    for seed in seeds:
+        dataset = recorded(lrm, count, seed, PLANTED)
+        problem, records = posed(lrm, dataset, drifts)
+        fit = estimate(problem, records, SOLVER.solve(problem, records, problem.parameters.nominal()))
+        truth = lrm.vector(problem.parameters, {n: oracle.PUBLISHED[n] for n in FREE})[list(fit.free_entries)]
+        ratios.append((fit.values[list(fit.free_entries)] - truth) / fit.deviations)
+        held.append([i.lower <= t <= i.upper for i, t in zip(fit.intervals, truth, strict=True)])
+        noise.append(fit.noise_scale)
+    return np.array(held), np.array(ratios), np.mean(noise)
+
+
+def test_intervals_that_know_of_a_drift_hold_the_truth_and_others_do_not(lrm):
+    seeds = range(100, 108)
+    held, ratios, _ = scores(lrm, seeds, PLANTED)
+    assert held.mean() > 0.88 and 0.7 < np.sqrt(np.mean(ratios**2)) < 1.3
+    held, ratios, _ = scores(lrm, seeds, {})
+    of_the_base = held[:, : len(PLANTED)]
+    assert of_the_base.mean() < 0.75 and np.sqrt(np.mean(ratios**2)) > 1.5
+
+
+@pytest.mark.slow
+def test_intervals_that_know_of_a_drift_hold_the_truth_as_often_as_they_say(lrm):
+    """The planted process also moves between knots, which counts as a little more noise."""
+    held, ratios, noise = scores(lrm, range(200, 350), PLANTED)
+    assert 0.93 < held.mean() < 0.97 and 0.88 < np.sqrt(np.mean(ratios**2)) < 1.05
+    assert 1.0 < noise < 1.25
+    held, _, _ = scores(lrm, range(200, 240), {})
+    assert held[:, : len(PLANTED)].mean() < 0.65
+
+
+def test_neighbours_tell_of_the_drift_so_held_out_errors_fall(lrm):
+    dataset = recorded(lrm, 120, 20, PLANTED, noise=0.2e-3)
+    splits, crossed = folds(120, 5, 0), {}
+    for name, drifts in (("still", {}), ("drifting", PLANTED)):
+        problem, records = posed(lrm, dataset, drifts)
+        crossed[name] = cross_validate(problem, records, splits, SOLVER, problem.parameters.nominal())
+    still, drifting = crossed["still"], crossed["drifting"]
+    assert drifting.errors.mean() < 0.75 * still.errors.mean()
+    assert drifting.at_rest.mean() == pytest.approx(still.errors.mean(), rel=0.15)
+    np.testing.assert_allclose(still.errors, still.at_rest, rtol=0, atol=1e-12)
+
+
+# ---------------------------------------------------------------- robust fits
+
+
+def test_a_robust_fit_finds_outliers_on_a_drifting_arm(lrm):
+    """Not the records that the drift moved, but those that lie off their neighbours."""
+    dataset = recorded(lrm, 80, 21, PLANTED, noise=0.2e-3)
+    wrong = [11, 40, 66]
+    channels = dict(dataset.channels)
+    channels["tracker.x"] = channels["tracker.x"].copy()
+    channels["tracker.x"][wrong] += 0.02
+    spoilt = replace(dataset, channels=channels)
+    problem, records = posed(lrm, spoilt, PLANTED)
+    start = problem.parameters.nominal()
+    clean = SOLVER.solve(problem, posed(lrm, dataset, PLANTED)[1], start).values
+    fit = Weighing(SOLVER, NoiseSettings(loss="reject")).fit(problem, records, start)
+    assert {each.record for each in fit.set_aside} == set(wrong)
+    upper = problem.triangular_factor(clean, records)
+    sd = np.sqrt(np.diag(np.linalg.inv(upper.T @ upper)))
+    free = list(problem.parameters.free_entries)
+    assert (np.abs(fit.solution.values - clean)[free] / sd).max() < 1
+    kept = np.setdiff1d(np.arange(80), wrong)
+    without = SOLVER.solve(problem, problem.subset(records, kept), start).values
+    np.testing.assert_allclose(fit.solution.values[free] / sd, without[free] / sd, rtol=0, atol=1e-4)
+
+
+# ---------------------------------------------------------------- through the command line
+
+DEMO = str(CONFIGS / "demo.yaml")
+COUNTED = "data.columns={sequence: pose_id}"
+GLOB = "arm.mdh.base_[xyz]"
+
+
+def armcal(command, *settings, data=None, **options):
+    """A command on the shipped demo with these settings."""
+    arguments = [command, DEMO, *(x for s in settings for x in ("--set", s))]
+    arguments += ["--data", str(data)] if data else []
+    arguments += [x for name, value in options.items() for x in (f"--{name}", str(value))]
+    return CliRunner().invoke(cli, arguments)
+
+
+def drifting(text, glob=GLOB):
+    return f'parameters.drift={{"{glob}": {text}}}'
+
+
+REFUSED = {
+    "no column": ((drifting("{sd: 0.4 mm, over: 10}"),), ("sequence", "columns", "pose_id")),
+    "no time": ((drifting("{sd: 0.4 mm, over: 20 min}"),), ("time", "do not carry")),
+    "a fixed parameter": ((drifting("{sd: 1 mm, over: 10}", "arm.mdh.d1"), COUNTED), ("arm.mdh.d1", "not free")),
+    "no such parameter": ((drifting("{sd: 1 mm, over: 10}", "arm.mdh.zz*"), COUNTED), ("arm.mdh.zz*",)),
+    "no distance": ((drifting("{sd: 0.4 mm, over: 0}"), COUNTED), ("above zero", "0")),
+    "a negative distance": ((drifting("{sd: 0.4 mm, over: -3}"), COUNTED), ("above zero", "-3")),
+    "a negative time": ((drifting("{sd: 0.4 mm, over: -3 min}"), COUNTED), ("above zero", "-3 min")),
+    "a distance in mm": ((drifting("{sd: 0.4 mm, over: 3 mm}"), COUNTED), ("mm", "20 min")),
+    "no deviation": ((drifting("{sd: 0 mm, over: 10}"), COUNTED), ("above zero",)),
+    "a negative deviation": ((drifting("{sd: -1 mm, over: 10}"), COUNTED), ("above zero",)),
+    "a deviation without a unit": ((drifting("{sd: 0.4, over: 10}"), COUNTED), ("unit", "mm")),
+    "a deviation in another unit": ((drifting("{sd: 0.4 deg, over: 10}"), COUNTED), ("deg", "length")),
+    "half of it": ((drifting("{sd: 0.4 mm}"), COUNTED), ("over",)),
+    "a distance far too short": ((drifting("{sd: 0.4 mm, over: 0.01}"), COUNTED), ("knots", "longer distance")),
+    "a distance absurdly short": ((drifting("{sd: 0.4 mm, over: 0.000000001}"), COUNTED), ("knots",)),
+    "variances estimated beside it": (
+        (drifting("{sd: 0.4 mm, over: 10}"), COUNTED, "noise.estimate=true", "evaluator=interpreted"),
+        ("drift",),
+    ),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_a_drift_that_cannot_be_is_refused_in_words(case, tmp_path):
+    settings, words = REFUSED[case]
+    told = armcal("run", *settings, out=tmp_path / "run")
+    text = " ".join(told.output.split())
+    assert told.exit_code == 2 and "Traceback" not in text, text
+    for word in words:
+        assert word in text, (word, text)
+
+
+def test_a_matrix_cannot_drift():
+    flex = "arms.arm.effects.flex={type: compliance}"
+    free = 'parameters.free=["arm.mdh.theta?", "arm.flex.C3"]'
+    told = armcal("check", flex, free, COUNTED, drifting("{sd: 0.1 rad/Nm, over: 10}", "arm.flex.C3"))
+    text = " ".join(told.output.split())
+    assert told.exit_code == 2 and "arm.flex.C3" in text and "matrix" in text and "Traceback" not in text
+
+
+@pytest.mark.parametrize("cell", ["", "nan", "first"])
+def test_a_record_that_does_not_say_its_place_is_refused_or_set_aside(cell, tmp_path):
+    lines = (CONFIGS / "demo.csv").read_text().splitlines()
+    head, *rows = lines
+    counted = [f"{row},{i}" for i, row in enumerate(rows)]
+    counted[5] = f"{rows[5]},{cell}"
+    (tmp_path / "gap.csv").write_text("\n".join([f"{head},sequence", *counted]) + "\n")
+    told = armcal("check", drifting("{sd: 0.4 mm, over: 10}"), data=tmp_path / "gap.csv")
+    assert "Traceback" not in told.output and "nan" not in told.output.replace("'nan'", "").lower().split()
+    assert told.exit_code == 2 or "1 set aside" in told.output, told.output
+
+
+def test_a_run_on_a_drifting_recording_states_both_errors(tmp_path):
+    """The arm's base wanders while the shipped poses are measured."""
+    lines = [line.split(",") for line in (CONFIGS / "demo.csv").read_text().splitlines()]
+    head, rows = lines[0], lines[1::2]
+    random, places = np.random.default_rng(22), np.array([float(row[0]) for row in rows])
+    for axis in "xyz":
+        shift = 1000 * wandering(places, 1.5e-3, 15.0, random)
+        for row, moved in zip(rows, shift, strict=True):
+            row[head.index(f"{axis}_mm")] = repr(float(row[head.index(f"{axis}_mm")]) + float(moved))
+    (tmp_path / "drift.csv").write_text("\n".join(",".join(row) for row in [head, *rows]) + "\n")
+    told = {}
+    for name, more in (("still", ()), ("drifting", (drifting("{sd: 1.5 mm, over: 15}"), COUNTED))):
+        settings = (*more, "evaluator=interpreted", "validation.folds=0")
+        ran = armcal("run", *settings, data=tmp_path / "drift.csv", out=tmp_path / name)
+        assert ran.exit_code == 0, ran.output
+        told[name] = json.loads((tmp_path / name / "metrics.json").read_text())
+    error = {name: content["error_mm"] for name, content in told.items()}
+    assert error["drifting"]["calibrated"]["holdout"]["mean"] < 0.8 * error["still"]["calibrated"]["holdout"]["mean"]
+    assert error["drifting"]["at_rest"]["holdout"]["mean"] > error["drifting"]["calibrated"]["holdout"]["mean"]
