@@ -14,6 +14,7 @@ from armcal.solve.coverage import (
     Recording,
     Scores,
     Stretch,
+    besides,
     collected,
     coverage,
     predictor,
@@ -39,7 +40,7 @@ class IntervalResult:
 
     Attributes:
         stretches: what half widths are multiplied by, from cross-validation; empty without.
-        crossed: shares held of training records, by folds that did not see them; stretched from inner folds.
+        crossed: shares held of training records, by folds that did not see them; stretched from the other folds.
         holdout: shares held of held-out records.
         half_width_mm: of 90 % intervals of a position coordinate, median over all records; stretched.
         radius_mm: of 95 % radii of positions, likewise.
@@ -128,7 +129,7 @@ def interval_result(
 def _crossed(
     crossed: tuple[CrossValidation, Sequence[Split]] | None, split: Split, count: int
 ) -> tuple[dict[Recording, Scores], dict[Recording, Coverage], dict[Recording, Stretch]]:
-    """Scores in dataset order, the shares they hold by stretches of inner folds, and the stretches from all of them."""
+    """Scores in dataset order, the shares they hold by stretches of other folds, and the stretches from all of them."""
     if crossed is None:
         return {}, {}, {}
     judged, splits = crossed
@@ -136,11 +137,12 @@ def _crossed(
     found = collected(splits, [fit.scores if fit else {} for fit in fits], len(split.train))
     shares: dict[Recording, Coverage] = {}
     for name, own in found.items():
-        inner: list[Stretch | None] = [None] * len(split.train)
-        for part, fit in zip(splits, fits, strict=True):
+        others: list[Stretch | None] = [None] * len(split.train)
+        for part in splits:
+            apart = stretch(besides(own, part.holdout))
             for i in part.holdout:
-                inner[i] = fit.stretches.get(name) if fit else None
-        share = coverage(own, inner)
+                others[i] = apart
+        share = coverage(own, others)
         if share is not None:
             shares[name] = share
     # Nothing is stretched whose share was not judged.

@@ -7,7 +7,6 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -263,8 +262,8 @@ def _crossed(
     if not asked.folds:
         return None
     splits = folds(len(ready.split.train), asked.folds, asked.seed)
-    judge, start = partial(fit_and_predict, inner=asked.folds, seed=asked.seed), problem.parameters.nominal()
-    parts = (ready.training, splits, experiment.estimator, start, progress, executor, judge)
+    start = problem.parameters.nominal()
+    parts = (ready.training, splits, experiment.estimator, start, progress, executor, fit_and_predict)
     return cross_validate(problem, *parts), splits
 
 

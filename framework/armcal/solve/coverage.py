@@ -4,14 +4,14 @@ Residuals of records that took no part in a fit are put in units of what was pre
 error is not Gaussian, or larger in some poses than in others, the shares held differ from the levels claimed. The
 intervals are then stretched by the quantile of these scores (split conformal prediction with scores in units of
 the predicted spread [Lei2018]), level by level. A stretch is never judged by the records it comes from: each fold of
-a cross-validation is judged by the stretch that folds inside of its training records gave.
+a cross-validation is judged by the stretch that the scores of the other folds give (cross-conformal [Vovk2015]).
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -24,7 +24,7 @@ from armcal.solve.estimator import Estimator
 from armcal.solve.noise_findings import Finding
 from armcal.solve.prediction import LEVELS, RADIUS_LEVEL, STATED, Predictor, Spread, ToldDrift, is_position, quantile
 from armcal.solve.problem import FactorRecords, Problem
-from armcal.solve.validation import FitTask, Indices, JudgedFit, Split, failed_fit, folds, judged_fit
+from armcal.solve.validation import FitTask, Indices, JudgedFit, Split, failed_fit, judged_fit
 from armcal.solve.variance import apply_components
 from armcal.solve.weighing import WeighedFit, Weighing, fit
 
@@ -79,11 +79,9 @@ class PredictedFit(JudgedFit):
 
     Attributes:
         scores: of the records that judge, by recording (``new`` only where something drifts).
-        stretches: found inside of the training records; empty if there were too few.
     """
 
     scores: Mapping[Recording, Scores]
-    stretches: Mapping[Recording, Stretch]
 
 
 @dataclass(frozen=True)
@@ -158,8 +156,8 @@ def whitened_like(
     return apply_components(problem, fitted.solution.values, held, fitted.components, estimator.settings.axes)
 
 
-def fit_and_predict(task: FitTask, inner: int, seed: int) -> JudgedFit:
-    """Fit, judge and score; ``inner`` folds of the training records give the stretches. See ``fit_and_judge``."""
+def fit_and_predict(task: FitTask) -> JudgedFit:
+    """Fit, judge and score; see ``fit_and_judge``."""
     began = time.perf_counter()
     try:
         train, held = task.parts()
@@ -170,33 +168,14 @@ def fit_and_predict(task: FitTask, inner: int, seed: int) -> JudgedFit:
         scores = score(predictor(task.problem, fitted), whitened_like(task.problem, fitted, held, task.estimator))
     except NotConvergedError:
         return failed_fit(task, began)
-    within = _inner_scores(task, fitted, inner, seed)
-    found = {name: s for name, each in within.items() if (s := stretch(each)) is not None}
-    return PredictedFit(judged.errors, judged.at_rest, True, time.perf_counter() - began, scores, found)
+    return PredictedFit(judged.errors, judged.at_rest, True, time.perf_counter() - began, scores)
 
 
-def _inner_scores(task: FitTask, fitted: WeighedFit, inner: int, seed: int) -> dict[Recording, Scores]:
-    """Scores of the training records by folds of them; started from the answer on all of them."""
-    train = task.split.train
-    if len(train) < max(FEWEST, inner):
-        return {}
-    splits = folds(len(train), inner, seed)
-    fits = []
-    for split in splits:
-        within = Split(train[split.train], train[split.holdout])
-        fits.append(_scored(FitTask(task.problem, task.estimator, fitted.solution.values, task.records, within)))
-    return collected(splits, fits, len(train))
-
-
-def _scored(task: FitTask) -> Mapping[Recording, Scores]:
-    try:
-        train, held = task.parts()
-        fitted = fit(task.problem, train, task.estimator, task.start)
-        if not fitted.solution.verdict.converged:
-            return {}
-        return score(predictor(task.problem, fitted), whitened_like(task.problem, fitted, held, task.estimator))
-    except NotConvergedError:
-        return {}
+def besides(scores: Scores, places: Indices) -> Scores:
+    """The scores of all records but some."""
+    errors = scores.errors.copy()
+    errors[:, places] = np.nan
+    return replace(scores, errors=errors)
 
 
 def collected(
