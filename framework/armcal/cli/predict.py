@@ -130,6 +130,9 @@ def _tell_missing(voice: Voice, loaded: Calibration, commands: Dataset, recordin
     kept = loaded.record.prediction
     if kept is not None and kept.recording is None and recording == "calibrated":
         voice.warn("no parameter drifts in this calibration: all recordings are alike.")
+    if kept is not None and kept.recording is not None and recording == "new" and any(map(commands.has, order)):
+        text = "these poses are taken for another recording than the calibration's, of whose drift nothing is known"
+        voice.warn(f"{text}; if they belong to it, say --recording calibrated.")
 
 
 def _columns(found: PlusMinus, shown: Sequence[WantedChannel]) -> dict[str, tuple[str, ...]]:
