@@ -94,19 +94,10 @@ class TorqueBacklash:
         return Spring(site, (), lambda torque: play * torque / ca.sqrt(torque * torque + floor))
 
 
-class BearingPlaySettings(Settings):
+class BearingPlaySettings(TorqueBacklashSettings):
     """Which joints' bearings, and the base, have play; and the moment at which 71 % of it is taken up."""
 
-    joints: JointChoice = "all"
     base: bool = True
-    transition: Torque = 0.05
-
-    @field_validator("transition")
-    @classmethod
-    def _positive(cls, value: float) -> float:
-        if value <= 0:
-            raise ValueError(f"a transition of {value:g} N m is not above zero: it keeps the equilibrium smooth")
-        return value
 
 
 class BearingPlay:
