@@ -22,9 +22,9 @@ FREE = {1: 28, 2: 20, 3: 7, 4: 27, 5: 6}
 PUBLISHED_COMPLIANCE = (0.01832, 0.07149, 0.06617, 0.07887, 0.07902, 0.37994, 0.01614)
 
 
-def run(repository: Path, data: Path, option: int, out: Path, *settings: str) -> dict:
-    """``armcal run`` of one option; its metrics."""
-    config = repository / "configs" / "lrm_arm" / f"option{option}.yaml"
+def run(repository: Path, data: Path, model: int | str, out: Path, *settings: str) -> dict:
+    """``armcal run`` of an option (its number) or another configuration of the arm (its name); its metrics."""
+    config = repository / "configs" / "lrm_arm" / f"{model if isinstance(model, str) else f'option{model}'}.yaml"
     arguments = ["run", str(config), "--data", str(data / "poses.csv"), "--out", str(out), "--json"]
     result = CliRunner().invoke(cli, arguments + [x for s in settings for x in ("--set", s)])
     assert result.exit_code == 0, result.output
@@ -99,3 +99,30 @@ def test_ipopt_and_cvxpy_agree_on_the_real_arm(repository: Path, loaded) -> None
         assert np.max(np.abs(one.values - two.values)[free] / deviations) < 1e-4
         errors = [record_errors(problem, s.values, subset).mean() * 1000 for s in (one, two)]
         assert errors[0] == pytest.approx(errors[1], abs=1e-4)
+
+
+def test_the_best_model_judged_by_records_that_did_not_train_it(
+    repository: Path, lrm_data: Path, tmp_path: Path
+) -> None:
+    told = run(repository, lrm_data, "best", tmp_path / "out")
+    crossed = told["error_mm"]["calibrated"]["cross_validated"]
+    assert crossed["count"] == 313
+    assert crossed["mean"] < 1.25 and crossed["p95"] < 2.5 and crossed["max"] < 4.5
+    # What is known of the drift is worth something, and without it the model is still far better than option 1.
+    assert 1.5 < told["error_mm"]["at_rest"]["cross_validated"]["mean"] < 1.75
+    for recording in ("same_recording", "new_recording"):
+        held = told["prediction_intervals"][recording]["cross_validated"]
+        assert 0.87 < held["share"]["90"] < 0.93 and 0.87 < held["share_without_stretch"]["90"] < 0.93
+    kept = yaml.safe_load((tmp_path / "out" / "calibration.yaml").read_text())["parameters"]
+    value = {p["name"]: p["value"] for p in kept}
+    for site in range(7):
+        xx, xy, xz, yy, yz, zz = (value[f"arm.flex.C{site}[{e}]"] for e in ("xx", "xy", "xz", "yy", "yz", "zz"))
+        assert np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])[0] > -1e-12
+
+
+def test_the_best_model_trained_on_the_published_poses_alone(repository: Path, lrm_data: Path, tmp_path: Path) -> None:
+    ids = f"validation.train_ids={lrm_data / 'published_50.csv'}"
+    held = run(repository, lrm_data, "best", tmp_path / "out", ids, "validation.folds=0")["error_mm"]["calibrated"][
+        "holdout"
+    ]
+    assert held["count"] == 263 and held["mean"] < 2.0

@@ -90,7 +90,7 @@ def _compliances(result: RunResult) -> Table:
 def _matrices(result: RunResult) -> Table:
     """Compliance matrices by their principal values, the softest direction last."""
     estimate = result.estimate
-    table = Table(title="Compliance matrices, principal values, rad/(N m)", title_justify="left")
+    table = Table(title="Principal compliances, rad/(N m)", title_justify="left")
     for column in ("parameter", "stiffest", "", "softest"):
         table.add_column(column, justify="left" if column == "parameter" else "right")
     for block in estimate.parameters.free:
