@@ -62,6 +62,11 @@ def armcal_register_simulators(register: Register) -> None:
 
 
 @hookspec
+def armcal_register_exporters(register: Register) -> None:
+    """Exporters: built as ``Exporter(settings)``; see ``armcal.use.exporter.Exporter``."""
+
+
+@hookspec
 def armcal_run_started(name: str, records: int) -> None:
     """A calibration run begins; observers may log it. What they return is ignored."""
 
@@ -88,5 +93,6 @@ KINDS = {
     "reader": "armcal_register_readers",
     "estimator": "armcal_register_estimators",
     "simulator": "armcal_register_simulators",
+    "exporter": "armcal_register_exporters",
 }
 """The kinds of component and the hook that registers each."""

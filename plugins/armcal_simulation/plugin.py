@@ -5,5 +5,8 @@ from armcal.hooks import Register, hookimpl
 
 @hookimpl
 def armcal_register_simulators(register: Register) -> None:
-    """Announce the simulator."""
+    """Announce the simulators."""
     register("elastic_arm", "armcal_simulation.simulator:ElasticArmSimulator", "an arm with a stated truth")
+    register(
+        "contacts", "armcal_simulation.contacts:ContactsSimulator", "postures in sockets and clamps"
+    )

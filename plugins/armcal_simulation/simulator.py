@@ -40,8 +40,8 @@ class PoseSettings(Settings):
         Raises:
             ConfigError: a joint has none, or a name is not a joint's.
         """
-        turning = {j for j, kind in zip(arm.joint_names, arm.joint_dimensions, strict=True) if kind == "angle"}
-        sliding = set(arm.joint_names) - turning
+        turning = {j for j, kind in arm.commanded.items() if kind == "angle"}
+        sliding = set(arm.commanded) - turning
         for given, wanted, key in ((self.levels, turning, "levels"), (self.travel, sliding, "travel")):
             missing, unknown = sorted(wanted - set(given)), sorted(set(given) - wanted)
             if missing or unknown:
@@ -49,7 +49,7 @@ class PoseSettings(Settings):
                     f"simulation.poses.{key}: missing {missing or 'none'}, unknown {unknown or 'none'}.",
                     hint=f"Give one list for each of {', '.join(sorted(wanted)) or 'no joint'}.",
                 )
-        return [np.array(self.levels.get(j) or self.travel[j]) for j in arm.joint_names]
+        return [np.array(self.levels.get(j) or self.travel[j]) for j in arm.commanded]
 
 
 class OutlierSettings(Settings):
@@ -102,11 +102,11 @@ class ElasticArmSimulator:
         commands = _poses(settings.poses, settings.poses.of(arm), random)
         reached, step = commands.copy(), settings.quantisation
         if step:
-            turning = [dimension == "angle" for dimension in arm.joint_dimensions]
+            turning = [dimension == "angle" for dimension in arm.commanded.values()]
             reached[turning] = np.round(commands[turning] / step) * step
-        named = [f"{arm.name}.{joint}" for joint in arm.joint_names]
+        named = [f"{arm.name}.{joint}" for joint in arm.commanded]
         approach = _approach(commands)
-        channels = {f"{arm.name}.approach.{j}": approach[i] for i, j in enumerate(arm.joint_names)}
+        channels = {f"{arm.name}.approach.{j}": approach[i] for i, j in enumerate(arm.commanded)}
         standing = Dataset(
             tuple(str(i) for i in range(1, commands.shape[1] + 1)),
             {**dict(zip(named, reached, strict=True)), **channels},

@@ -9,6 +9,7 @@ import casadi as ca
 from armcal.arm.assembly import ArmState
 from armcal.base.parameters import ParameterBlock, scalar
 from armcal.base.settings import Length, Length3, Settings
+from armcal.measure.contact import named_arm
 from armcal.measure.measurement import Channel
 from pydantic import field_validator
 
@@ -40,11 +41,7 @@ class TipPosition:
 
     def __init__(self, settings: TipPositionSettings, arm_names: Sequence[str]) -> None:
         self._settings = settings
-        if settings.arm is None and len(arm_names) != 1:
-            raise ValueError(f"there are {len(arm_names)} arms ({', '.join(arm_names)}); say which by arm: NAME")
-        self._arm = settings.arm or arm_names[0]
-        if self._arm not in arm_names:
-            raise ValueError(f"no arm is called {self._arm!r}; the arms are {', '.join(arm_names)}")
+        self._arm = named_arm(settings.arm, arm_names)
 
     @property
     def arms(self) -> tuple[str, ...]:

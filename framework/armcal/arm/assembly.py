@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any, Protocol, runtime_checkable
 
 import casadi as ca
 
@@ -13,7 +15,11 @@ from armcal.arm.elastic import deflections, elastic_sites, split_deflection
 from armcal.arm.model import ArmModel, Chain, forward
 from armcal.arm.statics import Load, Mass, wrenches
 from armcal.base.parameters import ParameterBlock, scalar
+from armcal.base.pose_blocks import pose_transform
 from armcal.base.se3 import Expression, Transform
+
+PLACEMENT = "placement"
+"""What the blocks of an arm's placement are called."""
 
 
 @dataclass(frozen=True)
@@ -25,6 +31,14 @@ class MassSpec:
     com: tuple[float, float, float]
     frame: str
     loads_up_to: int | None = None
+
+
+@runtime_checkable
+class MassiveModel(Protocol):
+    """What an arm model may provide beside the rest: the masses that its source states."""
+
+    def masses(self) -> Sequence[MassSpec]:
+        """Each in a named frame of the chain; a configured link of the same name takes its place."""
 
 
 @dataclass(frozen=True)
@@ -64,6 +78,9 @@ class Arm:
         model: the arm model.
         effects: joint effects by their names.
         masses: what gravity pulls on.
+        placement: blocks of the pose of the model's base in the base frame (``placement_x`` and so on); none where
+            the two are the same.
+        joint_noise: standard deviation of what a turning joint reads against where it stands (rad).
     """
 
     name: str
@@ -71,15 +88,43 @@ class Arm:
     model: ArmModel
     effects: Mapping[str, JointEffect]
     masses: tuple[MassSpec, ...]
+    placement: tuple[ParameterBlock, ...] = ()
+    joint_noise: float = 0.0
 
     @property
     def joint_names(self) -> tuple[str, ...]:
-        """From the base to the tip."""
+        """From the base to the tip, those that follow others too."""
         return self.model.joint_names
 
     @cached_property
+    def commanded(self) -> Mapping[str, str]:
+        """The joints that records have commands of, with ``angle`` or ``length``: all but those that follow others."""
+        joints = zip(self.nominal_chain.joints, self.joint_dimensions, strict=True)
+        return {joint.name: dimension for joint, dimension in joints if joint.mimic is None}
+
+    def joint_commands(self, commands: Sequence[Any]) -> list[Any]:
+        """What every joint is told (rad or m), from the ``commanded`` ones' commands."""
+        told = dict(zip(self.commanded, commands, strict=True))
+        return [
+            told[joint.name]
+            if joint.mimic is None
+            else joint.mimic.multiplier * told[joint.mimic.master] + joint.mimic.offset
+            for joint in self.nominal_chain.joints
+        ]
+
+    def joint_approaches(self, approaches: Sequence[Any]) -> list[Any]:
+        """From where every joint came (-1, 0, 1), from the ``commanded`` ones' approaches."""
+        told = dict(zip(self.commanded, approaches, strict=True))
+        return [
+            told[joint.name]
+            if joint.mimic is None
+            else math.copysign(joint.mimic.multiplier != 0, joint.mimic.multiplier) * told[joint.mimic.master]
+            for joint in self.nominal_chain.joints
+        ]
+
+    @cached_property
     def joint_dimensions(self) -> tuple[str, ...]:
-        """``angle`` or ``length`` of each joint's command."""
+        """``angle`` or ``length`` of each joint's displacement."""
         return tuple("angle" if joint.is_revolute else "length" for joint in self.nominal_chain.joints)
 
     @cached_property
@@ -93,7 +138,8 @@ class Arm:
 
     def parameters(self) -> tuple[ParameterBlock, ...]:
         """All blocks, under their full names."""
-        blocks = list(prefixed(self._scope(self.model_name), self.model.parameters()))
+        blocks = list(prefixed(f"{self.name}.", self.placement))
+        blocks += prefixed(self._scope(self.model_name), self.model.parameters())
         for name, effect in self.effects.items():
             blocks += prefixed(self._scope(name), effect.parameters())
         for mass in self.masses:
@@ -104,7 +150,11 @@ class Arm:
 
     def chain(self, values: Mapping[str, Expression]) -> Chain:
         """The model's chain, for full parameter names."""
-        return self.model.chain(scoped(values, self._scope(self.model_name)))
+        chain = self.model.chain(scoped(values, self._scope(self.model_name)))
+        if not self.placement:
+            return chain
+        base_T_model = pose_transform(PLACEMENT, scoped(values, f"{self.name}."))
+        return replace(chain, base_T_mount=base_T_model @ chain.base_T_mount)
 
     def springs(self, values: Mapping[str, Expression]) -> tuple[Spring, ...]:
         """The springs of all effects, in the order of the effects."""

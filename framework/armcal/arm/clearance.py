@@ -268,8 +268,9 @@ def _ends(capsule: Capsule) -> tuple[Point, Point]:
 def _point_function(arm: Arm, points: Sequence[Point]) -> ca.Function:
     """Joint commands to the points in the base frame, stacked."""
     chain = arm.nominal_chain
-    commands = ca.SX.sym("commands", len(chain.joints))
-    frames = forward(chain, [joint.offset + commands[i] for i, joint in enumerate(chain.joints)], {})
+    commands = ca.SX.sym("commands", len(arm.commanded))
+    told = arm.joint_commands(ca.vertsplit(commands))
+    frames = forward(chain, [joint.offset + told[i] for i, joint in enumerate(chain.joints)], {})
     mount = frames.sites[0]
     stacked = []
     for point in points:

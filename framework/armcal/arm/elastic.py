@@ -13,7 +13,7 @@ import casadi as ca
 
 from armcal.arm.effects import Spring
 from armcal.arm.model import Chain, Frames, Joint, Vector3
-from armcal.arm.statics import SiteWrench
+from armcal.arm.statics import SiteWrench, effort
 from armcal.base import se3
 from armcal.base.se3 import Expression
 
@@ -66,10 +66,10 @@ def deflections(chain: Chain, frames: Frames, acting: Sequence[SiteWrench], site
         joint = chain.joints[site.site - 1] if site.site else None
         total = ca.SX(site.size, 1)
         for spring in site.springs:
-            slides = joint is not None and not spring.directions and not joint.is_revolute
-            load = wrench.force if slides else wrench.moment
             axes = spring.directions or ((joint.axis,) if joint else ())
-            along = [ca.dot(ca.mtimes(pose.rotation, ca.SX(list(axis))), load) for axis in axes]
+            along = [ca.dot(ca.mtimes(pose.rotation, ca.SX(list(axis))), wrench.moment) for axis in axes]
+            if joint is not None and not site.directions:
+                along = [effort(joint, pose, wrench)]
             given = spring.law(ca.vertcat(*along))
             total += given if spring.directions == site.directions else ca.mtimes(_matrix(axes), given)
         parts.append(total)

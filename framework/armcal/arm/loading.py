@@ -10,7 +10,7 @@ import numpy as np
 
 from armcal.arm.assembly import Arm
 from armcal.arm.model import forward
-from armcal.arm.statics import Load, Mass, wrenches
+from armcal.arm.statics import Load, Mass, effort, wrenches
 from armcal.base.domains import Array
 
 LOAD_CHANNELS = (
@@ -68,8 +68,6 @@ def _function(arm: Arm, values: Mapping[str, Array]) -> ca.Function:
         lever = frames.base_T_tool.translation - site.origin
         levers += [ca.cross(ca.densify(site.rotation[:, axis]), ca.densify(lever)) for axis in range(3)]
         if index:
-            joint = chain.joints[index - 1]
-            axis = ca.mtimes(site.rotation, ca.SX(list(joint.axis)))
-            efforts.append(ca.dot(axis, wrench.moment if joint.is_revolute else wrench.force))
+            efforts.append(effort(chain.joints[index - 1], site, wrench))
     shown = ca.densify(ca.vertcat(*moments, *efforts, *levers))
     return ca.Function("site_loads", [commands, acting], [shown], {"cse": True})

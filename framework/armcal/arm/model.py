@@ -8,12 +8,24 @@ from typing import Protocol
 
 import casadi as ca
 
-from armcal.base import se3
+from armcal.base import se3, twists
 from armcal.base.parameters import ParameterBlock
 from armcal.base.se3 import Expression, Transform
 
 Vector3 = tuple[float, float, float]
 Z_AXIS: Vector3 = (0.0, 0.0, 1.0)
+
+
+@dataclass(frozen=True)
+class Mimic:
+    """How a joint follows another: its displacement is ``multiplier`` times that of ``master``, plus ``offset``.
+
+    ``master`` is a joint of the chain that follows none itself.
+    """
+
+    master: str
+    multiplier: float = 1.0
+    offset: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -27,6 +39,11 @@ class Joint:
         angular: the axis of a revolute joint (unit, in its own frame); zeros for a prismatic one.
         linear: the direction of a prismatic joint; zeros for a revolute one.
         offset: displacement (rad or m) at zero angle.
+        limits: of its command (rad or m); None where none are known.
+        endless: whether it may turn on and on, so that its angle may be of any size.
+        mimic: the joint that it follows; records have no column of one that does.
+        twist: what it moves along instead, of any pitch and length: angular and linear part (3x1 each) in its own
+            frame, not far from the axis, which still says whether it turns or slides; None for the axis itself.
     """
 
     name: str
@@ -34,6 +51,10 @@ class Joint:
     angular: Vector3 = Z_AXIS
     linear: Vector3 = (0.0, 0.0, 0.0)
     offset: Expression = 0.0
+    limits: tuple[float, float] | None = None
+    endless: bool = False
+    mimic: Mimic | None = None
+    twist: tuple[Expression, Expression] | None = None
 
     @property
     def is_revolute(self) -> bool:
@@ -47,6 +68,9 @@ class Joint:
 
     def motion(self, displacement: Expression) -> Transform:
         """The joint's own motion at a displacement (rad or m), in its frame."""
+        if self.twist is not None:
+            along = twists.turning_motion if self.is_revolute else twists.sliding_motion
+            return along(*self.twist, displacement)
         for name, unit in zip("xyz", ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), Z_AXIS), strict=True):
             if self.angular == unit:
                 return se3.rotation_about(name, displacement)

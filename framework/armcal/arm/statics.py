@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import casadi as ca
 
-from armcal.arm.model import Chain, Frames
+from armcal.arm.model import Chain, Frames, Joint, Site
 from armcal.base import se3
 from armcal.base.se3 import Expression
 
@@ -86,6 +86,15 @@ def wrenches(chain: Chain, frames: Frames, masses: Sequence[Mass], load: Load) -
         moment += _cross(frames.base_T_tool.translation - origin, load.force)
         result.append(SiteWrench(moment, weight * load.gravity + load.force))
     return tuple(reversed(result))
+
+
+def effort(joint: Joint, site: Site, wrench: SiteWrench) -> Expression:
+    """What a wrench does along a joint's own motion: its work per displacement (N m; N on a sliding joint)."""
+    if joint.twist is None:
+        axis = ca.mtimes(site.rotation, ca.SX(list(joint.axis)))
+        return ca.dot(axis, wrench.moment if joint.is_revolute else wrench.force)
+    angular, linear = (ca.mtimes(site.rotation, part) for part in joint.twist)
+    return ca.dot(angular, wrench.moment) + ca.dot(linear, wrench.force)
 
 
 def _frame(chain: Chain, frames: Frames, name: str) -> tuple[se3.Transform, int]:

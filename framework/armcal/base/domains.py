@@ -16,9 +16,17 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from armcal.base.quaternions import (
+    Array,
+    left_jacobian,
+    quaternion_exp,
+    quaternion_log,
+    quaternion_matrix,
+    rotation_matrix,
+)
+
+__all__ = ["Array", "Domain", "Interval", "Pose", "Rotation", "ScrewAxis", "Semidefinite", "symmetric"]
 
 _SYMMETRIC = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
@@ -33,6 +41,10 @@ class Domain(Protocol):
     @property
     def dof(self) -> int:
         """How many numbers an increment has."""
+
+    @property
+    def increments(self) -> tuple[str, ...]:
+        """A short name for each number of an increment."""
 
     def check(self, value: Array) -> str:
         """What is wrong with a canonical value; empty when nothing is."""
@@ -65,8 +77,13 @@ class Domain(Protocol):
         """The convex part of sum over entries of gradient * d2 entry / d delta2 (dof x dof); None to neglect it."""
 
 
-class _ByIncrement:
+class ByIncrement:
     """A domain whose coordinates are its increments."""
+
+    @property
+    def increments(self: Domain) -> tuple[str, ...]:
+        """Numbers, where a domain gives no names."""
+        return tuple(str(i) for i in range(self.dof))
 
     def increment_scale(self, scale: float) -> float:
         """The same."""
@@ -94,7 +111,7 @@ class _ByIncrement:
 
 
 @dataclass(frozen=True)
-class Interval(_ByIncrement):
+class Interval(ByIncrement):
     """A number between two bounds, both allowed."""
 
     lower: float = -math.inf
@@ -131,7 +148,7 @@ class Interval(_ByIncrement):
 
 
 @dataclass(frozen=True)
-class Rotation(_ByIncrement):
+class Rotation(ByIncrement):
     """A rotation: unit quaternion (w, x, y, z); increments are rotation vectors (rad) in the moved frame."""
 
     @property
@@ -144,6 +161,11 @@ class Rotation(_ByIncrement):
         """Three."""
         return 3
 
+    @property
+    def increments(self) -> tuple[str, ...]:
+        """About which axis of the moved frame."""
+        return ("rx", "ry", "rz")
+
     def check(self, value: Array) -> str:
         """Unit norm."""
         norm = float(np.linalg.norm(value))
@@ -151,20 +173,20 @@ class Rotation(_ByIncrement):
 
     def retract(self, base: Array, delta: Array) -> Array:
         """base * exp(delta)."""
-        product = _quaternion_matrix(base) @ _quaternion_exp(delta)
+        product = quaternion_matrix(base) @ quaternion_exp(delta)
         return np.asarray(product / np.linalg.norm(product))
 
     def local(self, base: Array, value: Array) -> Array:
         """log(base^-1 * value)."""
-        return _quaternion_log(_quaternion_matrix(base * np.array([1, -1, -1, -1])) @ value)
+        return quaternion_log(quaternion_matrix(base * np.array([1, -1, -1, -1])) @ value)
 
     def retract_jacobian(self, base: Array, delta: Array) -> Array:
         """Half of the quaternion product's matrix, after the right Jacobian of the exponential [Murray1994]."""
-        return np.asarray(0.5 * _quaternion_matrix(self.retract(base, delta))[:, 1:] @ _left_jacobian(delta).T)
+        return np.asarray(0.5 * quaternion_matrix(self.retract(base, delta))[:, 1:] @ left_jacobian(delta).T)
 
 
 @dataclass(frozen=True)
-class Pose(_ByIncrement):
+class Pose(ByIncrement):
     """A rigid motion: quaternion then translation (m); increments: rotation vector (rad), translation, both in the moved frame."""  # noqa: E501
 
     @property
@@ -177,30 +199,35 @@ class Pose(_ByIncrement):
         """Six."""
         return 6
 
+    @property
+    def increments(self) -> tuple[str, ...]:
+        """About and along which axis of the moved frame."""
+        return ("rx", "ry", "rz", "x", "y", "z")
+
     def check(self, value: Array) -> str:
         """Unit quaternion, finite translation."""
         return Rotation().check(value[:4]) or ("" if np.isfinite(value).all() else f"{value} is not finite")
 
     def retract(self, base: Array, delta: Array) -> Array:
         """Rotation and translation each moved in the base's own frame."""
-        moved = base[4:] + _rotation_matrix(base[:4]) @ delta[3:]
+        moved = base[4:] + rotation_matrix(base[:4]) @ delta[3:]
         return np.concatenate([Rotation().retract(base[:4], delta[:3]), moved])
 
     def local(self, base: Array, value: Array) -> Array:
         """The inverse of ``retract``."""
-        shift = _rotation_matrix(base[:4]).T @ (value[4:] - base[4:])
+        shift = rotation_matrix(base[:4]).T @ (value[4:] - base[4:])
         return np.concatenate([Rotation().local(base[:4], value[:4]), shift])
 
     def retract_jacobian(self, base: Array, delta: Array) -> Array:
         """Block diagonal (7 x 6)."""
         jacobian = np.zeros((7, 6))
         jacobian[:4, :3] = Rotation().retract_jacobian(base[:4], delta[:3])
-        jacobian[4:, 3:] = _rotation_matrix(base[:4])
+        jacobian[4:, 3:] = rotation_matrix(base[:4])
         return jacobian
 
 
 @dataclass(frozen=True)
-class ScrewAxis(_ByIncrement):
+class ScrewAxis(ByIncrement):
     """The axis of a revolute joint as a twist (w, v = -w x q), |w| = 1, w.v = 0; four degrees of freedom.
 
     An increment is two turns (rad) and two shifts (m), about and along two directions across the axis at
@@ -217,6 +244,11 @@ class ScrewAxis(_ByIncrement):
         """Four."""
         return 4
 
+    @property
+    def increments(self) -> tuple[str, ...]:
+        """Turns and shifts, across the axis."""
+        return ("turn1", "turn2", "shift1", "shift2")
+
     def check(self, value: Array) -> str:
         """Unit direction, moment across it."""
         norm, pitch = float(np.linalg.norm(value[:3])), float(value[:3] @ value[3:])
@@ -226,15 +258,15 @@ class ScrewAxis(_ByIncrement):
 
     def retract(self, base: Array, delta: Array) -> Array:
         """Turn the direction, shift the nearest point."""
-        across, nearest = _across(base[:3]), np.cross(base[:3], base[3:])
-        turn = _rotation_matrix(_quaternion_exp(across @ delta[:2]))
+        across, nearest = two_across(base[:3]), np.cross(base[:3], base[3:])
+        turn = rotation_matrix(quaternion_exp(across @ delta[:2]))
         direction = turn @ base[:3]
         direction = direction / np.linalg.norm(direction)
         return np.concatenate([direction, np.cross(nearest + across @ delta[2:], direction)])
 
     def local(self, base: Array, value: Array) -> Array:
         """The inverse of ``retract``."""
-        across, nearest = _across(base[:3]), np.cross(base[:3], base[3:])
+        across, nearest = two_across(base[:3]), np.cross(base[:3], base[3:])
         turn_axis = np.cross(base[:3], value[:3])
         sine, cosine = float(np.linalg.norm(turn_axis)), float(base[:3] @ value[:3])
         angle = math.atan2(sine, cosine)
@@ -246,9 +278,9 @@ class ScrewAxis(_ByIncrement):
 
     def retract_jacobian(self, base: Array, delta: Array) -> Array:
         """6 x 4."""
-        across, nearest = _across(base[:3]), np.cross(base[:3], base[3:])
+        across, nearest = two_across(base[:3]), np.cross(base[:3], base[3:])
         direction, point = self.retract(base, delta)[:3], nearest + across @ delta[2:]
-        turning = _left_jacobian(across @ delta[:2]) @ across
+        turning = left_jacobian(across @ delta[:2]) @ across
         jacobian = np.zeros((6, 4))
         for column in range(2):
             turned = np.cross(turning[:, column], direction)
@@ -276,6 +308,11 @@ class Semidefinite:
     def dof(self) -> int:
         """Six."""
         return 6
+
+    @property
+    def increments(self) -> tuple[str, ...]:
+        """As the entries."""
+        return self.entries
 
     def check(self, value: Array) -> str:
         """No negative eigenvalue."""
@@ -348,49 +385,9 @@ def _entries(matrix: Array) -> Array:
 _UNITS = tuple(symmetric(unit) for unit in np.eye(6))
 
 
-def _across(direction: Array) -> Array:
+def two_across(direction: Array) -> Array:
     """Two unit vectors across a direction and across each other (3x2), a smooth choice where it matters."""
     helper = np.eye(3)[int(np.argmin(np.abs(direction)))]
     first = np.cross(direction, helper)
     first = first / np.linalg.norm(first)
     return np.column_stack([first, np.cross(direction, first)])
-
-
-def _quaternion_matrix(q: Array) -> Array:
-    """Left multiplication: matrix(q) @ p is the product q p."""
-    w, x, y, z = q
-    return np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
-
-
-def _quaternion_exp(vector: Array) -> Array:
-    half = 0.5 * float(np.linalg.norm(vector))
-    return np.concatenate([[math.cos(half)], 0.5 * np.sinc(half / np.pi) * vector])
-
-
-def _quaternion_log(q: Array) -> Array:
-    q = q if q[0] >= 0 else -q
-    sine = float(np.linalg.norm(q[1:]))
-    factor = 2 * math.atan2(sine, q[0]) / sine if sine > 1e-12 else 2.0
-    return np.asarray(factor * q[1:])
-
-
-def _left_jacobian(vector: Array) -> Array:
-    """exp(vector + d) = exp(left_jacobian d) exp(vector) to first order. [Murray1994]"""
-    angle = float(np.linalg.norm(vector))
-    x, y, z = vector
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    if angle < 1e-4:
-        return np.asarray(np.eye(3) + (0.5 - angle**2 / 24) * cross + (1 / 6 - angle**2 / 120) * cross @ cross)
-    first, second = (1 - math.cos(angle)) / angle**2, (angle - math.sin(angle)) / angle**3
-    return np.asarray(np.eye(3) + first * cross + second * cross @ cross)
-
-
-def _rotation_matrix(q: Array) -> Array:
-    w, x, y, z = q / np.linalg.norm(q)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )

@@ -43,6 +43,7 @@ class ParameterBlock:
         free: whether the fit may move it.
         prior_sd: standard deviation of a Gaussian prior about the nominal value, per coordinate; None for no prior.
         drift: how it moves over a recording; None if it does not.
+        nuisance: whether it belongs to one group of records (a socket, a clamp): found with the rest, of no use after.
     """
 
     name: str
@@ -53,6 +54,7 @@ class ParameterBlock:
     free: bool = False
     prior_sd: float | None = None
     drift: Drift | None = None
+    nuisance: bool = False
 
     @property
     def entry_names(self) -> tuple[str, ...]:
@@ -164,6 +166,11 @@ class Parameters:
         return tuple(block for block in self.blocks if block.free)
 
     @cached_property
+    def nuisances(self) -> tuple[ParameterBlock, ...]:
+        """The blocks that belong to one group of records each."""
+        return tuple(block for block in self.blocks if block.nuisance)
+
+    @cached_property
     def free_entries(self) -> tuple[int, ...]:
         """Positions in a value vector of the free blocks' canonical entries."""
         return tuple(i for block in self.free for i in range(*self.entries_of(block.name).indices(1 << 30)))
@@ -174,7 +181,7 @@ class Parameters:
         names: list[str] = []
         for block in self.free:
             by_entry = block.domain.dof == block.size
-            names += block.entry_names if by_entry else [f"{block.name}<{i}>" for i in range(block.domain.dof)]
+            names += block.entry_names if by_entry else [f"{block.name}<{i}>" for i in block.domain.increments]
         return tuple(names)
 
     def _per_increment(self, of: Mapping[str, float]) -> Array:

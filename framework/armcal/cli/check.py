@@ -32,7 +32,7 @@ def check(voice: Voice, config: Path, data: Path | None, overrides: tuple[str, .
     voice.plugin_faults(registry)
     experiment = Experiment.load(config, overrides, data, registry)
     ready = assemble(experiment, Stopwatch())
-    start = experiment.parameters.nominal()
+    start = ready.problem.parameters.nominal()
     known = identify(ready.problem, start, ready.training)
     refused: ProblemError | None = None
     try:
@@ -56,7 +56,7 @@ def _content(experiment: Experiment, ready: Prepared, known: Identifiability) ->
     angles = {
         f"{name}.{joint}": _excitation(ready, f"{name}.{joint}")
         for name, arm in experiment.system.arms.items()
-        for joint in arm.joint_names
+        for joint in arm.commanded
     }
     return {
         "experiment": experiment.name,
@@ -68,7 +68,7 @@ def _content(experiment: Experiment, ready: Prepared, known: Identifiability) ->
         },
         "equations": ready.problem.equations(ready.training),
         "parameters": {
-            "all": list(experiment.parameters.names),
+            "all": list(ready.problem.parameters.names),
             "free": list(known.names),
             "rank": known.rank,
             "scaled_condition": known.condition if np.isfinite(known.condition) else None,

@@ -9,6 +9,7 @@ import click
 import numpy as np
 
 from armcal.base.domains import Array
+from armcal.base.parameters import Parameters
 from armcal.cli.common import Voice, overrides, speaking
 from armcal.errors import ConfigError, Location
 from armcal.plugins import discover
@@ -49,11 +50,11 @@ def identify(
     registry = discover()
     voice.plugin_faults(registry)
     experiment = Experiment.load(config, overrides, data, registry)
-    parameters = experiment.parameters
+    ready = assemble(experiment, Stopwatch())
+    parameters = ready.problem.parameters
     if not parameters.free:
         raise ConfigError("no parameter is free.", where=Location(str(config)), hint="Name some under parameters.free.")
-    preferred = [_preferred(experiment, glob) for glob in prefer]
-    ready = assemble(experiment, Stopwatch())
+    preferred = [_preferred(parameters, glob) for glob in prefer]
     triangle = factor_at_zero(ready.problem, parameters.nominal(), ready.training)
     known = identify_from(triangle, parameters)
     content = _content(experiment, ready, triangle, known)
@@ -68,9 +69,9 @@ def identify(
         _show_minimal(voice, content["minimal"])
 
 
-def _preferred(experiment: Experiment, glob: str) -> tuple[str, ...]:
-    names = experiment.parameters.select([glob])
-    free = {block.name for block in experiment.parameters.free}
+def _preferred(parameters: Parameters, glob: str) -> tuple[str, ...]:
+    names = parameters.select([glob])
+    free = {block.name for block in parameters.free}
     if not free.intersection(names):
         raise ConfigError(
             f"--prefer {glob}: none of the parameters it names is free.",
@@ -80,7 +81,7 @@ def _preferred(experiment: Experiment, glob: str) -> tuple[str, ...]:
 
 
 def _content(experiment: Experiment, ready: Prepared, triangle: Array, known: Identifiability) -> dict[str, Any]:
-    parameters, problem = experiment.parameters, ready.problem
+    parameters, problem = ready.problem.parameters, ready.problem
     equations = problem.equations(ready.training)
     covariance = expected_covariance(triangle, parameters)
     deviation = np.sqrt(np.diag(covariance))

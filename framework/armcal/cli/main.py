@@ -17,6 +17,7 @@ COMMANDS = {
     "identify": ("armcal.cli.identify:identify", "Which parameters the poses determine; a minimal set of them."),
     "study": ("armcal.cli.study:study", "Compare model variants by cross-validated error, or by load transfer."),
     "predict": ("armcal.cli.predict:predict", "Where a calibrated arm goes for commanded joint angles."),
+    "export": ("armcal.cli.export:export", "Write a calibrated arm in another program's format, such as URDF."),
     "plan": ("armcal.cli.plan:plan", "Which poses to measure: the best few, and how good any could be."),
     "simulate": ("armcal.cli.simulate:simulate", "Make measurements up from a stated truth."),
     "plugins": ("armcal.cli.plugins:plugins", "List plugins, or check one."),

@@ -12,6 +12,7 @@ from rich.table import Table
 
 from armcal.base.domains import Semidefinite, symmetric
 from armcal.cli.common import Voice
+from armcal.report.group_table import part_of
 from armcal.run.result import RunResult
 from armcal.solve.bootstrap import Bootstrap
 from armcal.solve.validation import ErrorSummary
@@ -24,6 +25,8 @@ def show_run(voice: Voice, result: RunResult, folder: Path, seconds: float) -> N
     """The end of a run: errors, compliances, verdict, where the report is."""
     out = voice.out
     out.print(_errors(result))
+    if result.groups.errors:
+        out.print(_groups(result))
     for compliances in (_compliances(result), _matrices(result)):
         if compliances.row_count:
             out.print(compliances)
@@ -63,6 +66,24 @@ def _errors(result: RunResult) -> Table:
         if at_rest is not None:
             table.add_row("", "", "drift unknown", *_numbers(at_rest), end_section=True)
     return table
+
+
+def _groups(result: RunResult) -> Table:
+    """A row a group: what its records miss each other by, and what its known distances miss."""
+    table = Table(title="By group, mean, mm: before and after", title_justify="left")
+    distances = any(group.distance_error_mm is not None for group in result.groups.errors)
+    for column in ("group", "records", "", "error", "", *(("distance error", "") if distances else ())):
+        table.add_column(column, justify="left" if column in ("group", "") else "right")
+    for group in result.groups.errors:
+        numbers = [f"{group.nominal_error_mm:.3f}", f"-> {group.error_mm:.3f}"]
+        if distances:
+            numbers += _before_after(group.nominal_distance_error_mm, group.distance_error_mm)
+        table.add_row(escape(group.name), str(group.records), part_of(group), *numbers)
+    return table
+
+
+def _before_after(before: float | None, after: float | None) -> list[str]:
+    return ["-", ""] if before is None or after is None else [f"{before:.3f}", f"-> {after:.3f}"]
 
 
 def _numbers(summary: ErrorSummary) -> list[str]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import replace
 from typing import Literal
 
@@ -18,6 +18,7 @@ from armcal.errors import ConfigError
 
 DIMENSION_OF_UNIT = {unit.name: unit.dimension for unit in UNITS.values() if unit == si_unit(unit.dimension)}
 Path = tuple[str | int, ...]
+_BY_NAME = ("values", "priors", "drift")
 
 
 class DriftSettings(Settings):
@@ -65,8 +66,21 @@ def select(parameters: Parameters, settings: ParameterSettings, source: ConfigSo
         for name in _matching(parameters, glob, source, place):
             deviation = _deviation(parameters[name], text, source, place)
             parameters = parameters.replaced({name: replace(parameters[name], prior_sd=deviation)})
-    free = set(parameters.select(settings.free)) - set(parameters.select(settings.fixed))
+    of_groups = {block.name for block in parameters.nuisances if block.free}
+    free = (set(parameters.select(settings.free)) | of_groups) - set(parameters.select(settings.fixed))
     return _with_drift(parameters.with_free(free), settings.drift, source, (*at, "drift"))
+
+
+def without_groups(settings: ParameterSettings, instances: Collection[str]) -> ParameterSettings:
+    """The settings less what they say of some instances, whose groups are not known before the records are."""
+
+    def of_others(patterns: Iterable[str]) -> list[str]:
+        return [pattern for pattern in patterns if pattern.partition(".")[0] not in instances]
+
+    kept = {key: {p: getattr(settings, key)[p] for p in of_others(getattr(settings, key))} for key in _BY_NAME}
+    return settings.model_copy(
+        update={**kept, "free": tuple(of_others(settings.free)), "fixed": tuple(of_others(settings.fixed))}
+    )
 
 
 def _with_drift(

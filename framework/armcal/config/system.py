@@ -8,13 +8,15 @@ from typing import Any, Literal, TypeVar
 
 from pydantic import Field, field_validator
 
-from armcal.arm.assembly import Arm, MassSpec, prefixed
+from armcal.arm.assembly import PLACEMENT, Arm, MassiveModel, MassSpec, prefixed
 from armcal.arm.statics import frame_names
 from armcal.base.parameters import ParameterBlock, Parameters
-from armcal.base.settings import Acceleration3, Force3, Length3, Mass, Settings, Torque3
+from armcal.base.pose_settings import PoseSettings
+from armcal.base.settings import Acceleration3, Angle, Force3, Length3, Mass, Settings, Torque3
 from armcal.config.validate import validate
 from armcal.config.yaml_source import ConfigSource
 from armcal.errors import ArmcalError, ConfigError, PluginError
+from armcal.measure.groups import Groups, group_blocks
 from armcal.measure.measurement import Measurement
 from armcal.plugins import Component, PluginRegistry
 from armcal.solve.factor import STATICS, Environment, gravity_tilt
@@ -37,9 +39,16 @@ class LinkSettings(Settings):
 
 
 class ArmSettings(Settings):
-    """One arm: its model, its joint effects and its masses, each by name."""
+    """One arm: its model, its joint effects and its masses, each by name.
+
+    ``placement`` is the pose of the model's base in the common base frame, for arms that stand side by side.
+    ``joint_noise`` is the standard deviation of what a turning joint reads against where it stands: of contacts, whose
+    only readings are the joints', it is most of the noise.
+    """
 
     model: dict[str, Any]
+    joint_noise: Angle = 0.0
+    placement: PoseSettings | None = None
     effects: dict[str, dict[str, Any]] = Field(default_factory=dict)
     links: dict[str, LinkSettings] = Field(default_factory=dict)
 
@@ -95,12 +104,13 @@ class System:
         s = self.statics
         return Environment(s.gravity, s.payload or 0.0, s.payload_com, s.force, s.torque)
 
-    def parameters(self) -> Parameters:
-        """Every block, all fixed."""
+    def parameters(self, groups: Groups | None = None) -> Parameters:
+        """Every block, fixed but for what is not known of groups of records."""
         blocks: list[ParameterBlock] = [block for arm in self.arms.values() for block in arm.parameters()]
         for name, measurement in self.measurements.items():
             blocks += prefixed(f"{name}.", measurement.parameters())
         blocks += gravity_tilt()
+        blocks += group_blocks(self.measurements, groups or {})
         return Parameters(tuple(blocks))
 
 
@@ -177,13 +187,22 @@ def _arm(source: ConfigSource, registry: PluginRegistry, name: str) -> tuple[Arm
         place: Path = (*at, "effects", effect)
         built, described_effects[effect] = build_component(source, registry, "effect", place, model.joint_names)
         effects[effect] = built
-    masses = tuple(MassSpec(link, s.mass, s.com, s.frame, s.loads_up_to_joint) for link, s in settings.links.items())
-    arm = _refusable(source, at, lambda: Arm(name, described_model["type"], model, effects, masses))
+    masses = tuple(MassSpec(n, s.mass, s.com, s.frame, s.loads_up_to_joint) for n, s in settings.links.items())
+    if isinstance(model, MassiveModel):
+        masses = (*(mass for mass in model.masses() if mass.name not in settings.links), *masses)
+    placement = settings.placement.blocks(PLACEMENT) if settings.placement else ()
+    parts = (model, effects, masses, placement, settings.joint_noise)
+    arm = _refusable(source, at, lambda: Arm(name, described_model["type"], *parts))
     known = _refusable(source, at, lambda: frame_names(arm.nominal_chain))
     for link, stated in settings.links.items():
         _check_link(source, (*at, "links", link), stated, known, len(arm.joint_names))
     links = {link: stated.to_config() for link, stated in settings.links.items()}
-    return arm, {"model": described_model, "effects": described_effects, "links": links}
+    described: dict[str, Any] = {"model": described_model, "effects": described_effects, "links": links}
+    if settings.joint_noise:
+        described["joint_noise_rad"] = settings.joint_noise
+    if settings.placement:
+        described["placement"] = settings.placement.to_config()
+    return arm, described
 
 
 def _check_link(source: ConfigSource, at: Path, link: LinkSettings, known: Mapping[str, int], joints: int) -> None:

@@ -39,7 +39,7 @@ class Layout:
 
     Attributes:
         joints: channels of commanded joint displacements, revolute (angle) and prismatic (length).
-        revolute: those of ``joints`` that turn.
+        revolute: those of ``joints`` that turn, but not on and on.
         approach: channels of approach directions.
         measured: channels of measured values, ``instance.name``.
         deviations: channels of their standard deviations.
@@ -104,7 +104,7 @@ def layout_of(
     measured = [w.channel for w in wanted if "." in w.channel and w.channel not in {*moved, *approach, *deviations}]
     return Layout(
         joints=tuple(w.channel for w in joints),
-        revolute=tuple(w.channel for w in joints if w.dimension == "angle"),
+        revolute=tuple(w.channel for w in joints if w.dimension == "angle" and not w.is_endless),
         approach=tuple(name for name in approach if dataset.has(name)),
         measured=tuple(name for name in measured if dataset.has(name)),
         columns=columns,

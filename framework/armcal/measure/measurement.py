@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -53,6 +53,67 @@ class RecordNoise(Protocol):
 
     def noise_channels(self) -> Sequence[Sequence[Channel]]:
         """Of each entry of the residual, the channels that may carry its standard deviation, the nearest first."""
+
+
+@dataclass(frozen=True)
+class Tie:
+    """What is known between two groups, beside all records: the distance of two sockets.
+
+    Attributes:
+        groups: their keys.
+        residual: of the values of their parameters, under local names, to what is left open (n x 1, m or rad).
+        noise: standard deviation of each entry.
+    """
+
+    groups: tuple[str, str]
+    residual: Callable[[Mapping[str, Expression], Mapping[str, Expression]], Expression]
+    noise: tuple[float, ...]
+
+
+@runtime_checkable
+class GroupedMeasurement(Protocol):
+    """What a measurement provides beside the rest if groups of records share unknowns: a socket, a clamp.
+
+    A group's key is its labels joined by a slash (``front/hole_0``). Its parameters have local names (``x``);
+    the framework puts instance and key before them (``sockets.front/hole_0.x``), and gives their values under the
+    local names.
+    """
+
+    @property
+    def group_labels(self) -> tuple[str, ...]:
+        """The text columns whose values together say which group a record belongs to; none if all belong to one."""
+
+    @property
+    def group_owner(self) -> str | None:
+        """The instance whose groups these are; None for its own."""
+
+    def group_parameters(self, group: str) -> Sequence[ParameterBlock]:
+        """The numbers of one group, free where they are not known; of every group the same names and domains."""
+
+    def told(self, arms: Mapping[str, ArmState], values: Mapping[str, Expression]) -> Mapping[str, Expression]:
+        """What one record alone says of its group's unknowns, to start from; empty to start from the nominal ones."""
+
+    def ties(self, groups: Sequence[str]) -> Sequence[Tie]:
+        """What is known between these groups."""
+
+    @property
+    def mean_weight(self) -> float:
+        """How many times more the mean of a group's residuals weighs than its records say; 1 for independent ones."""
+
+
+@runtime_checkable
+class DimensionedResidual(Protocol):
+    """What a measurement may provide beside the rest if its residual is not all lengths."""
+
+    def dimensions(self) -> Sequence[str]:
+        """``length`` or ``angle`` of each entry of the residual."""
+
+
+def residual_dimensions(measurement: Measurement) -> tuple[str, ...]:
+    """Of each entry of the residual; lengths if the measurement does not say."""
+    if isinstance(measurement, DimensionedResidual):
+        return tuple(measurement.dimensions())
+    return ("length",) * len(measurement.noise())
 
 
 def noise_channels(measurement: Measurement) -> tuple[tuple[Channel, ...], ...]:

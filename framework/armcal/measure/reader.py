@@ -22,6 +22,7 @@ class WantedChannel:
         dimension: of its unit.
         required: whether a record without it is useless.
         is_deviation: whether it is the standard deviation of a measured number.
+        is_endless: whether it is the angle of a joint that may turn on and on.
     """
 
     channel: str
@@ -29,6 +30,7 @@ class WantedChannel:
     dimension: str
     required: bool
     is_deviation: bool = False
+    is_endless: bool = False
 
 
 @dataclass(frozen=True)
@@ -98,9 +100,10 @@ def _deviations(measurements: Mapping[str, Measurement]) -> Iterator[WantedChann
 
 
 def _arm_channels(arm: Arm, alone: bool) -> Iterator[WantedChannel]:
-    for index, joint in enumerate(arm.joint_names, start=1):
+    endless = {joint.name for joint in arm.nominal_chain.joints if joint.endless}
+    for index, (joint, dimension) in enumerate(arm.commanded.items(), start=1):
         own = f"{arm.name}.{joint}"
-        yield WantedChannel(own, _names(own, (joint,), alone), arm.joint_dimensions[index - 1], True)
+        yield WantedChannel(own, _names(own, (joint,), alone), dimension, True, is_endless=joint in endless)
         approach = (f"approach{index}", f"approach_{joint}")
         yield WantedChannel(
             f"{arm.name}.approach.{joint}", _names(f"{arm.name}.{approach[0]}", approach, alone), DIMENSIONLESS, False

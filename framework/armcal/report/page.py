@@ -11,6 +11,7 @@ import numpy as np
 import armcal
 from armcal.base.domains import Array
 from armcal.report import error_figures, interval_figures, parameter_figures, workspace
+from armcal.report.group_table import group_rows
 from armcal.report.missed_table import missed_records
 from armcal.report.noise_tables import scatter_rows, suspicious_rows
 from armcal.report.numbers import NONE, common_decimals, count, duration, fixed, plural, ratio, significant, unbroken
@@ -77,7 +78,10 @@ def _accuracy(result: RunResult) -> dict[str, Any]:
         pairs.append(("Largest error", before.max, after.max))
         decimals = common_decimals([v for _, b, a in pairs for v in (b, a)], most=3)
         tiles = [(name, fixed(b, decimals), fixed(a, decimals), ratio(b, a)) for name, b, a in pairs]
-    return {"judged": from_set, "tiles": tiles, "error_rows": error_rows(result)}
+    rows = group_rows(result.groups.errors)
+    distances = bool(rows) and len(rows[0].numbers) > 2
+    shown = {"group_rows": rows, "group_distances": distances}
+    return {"judged": from_set, "tiles": tiles, "error_rows": error_rows(result), **shown}
 
 
 def _poses(result: RunResult) -> dict[str, Any]:

@@ -13,12 +13,14 @@ from armcal.base.config_text import ConfigText
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.base.parameters import Parameters
-from armcal.config.selection import select
+from armcal.config.selection import select, without_groups
 from armcal.config.system import System, build_component, build_system
 from armcal.config.validate import validate
 from armcal.config.yaml_source import ConfigSource, load_config
 from armcal.errors import ConfigError
 from armcal.measure.environment import noticed
+from armcal.measure.groups import grouped_instances, groups_of
+from armcal.measure.limits import warn_beyond_limits
 from armcal.measure.reader import Reader, ReadRequest, wanted_channels
 from armcal.plugins import PluginRegistry, discover
 from armcal.run.settings import ExperimentSettings
@@ -87,7 +89,8 @@ class Experiment:
             source = _with_data(source, data)
         settings = validate(ExperimentSettings, source)
         system = build_system(source, registry)
-        parameters = select(system.parameters(), settings.parameters, source)
+        known = without_groups(settings.parameters, grouped_instances(system.measurements))
+        parameters = select(system.parameters(), known, source)
         estimator = weighed(_estimator(source, registry), settings.noise)
         name = settings.name or source.path.stem
         found = tuple(_gravity_warnings(settings, np.array(settings.statics.gravity)))
@@ -110,12 +113,24 @@ class Experiment:
         reader, _ = build_component(self.source, self.registry, "reader", ("data",))
         dataset = reader.read(self.request(measured=True))
         self._require_payload(dataset)
-        dataset = noticed(dataset)
+        dataset = warn_beyond_limits(noticed(dataset), self.system.arms)
         if not dataset.has("gravity_z"):
             return dataset
         typical = np.median(dataset.stacked(["gravity_x", "gravity_y", "gravity_z"]), axis=1)
         told = [f"by its columns, {text}" for text in _gravity_warnings(self.settings, typical)]
         return replace(dataset, warnings=(*dataset.warnings, *told))
+
+    def of_records(self, dataset: Dataset) -> Experiment:
+        """The experiment with the parameters that the groups of these records bring.
+
+        Raises:
+            ConfigError: what is configured of a group's parameters is refused.
+            DataError: a record's group is not stated.
+        """
+        if not grouped_instances(self.system.measurements):
+            return self
+        blocks = self.system.parameters(groups_of(dataset, self.system.measurements))
+        return replace(self, parameters=select(blocks, self.settings.parameters, self.source))
 
     def request(self, *, measured: bool) -> ReadRequest:
         """What a reader should look for; with ``measured`` the measured values are required."""

@@ -102,6 +102,8 @@ def interval_result(
     Raises:
         NotConvergedError: a record has no elastic equilibrium at the values found.
     """
+    if problem.blueprint.groups:
+        return IntervalResult()  # a contact reads nothing that could be predicted
     by, alike = predictor(problem, fitted), whitened_like(problem, fitted, records, estimator)
     scores, shares, stretches = _crossed(crossed, split, records[0].count)
     holdout: dict[Recording, Coverage] = {}

@@ -54,9 +54,7 @@ def verdict_of(
     judged = _judged(run, errors)
     evidence = gather(run, judged, system, limit)
     joints = {
-        f"{name}.{joint}": dimension
-        for name, arm in system.arms.items()
-        for joint, dimension in zip(arm.joint_names, arm.joint_dimensions, strict=True)
+        f"{name}.{joint}": dimension for name, arm in system.arms.items() for joint, dimension in arm.commanded.items()
     }
     training = run.dataset.subset(run.split.train)
     verdict = judge(

@@ -13,7 +13,8 @@ from armcal.base.domains import Array
 from armcal.config.yaml_source import ConfigSource
 from armcal.errors import ConfigError, DataError, Location
 from armcal.run.experiment import Experiment
-from armcal.run.pipeline import Stopwatch, provenance
+from armcal.run.pipeline import Stopwatch
+from armcal.run.provenance import provenance
 from armcal.run.study import Study, Trainable, compiled, finite_summary, interpreted_first, naming
 from armcal.run.study_result import TransferCell, TransferResult
 from armcal.run.study_settings import LoadTransferSettings
@@ -164,7 +165,7 @@ def _plan(name: str, groups: Sequence[Indices], settings: LoadTransferSettings) 
 
 def _task(ready: Trainable, fit: _Fit) -> FitTask:
     e = ready.experiment
-    return FitTask(ready.problem, e.estimator, e.parameters.nominal(), ready.records, fit.split)
+    return FitTask(ready.problem, e.estimator, ready.problem.parameters.nominal(), ready.records, fit.split)
 
 
 def _collected(

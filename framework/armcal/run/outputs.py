@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
@@ -17,6 +17,7 @@ from armcal.config.yaml_source import ConfigSource
 from armcal.measure.reader import ENVIRONMENT
 from armcal.run import folder as folders
 from armcal.run.experiment import Experiment
+from armcal.run.groups import GroupError
 from armcal.run.result import RunResult
 from armcal.solve.bootstrap import Bootstrap
 from armcal.solve.profile import Profile
@@ -71,7 +72,8 @@ def metrics(result: RunResult) -> dict[str, Any]:
     estimate, told = result.estimate, result.estimate.verdict
     return {
         "experiment": result.name,
-        "error_mm": result.table.as_dict(),
+        "error_mm": _errors(result),
+        "groups": result.groups.as_dict(),
         "records": {
             "used": len(result.dataset),
             "train": len(result.split.train),
@@ -108,6 +110,22 @@ def metrics(result: RunResult) -> dict[str, Any]:
     }
 
 
+def _errors(result: RunResult) -> dict[str, Any]:
+    """The table, and of training and judging groups the mean of their means: a group of few records counts as much."""
+    table, groups = result.table.as_dict(), result.groups.errors
+    for key, own in (("train", [g for g in groups if g.trained]), ("holdout", _judging(groups))):
+        if own:
+            table["nominal"][key]["mean_of_groups"] = float(np.mean([g.nominal_error_mm for g in own]))
+            table["calibrated"][key]["mean_of_groups"] = float(np.mean([g.error_mm for g in own]))
+            known = [g.distance_error_mm for g in own if g.distance_error_mm is not None]
+            table["calibrated"][key]["distance_mean_of_groups"] = float(np.mean(known)) if known else None
+    return table
+
+
+def _judging(groups: Sequence[GroupError]) -> list[GroupError]:
+    return [group for group in groups if not group.trained]
+
+
 def calibration_content(result: RunResult, experiment: Experiment) -> dict[str, Any]:
     """The content of calibration.yaml."""
     estimate, provenance = result.estimate, result.provenance
@@ -133,6 +151,7 @@ def calibration_content(result: RunResult, experiment: Experiment) -> dict[str, 
         arms=dict(experiment.system.description["arms"]),
         measurements=dict(experiment.system.description["measurements"]),
         statics=dict(experiment.system.description["statics"]),
+        groups={owner: tuple(keys) for owner, keys in result.groups.keys.items()},
         parameters=parameter_records(estimate),
         prediction=result.prediction,
         information=information,

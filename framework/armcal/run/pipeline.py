@@ -2,32 +2,33 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from importlib.metadata import version
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
-from armcal.errors import DataError, Location, ProblemError
+from armcal.errors import ProblemError
 from armcal.measure.id_list import read_ids
 from armcal.plugins import PluginRegistry
 from armcal.run.experiment import Experiment
+from armcal.run.groups import RunGroups, group_errors, labels_of
 from armcal.run.intervals import IntervalResult, interval_result
 from armcal.run.judging import FittedRecords, verdict_of
 from armcal.run.noise import noise_result
+from armcal.run.provenance import provenance
+from armcal.run.reach import check_reach
 from armcal.run.result import ErrorTable, RecordErrors, RunResult
 from armcal.solve.bootstrap import Bootstrap, bootstrap
 from armcal.solve.coverage import fit_and_predict
 from armcal.solve.drift import residuals, with_drift
 from armcal.solve.estimator import Estimate, Progress, no_progress, require_solvable, spread
 from armcal.solve.evidence import Evidence
+from armcal.solve.joint_noise import with_joint_noise
+from armcal.solve.nuisance import restricted, settled, started, untrained
 from armcal.solve.parallel import Executor
 from armcal.solve.problem import FactorRecords, Problem
 from armcal.solve.profile import Profile, profiled, profiles
@@ -40,15 +41,14 @@ from armcal.solve.validation import (
     hold_out,
     record_errors,
     split_by_id,
+    split_by_label,
     summarise,
 )
 from armcal.solve.verdict import Verdict
 from armcal.solve.weighing import WeighedFit, fit
-from armcal.use.calibration import identity_of
 from armcal.use.intervals import PredictionRecord, covariance_rows, recording_record, stretch_records
 
 _MM = 1000.0
-_REACH_RATIO = 10.0
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,7 @@ def prepare(experiment: Experiment, watch: Stopwatch) -> Prepared:
     """
     ready = assemble(experiment, watch)
     with watch.stage("check"):
-        found = require_solvable(ready.problem, ready.training, experiment.parameters.nominal())
+        found = require_solvable(ready.problem, ready.training, ready.problem.parameters.nominal())
     return replace(ready, warnings=(*ready.warnings, *found))
 
 
@@ -106,6 +106,7 @@ def assemble(experiment: Experiment, watch: Stopwatch) -> Prepared:
     """
     with watch.stage("read"):
         dataset = experiment.read()
+        experiment = experiment.of_records(dataset)
     system = experiment.system
     with watch.stage("build"):
         problem = Problem.build(
@@ -116,11 +117,15 @@ def assemble(experiment: Experiment, watch: Stopwatch) -> Prepared:
             dataset,
             experiment.settings.evaluator,
         )
-        records = with_drift(problem, problem.records(dataset), dataset, experiment.parameters.nominal())
+        records = problem.records(dataset)
+        problem = started(problem, records)
+        records = with_joint_noise(problem, records, problem.parameters.nominal())
+        records = with_drift(problem, records, dataset, problem.parameters.nominal())
     with watch.stage("check"):
-        _check_reach(problem, records, dataset)
+        check_reach(problem, records, dataset)
         split = _split(experiment, dataset)
         _check_folds(experiment, split)
+        problem = restricted(problem, problem.subset(records, split.train))
         profiled(problem, experiment.settings.uncertainty.profile)
     return Prepared(dataset, problem, records, split, (*experiment.warnings, *dataset.warnings))
 
@@ -132,11 +137,7 @@ def calibrate(
     watch: Stopwatch | None = None,
     executor: Executor | None = None,
 ) -> RunResult:
-    """Calibrate; see ``outputs.write`` for what is left behind. ``executor`` does starts and folds at the same time.
-
-    Raises:
-        InputError: something is refused before solving.
-    """
+    """Calibrate (see ``outputs.write``), starts and folds by ``executor``; InputError where refused before solving."""
     watch, registry = watch or Stopwatch(), experiment.registry
     ready = prepare(experiment, watch)
     faults = _announce(experiment, ready)
@@ -169,7 +170,14 @@ def calibrate(
         intervals=intervals,
         profiles=profiled_result,
         prediction=_prediction(experiment, ready, fitted, intervals),
+        groups=_groups(experiment, ready, fitted, errors),
     )
+
+
+def _groups(experiment: Experiment, ready: Prepared, fitted: WeighedFit, errors: RecordErrors) -> RunGroups:
+    values, found = fitted.estimate.values, (errors.nominal_mm, errors.calibrated_mm)
+    told = group_errors(experiment, ready.problem, ready.records, ready.dataset, ready.split, values, found)
+    return RunGroups(told, ready.problem.blueprint.groups)
 
 
 def _uncertainty(
@@ -206,7 +214,7 @@ def _announce(experiment: Experiment, ready: Prepared) -> list[str]:
 
 def _fitted(experiment: Experiment, ready: Prepared, progress: Progress, executor: Executor | None) -> WeighedFit:
     estimator = spread(experiment.estimator, executor)
-    return fit(ready.problem, ready.training, estimator, experiment.parameters.nominal(), progress)
+    return fit(ready.problem, ready.training, estimator, ready.problem.parameters.nominal(), progress)
 
 
 def _judge(
@@ -240,6 +248,8 @@ def _tell_rejected(registry: PluginRegistry, records: Sequence[tuple[int, str, s
 
 def _split(experiment: Experiment, dataset: Dataset) -> Split:
     validation = experiment.settings.validation
+    if validation.train_groups:
+        return split_by_label(labels_of(experiment, dataset), validation.train_groups)
     if validation.train_ids is not None:
         return split_by_id(dataset.ids, read_ids(validation.train_ids))
     return hold_out(len(dataset), validation.holdout, validation.seed)
@@ -299,7 +309,8 @@ def _errors(
     ready: Prepared, fitted: WeighedFit, judged: tuple[CrossValidation, tuple[Split, ...]] | None
 ) -> RecordErrors:
     problem, records, values = ready.problem, ready.records, fitted.estimate.values
-    nominal = problem.parameters.nominal()
+    unfitted, nominal = untrained(problem), problem.parameters.nominal()
+    before, after = settled(unfitted, nominal, records), settled(problem, values, records)
     (crossed, at_rest), failed = np.full((2, len(ready.dataset)), np.nan), 0
     if judged is not None:
         train, found = ready.split.train, judged[0]
@@ -309,11 +320,11 @@ def _errors(
     shown = problem.predict(values, records)[0]
     first = len(problem.kernels[0].factor.output_channels)
     return RecordErrors(
-        nominal_mm=record_errors(problem, nominal, records) * _MM,
+        nominal_mm=record_errors(unfitted, nominal, records) * _MM,
         calibrated_mm=record_errors(problem, values, records, fitted.records) * _MM,
         cross_validated_mm=crossed,
-        nominal_residual_mm=np.vstack(problem.residuals(nominal, records)) * _MM,
-        calibrated_residual_mm=np.vstack(residuals(problem, values, records, fitted.records)) * _MM,
+        nominal_residual_mm=np.vstack(problem.residuals(before, records)) * _MM,
+        calibrated_residual_mm=np.vstack(residuals(problem, after, records, fitted.records)) * _MM,
         position_mm=shown[first + 9 : first + 12] * _MM,
         failed_folds=failed,
         at_rest_mm=record_errors(problem, values, records) * _MM if drifts else None,
@@ -343,38 +354,3 @@ def _table(errors: RecordErrors, split: Split) -> ErrorTable:
         at_rest = summaries(errors.at_rest_mm, errors.cross_validated_at_rest_mm)
     nominal = summaries(errors.nominal_mm, errors.nominal_mm)
     return ErrorTable(nominal, summaries(errors.calibrated_mm, errors.cross_validated_mm), at_rest)
-
-
-def _check_reach(problem: Problem, records: Sequence[FactorRecords], dataset: Dataset) -> None:
-    """Positions ten times farther out, or nearer, than the model's: a unit is wrong."""
-    shown = problem.predict(problem.parameters.nominal(), records)
-    for kernel, values in zip(problem.kernels, shown, strict=True):
-        channels = kernel.factor.output_channels
-        if [channel.rpartition(".")[2] for channel in channels] != ["x", "y", "z"]:
-            continue
-        expected = float(np.median(np.linalg.norm(values[:3], axis=0)))
-        found = float(np.median(np.linalg.norm(dataset.stacked(channels), axis=0)))
-        if found > _REACH_RATIO * expected or expected > _REACH_RATIO * found:
-            raise DataError(
-                f"{kernel.factor.name}: positions are typically {found:.4g} m from the base frame, the model's tip "
-                f"{expected:.4g} m.",
-                where=Location(dataset.source),
-                hint="Check the unit in the column names (x_mm or x_m) and the frame of the measurements.",
-            )
-
-
-def provenance(experiment: Experiment, dataset: Dataset) -> dict[str, Any]:
-    """Where the numbers of a run come from: files, hashes, versions."""
-    packages = ("armcal", "numpy", "scipy", "casadi", "cvxpy")
-    return {
-        "config": str(experiment.source.path),
-        "config_files": [Path(file).name for file in experiment.source.files],
-        "data": dataset.source,
-        "data_sha256": dataset.sha256,
-        "arm_sha256": identity_of(experiment.system.description),
-        "versions": {
-            "python": sys.version.split()[0],
-            **{name: version(name) for name in packages},
-        },
-        "plugins": {p.name: f"{p.distribution} {p.version}" for p in experiment.registry.plugins if not p.fault},
-    }

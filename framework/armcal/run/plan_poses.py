@@ -45,9 +45,9 @@ class JointSpace:
     def of(cls, experiment: Experiment) -> JointSpace:
         """That of an experiment's arms."""
         arms = experiment.system.arms
-        channels = tuple(f"{name}.{joint}" for name, arm in arms.items() for joint in arm.joint_names)
+        channels = tuple(f"{name}.{joint}" for name, arm in arms.items() for joint in arm.commanded)
         names = tuple(c.partition(".")[2] for c in channels) if len(arms) == 1 else channels
-        return cls(channels, names, tuple(d for arm in arms.values() for d in arm.joint_dimensions))
+        return cls(channels, names, tuple(d for arm in arms.values() for d in arm.commanded.values()))
 
     def by_joint(
         self, turning: Mapping[str, Sequence[float]], sliding: Mapping[str, Sequence[float]], keys: tuple[str, str]

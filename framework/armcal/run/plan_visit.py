@@ -45,7 +45,7 @@ def _efforts(ground: Ground, chosen: Dataset) -> Array:
     environment = ground.experiment.system.environment
     parts = []
     for name, arm in ground.experiment.system.arms.items():
-        angles = chosen.stacked([f"{name}.{joint}" for joint in arm.joint_names])
+        angles = chosen.stacked([f"{name}.{joint}" for joint in arm.commanded])
         load = environment.gravity, environment.payload_mass, environment.payload_com
         parts.append(holding_efforts(arm, angles, *load))
     return np.concatenate(parts)
@@ -66,7 +66,7 @@ def _with_approach(visited: Dataset, ground: Ground) -> Dataset:
     """The sign of each joint's last motion, as the order of visit makes it; 0 before the first."""
     channels = dict(visited.channels)
     for name, arm in ground.experiment.system.arms.items():
-        for joint in arm.joint_names:
+        for joint in arm.commanded:
             signs = np.sign(np.diff(visited.column(f"{name}.{joint}"), prepend=visited.column(f"{name}.{joint}")[:1]))
             moved = np.maximum.accumulate(np.where(signs != 0, np.arange(len(signs)), 0))
             channels[f"{name}.approach.{joint}"] = signs[moved]

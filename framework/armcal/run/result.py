@@ -7,6 +7,7 @@ from typing import Any
 
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
+from armcal.run.groups import RunGroups
 from armcal.run.intervals import IntervalResult
 from armcal.run.noise import NoiseResult
 from armcal.solve.bootstrap import Bootstrap
@@ -89,6 +90,7 @@ class RunResult:
         evidence: what residuals still depend on, which records are missed, what priors alone hold.
         profiles: intervals by profile likelihood, of the numbers asked for.
         prediction: what predictions need of the run beyond the values; None if it did not converge.
+        groups: of records, where something tells them apart.
     """
 
     name: str
@@ -109,6 +111,7 @@ class RunResult:
     evidence: Evidence = field(default_factory=Evidence)
     profiles: tuple[Profile, ...] = ()
     prediction: PredictionRecord | None = None
+    groups: RunGroups = field(default_factory=RunGroups)
 
     @property
     def train(self) -> Indices:

@@ -18,20 +18,25 @@ class ValidationSettings(Settings):
     """Which records judge.
 
     ``holdout`` is a fraction chosen by ``seed``; ``train_ids`` a CSV of record ids to train on (the rest judge);
-    ``folds`` cross-validates over the training records. Judged records whose error is above ``limit`` are listed and
-    explained; without one, those above three times the median error.
+    ``train_groups`` are the values of the text column ``group_by`` to train on (by default the first label of a
+    measurement's groups); ``folds`` cross-validates over the training records. Judged records whose error is above
+    ``limit`` are listed and explained; without one, those above three times the median error.
     """
 
     holdout: Annotated[float, Field(ge=0, lt=1)] = 0.0
     folds: Annotated[int, Field(ge=0)] = 0
     seed: Annotated[int, Field(ge=0)] = 0
     train_ids: InputPath | None = None
+    train_groups: tuple[str, ...] | None = None
+    group_by: str | None = None
     limit: Length | None = None
 
     @model_validator(mode="after")
     def _one_split(self) -> ValidationSettings:
-        if self.holdout and self.train_ids is not None:
-            raise ValueError("found both holdout and train_ids, expected one of them: set holdout: 0")
+        given = {"holdout": self.holdout > 0, "train_ids": self.train_ids, "train_groups": self.train_groups}
+        several = [name for name, value in given.items() if value]
+        if len(several) > 1:
+            raise ValueError(f"found both {several[0]} and {several[1]}, expected one of them: set holdout: 0")
         if self.folds == 1:
             raise ValueError("found folds: 1, expected 0 (none) or at least 2")
         if self.limit is not None and self.limit <= 0:

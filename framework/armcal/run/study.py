@@ -16,7 +16,8 @@ from armcal.config.yaml_source import ConfigSource
 from armcal.errors import InputError, NotConvergedError, ProblemError
 from armcal.plugins import PluginRegistry, discover
 from armcal.run.experiment import Experiment
-from armcal.run.pipeline import Prepared, Stopwatch, prepare, provenance
+from armcal.run.pipeline import Prepared, Stopwatch, prepare
+from armcal.run.provenance import provenance
 from armcal.run.settings import ExperimentSettings, ValidationSettings
 from armcal.run.study_result import NestedResult, StudyResult, VariantResult
 from armcal.run.study_settings import PREVIOUS, LoadTransferSettings, ModelStudySettings, study_settings
@@ -173,7 +174,7 @@ def _compile(problem: Problem) -> None:
 
 
 def _task(experiment: Experiment, ready: Prepared, split: Split) -> FitTask:
-    start = experiment.parameters.nominal()
+    start = ready.problem.parameters.nominal()
     return FitTask(ready.problem, experiment.estimator, start, ready.records, split)
 
 

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 from armcal.arm.assembly import Arm
 from armcal.base.parameters import Parameters
+from armcal.measure.groups import Groups
 from armcal.measure.measurement import Measurement
 from armcal.solve.factor import Environment, build_factor
 from armcal.solve.kernel import EvaluatorChoice, Kernel, build_kernel
@@ -14,13 +15,15 @@ from armcal.solve.kernel import EvaluatorChoice, Kernel, build_kernel
 
 @dataclass(frozen=True)
 class Blueprint:
-    """Arms, measurements and what else their expressions take; ``channels`` are those that the records carry."""
+    """Arms, measurements and what else their expressions take; ``channels`` are those that the records carry,
+    ``groups`` those that they fall into."""
 
     arms: Mapping[str, Arm]
     measurements: Mapping[str, Measurement]
     parameters: Parameters
     environment: Environment
     channels: frozenset[str]
+    groups: Groups = field(default_factory=dict)
 
     def kernels(self, records: int, choices: Mapping[str, EvaluatorChoice]) -> tuple[Kernel, ...]:
         """A kernel for each measurement, for about so many records, by the evaluator chosen for it."""

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.base.parameters import Parameters
-from armcal.solve.problem import BLOCK_RECORDS, Problem, triangular
+from armcal.solve.linearised import BLOCK_RECORDS
+from armcal.solve.problem import Problem, triangular
 
 Indices = NDArray[np.intp]
 RIDGE = 1e-9

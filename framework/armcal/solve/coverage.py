@@ -24,7 +24,7 @@ from armcal.solve.estimator import Estimator
 from armcal.solve.noise_findings import Finding
 from armcal.solve.prediction import LEVELS, RADIUS_LEVEL, STATED, Predictor, Spread, ToldDrift, is_position, quantile
 from armcal.solve.problem import FactorRecords, Problem
-from armcal.solve.validation import FitTask, Indices, JudgedFit, Split, failed_fit, judged_fit
+from armcal.solve.validation import FitTask, Indices, JudgedFit, Split, failed_fit, fit_and_judge, judged_fit
 from armcal.solve.variance import apply_components
 from armcal.solve.weighing import WeighedFit, Weighing, fit
 
@@ -158,6 +158,8 @@ def whitened_like(
 
 def fit_and_predict(task: FitTask) -> JudgedFit:
     """Fit, judge and score; see ``fit_and_judge``."""
+    if task.problem.blueprint.groups:
+        return fit_and_judge(task)  # a socket that is found anew from the records that judge it has no interval
     began = time.perf_counter()
     try:
         train, held = task.parts()

@@ -93,10 +93,11 @@ def dependences(problem: Problem, motion: Motion, dataset: Dataset) -> Iterator[
     yield from _of_order(here)
     for name, arm in arms.items():
         loads = motion.loads[name]
-        for index, joint in enumerate(arm.joint_names):
+        for joint, dimension in arm.commanded.items():
+            index = arm.joint_names.index(joint)
             shown = joint if len(arms) == 1 else f"{name}.{joint}"
-            angle = arm.joint_dimensions[index] == "angle"
-            yield from _of_level(here, name, f"{name}.{joint}", shown, arm.joint_dimensions[index])
+            angle = dimension == "angle"
+            yield from _of_level(here, name, f"{name}.{joint}", shown, dimension)
             yield from _of_approach(here, name, joint, shown, "rad" if angle else "m")
             yield from _of_torque(here, name, f"{name}.{joint}", shown, loads.efforts[index], angle)
         yield from _of_moments(problem, here, arm, loads, len(arms) == 1)

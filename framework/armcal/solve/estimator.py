@@ -17,6 +17,7 @@ from armcal.solve.identifiability import POOR_CONDITION, Identifiability
 from armcal.solve.parallel import Executor
 from armcal.solve.problem import FactorRecords, Problem, triangular
 from armcal.solve.projection import factor_at_zero
+from armcal.solve.scale import GIVE_A_LENGTH, UNSEEN_SCALE, scale_is_unseen
 from armcal.solve.structure import Undetermined, explain, held_by_nothing, identify, identify_from
 
 CONFIDENCE = 0.95
@@ -270,8 +271,12 @@ def require_solvable(problem: Problem, records: Sequence[FactorRecords], start: 
         more = len(explained) - MOST_TOLD
         listed += f"; and {more} more, which armcal identify lists" if more > 0 else ""
         text = f"the data does not determine {len(explained)} combinations"
+        unseen_scale = scale_is_unseen(parameters, start, known)
         if held_by_nothing(parameters, known):
-            raise ProblemError(f"{text}: {listed}.", hint=_mend(explained))
+            first, mend = (f"{UNSEEN_SCALE}; ", f"{GIVE_A_LENGTH}. ") if unseen_scale else ("", "")
+            raise ProblemError(f"{first}{text}: {listed}.", hint=f"{mend}{_mend(explained)}".capitalize())
+        if unseen_scale:
+            warnings.append(f"{UNSEEN_SCALE}; its priors hold it. To know it, {GIVE_A_LENGTH}.")
         told = listed if len(explained) <= FEW_HELD else "armcal identify lists them"
         warnings.append(f"{text}; their priors hold them: {told}.")
     if known.condition > POOR_CONDITION and not has_prior.all():

@@ -21,7 +21,7 @@ from armcal.arm.statics import Load
 from armcal.base import se3
 from armcal.base.parameters import ParameterBlock, Parameters, scalar
 from armcal.base.se3 import Expression
-from armcal.measure.measurement import Measurement, noise_channels
+from armcal.measure.measurement import GroupedMeasurement, Measurement, noise_channels, residual_dimensions
 
 Vector3 = tuple[float, float, float]
 _ZERO: Vector3 = (0.0, 0.0, 0.0)
@@ -56,6 +56,10 @@ class Factor:
         tools: each arm's base_T_tool without its last row, column by column (12 an arm; m).
         noise: standard deviation of each residual entry.
         noise_channels: of each residual entry, the channels that may carry a record's own one, the nearest first.
+        dimensions: ``length`` or ``angle`` of each residual entry.
+        told: what the record alone says of these, to start from; empty where it says nothing.
+        told_names: local names of the group's parameters that ``told`` holds the entries of, one an entry.
+        mean_weight: how many times more the mean of a group's residuals weighs.
     """
 
     name: str
@@ -70,6 +74,10 @@ class Factor:
     tools: Expression
     noise: tuple[float, ...]
     noise_channels: tuple[tuple[str, ...], ...] = ()
+    dimensions: tuple[str, ...] = ()
+    told: Expression = None
+    told_names: tuple[str, ...] = ()
+    mean_weight: float = 1.0
 
     @property
     def _inputs(self) -> list[Expression]:
@@ -83,6 +91,10 @@ class Factor:
         """(values, record, state) -> (next state, outputs and tools)."""
         shown = ca.densify(ca.vertcat(self.outputs, self.tools))
         return ca.Function("outputs", self._inputs, [self.next_state, shown], {"cse": True})
+
+    def told_function(self) -> ca.Function:
+        """(values, record, state) -> (next state, what the record says of its group's parameters)."""
+        return ca.Function("told", self._inputs, [self.next_state, ca.densify(self.told)], {"cse": True})
 
     def linearise_function(self) -> ca.Function:
         """(values, record, state) -> (next state, residual, Jacobian transposed), in equilibrium to second order."""
@@ -176,11 +188,9 @@ def build_factor(
     environment: Environment,
     available: frozenset[str],
 ) -> Factor:
-    """The expressions of one measurement.
-
-    ``available`` are the channels that the records carry; what they do not carry comes from ``environment``.
-    """
+    """The expressions of one measurement; ``available`` are the channels of the records, ``environment`` the rest."""
     symbols, values = _value_expressions(parameters)
+    group, of_group = _group_expressions(measurement)
     records = _Records(available)
     load = _tilted(_load(records, environment), scoped(values, f"{STATICS}."))
     states, deflections = {}, []
@@ -188,19 +198,20 @@ def build_factor(
         deflection = ca.SX.sym(f"deflection_{arm_name}", arms[arm_name].deflection_size)
         deflections.append(deflection)
         states[arm_name] = _arm_state(arms[arm_name], values, records, load, deflection)
-    local = scoped(values, f"{name}.")
+    local = {**scoped(values, f"{name}."), **of_group}
     predicted = measurement.outputs(states, local)
     measured = {c.name: records.optional(f"{name}.{c.name}", 0.0) for c in measurement.channels()}
     residual = measurement.residual(states, measured, local)
     next_state = ca.densify(ca.vertcat(*[states[a].next_deflection for a in measurement.arms]))
     outputs = ca.vertcat(*predicted.values())
     tools = ca.vertcat(*[ca.vec(states[a].base_T_tool.matrix()[:3, :]) for a in measurement.arms])
-    used = records.used_by(ca.vertcat(residual, next_state, outputs, tools))
+    told, told_names = _told(measurement, states, local)
+    used = records.used_by(ca.vertcat(residual, next_state, outputs, tools, told))
     return Factor(
         name=name,
         channels=tuple(used),
         output_channels=tuple(f"{name}.{channel}" for channel in predicted),
-        values=symbols,
+        values=ca.vertcat(symbols, group),
         record=ca.vertcat(*used.values()),
         state=ca.vertcat(*deflections),
         next_state=next_state,
@@ -209,7 +220,23 @@ def build_factor(
         tools=tools,
         noise=tuple(measurement.noise()),
         noise_channels=tuple(tuple(f"{name}.{c.name}" for c in own) for own in noise_channels(measurement)),
+        dimensions=residual_dimensions(measurement),
+        told=told,
+        told_names=told_names,
+        mean_weight=measurement.mean_weight if isinstance(measurement, GroupedMeasurement) else 1.0,
     )
+
+
+def _told(
+    measurement: Measurement, states: Mapping[str, ArmState], local: Mapping[str, Expression]
+) -> tuple[Expression, tuple[str, ...]]:
+    """What a record says of its group's parameters, and whose entries these are."""
+    if not isinstance(measurement, GroupedMeasurement):
+        return ca.SX(0, 1), ()
+    told = {name: ca.SX(entries) for name, entries in measurement.told(states, local).items()}
+    if not told:
+        return ca.SX(0, 1), ()
+    return ca.densify(ca.vertcat(*told.values())), tuple(n for n, e in told.items() for _ in range(e.numel()))
 
 
 def _load(records: _Records, environment: Environment) -> Load:
@@ -235,10 +262,11 @@ def _tilted(load: Load, tilt: Mapping[str, Expression]) -> Load:
 
 
 def _value_expressions(parameters: Parameters) -> tuple[Expression, dict[str, Expression]]:
-    """Symbols for the free canonical entries, and every block's value with fixed ones as numbers."""
-    symbols = ca.SX.sym("values", len(parameters.free_entries))
+    """Symbols for the free canonical entries, and every block's value with fixed ones as numbers; groups aside."""
+    main = [block for block in parameters.blocks if not block.nuisance]
+    symbols = ca.SX.sym("values", sum(block.size for block in main if block.free))
     values, start = {}, 0
-    for block in parameters.blocks:
+    for block in main:
         if block.free:
             values[block.name] = symbols[start : start + block.size]
             start += block.size
@@ -247,10 +275,24 @@ def _value_expressions(parameters: Parameters) -> tuple[Expression, dict[str, Ex
     return symbols, values
 
 
+def _group_expressions(measurement: Measurement) -> tuple[Expression, dict[str, Expression]]:
+    """Symbols for the entries of a group's parameters, whether free or not, and the parameters by local name."""
+    if not isinstance(measurement, GroupedMeasurement):
+        return ca.SX(0, 1), {}
+    blocks = [(block.name, block.size) for block in measurement.group_parameters("")]
+    symbols, start, values = ca.SX.sym("group", sum(size for _, size in blocks)), 0, {}
+    for name, size in blocks:
+        values[name] = symbols[start : start + size]
+        start += size
+    return symbols, values
+
+
 def _arm_state(
     arm: Arm, values: Mapping[str, Expression], records: _Records, load: Load, deflection: Expression
 ) -> ArmState:
-    angles = ca.vertcat(*[records.number(f"{arm.name}.{joint}") for joint in arm.joint_names])
-    approach = ca.vertcat(*[records.optional(f"{arm.name}.approach.{j}", 0.0) for j in arm.joint_names])
+    commands = [records.number(f"{arm.name}.{joint}") for joint in arm.commanded]
+    approaches = [records.optional(f"{arm.name}.approach.{joint}", 0.0) for joint in arm.commanded]
+    angles = ca.vertcat(*arm.joint_commands(commands))
+    approach = ca.vertcat(*arm.joint_approaches(approaches))
     conditions = {name: records.number(name) for name in arm.conditions if records.has(name)}
     return arm.state(values, ArmInputs(angles, approach, load, deflection, conditions))

@@ -173,13 +173,12 @@ class Kernel:
         """The exact Hessian of one record."""
         return self.factor.hessian_function()
 
-    def channel_slopes(self, values: Array, record: Array, state: Array, channels: Sequence[str]) -> Array:
-        """d residual / d channels (n_r x channels x records) at states in equilibrium."""
-        mapped = _Mapped(self.factor.channel_slope_function(tuple(channels)))
-        slopes = np.empty((self.factor.residual.numel() * len(channels), record.shape[1]))
+    def channel_slopes(
+        self, values: Array, record: Array, state: Array, slopes: Array, channels: Sequence[str]
+    ) -> None:
+        """d residual / d channels (n_r * channels x records) at states in equilibrium."""
         if slopes.size:
-            mapped(values, (record, state), (slopes,))
-        return slopes.reshape(self.factor.residual.numel(), len(channels), record.shape[1])
+            _Mapped(self.factor.channel_slope_function(tuple(channels)))(values, (record, state), (slopes,))
 
     def residuals(self, values: Array, record: Array, state: Array, residual: Array) -> None:
         """Residuals in equilibrium.
@@ -223,24 +222,28 @@ class Kernel:
                 )
             state[:, column] = at
 
-    def predict(self, values: Array, record: Array, state: Array) -> Array:
+    def predict(self, values: Array, record: Array, state: Array, shown: Array) -> None:
         """Outputs and tool poses in equilibrium (n_o + 12 an arm x records).
 
         Raises:
             NotConvergedError: a record has no equilibrium.
         """
-        mapped = _Mapped(self.outputs)
-        shown = np.empty((self.outputs.numel_out(1), record.shape[1]))
-        following = np.empty_like(state)
+        self._in_equilibrium(self.outputs, values, record, state, shown)
+
+    def tell(self, values: Array, record: Array, state: Array, said: Array) -> None:
+        """What each record says of its group's parameters, in equilibrium (entries x records)."""
+        self._in_equilibrium(self.factor.told_function(), values, record, state, said)
+
+    def _in_equilibrium(self, function: ca.Function, values: Array, record: Array, state: Array, shown: Array) -> None:
+        mapped, following = _Mapped(function), np.empty_like(state)
         for _ in range(MOST_PASSES):
             mapped(values, (record, state), (following, shown))
             moved = np.abs(following - state).max(initial=0.0)
             state[:] = following
             if moved <= REST_RAD and not _out_of_hand(state):
-                return shown
+                return
         self._settle_by_newton(values, record, state)
         mapped(values, (record, state), (following, shown))
-        return shown
 
 
 def _out_of_hand(state: Array) -> bool:

@@ -209,7 +209,7 @@ def _along(record: int, problem: Problem, motion: Motion, judged: Judged) -> str
         return ""
     name, _, joint = motion.channels[best].partition(".")
     arm = problem.blueprint.arms[name]
-    unit = display_unit(arm.joint_dimensions[arm.joint_names.index(joint)])
+    unit = display_unit(arm.commanded[joint])
     off = abs(float(own @ slopes[:, best] / (slopes[:, best] @ slopes[:, best])))
     shown = joint if len(problem.blueprint.arms) == 1 else motion.channels[best]
     return f"it misses along {shown}'s own motion, as if {to_unit(off, unit.name):.1f} {unit.name} off"

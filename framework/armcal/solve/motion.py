@@ -35,7 +35,7 @@ class Motion:
     def of(cls, problem: Problem, values: Array, records: Sequence[FactorRecords], dataset: Dataset) -> Motion:
         """At the values that a fit found."""
         arms = problem.blueprint.arms
-        channels = tuple(f"{name}.{joint}" for name, arm in arms.items() for joint in arm.joint_names)
+        channels = tuple(f"{name}.{joint}" for name, arm in arms.items() for joint in arm.commanded)
         blocks = {b.name: values[problem.parameters.entries_of(b.name)] for b in problem.parameters.blocks}
         loads = {name: site_loads(arm, blocks, *_inputs(problem, arm, dataset)) for name, arm in arms.items()}
         return cls(channels, problem.channel_slopes(values, records, channels), loads)
@@ -77,4 +77,5 @@ def _inputs(problem: Problem, arm: Arm, dataset: Dataset) -> tuple[Array, Array]
         dataset.column(channel) if dataset.has(channel) else np.full(len(dataset), default)
         for channel, default in zip(LOAD_CHANNELS, stated, strict=True)
     ]
-    return dataset.stacked([f"{arm.name}.{joint}" for joint in arm.joint_names]), np.array(acting)
+    commands = [dataset.column(f"{arm.name}.{joint}") for joint in arm.commanded]
+    return np.array(arm.joint_commands(commands)), np.array(acting)

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import pickle
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 from typing import Any
 
 import numpy as np
@@ -16,63 +15,35 @@ from armcal.arm.assembly import Arm
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.base.parameters import Parameters
+from armcal.measure.groups import Groups, group_numbers, groups_of, ties_of
 from armcal.measure.measurement import Measurement
+from armcal.solve import factor_records, gather
 from armcal.solve.blueprint import Blueprint
-from armcal.solve.c_source import LANES
-from armcal.solve.correlation import Correlation
 from armcal.solve.factor import Environment
+from armcal.solve.factor_records import FactorRecords, correlation_of
+from armcal.solve.gather import Slots
 from armcal.solve.kernel import EvaluatorChoice, Kernel
-from armcal.solve.whitening import by_deviation, declared, transformed
+from armcal.solve.linearised import BLOCK_RECORDS, linearised, mean_shares
+from armcal.solve.normal_equations import ExtraRows, NormalEquations, TieFunction, stacked
+from armcal.solve.whitening import declared, transformed
 
-BLOCK_RECORDS = 1024
-_THREADS = 2
-
-
-@dataclass(frozen=True)
-class FactorRecords:
-    """The records of one factor, padded to whole vectors; ``state`` is workspace that keeps equilibria warm.
-
-    ``weight`` (width) multiplies squared residuals. ``whitening`` (n_r x n_r x width) makes each record's residual
-    one of unit covariance; None stands for the factor's own noise, the same in every record. ``correlation`` is what
-    the records of all factors share, the same object in each; None where they are independent.
-    """
-
-    count: int
-    record: Array
-    weight: Array
-    state: Array
-    whitening: Array | None = None
-    correlation: Correlation | None = None
-
-
-@dataclass(frozen=True)
-class NormalEquations:
-    """Half the squared whitened residuals and their Gauss-Newton model.
-
-    ``gradient`` (n) and ``hessian`` (n x n) are with respect to the free canonical entries.
-    """
-
-    cost: float
-    gradient: Array
-    hessian: Array
-
-    def chained(self, jacobian: Array) -> NormalEquations:
-        """The same with respect to increments, by d entries / d increment."""
-        return NormalEquations(self.cost, jacobian.T @ self.gradient, jacobian.T @ self.hessian @ jacobian)
+__all__ = ["FactorRecords", "NormalEquations", "Problem", "triangular"]
 
 
 @dataclass(frozen=True)
 class Problem:
-    """Kernels over one set of parameters.
+    """Kernels over one set of parameters; ``known_ties`` are what is known between groups beside the records.
 
-    Value vectors hold all canonical entries; the fixed ones are compiled in and must be the nominal ones. In another
-    process a problem is compiled anew, once, from its blueprint and by the same evaluators.
+    Value vectors hold all canonical entries. Those that the blueprint fixes are compiled in and must be the nominal
+    ones; ``parameters`` may hold more. In another process a problem is compiled anew, once, from its blueprint and by
+    the same evaluators.
     """
 
     parameters: Parameters
     kernels: tuple[Kernel, ...]
     environment: Environment
     blueprint: Blueprint
+    known_ties: tuple[TieFunction, ...] = ()
 
     @classmethod
     def build(
@@ -83,11 +54,15 @@ class Problem:
         environment: Environment,
         dataset: Dataset,
         evaluator: EvaluatorChoice = "auto",
+        groups: Groups | None = None,
     ) -> Problem:
-        """Compile for datasets with the channels of this one."""
-        blueprint = Blueprint(arms, measurements, parameters, environment, frozenset(dataset.channels))
+        """Compile for datasets with the channels of this one, and its groups where none are given."""
+        if groups is None:
+            groups = groups_of(dataset, measurements) if parameters.nuisances else {}
+        blueprint = Blueprint(arms, measurements, parameters, environment, frozenset(dataset.channels), groups)
         choices = dict.fromkeys(measurements, evaluator)
-        return cls(parameters, blueprint.kernels(len(dataset), choices), environment, blueprint)
+        kernels, ties = blueprint.kernels(len(dataset), choices), _ties(blueprint)
+        return cls(parameters, kernels, environment, blueprint, ties)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _from_bytes, (self._bytes,)
@@ -96,7 +71,7 @@ class Problem:
     def _bytes(self) -> bytes:
         """The blueprint, and what evaluates each measurement."""
         choices = {k.factor.name: "compiled" if k.backend.name == "compiled" else "interpreted" for k in self.kernels}
-        return pickle.dumps((self.blueprint.bare(), choices))
+        return pickle.dumps((self.blueprint.bare(), choices, self.parameters))
 
     def evaluated_by(self, evaluator: EvaluatorChoice) -> Problem:
         """The same problem by another evaluator; ``compiled`` waits for the compiler. Records serve both."""
@@ -119,63 +94,49 @@ class Problem:
         return tuple(self.parameters.entry_names[i] for i in self.parameters.free_entries)
 
     @cached_property
-    def _free(self) -> NDArray[np.intp]:
-        return np.array(self.parameters.free_entries, dtype=np.intp)
+    def slots(self) -> tuple[Slots, ...]:
+        """Where each kernel's values come from, and where its Jacobian goes."""
+        plan = self.blueprint
+        return tuple(
+            gather.slots_of(name, measurement, plan.parameters, self.parameters, plan.groups)
+            for name, measurement in plan.measurements.items()
+        )
+
+    @cached_property
+    def ties(self) -> tuple[TieFunction, ...]:
+        """What is known between groups that are free."""
+        free = set(self.parameters.free_entries)
+        return tuple(tie for tie in self.known_ties if free.intersection(tie.entries.tolist()))
 
     def records(self, dataset: Dataset, weights: Array | None = None) -> tuple[FactorRecords, ...]:
         """A dataset as the kernels read it; ``weights`` (N) multiply each record's squared residual."""
-        count = len(dataset)
-        padded = -(-count // LANES) * LANES
-        fill = np.concatenate([np.arange(count), np.full(padded - count, max(0, count - 1))]).astype(np.intp)
-        weight = np.zeros(padded)
-        weight[:count] = 1.0 if weights is None else weights
+        plan = self.blueprint
+        factors = [kernel.factor for kernel in self.kernels]
+        numbers = [group_numbers(dataset, name, m, plan.groups) for name, m in plan.measurements.items()]
+        masks = [factor_records.applicable(f, dataset, n) for f, n in zip(factors, numbers, strict=True)]
+        # A record that is nobody's stays everybody's, so that it is found out.
+        nobodys = ~np.any(masks, axis=0)
         return tuple(
-            FactorRecords(
-                count,
-                np.take(dataset.stacked(kernel.factor.channels), fill, axis=1),
-                weight,
-                np.zeros((kernel.factor.state.numel(), padded)),
-                _whitening(kernel, dataset, fill),
-            )
-            for kernel in self.kernels
+            factor_records.factor_records(factor, dataset, number, mask | nobodys, weights)
+            for factor, number, mask in zip(factors, numbers, masks, strict=True)
         )
 
     @staticmethod
     def subset(records: Sequence[FactorRecords], chosen: NDArray[np.intp]) -> tuple[FactorRecords, ...]:
         """Some records of all."""
-        padded = -(-len(chosen) // LANES) * LANES
-        fill = np.concatenate([chosen, np.full(padded - len(chosen), chosen[-1] if len(chosen) else 0)]).astype(np.intp)
-        parts = []
-        shared = _correlation(records)
-        correlation = None
-        if shared is not None:
-            inside = (np.arange(padded) < len(chosen)).astype(float)
-            correlation = shared.subset(fill).weighted([inside] * len(records))
-        for each in records:
-            weight = each.weight[fill]
-            weight[len(chosen) :] = 0
-            record, state = np.take(each.record, fill, axis=1), np.take(each.state, fill, axis=1)
-            whitening = None if each.whitening is None else np.take(each.whitening, fill, axis=2)
-            parts.append(FactorRecords(len(chosen), record, weight, state, whitening, correlation))
-        return tuple(parts)
+        return factor_records.subset(records, chosen)
 
     @staticmethod
     def weighted(records: Sequence[FactorRecords], weights: Sequence[Array]) -> tuple[FactorRecords, ...]:
         """The same records with their weights multiplied, factor by factor (N each); equilibria stay shared."""
-        factors = [np.pad(w, (0, len(each.weight) - each.count)) for each, w in zip(records, weights, strict=True)]
-        shared = _correlation(records)
-        correlation = None if shared is None else shared.weighted(factors)
-        return tuple(
-            replace(each, weight=each.weight * factor, correlation=correlation)
-            for each, factor in zip(records, factors, strict=True)
-        )
+        return factor_records.weighted(records, weights)
 
     def equations(self, records: Sequence[FactorRecords]) -> int:
         """How many residual numbers the records give; those of weight zero are no evidence."""
         return sum(
             int(np.count_nonzero(each.weight)) * len(kernel.factor.noise)
             for kernel, each in zip(self.kernels, records, strict=True)
-        )
+        ) + sum(len(tie.noise) for tie in self.ties)
 
     def residuals(self, values: Array, records: Sequence[FactorRecords]) -> tuple[Array, ...]:
         """Raw residuals in equilibrium, one (n_r x N) matrix a factor.
@@ -183,11 +144,11 @@ class Problem:
         Raises:
             NotConvergedError: a record has no elastic equilibrium at these values.
         """
-        free = self._free_values(values)
+        self._check_fixed(values)
         result = []
-        for kernel, each in zip(self.kernels, records, strict=True):
+        for kernel, slots, each in zip(self.kernels, self.slots, records, strict=True):
             residual = np.empty((kernel.factor.residual.numel(), each.record.shape[1]))
-            kernel.residuals(free, each.record, each.state, residual)
+            gather.evaluated(slots, values, each.group, kernel.residuals, each.record, each.state, residual)
             result.append(residual[:, : each.count])
         return tuple(result)
 
@@ -195,7 +156,12 @@ class Problem:
         """Half the weighted squared whitened residuals."""
         weighted = self.weighted_residuals(values, records)
         total = sum(0.5 * float(np.sum(residual**2)) for residual in weighted)
-        shared = _correlation(records)
+        for kernel, each, residual in zip(self.kernels, records, weighted, strict=True):
+            total += sum(
+                0.5 * float(np.sum((residual @ s[: each.count]) ** 2)) for s in mean_shares(kernel.factor, each)
+            )
+        total += sum(0.5 * float(np.sum((tie.residual(values) / tie.noise) ** 2)) for tie in self.ties)
+        shared = correlation_of(records)
         if shared is None:
             return total
         return total - 0.5 * float(np.sum(shared.absorbed(shared.products(weighted)) ** 2))
@@ -221,23 +187,24 @@ class Problem:
     def normal_equations(self, values: Array, records: Sequence[FactorRecords]) -> NormalEquations:
         """Cost, gradient and Gauss-Newton Hessian, accumulated in blocks: memory does not grow with the records."""
         blocks = [_block_sums(*block) for block in self._shared_blocks(values, records)]
-        entries, shared = len(self._free), _correlation(records)
+        entries, shared = len(self.parameters.free_entries), correlation_of(records)
         cost = sum((b[0] for b in blocks), 0.0)
         gradient = sum((b[1] for b in blocks), np.zeros(entries))
         hessian = sum((b[2] for b in blocks), np.zeros((entries, entries)))
+        equations = self._extra(values, records).added_to(NormalEquations(cost, gradient, hessian))
         if shared is None:
-            return NormalEquations(cost, gradient, hessian)
+            return equations
         by_entries = shared.absorbed(sum((b[3] for b in blocks), np.zeros((shared.size, entries))))
         by_residual = shared.absorbed(sum((b[4] for b in blocks), np.zeros(shared.size)))
         return NormalEquations(
-            cost - 0.5 * float(by_residual @ by_residual),
-            gradient - by_entries.T @ by_residual,
-            hessian - by_entries.T @ by_entries,
+            equations.cost - 0.5 * float(by_residual @ by_residual),
+            equations.gradient - by_entries.T @ by_residual,
+            equations.hessian - by_entries.T @ by_entries,
         )
 
     def triangular_factor(self, values: Array, records: Sequence[FactorRecords]) -> Array:
         """R with R'R = J'J of the whitened residuals by coordinates: singular values keep their condition."""
-        chain, shared = self.parameters.entries_jacobian(values), _correlation(records)
+        chain, shared = self.parameters.entries_jacobian(values), correlation_of(records)
         innovations = 0 if shared is None else shared.size
         triangle = np.hstack([np.eye(innovations), np.zeros((innovations, self.increments))])
         for jacobian, _, slope in self._shared_blocks(values, records):
@@ -245,6 +212,8 @@ class Problem:
             if slope is not None:
                 rows = np.hstack([slope.reshape(-1, innovations), rows])
             triangle = triangular(np.vstack([triangle, rows]))
+        beside = self._extra(values, records).jacobian @ chain
+        triangle = triangular(np.vstack([triangle, np.hstack([np.zeros((len(beside), innovations)), beside])]))
         return triangle[innovations:, innovations:]
 
     def jacobians(self, values: Array, records: Sequence[FactorRecords]) -> Iterator[Array]:
@@ -256,42 +225,75 @@ class Problem:
 
         Of records that hang together the Gauss-Newton one: their curvature would couple all of them.
         """
-        if _correlation(records) is not None:
+        if correlation_of(records) is not None:
             return self.normal_equations(values, records).hessian
-        free = self._free_values(values)
         self.residuals(values, records)
-        total = np.zeros((len(free), len(free)))
-        for kernel, each in zip(self.kernels, records, strict=True):
-            for i in range(each.count):
-                whitening = declared(kernel.factor.noise) if each.whitening is None else each.whitening[:, :, i]
-                one = kernel.hessian(free, each.record[:, i], each.state[:, i], whitening)
-                total += each.weight[i] * np.asarray(one)
-        return total
+        size = len(self.parameters.free_entries)
+        total = np.zeros((size, size))
+        for kernel, slots, each in zip(self.kernels, self.slots, records, strict=True):
+            for number, columns in slots.parts(each.group, each.count):
+                own, free = slots.values(values, number), slots.free[number]
+                seen = np.flatnonzero(free != gather.HELD)
+                for i in columns:
+                    whitening = declared(kernel.factor.noise) if each.whitening is None else each.whitening[:, :, i]
+                    one = kernel.hessian(own, each.record[:, i], each.state[:, i], whitening)
+                    total[np.ix_(free[seen], free[seen])] += each.weight[i] * np.asarray(one)[np.ix_(seen, seen)]
+        beside = self._extra(values, records).jacobian
+        return total + beside.T @ beside
 
     def channel_slopes(
         self, values: Array, records: Sequence[FactorRecords], channels: Sequence[str]
     ) -> tuple[Array, ...]:
         """d residual / d record channels in equilibrium, one (n_r x channels x N) array a factor; raw, not whitened."""
-        free = self._free_values(values)
         self.residuals(values, records)
-        return tuple(
-            kernel.channel_slopes(free, each.record, each.state, channels)[:, :, : each.count]
-            for kernel, each in zip(self.kernels, records, strict=True)
-        )
+        result = []
+        for kernel, slots, each in zip(self.kernels, self.slots, records, strict=True):
+            slope = np.empty((kernel.factor.residual.numel() * len(channels), each.record.shape[1]))
+            evaluate = partial(kernel.channel_slopes, channels=channels)
+            gather.evaluated(slots, values, each.group, evaluate, each.record, each.state, slope)
+            result.append(slope.reshape(-1, len(channels), each.record.shape[1])[:, :, : each.count])
+        return tuple(result)
 
     def predict(self, values: Array, records: Sequence[FactorRecords]) -> tuple[Array, ...]:
         """Outputs and tool positions in equilibrium, one (n_o + 12 an arm x N) matrix a factor."""
-        free = self._free_values(values)
-        return tuple(
-            kernel.predict(free, each.record, each.state)[:, : each.count]
-            for kernel, each in zip(self.kernels, records, strict=True)
-        )
+        self._check_fixed(values)
+        result = []
+        for kernel, slots, each in zip(self.kernels, self.slots, records, strict=True):
+            shown = np.empty((kernel.outputs.numel_out(1), each.record.shape[1]))
+            gather.evaluated(slots, values, each.group, kernel.predict, each.record, each.state, shown)
+            result.append(shown[:, : each.count])
+        return tuple(result)
+
+    def told(self, values: Array, records: Sequence[FactorRecords]) -> tuple[Array, ...]:
+        """What each record alone says of its group's parameters, one (entries x N) matrix a factor."""
+        result = []
+        for kernel, slots, each in zip(self.kernels, self.slots, records, strict=True):
+            said = np.empty((len(kernel.factor.told_names), each.record.shape[1]))
+            if len(said):
+                gather.evaluated(slots, values, each.group, kernel.tell, each.record, each.state, said)
+            result.append(said[:, : each.count])
+        return tuple(result)
+
+    def _extra(self, values: Array, records: Sequence[FactorRecords]) -> ExtraRows:
+        """The rows that belong to no single record."""
+        places = {entry: i for i, entry in enumerate(self.parameters.free_entries)}
+        rows = [tie.rows(values, places, len(places)) for tie in self.ties]
+        rows += self._mean_rows(values, records)
+        return stacked(rows, len(places))
+
+    def _mean_rows(self, values: Array, records: Sequence[FactorRecords]) -> Iterator[ExtraRows]:
+        for kernel, slots, each in zip(self.kernels, self.slots, records, strict=True):
+            shares = mean_shares(kernel.factor, each)
+            if len(shares):
+                blocks = list(linearised(kernel, slots, each, values))
+                jacobian, residual = (np.concatenate(parts, axis=-1) for parts in zip(*blocks, strict=True))
+                yield from (ExtraRows(residual @ share, jacobian @ share) for share in shares)
 
     def _shared_blocks(
         self, values: Array, records: Sequence[FactorRecords]
     ) -> Iterator[tuple[Array, Array, Array | None]]:
         """Blocks, each with its slopes by the innovations of a drift (n_r x B x n_z), if there is one."""
-        shared = _correlation(records)
+        shared = correlation_of(records)
         blocks = self._blocks(values, records)
         for factor, each in enumerate(records):
             for start in range(0, each.record.shape[1], BLOCK_RECORDS):
@@ -299,79 +301,39 @@ class Problem:
                 yield (*next(blocks), slope)
 
     def _blocks(self, values: Array, records: Sequence[FactorRecords]) -> Iterator[tuple[Array, Array]]:
-        """Whitened, weighted Jacobians (n_r x n_v x B) and residuals (n_r x B), in order; two at a time in threads."""
-        free = self._free_values(values)
-        for kernel, each in zip(self.kernels, records, strict=True):
-            width = each.record.shape[1]
-            starts = range(0, width, BLOCK_RECORDS)
+        """Whitened, weighted Jacobians (n_r x n_v x B) and residuals (n_r x B), in order."""
+        self._check_fixed(values)
+        for kernel, slots, each in zip(self.kernels, self.slots, records, strict=True):
+            yield from linearised(kernel, slots, each, values)
 
-            def work(start: int, kernel: Kernel = kernel, each: FactorRecords = each) -> tuple[Array, Array]:
-                return _linearised_block(kernel, free, each, slice(start, start + BLOCK_RECORDS))
-
-            if len(starts) <= _THREADS or kernel.backend.name != "compiled":
-                yield from map(work, starts)
-            else:
-                with ThreadPoolExecutor(_THREADS) as pool:
-                    yield from _in_order(pool, work, starts)
-
-    def _free_values(self, values: Array) -> Array:
-        fixed = np.ones(len(values), dtype=bool)
-        fixed[self._free] = False
+    def _check_fixed(self, values: Array) -> None:
+        fixed = self._compiled_in
         if not np.array_equal(values[fixed], self.parameters.nominal()[fixed]):
             raise ValueError("a fixed parameter differs from the value the problem was compiled with")
-        return np.ascontiguousarray(values[self._free])
+
+    @cached_property
+    def _compiled_in(self) -> NDArray[np.intp]:
+        """Positions of the entries that the kernels hold as numbers."""
+        plan = self.blueprint.parameters
+        held = [block.name for block in plan.blocks if not block.free and not block.nuisance]
+        return np.array([i for name in held for i in range(*plan.entries_of(name).indices(1 << 30))], dtype=np.intp)
 
 
 @lru_cache(maxsize=64)
 def _from_bytes(written: bytes) -> Problem:
     """A problem that another process sent, compiled once here."""
-    blueprint, choices = pickle.loads(written)
-    return Problem(blueprint.parameters, blueprint.kernels(0, choices), blueprint.environment, blueprint)
+    blueprint, choices, parameters = pickle.loads(written)
+    return Problem(parameters, blueprint.kernels(0, choices), blueprint.environment, blueprint, _ties(blueprint))
 
 
-def _whitening(kernel: Kernel, dataset: Dataset, fill: NDArray[np.intp]) -> Array | None:
-    """From the records' own noise; None if no record states any."""
-    choices = kernel.factor.noise_channels
-    stated = [next((channel for channel in own if dataset.has(channel)), None) for own in choices]
-    if not any(stated):
-        return None
-    pairs = zip(stated, kernel.factor.noise, strict=True)
-    return by_deviation(np.array([dataset.column(c)[fill] if c else np.full(len(fill), sd) for c, sd in pairs]))
+def _ties(blueprint: Blueprint) -> tuple[TieFunction, ...]:
+    owned = ties_of(blueprint.measurements, blueprint.groups)
+    return tuple(TieFunction.of(each, blueprint.parameters) for each in owned)
 
 
 def triangular(rows: Array) -> Array:
     """R of a QR decomposition."""
     return np.asarray(np.linalg.qr(rows, mode="r"))
-
-
-def _in_order(
-    pool: ThreadPoolExecutor, work: Callable[[int], tuple[Array, Array]], starts: Sequence[int]
-) -> Iterator[tuple[Array, Array]]:
-    """Results in the order of ``starts``, with only a few blocks alive at a time."""
-    pending = [pool.submit(work, start) for start in starts[: 2 * _THREADS]]
-    for start in [*starts[2 * _THREADS :], *[None] * len(pending)]:
-        yield pending.pop(0).result()
-        if start is not None:
-            pending.append(pool.submit(work, start))
-
-
-def _linearised_block(kernel: Kernel, free: Array, each: FactorRecords, part: slice) -> tuple[Array, Array]:
-    record, state, weight = each.record[:, part], each.state[:, part], each.weight[part]
-    n_residual, n_values = kernel.factor.residual.numel(), len(free)
-    jacobian = np.empty((n_residual * n_values, record.shape[1]))
-    residual = np.empty((n_residual, record.shape[1]))
-    kernel.linearise(free, record, state, residual, jacobian)
-    shaped = jacobian.reshape(n_residual, n_values, record.shape[1])
-    if each.whitening is not None:
-        whitening = each.whitening[:, :, part] * np.sqrt(weight)
-        return transformed(whitening, shaped), transformed(whitening, residual)
-    scale = np.sqrt(weight) / np.array(kernel.factor.noise)[:, None]
-    shaped *= scale[:, None, :]
-    return shaped, residual * scale
-
-
-def _correlation(records: Sequence[FactorRecords]) -> Correlation | None:
-    return records[0].correlation if records else None
 
 
 def _block_sums(jacobian: Array, residual: Array, slope: Array | None) -> tuple[Any, ...]:

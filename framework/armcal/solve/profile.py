@@ -282,6 +282,11 @@ class Pinned:
         """Of no increment."""
         return scale
 
+    @property
+    def increments(self) -> tuple[str, ...]:
+        """None."""
+        return ()
+
     def coordinates(self, base: Array, delta: Array) -> Array:
         """None."""
         return np.zeros(0)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from armcal.base.domains import Array
 from armcal.solve.factor import Factor
+from armcal.solve.gather import Slots, evaluated
 from armcal.solve.kernel import Kernel
 from armcal.solve.problem import FactorRecords, Problem
 
@@ -41,10 +42,9 @@ def projected(problem: Problem, values: Array, records: Sequence[FactorRecords])
             _as_predicted(kernel.factor, each, outputs) if _bilinear(kernel.factor) else each
             for kernel, each, outputs in zip(problem.kernels, records, shown, strict=True)
         )
-    free = np.ascontiguousarray(values[list(problem.parameters.free_entries)])
     return tuple(
-        _fitting_joints(kernel, free, each) if _measures_nothing(kernel.factor) else each
-        for kernel, each in zip(problem.kernels, result, strict=True)
+        _fitting_joints(kernel, slots, values, each) if _measures_nothing(kernel.factor) else each
+        for kernel, slots, each in zip(problem.kernels, problem.slots, result, strict=True)
     )
 
 
@@ -107,37 +107,37 @@ def _as_predicted(factor: Factor, each: FactorRecords, outputs: Array) -> Factor
     return replace(each, record=record)
 
 
-def _fitting_joints(kernel: Kernel, free: Array, each: FactorRecords) -> FactorRecords:
+def _fitting_joints(kernel: Kernel, slots: Slots, values: Array, each: FactorRecords) -> FactorRecords:
     """Joint angles moved by Gauss-Newton steps of least length until the residual is gone."""
     rows = joint_channels(kernel.factor)
     moved = each.record.copy()
     if not rows or not each.count:
         return each
     for _ in range(_MOST_STEPS):
-        residual = _residual(kernel, free, moved, each)
+        residual = _residual(kernel, slots, values, replace(each, record=moved))
         if (_whitened(kernel.factor, residual) < _AT_ZERO * 1e-3).all():
             break
-        slopes = np.stack([_slope(kernel, free, moved, each, row) for row in rows], axis=-1)
+        slopes = np.stack([_slope(kernel, slots, values, replace(each, record=moved), row) for row in rows], axis=-1)
         step = np.einsum("nqr,rn->qn", np.linalg.pinv(slopes.transpose(1, 0, 2), rcond=1e-9), residual)
         longest = np.abs(step).max(axis=0)
         moved[list(rows)] -= step * np.minimum(1.0, 0.3 / np.maximum(longest, 1e-300))
-    reached = _whitened(kernel.factor, _residual(kernel, free, moved, each)) < _AT_ZERO
+    reached = _whitened(kernel.factor, _residual(kernel, slots, values, replace(each, record=moved))) < _AT_ZERO
     return replace(each, record=np.where(reached, moved, each.record))
 
 
-def _slope(kernel: Kernel, free: Array, record: Array, each: FactorRecords, row: int) -> Array:
+def _slope(kernel: Kernel, slots: Slots, values: Array, each: FactorRecords, row: int) -> Array:
     """d residual / d one joint angle, by central differences (n_r x N)."""
     sides = []
     for sign in (1.0, -1.0):
-        aside = record.copy()
+        aside = each.record.copy()
         aside[row] += sign * _STEP
-        sides.append(_residual(kernel, free, aside, each))
+        sides.append(_residual(kernel, slots, values, replace(each, record=aside)))
     return np.asarray((sides[0] - sides[1]) / (2 * _STEP))
 
 
-def _residual(kernel: Kernel, free: Array, record: Array, each: FactorRecords) -> Array:
-    residual = np.empty((kernel.factor.residual.numel(), record.shape[1]))
-    kernel.residuals(free, record, each.state.copy(), residual)
+def _residual(kernel: Kernel, slots: Slots, values: Array, each: FactorRecords) -> Array:
+    residual = np.empty((kernel.factor.residual.numel(), each.record.shape[1]))
+    evaluated(slots, values, each.group, kernel.residuals, each.record, each.state.copy(), residual)
     return residual
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,7 @@ from armcal.base.domains import Array
 from armcal.errors import NotConvergedError, ProblemError
 from armcal.solve.drift import residuals
 from armcal.solve.estimator import Estimator, Progress, Solution, no_progress
+from armcal.solve.nuisance import restricted, settled
 from armcal.solve.parallel import Executor, Sequential
 from armcal.solve.problem import FactorRecords, Problem
 
@@ -60,10 +61,20 @@ def record_errors(
 ) -> Array:
     """How far each record's measurement lies from the prediction; root mean square over several measurements (N).
 
+    Angles are left out. Groups that the problem holds, as those that no training record touched, are fitted to these
+    records first: what is left is how far the records of a group disagree.
     ``told_by`` are the records that tell how far drifting parameters had drifted; without them they are at rest.
     """
+    values = settled(problem, values, records)
     found = problem.residuals(values, records) if told_by is None else residuals(problem, values, records, told_by)
-    return np.asarray(np.sqrt(np.mean([np.sum(residual**2, axis=0) for residual in found], axis=0)))
+    squares, count = np.zeros((2, records[0].count))
+    for kernel, each, residual in zip(problem.kernels, records, found, strict=True):
+        lengths = np.array([dimension == "length" for dimension in kernel.factor.dimensions], dtype=bool)
+        if lengths.any():
+            squares += np.where(each.measured, np.sum(residual[lengths] ** 2, axis=0), 0.0)
+            count += each.measured
+    with np.errstate(invalid="ignore"):
+        return np.asarray(np.sqrt(squares / count))
 
 
 def hold_out(count: int, fraction: float, seed: int) -> Split:
@@ -87,6 +98,22 @@ def split_by_id(ids: Sequence[str], train_ids: Sequence[str]) -> Split:
             hint="Check that the list belongs to this dataset; records set aside on reading cannot train.",
         )
     inside = np.array([record in wanted for record in ids], dtype=bool)
+    return Split(np.flatnonzero(inside), np.flatnonzero(~inside))
+
+
+def split_by_label(labels: Sequence[str], train: Sequence[str]) -> Split:
+    """Records with one of these labels train, the others judge.
+
+    Raises:
+        ProblemError: no record has one of the labels.
+    """
+    missing = sorted(set(train) - set(labels))
+    if missing:
+        raise ProblemError(
+            f"no record belongs to {missing[0]!r}; there are {', '.join(sorted(set(labels)))}.",
+            hint="Correct validation.train_groups.",
+        )
+    inside = np.array([label in set(train) for label in labels], dtype=bool)
     return Split(np.flatnonzero(inside), np.flatnonzero(~inside))
 
 
@@ -115,6 +142,11 @@ class FitTask:
         """The records that train, and those that judge."""
         train, held = (self.problem.subset(self.records, part) for part in (self.split.train, self.split.holdout))
         return train, held
+
+    def trained(self) -> FitTask:
+        """The task with what its training records can tell of groups."""
+        train, _ = self.parts()
+        return replace(self, problem=restricted(self.problem, train))
 
 
 @dataclass(frozen=True)
@@ -145,7 +177,7 @@ class CrossValidation:
 
 def fit_and_judge(task: FitTask) -> JudgedFit:
     """Fit on the training records of a task, judge on its others."""
-    began = time.perf_counter()
+    began, task = time.perf_counter(), task.trained()
     try:
         train, held = task.parts()
         solution = task.estimator.solve(task.problem, train, task.start)

@@ -191,13 +191,13 @@ def _groups(problem: Problem, name: str, count: int, axes: Axes) -> list[tuple[s
 
 def _joints(problem: Problem) -> list[str]:
     """Joint channels of all arms."""
-    return [f"{arm.name}.{joint}" for arm in problem.blueprint.arms.values() for joint in arm.joint_names]
+    return [f"{arm.name}.{joint}" for arm in problem.blueprint.arms.values() for joint in arm.commanded]
 
 
 def _joint_unit(problem: Problem, channel: str) -> str:
     arm, _, joint = channel.rpartition(".")
     found = next(a for a in problem.blueprint.arms.values() if a.name == arm)
-    return "rad" if found.joint_dimensions[found.joint_names.index(joint)] == "angle" else "m"
+    return "rad" if found.commanded[joint] == "angle" else "m"
 
 
 def _mean_variance(basis: Sequence[Array], records: Sequence[FactorRecords]) -> float:

@@ -10,6 +10,7 @@ from types import MappingProxyType
 from armcal.plugins import Component, PluginInfo, PluginRegistry
 from armcal.testing.effect_checks import check_effect
 from armcal.testing.estimator_checks import check_estimator
+from armcal.testing.exporter_checks import check_exporter
 from armcal.testing.measurement_checks import check_measurement
 from armcal.testing.model_checks import check_model
 from armcal.testing.results import CheckResult, ContractError, Recorder, expect
@@ -30,6 +31,7 @@ _CHECKS: Mapping[str, Callable[[Recorder, Subject], None]] = MappingProxyType(
         "reader": check_reader,
         "estimator": check_estimator,
         "simulator": check_simulator,
+        "exporter": check_exporter,
     }
 )
 

@@ -112,7 +112,8 @@ def _parts(chain: Chain) -> list[Expression]:
     transforms = [chain.base_T_mount, chain.tool.joint_T_frame]
     transforms += [joint.parent_T_joint for joint in chain.joints]
     transforms += [at.joint_T_frame for at in chain.frames.values()]
-    return [*(t.matrix() for t in transforms), *(joint.offset for joint in chain.joints)]
+    twists = [part for joint in chain.joints if joint.twist is not None for part in joint.twist]
+    return [*(t.matrix() for t in transforms), *(joint.offset for joint in chain.joints), *twists]
 
 
 def _kinematics(blocks: tuple[ParameterBlock, ...], values: dict[str, Expression], chain: Chain) -> _Kinematics:

@@ -133,7 +133,7 @@ def commands(arms: Mapping[str, Arm], count: int, random: np.random.Generator) -
     return {
         f"{arm.name}.{joint}": random.uniform(-1, 1, count) * (2.0 if dimension == "angle" else 0.2)
         for arm in arms.values()
-        for joint, dimension in zip(arm.joint_names, arm.joint_dimensions, strict=True)
+        for joint, dimension in arm.commanded.items()
     }
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import yaml
+from pydantic import Field
 
 from armcal.base.config_text import plain
 from armcal.base.dataset import Dataset
@@ -29,6 +31,7 @@ from armcal.solve.variance import Component
 from armcal.use.intervals import PlusMinus, PredictionRecord, Uncertainty
 
 SCHEMA = 1
+_LINE_END = re.compile("[\n\r\x85\u2028\u2029]")
 
 
 class ParameterRecord(Settings):
@@ -69,6 +72,7 @@ class CalibrationFile(Settings):
     arms: dict[str, Any]
     measurements: dict[str, Any]
     statics: dict[str, Any]
+    groups: dict[str, tuple[str, ...]] = Field(default_factory=dict)
     parameters: tuple[ParameterRecord, ...]
     prediction: PredictionRecord | None = None
     information: InformationRecord
@@ -126,7 +130,7 @@ class Calibration:
                 hint="Change the experiment's configuration and run it again.",
             )
         system = build_system(source, registry or discover())
-        parameters = system.parameters()
+        parameters = system.parameters(record.groups)
         return cls(system, parameters.with_nominal(_values(parameters, record, path)), record)
 
     def predict(self, commands: Dataset) -> tuple[dict[str, Array], Array]:
@@ -157,6 +161,7 @@ class Calibration:
             self.system.environment,
             commands,
             "interpreted",
+            self.record.groups,
         )
         shown = problem.predict(fixed.nominal(), problem.records(commands))
         channels = {
@@ -215,7 +220,7 @@ class Calibration:
         name = arm or next(iter(self.system.arms))
         if name not in self.system.arms:
             raise ValueError(f"no arm is called {name!r}; the arms are {', '.join(self.system.arms)}")
-        joints = self.system.arms[name].joint_names
+        joints = tuple(self.system.arms[name].commanded)
         angles = np.atleast_2d(np.asarray(joint_angles, dtype=float))
         if angles.shape[1] != len(joints):
             raise ValueError(f"found {angles.shape[1]} joint angles a row, the arm {name} has {len(joints)} joints")
@@ -257,7 +262,19 @@ def parameter_records(estimate: Estimate) -> tuple[ParameterRecord, ...]:
 
 def dump(content: Mapping[str, Any]) -> str:
     """YAML text, keys in order, numbers to their last digit."""
-    return yaml.safe_dump(plain(dict(content)), sort_keys=False, allow_unicode=True, width=110)
+    return yaml.dump(plain(dict(content)), Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=110)
+
+
+class _Dumper(yaml.SafeDumper):
+    """Puts text of several lines in double quotes, the only style that keeps every kind of line end."""
+
+
+def _quoted(dumper: yaml.SafeDumper, text: str) -> yaml.ScalarNode:
+    style = '"' if _LINE_END.search(text) else None
+    return dumper.represent_scalar("tag:yaml.org,2002:str", text, style=style)
+
+
+_Dumper.add_representer(str, _quoted)
 
 
 def _uncertainty(estimate: Estimate, index: int) -> dict[str, Any]:

@@ -1,0 +1,50 @@
+"""What contacts share: a socket, a clamp or a plane reads nothing but the joints."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from armcal.arm.assembly import ArmState
+from armcal.base.parameters import ParameterBlock
+from armcal.base.se3 import Expression
+from armcal.measure.measurement import Channel, Tie
+
+
+class Contact:
+    """A base for measurements that only constrain; what a contact is, its subclass says.
+
+    See ``GroupedMeasurement`` for what each method gives.
+    """
+
+    group_owner: str | None = None
+    mean_weight: float = 1.0
+
+    def parameters(self) -> tuple[ParameterBlock, ...]:
+        """None of its own."""
+        return ()
+
+    def channels(self) -> tuple[Channel, ...]:
+        """None: the joints are all that is read."""
+        return ()
+
+    def outputs(self, arms: Mapping[str, ArmState], values: Mapping[str, Expression]) -> dict[str, Expression]:
+        """None."""
+        return {}
+
+    def ties(self, groups: Sequence[str]) -> tuple[Tie, ...]:
+        """Nothing is known between groups."""
+        return ()
+
+
+def named_arm(asked: str | None, arm_names: Sequence[str]) -> str:
+    """The arm that a configuration names, or the only one.
+
+    Raises:
+        ValueError: there is no such arm, or several and none is named.
+    """
+    if asked is None and len(arm_names) != 1:
+        raise ValueError(f"there are {len(arm_names)} arms ({', '.join(arm_names)}); say which by arm: NAME")
+    name = asked or arm_names[0]
+    if name not in arm_names:
+        raise ValueError(f"no arm is called {name!r}; the arms are {', '.join(arm_names)}")
+    return name

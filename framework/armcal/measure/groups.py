@@ -1,0 +1,130 @@
+"""Which group of records each record belongs to, and the parameters that the groups bring."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armcal.base.dataset import Dataset
+from armcal.base.parameters import ParameterBlock
+from armcal.errors import DataError, Location
+from armcal.measure.measurement import GroupedMeasurement, Measurement, Tie
+
+Groups = Mapping[str, tuple[str, ...]]
+"""Keys of the groups, in order, by the instance that owns them."""
+NO_GROUP = -1
+ONLY = "one"
+"""The key of the one group of a measurement without labels."""
+_FORBIDDEN = frozenset("[]*?\"'")
+
+
+@dataclass(frozen=True)
+class OwnedTie:
+    """A tie with the full names of the parameters it holds together.
+
+    Attributes:
+        names: local names of each group's parameters to full ones, one mapping a group.
+        tie: what is known.
+    """
+
+    names: tuple[Mapping[str, str], Mapping[str, str]]
+    tie: Tie
+
+
+def owner_of(instance: str, measurement: GroupedMeasurement) -> str:
+    """The instance whose groups a measurement uses."""
+    return measurement.group_owner or instance
+
+
+def groups_of(dataset: Dataset, measurements: Mapping[str, Measurement]) -> dict[str, tuple[str, ...]]:
+    """The groups in a dataset, sorted, so that the order of records means nothing.
+
+    Raises:
+        DataError: a label is missing, or unfit for a name.
+    """
+    found: dict[str, set[str]] = {}
+    for instance, measurement in measurements.items():
+        if isinstance(measurement, GroupedMeasurement):
+            keys = {key for key in record_keys(dataset, measurement) if key}
+            found.setdefault(owner_of(instance, measurement), set()).update(keys)
+    return {owner: tuple(sorted(keys)) for owner, keys in found.items()}
+
+
+def record_keys(dataset: Dataset, measurement: GroupedMeasurement) -> tuple[str, ...]:
+    """The key of each record's group; empty where a label is.
+
+    Raises:
+        DataError: a label is missing, or unfit for a name.
+    """
+    if not measurement.group_labels:
+        return (ONLY,) * len(dataset)
+    columns = []
+    for label in measurement.group_labels:
+        if label not in dataset.extra:
+            raise DataError(
+                f"found no column {label}, expected it to say which group a record belongs to.",
+                where=Location(dataset.source or None, field=label),
+                hint=f"Add a text column {label}, or map one: columns: {{{label}: NAME}} in the data section.",
+            )
+        columns.append([cell.strip() for cell in dataset.extra[label]])
+    for index, cells in enumerate(zip(*columns, strict=True)):
+        if any(_FORBIDDEN.intersection(cell) for cell in cells):
+            raise DataError(
+                f"found the label {'/'.join(cells)[:60]!r}, which is no name.",
+                where=Location(dataset.source or None, row=dataset.rows[index] if dataset.rows else index + 1),
+                hint="Use letters, digits, dashes and underscores.",
+            )
+    return tuple("/".join(cells) if all(cells) else "" for cells in zip(*columns, strict=True))
+
+
+def group_numbers(dataset: Dataset, instance: str, measurement: Measurement, groups: Groups) -> NDArray[np.intp] | None:
+    """Of each record the place of its group (N); -1 where it has none; None if the measurement has no groups."""
+    if not isinstance(measurement, GroupedMeasurement):
+        return None
+    known = groups.get(owner_of(instance, measurement), ())
+    if not known or any(label not in dataset.extra for label in measurement.group_labels):
+        return np.full(len(dataset), NO_GROUP, dtype=np.intp)
+    place = {key: number for number, key in enumerate(known)}
+    return np.array([place.get(key, NO_GROUP) for key in record_keys(dataset, measurement)], dtype=np.intp)
+
+
+def group_blocks(measurements: Mapping[str, Measurement], groups: Groups) -> tuple[ParameterBlock, ...]:
+    """The parameters of all groups under their full names."""
+    blocks = []
+    for instance, measurement in measurements.items():
+        if isinstance(measurement, GroupedMeasurement) and owner_of(instance, measurement) == instance:
+            for key in groups.get(instance, ()):
+                for block in measurement.group_parameters(key):
+                    name = group_name(instance, key, block.name)
+                    blocks.append(replace(block, name=name, nuisance=True))
+    return tuple(blocks)
+
+
+def grouped_instances(measurements: Mapping[str, Measurement]) -> tuple[str, ...]:
+    """The instances whose records fall into groups."""
+    return tuple(name for name, measurement in measurements.items() if isinstance(measurement, GroupedMeasurement))
+
+
+def group_name(owner: str, key: str, local: str) -> str:
+    """The full name of a group's parameter."""
+    return f"{owner}.{key}.{local}"
+
+
+def ties_of(measurements: Mapping[str, Measurement], groups: Groups) -> tuple[OwnedTie, ...]:
+    """All that is known between groups."""
+    found = []
+    for instance, measurement in measurements.items():
+        if isinstance(measurement, GroupedMeasurement):
+            owner = owner_of(instance, measurement)
+            for tie in measurement.ties(groups.get(owner, ())):
+                first, second = (_names(owner, measurement, key) for key in tie.groups)
+                found.append(OwnedTie((first, second), tie))
+    return tuple(found)
+
+
+def _names(owner: str, measurement: GroupedMeasurement, key: str) -> dict[str, str]:
+    blocks: Sequence[ParameterBlock] = measurement.group_parameters(key)
+    return {block.name: group_name(owner, key, block.name) for block in blocks}

@@ -1,0 +1,127 @@
+"""Errors by group of records: one tool position, one fixture, one day."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from armcal.base.dataset import Dataset
+from armcal.base.domains import Array
+from armcal.errors import ConfigError
+from armcal.measure.groups import Groups
+from armcal.measure.measurement import GroupedMeasurement
+from armcal.run.experiment import Experiment
+from armcal.solve.nuisance import settled, untrained
+from armcal.solve.problem import FactorRecords, Problem
+from armcal.solve.validation import Split
+
+_MM = 1000.0
+
+
+@dataclass(frozen=True)
+class GroupError:
+    """How wrong the model is on the records of one group (mean, mm), before and after calibration.
+
+    ``distance_error_mm`` is what is left of known distances within the group; None where none is known.
+    """
+
+    name: str
+    records: int
+    trained: int
+    nominal_error_mm: float
+    error_mm: float
+    nominal_distance_error_mm: float | None
+    distance_error_mm: float | None
+
+    def as_dict(self) -> dict[str, Any]:
+        """For metrics.json."""
+        return {key: value for key, value in self.__dict__.items() if key != "name"}
+
+
+@dataclass(frozen=True)
+class RunGroups:
+    """What a run found of groups: their errors, sorted by name, and the keys of those that bring parameters."""
+
+    errors: tuple[GroupError, ...] = ()
+    keys: Groups = field(default_factory=dict)
+
+    def as_dict(self) -> dict[str, Any]:
+        """For metrics.json."""
+        return {each.name: each.as_dict() for each in self.errors}
+
+
+def label_of(experiment: Experiment) -> str | None:
+    """The text column that tells groups apart; None if there is none."""
+    asked = experiment.settings.validation.group_by
+    if asked is not None:
+        return asked
+    labels = [
+        measurement.group_labels
+        for measurement in experiment.system.measurements.values()
+        if isinstance(measurement, GroupedMeasurement)
+    ]
+    return next((each[0] for each in labels if each), None)
+
+
+def labels_of(experiment: Experiment, dataset: Dataset) -> tuple[str, ...]:
+    """Which group each record belongs to.
+
+    Raises:
+        ConfigError: no column tells.
+    """
+    label = label_of(experiment)
+    if label is None or label not in dataset.extra:
+        raise ConfigError(
+            f"found no column {label or 'of groups'} in the records; they have {', '.join(dataset.extra) or 'none'}.",
+            where=experiment.source.where(("validation",)),
+            hint="Name a text column of the data: group_by: NAME.",
+        )
+    return dataset.extra[label]
+
+
+def group_errors(
+    experiment: Experiment,
+    problem: Problem,
+    records: tuple[FactorRecords, ...],
+    dataset: Dataset,
+    split: Split,
+    values: Array,
+    errors_mm: tuple[Array, Array],
+) -> tuple[GroupError, ...]:
+    """Of each group, sorted by name; none if nothing tells groups apart.
+
+    Args:
+        experiment: what was asked.
+        problem: as it was fitted.
+        records: all of them.
+        dataset: the same with their labels.
+        split: which trained.
+        values: of the fit.
+        errors_mm: of each record, nominal and calibrated (N each).
+    """
+    label = label_of(experiment)
+    if label is None or label not in dataset.extra:
+        return ()
+    labels = np.array(dataset.extra[label])
+    before = _distances(problem, settled(untrained(problem), problem.parameters.nominal(), records))
+    # Distances are judged by what the records of each socket say, not by what the known distance made of them.
+    after = _distances(problem, settled(untrained(problem), values, records))
+    result = []
+    for name in sorted(set(labels.tolist())):
+        inside = labels == name
+        nominal, calibrated = (float(np.nanmean(each[inside])) for each in errors_mm)
+        trained = int(np.sum(inside[split.train]))
+        of_nominal, of_calibrated = _within(name, before), _within(name, after)
+        result.append(GroupError(name, int(inside.sum()), trained, nominal, calibrated, of_nominal, of_calibrated))
+    return tuple(result)
+
+
+def _distances(problem: Problem, values: Array) -> list[tuple[tuple[str, str], float]]:
+    return [(tie.groups, float(np.linalg.norm(tie.residual(values))) * _MM) for tie in problem.known_ties]
+
+
+def _within(name: str, distances: list[tuple[tuple[str, str], float]]) -> float | None:
+    own = [error for groups, error in distances if all(name in group.split("/") for group in groups)]
+    return float(np.mean(own)) if own else None

@@ -1,0 +1,77 @@
+"""A factor's whitened Jacobian and residual, a block of records at a time: memory does not grow with the records."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+
+from armcal.base.domains import Array
+from armcal.measure.groups import NO_GROUP
+from armcal.solve.factor import Factor
+from armcal.solve.factor_records import FactorRecords
+from armcal.solve.gather import Slots, evaluated, scattered
+from armcal.solve.kernel import Kernel
+from armcal.solve.whitening import transformed
+
+BLOCK_RECORDS = 1024
+_THREADS = 2
+
+Block = tuple[Array, Array]
+"""Jacobian (n_r x n_v x B) and residual (n_r x B)."""
+
+
+def linearised(kernel: Kernel, slots: Slots, each: FactorRecords, values: Array) -> Iterator[Block]:
+    """Whitened, weighted blocks by the free entries, in order; two at a time in threads."""
+    starts = range(0, each.record.shape[1], BLOCK_RECORDS)
+
+    def work(start: int) -> Block:
+        return _block(kernel, slots, each, values, slice(start, start + BLOCK_RECORDS))
+
+    if len(starts) <= _THREADS or kernel.backend.name != "compiled":
+        yield from map(work, starts)
+        return
+    with ThreadPoolExecutor(_THREADS) as pool:
+        yield from _in_order(pool, work, starts)
+
+
+def mean_shares(factor: Factor, each: FactorRecords) -> list[Array]:
+    """Of each group whose mean weighs more than its records say, what each whitened record adds to a row (width).
+
+    A group of n records whose whitened residuals have the mean m gives n |m|^2; with the row it gives as many times
+    more as the measurement says.
+    """
+    if factor.mean_weight <= 1 or each.group is None:
+        return []
+    beyond, inside = np.sqrt(factor.mean_weight - 1), each.weight > 0
+    shares = []
+    for number in np.unique(each.group[inside]):
+        members = inside & (each.group == number) & (number != NO_GROUP)
+        shares.append(np.where(members, beyond / np.sqrt(max(1, members.sum())), 0.0))
+    return shares
+
+
+def _block(kernel: Kernel, slots: Slots, each: FactorRecords, values: Array, part: slice) -> Block:
+    record, state, weight = each.record[:, part], each.state[:, part], each.weight[part]
+    group = None if each.group is None else each.group[part]
+    n_residual, n_values, width = kernel.factor.residual.numel(), kernel.factor.values.numel(), record.shape[1]
+    jacobian = np.empty((n_residual * n_values, width))
+    residual = np.empty((n_residual, width))
+    evaluated(slots, values, group, kernel.linearise, record, state, residual, jacobian)
+    shaped = scattered(slots, group, jacobian.reshape(n_residual, n_values, width))
+    if each.whitening is not None:
+        whitening = each.whitening[:, :, part] * np.sqrt(weight)
+        return transformed(whitening, shaped), transformed(whitening, residual)
+    scale = np.sqrt(weight) / np.array(kernel.factor.noise)[:, None]
+    shaped *= scale[:, None, :]
+    return shaped, residual * scale
+
+
+def _in_order(pool: ThreadPoolExecutor, work: Callable[[int], Block], starts: Sequence[int]) -> Iterator[Block]:
+    """Results in the order of ``starts``, with only a few blocks alive at a time."""
+    pending = [pool.submit(work, start) for start in starts[: 2 * _THREADS]]
+    for start in [*starts[2 * _THREADS :], *[None] * len(pending)]:
+        yield pending.pop(0).result()
+        if start is not None:
+            pending.append(pool.submit(work, start))

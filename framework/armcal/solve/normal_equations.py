@@ -1,0 +1,107 @@
+"""Normal equations, and the rows that stand beside those of the records: what ties groups, and their means."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from armcal.base.domains import Array
+from armcal.base.parameters import Parameters
+from armcal.base.se3 import Expression
+from armcal.measure.groups import OwnedTie
+
+
+@dataclass(frozen=True)
+class NormalEquations:
+    """Half the squared whitened residuals and their Gauss-Newton model.
+
+    ``gradient`` (n) and ``hessian`` (n x n) are with respect to the free canonical entries.
+    """
+
+    cost: float
+    gradient: Array
+    hessian: Array
+
+    def chained(self, jacobian: Array) -> NormalEquations:
+        """The same with respect to increments, by d entries / d increment."""
+        return NormalEquations(self.cost, jacobian.T @ self.gradient, jacobian.T @ self.hessian @ jacobian)
+
+
+@dataclass(frozen=True)
+class ExtraRows:
+    """Whitened rows that belong to no single record: residual (m) and Jacobian by free entries (m x n)."""
+
+    residual: Array
+    jacobian: Array
+
+    @property
+    def cost(self) -> float:
+        """Half their square."""
+        return 0.5 * float(self.residual @ self.residual)
+
+    def added_to(self, equations: NormalEquations) -> NormalEquations:
+        """The sums with these rows among them."""
+        by_residual, products = self.jacobian.T @ self.residual, self.jacobian.T @ self.jacobian
+        return NormalEquations(
+            equations.cost + self.cost, equations.gradient + by_residual, equations.hessian + products
+        )
+
+
+def stacked(rows: Sequence[ExtraRows], width: int) -> ExtraRows:
+    """Several as one."""
+    residual = np.concatenate([np.zeros(0), *(each.residual for each in rows)])
+    return ExtraRows(residual, np.vstack([np.zeros((0, width)), *(each.jacobian for each in rows)]))
+
+
+@dataclass(frozen=True)
+class TieFunction:
+    """One tie, ready to evaluate.
+
+    Attributes:
+        groups: the keys.
+        entries: positions in a value vector of what it holds together (n).
+        noise: standard deviation of each entry of its residual.
+        function: of those numbers to the residual (m or rad) and its Jacobian.
+    """
+
+    groups: tuple[str, str]
+    entries: NDArray[np.intp]
+    noise: Array
+    function: ca.Function
+
+    @classmethod
+    def of(cls, owned: OwnedTie, parameters: Parameters) -> TieFunction:
+        """Built for the blocks of a problem."""
+        entries: list[int] = []
+        sides: list[dict[str, ca.SX]] = []
+        symbols: list[ca.SX] = []
+        for names in owned.names:
+            side: dict[str, ca.SX] = {}
+            for local, full in names.items():
+                place = parameters.entries_of(full)
+                side[local] = ca.SX.sym(local, place.stop - place.start)
+                symbols.append(side[local])
+                entries += range(place.start, place.stop)
+            sides.append(side)
+        stacked_symbols = ca.vertcat(*symbols)
+        residual = owned.tie.residual(sides[0], sides[1])
+        outputs: list[Expression] = [ca.densify(residual), ca.densify(ca.jacobian(residual, stacked_symbols))]
+        function = ca.Function("tie", [stacked_symbols], outputs)
+        return cls(owned.tie.groups, np.array(entries, dtype=np.intp), np.array(owned.tie.noise), function)
+
+    def residual(self, values: Array) -> Array:
+        """What is left open at a value vector (m or rad)."""
+        return np.asarray(self.function(values[self.entries])[0]).ravel()
+
+    def rows(self, values: Array, places: Mapping[int, int], width: int) -> ExtraRows:
+        """Whitened; ``places`` are those of free entries by position in the value vector."""
+        residual, slope = (np.asarray(each) for each in self.function(values[self.entries]))
+        jacobian = np.zeros((len(self.noise), width))
+        for column, entry in enumerate(self.entries):
+            if entry in places:
+                jacobian[:, places[int(entry)]] += slope[:, column]
+        return ExtraRows(residual.ravel() / self.noise, jacobian / self.noise[:, None])

@@ -1,0 +1,142 @@
+"""A ball on the tool, seated in a socket: it touches what does not move, and measures nothing else. [Franzese2025]"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar, Literal
+
+import casadi as ca
+from armcal.arm.assembly import ArmState
+from armcal.base.parameters import ParameterBlock, scalar
+from armcal.base.settings import Length, Length3, Settings
+from armcal.measure.contact import Contact, named_arm
+from armcal.measure.measurement import Channel, Tie
+from pydantic import Field, field_validator, model_validator
+
+_MEAN_WEIGHT = 1e8
+"""The mean of a socket's postures then lies in the socket to a ten-thousandth of one posture's error."""
+
+
+class KnownDistance(Settings):
+    """The distance of two sockets of the same tool position, and how sure it is (standard deviation)."""
+
+    between: tuple[str, str]
+    distance: Length
+    noise: Length
+
+    @model_validator(mode="after")
+    def _possible(self) -> KnownDistance:
+        if self.distance <= 0 or self.noise <= 0:
+            raise ValueError("found a distance or noise of zero or less, expected both above zero")
+        if self.between[0] == self.between[1]:
+            raise ValueError(f"found {self.between[0]} twice, expected two sockets")
+        return self
+
+
+class BallInSocketSettings(Settings):
+    """How well the ball seats (standard deviation of each coordinate, m), where it sits on the tool, what is known.
+
+    A record's socket is named by its text columns ``group_labels``. Sockets lie anywhere; those in ``sockets`` lie
+    at known places of the base frame, by their key (``front/hole_0``). ``socket: mean`` holds each socket at the
+    mean of its postures, whatever is known of distances. ``sockets_of`` names another measurement of this type whose
+    sockets these are: both arms touch the same ones.
+    """
+
+    noise: Length
+    arm: str | None = None
+    centre: Length3 = (0.0, 0.0, 0.0)
+    group_labels: tuple[str, ...] = ("position", "socket")
+    distances: tuple[KnownDistance, ...] = ()
+    sockets: dict[str, Length3] = Field(default_factory=dict)
+    socket: Literal["fitted", "mean"] = "fitted"
+    sockets_of: str | None = None
+
+    @field_validator("noise")
+    @classmethod
+    def _positive(cls, value: float) -> float:
+        if value <= 0:
+            raise ValueError(f"a noise of {value * 1000:g} mm is not above zero: give how well the ball seats")
+        return value
+
+
+class BallInSocket(Contact):
+    """The measurement ``ball_in_socket``: parameters centre_x, centre_y, centre_z in the tool frame, and each socket's x, y, z."""  # noqa: E501
+
+    Settings: ClassVar[type[BallInSocketSettings]] = BallInSocketSettings
+    EXAMPLE: ClassVar[Mapping[str, Any]] = {
+        "noise_mm": 0.2,
+        "centre_mm": [0, 0, 40],
+        "distances": [{"between": ["hole_0", "hole_1"], "distance_mm": 50, "noise_mm": 0.05}],
+    }
+
+    def __init__(self, settings: BallInSocketSettings, arm_names: Sequence[str]) -> None:
+        self._settings = settings
+        self._arm = named_arm(settings.arm, arm_names)
+        self.group_owner = settings.sockets_of
+        self.mean_weight = _MEAN_WEIGHT if settings.socket == "mean" else 1.0
+
+    @property
+    def arms(self) -> tuple[str, ...]:
+        """The one arm that carries the ball."""
+        return (self._arm,)
+
+    @property
+    def group_labels(self) -> tuple[str, ...]:
+        """What names a socket."""
+        return self._settings.group_labels
+
+    def parameters(self) -> tuple[ParameterBlock, ...]:
+        """The ball's centre on the tool (m)."""
+        return tuple(
+            scalar(f"centre_{axis}", "m", x, 0.01) for axis, x in zip("xyz", self._settings.centre, strict=True)
+        )
+
+    def group_parameters(self, group: str) -> tuple[ParameterBlock, ...]:
+        """A socket's place in the base frame (m); fixed if it is known."""
+        known = self._settings.sockets.get(group)
+        blocks = [scalar(axis, "m", x, 0.01) for axis, x in zip("xyz", known or (0.0, 0.0, 0.0), strict=True)]
+        return tuple(ParameterBlock(b.name, b.unit, b.nominal, b.domain, b.scale, free=known is None) for b in blocks)
+
+    def told(self, arms: Mapping[str, ArmState], values: Mapping[str, Any]) -> dict[str, Any]:
+        """The socket is where the ball is."""
+        place = self._ball(arms, values)
+        return {axis: place[i] for i, axis in enumerate("xyz")}
+
+    def ties(self, groups: Sequence[str]) -> tuple[Tie, ...]:
+        """Known distances, within each tool position."""
+        if self._settings.sockets_of is not None:
+            return ()
+        found = []
+        for known in self._settings.distances:
+            for first in groups:
+                position, slash, socket = first.rpartition("/")
+                second = f"{position}{slash}{known.between[1]}"
+                if socket == known.between[0] and second in groups:
+                    found.append(Tie((first, second), _distance(known.distance), (known.noise,)))
+        return tuple(found)
+
+    def residual(self, arms: Mapping[str, ArmState], measured: Mapping[str, Any], values: Mapping[str, Any]) -> Any:
+        """From the socket to the ball, in the base frame (3x1, m)."""
+        return self._ball(arms, values) - ca.vertcat(*[values[axis] for axis in "xyz"])
+
+    def noise(self) -> tuple[float, ...]:
+        """Of each coordinate (m)."""
+        return (self._settings.noise,) * 3
+
+    def noise_channels(self) -> tuple[tuple[Channel, ...], ...]:
+        """One for all three."""
+        return ((Channel("noise", "length"),),) * 3
+
+    def _ball(self, arms: Mapping[str, ArmState], values: Mapping[str, Any]) -> Any:
+        centre = ca.sparsify(ca.vertcat(*[values[f"centre_{axis}"] for axis in "xyz"]))
+        return arms[self._arm].base_T_tool.apply(centre)
+
+
+def _distance(known: float) -> Any:
+    """What is left of a known distance (m) between two sockets."""
+
+    def residual(first: Mapping[str, Any], second: Mapping[str, Any]) -> Any:
+        apart = ca.vertcat(*[second[axis] - first[axis] for axis in "xyz"])
+        return ca.sqrt(ca.dot(apart, apart)) - known
+
+    return residual

@@ -1,0 +1,95 @@
+"""A tool clamped at points that do not move: known, unknown, or known to each other. [Bergstrom2016]"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any, ClassVar
+
+import casadi as ca
+from armcal.arm.assembly import ArmState
+from armcal.base import se3
+from armcal.base.parameters import ParameterBlock
+from armcal.base.pose_blocks import pose_blocks, pose_transform, quaternion_expression
+from armcal.base.pose_settings import PoseSettings
+from armcal.base.settings import Angle, Length, Settings
+from armcal.measure.contact import Contact, named_arm
+from pydantic import Field, model_validator
+
+
+class ClampedToolSettings(Settings):
+    """How well the clamp holds the tool (standard deviations), and what is known of the points.
+
+    ``points`` are the poses of the clamped tool that are known, in the fixture, by the point's name: a record's text
+    columns ``group_labels`` joined by a slash (``one`` if there are none). A point that is not named here is found.
+    ``fixture`` is the fixture's pose in the base frame. It is held; free its parameters (``NAME.fixture_*``) where
+    the points are known only to each other.
+    """
+
+    noise: Length
+    orientation_noise: Angle
+    arm: str | None = None
+    group_labels: tuple[str, ...] = ("point",)
+    points: dict[str, PoseSettings] = Field(default_factory=dict)
+    fixture: PoseSettings = PoseSettings()
+
+    @model_validator(mode="after")
+    def _sane(self) -> ClampedToolSettings:
+        if self.noise <= 0 or self.orientation_noise <= 0:
+            raise ValueError("found a noise of zero or less, expected how far the clamp gives (standard deviation)")
+        return self
+
+
+class ClampedTool(Contact):
+    """The measurement ``clamped_tool``: parameters fixture_x .. fixture_rotation; of each point point_x .. point_rotation."""  # noqa: E501
+
+    Settings: ClassVar[type[ClampedToolSettings]] = ClampedToolSettings
+    EXAMPLE: ClassVar[Mapping[str, Any]] = {
+        "noise_mm": 0.1,
+        "orientation_noise_mrad": 0.5,
+        "points": {"bench": {"position_mm": [300, 50, 120], "rpy_deg": [180, 0, 30]}},
+    }
+
+    def __init__(self, settings: ClampedToolSettings, arm_names: Sequence[str]) -> None:
+        self._settings = settings
+        self._arm = named_arm(settings.arm, arm_names)
+
+    @property
+    def arms(self) -> tuple[str, ...]:
+        """The one arm that is clamped."""
+        return (self._arm,)
+
+    @property
+    def group_labels(self) -> tuple[str, ...]:
+        """What names a point."""
+        return self._settings.group_labels
+
+    def parameters(self) -> tuple[ParameterBlock, ...]:
+        """The fixture in the base frame (m, unit quaternion)."""
+        return self._settings.fixture.blocks("fixture")
+
+    def group_parameters(self, group: str) -> tuple[ParameterBlock, ...]:
+        """The clamped tool's pose in the fixture (m, unit quaternion)."""
+        known = self._settings.points.get(group)
+        blocks = pose_blocks("point") if known is None else known.blocks("point")
+        return tuple(replace(block, free=known is None) for block in blocks)
+
+    def told(self, arms: Mapping[str, ArmState], values: Mapping[str, Any]) -> dict[str, Any]:
+        """The point is where the tool is."""
+        here = pose_transform("fixture", values).inverse() @ arms[self._arm].base_T_tool
+        place = {f"point_{axis}": here.translation[i] for i, axis in enumerate("xyz")}
+        return {**place, "point_rotation": quaternion_expression(here.rotation)}
+
+    def residual(self, arms: Mapping[str, ArmState], measured: Mapping[str, Any], values: Mapping[str, Any]) -> Any:
+        """From the clamp to the tool, in the clamp's frame: position (3, m) and rotation vector (3, rad)."""
+        base_T_point = pose_transform("fixture", values) @ pose_transform("point", values)
+        error = base_T_point.inverse() @ arms[self._arm].base_T_tool
+        return ca.vertcat(error.translation, se3.rotation_vector(error.rotation))
+
+    def noise(self) -> tuple[float, ...]:
+        """Of the position (m) and of the rotation (rad)."""
+        return (self._settings.noise,) * 3 + (self._settings.orientation_noise,) * 3
+
+    def dimensions(self) -> tuple[str, ...]:
+        """Position, then rotation."""
+        return ("length",) * 3 + ("angle",) * 3

@@ -1,0 +1,1 @@
+"""Arm models from URDF files, and calibrated arms written back into them."""

@@ -1,0 +1,110 @@
+"""Other origins in a URDF, in place: every byte that is not a changed number stays as it was."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+from armcal_urdf.elements import UTF8, Element
+from armcal_urdf.numbers import Three, words_of
+from armcal_urdf.robot import UrdfJoint
+
+_WHITE = b" \t\r\n"
+
+
+@dataclass(frozen=True)
+class Placed:
+    """A joint and where it stands now: xyz (m) and rpy (rad)."""
+
+    joint: UrdfJoint
+    xyz: Three
+    rpy: Three
+
+    @property
+    def changed(self) -> Mapping[str, Three]:
+        """The attributes of which a number changed."""
+        pairs = {"xyz": (self.joint.xyz, self.xyz), "rpy": (self.joint.rpy, self.rpy)}
+        return {name: now for name, (before, now) in pairs.items() if before != now}
+
+
+@dataclass(frozen=True)
+class _Edit:
+    """Bytes from ``start`` to before ``end`` become ``new``."""
+
+    start: int
+    end: int
+    new: bytes
+
+
+@dataclass(frozen=True)
+class _StartTag:
+    """Where a start tag's name ends, where each attribute's value stands, and where the tag ends."""
+
+    name_end: int
+    values: Mapping[str, tuple[int, int]]
+    end: int
+
+
+def with_origins(text: str, placed: Iterable[Placed]) -> str:
+    """The text with other origins of joints; ``placed`` has joints that were read from this very text."""
+    data = text.encode(UTF8)
+    edits = sorted((edit for each in placed for edit in _edits(data, each)), key=lambda edit: edit.start)
+    parts, here = [], 0
+    for edit in edits:
+        parts += [data[here : edit.start], edit.new]
+        here = edit.end
+    return b"".join([*parts, data[here:]]).decode(UTF8)
+
+
+def _edits(data: bytes, placed: Placed) -> list[_Edit]:
+    element, changed = placed.joint.element, placed.changed
+    origin = element.one("origin")
+    if not changed:
+        return []
+    if origin is None:
+        return [_new_origin(data, element, changed)]
+    tag = _start_tag(data, origin.start)
+    edits = []
+    for name, numbers in changed.items():
+        if name in tag.values:
+            edits.append(_Edit(*tag.values[name], _written(numbers, words_of(origin.attributes[name])).encode()))
+        else:
+            edits.append(_Edit(tag.name_end, tag.name_end, f' {name}="{_written(numbers, [])}"'.encode()))
+    return edits
+
+
+def _new_origin(data: bytes, joint: Element, changed: Mapping[str, Three]) -> _Edit:
+    """As the joint's first element, on a line of its own if the next thing in it stands on one."""
+    end = _start_tag(data, joint.start).end
+    inside = data[end:]
+    lead = inside[: len(inside) - len(inside.lstrip(_WHITE))].decode(UTF8)
+    attributes = " ".join(f'{name}="{_written(numbers, [])}"' for name, numbers in changed.items())
+    return _Edit(end, end, f"{lead}<origin {attributes}/>".encode())
+
+
+def _written(numbers: Three, before: list[str]) -> str:
+    """Numbers that read back to the last bit; one that is the same as before keeps its digits."""
+    known = before if len(before) == len(numbers) else ["nan"] * len(numbers)
+    return " ".join(word if float(word) == now else repr(now) for now, word in zip(numbers, known, strict=True))
+
+
+def _start_tag(data: bytes, start: int) -> _StartTag:
+    """Walk through the start tag at an offset of a text that is known to be well-formed."""
+    here = start + 1
+    while data[here] not in b" \t\r\n/>":
+        here += 1
+    name_end = here
+    values: dict[str, tuple[int, int]] = {}
+    while True:
+        while data[here] in _WHITE:
+            here += 1
+        if data[here] in b"/>":
+            return _StartTag(name_end, values, data.index(b">", here) + 1)
+        equals = data.index(b"=", here)
+        name = data[here:equals].strip(_WHITE).decode(UTF8)
+        here = equals + 1
+        while data[here] in _WHITE:
+            here += 1
+        close = data.index(data[here : here + 1], here + 1)
+        values[name] = (here + 1, close)
+        here = close + 1

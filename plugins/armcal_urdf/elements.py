@@ -1,0 +1,126 @@
+"""Strict XML: elements with their lines and places; nothing in a file can name another file or grow.
+
+Document types are refused, and with them every entity but the five of XML itself. Processing instructions and
+comments are passed over.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import NoReturn
+from xml.parsers import expat
+
+from armcal.errors import ConfigError, Location
+
+MAX_DEPTH = 50
+UTF8 = "utf-8"
+
+
+@dataclass(frozen=True)
+class Element:
+    """One element.
+
+    Attributes:
+        tag: its name.
+        attributes: values by name, references expanded.
+        line: of its start tag, from 1.
+        start: offset of its start tag in the text as UTF-8.
+        label: the file's name for people.
+        children: elements in it.
+    """
+
+    tag: str
+    attributes: Mapping[str, str]
+    line: int
+    start: int
+    label: str
+    children: list[Element] = field(default_factory=list)
+
+    def all(self, tag: str) -> Iterator[Element]:
+        """The children of a name."""
+        return (child for child in self.children if child.tag == tag)
+
+    def one(self, tag: str) -> Element | None:
+        """The child of a name; None if there is none.
+
+        Raises:
+            ConfigError: it stands twice.
+        """
+        found = list(self.all(tag))
+        if len(found) > 1:
+            found[1].refuse(f"found <{tag}> twice in one <{self.tag}>.", f"The first is at line {found[0].line}.")
+        return found[0] if found else None
+
+    def text(self, name: str) -> str:
+        """An attribute that has to be there and hold something.
+
+        Raises:
+            ConfigError: it is missing or empty.
+        """
+        value = self.attributes.get(name, "")
+        if not value.strip():
+            found = "an empty" if name in self.attributes else "no"
+            self.refuse(f"found {found} attribute {name!r} in <{self.tag}>.", f'Write <{self.tag} {name}="..."/>.')
+        return value
+
+    def refuse(self, message: str, hint: str) -> NoReturn:
+        """Raise a ConfigError about this element."""
+        raise ConfigError(message, where=Location(self.label or None, self.line), hint=hint)
+
+
+def read_elements(text: str, label: str) -> Element:
+    """The root element of a text.
+
+    Raises:
+        ConfigError: not well-formed, a document type, or nested too deeply; with file and line.
+    """
+    try:
+        data = text.encode(UTF8)
+    except UnicodeEncodeError as fault:
+        line = text.count("\n", 0, fault.start) + 1
+        hint = "Delete it."
+        raise ConfigError("found half a surrogate pair.", where=Location(label or None, line), hint=hint) from fault
+    parser = expat.ParserCreate(UTF8)
+    builder = _Builder(parser, label)
+    try:
+        parser.Parse(data, True)
+    except expat.ExpatError as fault:
+        raise ConfigError(
+            f"this is not well-formed XML: {expat.ErrorString(fault.code)}.",
+            where=Location(label or None, fault.lineno),
+            hint="Check tags, quotes and < > & on this line and the ones before it.",
+        ) from fault
+    return builder.root[0]
+
+
+class _Builder:
+    """Builds elements out of the parser's events."""
+
+    def __init__(self, parser: expat.XMLParserType, label: str) -> None:
+        self.root: list[Element] = []
+        self._parser, self._label = parser, label
+        self._open: list[Element] = []
+        parser.StartElementHandler = self._start
+        parser.EndElementHandler = self._end
+        parser.StartDoctypeDeclHandler = self._doctype
+
+    def _start(self, tag: str, attributes: dict[str, str]) -> None:
+        line, start = self._parser.CurrentLineNumber, self._parser.CurrentByteIndex
+        element = Element(tag, attributes, line, start, self._label)
+        if tag.startswith("xacro:"):
+            element.refuse(f"found <{tag}>: this is xacro, not yet a URDF.", "Run it through xacro first.")
+        if len(self._open) >= MAX_DEPTH:
+            element.refuse(f"elements are nested deeper than {MAX_DEPTH} levels.", "A URDF needs five.")
+        (self._open[-1].children if self._open else self.root).append(element)
+        self._open.append(element)
+
+    def _end(self, tag: str) -> None:
+        self._open.pop()
+
+    def _doctype(self, name: str, *_: object) -> None:
+        raise ConfigError(
+            f"found a document type (<!DOCTYPE {name}>), which could name files and entities.",
+            where=Location(self._label or None, self._parser.CurrentLineNumber),
+            hint="Delete it: a URDF has none.",
+        )
