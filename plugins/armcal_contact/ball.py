@@ -13,8 +13,8 @@ from armcal.measure.contact import Contact, named_arm
 from armcal.measure.measurement import Channel, Tie
 from pydantic import Field, field_validator, model_validator
 
-_MEAN_WEIGHT = 1e8
-"""The mean of a socket's postures then lies in the socket to a ten-thousandth of one posture's error."""
+_MEAN_WEIGHT = 1e6
+"""The mean of a socket's postures then lies in the socket to a thousandth of one posture's error."""
 
 
 class KnownDistance(Settings):

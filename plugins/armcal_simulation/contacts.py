@@ -36,7 +36,7 @@ class ContactsSettings(Settings):
     """
 
     truth: InputPath
-    groups: dict[str, tuple[str, ...]]
+    groups: Annotated[dict[str, tuple[str, ...]], Field(min_length=1)]
     count: Annotated[int, Field(ge=1)]
     within: Angle = 1.0
     travel: Length = 0.1
@@ -61,7 +61,7 @@ class ContactsSimulator:
     Settings: ClassVar[type[ContactsSettings]] = ContactsSettings
     EXAMPLE: ClassVar[Mapping[str, Any]] = {
         "truth": str(EXAMPLE_TRUTH),
-        "groups": {},
+        "groups": {"sockets": ["front/hole_0", "front/hole_1"]},
         "count": 5,
         "within_deg": 60,
         "seed": 1,
@@ -77,7 +77,7 @@ class ContactsSimulator:
             ConfigError: the truth names unknown parameters, a measurement has no groups, or no posture reaches one.
         """
         random = np.random.default_rng(self._settings.seed)
-        channels = [f"{arm.name}.{joint}" for arm in request.arms.values() for joint in arm.joint_names]
+        channels = [f"{arm.name}.{joint}" for arm in request.arms.values() for joint in arm.commanded]
         parts: list[dict[str, Array]] = []
         labels: list[tuple[str, str, str]] = []
         for contact in self._contacts(request):
@@ -131,7 +131,7 @@ class ContactsSimulator:
     def _middle(self, request: SimulationRequest, names: list[str]) -> dict[str, float]:
         around = self._settings.around
         for arm, joints in around.items():
-            known = request.arms[arm].joint_names if arm in request.arms else ()
+            known = tuple(request.arms[arm].commanded) if arm in request.arms else ()
             unknown = sorted(set(joints) - set(known))
             if not known or unknown:
                 raise ConfigError(
@@ -144,14 +144,14 @@ class ContactsSimulator:
         return {
             f"{arm.name}.{joint}": self._settings.within if dimension == "angle" else self._settings.travel
             for arm in request.arms.values()
-            for joint, dimension in zip(arm.joint_names, arm.joint_dimensions, strict=True)
+            for joint, dimension in arm.commanded.items()
         }
 
     def _noise(self, request: SimulationRequest, channel: str, count: int, random: np.random.Generator) -> Array:
         arm, _, joint = channel.partition(".")
         of = request.arms[arm]
         stated = self._settings.joint_noise
-        turns = of.joint_dimensions[of.joint_names.index(joint)] == "angle"
+        turns = of.commanded[joint] == "angle"
         sd = (of.joint_noise if stated is None else stated) if turns else 0.0
         return random.normal(0.0, 1.0, count) * sd
 
@@ -161,7 +161,7 @@ def _alone(
 ) -> Problem:
     """One measurement at the truth."""
     fixed = parameters.with_free(())
-    names = [f"{arm.name}.{joint}" for arm in request.arms.values() for joint in arm.joint_names]
+    names = [f"{arm.name}.{joint}" for arm in request.arms.values() for joint in arm.commanded]
     shape = Dataset(("1",), {name: np.zeros(1) for name in names})
     measurements = {instance: request.measurements[instance]}
     return Problem.build(request.arms, measurements, fixed, request.environment, shape, "interpreted", groups)

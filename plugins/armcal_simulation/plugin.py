@@ -7,6 +7,4 @@ from armcal.hooks import Register, hookimpl
 def armcal_register_simulators(register: Register) -> None:
     """Announce the simulators."""
     register("elastic_arm", "armcal_simulation.simulator:ElasticArmSimulator", "an arm with a stated truth")
-    register(
-        "contacts", "armcal_simulation.contacts:ContactsSimulator", "postures in sockets and clamps"
-    )
+    register("contacts", "armcal_simulation.contacts:ContactsSimulator", "postures in sockets and clamps")

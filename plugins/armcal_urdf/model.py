@@ -157,7 +157,7 @@ class UrdfModel:
 
 
 def _origin(name: str, values: Mapping[str, Any]) -> Transform:
-    """Translation, then Rz(yaw) Ry(pitch) Rx(roll)."""
+    """Translation, then Rz(yaw) Ry(pitch) Rx(roll). [URDF]"""
     shift = se3.translation(*[values[f"{name}_{axis}"] for axis in XYZ])
     roll, pitch, yaw = (values[f"{name}_{angle}"] for angle in RPY)
     turn = se3.rotation_about("z", yaw) @ se3.rotation_about("y", pitch) @ se3.rotation_about("x", roll)

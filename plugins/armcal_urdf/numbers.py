@@ -63,8 +63,10 @@ def unit_axis(element: Element | None) -> Three:
     """The direction of an <axis>, of length one; x where there is none, as the format says.
 
     Raises:
-        ConfigError: not three numbers, or all zero.
+        ConfigError: there are none in it, not three, or all zero.
     """
+    if element is not None:
+        element.text("xyz")
     x, y, z = three(element, "xyz", (1.0, 0.0, 0.0))
     length = math.hypot(x, y, z)
     if element is not None and length < SHORTEST_AXIS:

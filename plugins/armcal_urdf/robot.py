@@ -1,4 +1,4 @@
-"""What a URDF says, checked: links with their masses, and joints that make one tree of them."""
+"""What a URDF says, checked: links with their masses, and joints that make one tree of them. [URDF]"""
 
 from __future__ import annotations
 
@@ -18,6 +18,9 @@ FREE = ("floating", "planar")
 _KINDS = (*MOVING, "fixed", *FREE)
 _IN_JOINT = ("origin", "parent", "child", "axis", "calibration", "dynamics", "limit", "mimic", "safety_controller")
 _IN_LINK = ("inertial", "visual", "collision")
+_ORIGIN = ("xyz", "rpy")
+_MIMIC = ("joint", "multiplier", "offset")
+_LIMIT = ("lower", "upper", "effort", "velocity", "acceleration", "deceleration", "jerk")
 _ALIKE = 0.8
 _ANY = sys.float_info.max
 
@@ -155,7 +158,7 @@ def _link(element: Element) -> UrdfLink:
     mass = number(stated, "value", 0.0)
     if mass < 0:
         stated.refuse(f"found a mass of {mass:g} kg.", "Give the mass, 0 for none.")
-    return UrdfLink(name, mass, three(inertial.one("origin"), "xyz"), element)
+    return UrdfLink(name, mass, three(_only(inertial.one("origin"), _ORIGIN), "xyz"), element)
 
 
 def _joint(element: Element) -> UrdfJoint:
@@ -163,10 +166,7 @@ def _joint(element: Element) -> UrdfJoint:
     _refuse_misspelt(element, _IN_JOINT)
     if kind not in _KINDS:
         element.refuse(f"joint {name!r} has the type {kind!r}.", f"The types are {', '.join(_KINDS)}.")
-    origin = element.one("origin")
-    unknown = sorted(set(origin.attributes) - {"xyz", "rpy"}) if origin else []
-    if origin is not None and unknown:
-        origin.refuse(f"found the attribute {unknown[0]!r} in <origin>.", "Write xyz (m) and rpy (rad).")
+    origin = _only(element.one("origin"), _ORIGIN)
     return UrdfJoint(
         name=name,
         kind=kind,
@@ -174,9 +174,9 @@ def _joint(element: Element) -> UrdfJoint:
         child=_named_link(element, "child", name),
         xyz=three(origin, "xyz"),
         rpy=three(origin, "rpy"),
-        axis=unit_axis(element.one("axis")) if kind in MOVING else (1.0, 0.0, 0.0),
+        axis=unit_axis(_only(element.one("axis"), ("xyz",))) if kind in MOVING else (1.0, 0.0, 0.0),
         limits=_limits(element.one("limit"), name) if kind in ("revolute", "prismatic") else None,
-        mimic=_mimic(element.one("mimic"), name) if kind in MOVING else None,
+        mimic=_mimic(_only(element.one("mimic"), _MIMIC), name) if kind in MOVING else None,
         element=element,
     )
 
@@ -190,7 +190,11 @@ def _named_link(element: Element, which: str, joint: str) -> str:
 
 def _limits(element: Element | None, joint: str) -> tuple[float, float] | None:
     """Where only one end is written the other is 0, as the format says; where neither is, nothing is known."""
-    if element is None or not {"lower", "upper"} & set(element.attributes):
+    if element is None:
+        return None
+    for attribute in element.attributes:
+        _refuse_alike(element, f"the attribute {attribute!r}", attribute, _LIMIT)
+    if not {"lower", "upper"} & set(element.attributes):
         return None
     lower, upper = (number(element, name, 0.0, _ANY) for name in ("lower", "upper"))
     if lower > upper:
@@ -209,12 +213,24 @@ def _mimic(element: Element | None, joint: str) -> Mimic | None:
     return Mimic(master, number(element, "multiplier", 1.0), number(element, "offset", 0.0))
 
 
+def _only(element: Element | None, known: tuple[str, ...]) -> Element | None:
+    """An element without attributes beside the known ones: what it means by others would be passed over."""
+    unknown = sorted(set(element.attributes) - set(known)) if element else []
+    if element is not None and unknown:
+        element.refuse(f"found the attribute {unknown[0]!r} in <{element.tag}>.", f"Write {' and '.join(known)}.")
+    return element
+
+
 def _refuse_misspelt(element: Element, known: tuple[str, ...]) -> None:
     """A misspelt <origin> would be passed over, and the arm be wrong; what is another thing altogether may stay."""
     for child in element.children:
-        near = [] if child.tag in known else difflib.get_close_matches(child.tag.lower(), known, n=1, cutoff=_ALIKE)
-        if near:
-            child.refuse(f"found <{child.tag}> in <{element.tag}>.", f"Did you mean <{near[0]}>?")
+        _refuse_alike(child, f"<{child.tag}>", child.tag, known)
+
+
+def _refuse_alike(element: Element, found: str, name: str, known: tuple[str, ...]) -> None:
+    near = [] if name in known else difflib.get_close_matches(name.lower(), known, n=1, cutoff=_ALIKE)
+    if near:
+        element.refuse(f"found {found}, which nothing reads.", f"Did you mean {near[0]}?")
 
 
 def _require_tree(robot: Robot, top: Element) -> None:

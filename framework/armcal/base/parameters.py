@@ -11,7 +11,7 @@ from functools import cached_property
 
 import numpy as np
 
-from armcal.base.domains import Array, Domain, Interval
+from armcal.base.domains import Array, Domain, Interval, Rotation
 from armcal.errors import ConfigError
 
 _EVERYWHERE = (-math.inf, math.inf)
@@ -35,7 +35,7 @@ class ParameterBlock:
 
     Attributes:
         name: instance, component and local name: ``arm.mdh.theta3``.
-        unit: SI unit of its entries (``m``, ``rad``, ``rad_per_Nm``, ``kg``, ``1``).
+        unit: SI unit of its increments, and so of its prior (``m``, ``rad``, ``rad_per_Nm``, ``kg``, ``1``).
         nominal: canonical entries of the nominal value.
         domain: where it lives.
         scale: the size of a correction one would call ordinary, in ``unit``; conditions the solver and the rank
@@ -60,6 +60,11 @@ class ParameterBlock:
     def entry_names(self) -> tuple[str, ...]:
         """The name of each canonical entry."""
         return tuple(f"{self.name}[{suffix}]" if suffix else self.name for suffix in self.domain.entries)
+
+    @property
+    def entry_unit(self) -> str:
+        """SI unit of its canonical entries: that of its increments, but for a quaternion's."""
+        return "1" if isinstance(self.domain, Rotation) else self.unit
 
     @property
     def size(self) -> int:

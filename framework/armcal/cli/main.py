@@ -19,6 +19,7 @@ COMMANDS = {
     "predict": ("armcal.cli.predict:predict", "Where a calibrated arm goes for commanded joint angles."),
     "export": ("armcal.cli.export:export", "Write a calibrated arm in another program's format, such as URDF."),
     "plan": ("armcal.cli.plan:plan", "Which poses to measure: the best few, and how good any could be."),
+    "convert": ("armcal.cli.convert:convert", "The geometry of an arm in another form: mdh, poe, urdf."),
     "simulate": ("armcal.cli.simulate:simulate", "Make measurements up from a stated truth."),
     "plugins": ("armcal.cli.plugins:plugins", "List plugins, or check one."),
 }

@@ -15,6 +15,7 @@ from armcal.cli.common import Voice
 from armcal.report.group_table import part_of
 from armcal.run.result import RunResult
 from armcal.solve.bootstrap import Bootstrap
+from armcal.solve.estimator import Estimate
 from armcal.solve.validation import ErrorSummary
 
 _SETS = {"train": "training", "holdout": "held out", "cross_validated": "cross-validated"}
@@ -103,9 +104,15 @@ def _compliances(result: RunResult) -> Table:
         digits = _digits(float(sd))
         ends = f"{interval.lower:.{digits}f} to {interval.upper:.{digits}f}"
         span = f"up to {interval.upper:.{digits}f}" if interval.one_sided else ends
-        flag = "at its bound" if name in estimate.at_bound else ("" if estimate.determined[i] else "not determined")
+        flag = "at its bound" if name in estimate.at_bound else _held(estimate, i)
         table.add_row(escape(name), f"{value:.{digits}f}", f"{sd:.{digits}f}", span, flag)
     return table
+
+
+def _held(estimate: Estimate, index: int) -> str:
+    if estimate.told_by_data[index]:
+        return ""
+    return "held by its prior" if estimate.determined[index] else "not determined"
 
 
 def _matrices(result: RunResult) -> Table:

@@ -7,23 +7,42 @@ records set aside or a warning added, or raises `DataError`. ``check_dataset`` r
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from armcal.base.dataset import Dataset
-from armcal.base.units import UNITS, split_suffix, to_unit
+from armcal.base.units import split_suffix, to_unit
 from armcal.errors import DataError, Location
+from armcal.measure.layout import Layout, joints_by_arm, layout_of, set_aside, warned
+from armcal.measure.missing import set_aside_not_finite
 from armcal.measure.reader import WantedChannel
+
+__all__ = [
+    "Layout",
+    "check_dataset",
+    "layout_of",
+    "refuse_approaches",
+    "refuse_conflicting_ids",
+    "refuse_joint_count",
+    "refuse_joint_units",
+    "require_records",
+    "set_aside_backward_time",
+    "set_aside_duplicates",
+    "set_aside_frozen",
+    "set_aside_not_finite",
+    "set_aside_without_noise",
+    "warn_repeated_poses",
+    "warn_small_degrees",
+]
 
 FROZEN_RECORDS = 5
 """So many identical measurements in a row, while the joints moved, and the instrument has stopped."""
 MAX_BACKWARD_FRACTION = 0.01
 """Of the records; more of them out of order in time, and the time itself is not to be trusted."""
 
-_APPROACH = ".approach."
 _DIGITS = "0123456789"
 _FULL_TURN = 2 * math.pi
 _SMALL_DEGREES = (0.5, 6.3)
@@ -31,87 +50,6 @@ _SMALL_DEGREES = (0.5, 6.3)
 _MAX_DEGREES = 720.0
 _VARIES_AT_REST = ("time", "temperature")
 """Channels that may differ between a record and its copy."""
-
-
-@dataclass(frozen=True)
-class Layout:
-    """What the channels of a dataset are, and what they were called in its source.
-
-    Attributes:
-        joints: channels of commanded joint displacements, revolute (angle) and prismatic (length).
-        revolute: those of ``joints`` that turn, but not on and on.
-        approach: channels of approach directions.
-        measured: channels of measured values, ``instance.name``.
-        deviations: channels of their standard deviations.
-        columns: channel to its column in the source, for messages.
-        units: channel to the unit that its column declares; absent or SI means SI.
-        by_line: whether ``Dataset.rows`` are lines of a text file; otherwise they are row numbers.
-    """
-
-    joints: tuple[str, ...] = ()
-    revolute: tuple[str, ...] = ()
-    approach: tuple[str, ...] = ()
-    measured: tuple[str, ...] = ()
-    columns: Mapping[str, str] = field(default_factory=dict)
-    units: Mapping[str, str] = field(default_factory=dict)
-    by_line: bool = False
-    deviations: tuple[str, ...] = ()
-
-    def column(self, channel: str) -> str:
-        """What a channel is called in the source."""
-        return self.columns.get(channel, channel)
-
-    def row(self, dataset: Dataset, index: int) -> int:
-        """Where a record stood in its source, from 1."""
-        return dataset.rows[index] if dataset.rows else index + 1
-
-    def place(self, dataset: Dataset, index: int) -> str:
-        """Where a record stood, in words."""
-        return f"{'line' if self.by_line else 'row'} {self.row(dataset, index)}"
-
-    def where(self, dataset: Dataset, index: int, channel: str | None = None) -> Location:
-        """A record's place, for an error."""
-        at = self.row(dataset, index)
-        column = self.column(channel) if channel else None
-        if self.by_line:
-            return Location(dataset.source or None, line=at, field=column)
-        return Location(dataset.source or None, row=at, field=column)
-
-    def shown(self, channel: str, si_value: float) -> str:
-        """A value in the unit its source declares."""
-        unit = self.units.get(channel, "1")
-        value = to_unit(si_value, unit) if unit in UNITS else si_value
-        return f"{value:.10g}" + ("" if unit == "1" else f" {unit}")
-
-
-def layout_of(
-    wanted: Sequence[WantedChannel],
-    dataset: Dataset,
-    columns: Mapping[str, str],
-    units: Mapping[str, str],
-    *,
-    by_line: bool,
-) -> Layout:
-    """The layout of a dataset that was read for some wanted channels.
-
-    A channel that has an approach (``arm.approach.q1``) is a joint (``arm.q1``); any other channel that belongs
-    to an instance is measured; one that belongs to none (``payload``) describes the surroundings.
-    """
-    approach = [w.channel for w in wanted if _APPROACH in w.channel]
-    moved = {joint.channel for joints in _joints_by_arm(wanted).values() for joint in joints}
-    joints = [w for w in wanted if w.channel in moved and dataset.has(w.channel)]
-    deviations = [w.channel for w in wanted if w.is_deviation]
-    measured = [w.channel for w in wanted if "." in w.channel and w.channel not in {*moved, *approach, *deviations}]
-    return Layout(
-        joints=tuple(w.channel for w in joints),
-        revolute=tuple(w.channel for w in joints if w.dimension == "angle" and not w.is_endless),
-        approach=tuple(name for name in approach if dataset.has(name)),
-        measured=tuple(name for name in measured if dataset.has(name)),
-        columns=columns,
-        units=units,
-        by_line=by_line,
-        deviations=tuple(name for name in deviations if dataset.has(name)),
-    )
 
 
 def check_dataset(dataset: Dataset, layout: Layout) -> Dataset:
@@ -141,7 +79,7 @@ def refuse_joint_count(names: Sequence[str], wanted: Sequence[WantedChannel], wh
     Raises:
         DataError: with both counts; not if no column at all is a joint's, which is a matter of names.
     """
-    for arm, joints in _joints_by_arm(wanted).items():
+    for arm, joints in joints_by_arm(wanted).items():
         own = {name for joint in joints for name in joint.columns}
         prefixes = {name.rstrip(_DIGITS) for name in own if name[-1:].isdigit()} - {""}
         found: dict[str, str] = {}
@@ -162,15 +100,6 @@ def refuse_joint_count(names: Sequence[str], wanted: Sequence[WantedChannel], wh
             )
 
 
-def _joints_by_arm(wanted: Sequence[WantedChannel]) -> dict[str, list[WantedChannel]]:
-    moved = {w.channel.replace(_APPROACH, ".", 1) for w in wanted if _APPROACH in w.channel}
-    arms: dict[str, list[WantedChannel]] = {}
-    for w in wanted:
-        if w.channel in moved:
-            arms.setdefault(w.channel.rpartition(".")[0], []).append(w)
-    return arms
-
-
 def require_records(dataset: Dataset) -> Dataset:
     """The dataset, if it has a record.
 
@@ -188,25 +117,14 @@ def require_records(dataset: Dataset) -> Dataset:
     )
 
 
-def set_aside_not_finite(dataset: Dataset, layout: Layout) -> Dataset:
-    """Set aside records with a value that is missing (NaN) or infinite."""
-    faults: dict[int, list[str]] = {}
-    for channel, values in dataset.channels.items():
-        for index in np.flatnonzero(~np.isfinite(values)):
-            kind = "is empty or NaN" if np.isnan(values[index]) else "is infinite"
-            faults.setdefault(int(index), []).append(f"{layout.column(channel)} {kind}")
-    faulty = {index: ", ".join(reasons) for index, reasons in faults.items()}
-    return _set_aside(dataset, layout, faulty, "a value is missing or not finite", "Measure these again.")
-
-
 def set_aside_without_noise(dataset: Dataset, layout: Layout) -> Dataset:
     """Set aside records that state a standard deviation of zero or less: none could weigh that much."""
     faulty = {
         int(i): f"{layout.column(channel)} is {layout.shown(channel, dataset.column(channel)[i])}, not above zero"
-        for channel in layout.deviations
+        for channel in filter(dataset.has, layout.deviations)
         for i in np.flatnonzero(dataset.column(channel) <= 0)
     }
-    return _set_aside(dataset, layout, faulty, "their noise is not above zero", "State the standard deviation.")
+    return set_aside(dataset, layout, faulty, "their noise is not above zero", "State the standard deviation.")
 
 
 def refuse_approaches(dataset: Dataset, layout: Layout) -> None:
@@ -234,7 +152,7 @@ def refuse_joint_units(dataset: Dataset, layout: Layout) -> None:
         DataError: radians beyond one turn, or degrees that look like whole tenths of a degree.
     """
     for channel in layout.revolute if len(dataset) else ():
-        values, unit, column = dataset.column(channel), layout.units.get(channel, "rad"), layout.column(channel)
+        values, unit, column = _known(dataset, channel), layout.units.get(channel, "rad"), layout.column(channel)
         first = int(np.argmax(np.abs(values)))
         where = layout.where(dataset, first, channel)
         largest = float(np.abs(values[first]))
@@ -260,11 +178,11 @@ def warn_small_degrees(dataset: Dataset, layout: Layout) -> Dataset:
     called = [channel for channel in layout.revolute if layout.units.get(channel) == "deg"]
     if not called or not len(dataset):
         return dataset
-    largest = float(np.abs(to_unit(dataset.stacked(called), "deg")).max())
+    largest = max(float(np.abs(to_unit(_known(dataset, channel), "deg")).max()) for channel in called)
     if not _SMALL_DEGREES[0] < largest <= _SMALL_DEGREES[1]:
         return dataset
     names = f"{layout.column(called[0])} to {layout.column(called[-1])}" if len(called) > 1 else called[0]
-    return _warned(
+    return warned(
         dataset,
         f"no joint angle in {names} is beyond {largest:.3g} deg: are these radians? "
         "If so, end the columns' names in _rad.",
@@ -315,7 +233,7 @@ def set_aside_backward_time(dataset: Dataset, layout: Layout) -> Dataset:
             where=layout.where(dataset, int(wrong[0]), "time"),
             hint="Sort the records by time, or correct the clock.",
         )
-    return _set_aside(dataset, layout, faulty, "the time goes backwards", "Check the clock.")
+    return set_aside(dataset, layout, faulty, "the time goes backwards", "Check the clock.")
 
 
 def set_aside_frozen(dataset: Dataset, layout: Layout) -> Dataset:
@@ -323,14 +241,17 @@ def set_aside_frozen(dataset: Dataset, layout: Layout) -> Dataset:
     faulty: dict[int, str] = {}
     if not layout.joints or len(dataset) < FROZEN_RECORDS:
         return dataset
-    joints = dataset.stacked(layout.joints)
+    joints = np.array([_known(dataset, channel) for channel in layout.joints])
     for instance, channels in _instances(layout.measured).items():
-        for start, stop in _runs(dataset.stacked(channels)):
-            if np.ptp(joints[:, start:stop], axis=1).any():
-                since = layout.place(dataset, start)
+        read = dataset.stacked(channels)
+        made = np.flatnonzero(~np.isnan(read).any(axis=0))
+        for start, stop in _runs(read[:, made]):
+            run = made[start:stop]
+            if np.ptp(joints[:, run], axis=1).any():
+                since = layout.place(dataset, int(run[0]))
                 reason = f"{instance} repeats the values of {since} while the joints moved: it had frozen"
-                faulty.update(dict.fromkeys(range(start + 1, stop), reason))
-    return _set_aside(dataset, layout, faulty, "the instrument had frozen", "Measure these poses again.")
+                faulty.update(dict.fromkeys(run[1:].tolist(), reason))
+    return set_aside(dataset, layout, faulty, "the instrument had frozen", "Measure these poses again.")
 
 
 def set_aside_duplicates(dataset: Dataset, layout: Layout) -> Dataset:
@@ -338,11 +259,12 @@ def set_aside_duplicates(dataset: Dataset, layout: Layout) -> Dataset:
     if not layout.measured:  # poses to predict may repeat
         return dataset
     alike = _first_alike(dataset, [name for name in dataset.channels if name not in _VARIES_AT_REST])
+    reads = ~np.isnan(dataset.stacked(layout.measured)).all(axis=0)  # an arm at rest in a contact is no copy
     faulty = {
         int(i): f"it is an exact duplicate of {layout.place(dataset, int(alike[i]))}"
-        for i in np.flatnonzero(alike != np.arange(len(dataset)))
+        for i in np.flatnonzero(reads & (alike != np.arange(len(dataset))))
     }
-    return _set_aside(dataset, layout, faulty, "they are exact duplicates", "A copy is not another measurement.")
+    return set_aside(dataset, layout, faulty, "they are exact duplicates", "A copy is not another measurement.")
 
 
 def warn_repeated_poses(dataset: Dataset, layout: Layout) -> Dataset:
@@ -355,24 +277,17 @@ def warn_repeated_poses(dataset: Dataset, layout: Layout) -> Dataset:
     if not repeats.size:
         return dataset
     again, before = layout.place(dataset, int(repeats[0])), layout.place(dataset, int(alike[repeats[0]]))
-    return _warned(
+    return warned(
         dataset,
         f"{repeats.size} of {len(dataset)} records repeat a pose (the first: {again} that of {before}): "
         f"there are effectively {len(dataset) - repeats.size} distinct poses. Measure more different ones.",
     )
 
 
-def _set_aside(dataset: Dataset, layout: Layout, faulty: Mapping[int, str], why: str, mend: str) -> Dataset:
-    if not faulty:
-        return dataset
-    first = layout.place(dataset, min(faulty))
-    count = f"{len(faulty)} of {len(dataset)} records {'was' if len(faulty) == 1 else 'were'} set aside"
-    return _warned(dataset.without(faulty), f"{count} because {why} (the first: {first}). {mend}")
-
-
-def _warned(dataset: Dataset, text: str) -> Dataset:
-    place = f"{dataset.source}: " if dataset.source else ""
-    return replace(dataset, warnings=(*dataset.warnings, place + text))
+def _known(dataset: Dataset, channel: str) -> NDArray[np.float64]:
+    """A channel with zeros for what was not recorded."""
+    values = dataset.column(channel)
+    return np.where(np.isnan(values), 0.0, values)
 
 
 def _instances(channels: Sequence[str]) -> dict[str, list[str]]:
@@ -394,6 +309,7 @@ def _runs(values: NDArray[np.float64]) -> list[tuple[int, int]]:
 def _first_alike(dataset: Dataset, channels: Sequence[str]) -> NDArray[np.intp]:
     """For each record the first that agrees with it, to the last bit, in these channels."""
     table = np.ascontiguousarray(dataset.stacked(channels).T) + 0.0  # -0.0 and 0.0 are one value
+    table[np.isnan(table)] = np.nan  # and so are all that are missing
     data, step = table.tobytes(), table.itemsize * table.shape[1]
     first: dict[bytes, int] = {}
     found = (first.setdefault(data[i * step : (i + 1) * step], i) for i in range(len(dataset)))

@@ -36,6 +36,23 @@ class Contact:
         return ()
 
 
+class ArmAlone(Contact):
+    """No instrument at all: it only makes an arm's poses known."""
+
+    def __init__(self, arm: str) -> None:
+        self.arms = (arm,)
+
+    def residual(
+        self, arms: Mapping[str, ArmState], measured: Mapping[str, Expression], values: Mapping[str, Expression]
+    ) -> Expression:
+        """Where the tool is (3x1, m)."""
+        return arms[self.arms[0]].base_T_tool.translation
+
+    def noise(self) -> tuple[float, ...]:
+        """Of no meaning."""
+        return (1.0, 1.0, 1.0)
+
+
 def named_arm(asked: str | None, arm_names: Sequence[str]) -> str:
     """The arm that a configuration names, or the only one.
 

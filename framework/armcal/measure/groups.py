@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from armcal.base.dataset import Dataset
 from armcal.base.parameters import ParameterBlock
-from armcal.errors import DataError, Location
+from armcal.errors import ConfigError, DataError, Location
 from armcal.measure.measurement import GroupedMeasurement, Measurement, Tie
 
 Groups = Mapping[str, tuple[str, ...]]
@@ -44,10 +44,12 @@ def groups_of(dataset: Dataset, measurements: Mapping[str, Measurement]) -> dict
 
     Raises:
         DataError: a label is missing, or unfit for a name.
+        ConfigError: a measurement uses the groups of one that has no such groups.
     """
     found: dict[str, set[str]] = {}
     for instance, measurement in measurements.items():
         if isinstance(measurement, GroupedMeasurement):
+            _check_owner(instance, measurement, measurements)
             keys = {key for key in record_keys(dataset, measurement) if key}
             found.setdefault(owner_of(instance, measurement), set()).update(keys)
     return {owner: tuple(sorted(keys)) for owner, keys in found.items()}
@@ -70,8 +72,10 @@ def record_keys(dataset: Dataset, measurement: GroupedMeasurement) -> tuple[str,
                 hint=f"Add a text column {label}, or map one: columns: {{{label}: NAME}} in the data section.",
             )
         columns.append([cell.strip() for cell in dataset.extra[label]])
+    # A slash would join labels of different groups to the same key.
+    forbidden = _FORBIDDEN | ({"/"} if len(columns) > 1 else set())
     for index, cells in enumerate(zip(*columns, strict=True)):
-        if any(_FORBIDDEN.intersection(cell) for cell in cells):
+        if any(forbidden.intersection(cell) for cell in cells):
             raise DataError(
                 f"found the label {'/'.join(cells)[:60]!r}, which is no name.",
                 where=Location(dataset.source or None, row=dataset.rows[index] if dataset.rows else index + 1),
@@ -81,14 +85,35 @@ def record_keys(dataset: Dataset, measurement: GroupedMeasurement) -> tuple[str,
 
 
 def group_numbers(dataset: Dataset, instance: str, measurement: Measurement, groups: Groups) -> NDArray[np.intp] | None:
-    """Of each record the place of its group (N); -1 where it has none; None if the measurement has no groups."""
+    """Of each record the place of its group (N); -1 where it has none.
+
+    None if the measurement has no groups, or none that the records could belong to: no group is known, or no label.
+    """
     if not isinstance(measurement, GroupedMeasurement):
         return None
     known = groups.get(owner_of(instance, measurement), ())
     if not known or any(label not in dataset.extra for label in measurement.group_labels):
-        return np.full(len(dataset), NO_GROUP, dtype=np.intp)
+        return None
     place = {key: number for number, key in enumerate(known)}
     return np.array([place.get(key, NO_GROUP) for key in record_keys(dataset, measurement)], dtype=np.intp)
+
+
+def refuse_lost(dataset: Dataset, measurements: Mapping[str, Measurement], lost: NDArray[np.bool_]) -> None:
+    """Refuse records that belong to no measurement, for want of a group.
+
+    Raises:
+        DataError: there are some.
+    """
+    if not lost.any():
+        return
+    labels = [n for m in measurements.values() if isinstance(m, GroupedMeasurement) for n in m.group_labels]
+    first, named = int(np.argmax(lost)), ", ".join(dict.fromkeys(labels))
+    raise DataError(
+        f"found {int(lost.sum())} records that no measurement applies to, the first: {dataset.ids[first]}; "
+        f"expected a reading, or labels of a group in {named}.",
+        where=Location(dataset.source or None, row=dataset.rows[first] if dataset.rows else first + 1),
+        hint="Fill in the labels, or leave the record out.",
+    )
 
 
 def group_blocks(measurements: Mapping[str, Measurement], groups: Groups) -> tuple[ParameterBlock, ...]:
@@ -123,6 +148,23 @@ def ties_of(measurements: Mapping[str, Measurement], groups: Groups) -> tuple[Ow
                 first, second = (_names(owner, measurement, key) for key in tie.groups)
                 found.append(OwnedTie((first, second), tie))
     return tuple(found)
+
+
+def _check_owner(instance: str, measurement: GroupedMeasurement, measurements: Mapping[str, Measurement]) -> None:
+    name = owner_of(instance, measurement)
+    owner = measurements.get(name)
+    if not isinstance(owner, GroupedMeasurement) or owner_of(name, owner) != name:
+        others = [n for n, m in measurements.items() if isinstance(m, GroupedMeasurement) and owner_of(n, m) == n]
+        raise ConfigError(
+            f"{instance} uses the groups of {name!r}, which is no measurement with groups of its own.",
+            hint=f"Those are {', '.join(others) or 'none'}.",
+        )
+    mine, theirs = ([b.name for b in each.group_parameters("")] for each in (measurement, owner))
+    if mine != theirs or len(measurement.group_labels) != len(owner.group_labels):
+        raise ConfigError(
+            f"{instance} uses the groups of {name}, which are of another kind.",
+            hint="Share groups between measurements of the same type, with as many group_labels.",
+        )
 
 
 def _names(owner: str, measurement: GroupedMeasurement, key: str) -> dict[str, str]:

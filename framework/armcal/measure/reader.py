@@ -23,6 +23,7 @@ class WantedChannel:
         required: whether a record without it is useless.
         is_deviation: whether it is the standard deviation of a measured number.
         is_endless: whether it is the angle of a joint that may turn on and on.
+        parts: the measurements (instances) that need it; none if the record as a whole does, or nothing does.
     """
 
     channel: str
@@ -31,6 +32,7 @@ class WantedChannel:
     required: bool
     is_deviation: bool = False
     is_endless: bool = False
+    parts: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -73,7 +75,10 @@ def wanted_channels(
 
     ``measured`` says whether measured values are required (a calibration) or may be absent (a prediction).
     """
-    wanted = [channel for arm in arms.values() for channel in _arm_channels(arm, len(arms) == 1)]
+    wanted: list[WantedChannel] = []
+    for arm in arms.values():
+        parts = tuple(name for name, measurement in measurements.items() if arm.name in measurement.arms)
+        wanted += _arm_channels(arm, len(arms) == 1, parts)
     needed = {name for arm in arms.values() for name in arm.conditions} if measured else set()
     wanted += [WantedChannel(name, (name,), dimension, name in needed) for name, dimension in ENVIRONMENT]
     local = [c.name for m in measurements.values() for c in m.channels()]
@@ -81,7 +86,7 @@ def wanted_channels(
         for channel in measurement.channels():
             own = f"{instance}.{channel.name}"
             names = (own, channel.name) if local.count(channel.name) == 1 else (own,)
-            wanted.append(WantedChannel(own, names, channel.dimension, measured))
+            wanted.append(WantedChannel(own, names, channel.dimension, measured, parts=(instance,)))
     return (*wanted, *_deviations(measurements)) if measured else tuple(wanted)
 
 
@@ -96,14 +101,15 @@ def _deviations(measurements: Mapping[str, Measurement]) -> Iterator[WantedChann
         for channel in channels.values():
             own = f"{instance}.{channel.name}"
             names = (own, channel.name) if local.count(channel.name) == 1 else (own,)
-            yield WantedChannel(own, names, channel.dimension, required=False, is_deviation=True)
+            yield WantedChannel(own, names, channel.dimension, False, is_deviation=True, parts=(instance,))
 
 
-def _arm_channels(arm: Arm, alone: bool) -> Iterator[WantedChannel]:
+def _arm_channels(arm: Arm, alone: bool, parts: tuple[str, ...]) -> Iterator[WantedChannel]:
     endless = {joint.name for joint in arm.nominal_chain.joints if joint.endless}
     for index, (joint, dimension) in enumerate(arm.commanded.items(), start=1):
         own = f"{arm.name}.{joint}"
-        yield WantedChannel(own, _names(own, (joint,), alone), dimension, True, is_endless=joint in endless)
+        names = _names(own, (joint,), alone)
+        yield WantedChannel(own, names, dimension, True, is_endless=joint in endless, parts=parts)
         approach = (f"approach{index}", f"approach_{joint}")
         yield WantedChannel(
             f"{arm.name}.approach.{joint}", _names(f"{arm.name}.{approach[0]}", approach, alone), DIMENSIONLESS, False

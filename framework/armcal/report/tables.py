@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -105,7 +105,7 @@ class RawParameter:
 
 @dataclass(frozen=True)
 class ParameterRow:
-    """One free parameter, in words."""
+    """One free parameter, in words; ``held`` where only a prior says what it is, or nothing."""
 
     name: str
     unit: str
@@ -118,6 +118,7 @@ class ParameterRow:
     at_bound: bool
     determined: bool
     raw: RawParameter
+    held: bool = False
 
 
 def parameter_rows(estimate: Estimate) -> tuple[ParameterRow, ...]:
@@ -134,10 +135,11 @@ def parameter_rows(estimate: Estimate) -> tuple[ParameterRow, ...]:
         decimals.append(_decimals(raw[-1]))
     widest = max(decimals, default=0)
     bounds = set(estimate.at_bound)
-    return tuple(
+    rows = (
         _row(names[i], units[i], raw[i], estimate.intervals[i], decimals[i], widest, names[i] in bounds)
         for i in range(len(names))
     )
+    return tuple(replace(row, held=not seen) for row, seen in zip(rows, estimate.told_by_data, strict=True))
 
 
 def _decimals(raw: RawParameter) -> int:

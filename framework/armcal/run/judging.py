@@ -65,7 +65,7 @@ def verdict_of(
         judged[np.isfinite(judged)],
         f"{held} held-out records" if held else "cross-validation",
         run.dataset.ids,
-        suggest(run.problem, training, found, joints) if found.names else (),
+        suggest(run.problem, training, found, joints) if found.names and _reads(run.problem) else (),
         run.fitted,
         intervals.findings(),
         evidence,
@@ -92,6 +92,11 @@ def gather(run: FittedRecords, judged_mm: Array, system: System, limit: float | 
     acting = problem.weighted(run.fitted.records, run.fitted.weights)
     own = (training, motion.subset(train), position[train])
     return Evidence(leftover(problem, acting, found, *own, modelled=effect_types(system)), missed, alone)
+
+
+def _reads(problem: Problem) -> bool:
+    """Whether all measurements read something: in a contact no pose can be chosen that does not touch."""
+    return all(kernel.factor.output_channels for kernel in problem.kernels)
 
 
 def effect_types(system: System) -> frozenset[str]:

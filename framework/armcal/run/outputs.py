@@ -83,7 +83,8 @@ def metrics(result: RunResult) -> dict[str, Any]:
         },
         "parameters": {
             "free": len(estimate.names),
-            "determined": int(sum(estimate.determined)),
+            "determined": int(sum(estimate.told_by_data)),
+            "held_by_priors": [n for n, seen in zip(estimate.names, estimate.told_by_data, strict=True) if not seen],
             "at_bound": list(estimate.at_bound),
             "undetermined": [str(combination) for combination in estimate.identifiability.undetermined],
             "scaled_condition": _finite(estimate.identifiability.condition),

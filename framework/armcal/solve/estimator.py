@@ -115,6 +115,7 @@ class Estimate:
         degrees_of_freedom: residual numbers less determined parameters.
         identifiability: what the data alone determines.
         determined: per free entry, whether data and priors together determine it.
+        told_by_data: per free entry, whether the data alone does; else only a prior holds it, if anything does.
         verdict: the solver's.
     """
 
@@ -128,6 +129,7 @@ class Estimate:
     degrees_of_freedom: int
     identifiability: Identifiability
     determined: tuple[bool, ...]
+    told_by_data: tuple[bool, ...]
     verdict: SolverVerdict
 
     @cached_property
@@ -214,20 +216,29 @@ def estimate(
     gradient = equations.gradient + prior * moved
     step = -(half @ (half.T @ gradient))
     unseen = np.linalg.norm(directions[~seen], axis=0) if len(values) else np.zeros(0)
-    free = list(parameters.free_entries)
     return Estimate(
         parameters=parameters,
         values=solution.values,
         free_entries=parameters.free_entries,
         covariance=chain @ covariance @ chain.T,
-        unconstrained=solution.values[free] + chain @ step,
+        unconstrained=solution.values[list(parameters.free_entries)] + chain @ step,
         square_root_information=_square_root(triangle, prior, influence),
         noise_scale=influence.noise_scale,
         degrees_of_freedom=freedom,
         identifiability=known,
         determined=tuple(bool(x) for x in ~(np.abs(chain) @ unseen > 1e-6)),
+        told_by_data=_told_by_data(chain, scales, known),
         verdict=solution.verdict,
     )
+
+
+def _told_by_data(chain: Array, scales: Array, known: Identifiability) -> tuple[bool, ...]:
+    """Of each entry, whether it takes part in no undetermined combination (by more than 1e-6 of its ordinary size)."""
+    if not len(known.null):
+        return (True,) * len(chain)
+    moves = np.linalg.norm(chain @ (known.null * scales).T, axis=1)
+    ordinary = np.linalg.norm(chain * scales, axis=1)
+    return tuple(bool(x) for x in moves <= 1e-6 * np.where(ordinary > 0, ordinary, 1.0))
 
 
 def _acting(problem: Problem, records: Sequence[FactorRecords], influence: Influence | None) -> Sequence[FactorRecords]:

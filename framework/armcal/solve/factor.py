@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import casadi as ca
 
@@ -22,6 +23,7 @@ from armcal.base import se3
 from armcal.base.parameters import ParameterBlock, Parameters, scalar
 from armcal.base.se3 import Expression
 from armcal.measure.measurement import GroupedMeasurement, Measurement, noise_channels, residual_dimensions
+from armcal.measure.partners import OTHER
 
 Vector3 = tuple[float, float, float]
 _ZERO: Vector3 = (0.0, 0.0, 0.0)
@@ -195,9 +197,10 @@ def build_factor(
     load = _tilted(_load(records, environment), scoped(values, f"{STATICS}."))
     states, deflections = {}, []
     for arm_name in measurement.arms:
-        deflection = ca.SX.sym(f"deflection_{arm_name}", arms[arm_name].deflection_size)
-        deflections.append(deflection)
-        states[arm_name] = _arm_state(arms[arm_name], values, records, load, deflection)
+        arm = arms[arm_name.removesuffix(OTHER)]
+        deflections.append(ca.SX.sym(f"deflection_{arm_name}", arm.deflection_size))
+        which = arm_name.removeprefix(arm.name)
+        states[arm_name] = _arm_state(arm, which, values, records, load, deflections[-1])
     local = {**scoped(values, f"{name}."), **of_group}
     predicted = measurement.outputs(states, local)
     measured = {c.name: records.optional(f"{name}.{c.name}", 0.0) for c in measurement.channels()}
@@ -218,13 +221,20 @@ def build_factor(
         residual=residual,
         outputs=outputs,
         tools=tools,
-        noise=tuple(measurement.noise()),
-        noise_channels=tuple(tuple(f"{name}.{c.name}" for c in own) for own in noise_channels(measurement)),
-        dimensions=residual_dimensions(measurement),
         told=told,
         told_names=told_names,
-        mean_weight=measurement.mean_weight if isinstance(measurement, GroupedMeasurement) else 1.0,
+        **_of_residual(name, measurement),
     )
+
+
+def _of_residual(name: str, measurement: Measurement) -> dict[str, Any]:
+    """What a measurement says of its residual's entries."""
+    return {
+        "noise": tuple(measurement.noise()),
+        "noise_channels": tuple(tuple(f"{name}.{c.name}" for c in own) for own in noise_channels(measurement)),
+        "dimensions": residual_dimensions(measurement),
+        "mean_weight": measurement.mean_weight if isinstance(measurement, GroupedMeasurement) else 1.0,
+    }
 
 
 def _told(
@@ -288,10 +298,11 @@ def _group_expressions(measurement: Measurement) -> tuple[Expression, dict[str, 
 
 
 def _arm_state(
-    arm: Arm, values: Mapping[str, Expression], records: _Records, load: Load, deflection: Expression
+    arm: Arm, which: str, values: Mapping[str, Expression], records: _Records, load: Load, deflection: Expression
 ) -> ArmState:
-    commands = [records.number(f"{arm.name}.{joint}") for joint in arm.commanded]
-    approaches = [records.optional(f"{arm.name}.approach.{joint}", 0.0) for joint in arm.commanded]
+    """An arm in a record, or where ``which`` is ``@other`` in the record's partner."""
+    commands = [records.number(f"{arm.name}.{joint}{which}") for joint in arm.commanded]
+    approaches = [records.optional(f"{arm.name}.approach.{joint}{which}", 0.0) for joint in arm.commanded]
     angles = ca.vertcat(*arm.joint_commands(commands))
     approach = ca.vertcat(*arm.joint_approaches(approaches))
     conditions = {name: records.number(name) for name in arm.conditions if records.has(name)}

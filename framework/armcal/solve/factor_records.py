@@ -50,9 +50,7 @@ class FactorRecords:
 def applicable(factor: Factor, dataset: Dataset, numbers: Indices | None) -> Mask:
     """Which records have what a measurement needs: every channel, and a group where it has groups (N)."""
     mask = ~np.isnan(dataset.stacked(factor.channels)).any(axis=0)
-    if numbers is not None and not (numbers == NO_GROUP).all():
-        mask &= numbers != NO_GROUP
-    return np.asarray(mask)
+    return np.asarray(mask if numbers is None else mask & (numbers != NO_GROUP))
 
 
 def factor_records(
@@ -72,16 +70,19 @@ def factor_records(
     record, lacking = np.take(dataset.stacked(factor.channels), fill, axis=1), ~applies[fill]
     weight = np.zeros(len(fill))
     weight[:count] = 1.0 if weights is None else weights
+    # Any record will do in place of one that is not there.
+    stand_in = fill
     if lacking.any():
-        # Any record will do in place of one that is not there.
-        record[:, lacking] = record[:, [np.argmin(lacking)]] if not lacking.all() else np.nan_to_num(record)
         weight[lacking] = 0.0
+        record = np.nan_to_num(record) if lacking.all() else record
+        stand_in = np.where(lacking, fill[np.argmin(lacking)], fill)
+        record[:, lacking] = record[:, [np.argmin(lacking)]]
     return FactorRecords(
         count,
         record,
         weight,
         np.zeros((factor.state.numel(), len(fill))),
-        _whitening(factor, dataset, fill),
+        None if lacking.any() and lacking.all() else _whitening(factor, dataset, stand_in),
         group=None if numbers is None else numbers[fill],
         applies=np.asarray(~lacking) if lacking.any() else None,
     )

@@ -24,7 +24,7 @@ def with_joint_noise(problem: Problem, records: Sequence[FactorRecords], values:
     stated = {
         f"{arm.name}.{joint}": arm.joint_noise
         for arm in arms
-        for joint, dimension in zip(arm.joint_names, arm.joint_dimensions, strict=True)
+        for joint, dimension in arm.commanded.items()
         if arm.joint_noise and dimension == "angle"
     }
     if not stated:

@@ -164,6 +164,11 @@ class Kernel:
         return self.factor.newton_function()
 
     @cached_property
+    def _by_channels(self) -> dict[tuple[str, ...], _Mapped]:
+        """Slopes by channels, once they were asked for."""
+        return {}
+
+    @cached_property
     def outputs(self) -> ca.Function:
         """What the instrument would read, and where the tools are."""
         return self.factor.output_function()
@@ -178,7 +183,10 @@ class Kernel:
     ) -> None:
         """d residual / d channels (n_r * channels x records) at states in equilibrium."""
         if slopes.size:
-            _Mapped(self.factor.channel_slope_function(tuple(channels)))(values, (record, state), (slopes,))
+            chosen = tuple(channels)
+            if chosen not in self._by_channels:
+                self._by_channels[chosen] = _Mapped(self.factor.channel_slope_function(chosen))
+            self._by_channels[chosen](values, (record, state), (slopes,))
 
     def residuals(self, values: Array, record: Array, state: Array, residual: Array) -> None:
         """Residuals in equilibrium.

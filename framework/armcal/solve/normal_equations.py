@@ -66,12 +66,14 @@ class TieFunction:
         entries: positions in a value vector of what it holds together (n).
         noise: standard deviation of each entry of its residual.
         function: of those numbers to the residual (m or rad) and its Jacobian.
+        bend: of those numbers and a factor for each entry of the residual to the second derivative of their product.
     """
 
     groups: tuple[str, str]
     entries: NDArray[np.intp]
     noise: Array
     function: ca.Function
+    bend: ca.Function
 
     @classmethod
     def of(cls, owned: OwnedTie, parameters: Parameters) -> TieFunction:
@@ -91,7 +93,16 @@ class TieFunction:
         residual = owned.tie.residual(sides[0], sides[1])
         outputs: list[Expression] = [ca.densify(residual), ca.densify(ca.jacobian(residual, stacked_symbols))]
         function = ca.Function("tie", [stacked_symbols], outputs)
-        return cls(owned.tie.groups, np.array(entries, dtype=np.intp), np.array(owned.tie.noise), function)
+        factors = ca.SX.sym("factors", len(owned.tie.noise))
+        second = ca.densify(ca.hessian(ca.dot(factors, residual), stacked_symbols)[0])
+        bend = ca.Function("tie_bend", [stacked_symbols, factors], [second])
+        return cls(owned.tie.groups, np.array(entries, dtype=np.intp), np.array(owned.tie.noise), function, bend)
+
+    @property
+    def sides(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """The positions that belong to each group; every group has the same parameters."""
+        half = len(self.entries) // 2
+        return self.entries[:half], self.entries[half:]
 
     def residual(self, values: Array) -> Array:
         """What is left open at a value vector (m or rad)."""
@@ -100,8 +111,20 @@ class TieFunction:
     def rows(self, values: Array, places: Mapping[int, int], width: int) -> ExtraRows:
         """Whitened; ``places`` are those of free entries by position in the value vector."""
         residual, slope = (np.asarray(each) for each in self.function(values[self.entries]))
+        columns, free = self._free(places)
         jacobian = np.zeros((len(self.noise), width))
-        for column, entry in enumerate(self.entries):
-            if entry in places:
-                jacobian[:, places[int(entry)]] += slope[:, column]
+        jacobian[:, free] = slope[:, columns]
         return ExtraRows(residual.ravel() / self.noise, jacobian / self.noise[:, None])
+
+    def curvature(self, values: Array, places: Mapping[int, int], width: int) -> Array:
+        """What the residual's own curvature adds to the Hessian of half its whitened square (width x width)."""
+        second = np.asarray(self.bend(values[self.entries], self.residual(values) / self.noise**2))
+        columns, free = self._free(places)
+        whole = np.zeros((width, width))
+        whole[np.ix_(free, free)] = second[np.ix_(columns, columns)]
+        return whole
+
+    def _free(self, places: Mapping[int, int]) -> tuple[list[int], list[int]]:
+        """Which of its numbers are free, and their places."""
+        found = [(column, places[entry]) for column, entry in enumerate(self.entries.tolist()) if entry in places]
+        return [column for column, _ in found], [place for _, place in found]

@@ -121,7 +121,9 @@ def _sayings(
         for number in np.unique(group[(group >= 0) & (weight > 0)]):
             members = np.flatnonzero((group == number) & (weight > 0))
             said = np.median(told[factor][:, members], axis=1)
-            one = members[np.argmin(np.abs(told[factor][:, members] - said[:, None]).sum(axis=0))]
+            away = np.abs(told[factor][:, members] - said[:, None]).sum(axis=0)
+            # Of two equally near ones what they say decides: not which stands first.
+            one = members[np.lexsort((*told[factor][:, members], away))[0]]
             key = plan.groups[owner][number]
             found.setdefault((owner, key), (owner, key, factor, told[factor][:, one]))
     return list(found.values())

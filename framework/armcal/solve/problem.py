@@ -15,8 +15,9 @@ from armcal.arm.assembly import Arm
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.base.parameters import Parameters
-from armcal.measure.groups import Groups, group_numbers, groups_of, ties_of
+from armcal.measure.groups import NO_GROUP, Groups, group_numbers, groups_of, refuse_lost, ties_of
 from armcal.measure.measurement import Measurement
+from armcal.measure.partners import with_partners
 from armcal.solve import factor_records, gather
 from armcal.solve.blueprint import Blueprint
 from armcal.solve.factor import Environment
@@ -57,6 +58,7 @@ class Problem:
         groups: Groups | None = None,
     ) -> Problem:
         """Compile for datasets with the channels of this one, and its groups where none are given."""
+        dataset = with_partners(dataset, measurements)
         if groups is None:
             groups = groups_of(dataset, measurements) if parameters.nuisances else {}
         blueprint = Blueprint(arms, measurements, parameters, environment, frozenset(dataset.channels), groups)
@@ -104,21 +106,32 @@ class Problem:
 
     @cached_property
     def ties(self) -> tuple[TieFunction, ...]:
-        """What is known between groups that are free."""
-        free = set(self.parameters.free_entries)
-        return tuple(tie for tie in self.known_ties if free.intersection(tie.entries.tolist()))
+        """What is known between groups that are free, or free and known.
+
+        A group held because no record belongs to it is not known: a tie to where it starts would be made up.
+        """
+        free, could = set(self.parameters.free_entries), set(self.blueprint.parameters.free_entries)
+        sides = [[set(side.tolist()) for side in tie.sides] for tie in self.known_ties]
+        return tuple(
+            tie
+            for tie, both in zip(self.known_ties, sides, strict=True)
+            if any(side & free for side in both) and all(side & free or not side & could for side in both)
+        )
 
     def records(self, dataset: Dataset, weights: Array | None = None) -> tuple[FactorRecords, ...]:
         """A dataset as the kernels read it; ``weights`` (N) multiply each record's squared residual."""
         plan = self.blueprint
+        dataset = with_partners(dataset, plan.measurements)
         factors = [kernel.factor for kernel in self.kernels]
         numbers = [group_numbers(dataset, name, m, plan.groups) for name, m in plan.measurements.items()]
         masks = [factor_records.applicable(f, dataset, n) for f, n in zip(factors, numbers, strict=True)]
-        # A record that is nobody's stays everybody's, so that it is found out.
+        # A record that is nobody's stays with all that read it, so that it is found out.
         nobodys = ~np.any(masks, axis=0)
+        readers = [nobodys if number is None else nobodys & (number != NO_GROUP) for number in numbers]
+        refuse_lost(dataset, plan.measurements, nobodys & ~np.any(readers, axis=0))
         return tuple(
-            factor_records.factor_records(factor, dataset, number, mask | nobodys, weights)
-            for factor, number, mask in zip(factors, numbers, masks, strict=True)
+            factor_records.factor_records(factor, dataset, number, mask | reader, weights)
+            for factor, number, mask, reader in zip(factors, numbers, masks, readers, strict=True)
         )
 
     @staticmethod
@@ -223,7 +236,8 @@ class Problem:
     def exact_hessian(self, values: Array, records: Sequence[FactorRecords]) -> Array:
         """The Hessian of ``cost`` by free canonical entries with the curvature of the residuals (n x n).
 
-        Of records that hang together the Gauss-Newton one: their curvature would couple all of them.
+        Of records that hang together the Gauss-Newton one: their curvature would couple all of them. Nor has it the
+        curvature of groups' means, where these weigh more than their records say.
         """
         if correlation_of(records) is not None:
             return self.normal_equations(values, records).hessian
@@ -238,8 +252,9 @@ class Problem:
                     whitening = declared(kernel.factor.noise) if each.whitening is None else each.whitening[:, :, i]
                     one = kernel.hessian(own, each.record[:, i], each.state[:, i], whitening)
                     total[np.ix_(free[seen], free[seen])] += each.weight[i] * np.asarray(one)[np.ix_(seen, seen)]
-        beside = self._extra(values, records).jacobian
-        return total + beside.T @ beside
+        beside, places = self._extra(values, records).jacobian, self._places
+        bends = sum((tie.curvature(values, places, size) for tie in self.ties), np.zeros((size, size)))
+        return total + beside.T @ beside + bends
 
     def channel_slopes(
         self, values: Array, records: Sequence[FactorRecords], channels: Sequence[str]
@@ -276,10 +291,15 @@ class Problem:
 
     def _extra(self, values: Array, records: Sequence[FactorRecords]) -> ExtraRows:
         """The rows that belong to no single record."""
-        places = {entry: i for i, entry in enumerate(self.parameters.free_entries)}
+        places = self._places
         rows = [tie.rows(values, places, len(places)) for tie in self.ties]
         rows += self._mean_rows(values, records)
         return stacked(rows, len(places))
+
+    @property
+    def _places(self) -> dict[int, int]:
+        """Where each free entry stands among the free ones."""
+        return {entry: i for i, entry in enumerate(self.parameters.free_entries)}
 
     def _mean_rows(self, values: Array, records: Sequence[FactorRecords]) -> Iterator[ExtraRows]:
         for kernel, slots, each in zip(self.kernels, self.slots, records, strict=True):

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import casadi as ca
 import numpy as np
@@ -19,7 +20,6 @@ from armcal.solve.gather import Slots, evaluated
 from armcal.solve.kernel import Kernel
 from armcal.solve.problem import FactorRecords, Problem
 
-_STEP = 1e-6
 _MOST_STEPS = 12
 _AT_ZERO = 1e-6
 """In units of the noise: a residual below this is none."""
@@ -110,34 +110,35 @@ def _as_predicted(factor: Factor, each: FactorRecords, outputs: Array) -> Factor
 def _fitting_joints(kernel: Kernel, slots: Slots, values: Array, each: FactorRecords) -> FactorRecords:
     """Joint angles moved by Gauss-Newton steps of least length until the residual is gone."""
     rows = joint_channels(kernel.factor)
-    moved = each.record.copy()
     if not rows or not each.count:
         return each
+    moved = replace(each, record=each.record.copy(), state=each.state.copy())
     for _ in range(_MOST_STEPS):
-        residual = _residual(kernel, slots, values, replace(each, record=moved))
+        residual = _residual(kernel, slots, values, moved)
         if (_whitened(kernel.factor, residual) < _AT_ZERO * 1e-3).all():
             break
-        slopes = np.stack([_slope(kernel, slots, values, replace(each, record=moved), row) for row in rows], axis=-1)
-        step = np.einsum("nqr,rn->qn", np.linalg.pinv(slopes.transpose(1, 0, 2), rcond=1e-9), residual)
+        inverse = np.linalg.pinv(_slopes(kernel, slots, values, moved).transpose(2, 0, 1), rcond=1e-9)
+        step = np.einsum("nqr,rn->qn", inverse, residual)
         longest = np.abs(step).max(axis=0)
-        moved[list(rows)] -= step * np.minimum(1.0, 0.3 / np.maximum(longest, 1e-300))
-    reached = _whitened(kernel.factor, _residual(kernel, slots, values, replace(each, record=moved))) < _AT_ZERO
-    return replace(each, record=np.where(reached, moved, each.record))
+        moved.record[list(rows)] -= step * np.minimum(1.0, 0.3 / np.maximum(longest, 1e-300))
+    reached = _whitened(kernel.factor, _residual(kernel, slots, values, moved)) < _AT_ZERO
+    return replace(each, record=np.where(reached, moved.record, each.record))
 
 
-def _slope(kernel: Kernel, slots: Slots, values: Array, each: FactorRecords, row: int) -> Array:
-    """d residual / d one joint angle, by central differences (n_r x N)."""
-    sides = []
-    for sign in (1.0, -1.0):
-        aside = each.record.copy()
-        aside[row] += sign * _STEP
-        sides.append(_residual(kernel, slots, values, replace(each, record=aside)))
-    return np.asarray((sides[0] - sides[1]) / (2 * _STEP))
+def _slopes(kernel: Kernel, slots: Slots, values: Array, each: FactorRecords) -> Array:
+    """d residual / d joint angles at states in equilibrium (n_r x joints x N)."""
+    channels = [kernel.factor.channels[row] for row in joint_channels(kernel.factor)]
+    size, width = kernel.factor.residual.numel(), each.record.shape[1]
+    slopes = np.empty((size * len(channels), width))
+    evaluate = partial(kernel.channel_slopes, channels=channels)
+    evaluated(slots, values, each.group, evaluate, each.record, each.state, slopes)
+    return slopes.reshape(size, len(channels), width)
 
 
 def _residual(kernel: Kernel, slots: Slots, values: Array, each: FactorRecords) -> Array:
+    """Raw (n_r x N); the state is left in equilibrium."""
     residual = np.empty((kernel.factor.residual.numel(), each.record.shape[1]))
-    evaluated(slots, values, each.group, kernel.residuals, each.record, each.state.copy(), residual)
+    evaluated(slots, values, each.group, kernel.residuals, each.record, each.state, residual)
     return residual
 
 

@@ -12,7 +12,8 @@ from armcal.base.domains import Array
 from armcal.base.parameters import ParameterBlock, Parameters
 from armcal.base.se3 import Expression
 from armcal.base.units import units_of
-from armcal.measure.measurement import Channel, Measurement
+from armcal.measure.measurement import Channel, GroupedMeasurement, Measurement
+from armcal.measure.partners import OTHER
 from armcal.solve.factor import Factor, build_factor
 from armcal.testing.expressions import (
     check_parameters,
@@ -29,6 +30,7 @@ ARM_NAMES = ((ARM,), ("left", "right"))
 """The arms that a measurement is built for: one, or if it refuses that, two."""
 _RATIO = "1"
 _INSTRUMENT = "instrument"
+_GROUP = "front/hole"
 
 
 def check_measurement(record: Recorder, subject: Subject) -> None:
@@ -48,8 +50,14 @@ def check_measurement(record: Recorder, subject: Subject) -> None:
     record.check("residuals depend on what is given", lambda: _closed(factor))
     measured = [f"{_INSTRUMENT}.{channel.name}" for channel in channels]
     record.check("outputs are channels", lambda: _outputs(factor, measured))
-    record.check("the residual is zero where outputs are measured", lambda: _zero(factor, arms, blocks, measured))
-    record.check("its Jacobian is finite and agrees with differences", lambda: _jacobian(factor, arms, blocks))
+    record.check(
+        "the residual is zero where outputs are measured", lambda: _zero(factor, measurement, arms, blocks, measured)
+    )
+    record.check(
+        "its Jacobian is finite and agrees with differences", lambda: _jacobian(factor, measurement, arms, blocks)
+    )
+    record.check("all groups have the same parameters", lambda: _groups(measurement))
+    record.check("what a record says of its group fits it", lambda: _told(factor, measurement, arms, blocks))
 
 
 def _build(subject: Subject) -> tuple[Measurement, dict[str, Arm]]:
@@ -60,7 +68,7 @@ def _build(subject: Subject) -> tuple[Measurement, dict[str, Arm]]:
         except PLUGIN_FAULTS as fault:
             refused.append(f"{', '.join(names)}: {fault}")
             continue
-        unknown = [name for name in measurement.arms if name not in names]
+        unknown = [name for name in measurement.arms if name.removesuffix(OTHER) not in names]
         expect(
             len(measurement.arms) > 0 and not unknown,
             f"found the arms {tuple(measurement.arms)}, expected some of {names}",
@@ -123,10 +131,42 @@ def _outputs(factor: Factor, measured: Sequence[str]) -> None:
     expect(not unknown, f"found the outputs {', '.join(unknown)}, expected names of channels")
 
 
-def _point(factor: Factor, arms: Mapping[str, Arm], blocks: Sequence[ParameterBlock]) -> tuple[Array, Array]:
+def _group_blocks(measurement: Measurement) -> tuple[ParameterBlock, ...]:
+    """Of one group that is not known beforehand."""
+    return tuple(measurement.group_parameters(_GROUP)) if isinstance(measurement, GroupedMeasurement) else ()
+
+
+def _groups(measurement: Measurement) -> None:
+    """Every group has the same parameters, and ties hold groups that are there."""
+    if not isinstance(measurement, GroupedMeasurement):
+        raise NotRun("its records fall into no groups")
+    shapes = {tuple((b.name, b.domain, b.unit) for b in measurement.group_parameters(key)) for key in ("", _GROUP)}
+    expect(len(shapes) == 1, "found groups with different parameters, expected the same names, domains and units")
+    keys = (_GROUP, f"{_GROUP}_2")
+    strange = [tie.groups for tie in measurement.ties(keys) if not set(tie.groups) <= set(keys)]
+    expect(not strange, f"found a tie of {strange}, expected only groups it was given")
+    expect(measurement.mean_weight >= 1, f"found the mean weight {measurement.mean_weight}, expected at least 1")
+
+
+def _told(factor: Factor, measurement: Measurement, arms: Mapping[str, Arm], blocks: Sequence[ParameterBlock]) -> None:
+    """What a record says of its group fits that record."""
+    own = _group_blocks(measurement)
+    if not factor.told_names or set(factor.told_names) != {block.name for block in own}:
+        raise NotRun("a record alone does not say all of its group's parameters")
+    values, record = _point(factor, measurement, arms, blocks)
+    said = np.asarray(_function(factor, factor.told)(np.concatenate([values, record]))).ravel()
+    values[len(values) - len(said) :] = said
+    found = np.asarray(_function(factor, factor.residual)(np.concatenate([values, record]))).ravel()
+    worst = float(np.abs(found).max())
+    expect(worst <= 1e-9, f"found a residual of {worst:.1e} with what the record itself says, expected zero")
+
+
+def _point(
+    factor: Factor, measurement: Measurement, arms: Mapping[str, Arm], blocks: Sequence[ParameterBlock]
+) -> tuple[Array, Array]:
     """Values, and a record with random joint angles whose measured channels say what would be read."""
     random = np.random.default_rng(1)
-    values = near_nominal(_parameters(arms, blocks).blocks, random)
+    values = near_nominal((*_parameters(arms, blocks).blocks, *_group_blocks(measurement)), random)
     record = random.uniform(-1, 1, factor.record.numel())
     shown = np.asarray(_function(factor, factor.outputs)(np.concatenate([values, record]))).ravel()
     read = dict(zip(factor.output_channels, shown, strict=True))
@@ -137,19 +177,30 @@ def _function(factor: Factor, expression: Expression) -> ca.Function:
     return ca.Function("shown", [stacked([factor.values, factor.record])], [stacked([expression])])
 
 
-def _zero(factor: Factor, arms: Mapping[str, Arm], blocks: Sequence[ParameterBlock], measured: Sequence[str]) -> None:
+def _zero(
+    factor: Factor,
+    measurement: Measurement,
+    arms: Mapping[str, Arm],
+    blocks: Sequence[ParameterBlock],
+    measured: Sequence[str],
+) -> None:
     if not factor.output_channels:
         raise NotRun("it reads nothing")
     if set(factor.output_channels) != set(measured):
         raise NotRun("it has channels without an output")
-    found = np.asarray(_function(factor, factor.residual)(np.concatenate(_point(factor, arms, blocks)))).ravel()
+    found = np.asarray(
+        _function(factor, factor.residual)(np.concatenate(_point(factor, measurement, arms, blocks)))
+    ).ravel()
     worst = float(np.abs(found).max())
     expect(worst <= 1e-9, f"found a residual of {worst:.1e}, expected zero")
 
 
-def _jacobian(factor: Factor, arms: Mapping[str, Arm], blocks: Sequence[ParameterBlock]) -> None:
-    values, record = _point(factor, arms, blocks)
+def _jacobian(
+    factor: Factor, measurement: Measurement, arms: Mapping[str, Arm], blocks: Sequence[ParameterBlock]
+) -> None:
+    values, record = _point(factor, measurement, arms, blocks)
     disturbed = record + 0.01 * np.random.default_rng(2).uniform(-1, 1, len(record))
     at = np.concatenate([values, disturbed])
-    names = (*_parameters(arms, blocks).entry_names, *factor.channels)
+    of_group = [name for block in _group_blocks(measurement) for name in block.entry_names]
+    names = (*_parameters(arms, blocks).entry_names, *of_group, *factor.channels)
     expect_derivatives(_function(factor, factor.residual), at, "the residual", names)

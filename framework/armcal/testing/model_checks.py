@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
-from armcal.arm.assembly import Arm, MassSpec
+from armcal.arm.assembly import Arm, MassiveModel, MassSpec
 from armcal.arm.model import ArmModel, Chain, Joint, forward
-from armcal.arm.statics import MOUNT_FRAME, TOOL_FRAME
+from armcal.arm.statics import MOUNT_FRAME, TOOL_FRAME, frame_names
 from armcal.base.domains import Array
 from armcal.base.parameters import ParameterBlock
 from armcal.base.se3 import Expression, Transform
@@ -62,6 +62,8 @@ def check_model(record: Recorder, subject: Subject) -> None:
     chain = record.check("its chain has one joint for each name", lambda: _chain(model.chain(values), names))
     if chain is None:
         return
+    if isinstance(model, MassiveModel):
+        record.check("its masses stand in its frames", lambda: _masses(model, chain))
     parts = stacked(_parts(chain))
     record.check("the chain depends on its parameters alone", lambda: expect_only(parts, list(values.values())))
     record.check(
@@ -97,6 +99,16 @@ def _chain(chain: Chain, names: Sequence[str]) -> Chain:
     taken = sorted({MOUNT_FRAME, TOOL_FRAME} & set(chain.frames))
     expect(not taken, f"found a frame called {', '.join(taken)}, which armcal uses itself")
     return chain
+
+
+def _masses(model: MassiveModel, chain: Chain) -> None:
+    frames, masses = frame_names(chain), tuple(model.masses())
+    for mass in masses:
+        expect("." not in mass.name, f"found the mass {mass.name!r}, expected a name without a dot")
+        expect(mass.mass >= 0, f"the mass {mass.name} is {mass.mass} kg, expected 0 or more")
+        expect(mass.frame in frames, f"the mass {mass.name} is in {mass.frame!r}, expected one of {', '.join(frames)}")
+    names = [mass.name for mass in masses]
+    expect(len(set(names)) == len(names), f"found {', '.join(names)}, expected every name once")
 
 
 def _axis(joint: Joint) -> None:

@@ -23,6 +23,7 @@ from armcal.config.system import System, build_system
 from armcal.config.validate import validate
 from armcal.config.yaml_source import load_config
 from armcal.errors import ConfigError, DataError, Location
+from armcal.measure.contact import ArmAlone
 from armcal.plugins import PluginRegistry, discover
 from armcal.solve.coverage import Recording
 from armcal.solve.estimator import Estimate
@@ -35,7 +36,10 @@ _LINE_END = re.compile("[\n\r\x85\u2028\u2029]")
 
 
 class ParameterRecord(Settings):
-    """One canonical entry as it is kept; ``sd``, ``lower`` and ``upper`` are null where they are not known."""
+    """One canonical entry as it is kept; ``sd``, ``lower`` and ``upper`` are null where they are not known.
+
+    ``determined`` is by the records alone; what they do not determine may be held by a prior, and is no finding.
+    """
 
     name: str
     unit: str
@@ -46,6 +50,7 @@ class ParameterRecord(Settings):
     lower: float | None = None
     upper: float | None = None
     determined: bool | None = None
+    held_by_prior: bool = False
     at_bound: bool = False
 
 
@@ -226,8 +231,7 @@ class Calibration:
             raise ValueError(f"found {angles.shape[1]} joint angles a row, the arm {name} has {len(joints)} joints")
         channels = {f"{name}.{joint}": angles[:, i] for i, joint in enumerate(joints)}
         commands = Dataset(tuple(str(i) for i in range(len(angles))), channels)
-        measured = next(n for n, m in self.system.measurements.items() if m.arms == (name,))
-        alone = replace(self.system, measurements={measured: self.system.measurements[measured]})
+        alone = replace(self.system, measurements={"pose": ArmAlone(name)})
         poses = replace(self, system=alone).predict(commands)[1]
         return np.asarray(poses[0])
 
@@ -240,7 +244,7 @@ def identity_of(description: Mapping[str, Any]) -> str:
 def parameter_records(estimate: Estimate) -> tuple[ParameterRecord, ...]:
     """Every canonical entry of an estimate."""
     parameters, nominal = estimate.parameters, estimate.parameters.nominal()
-    units = [block.unit for block in parameters.blocks for _ in block.entry_names]
+    units = [block.entry_unit for block in parameters.blocks for _ in block.entry_names]
     place = {name: i for i, name in enumerate(estimate.names)}
     records = []
     for position, name in enumerate(parameters.entry_names):
@@ -283,7 +287,8 @@ def _uncertainty(estimate: Estimate, index: int) -> dict[str, Any]:
         "sd": _finite(estimate.deviations[index]),
         "lower": _finite(interval.lower),
         "upper": _finite(interval.upper),
-        "determined": estimate.determined[index],
+        "determined": estimate.told_by_data[index],
+        "held_by_prior": estimate.determined[index] and not estimate.told_by_data[index],
     }
 
 

@@ -1,0 +1,126 @@
+"""What the channels of a dataset are, and what they were called in its source."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+from armcal.base.dataset import Dataset
+from armcal.base.units import UNITS, to_unit
+from armcal.errors import Location
+from armcal.measure.reader import WantedChannel
+
+_APPROACH = ".approach."
+
+
+@dataclass(frozen=True)
+class Layout:
+    """What the channels of a dataset are, and what they were called in its source.
+
+    Attributes:
+        joints: channels of commanded joint displacements, revolute (angle) and prismatic (length).
+        revolute: those of ``joints`` that turn, but not on and on.
+        approach: channels of approach directions.
+        measured: channels of measured values, ``instance.name``.
+        deviations: channels of their standard deviations.
+        columns: channel to its column in the source, for messages.
+        units: channel to the unit that its column declares; absent or SI means SI.
+        by_line: whether ``Dataset.rows`` are lines of a text file; otherwise they are row numbers.
+        by_id: whether a record's id says where it stood, better than its row does.
+        parts: channel to the measurements that need it; one that is absent belongs to the record as a whole.
+    """
+
+    joints: tuple[str, ...] = ()
+    revolute: tuple[str, ...] = ()
+    approach: tuple[str, ...] = ()
+    measured: tuple[str, ...] = ()
+    columns: Mapping[str, str] = field(default_factory=dict)
+    units: Mapping[str, str] = field(default_factory=dict)
+    by_line: bool = False
+    deviations: tuple[str, ...] = ()
+    by_id: bool = False
+    parts: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+
+    def column(self, channel: str) -> str:
+        """What a channel is called in the source."""
+        return self.columns.get(channel, channel)
+
+    def row(self, dataset: Dataset, index: int) -> int:
+        """Where a record stood in its source, from 1."""
+        return dataset.rows[index] if dataset.rows else index + 1
+
+    def place(self, dataset: Dataset, index: int) -> str:
+        """Where a record stood, in words."""
+        if self.by_id:
+            return dataset.ids[index]
+        return f"{'line' if self.by_line else 'row'} {self.row(dataset, index)}"
+
+    def where(self, dataset: Dataset, index: int, channel: str | None = None) -> Location:
+        """A record's place, for an error."""
+        at = self.row(dataset, index)
+        column = self.column(channel) if channel else None
+        if self.by_line:
+            return Location(dataset.source or None, line=at, field=column)
+        return Location(dataset.source or None, row=at, field=column)
+
+    def shown(self, channel: str, si_value: float) -> str:
+        """A value in the unit its source declares."""
+        unit = self.units.get(channel, "1")
+        value = to_unit(si_value, unit) if unit in UNITS else si_value
+        return f"{value:.10g}" + ("" if unit == "1" else f" {unit}")
+
+
+def layout_of(
+    wanted: Sequence[WantedChannel],
+    dataset: Dataset,
+    columns: Mapping[str, str],
+    units: Mapping[str, str],
+    *,
+    by_line: bool,
+) -> Layout:
+    """The layout of a dataset that was read for some wanted channels.
+
+    A channel that has an approach (``arm.approach.q1``) is a joint (``arm.q1``); any other channel that belongs
+    to an instance is measured; one that belongs to none (``payload``) describes the surroundings.
+    """
+    approach = [w.channel for w in wanted if _APPROACH in w.channel]
+    moved = {joint.channel for joints in joints_by_arm(wanted).values() for joint in joints}
+    joints = [w for w in wanted if w.channel in moved and dataset.has(w.channel)]
+    deviations = [w.channel for w in wanted if w.is_deviation]
+    measured = [w.channel for w in wanted if "." in w.channel and w.channel not in {*moved, *approach, *deviations}]
+    return Layout(
+        joints=tuple(w.channel for w in joints),
+        revolute=tuple(w.channel for w in joints if w.dimension == "angle" and not w.is_endless),
+        approach=tuple(name for name in approach if dataset.has(name)),
+        measured=tuple(name for name in measured if dataset.has(name)),
+        columns=columns,
+        units=units,
+        by_line=by_line,
+        deviations=tuple(name for name in deviations if dataset.has(name)),
+        parts={w.channel: w.parts for w in wanted if w.parts and dataset.has(w.channel)},
+    )
+
+
+def joints_by_arm(wanted: Sequence[WantedChannel]) -> dict[str, list[WantedChannel]]:
+    """The channels of each arm's joints: those that have an approach."""
+    moved = {w.channel.replace(_APPROACH, ".", 1) for w in wanted if _APPROACH in w.channel}
+    arms: dict[str, list[WantedChannel]] = {}
+    for w in wanted:
+        if w.channel in moved:
+            arms.setdefault(w.channel.rpartition(".")[0], []).append(w)
+    return arms
+
+
+def set_aside(dataset: Dataset, layout: Layout, faulty: Mapping[int, str], why: str, mend: str) -> Dataset:
+    """The dataset without some records (index to reason), and with a warning that says so."""
+    if not faulty:
+        return dataset
+    first = layout.place(dataset, min(faulty))
+    count = f"{len(faulty)} of {len(dataset)} records {'was' if len(faulty) == 1 else 'were'} set aside"
+    return warned(dataset.without(faulty), f"{count} because {why} (the first: {first}). {mend}")
+
+
+def warned(dataset: Dataset, text: str) -> Dataset:
+    """The dataset with one more warning."""
+    place = f"{dataset.source}: " if dataset.source else ""
+    return replace(dataset, warnings=(*dataset.warnings, place + text))

@@ -1,0 +1,105 @@
+"""Values that are missing: which of them cost a record, and which only one of its measurements."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armcal.base.dataset import Dataset
+from armcal.base.domains import Array
+from armcal.measure.layout import Layout, set_aside, warned
+from armcal.measure.reader import WantedChannel
+
+Mask = NDArray[np.bool_]
+
+
+def set_aside_not_finite(dataset: Dataset, layout: Layout) -> Dataset:
+    """Set aside records with an infinite value, and those from which nothing can be had.
+
+    A missing value (NaN) in a channel that no measurement owns costs the record. One in a channel of measurements
+    (``Layout.parts``) costs it only if no measurement has all it needs; else those that lack something are left out
+    of this record, with a warning where they have a part of their own values.
+    """
+    if all(np.isfinite(values).all() for values in dataset.channels.values()):
+        return dataset
+    complete = _complete(dataset, layout)
+    lost = np.zeros(len(dataset), dtype=bool)
+    if complete:
+        lost |= ~np.any(list(complete.values()), axis=0)
+    for channel, values in dataset.channels.items():
+        lost |= np.isinf(values) if layout.parts.get(channel) else ~np.isfinite(values)
+    faulty = {int(index): _reason(dataset, layout, int(index)) for index in np.flatnonzero(lost)}
+    kept = set_aside(dataset, layout, faulty, "a value is missing or not finite", "Measure these again.")
+    return _without_incomplete(kept, layout, {part: mask[~lost] for part, mask in complete.items()})
+
+
+def _complete(dataset: Dataset, layout: Layout) -> dict[str, Mask]:
+    """Of each measurement whether a record has all it needs (N)."""
+    found: dict[str, Mask] = {}
+    for channel, parts in layout.parts.items():
+        known = np.isfinite(dataset.column(channel))
+        for part in parts:
+            found[part] = found[part] & known if part in found else known
+    return found
+
+
+def _reason(dataset: Dataset, layout: Layout, index: int) -> str:
+    """Everything that a record lacks."""
+    found = []
+    for channel, values in dataset.channels.items():
+        if not np.isfinite(values[index]):
+            kind = "is empty or NaN" if np.isnan(values[index]) else "is infinite"
+            found.append(f"{layout.column(channel)} {kind}")
+    return ", ".join(found)
+
+
+def _without_incomplete(dataset: Dataset, layout: Layout, complete: Mapping[str, Mask]) -> Dataset:
+    """Measurements that lack something are made to lack all they read; standard deviations stay numbers."""
+    channels = dict(dataset.channels)
+    for part, whole in complete.items():
+        own = [name for name in layout.measured if name.rpartition(".")[0] == part]
+        if whole.all():
+            continue
+        partly = ~whole & np.any([np.isfinite(channels[name]) for name in own], axis=0) if own else whole & False
+        if partly.any():
+            first = layout.place(dataset, int(np.argmax(partly)))
+            text = f"{part} is left out of {int(partly.sum())} of {len(dataset)} records, which have only a part of "
+            dataset = warned(dataset, f"{text}what it needs (the first: {first}). Fill in the rest, or leave out all.")
+        for name in own:
+            channels[name] = np.where(whole, channels[name], np.nan)
+    dataset = replace(dataset, channels=channels)
+    for channel in layout.deviations:
+        dataset = _with_deviations(dataset, layout, channel)
+    return dataset
+
+
+def _with_deviations(dataset: Dataset, layout: Layout, channel: str) -> Dataset:
+    """Where a standard deviation is missing the largest one stands; a channel without any is dropped.
+
+    It counts only for contacts, which read nothing that could say whether they were made.
+    """
+    values = dataset.column(channel)
+    missing = np.isnan(values)
+    if not missing.any():
+        return dataset
+    others = {name: numbers for name, numbers in dataset.channels.items() if name != channel}
+    if missing.all():
+        return replace(dataset, channels=others)
+    largest = float(values[~missing].max())
+    filled: Array = np.where(missing, largest, values)
+    found = replace(dataset, channels={name: others.get(name, filled) for name in dataset.channels})
+    part = channel.rpartition(".")[0]
+    if any(name.rpartition(".")[0] == part for name in layout.measured):
+        return found
+    text = f"{layout.column(channel)} is empty in {int(missing.sum())} of {len(dataset)} records: if {part} was made "
+    return warned(found, f"{text}there, the largest one stated counts ({layout.shown(channel, largest)}).")
+
+
+def with_absent(dataset: Dataset, wanted: Sequence[WantedChannel]) -> Dataset:
+    """The dataset with every required channel: those that its source cannot have are missing in all records."""
+    absent = [w.channel for w in wanted if w.required and not dataset.has(w.channel)]
+    none = np.full(len(dataset), np.nan)
+    return replace(dataset, channels={**dataset.channels, **dict.fromkeys(absent, none)}) if absent else dataset

@@ -1,0 +1,181 @@
+"""An arm as numbers: every joint's frame and axis at zero angles, whatever model it came from."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+from armcal.arm.model import ArmModel, Chain, Joint, Mimic, forward
+from armcal.base.domains import Array
+from armcal.base.se3 import Expression, Transform
+from armcal.errors import ProblemError
+
+NEGLIGIBLE = 1e-12
+"""m/rad, rad/m or 1: what rounding leaves of a pitch, of a turn, and of a difference of scale."""
+FREE_ANGLE, FREE_TRAVEL = math.pi, 0.5
+_WIDEST = 4 * math.pi
+
+
+@dataclass(frozen=True)
+class RigidJoint:
+    """One joint at zero angles.
+
+    Attributes:
+        name: the joint's name.
+        base_T_joint: its frame (4x4).
+        axis: about or along which it moves (unit, in its frame).
+        slides: whether it slides.
+        pitch: how far it slides as it turns (m/rad); of a joint that slides, how far it turns (rad/m).
+        scale: how far it moves for a command of one.
+        limits: of its command (rad or m), if known.
+        endless: whether it turns on and on.
+        mimic: the joint that it follows.
+    """
+
+    name: str
+    base_T_joint: Array
+    axis: Array
+    slides: bool
+    pitch: float = 0.0
+    scale: float = 1.0
+    limits: tuple[float, float] | None = None
+    endless: bool = False
+    mimic: Mimic | None = None
+
+    @property
+    def direction(self) -> Array:
+        """The axis in the base frame."""
+        return np.asarray(self.base_T_joint[:3, :3] @ self.axis)
+
+    @property
+    def point(self) -> Array:
+        """The frame's origin in the base frame (m): a point of the axis."""
+        return np.asarray(self.base_T_joint[:3, 3])
+
+
+@dataclass(frozen=True)
+class RigidChain:
+    """A chain at zero angles: joints from the base to the tip, the mount and the tool (4x4 each)."""
+
+    joints: tuple[RigidJoint, ...]
+    base_T_mount: Array
+    base_T_tool: Array
+
+
+def numeric_chain(model: ArmModel, values: Mapping[str, Array]) -> Chain:
+    """A model's chain for values under local names; all its expressions are constants."""
+    return model.chain({name: ca.SX(ca.DM(value)) for name, value in values.items()})
+
+
+def rigid_chain(chain: Chain) -> RigidChain:
+    """A chain of constants as numbers at zero commands, offsets taken into the frames."""
+    here = _pose(chain.base_T_mount)
+    joints = []
+    for joint in chain.joints:
+        here = here @ _pose(joint.parent_T_joint) @ _pose(joint.motion(joint.offset))
+        joints.append(_rigid(joint, here))
+    if chain.tool.joint != len(chain.joints):
+        raise ProblemError(
+            f"the tool hangs on joint {chain.tool.joint} of {len(chain.joints)}.",
+            hint="Only chains whose last joint moves the tool are converted.",
+        )
+    return RigidChain(tuple(joints), _pose(chain.base_T_mount), here @ _pose(chain.tool.joint_T_frame))
+
+
+def require_plain_axes(chain: RigidChain, target: str) -> None:
+    """Raise ProblemError for the first joint with a pitch, or with a scale other than one."""
+    for number, joint in enumerate(chain.joints, start=1):
+        bent, stretched = abs(joint.pitch) > NEGLIGIBLE, abs(joint.scale - 1) > NEGLIGIBLE
+        if not (bent or stretched):
+            continue
+        unit = "rad/m" if joint.slides else "m/rad"
+        pitch = f"pitch {joint.pitch:.6g} {unit}" if bent else "no pitch"
+        raise ProblemError(
+            f"joint {number} ({joint.name}) has {pitch} and scale {joint.scale:.9g}; {target} has joints without pitch "
+            "and of scale 1.",
+            hint="Calibrate with parametrisation: minimal, which keeps axes axes.",
+        )
+
+
+def require_independent(chain: RigidChain, target: str) -> None:
+    """Raise ProblemError for the first joint that follows another."""
+    for joint in chain.joints:
+        if joint.mimic is not None:
+            raise ProblemError(
+                f"joint {joint.name} follows {joint.mimic.master}; {target} has no joints that follow others.",
+                hint="Convert to urdf, or take a part of the chain that ends before it.",
+            )
+
+
+def random_commands(chain: RigidChain, count: int, seed: int) -> Array:
+    """Commands (count x joints): within limits where they are known, else half a turn or 0.5 m either way."""
+    random = np.random.default_rng(seed)
+    ends = [joint.limits or _free(joint) for joint in chain.joints]
+    lower, upper = np.clip(np.array(ends, dtype=float), -_WIDEST, _WIDEST).T
+    return np.asarray(random.uniform(lower, upper, (count, len(chain.joints))))
+
+
+def tool_poses(chain: Chain, commands: Array) -> Array:
+    """base_T_tool (N x 4 x 4) of a chain of constants at commands (N x joints), without effects."""
+    symbols = ca.SX.sym("command", len(chain.joints))
+    moved = [joint.offset + symbols[i] for i, joint in enumerate(chain.joints)]
+    shown = ca.densify(forward(chain, moved, {}).base_T_tool.matrix())
+    function = ca.Function("tool", [symbols], [ca.vec(shown.T)], {"cse": True})
+    return np.asarray(function.map(len(commands))(commands.T).full()).T.reshape(-1, 4, 4)
+
+
+def largest_difference(one: Array, two: Array) -> tuple[float, float]:
+    """The largest distance (m) and the largest angle (rad) between poses (N x 4 x 4), pose by pose."""
+    apart = float(np.linalg.norm(one[:, :3, 3] - two[:, :3, 3], axis=1).max())
+    turn = one[:, :3, :3].transpose(0, 2, 1) @ two[:, :3, :3]
+    vee = np.stack([turn[:, 2, 1] - turn[:, 1, 2], turn[:, 0, 2] - turn[:, 2, 0], turn[:, 1, 0] - turn[:, 0, 1]], 1)
+    angles = np.arctan2(0.5 * np.linalg.norm(vee, axis=1), 0.5 * (np.trace(turn, axis1=1, axis2=2) - 1))
+    return apart, float(angles.max())
+
+
+def rpy_of(rotation: Array) -> tuple[float, float, float]:
+    """Roll, pitch and yaw (rad) of R = Rz(yaw) Ry(pitch) Rx(roll), exact at a pitch of a right angle too.
+
+    Yaw is taken first and the rest measured in the frame that it leaves, so that its error does not add to the roll's.
+    """
+    level = math.hypot(rotation[0, 0], rotation[1, 0])
+    yaw = math.atan2(rotation[1, 0], rotation[0, 0]) if level > 1e-15 else 0.0
+    cosine, sine = math.cos(yaw), math.sin(yaw)
+    left = np.array([[cosine, sine, 0.0], [-sine, cosine, 0.0], [0.0, 0.0, 1.0]]) @ rotation
+    return math.atan2(-left[1, 2], left[1, 1]), math.atan2(-left[2, 0], left[0, 0]), yaw
+
+
+def _free(joint: RigidJoint) -> tuple[float, float]:
+    reach = FREE_TRAVEL if joint.slides else FREE_ANGLE
+    return -reach, reach
+
+
+def _rigid(joint: Joint, placed: Array) -> RigidJoint:
+    """A joint whose frame, offset included, stands here; the frame is shifted onto an axis that lies beside it."""
+    told = (joint.limits, joint.endless, joint.mimic)
+    if joint.twist is None:
+        axis = np.array(joint.axis) / np.linalg.norm(joint.axis)
+        return RigidJoint(joint.name, placed, axis, not joint.is_revolute, 0.0, 1.0, *told)
+    angular, linear = (_numbers(part).ravel() for part in joint.twist)
+    if not joint.is_revolute:
+        scale = float(np.linalg.norm(linear))
+        return RigidJoint(
+            joint.name, placed, linear / scale, True, float(np.linalg.norm(angular)) / scale, scale, *told
+        )
+    scale = float(np.linalg.norm(angular))
+    beside = np.eye(4)
+    beside[:3, 3] = np.cross(angular, linear) / scale**2
+    pitch = float(angular @ linear) / scale**2
+    return RigidJoint(joint.name, placed @ beside, angular / scale, False, pitch, scale, *told)
+
+
+def _pose(transform: Transform) -> Array:
+    return _numbers(transform.matrix())
+
+
+def _numbers(expression: Expression) -> Array:
+    return np.asarray(ca.evalf(ca.densify(ca.SX(expression))).full())

@@ -1,0 +1,1 @@
+"""Contacts: what a tool touches, and recordings of it."""

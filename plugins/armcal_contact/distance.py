@@ -1,0 +1,77 @@
+"""The distance between the tips of two records: a gauge block, a pair of callipers, a tape."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
+
+import casadi as ca
+from armcal.arm.assembly import ArmState
+from armcal.base.parameters import ParameterBlock, scalar
+from armcal.base.settings import Length, Length3, Settings
+from armcal.measure.contact import named_arm
+from armcal.measure.measurement import Channel
+from armcal.measure.partners import OTHER
+from pydantic import field_validator
+
+
+class TipDistanceSettings(Settings):
+    """How well a distance is known (standard deviation), where the tip sits on the tool, which column names the pair.
+
+    A record that has a ``distance`` names the other record by its id in the text column ``partner``.
+    """
+
+    noise: Length
+    arm: str | None = None
+    tip: Length3 = (0.0, 0.0, 0.0)
+    partner: str = "partner"
+
+    @field_validator("noise")
+    @classmethod
+    def _positive(cls, value: float) -> float:
+        if value <= 0:
+            raise ValueError(f"a noise of {value * 1000:g} mm is not above zero: give how well distances are known")
+        return value
+
+
+class TipDistance:
+    """The measurement ``tip_distance``: channel distance; parameters tip_x, tip_y, tip_z in the tool frame."""
+
+    Settings: ClassVar[type[TipDistanceSettings]] = TipDistanceSettings
+    EXAMPLE: ClassVar[Mapping[str, Any]] = {"noise_mm": 0.05, "tip_mm": [0, 0, 60]}
+
+    def __init__(self, settings: TipDistanceSettings, arm_names: Sequence[str]) -> None:
+        self._settings = settings
+        self._arm = named_arm(settings.arm, arm_names)
+
+    @property
+    def arms(self) -> tuple[str, ...]:
+        """The arm, in this record and in the other."""
+        return (self._arm, self._arm + OTHER)
+
+    @property
+    def partner_label(self) -> str:
+        """What names the other record."""
+        return self._settings.partner
+
+    def parameters(self) -> tuple[ParameterBlock, ...]:
+        """The tip on the tool (m)."""
+        return tuple(scalar(f"tip_{axis}", "m", x, 0.01) for axis, x in zip("xyz", self._settings.tip, strict=True))
+
+    def channels(self) -> tuple[Channel, ...]:
+        """The distance of the two tips."""
+        return (Channel("distance", "length"),)
+
+    def outputs(self, arms: Mapping[str, ArmState], values: Mapping[str, Any]) -> dict[str, Any]:
+        """The distance of the two tips (m)."""
+        tip = ca.sparsify(ca.vertcat(*[values[f"tip_{axis}"] for axis in "xyz"]))
+        here, there = (arms[name].base_T_tool.apply(tip) for name in self.arms)
+        return {"distance": ca.sqrt(ca.dot(here - there, here - there))}
+
+    def residual(self, arms: Mapping[str, ArmState], measured: Mapping[str, Any], values: Mapping[str, Any]) -> Any:
+        """Measured minus predicted (1x1, m)."""
+        return measured["distance"] - self.outputs(arms, values)["distance"]
+
+    def noise(self) -> tuple[float, ...]:
+        """Of a distance (m)."""
+        return (self._settings.noise,)

@@ -1,0 +1,18 @@
+"""Registration; imports nothing heavy."""
+
+from armcal.hooks import Register, hookimpl
+
+
+@hookimpl
+def armcal_register_measurements(register: Register) -> None:
+    """Announce the measurements."""
+    register("ball_in_socket", "armcal_contact.ball:BallInSocket", "a ball on the tool, seated in sockets")
+    register("clamped_tool", "armcal_contact.clamp:ClampedTool", "the tool clamped at points that do not move")
+    register("plane_contact", "armcal_contact.plane:PlaneContact", "a tip that touches planes")
+    register("tip_distance", "armcal_contact.distance:TipDistance", "the distance between the tips of two records")
+
+
+@hookimpl
+def armcal_register_readers(register: Register) -> None:
+    """Announce the reader."""
+    register("mukca", "armcal_contact.mukca_reader:MukcaReader", "folders of postures with a ball in two sockets")

@@ -1,0 +1,1 @@
+"""Two arms that hold each other."""

@@ -1,0 +1,181 @@
+"""A log as a table: its delimiter and header found, chosen columns as numbers or as text, by line."""
+
+from __future__ import annotations
+
+import difflib
+import hashlib
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+from stat import S_ISREG
+from typing import NoReturn
+
+import numpy as np
+from armcal.base.domains import Array
+from armcal.errors import DataError, Location
+
+MAX_BYTES = 2 * 1024**3
+_ROWS_AT_ONCE = 256
+_MISSING = frozenset({"", "na", "n/a", "nan", "null", "none"})
+_DELIMITERS = "\t;|,"
+"""The likeliest first: where columns are parted by semicolons, commas are decimal ones."""
+_SAVE_AS_TEXT = "Save the log as text in UTF-8."
+
+Column = str | int
+"""A column's name in the header, or its number from 1."""
+
+
+@dataclass(frozen=True)
+class LogTable:
+    """The columns that were asked for.
+
+    Attributes:
+        lines: of each row (from 1).
+        numbers: of each number column (columns x rows); NaN where a cell is empty.
+        texts: of each text column.
+        names: what each number column is called in the file.
+        sha256: of the file.
+    """
+
+    lines: tuple[int, ...]
+    numbers: Array
+    texts: tuple[tuple[str, ...], ...]
+    names: tuple[str, ...]
+    sha256: str
+
+
+def read_table(path: Path, delimiter: str, numbers: Sequence[Column], texts: Sequence[Column]) -> LogTable:
+    """Read columns; ``delimiter`` may be ``auto``, and a blank stands for any blanks.
+
+    Raises:
+        DataError: with file, line and column.
+    """
+    try:
+        raw = _read(path)
+    except OSError as fault:
+        _refuse(path, f"it cannot be read ({fault.strerror or fault}).", "Check the path and its permissions.")
+    rows = _rows(path, raw, delimiter)
+    first = next(rows, None)
+    if first is None:
+        _refuse(path, "it is empty.", "Give a row a moment.")
+    line, cells = first
+    header = [] if all(_is_number(cell) or cell.lower() in _MISSING for cell in cells) else cells
+    places = [_place(path, line, header, len(cells), column) for column in (*numbers, *texts)]
+    body = rows if header else _with_first(first, rows)
+    names = [header[place] if header else f"column {place + 1}" for place in places]
+    lines, columns, words = _load(path, body, len(cells), places[: len(numbers)], places[len(numbers) :], names)
+    if not lines:
+        _refuse(path, "found a header and no rows.", "Give a row a moment.", line)
+    return LogTable(lines, columns, words, tuple(names[: len(numbers)]), hashlib.sha256(raw).hexdigest())
+
+
+def _read(path: Path) -> bytes:
+    if not path.exists():
+        _refuse(path, "there is no such file.", "Check the path.")
+    found = path.stat()
+    if not S_ISREG(found.st_mode):
+        kind = "a directory" if path.is_dir() else "not a regular file"
+        _refuse(path, f"it is {kind}, expected a log.", "Give the path of the file itself.")
+    if found.st_size > MAX_BYTES:
+        _refuse(path, f"it has {found.st_size / 1024**3:.1f} GiB, expected at most 2 GiB.", "Split it.")
+    return path.read_bytes()
+
+
+def _rows(path: Path, raw: bytes, delimiter: str) -> Iterator[tuple[int, list[str]]]:
+    """Rows that are not blank, each with its line."""
+    for line, data in enumerate(raw.splitlines(), start=1):
+        try:
+            text = data.decode("utf-8-sig" if line == 1 else "utf-8")
+        except UnicodeDecodeError:
+            _refuse(path, "found bytes that are not UTF-8 text.", _SAVE_AS_TEXT, line)
+        if "\0" in text:
+            _refuse(path, "found a NUL byte, expected text.", _SAVE_AS_TEXT, line)
+        if not text.strip():
+            continue
+        if delimiter == "auto":
+            delimiter = next((each for each in _DELIMITERS if each in text), " ")
+        parts = text.split() if delimiter == " " else text.split(delimiter)
+        yield line, [part.strip().strip('"').strip() for part in parts]
+
+
+def _with_first(first: tuple[int, list[str]], rows: Iterator[tuple[int, list[str]]]) -> Iterator[tuple[int, list[str]]]:
+    yield first
+    yield from rows
+
+
+def _place(path: Path, line: int, header: Sequence[str], count: int, column: Column) -> int:
+    """Where a column stands, from 0."""
+    if isinstance(column, int):
+        if not 1 <= column <= count:
+            _refuse(path, f"found {count} columns, expected a column {column}.", "Columns count from 1.", line)
+        return column - 1
+    if not header:
+        found = f"found no header, expected one with the column {column}."
+        _refuse(path, found, "Add it, or give the columns' numbers, from 1.", line)
+    if header.count(column) != 1:
+        near = difflib.get_close_matches(column, header, n=2)
+        found = f"found the column {column} {header.count(column)} times" if column in header else f"no column {column}"
+        hint = f"The nearest is {' or '.join(near)}." if near else f"The columns are {', '.join(header[:20])[:200]}."
+        _refuse(path, f"{found}, expected it once.", hint, line, column)
+    return header.index(column)
+
+
+def _load(
+    path: Path,
+    rows: Iterator[tuple[int, list[str]]],
+    count: int,
+    numbers: Sequence[int],
+    texts: Sequence[int],
+    names: Sequence[str],
+) -> tuple[tuple[int, ...], Array, tuple[tuple[str, ...], ...]]:
+    lines: list[int] = []
+    blocks: list[Array] = [np.zeros((len(numbers), 0))]
+    words: list[list[str]] = [[] for _ in texts]
+    while block := list(islice(rows, _ROWS_AT_ONCE)):
+        ragged = next(((line, cells) for line, cells in block if len(cells) != count), None)
+        if ragged:
+            mend = "Complete the row, or give the delimiter; numbers have a decimal point."
+            _refuse(path, f"found {len(ragged[1])} cells, expected {count} as in the first row.", mend, ragged[0])
+        found = [line for line, _ in block]
+        table = list(zip(*(cells for _, cells in block), strict=True))
+        blocks.append(
+            np.array([_numbers(path, found, table[at], name) for at, name in zip(numbers, names, strict=False)])
+        )
+        for own, at in zip(words, texts, strict=True):
+            own += table[at]
+        lines += found
+    return tuple(lines), np.hstack(blocks), tuple(tuple(own) for own in words)
+
+
+def _numbers(path: Path, lines: Sequence[int], cells: Sequence[str], name: str) -> Array:
+    joined = "".join(cells)
+    if joined.isascii() and "_" not in joined:
+        try:
+            return np.array(cells, dtype=np.float64)
+        except ValueError:  # a cell is empty, or is no number
+            pass
+    return np.array([_number(path, line, cell, name) for line, cell in zip(lines, cells, strict=True)])
+
+
+def _number(path: Path, line: int, cell: str, name: str) -> float:
+    if _is_number(cell):
+        return float(cell)
+    if cell.lower() in _MISSING:
+        return math.nan
+    _refuse(path, f"found {cell[:40]!r}, expected a number.", "Correct it, or leave the cell empty.", line, name)
+
+
+def _is_number(text: str) -> bool:
+    if not text.isascii() or "_" in text:
+        return False
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _refuse(path: Path, message: str, hint: str, line: int | None = None, column: str | None = None) -> NoReturn:
+    raise DataError(message, where=Location(str(path), line=line, field=column), hint=hint)

@@ -1,0 +1,137 @@
+"""Columns of an orientation: a quaternion or a rotation matrix, and what else the same columns might mean."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Literal, Protocol
+
+import numpy as np
+from armcal.base.domains import Array
+from armcal.base.settings import Settings
+from scipy.spatial.transform import Rotation
+
+QUATERNION = ("qw", "qx", "qy", "qz")
+MATRIX = tuple(f"r{row}{column}" for row in (1, 2, 3) for column in (1, 2, 3))
+_INVERSE = "the inverse rotation (body_T_base)"
+_OTHER = {"xyzw": "wxyz", "wxyz": "xyzw"}
+_Nine = tuple[str, str, str, str, str, str, str, str, str]
+
+
+class Orientation(Protocol):
+    """How a file gives base_T_body's rotation.
+
+    Values are numbers of all records, one row each, in the order of ``mapped``.
+    """
+
+    @property
+    def kind(self) -> str:
+        """What one of them is called."""
+
+    @property
+    def declared(self) -> str:
+        """What the file is said to hold."""
+
+    def mapped(self) -> Mapping[str, str]:
+        """The file's own column of each local name."""
+
+    def size(self, values: Array) -> Array:
+        """How large each is (N); zero for none at all."""
+
+    def fault(self, values: Array) -> Array:
+        """How far each is from a rotation or a reflection (N)."""
+
+    def rotations(self, values: Array) -> Rotation:
+        """Of each record.
+
+        Raises:
+            ValueError: a value is none.
+        """
+
+    def others(self, values: Array) -> Mapping[str, Rotation]:
+        """What the columns would be if they meant something else."""
+
+
+class QuaternionColumns(Settings):
+    """The four columns of a quaternion, as they stand in the file, and in which order its parts stand in them."""
+
+    columns: tuple[str, str, str, str]
+    order: Literal["xyzw", "wxyz"]
+
+    @property
+    def kind(self) -> str:
+        """See ``Orientation``, as below."""
+        return "quaternion"
+
+    @property
+    def declared(self) -> str:
+        """The order."""
+        return f"order: {self.order}"
+
+    def mapped(self) -> dict[str, str]:
+        """Channels w, x, y, z, whatever the order in the file."""
+        own = dict(zip(self.order, self.columns, strict=True))
+        return {name: own[name[1]] for name in QUATERNION}
+
+    def size(self, values: Array) -> Array:
+        """The length."""
+        return np.asarray(np.linalg.norm(values, axis=1))
+
+    def fault(self, values: Array) -> Array:
+        """The length's distance from one."""
+        return np.abs(self.size(values) - 1)
+
+    def rotations(self, values: Array) -> Rotation:
+        """Of quaternions of any length but zero."""
+        return Rotation.from_quat(values[:, [1, 2, 3, 0]])
+
+    def others(self, values: Array) -> dict[str, Rotation]:
+        """The other order, and the inverse."""
+        other = _OTHER[self.order]
+        in_file = values[:, ["wxyz".index(part) for part in self.order]]
+        exchanged = Rotation.from_quat(in_file[:, [other.index(part) for part in "xyzw"]])
+        return {f"order: {other}": exchanged, _INVERSE: self.rotations(values).inv()}
+
+
+class RotationColumns(Settings):
+    """The nine columns of a rotation matrix, row by row."""
+
+    columns: _Nine
+
+    @property
+    def kind(self) -> str:
+        """See ``Orientation``, as below."""
+        return "rotation matrix"
+
+    @property
+    def declared(self) -> str:
+        """Row by row."""
+        return "the matrix row by row"
+
+    def mapped(self) -> dict[str, str]:
+        """r11, r12, ... r33."""
+        return dict(zip(MATRIX, self.columns, strict=True))
+
+    def size(self, values: Array) -> Array:
+        """The largest entry."""
+        return np.asarray(np.abs(values).max(axis=1))
+
+    def fault(self, values: Array) -> Array:
+        """The largest entry of R^T R - I."""
+        matrices = values.reshape(-1, 3, 3)
+        squares = np.swapaxes(matrices, 1, 2) @ matrices
+        return np.asarray(np.abs(squares - np.eye(3)).max(axis=(1, 2)))
+
+    def rotations(self, values: Array) -> Rotation:
+        """The nearest ones."""
+        return Rotation.from_matrix(values.reshape(-1, 3, 3))
+
+    def others(self, values: Array) -> dict[str, Rotation]:
+        """Column by column, which is the inverse as well."""
+        return {"the matrix column by column, or body_T_base": self.rotations(values).inv()}
+
+
+def reflections(values: Array) -> Array:
+    """Places of matrices (N x 9) that mirror; none among quaternions (N x 4)."""
+    if values.shape[1] != len(MATRIX):
+        return np.zeros(0, dtype=np.intp)
+    return np.flatnonzero(np.linalg.det(values.reshape(-1, 3, 3)) < 0)

@@ -1,0 +1,161 @@
+"""Records from a CSV file as ``csv`` reads them, with orientations as quaternions or rotation matrices."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any, ClassVar, NoReturn
+
+import numpy as np
+from armcal.base.dataset import Dataset
+from armcal.base.domains import Array
+from armcal.base.units import DIMENSIONLESS
+from armcal.errors import DataError, Location
+from armcal.measure.checks import Layout, require_records
+from armcal.measure.layout import set_aside, warned
+from armcal.measure.reader import ReadRequest, WantedChannel
+from pydantic import model_validator
+
+from armcal_tracker.csv_reader import CsvReader, CsvSettings
+from armcal_tracker.orientation import QUATERNION, Orientation, QuaternionColumns, RotationColumns, reflections
+from armcal_tracker.rotation_match import misfit, nominal_rotations
+
+TOLERANCE = 1e-3
+"""How far a quaternion's length may be from one, or an entry of R^T R from the identity's."""
+MOST_FAULTY = 0.05
+WORSE = 3.0
+WORST_DEG = 5.0
+"""What the columns are said to mean is refused if it fits the arm worse than this, and so much worse than another."""
+_ZERO = 1e-6
+
+
+class PoseCsvSettings(CsvSettings):
+    """As ``csv``, and base_T_body's orientation: either ``quaternion`` or ``rotation`` says which columns hold it.
+
+    ``measurement`` names the measurement that reads orientations; by default the only one.
+    """
+
+    quaternion: QuaternionColumns | None = None
+    rotation: RotationColumns | None = None
+    measurement: str | None = None
+
+    @model_validator(mode="after")
+    def _one_orientation(self) -> PoseCsvSettings:
+        if (self.quaternion is None) == (self.rotation is None):
+            raise ValueError("expected one of quaternion: {columns: [...], order: xyzw} and rotation: {columns: [...]}")
+        return self
+
+    @property
+    def orientation(self) -> Orientation:
+        """Whichever is given."""
+        found = self.quaternion or self.rotation
+        assert found is not None
+        return found
+
+
+class PoseCsvReader:
+    """The reader ``pose_csv``: orientations become unit quaternions, ``INSTANCE.qw`` (never below 0) to ``INSTANCE.qz``."""  # noqa: E501
+
+    Settings: ClassVar[type[PoseCsvSettings]] = PoseCsvSettings
+    EXAMPLE: ClassVar[Mapping[str, Any]] = {
+        "path": "/no/such/folder/measurements",
+        "quaternion": {"columns": ["qx", "qy", "qz", "qw"], "order": "xyzw"},
+    }
+
+    def __init__(self, settings: PoseCsvSettings) -> None:
+        self._settings = settings
+        self._orientation = settings.orientation
+
+    def read(self, request: ReadRequest) -> Dataset:
+        """The records of the file, in SI; ``rows`` are lines, the header's being 1.
+
+        Raises:
+            DataError: with file, line and column; or the orientations are not those of this arm.
+        """
+        s, instance = self._settings, self._instance(request)
+        mapped = {f"{instance}.{name}": own for name, own in self._orientation.mapped().items()}
+        reader = CsvReader(CsvSettings(path=s.path, columns={**s.columns, **mapped}, delimiter=s.delimiter))
+        dataset = reader.read(replace(request, wanted=_wanted(request, instance, tuple(mapped))))
+        dataset = self._without_faulty(dataset, tuple(mapped))
+        values = dataset.stacked(tuple(mapped)).T
+        made = np.flatnonzero(~np.isnan(values).any(axis=1))
+        self._refuse_reflections(dataset, values, made)
+        self._refuse_other_meaning(dataset.subset(made), request, instance, values[made])
+        return self._with_quaternions(dataset, instance, values, made)
+
+    def _instance(self, request: ReadRequest) -> str:
+        reading = [name for name, m in request.measurements.items() if {c.name for c in m.channels()} >= {*QUATERNION}]
+        asked = self._settings.measurement
+        if asked in reading or (asked is None and len(reading) == 1):
+            return asked or reading[0]
+        self._refuse(
+            f"found {', '.join(reading) or 'no measurement'} to read orientations, expected {asked or 'one'}.",
+            "Add a measurement tip_pose, or set measurement: NAME in the data section.",
+        )
+
+    def _without_faulty(self, dataset: Dataset, channels: tuple[str, ...]) -> Dataset:
+        """Set aside what is no rotation; refuse the file if that is more than a few."""
+        values, kind = dataset.stacked(channels).T, self._orientation.kind
+        made = ~np.isnan(values).any(axis=1)
+        off, size = self._orientation.fault(values), self._orientation.size(values)
+        zero, wrong = made & (size < _ZERO), made & (size >= _ZERO) & (off > TOLERANCE)
+        if wrong.sum() > MOST_FAULTY * made.sum():
+            first = int(np.flatnonzero(wrong)[0])
+            found = f"found {wrong.sum()} of {made.sum()} orientations that are no {kind}, the first off by"
+            hint = "Check that the columns are those of the orientation, and in this order."
+            self._refuse(f"{found} {off[first]:.3g} (more than {TOLERANCE:g}).", hint, dataset.rows[first])
+        faulty = {int(i): f"its {kind} is zero" for i in np.flatnonzero(zero)}
+        faulty |= {int(i): f"its {kind} is off by {off[i]:.3g}" for i in np.flatnonzero(wrong)}
+        return require_records(
+            set_aside(dataset, Layout(by_line=True), faulty, f"the {kind} is none", "Measure these again.")
+        )
+
+    def _refuse_reflections(self, dataset: Dataset, values: Array, made: Array) -> None:
+        mirrored = reflections(values[made])
+        if mirrored.size:
+            found = f"found {mirrored.size} of {len(made)} rotation matrices that are reflections (determinant -1)."
+            hint = "Check the order and signs of the columns, and that the frames are right-handed."
+            self._refuse(found, hint, dataset.rows[made[mirrored[0]]])
+
+    def _refuse_other_meaning(self, dataset: Dataset, request: ReadRequest, instance: str, values: Array) -> None:
+        """Refuse orientations that turn unlike the nominal arm, where another reading of the columns turns like it."""
+        arm = request.arms.get(request.measurements[instance].arms[0])
+        if arm is None or not len(dataset):
+            return
+        nominal = nominal_rotations(arm, dataset)
+        declared = np.degrees(misfit(self._orientation.rotations(values), nominal))
+        others = {name: np.degrees(misfit(r, nominal)) for name, r in self._orientation.others(values).items()}
+        best = min(others, key=lambda name: others[name])
+        if declared > WORST_DEG and declared > WORSE * others[best]:
+            self._refuse(
+                f"orientations turn unlike the nominal arm: with {self._orientation.declared} the turns between records "
+                f"are off by {declared:.2f} deg (median), with {best} by {others[best]:.2f} deg.",
+                "Correct the order of the columns, or give base_T_body's orientation.",
+            )
+
+    def _with_quaternions(self, dataset: Dataset, instance: str, values: Array, made: Array) -> Dataset:
+        """Unit quaternions, of a sign that does not jump back and forth for nothing."""
+        found = np.full((len(dataset), 4), np.nan)
+        found[made] = self._orientation.rotations(values[made]).as_quat()[:, [3, 0, 1, 2]]
+        negative = found[:, 0] < 0
+        found[negative] *= -1
+        given = {f"{instance}.{name}" for name in self._orientation.mapped()}
+        channels = {name: numbers for name, numbers in dataset.channels.items() if name not in given}
+        channels |= {f"{instance}.{name}": found[:, i] for i, name in enumerate(QUATERNION)}
+        dataset = replace(dataset, channels=channels)
+        if self._settings.quaternion is None or not negative.any():
+            return dataset
+        text = (
+            f"{negative.sum()} of {len(made)} quaternions had qw below 0 and were negated, which is the same rotation."
+        )
+        return warned(dataset, text)
+
+    def _refuse(self, message: str, hint: str, line: int | None = None) -> NoReturn:
+        raise DataError(message, where=Location(str(self._settings.path), line=line), hint=hint)
+
+
+def _wanted(request: ReadRequest, instance: str, channels: tuple[str, ...]) -> tuple[WantedChannel, ...]:
+    """The request with the file's numbers in place of the quaternion; they cannot be absent."""
+    quaternion = {f"{instance}.{name}" for name in QUATERNION}
+    rest = tuple(w for w in request.wanted if w.channel not in quaternion)
+    return (*rest, *(WantedChannel(name, (name,), DIMENSIONLESS, True, parts=(instance,)) for name in channels))
