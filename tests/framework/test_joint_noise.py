@@ -153,7 +153,7 @@ def test_slopes_by_joints_are_those_in_elastic_equilibrium(lrm):
     experiment = lrm.experiment()
     dataset = lrm.dataset(q)
     problem, names = lrm.problem(experiment, dataset), [f"arm.q{i}" for i in range(1, 7)]
-    soft = {n: 20 * x for n, x in oracle.published().items() if n.startswith("k")}
+    soft = {n: 2 * x for n, x in oracle.published().items() if n.startswith("k")}
     values = lrm.vector(problem.parameters, {n: soft[n] for n in soft})
     found = problem.channel_slopes(values, problem.records(dataset), names)[0]
     for joint, step in enumerate(1e-5 * np.eye(6)):
@@ -207,14 +207,8 @@ def inside_and_errors(seeds):
     return float(np.mean(held)), np.array(errors).reshape(seeds, -1)
 
 
-def test_a_few_seeds_lie_in_their_intervals_about_as_often_as_they_say():
-    share, errors = inside_and_errors(25)
-    assert 0.88 <= share <= 0.995
-    assert 0.8 < np.sqrt(np.mean(errors**2)) < 1.2
-
-
-@pytest.mark.slow
 def test_a_hundred_seeds_lie_in_their_intervals_as_often_as_they_say():
     share, errors = inside_and_errors(100)
     assert 0.92 <= share <= 0.98
+    assert np.sqrt(np.mean(errors**2)) == pytest.approx(1.0, abs=0.1)
     assert np.abs(errors.mean(axis=0)).max() < 0.45, "an estimate is off by more than chance"

@@ -20,7 +20,7 @@ from armcal.testing.contract import CheckResult, check_component
 ROOT = Path(__file__).parents[2]
 DATA = ROOT / "tests" / "data"
 SCARA = DATA / "scara_plugin"
-OURS = ("cvxpy", "ipopt", "joints", "mdh", "simulation", "tracker")
+OURS = ("cvxpy", "ipopt", "joints", "mdh", "poe", "simulation", "tracker")
 HEAVY = ("numpy", "casadi", "matplotlib", "pydantic", "scipy", "cvxpy")
 Ran = subprocess.CompletedProcess[str]
 

@@ -370,3 +370,57 @@ def test_an_arm_that_does_not_make_sense_is_refused(change, said):
     config = {key: value for key, value in {**frida.model(), **change}.items() if value is not None}
     with pytest.raises(ValidationError, match=said):
         PoeSettings.model_validate(config)
+
+
+CALIBRATION = """
+arms: {arm: {model: MODEL}}
+statics: {gravity_m_s2: [0, 0, -9.81], payload_g: 0}
+measurements: {tracker: {type: tip_position, noise_mm: 0.05}}
+data: {type: csv, path: measured.csv}
+simulation:
+  type: elastic_arm
+  truth: truth.yaml
+  seed: 5
+  poses:
+    kind: random
+    count: 120
+    levels_rad: {q1: [-2, 2], q3: [-2, 2], q5: [-2, 2]}
+    travel_mm: {q2: [-200, 200], q4: [-200, 200]}
+parameters: {free: ["arm.poe.axis?", "arm.poe.tool_?"]}
+estimator: {type: ipopt}
+"""
+
+
+def test_axes_are_found_by_calibration(tmp_path):
+    """Offsets that are wrong in truth turn every axis beyond them; the axes that are found make up for it."""
+    import json
+
+    from armcal.cli.main import cli
+    from armcal.use.calibration import Calibration
+    from click.testing import CliRunner
+
+    path = tmp_path / "experiment.yaml"
+    path.write_text(CALIBRATION.replace("MODEL", json.dumps({"type": "poe", **MIXED})), encoding="utf-8")
+    wrong = {"offset1": 0.03, "offset3": -0.05, "offset4": 0.01}
+    nominal = {b.name: b.nominal[0] for b in poe(MIXED).parameters()}
+    units = {name: "m" if name == "offset4" else "rad" for name in wrong}
+    truth = [f"arm.poe.{name}: {nominal[name] + by!r} {units[name]}\n" for name, by in wrong.items()]
+    (tmp_path / "truth.yaml").write_text("".join(truth), encoding="utf-8")
+    for command in (
+        ["simulate", str(path), "--out", str(tmp_path / "measured.csv")],
+        ["run", str(path), "--out", str(tmp_path / "run"), "--set", "evaluator=interpreted"],
+    ):
+        done = CliRunner().invoke(cli, command)
+        assert done.exit_code == 0, done.output
+    calibration = Calibration.load(tmp_path / "run" / "calibration.yaml")
+    for name in calibration.parameters.names:
+        if ".axis" in name:
+            block = calibration.parameters[name]
+            assert block.domain.check(np.array(block.nominal)) == ""
+    parameters, function = kinematics(poe(MIXED))
+    values = parameters.nominal()
+    for name, by in wrong.items():
+        values[parameters.entries_of(name)] += by
+    q = np.random.default_rng(12).uniform(-1, 1, (50, 5)) * [2, 0.2, 2, 0.2, 2]
+    expected = np.array([np.asarray(function(values, row))[:3, 3] for row in q])
+    assert np.abs(calibration.forward(q)[:, :3, 3] - expected).max() < 1e-4

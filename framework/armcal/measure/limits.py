@@ -33,7 +33,7 @@ def _beyond(dataset: Dataset, name: str, arm: Arm, alone: bool) -> list[str]:
     commands = arm.joint_commands([dataset.column(channel) for channel in channels])
     told = []
     for joint, dimension, angles in zip(arm.nominal_chain.joints, arm.joint_dimensions, commands, strict=True):
-        over = _over(joint, np.asarray(angles))
+        over = np.nan_to_num(_over(joint, np.asarray(angles)), nan=-np.inf, neginf=-np.inf)
         count = int(np.sum(over > TOLERANCE[dimension]))
         if count and joint.limits:
             unit = display_unit(dimension).name
