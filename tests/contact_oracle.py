@@ -100,26 +100,28 @@ def random_joints(chain: ChainSpec, count: int, seed: int, within: float = 1.2) 
     return np.random.default_rng(seed).uniform(-within, within, (count, len(chain.rows)))
 
 
+def at_rest(residual: Any, q: np.ndarray) -> np.ndarray:
+    """Joint angles (N x n) moved by Newton steps of least length to where ``residual`` (of them, N x m) is zero."""
+    for _ in range(25):
+        sides = [(residual(q + h), residual(q - h)) for h in 1e-6 * np.eye(q.shape[1])]
+        slopes = np.stack([(up - down) / 2e-6 for up, down in sides], axis=-1)
+        step = np.einsum("nij,nj->ni", np.linalg.pinv(slopes, rcond=1e-6), residual(q))
+        q = q - step * np.minimum(1.0, 0.3 / np.maximum(np.abs(step).max(axis=1), 1e-300))[:, None]
+    return q
+
+
 def touching(
     chain: ChainSpec, residual: Any, count: int, seed: int, v: Mapping[str, float] | None = None, arm: str = "arm"
 ) -> np.ndarray:
-    """Joint angles (count x n) where ``residual`` (tool poses, N x 4 x 4, to N x m) is zero, by Newton steps."""
+    """Joint angles (count x n) where ``residual`` (tool poses, N x 4 x 4, to N x m) is zero."""
+
+    def left_open(q: np.ndarray) -> np.ndarray:
+        return residual(tool_poses(chain, q, v, arm))
+
     random, found = np.random.default_rng(seed), np.zeros((0, len(chain.rows)))
     for _ in range(60):
-        q = random.uniform(-1.2, 1.2, (4 * count, len(chain.rows)))
-        for _ in range(25):
-            at = residual(tool_poses(chain, q, v, arm))
-            slopes = np.stack(
-                [
-                    (residual(tool_poses(chain, q + h, v, arm)) - residual(tool_poses(chain, q - h, v, arm))) / 2e-6
-                    for h in 1e-6 * np.eye(q.shape[1])
-                ],
-                axis=-1,
-            )
-            step = np.einsum("nij,nj->ni", np.linalg.pinv(slopes, rcond=1e-6), at)
-            q = q - step * np.minimum(1.0, 0.3 / np.maximum(np.abs(step).max(axis=1), 1e-300))[:, None]
-        at = residual(tool_poses(chain, q, v, arm))
-        good = (np.abs(at).max(axis=1) < 1e-12) & (np.abs(q).max(axis=1) < 2.6)
+        q = at_rest(left_open, random.uniform(-1.2, 1.2, (4 * count, len(chain.rows))))
+        good = (np.abs(left_open(q)).max(axis=1) < 1e-12) & (np.abs(q).max(axis=1) < 2.6)
         found = np.vstack([found, q[good]])
         if len(found) >= count:
             return found[:count]

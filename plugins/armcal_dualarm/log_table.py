@@ -61,7 +61,7 @@ def read_table(path: Path, delimiter: str, numbers: Sequence[Column], texts: Seq
     if first is None:
         _refuse(path, "it is empty.", "Give a row a moment.")
     line, cells = first
-    header = [] if all(_is_number(cell) or cell.lower() in _MISSING for cell in cells) else cells
+    header = cells if _is_header(cells, numbers, texts) else []
     places = [_place(path, line, header, len(cells), column) for column in (*numbers, *texts)]
     body = rows if header else _with_first(first, rows)
     names = [header[place] if header else f"column {place + 1}" for place in places]
@@ -103,6 +103,14 @@ def _rows(path: Path, raw: bytes, delimiter: str) -> Iterator[tuple[int, list[st
 def _with_first(first: tuple[int, list[str]], rows: Iterator[tuple[int, list[str]]]) -> Iterator[tuple[int, list[str]]]:
     yield first
     yield from rows
+
+
+def _is_header(cells: Sequence[str], numbers: Sequence[Column], texts: Sequence[Column]) -> bool:
+    """Whether the first row holds names: asked for by name, no cell a number; by place, no number where one is due."""
+    if any(isinstance(column, str) for column in (*numbers, *texts)):
+        return not any(_is_number(cell) for cell in cells)
+    due = [cells[column - 1] for column in numbers if isinstance(column, int) and 1 <= column <= len(cells)]
+    return not any(_is_number(cell) for cell in due) and any(cell.lower() not in _MISSING for cell in due)
 
 
 def _place(path: Path, line: int, header: Sequence[str], count: int, column: Column) -> int:

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from armcal.base.domains import Array
 from armcal.base.settings import Angle, Duration, Settings
+from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-_SPREAD_RAD = 1.7453292519943295e-04
+_SPREAD_RAD = math.radians(0.01)
 
 
 class StillSettings(Settings):
@@ -61,7 +63,9 @@ def rests(joints: Array, labels: Sequence[Sequence[str]], time: Array | None, se
     return found
 
 
-def _breaks(joints: Array, labels: Sequence[Sequence[str]], time: Array | None, settings: StillSettings) -> Array:
+def _breaks(
+    joints: Array, labels: Sequence[Sequence[str]], time: Array | None, settings: StillSettings
+) -> NDArray[np.bool_]:
     """Before which rows a rest ends, whatever the joints do (N)."""
     missing = np.isnan(joints)
     breaks = np.zeros(joints.shape[1], dtype=bool)
@@ -77,7 +81,7 @@ def _breaks(joints: Array, labels: Sequence[Sequence[str]], time: Array | None, 
     return breaks
 
 
-def _end(joints: Array, breaks: Array, start: int, spread: float) -> int:
+def _end(joints: Array, breaks: NDArray[np.bool_], start: int, spread: float) -> int:
     """The row before which a joint has moved by more than the spread since ``start``."""
     low = high = joints[:, start]
     for row in range(start + 1, joints.shape[1]):

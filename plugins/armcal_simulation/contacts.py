@@ -14,7 +14,7 @@ from armcal.base.settings import Angle, InputPath, Length, Settings
 from armcal.config.selection import with_values
 from armcal.config.yaml_source import load_config
 from armcal.errors import ConfigError
-from armcal.measure.groups import ONLY, group_blocks
+from armcal.measure.groups import ONLY, group_blocks, owner_of
 from armcal.measure.measurement import GroupedMeasurement
 from armcal.solve.problem import Problem
 from armcal.solve.projection import fits, joint_channels, projected
@@ -86,23 +86,23 @@ class ContactsSimulator:
             labels += [(contact.instance, contact.key, str(i)) for i in range(1, self._settings.count + 1)]
         whole = {c: np.concatenate([np.zeros(0), *(part[c] for part in parts)]) for c in channels}
         noisy = {c: values + self._noise(request, c, len(values), random) for c, values in whole.items()}
-        ids = tuple(f"{key}/{number}" for _, key, number in labels)
+        # Two arms may touch the same socket.
+        several = len(self._settings.groups) > 1
+        ids = tuple("/".join(parts if several else parts[1:]) for parts in labels)
         return Dataset(ids, noisy, _label_columns(request, labels), source="simulation")
 
     def _contacts(self, request: SimulationRequest) -> Iterator[_Contact]:
-        groups = self._settings.groups
+        asked = self._settings.groups
+        for instance, keys in asked.items():
+            _check_groups(request, instance, keys)
+        groups = _by_owner(request, asked)
         blocks = group_blocks(request.measurements, groups)
         source = load_config(self._settings.truth)
         parameters = with_values(Parameters((*request.parameters.blocks, *blocks)), source.data, source, ())
-        for instance, keys in groups.items():
-            measurement = request.measurements.get(instance)
-            if not isinstance(measurement, GroupedMeasurement):
-                raise ConfigError(
-                    f"simulation.groups: {instance!r} is no measurement with groups.",
-                    hint=f"The measurements are {', '.join(request.measurements)}.",
-                )
+        for instance, keys in asked.items():
+            labels = _labels(request, instance)
             for key in keys:
-                yield _Contact(instance, key, measurement.group_labels, _alone(request, parameters, instance, groups))
+                yield _Contact(instance, key, labels, _alone(request, parameters, instance, groups))
 
     def _postures(self, contact: _Contact, request: SimulationRequest, random: np.random.Generator) -> dict[str, Array]:
         """Joint angles without noise (count each), of the arms that take part."""
@@ -154,6 +154,34 @@ class ContactsSimulator:
         turns = of.commanded[joint] == "angle"
         sd = (of.joint_noise if stated is None else stated) if turns else 0.0
         return random.normal(0.0, 1.0, count) * sd
+
+
+def _check_groups(request: SimulationRequest, instance: str, keys: tuple[str, ...]) -> None:
+    if not isinstance(request.measurements.get(instance), GroupedMeasurement):
+        raise ConfigError(
+            f"simulation.groups: {instance!r} is no measurement with groups.",
+            hint=f"The measurements are {', '.join(request.measurements)}.",
+        )
+    labels = _labels(request, instance)
+    for key in keys:
+        if len(key.split("/")) != len(labels) if labels else key != ONLY:
+            shape = "/".join(label.upper() for label in labels) or ONLY
+            raise ConfigError(f"simulation.groups.{instance}: found {key!r}, expected {shape}.")
+
+
+def _labels(request: SimulationRequest, instance: str) -> tuple[str, ...]:
+    measurement = request.measurements[instance]
+    return measurement.group_labels if isinstance(measurement, GroupedMeasurement) else ()
+
+
+def _by_owner(request: SimulationRequest, asked: Mapping[str, tuple[str, ...]]) -> dict[str, tuple[str, ...]]:
+    """The groups by whose they are: what one measurement takes up may be another's."""
+    found: dict[str, tuple[str, ...]] = {}
+    for instance, keys in asked.items():
+        measurement = request.measurements[instance]
+        owner = owner_of(instance, measurement) if isinstance(measurement, GroupedMeasurement) else instance
+        found[owner] = tuple(dict.fromkeys((*found.get(owner, ()), *keys)))
+    return found
 
 
 def _alone(

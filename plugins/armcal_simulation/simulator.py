@@ -20,6 +20,8 @@ from armcal.solve.simulation import SimulationRequest, measured_without_noise, w
 from armcal.testing import EXAMPLE_TRUTH
 from pydantic import Field, model_validator
 
+from armcal_simulation.readings import disturbed, is_orientation
+
 
 class PoseSettings(Settings):
     """Which poses are visited.
@@ -120,17 +122,9 @@ class ElasticArmSimulator:
     ) -> Mapping[str, Array]:
         true = _with_truth(request, self._settings)
         exact = measured_without_noise(true, standing)
-        noise = {
-            f"{name}.{channel.name}": deviation
-            for name, measurement in request.measurements.items()
-            for channel, deviation in zip(measurement.channels(), measurement.noise(), strict=True)
-        }
-        stated = self._settings.noise
-        disturbed = {
-            channel: values + random.normal(0.0, noise[channel] if stated is None else stated, len(values))
-            for channel, values in exact.items()
-        }
-        return _with_outliers(disturbed, self._settings.outliers, random)
+        read = disturbed(request.measurements, exact, self._settings.noise, random)
+        moved = {channel: values for channel, values in read.items() if not is_orientation(channel)}
+        return {**read, **_with_outliers(moved, self._settings.outliers, random)}
 
 
 def _poses(poses: PoseSettings, levels: list[Array], random: np.random.Generator) -> Array:

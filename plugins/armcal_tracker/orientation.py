@@ -12,7 +12,6 @@ from scipy.spatial.transform import Rotation
 
 QUATERNION = ("qw", "qx", "qy", "qz")
 MATRIX = tuple(f"r{row}{column}" for row in (1, 2, 3) for column in (1, 2, 3))
-_INVERSE = "the inverse rotation (body_T_base)"
 _OTHER = {"xyzw": "wxyz", "wxyz": "xyzw"}
 _Nine = tuple[str, str, str, str, str, str, str, str, str]
 
@@ -85,11 +84,11 @@ class QuaternionColumns(Settings):
         return Rotation.from_quat(values[:, [1, 2, 3, 0]])
 
     def others(self, values: Array) -> dict[str, Rotation]:
-        """The other order, and the inverse."""
+        """The other order; it is the inverse between two fixed rotations, so no turn tells one from the other."""
         other = _OTHER[self.order]
         in_file = values[:, ["wxyz".index(part) for part in self.order]]
         exchanged = Rotation.from_quat(in_file[:, [other.index(part) for part in "xyzw"]])
-        return {f"order: {other}": exchanged, _INVERSE: self.rotations(values).inv()}
+        return {f"order: {other}, or as body_T_base,": exchanged}
 
 
 class RotationColumns(Settings):
@@ -127,7 +126,7 @@ class RotationColumns(Settings):
 
     def others(self, values: Array) -> dict[str, Rotation]:
         """Column by column, which is the inverse as well."""
-        return {"the matrix column by column, or body_T_base": self.rotations(values).inv()}
+        return {"it column by column, that is as body_T_base,": self.rotations(values).inv()}
 
 
 def reflections(values: Array) -> Array:

@@ -14,6 +14,4 @@ def armcal_register_measurements(register: Register) -> None:
 def armcal_register_readers(register: Register) -> None:
     """Announce the readers."""
     register("csv", "armcal_tracker.csv_reader:CsvReader", "columns by name with their unit as suffix")
-    register(
-        "pose_csv", "armcal_tracker.pose_csv_reader:PoseCsvReader", "as csv, with orientations in it"
-    )
+    register("pose_csv", "armcal_tracker.pose_csv_reader:PoseCsvReader", "as csv, with orientations in it")

@@ -128,8 +128,8 @@ class PoseCsvReader:
         best = min(others, key=lambda name: others[name])
         if declared > WORST_DEG and declared > WORSE * others[best]:
             self._refuse(
-                f"orientations turn unlike the nominal arm: with {self._orientation.declared} the turns between records "
-                f"are off by {declared:.2f} deg (median), with {best} by {others[best]:.2f} deg.",
+                f"orientations turn unlike the nominal arm: with {self._orientation.declared} the turns between "
+                f"records are off by {declared:.2f} deg (median), with {best} by {others[best]:.2f} deg.",
                 "Correct the order of the columns, or give base_T_body's orientation.",
             )
 

@@ -9,6 +9,8 @@ from armcal_urdf.elements import UTF8, Element
 from armcal_urdf.numbers import Three, words_of
 from armcal_urdf.robot import UrdfJoint
 
+_ROUNDING = 1e-13
+"""m or rad: what a solver leaves of a number that nothing moved."""
 _WHITE = b" \t\r\n"
 
 
@@ -83,9 +85,10 @@ def _new_origin(data: bytes, joint: Element, changed: Mapping[str, Three]) -> _E
 
 
 def _written(numbers: Three, before: list[str]) -> str:
-    """Numbers that read back to the last bit; one that is the same as before keeps its digits."""
+    """Numbers that read back to the last bit; one that did not change, but for rounding, keeps its digits."""
     known = before if len(before) == len(numbers) else ["nan"] * len(numbers)
-    return " ".join(word if float(word) == now else repr(now) for now, word in zip(numbers, known, strict=True))
+    pairs = zip(numbers, known, strict=True)
+    return " ".join(word if abs(float(word) - now) <= _ROUNDING else repr(now) for now, word in pairs)
 
 
 def _start_tag(data: bytes, start: int) -> _StartTag:

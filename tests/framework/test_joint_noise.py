@@ -11,6 +11,7 @@ import pytest
 from armcal.solve.estimator import estimate
 from armcal.solve.joint_noise import with_joint_noise
 from armcal.solve.nuisance import started
+from armcal_contact.distance import TipDistance
 from armcal_ipopt.estimator import IpoptEstimator
 from armcal_tracker.position import TipPosition, TipPositionSettings
 from chain_oracle import ChainSpec, Row
@@ -130,6 +131,24 @@ def test_each_arm_brings_its_own_joints_and_rows_of_the_other_do_not_matter():
     found = problem.normal_equations(values, weighed)
     assert np.isfinite(found.hessian).all()
     assert found.cost == pytest.approx(problem.cost(values, weighed), rel=1e-12)
+
+
+def test_a_distance_between_two_records_has_the_noise_of_both():
+    q, tip = co.random_joints(LEFT, 6, 9), (0.0, 0.01, 0.05)
+    partner = ("", "0", "0", "", "3", "1")
+    reading = np.where([bool(name) for name in partner], 0.2, np.nan)
+    data = co.dataset([({**co.joints(q, "left"), "gauge.distance": reading}, {})])
+    data = replace(data, extra={"partner": partner})
+    gauge = TipDistance(TipDistance.Settings.si(noise=SEAT_SD, tip=tip), ("left",))
+    problem, records = co.Bench({"left": noisy_arm()}, {"gauge": gauge}).problem(data.subset([0, 3, 1, 2, 4, 5]))
+    records = problem.subset(records, np.arange(2, 6))
+    found = covariances(problem, records, problem.parameters.nominal())[0].ravel()
+    at, turns = co.points(LEFT, q, tip), slopes(LEFT, q, tip)
+    for row, one in enumerate((1, 2, 4, 5)):
+        other = int(partner[one])
+        line = (at[one] - at[other]) / np.linalg.norm(at[one] - at[other])
+        by_joint = np.concatenate([line @ turns[one], line @ turns[other]])
+        assert found[row] == pytest.approx(SEAT_SD**2 + JOINT_SD**2 * by_joint @ by_joint, rel=1e-6)
 
 
 def test_part_of_the_records_keeps_the_whitening_of_each():

@@ -18,7 +18,6 @@ from armcal_contact.plane import PlaneContact
 from armcal_dualarm.closure import ClosedChain
 from armcal_ipopt.estimator import IpoptEstimator
 from contact_oracle import LEFT
-from pydantic import ValidationError
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
@@ -64,16 +63,16 @@ def state(position, rotation):
 # ---------------------------------------------------------------- planes
 
 
+def on_plane(normal, offset, tip=(0, 0, 0)):
+    """How far the tip of a tool is beyond a plane (N x 1)."""
+    return lambda poses: ((poses @ np.array([*tip, 1.0]))[:, :3] @ np.array(normal) - offset)[:, None]
+
+
 def touches_of_plane(normal, offset, tip, count, seed, scatter):
     """Joint angles whose tip lies on a plane, but for the scatter across it."""
-    random = np.random.default_rng(seed)
-    off = random.normal(0, scatter, count)
-    found = []
-    for i in range(count):
-        aside = offset + off[i]
-        at = lambda poses, c=aside: ((poses @ np.array([*tip, 1.0]))[:, :3] @ normal - c)[:, None]  # noqa: E731
-        found.append(co.touching(LEFT, at, 1, 100 * seed + i)[0])
-    return np.array(found)
+    off = np.random.default_rng(seed).normal(0, scatter, count)
+    each = [co.touching(LEFT, on_plane(normal, offset + x, tip), 1, 100 * seed + i) for i, x in enumerate(off)]
+    return np.concatenate(each)
 
 
 @pytest.mark.parametrize("stated", [(0.0, 0.0, 1.0), (0.3, -1.0, 0.2), (-1.0, 0.0, 0.0)], ids=str)
@@ -104,7 +103,7 @@ def test_two_planes_and_a_length_of_the_arm_come_back_together():
     truth = {**co.named(LEFT), "arm.mdh.theta3": 0.01}
     parts = []
     for number, (name, normal) in enumerate({"table": (0, 0, 1), "wall": (0.6, 0, 0.8)}.items()):
-        at = lambda poses, n=np.array(normal), c=0.2 + 0.1 * number: (poses[:, :3, 3] @ n - c)[:, None]  # noqa: E731
+        at = on_plane(normal, 0.2 + 0.1 * number)
         parts.append((co.joints(co.touching(LEFT, at, 14, 5 + number, truth)), {"plane": name}))
     plane = PlaneContact(PlaneContact.Settings.si(noise=0.1 * MM, normal=(0.2, 0, 1)), ("arm",))
     made = co.Bench({"arm": co.the_arm(LEFT)}, {"plane": plane}, ("arm.mdh.theta3",))
@@ -284,17 +283,18 @@ def test_both_arms_of_a_closed_chain_bring_the_noise_of_their_joints():
 @needs_logarithm
 def test_two_arms_that_hold_each_other_tell_a_length_of_either_and_the_clamp():
     truth = {**co.named(co.SEVEN, "left"), "left.mdh.a3": 0.033}
-    hold = matrix((0, 0, 0.05), Rotation.from_euler("xyz", [180, 0, 90], degrees=True))
-    q_left = co.random_joints(co.SEVEN, 40, 5, 1.0)
-    parts = []
-    for i, pose in enumerate(co.tool_poses(co.SEVEN, q_left, truth, "left")):
-        try:
-            q_right = co.touching(ACROSS, held(pose @ hold), 1, 30 + i)
-        except AssertionError:
-            continue
-        parts.append(({**co.joints(q_left[[i]], "left"), **co.joints(q_right, "right")}, {}))
-        if len(parts) == 12:
-            break
+    middle = co.random_joints(co.SEVEN, 2, 5).ravel()
+
+    def between(q):
+        left = co.tool_poses(co.SEVEN, q[:, :7], truth, "left")
+        return np.linalg.inv(left) @ co.tool_poses(ACROSS, q[:, 7:])
+
+    hold = between(middle[None])[0]
+    around = middle + np.random.default_rng(6).uniform(-0.6, 0.6, (30, 14))
+    q = co.at_rest(lambda q: held(hold)(between(q)), around)
+    q = q[np.abs(held(hold)(between(q))).max(axis=1) < 1e-12][:12]
+    assert len(q) == 12
+    parts = [({**co.joints(q[:, :7], "left"), **co.joints(q[:, 7:], "right")}, {})]
     arms, chain = two_arms()
     problem, records = co.Bench(arms, {"chain": chain}, ("left.mdh.a3",)).problem(co.dataset(parts))
     begun, values = solved(problem, records)
@@ -329,16 +329,11 @@ REFUSED = {
 
 @pytest.mark.parametrize("case", REFUSED)
 def test_settings_that_make_no_sense_are_refused_in_words(case):
-    with pytest.raises((ValidationError, ValueError, InputError)) as told:
+    with pytest.raises((ValueError, InputError)) as told:
         REFUSED[case]()
-    assert (
-        "found" in str(told.value)
-        or "say which" in str(told.value)
-        or "no arm" in str(told.value)
-        or "not above zero" in str(told.value)
-    )
+    assert any(word in str(told.value) for word in ("found", "say which", "no arm", "not above zero", "finite"))
 
 
-def test_without_numbers_of_two_arms_the_names_are_given():
+def test_where_one_of_two_arms_has_to_be_named_both_are():
     with pytest.raises(ValueError, match="left, right"):
         BallInSocket(BallInSocket.Settings.si(noise=1e-4), ARMS)

@@ -157,11 +157,19 @@ def test_only_a_sliding_joint_may_be_beyond_two_pi(tmp_path):
         ("front__hole_0", "", "hole_0.csv: it is empty"),
         ("front__hole_0", "\n \n", "hole_0.csv: it is empty"),
         ("front__hole_0", "0.1,0.2,0.3\n0.1,0.2\n", "hole_0.csv:2: found 2 numbers, expected 3 as in the first row"),
-        ("back__hole_1", "0.1,0.2\n0.3,0.4\n", "hole_1.csv:1: found 2 columns, expected 3: a joint angle of the arm arm"),
+        (
+            "back__hole_1",
+            "0.1,0.2\n0.3,0.4\n",
+            "hole_1.csv:1: found 2 columns, expected 3: a joint angle of the arm arm",
+        ),
         ("back__hole_1", "1,2,3\n\n1,2,x3\n", "hole_1.csv:3, column 3 (q3): found 'x3', expected a number"),
         ("back__hole_1", "q1,q2,q3\n1,2,3\n", "hole_1.csv:1, column 1 (q1): found 'q1', expected a number"),
         ("back__hole_1", "1,2,3\n1,2,1_0\n", "found '1_0'"),
-        ("back__hole_1", "1,2,3\n30,20,-45\n", "hole_1.csv:2, column 1 (q1): found 30 rad, more than one turn (2 pi rad)"),
+        (
+            "back__hole_1",
+            "1,2,3\n30,20,-45\n",
+            "hole_1.csv:2, column 1 (q1): found 30 rad, more than one turn (2 pi rad)",
+        ),
         ("back__hole_1", b"1,2,3\n1,\xff,3\n", "hole_1.csv:2: found the byte 0xff"),
         ("back__hole_1", b"1,2,3\n1,2\0,3\n", "hole_1.csv:2: found a NUL byte"),
     ],
@@ -187,7 +195,13 @@ def test_folders_that_are_none(tmp_path):
 
 
 def test_other_tables_are_ignored_with_a_warning_and_one_socket_is_warned_of(tmp_path):
-    files = {"front/notes.txt": "x", "notes.csv": "x", "front/.hole_0.csv": "x", "front/HOLE_0.csv": "x", ".git/a.csv": "x"}
+    files = {
+        "front/notes.txt": "x",
+        "notes.csv": "x",
+        "front/.hole_0.csv": "x",
+        "front/HOLE_0.csv": "x",
+        ".git/a.csv": "x",
+    }
     dataset = read(folder(good(tmp_path), files | {"side/hole_1.csv": 5, "top/other.csv": "x"}))
     assert len(dataset) == 21
     told = [text.removeprefix(str(tmp_path)) for text in dataset.warnings]
@@ -215,7 +229,9 @@ def damaged(place, random):
             path.unlink()
             path.mkdir()
         elif kind == 3:
-            path.write_bytes(raw.replace(b",", [b";", b"\t", b",,", b"\n"][random.integers(4)], int(random.integers(1, 9))))
+            path.write_bytes(
+                raw.replace(b",", [b";", b"\t", b",,", b"\n"][random.integers(4)], int(random.integers(1, 9)))
+            )
         elif kind == 4:
             path.write_bytes(random.bytes(200))
         elif kind == 5:

@@ -10,6 +10,7 @@ from armcal.base import se3
 from armcal.base.parameters import Parameters
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import calibrate
+from armcal.solve.simulation import SimulationRequest, measured_without_noise
 from armcal_tracker.pose import TipPose, TipPoseSettings
 from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
@@ -195,3 +196,30 @@ def test_a_calibration_finds_offsets_and_the_bodys_rotation_from_a_file(tmp_path
     w, x, y, z = values[found.entries_of("tracker.target_rotation")]
     assert (Rotation.from_quat([x, y, z, w]).inv() * body).magnitude() < 1e-3
     assert max(sd.values()) < 1e-3
+
+
+SIMULATION = """
+extends: arm.yaml
+simulation:
+  type: elastic_arm
+  truth: truth.yaml
+  poses: {kind: random, count: 300, levels_deg: {q1: [-80, 80], q2: [-80, 80], q3: [-80, 80], q4: [0, 9], q5: [1, 9]}}
+  seed: 4
+  outliers: {fraction: 0.1, size_mm: 50}
+"""
+
+
+def test_simulated_orientations_are_turned_by_the_declared_noise_and_stay_quaternions(tmp_path):
+    (tmp_path / "arm.yaml").write_text(CONFIG, encoding="utf-8")
+    (tmp_path / "sim.yaml").write_text(SIMULATION, encoding="utf-8")
+    (tmp_path / "truth.yaml").write_text("arm.mdh.theta2: 0 deg\n", encoding="utf-8")
+    experiment = Experiment.load(tmp_path / "sim.yaml")
+    system = experiment.system
+    request = SimulationRequest(system.arms, system.measurements, experiment.parameters, system.environment)
+    dataset = experiment.simulator().simulate(request)
+    exact = measured_without_noise(request, dataset)
+    w, x, y, z = dataset.stacked([f"tracker.{name}" for name in NAMES])
+    np.testing.assert_allclose(w**2 + x**2 + y**2 + z**2, 1, rtol=1e-14)
+    truth = Rotation.from_quat(np.array([exact[f"tracker.q{part}"] for part in "xyzw"]).T)
+    turned = (truth.inv() * Rotation.from_quat(np.array([x, y, z, w]).T)).as_rotvec()
+    np.testing.assert_allclose(turned.std(axis=0), 2e-4, rtol=0.15)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from armcal.arm.assembly import Arm
 from armcal.errors import ArmcalError, DataError
+from armcal.measure.contact import ArmAlone
 from armcal.measure.reader import ReadRequest, wanted_channels
 from armcal_dualarm.closure import ClosedChain, ClosedChainSettings
 from armcal_dualarm.log_reader import TwoArmLogReader, TwoArmLogSettings
@@ -114,29 +115,17 @@ def test_joint_angles_need_neither_order_nor_ratios(tmp_path):
 
 
 def test_an_arm_without_columns_or_with_empty_cells_is_not_recorded(tmp_path):
-    from armcal_tracker.position import TipPosition, TipPositionSettings
-
+    left_only = text(motors(joints(3))[:, :7])
+    assert "found no usable record" in refusal(tmp_path, left_only, arms={"left": LEFT})
     arms = {"left": arm("left"), "right": arm("right")}
-    tips = {side: TipPosition(TipPositionSettings.si(noise=1e-3, arm=side), tuple(arms)) for side in arms}
-    balls = {f"{side}_ball": ClosedChain(ClosedChainSettings.si(noise=1, orientation_noise=1), tuple(arms)) for side in arms}
-    asked = ReadRequest(arms, tips | balls, wanted_channels(arms, tips | balls, measured=False))
-    refused = refusal(tmp_path, text(motors(joints(3))[:, :7]), asked, arms={"left": LEFT})
-    assert "found no usable record" in refused and "right.q1 is empty" in refused
-    alone = ReadRequest(arms, {"l": Free("left"), "r": Free("right")}, ())
-    alone = ReadRequest(arms, alone.measurements, wanted_channels(arms, alone.measurements, measured=True))
-    dataset = read(tmp_path, text(motors(joints(3))[:, :7]), alone, arms={"left": LEFT})
+    apart = {side: ArmAlone(side) for side in arms}
+    asked = ReadRequest(arms, apart, wanted_channels(arms, apart, measured=True))
+    dataset = read(tmp_path, left_only, asked, arms={"left": LEFT})
     assert len(dataset) == 3 and np.isnan(dataset.column("right.q1")).all()
     rows = text(motors(joints(3))).splitlines()
     rows[1] = ",".join(rows[1].split(",")[:7]) + "," * 7
-    dataset = read(tmp_path, "\n".join(rows), alone)
+    dataset = read(tmp_path, "\n".join(rows), asked)
     assert len(dataset) == 3 and np.isnan(dataset.column("right.q4")).tolist() == [False, True, False]
-
-
-def Free(side):  # noqa: N802
-    """A measurement of one arm that reads nothing."""
-    from armcal.measure.contact import ArmAlone
-
-    return ArmAlone(side)
 
 
 def moving_log(rests, noise=2e-6, seed=4):
@@ -151,7 +140,7 @@ def moving_log(rests, noise=2e-6, seed=4):
 
 @pytest.mark.parametrize("still", [{"samples": 20}, {"window": "0.2 s", "spread_deg": 0.01}, {"window_ms": 400}])
 def test_a_continuous_log_is_reduced_to_its_rests(tmp_path, still):
-    rests = [row for row in joints(6, seed=7)]
+    rests = list(joints(6, seed=7))
     log = moving_log(rests)
     table = np.column_stack([0.01 * np.arange(len(log)), motors(log)])
     arms = {"left": {**LEFT, "columns": list(range(2, 9))}, "right": {**RIGHT, "columns": list(range(9, 16))}}
@@ -184,12 +173,28 @@ def test_creeping_joints_are_not_at_rest(tmp_path):
         ("", {}, "log.txt: it is empty"),
         (text(motors(joints(2))) + "1,2\n", {}, "log.txt:3: found 2 cells, expected 14 as in the first row"),
         (text(motors(joints(2))[:, :13]), {}, "log.txt:1: found 13 columns, expected a column 14"),
-        (text(motors(joints(1))) + "x," + text(motors(joints(1)))[:-1].partition(",")[2], {}, "2, column 1: found 'x', exp"),
+        (
+            text(motors(joints(1))) + "x," + text(motors(joints(1)))[:-1].partition(",")[2],
+            {},
+            "2, column 1: found 'x', exp",
+        ),
         (text(100 * motors(joints(2))), {}, "left.q1 would stand at"),
-        ("a,b\n1,2\n", {"arms": {"left": {**LEFT, "columns": list("abcdefg")}}}, "log.txt:1, c: no column c, expected it"),
-        (text(motors(joints(2))), {"labels": {"clamp": "clamp"}}, "found no header, expected one with the column clamp"),
+        (
+            "a,b\n1,2\n",
+            {"arms": {"left": {**LEFT, "columns": list("abcdefg")}}},
+            "log.txt:1, g: no column g, expected it",
+        ),
+        (
+            text(motors(joints(2))),
+            {"labels": {"clamp": "clamp"}},
+            "found no header, expected one with the column clamp",
+        ),
         (text(motors(joints(2))), {"arms": {"middle": LEFT}}, "no arm is called 'middle'; the arms are left, right"),
-        (text(motors(joints(2))), {"arms": {"left": {"columns": [1, 2]}}}, "2 columns for the arm left, which has 7 joints"),
+        (
+            text(motors(joints(2))),
+            {"arms": {"left": {"columns": [1, 2]}}},
+            "2 columns for the arm left, which has 7 joints",
+        ),
         (b"1,\xff\n", {}, "log.txt:1: found bytes that are not UTF-8"),
         ("a,a\n" * 2, {"arms": {"left": {"columns": list("abcdefg")}}}, "found the column a 2 times"),
     ],

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -14,7 +14,8 @@ import numpy as np
 from armcal.base.config_text import ConfigText
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
-from armcal.base.units import split_suffix, to_unit
+from armcal.base.pose_settings import quaternion_of
+from armcal.base.units import DIMENSIONLESS, split_suffix, to_unit
 from armcal.cli.common import Voice, speaking
 from armcal.errors import DataError, InputError, Location
 from armcal.measure.csv_writer import column_names, write_csv
@@ -48,16 +49,20 @@ def predict(voice: Voice, calibration: Path, poses: Path, out: Path, recording: 
     system = loaded.system
     commands = _read(registry, loaded, poses, columns)
     _tell_missing(voice, loaded, commands, recording)
-    channels, _ = loaded.predict(commands)
+    channels, placed = loaded.predict(commands)
     found = None
-    if loaded.record.prediction is None:
+    if not loaded.readable:
+        channels = _tools(placed, tuple(system.arms))
+    elif loaded.record.prediction is None:
         voice.warn("the calibration keeps nothing about the errors of predictions: run it again to have them.")
     else:
         found = loaded.plus_minus(commands, _RECORDINGS[recording])
         channels = {name: values + found.shift.get(name, 0.0) for name, values in channels.items()}
     if out.resolve() == poses.resolve():
         raise DataError("it is the file of poses itself.", where=Location(str(out)), hint="Give another --out.")
-    wanted = wanted_channels(system.arms, system.measurements, measured=False)
+    wanted = wanted_channels(system.arms, loaded.readable, measured=False)
+    if not loaded.readable:
+        wanted = (*wanted, *_tool_channels(tuple(system.arms)))
     shown = [channel for channel in wanted if channel.channel in channels]
     extra = _columns(found, shown) if found else {}
     write_csv(out, replace(commands, channels=channels, extra=extra), shown)
@@ -78,6 +83,24 @@ def predict(voice: Voice, calibration: Path, poses: Path, out: Path, recording: 
             "in the median pose",
             markup=False,
         )
+
+
+def _tools(placed: Array, arms: Sequence[str]) -> dict[str, Array]:
+    """Where tools are, as channels: position (m) and unit quaternion (arms x N x 4 x 4)."""
+    channels: dict[str, Array] = {}
+    for arm, poses in zip(arms, placed, strict=True):
+        turns = np.array([quaternion_of(pose[:3, :3]) for pose in poses]).reshape(-1, 4)
+        channels |= {f"{arm}.tool_{axis}": poses[:, i, 3] for i, axis in enumerate("xyz")}
+        channels |= {f"{arm}.tool_q{axis}": turns[:, i] for i, axis in enumerate("wxyz")}
+    return channels
+
+
+def _tool_channels(arms: Sequence[str]) -> Iterator[WantedChannel]:
+    for arm in arms:
+        names = [(f"tool_{axis}", "length") for axis in "xyz"] + [(f"tool_q{axis}", DIMENSIONLESS) for axis in "wxyz"]
+        for name, dimension in names:
+            own = f"{arm}.{name}"
+            yield WantedChannel(own, (own, name) if len(arms) == 1 else (own,), dimension, required=False)
 
 
 def _read(registry: PluginRegistry, loaded: Calibration, poses: Path, columns: Sequence[str]) -> Dataset:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+import casadi as ca
+
 from armcal.arm.assembly import ArmState
 from armcal.base.parameters import ParameterBlock
 from armcal.base.se3 import Expression
@@ -36,21 +38,21 @@ class Contact:
         return ()
 
 
-class ArmAlone(Contact):
-    """No instrument at all: it only makes an arm's poses known."""
+class ArmsAlone(Contact):
+    """No instrument at all: it only makes the poses of arms known."""
 
-    def __init__(self, arm: str) -> None:
-        self.arms = (arm,)
+    def __init__(self, arms: Sequence[str]) -> None:
+        self.arms = tuple(arms)
 
     def residual(
         self, arms: Mapping[str, ArmState], measured: Mapping[str, Expression], values: Mapping[str, Expression]
     ) -> Expression:
-        """Where the tool is (3x1, m)."""
-        return arms[self.arms[0]].base_T_tool.translation
+        """Where the tools are (3 an arm, m)."""
+        return ca.vertcat(*[arms[name].base_T_tool.translation for name in self.arms])
 
     def noise(self) -> tuple[float, ...]:
         """Of no meaning."""
-        return (1.0, 1.0, 1.0)
+        return (1.0,) * (3 * len(self.arms))
 
 
 def named_arm(asked: str | None, arm_names: Sequence[str]) -> str:

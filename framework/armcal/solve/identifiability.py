@@ -136,17 +136,30 @@ def expected_covariance(triangle: Array, parameters: Parameters) -> Array:
 
 
 def correlated_pairs(
-    covariance: Array, names: tuple[str, ...], above: float = CORRELATED
+    covariance: Array, names: tuple[str, ...], above: float = CORRELATED, bound: frozenset[str] = frozenset()
 ) -> tuple[tuple[str, str, float], ...]:
-    """Pairs of parameters whose estimates correlate by more than ``above``, the strongest first."""
+    """Pairs of parameters whose estimates correlate by more than ``above``, the strongest first.
+
+    Entries of one block in ``bound`` are not paired: they hang together by what they are, as a quaternion's do.
+    """
     correlation = correlations(covariance)
     rows, columns = np.triu_indices(len(names), 1)
     pairs = [
         (names[i], names[j], float(correlation[i, j]))
         for i, j in zip(rows, columns, strict=True)
-        if abs(correlation[i, j]) > above
+        if abs(correlation[i, j]) > above and not _of_one(names[i], names[j], bound)
     ]
     return tuple(sorted(pairs, key=lambda pair: -abs(pair[2])))
+
+
+def bound_blocks(parameters: Parameters) -> frozenset[str]:
+    """Names of the blocks with more entries than degrees of freedom."""
+    return frozenset(block.name for block in parameters.free if block.domain.dof < block.size)
+
+
+def _of_one(one: str, other: str, bound: frozenset[str]) -> bool:
+    owner = one.partition("[")[0]
+    return owner in bound and owner == other.partition("[")[0]
 
 
 def correlations(covariance: Array) -> Array:

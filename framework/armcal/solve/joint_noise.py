@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from armcal.base.domains import Array
+from armcal.measure.partners import OTHER
 from armcal.solve.problem import FactorRecords, Problem
 from armcal.solve.whitening import by_covariance, declared, transformed
 
@@ -15,16 +16,19 @@ from armcal.solve.whitening import by_covariance, declared, transformed
 def with_joint_noise(problem: Problem, records: Sequence[FactorRecords], values: Array) -> tuple[FactorRecords, ...]:
     """The records whitened by the noise of residuals and of joints together; the same where no joint has any.
 
-    The covariance of a residual is its own plus S diag(sd^2) S', with S its derivative by the joints at these values.
+    The covariance of a residual is its own plus S diag(sd^2) S', with S its derivative by the joints at these values,
+    those of the other record where a measurement lies between two. Records that name the same other one share its
+    noise; that they hang together is left out.
 
     Raises:
         NotConvergedError: a record has no elastic equilibrium at these values.
     """
     arms = problem.blueprint.arms.values()
     stated = {
-        f"{arm.name}.{joint}": arm.joint_noise
+        f"{arm.name}.{joint}{which}": arm.joint_noise
         for arm in arms
         for joint, dimension in arm.commanded.items()
+        for which in ("", OTHER)
         if arm.joint_noise and dimension == "angle"
     }
     if not stated:

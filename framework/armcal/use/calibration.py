@@ -23,7 +23,9 @@ from armcal.config.system import System, build_system
 from armcal.config.validate import validate
 from armcal.config.yaml_source import load_config
 from armcal.errors import ConfigError, DataError, Location
-from armcal.measure.contact import ArmAlone
+from armcal.measure.contact import ArmsAlone
+from armcal.measure.measurement import Measurement
+from armcal.measure.partners import PairedMeasurement
 from armcal.plugins import PluginRegistry, discover
 from armcal.solve.coverage import Recording
 from armcal.solve.estimator import Estimate
@@ -138,6 +140,12 @@ class Calibration:
         parameters = system.parameters(record.groups)
         return cls(system, parameters.with_nominal(_values(parameters, record, path)), record)
 
+    @property
+    def readable(self) -> Mapping[str, Measurement]:
+        """The measurements whose readings a single pose has: a contact reads nothing."""
+        measurements = self.system.measurements.items()
+        return {name: m for name, m in measurements if m.channels() and not isinstance(m, PairedMeasurement)}
+
     def predict(self, commands: Dataset) -> tuple[dict[str, Array], Array]:
         """What instruments would read and where the first measurement's arms' tools are, in elastic equilibrium.
 
@@ -161,12 +169,12 @@ class Calibration:
         fixed = self.parameters.with_free(())
         problem = Problem.build(
             self.system.arms,
-            self.system.measurements,
+            self.readable or {"pose": ArmsAlone(tuple(self.system.arms))},
             fixed,
             self.system.environment,
             commands,
             "interpreted",
-            self.record.groups,
+            groups={},
         )
         shown = problem.predict(fixed.nominal(), problem.records(commands))
         channels = {
@@ -200,7 +208,14 @@ class Calibration:
         fitted = self.parameters.with_nominal(np.array([entry.nominal for entry in entries])).with_free(free)
         components = tuple(_component(each) for each in noise.get("components", ()))
         measure = (float(noise["scale"]), int(noise["degrees_of_freedom"]))
-        return Uncertainty(self.system, fitted, self.parameters.nominal(), kept, *measure, components)
+        return Uncertainty(
+            replace(self.system, measurements=self.readable),
+            fitted,
+            self.parameters.nominal(),
+            kept,
+            *measure,
+            components,
+        )
 
     def plus_minus(self, commands: Dataset, recording: Recording = "new") -> PlusMinus:
         """How far measurements at these commands may lie from ``predict``.
@@ -231,7 +246,7 @@ class Calibration:
             raise ValueError(f"found {angles.shape[1]} joint angles a row, the arm {name} has {len(joints)} joints")
         channels = {f"{name}.{joint}": angles[:, i] for i, joint in enumerate(joints)}
         commands = Dataset(tuple(str(i) for i in range(len(angles))), channels)
-        alone = replace(self.system, measurements={"pose": ArmAlone(name)})
+        alone = replace(self.system, measurements={"pose": ArmsAlone([name])})
         poses = replace(self, system=alone).predict(commands)[1]
         return np.asarray(poses[0])
 

@@ -205,7 +205,7 @@ class Uncertainty:
     def _problem(self, dataset: Dataset) -> Problem:
         system = self.system
         parts = (system.arms, system.measurements, self._drifting, system.environment, dataset)
-        return Problem.build(*parts, "interpreted")
+        return Problem.build(*parts, "interpreted", groups={})
 
     @cached_property
     def _drifting(self) -> Parameters:
