@@ -78,7 +78,7 @@ def labels_of(experiment: Experiment, dataset: Dataset) -> tuple[str, ...]:
             where=experiment.source.where(("validation",)),
             hint="Name a text column of the data: group_by: NAME.",
         )
-    return dataset.extra[label]
+    return _texts(dataset, label)
 
 
 def group_errors(
@@ -104,7 +104,7 @@ def group_errors(
     label = label_of(experiment)
     if label is None or label not in dataset.extra:
         return ()
-    labels = np.array(dataset.extra[label])
+    labels = np.array(_texts(dataset, label))
     before = _distances(problem, settled(untrained(problem), problem.parameters.nominal(), records))
     # Distances are judged by what the records of each socket say, not by what the known distance made of them.
     after = _distances(problem, settled(untrained(problem), values, records))
@@ -116,6 +116,11 @@ def group_errors(
         of_nominal, of_calibrated = _within(name, before), _within(name, after)
         result.append(GroupError(name, int(inside.sum()), trained, nominal, calibrated, of_nominal, of_calibrated))
     return tuple(result)
+
+
+def _texts(dataset: Dataset, label: str) -> tuple[str, ...]:
+    """A text column as groups are named by it: spaces about a text mean nothing."""
+    return tuple(text.strip() for text in dataset.extra[label])
 
 
 def _distances(problem: Problem, values: Array) -> list[tuple[tuple[str, str], float]]:
