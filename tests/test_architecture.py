@@ -103,6 +103,7 @@ ORDER = [
     "armcal.solve.misses",
     "armcal.solve.evidence",
     "armcal.solve.noise_findings",
+    "armcal.solve.moved",
     "armcal.solve.evidence_findings",
     "armcal.solve.prediction",
     "armcal.solve.coverage",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from armcal.base.domains import Array
@@ -13,6 +14,8 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 _SPREAD_RAD = math.radians(0.01)
+Indices = NDArray[np.intp]
+Mask = NDArray[np.bool_]
 
 
 class StillSettings(Settings):
@@ -52,20 +55,16 @@ def rests(joints: Array, labels: Sequence[Sequence[str]], time: Array | None, se
         settings: what still means.
     """
     breaks = _breaks(joints, labels, time, settings)
-    found, start, count = [], 0, joints.shape[1]
-    while start < count:
-        stop = _end(joints, breaks, start, settings.spread)
-        if _is_long(start, stop, time, settings):
-            found.append(Rest(start, stop))
-            start = stop
-        else:
-            start += 1
+    edges = [0, *np.flatnonzero(breaks).tolist(), joints.shape[1]]
+    found: list[Rest] = []
+    for start, stop in pairwise(edges):
+        part = np.nan_to_num(joints[:, start:stop])  # what is missing is so throughout, or there were a break
+        stops = _shortest(stop - start, None if time is None else time[start:stop], settings)
+        found += [Rest(start + rest.start, start + rest.stop) for rest in _within(part, stops, settings.spread)]
     return found
 
 
-def _breaks(
-    joints: Array, labels: Sequence[Sequence[str]], time: Array | None, settings: StillSettings
-) -> NDArray[np.bool_]:
+def _breaks(joints: Array, labels: Sequence[Sequence[str]], time: Array | None, settings: StillSettings) -> Mask:
     """Before which rows a rest ends, whatever the joints do (N)."""
     missing = np.isnan(joints)
     breaks = np.zeros(joints.shape[1], dtype=bool)
@@ -81,17 +80,48 @@ def _breaks(
     return breaks
 
 
-def _end(joints: Array, breaks: NDArray[np.bool_], start: int, spread: float) -> int:
-    """The row before which a joint has moved by more than the spread since ``start``."""
-    low = high = joints[:, start]
-    for row in range(start + 1, joints.shape[1]):
+def _shortest(count: int, time: Array | None, settings: StillSettings) -> Indices:
+    """For each row that can begin a rest (the first ones), before which row the shortest such rest would end."""
+    if settings.samples is not None or time is None or settings.window is None:
+        return np.arange(settings.samples or 2, count + 1)
+    stops = np.maximum(np.searchsorted(time, time + settings.window) + 1, np.arange(count) + 2)
+    return stops[stops <= count]
+
+
+def _within(joints: Array, stops: Indices, spread: float) -> list[Rest]:
+    """The rests of a stretch without breaks: each begins where the shortest one holds, and goes on while it does."""
+    found: list[Rest] = []
+    end = 0
+    for start in np.flatnonzero((_spreads(joints, stops) <= spread).all(axis=0)).tolist():
+        if start >= end:
+            end = _end(joints, start, int(stops[start]), spread)
+            found.append(Rest(start, end))
+    return found
+
+
+def _spreads(joints: Array, stops: Indices) -> Array:
+    """Largest less smallest in the rows from i to before ``stops[i]`` (joints x starts).
+
+    From the extremes of stretches whose lengths are powers of two, each twice the last.
+    """
+    found = np.zeros((len(joints), len(stops)))
+    starts = np.arange(len(stops))
+    levels = np.log2(np.maximum(stops - starts, 1)).astype(int)
+    low = high = joints
+    for level in range(levels.max(initial=-1) + 1):
+        width = 2**level
+        first = starts[levels == level]
+        last = stops[first] - width
+        found[:, first] = np.maximum(high[:, first], high[:, last]) - np.minimum(low[:, first], low[:, last])
+        low, high = np.minimum(low[:, :-width], low[:, width:]), np.maximum(high[:, :-width], high[:, width:])
+    return found
+
+
+def _end(joints: Array, start: int, stop: int, spread: float) -> int:
+    """The row before which a joint has moved by more than the spread since ``start``; it has not before ``stop``."""
+    low, high = joints[:, start:stop].min(axis=1), joints[:, start:stop].max(axis=1)
+    for row in range(stop, joints.shape[1]):
         low, high = np.minimum(low, joints[:, row]), np.maximum(high, joints[:, row])
-        if breaks[row] or (high - low > spread).any():
+        if (high - low > spread).any():
             return row
     return joints.shape[1]
-
-
-def _is_long(start: int, stop: int, time: Array | None, settings: StillSettings) -> bool:
-    if settings.samples is not None:
-        return stop - start >= settings.samples
-    return time is not None and stop - start > 1 and bool(time[stop - 1] - time[start] >= settings.window)

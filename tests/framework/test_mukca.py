@@ -81,6 +81,9 @@ BEST = {
     ("kinova", "left"): 1.02 * 3.257,
     ("kinova", "lower_left"): 1.02 * 3.782,
 }
+FIRST = (("panda", "front_center"), ("kinova", "left"))
+POLISHED = (("kuka", "front"), ("kinova", "left"))
+SLOW = pytest.mark.slow
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -94,9 +97,9 @@ def run(tmp_path_factory):
     """``armcal run``, each asked for once: its metrics and the calibrated values by name."""
 
     @cache
-    def told(config, data, *trained, settings=()):
+    def told(config, data, *trained):
         out = tmp_path_factory.mktemp("run") / "out"
-        asked = [f"validation.train_groups=[{','.join(trained)}]", *settings]
+        asked = [f"validation.train_groups=[{','.join(trained)}]", "evaluator=interpreted"]
         arguments = ["run", str(config), "--data", str(data), "--out", str(out), "--json"]
         result = CliRunner().invoke(cli, arguments + [x for s in asked for x in ("--set", s)])
         assert result.exit_code == 0, result.output
@@ -225,7 +228,9 @@ class PublishedCost:
         return self(x + 1j * h * np.eye(len(x))).imag / h
 
 
-@pytest.mark.parametrize(("name", "trained"), PUBLISHED)
+@pytest.mark.parametrize(
+    ("name", "trained"), [pytest.param(*k, marks=[] if k in POLISHED else SLOW) for k in PUBLISHED]
+)
 def test_nothing_near_the_solution_has_a_lower_published_cost(run, name, trained):
     told, values = published(run, name, trained)
     urdf = Urdf.read(CONFIGS / ROBOTS[name].urdf, ROBOTS[name].root)
@@ -240,12 +245,18 @@ def test_nothing_near_the_solution_has_a_lower_published_cost(run, name, trained
     steps = np.random.default_rng(0).normal(size=(400, len(x)))
     for size in (1e-3, 1e-5, 1e-7):
         assert np.all(cost(x + size * steps) > reached * (1 - 1e-7))
-    options = {"maxiter": 60, "ftol": 0.0, "gtol": 0.0, "maxcor": 50}
-    polish = lambda start: minimize(lambda v: cost(v) / reached, start, jac=lambda v: cost.slope(v) / reached,
-                                    method="L-BFGS-B", options=options)  # fmt: skip # noqa: E731
-    assert polish(x).fun > 1 - 1e-7
+    assert polished(cost, x) > reached * (1 - 1e-7)
     beside = x + 1e-3 * steps[0]
-    assert polish(beside).fun < 0.5 * cost(beside) / reached, "the polish does not work: the test is empty"
+    risen = cost(beside) - reached
+    assert polished(cost, beside) < reached + 0.5 * risen, "the polish does not work: the test is empty"
+
+
+def polished(cost, start):
+    """The cost that a general minimiser comes to."""
+    unit = cost(start)
+    options = {"maxiter": 20, "ftol": 0.0, "gtol": 0.0, "maxcor": 30}
+    slope = lambda x: cost.slope(x) / unit  # noqa: E731
+    return unit * minimize(lambda x: cost(x) / unit, start, jac=slope, method="L-BFGS-B", options=options).fun
 
 
 def _moved(urdf, x):
@@ -274,7 +285,7 @@ def test_every_row_of_the_published_table(run, name, trained):
     assert told["solver"]["converged"] and told["solver"]["iterations"] <= 12
 
 
-@pytest.mark.parametrize(("name", "trained"), BEST)
+@pytest.mark.parametrize(("name", "trained"), [pytest.param(*k, marks=[] if k in FIRST else SLOW) for k in BEST])
 def test_joint_effects_do_better_on_positions_that_did_not_train_them(run, name, trained):
     told, _ = run(CONFIGS / f"{name}_best.yaml", DATA / ROBOTS[name].folder, trained)
     held = told["error_mm"]["calibrated"]["holdout"]
@@ -363,10 +374,12 @@ def test_units_mean_nothing(run, tmp_path):
     """The same problem in other units: m for mm, um for mm, rad and deg for mrad."""
     shutil.copytree(CONFIGS, tmp_path / "mukca")
     for file, pairs in {
-        "ball.yaml": {"noise_mm: 0.1\n": "noise_m: 0.0001\n", "distance_mm: 50, noise_mm: 0.1": "distance_m: 0.05, "
-                      "noise_um: 100"},
+        "ball.yaml": {
+            "noise_mm: 0.1\n": "noise_m: 0.0001\n",
+            "distance_mm: 50, noise_mm: 0.1": "distance_m: 0.05, noise_um: 100",
+        },
         "kuka.yaml": {"10 mm": "0.01 m", "10 mrad": "0.5729577951308232 deg"},
-    }.items():  # fmt: skip
+    }.items():
         text = (tmp_path / "mukca" / file).read_text()
         for old, new in pairs.items():
             assert old in text

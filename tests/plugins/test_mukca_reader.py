@@ -249,11 +249,11 @@ def damaged(place, random):
 
 
 def test_damaged_folders_are_read_or_refused_by_an_armcal_error(tmp_path):
-    random, refused = np.random.default_rng(5), 0
+    random, refused, asked = np.random.default_rng(5), 0, request()
     for number in range(200):
         place = damaged(tmp_path / str(number), random)
         try:
-            dataset = read(place, weights=("positions", "postures")[number % 2])
+            dataset = read(place, asked, weights=("positions", "postures")[number % 2])
         except ArmcalError as fault:
             assert fault.exit_code == 2 and fault.hint
             refused += 1

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from armcal.arm.assembly import Arm
 from armcal.errors import ArmcalError, DataError
-from armcal.measure.contact import ArmAlone
 from armcal.measure.reader import ReadRequest, wanted_channels
+from armcal_contact.ball import BallInSocket, BallInSocketSettings
 from armcal_dualarm.closure import ClosedChain, ClosedChainSettings
 from armcal_dualarm.log_reader import TwoArmLogReader, TwoArmLogSettings
+from armcal_dualarm.still import Rest, StillSettings, rests
 from armcal_mdh.model import MdhModel, MdhSettings
 from pydantic import ValidationError
 
@@ -118,7 +119,7 @@ def test_an_arm_without_columns_or_with_empty_cells_is_not_recorded(tmp_path):
     left_only = text(motors(joints(3))[:, :7])
     assert "found no usable record" in refusal(tmp_path, left_only, arms={"left": LEFT})
     arms = {"left": arm("left"), "right": arm("right")}
-    apart = {side: ArmAlone(side) for side in arms}
+    apart = {side: BallInSocket(BallInSocketSettings.si(noise=1e-3, arm=side), tuple(arms)) for side in arms}
     asked = ReadRequest(arms, apart, wanted_channels(arms, apart, measured=True))
     dataset = read(tmp_path, left_only, asked, arms={"left": LEFT})
     assert len(dataset) == 3 and np.isnan(dataset.column("right.q1")).all()
@@ -159,6 +160,34 @@ def test_a_rest_ends_with_its_label_and_with_a_pause(tmp_path):
     lines = [f"{row},{times[i]},{'ab'[i >= 10]}" for i, row in enumerate(rows)]
     dataset = read(tmp_path, "\n".join(lines), time=15, labels={"clamp": 16}, still={"window_s": 0.05})
     assert dataset.rows == (1, 11, 31) and dataset.extra["clamp"] == ("a", "b", "b")
+
+
+def plainly(joints, stops, spread):
+    """Rests by trying every row, for joints that are all there."""
+    found, start = [], 0
+    while start < len(stops):
+        stop = int(stops[start])
+        if (np.ptp(joints[:, start:stop], axis=1) <= spread).all():
+            while stop < joints.shape[1] and (np.ptp(joints[:, start : stop + 1], axis=1) <= spread).all():
+                stop += 1
+            found.append(Rest(start, stop))
+            start = stop
+        else:
+            start += 1
+    return found
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_rests_are_those_that_trying_every_row_finds(seed):
+    random = np.random.default_rng(seed)
+    log = np.cumsum(random.normal(size=(3, 400)) * random.choice([0.0, 0.02, 1.0], 400, p=[0.6, 0.35, 0.05]), axis=1)
+    samples = int(random.integers(2, 20))
+    settings = StillSettings.si(samples=samples, spread=0.1)
+    assert rests(log, (), None, settings) == plainly(log, np.arange(samples, 401), 0.1)
+    time = np.cumsum(random.uniform(0.0, 0.02, 400))
+    stops = [next((j + 1 for j in range(i + 1, 400) if time[j] - time[i] >= 0.1), None) for i in range(400)]
+    timed = StillSettings.si(window=0.1, spread=0.1)
+    assert rests(log, (), time, timed) == plainly(log, [stop for stop in stops if stop], 0.1)
 
 
 def test_creeping_joints_are_not_at_rest(tmp_path):
@@ -233,7 +262,7 @@ def test_settings_that_make_no_sense(settings, said):
 
 
 def test_damaged_logs_are_read_or_refused_by_an_armcal_error(tmp_path):
-    random, refused = np.random.default_rng(6), 0
+    random, refused, asked = np.random.default_rng(6), 0, request()
     whole = bytearray(text(motors(joints(6))).encode())
     for number in range(200):
         raw = bytearray(whole)
@@ -241,7 +270,7 @@ def test_damaged_logs_are_read_or_refused_by_an_armcal_error(tmp_path):
             raw[at] = random.choice([*b",;\n\t -.e9x", random.integers(256)])
         raw = raw[: random.integers(len(raw))] if number % 5 == 0 else raw
         try:
-            read(tmp_path, bytes(raw), still={"samples": 2, "spread_deg": 400} if number % 2 else None)
+            read(tmp_path, bytes(raw), asked, still={"samples": 2, "spread_deg": 400} if number % 2 else None)
         except ArmcalError as fault:
             assert fault.exit_code == 2 and fault.hint
             refused += 1

@@ -133,6 +133,13 @@ def grouped_instances(measurements: Mapping[str, Measurement]) -> tuple[str, ...
     return tuple(name for name, measurement in measurements.items() if isinstance(measurement, GroupedMeasurement))
 
 
+def group_key(measurements: Mapping[str, Measurement], groups: Groups, instance: str, number: int) -> str:
+    """The key of a measurement's group by its place."""
+    measurement = measurements[instance]
+    owner = owner_of(instance, measurement) if isinstance(measurement, GroupedMeasurement) else instance
+    return groups[owner][number]
+
+
 def group_name(owner: str, key: str, local: str) -> str:
     """The full name of a group's parameter."""
     return f"{owner}.{key}.{local}"

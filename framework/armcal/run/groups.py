@@ -109,7 +109,7 @@ def group_errors(
     # Distances are judged by what the records of each socket say, not by what the known distance made of them.
     after = _distances(problem, settled(untrained(problem), values, records))
     result = []
-    for name in sorted(set(labels.tolist())):
+    for name in sorted(set(labels.tolist()) - {""}):
         inside = labels == name
         nominal, calibrated = (float(np.nanmean(each[inside])) for each in errors_mm)
         trained = int(np.sum(inside[split.train]))

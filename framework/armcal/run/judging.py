@@ -18,6 +18,7 @@ from armcal.solve.evidence import Evidence, priors_alone, unseen_poses
 from armcal.solve.leftover import leftover
 from armcal.solve.misses import Judged, misses
 from armcal.solve.motion import Motion, recorded_position
+from armcal.solve.moved import Moved, moved_findings, moved_groups
 from armcal.solve.problem import FactorRecords, Problem
 from armcal.solve.suggestion import suggest
 from armcal.solve.validation import Split
@@ -67,7 +68,7 @@ def verdict_of(
         run.dataset.ids,
         suggest(run.problem, training, found, joints) if found.names and _reads(run.problem) else (),
         run.fitted,
-        intervals.findings(),
+        [*intervals.findings(), *moved_findings(_moved(run))],
         evidence,
     )
     return verdict, evidence
@@ -92,6 +93,14 @@ def gather(run: FittedRecords, judged_mm: Array, system: System, limit: float | 
     acting = problem.weighted(run.fitted.records, run.fitted.weights)
     own = (training, motion.subset(train), position[train])
     return Evidence(leftover(problem, acting, found, *own, modelled=effect_types(system)), missed, alone)
+
+
+def _moved(run: FittedRecords) -> tuple[Moved, ...]:
+    """Of the training groups, by a fit that converged."""
+    if not run.fitted.estimate.verdict.converged:
+        return ()
+    acting = run.problem.weighted(run.fitted.records, run.fitted.weights)
+    return moved_groups(run.problem, run.fitted.estimate.values, acting)
 
 
 def _reads(problem: Problem) -> bool:

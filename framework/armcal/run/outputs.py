@@ -176,8 +176,8 @@ def residuals_text(result: RunResult) -> str:
     errors, dataset = result.errors, result.dataset
     held = np.zeros(len(dataset), dtype=bool)
     held[result.split.holdout] = True
-    rows = len(errors.calibrated_residual_mm)
-    axes = ["dx_mm", "dy_mm", "dz_mm"] if rows == 3 else [f"residual{i}_mm" for i in range(1, rows + 1)]
+    numbered = [f"residual{i}_mm" for i in range(1, len(errors.calibrated_residual_mm) + 1)]
+    axes = list(errors.residual_columns) or numbered
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     columns = ["pose_id", "source_row", "set", "weight", "nominal_mm", "calibrated_mm", "cross_validated_mm", *axes]

@@ -329,7 +329,17 @@ def _errors(
         failed_folds=failed,
         at_rest_mm=record_errors(problem, values, records) * _MM if drifts else None,
         cross_validated_at_rest_mm=at_rest if drifts else None,
+        residual_columns=_residual_columns(problem),
     )
+
+
+def _residual_columns(problem: Problem) -> tuple[str, ...]:
+    """What the rows of all residuals are called: by axis where there is one position, else by number."""
+    dimensions = [dimension for kernel in problem.kernels for dimension in kernel.factor.dimensions]
+    if dimensions == ["length"] * 3:
+        return ("dx_mm", "dy_mm", "dz_mm")
+    units = {"length": "mm", "angle": "mrad"}
+    return tuple(f"residual{i}_{units[dimension]}" for i, dimension in enumerate(dimensions, start=1))
 
 
 def _fold_warnings(errors: RecordErrors, experiment: Experiment) -> list[str]:

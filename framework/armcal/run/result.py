@@ -33,6 +33,7 @@ class RecordErrors:
         failed_folds: how many folds of the cross-validation did not converge.
         at_rest_mm: with the calibrated parameters where nothing is known of a drift (N); None if nothing drifts.
         cross_validated_at_rest_mm: the same by the fold that did not train on it.
+        residual_columns: names of the rows of the residuals, with their units (mm; mrad for angles).
     """
 
     nominal_mm: Array
@@ -44,6 +45,7 @@ class RecordErrors:
     failed_folds: int = 0
     at_rest_mm: Array | None = None
     cross_validated_at_rest_mm: Array | None = None
+    residual_columns: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

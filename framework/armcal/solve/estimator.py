@@ -282,7 +282,7 @@ def require_solvable(problem: Problem, records: Sequence[FactorRecords], start: 
         more = len(explained) - MOST_TOLD
         listed += f"; and {more} more, which armcal identify lists" if more > 0 else ""
         text = f"the data does not determine {len(explained)} combinations"
-        unseen_scale = scale_is_unseen(parameters, start, known)
+        unseen_scale = scale_is_unseen(problem, start, records, known)
         if held_by_nothing(parameters, known):
             first, mend = (f"{UNSEEN_SCALE}; ", f"{GIVE_A_LENGTH}. ") if unseen_scale else ("", "")
             raise ProblemError(f"{first}{text}: {listed}.", hint=f"{mend}{_mend(explained)}".capitalize())

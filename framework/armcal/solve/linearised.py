@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import numpy as np
 
@@ -37,19 +38,31 @@ def linearised(kernel: Kernel, slots: Slots, each: FactorRecords, values: Array)
 
 
 def mean_shares(factor: Factor, each: FactorRecords) -> list[Array]:
-    """Of each group whose mean weighs more than its records say, what each whitened record adds to a row (width).
+    """Of each group whose mean weighs more than its records say, what each record adds to a row (width).
 
-    A group of n records whose whitened residuals have the mean m gives n |m|^2; with the row it gives as many times
-    more as the measurement says.
+    The shares go with residuals in units of the declared noise: the mean of a group is that of its records by their
+    weights alone, whatever is known of their own noise. Records of total weight n whose residuals have the mean m give
+    n |m|^2 to a sum of squares; with the row as many times more as the measurement says.
     """
     if factor.mean_weight <= 1 or each.group is None:
         return []
     beyond, inside = np.sqrt(factor.mean_weight - 1), each.weight > 0
     shares = []
-    for number in np.unique(each.group[inside]):
-        members = inside & (each.group == number) & (number != NO_GROUP)
-        shares.append(np.where(members, beyond / np.sqrt(max(1, members.sum())), 0.0))
+    for number in np.unique(each.group[inside & (each.group != NO_GROUP)]):
+        weight = np.where(each.group == number, each.weight, 0.0)
+        shares.append(beyond * weight / np.sqrt(weight.sum()))
     return shares
+
+
+def linearised_means(kernel: Kernel, slots: Slots, each: FactorRecords, values: Array) -> list[Block]:
+    """Jacobian (n_r x n_v) and residual (n_r) of each group whose mean weighs more."""
+    shares = mean_shares(kernel.factor, each)
+    if not shares:
+        return []
+    alike = replace(each, whitening=None, weight=np.ones_like(each.weight))
+    blocks = list(linearised(kernel, slots, alike, values))
+    jacobian, residual = (np.concatenate(parts, axis=-1) for parts in zip(*blocks, strict=True))
+    return [(jacobian @ share, residual @ share) for share in shares]
 
 
 def _block(kernel: Kernel, slots: Slots, each: FactorRecords, values: Array, part: slice) -> Block:

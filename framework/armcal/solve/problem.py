@@ -24,7 +24,7 @@ from armcal.solve.factor import Environment
 from armcal.solve.factor_records import FactorRecords, correlation_of
 from armcal.solve.gather import Slots
 from armcal.solve.kernel import EvaluatorChoice, Kernel
-from armcal.solve.linearised import BLOCK_RECORDS, linearised, mean_shares
+from armcal.solve.linearised import BLOCK_RECORDS, linearised, linearised_means, mean_shares
 from armcal.solve.normal_equations import ExtraRows, NormalEquations, TieFunction, stacked
 from armcal.solve.whitening import declared, transformed
 
@@ -167,12 +167,14 @@ class Problem:
 
     def cost(self, values: Array, records: Sequence[FactorRecords]) -> float:
         """Half the weighted squared whitened residuals."""
-        weighted = self.weighted_residuals(values, records)
+        raw = self.residuals(values, records)
+        whitened = zip(records, self.whitened(raw, records), strict=True)
+        weighted = [residual * np.sqrt(each.weight[: each.count]) for each, residual in whitened]
         total = sum(0.5 * float(np.sum(residual**2)) for residual in weighted)
-        for kernel, each, residual in zip(self.kernels, records, weighted, strict=True):
-            total += sum(
-                0.5 * float(np.sum((residual @ s[: each.count]) ** 2)) for s in mean_shares(kernel.factor, each)
-            )
+        for kernel, each, residual in zip(self.kernels, records, raw, strict=True):
+            declared_ones = residual / np.array(kernel.factor.noise)[:, None]
+            for share in mean_shares(kernel.factor, each):
+                total += 0.5 * float(np.sum((declared_ones @ share[: each.count]) ** 2))
         total += sum(0.5 * float(np.sum((tie.residual(values) / tie.noise) ** 2)) for tie in self.ties)
         shared = correlation_of(records)
         if shared is None:
@@ -293,21 +295,15 @@ class Problem:
         """The rows that belong to no single record."""
         places = self._places
         rows = [tie.rows(values, places, len(places)) for tie in self.ties]
-        rows += self._mean_rows(values, records)
+        for kernel, slots, each in zip(self.kernels, self.slots, records, strict=True):
+            means = linearised_means(kernel, slots, each, values)
+            rows += [ExtraRows(residual, jacobian) for jacobian, residual in means]
         return stacked(rows, len(places))
 
     @property
     def _places(self) -> dict[int, int]:
         """Where each free entry stands among the free ones."""
         return {entry: i for i, entry in enumerate(self.parameters.free_entries)}
-
-    def _mean_rows(self, values: Array, records: Sequence[FactorRecords]) -> Iterator[ExtraRows]:
-        for kernel, slots, each in zip(self.kernels, self.slots, records, strict=True):
-            shares = mean_shares(kernel.factor, each)
-            if len(shares):
-                blocks = list(linearised(kernel, slots, each, values))
-                jacobian, residual = (np.concatenate(parts, axis=-1) for parts in zip(*blocks, strict=True))
-                yield from (ExtraRows(residual @ share, jacobian @ share) for share in shares)
 
     def _shared_blocks(
         self, values: Array, records: Sequence[FactorRecords]

@@ -1,0 +1,58 @@
+"""A socket that moved while it was used: found, told with its size, and not seen where nothing moved."""
+
+from __future__ import annotations
+
+import contact_oracle as co
+import numpy as np
+import pytest
+from armcal.base.dataset import Dataset
+from armcal.solve.moved import FEWEST, moved_findings, moved_groups
+from armcal.solve.nuisance import settled, started, untrained
+from armcal_contact.ball import BallInSocket, BallInSocketSettings
+
+NOISE = 2e-4
+PLACES = {"hole_0": (0.35, 0.1, 0.25), "hole_1": (0.38, 0.12, 0.27)}
+
+
+def found(shift_m: float, before: int, count: int = 20, seed: int = 0):
+    """What is said of two sockets, the first shifted after so many records."""
+    random = np.random.default_rng(seed)
+    joints, sockets = [], []
+    for name, place in PLACES.items():
+        parts = [before, count - before] if name == "hole_0" else [0, count]
+        for part, at in zip(parts, (place, np.add(place, [shift_m, 0, 0])), strict=True):
+            at = at if name == "hole_0" else place
+            if part:
+                joints.append(co.touching(co.ELBOW, co.in_socket(at), part, int(random.integers(1 << 30))))
+            sockets += [name] * part
+    q = np.vstack(joints) + random.normal(0, NOISE / 0.5, (len(sockets), len(co.ELBOW.rows)))
+    channels = {f"arm.q{i + 1}": q[:, i] for i in range(q.shape[1])}
+    extra = {"position": ("here",) * len(q), "socket": tuple(sockets)}
+    data = Dataset(tuple(str(i) for i in range(len(q))), channels, extra)
+    ball = BallInSocket(BallInSocketSettings.si(noise=NOISE), ("arm",))
+    problem, records = co.Bench({"arm": co.the_arm(co.ELBOW)}, {"balls": ball}).problem(data)
+    problem = started(problem, records)
+    values = settled(untrained(problem), problem.parameters.nominal(), records)
+    return moved_groups(problem, values, records)
+
+
+@pytest.mark.parametrize("before", [4, 7, 15])
+def test_a_socket_that_moved_is_named_with_where_and_how_far(before):
+    (told,) = found(0.006, before)
+    assert (told.key, told.before, told.after) == ("here/hole_0", before, 20 - before)
+    assert told.distance == pytest.approx(0.006, rel=0.15)
+    (finding,) = moved_findings([told])
+    assert f"first {before} records" in finding.text and "Did it move" in finding.text
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_nothing_is_said_where_nothing_moved(seed):
+    assert found(0.0, 10, seed=seed) == ()
+
+
+def test_a_move_no_larger_than_the_scatter_is_not_claimed():
+    assert found(2 * NOISE, 10) == ()
+
+
+def test_few_records_say_nothing():
+    assert found(0.01, 3, count=FEWEST - 1) == ()
