@@ -77,7 +77,8 @@ class PlaneContact(Contact):
 
     def told(self, arms: Mapping[str, ArmState], values: Mapping[str, Any]) -> dict[str, Any]:
         """A plane of the stated normal goes through the tip."""
-        return {"offset": ca.dot(ca.SX(list(self._settings.normal)), self._tip(arms, values))}
+        offset = ca.dot(ca.SX(list(self._settings.normal)), self._tip(arms, values))
+        return {"tilt_1": ca.SX(0), "tilt_2": ca.SX(0), "offset": offset}
 
     def residual(self, arms: Mapping[str, ArmState], measured: Mapping[str, Any], values: Mapping[str, Any]) -> Any:
         """How far the tip is beyond the plane (1x1, m)."""

@@ -61,7 +61,7 @@ class ContactsSimulator:
     Settings: ClassVar[type[ContactsSettings]] = ContactsSettings
     EXAMPLE: ClassVar[Mapping[str, Any]] = {
         "truth": str(EXAMPLE_TRUTH),
-        "groups": {"sockets": ["front/hole_0", "front/hole_1"]},
+        "groups": {"walls": ["floor"]},
         "count": 5,
         "within_deg": 60,
         "seed": 1,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import casadi as ca
 import numpy as np
@@ -16,10 +16,11 @@ from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.base.parameters import ParameterBlock, Parameters, scalar
 from armcal.base.se3 import Expression
+from armcal.measure.contact import Contact
 from armcal.measure.measurement import Channel
 from armcal.solve.factor import Environment
 
-ARM, TRACKER = "arm", "tracker"
+ARM, TRACKER, WALLS = "arm", "tracker", "walls"
 GRAVITY = Environment((0.0, 0.0, -9.81))
 NOISE_M = 1e-3
 _Y_AXIS = (0.0, 1.0, 0.0)
@@ -78,6 +79,36 @@ class Springs:
 
         base = Spring(0, ((1.0, 0.0, 0.0), _Y_AXIS), law)
         return (base, *(Spring(site, (), law) for site in range(1, self.joints + 1)))
+
+
+class Walls(Contact):
+    """The tool on level walls, each at a height of its own (m)."""
+
+    group_labels = ("wall",)
+
+    def __init__(self, arm: str = ARM) -> None:
+        self.arms = (arm,)
+
+    def group_parameters(self, group: str) -> tuple[ParameterBlock, ...]:
+        """A wall's height."""
+        return (replace(scalar("height", "m", 0.0, 0.01), free=True),)
+
+    def told(self, arms: Mapping[str, ArmState], values: Mapping[str, Expression]) -> dict[str, Expression]:
+        """The tool is at the wall's height."""
+        return {"height": arms[self.arms[0]].base_T_tool.translation[2]}
+
+    def residual(
+        self,
+        arms: Mapping[str, ArmState],
+        measured: Mapping[str, Expression],
+        values: Mapping[str, Expression],
+    ) -> Expression:
+        """How far the tool is above the wall (m)."""
+        return arms[self.arms[0]].base_T_tool.translation[2] - values["height"]
+
+    def noise(self) -> tuple[float, ...]:
+        """Of the height."""
+        return (NOISE_M,)
 
 
 @dataclass(frozen=True)

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from pydantic import ValidationError
 
+from armcal.arm.assembly import Arm
 from armcal.base.dataset import Dataset
 from armcal.errors import InputError
+from armcal.measure.measurement import Measurement
 from armcal.measure.reader import Reader, ReadRequest, wanted_channels
 from armcal.solve.simulation import SimulationRequest, Simulator
-from armcal.testing.planar import ARM, GRAVITY, TRACKER, Tip, all_parameters, planar_arms
+from armcal.testing.planar import ARM, GRAVITY, TRACKER, WALLS, Tip, Walls, all_parameters, planar_arms
 from armcal.testing.results import ContractError, NotRun, Recorder, expect
 from armcal.testing.settings_checks import MISSING_FILE, Subject
 
@@ -59,12 +62,9 @@ def check_simulator(record: Recorder, subject: Subject) -> None:
 
 
 def _repeats(subject: Subject, simulator: Simulator) -> None:
-    arms, measurements = planar_arms([ARM]), {TRACKER: Tip()}
-    request = SimulationRequest(arms, measurements, all_parameters(arms), GRAVITY)
-    try:
-        first = simulator.simulate(request)
-    except InputError as fault:
-        raise NotRun(f"its EXAMPLE does not suit the arm of the check: {fault}") from fault
+    arms = planar_arms([ARM])
+    request, first = _suited(simulator, arms, ({TRACKER: Tip()}, {WALLS: Walls()}))
+    measurements = request.measurements
     for wanted in wanted_channels(arms, measurements, measured=True):
         expect(
             first.has(wanted.channel) or not wanted.required,
@@ -72,6 +72,20 @@ def _repeats(subject: Subject, simulator: Simulator) -> None:
         )
     _same(first, simulator.simulate(request), "the second time")
     _same(first, subject.made(subject.settings).simulate(request), "from a second simulator of equal settings")
+
+
+def _suited(
+    simulator: Simulator, arms: Mapping[str, Arm], choices: Sequence[Mapping[str, Measurement]]
+) -> tuple[SimulationRequest, Dataset]:
+    """The first of some measurements that a simulator's EXAMPLE suits, an instrument or a contact, and its records."""
+    refused = []
+    for measurements in choices:
+        request = SimulationRequest(arms, measurements, all_parameters(arms), GRAVITY)
+        try:
+            return request, simulator.simulate(request)
+        except InputError as fault:
+            refused.append(str(fault))
+    raise NotRun(f"its EXAMPLE does not suit the arm of the check: {'; '.join(refused)}")
 
 
 def _same(first: Dataset, again: Dataset, when: str) -> None:
