@@ -73,6 +73,7 @@ ORDER = [
     "armcal.solve.identifiability",
     "armcal.solve.projection",
     "armcal.solve.structure",
+    "armcal.solve.tool_motion",
     "armcal.solve.scale",
     "armcal.solve.minimal",
     "armcal.solve.estimator",

@@ -47,8 +47,8 @@ def number(text):
 class Case:
     """A configuration with settings of its own; everything is built once."""
 
-    name: str
-    settings: tuple[str, ...]
+    path: Path
+    settings: tuple[str, ...] = ()
 
     @classmethod
     def load(cls, name, joint_noise=None, clamp=None, priors=None):
@@ -60,11 +60,11 @@ class Case:
             settings += [f"arms.{arm}.joint_noise_rad={joint_noise}" for arm in names]
         settings += [f"measurements.closure.clamps.one={json.dumps(clamp)}"] if clamp else []
         settings += [f"parameters.priors={json.dumps(priors)}"] if priors else []
-        return cls(name, tuple(settings))
+        return cls(CONFIGS / f"{name}.yaml", tuple(settings))
 
     @cached_property
     def experiment(self):
-        return Experiment.load(CONFIGS / f"{self.name}.yaml", [*self.settings, "simulation.joint_noise=0"])
+        return Experiment.load(self.path, [*self.settings, "simulation.joint_noise=0"])
 
     @property
     def truth_file(self):
@@ -81,7 +81,7 @@ class Case:
     @cached_property
     def truth(self):
         """What the truth states, by entry."""
-        stated = yaml.safe_load((CONFIGS / self.truth_file).read_text())
+        stated = yaml.safe_load((self.path.parent / self.truth_file).read_text())
         return {name: number(value) for name, value in stated.items()}
 
     @cached_property
@@ -97,7 +97,7 @@ class Case:
 
     @cached_property
     def true_values(self):
-        source = load_config(CONFIGS / self.truth_file)
+        source = load_config(self.path.parent / self.truth_file)
         return with_values(self.problem.parameters, source.data, source, ()).nominal()
 
     def records(self, seed=None):
@@ -224,7 +224,8 @@ def placements():
 def oracle_slopes(case, arms, columns, step=1e-5):
     """d closing error / d numbers at the truth (6 N x n), by finite differences.
 
-    An axis has six numbers here, two of which move nothing. ``point`` and ``clamp`` are a pose that all records share.
+    An axis has six numbers here, two of which move nothing. ``point`` and ``clamp`` are a pose that all records share,
+    ``placement`` is that of the right arm.
     """
     alone = "arm" in arms
     sides = {arm: NumpyArm(case, arm) for arm in (["arm"] if alone else ["left", "right"])}
@@ -234,17 +235,24 @@ def oracle_slopes(case, arms, columns, step=1e-5):
         at = {arm: side.poses(*(change if arm == moved else ())) for arm, side in sides.items()}
         if alone:
             return at["arm"]
-        return inverse(bases["left"] @ at["left"]) @ bases["right"] @ at["right"]
+        nudge = exponential(change[-1] * np.eye(6)[change[-2]], np.ones(1)) if moved == "placement" else np.eye(4)
+        return inverse(bases["left"] @ at["left"]) @ bases["right"] @ nudge @ at["right"]
 
     here = closed()
     if not alone:
         assert np.abs(here - here[0]).max() < 1e-8, "the chain does not close at the truth"
     back, found = inverse(here), []
-    for arm in arms:
-        for kind in (c for c in columns if c not in ("point", "clamp")):
-            for joint, entry in NumpyArm.numbers(kind):
-                up, down = (closed(arm, kind, joint, entry, sign * step) for sign in (1, -1))
-                found.append(((small(back @ up) - small(back @ down)) / (2 * step)).ravel())
+    changes = [
+        (arm, kind, *place)
+        for arm in arms
+        for kind in columns
+        if kind in ("offsets", "twists", "axes", "tools")
+        for place in NumpyArm.numbers(kind)
+    ]
+    changes += [("placement", k) for k in range(6)] if "placement" in columns else []
+    for change in changes:
+        up, down = (closed(*change, sign * step) for sign in (1, -1))
+        found.append(((small(back @ up) - small(back @ down)) / (2 * step)).ravel())
     if {"point", "clamp"} & set(columns):
         found += list(np.tile(np.eye(6), (len(here), 1)).T)
     return np.array(found).T

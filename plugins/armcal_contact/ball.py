@@ -9,7 +9,7 @@ import casadi as ca
 from armcal.arm.assembly import ArmState
 from armcal.base.parameters import ParameterBlock, scalar
 from armcal.base.settings import Length, Length3, Settings
-from armcal.measure.contact import Contact, named_arm
+from armcal.measure.contact import ContactSettings, OneArmContact
 from armcal.measure.measurement import Channel, Tie
 from pydantic import Field, field_validator, model_validator
 
@@ -33,7 +33,7 @@ class KnownDistance(Settings):
         return self
 
 
-class BallInSocketSettings(Settings):
+class BallInSocketSettings(ContactSettings):
     """How well the ball seats (standard deviation of each coordinate, m), where it sits on the tool, what is known.
 
     A record's socket is named by its text columns ``group_labels``. Sockets lie anywhere; those in ``sockets`` lie
@@ -43,7 +43,6 @@ class BallInSocketSettings(Settings):
     """
 
     noise: Length
-    arm: str | None = None
     centre: Length3 = (0.0, 0.0, 0.0)
     group_labels: tuple[str, ...] = ("position", "socket")
     distances: tuple[KnownDistance, ...] = ()
@@ -59,7 +58,7 @@ class BallInSocketSettings(Settings):
         return value
 
 
-class BallInSocket(Contact):
+class BallInSocket(OneArmContact):
     """The measurement ``ball_in_socket``: parameters centre_x, centre_y, centre_z in the tool frame, and each socket's x, y, z."""  # noqa: E501
 
     Settings: ClassVar[type[BallInSocketSettings]] = BallInSocketSettings
@@ -70,20 +69,10 @@ class BallInSocket(Contact):
     }
 
     def __init__(self, settings: BallInSocketSettings, arm_names: Sequence[str]) -> None:
+        super().__init__(settings, arm_names)
         self._settings = settings
-        self._arm = named_arm(settings.arm, arm_names)
         self.group_owner = settings.sockets_of
         self.mean_weight = _MEAN_WEIGHT if settings.socket == "mean" else 1.0
-
-    @property
-    def arms(self) -> tuple[str, ...]:
-        """The one arm that carries the ball."""
-        return (self._arm,)
-
-    @property
-    def group_labels(self) -> tuple[str, ...]:
-        """What names a socket."""
-        return self._settings.group_labels
 
     def parameters(self) -> tuple[ParameterBlock, ...]:
         """The ball's centre on the tool (m)."""
@@ -129,7 +118,7 @@ class BallInSocket(Contact):
 
     def _ball(self, arms: Mapping[str, ArmState], values: Mapping[str, Any]) -> Any:
         centre = ca.sparsify(ca.vertcat(*[values[f"centre_{axis}"] for axis in "xyz"]))
-        return arms[self._arm].base_T_tool.apply(centre)
+        return self.base_T_tool(arms).apply(centre)
 
 
 def _distance(known: float) -> Any:

@@ -12,12 +12,12 @@ from armcal.base import se3
 from armcal.base.parameters import ParameterBlock
 from armcal.base.pose_blocks import pose_blocks, pose_transform, quaternion_expression
 from armcal.base.pose_settings import PoseSettings
-from armcal.base.settings import Angle, Length, Settings
-from armcal.measure.contact import Contact, named_arm
+from armcal.base.settings import Angle, Length
+from armcal.measure.contact import ContactSettings, OneArmContact
 from pydantic import Field, model_validator
 
 
-class ClampedToolSettings(Settings):
+class ClampedToolSettings(ContactSettings):
     """How well the clamp holds the tool (standard deviations), and what is known of the points.
 
     ``points`` are the poses of the clamped tool that are known, in the fixture, by the point's name: a record's text
@@ -28,7 +28,6 @@ class ClampedToolSettings(Settings):
 
     noise: Length
     orientation_noise: Angle
-    arm: str | None = None
     group_labels: tuple[str, ...] = ("point",)
     points: dict[str, PoseSettings] = Field(default_factory=dict)
     fixture: PoseSettings = PoseSettings()
@@ -40,7 +39,7 @@ class ClampedToolSettings(Settings):
         return self
 
 
-class ClampedTool(Contact):
+class ClampedTool(OneArmContact):
     """The measurement ``clamped_tool``: parameters fixture_x .. fixture_rotation; of each point point_x .. point_rotation."""  # noqa: E501
 
     Settings: ClassVar[type[ClampedToolSettings]] = ClampedToolSettings
@@ -51,18 +50,8 @@ class ClampedTool(Contact):
     }
 
     def __init__(self, settings: ClampedToolSettings, arm_names: Sequence[str]) -> None:
+        super().__init__(settings, arm_names)
         self._settings = settings
-        self._arm = named_arm(settings.arm, arm_names)
-
-    @property
-    def arms(self) -> tuple[str, ...]:
-        """The one arm that is clamped."""
-        return (self._arm,)
-
-    @property
-    def group_labels(self) -> tuple[str, ...]:
-        """What names a point."""
-        return self._settings.group_labels
 
     def parameters(self) -> tuple[ParameterBlock, ...]:
         """The fixture in the base frame (m, unit quaternion)."""
@@ -76,14 +65,14 @@ class ClampedTool(Contact):
 
     def told(self, arms: Mapping[str, ArmState], values: Mapping[str, Any]) -> dict[str, Any]:
         """The point is where the tool is."""
-        here = pose_transform("fixture", values).inverse() @ arms[self._arm].base_T_tool
+        here = pose_transform("fixture", values).inverse() @ self.base_T_tool(arms)
         place = {f"point_{axis}": here.translation[i] for i, axis in enumerate("xyz")}
         return {**place, "point_rotation": quaternion_expression(here.rotation)}
 
     def residual(self, arms: Mapping[str, ArmState], measured: Mapping[str, Any], values: Mapping[str, Any]) -> Any:
         """From the clamp to the tool, in the clamp's frame: position (3, m) and rotation vector (3, rad)."""
         base_T_point = pose_transform("fixture", values) @ pose_transform("point", values)
-        error = base_T_point.inverse() @ arms[self._arm].base_T_tool
+        error = base_T_point.inverse() @ self.base_T_tool(arms)
         return ca.vertcat(error.translation, se3.rotation_vector(error.rotation))
 
     def noise(self) -> tuple[float, ...]:

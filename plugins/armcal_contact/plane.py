@@ -11,12 +11,12 @@ import numpy as np
 from armcal.arm.assembly import ArmState
 from armcal.base import se3
 from armcal.base.parameters import ParameterBlock, scalar
-from armcal.base.settings import Length, Length3, Settings
-from armcal.measure.contact import Contact, named_arm
+from armcal.base.settings import Length, Length3
+from armcal.measure.contact import ContactSettings, OneArmContact
 from pydantic import field_validator
 
 
-class PlaneContactSettings(Settings):
+class PlaneContactSettings(ContactSettings):
     """How well the tip touches (standard deviation across the plane), where it sits on the tool, which way planes face.
 
     ``normal`` is about where the planes' normals point, in the base frame; they are found within a right angle of it.
@@ -24,7 +24,6 @@ class PlaneContactSettings(Settings):
     """
 
     noise: Length
-    arm: str | None = None
     tip: Length3 = (0.0, 0.0, 0.0)
     normal: tuple[float, float, float] = (0.0, 0.0, 1.0)
     group_labels: tuple[str, ...] = ("plane",)
@@ -46,25 +45,15 @@ class PlaneContactSettings(Settings):
         return x, y, z
 
 
-class PlaneContact(Contact):
+class PlaneContact(OneArmContact):
     """The measurement ``plane_contact``: tip_x, tip_y, tip_z in the tool frame; of each plane tilt_1, tilt_2 (rad) and offset (m)."""  # noqa: E501
 
     Settings: ClassVar[type[PlaneContactSettings]] = PlaneContactSettings
     EXAMPLE: ClassVar[Mapping[str, Any]] = {"noise_mm": 0.05, "tip_mm": [0, 0, 60]}
 
     def __init__(self, settings: PlaneContactSettings, arm_names: Sequence[str]) -> None:
+        super().__init__(settings, arm_names)
         self._settings = settings
-        self._arm = named_arm(settings.arm, arm_names)
-
-    @property
-    def arms(self) -> tuple[str, ...]:
-        """The one arm that touches."""
-        return (self._arm,)
-
-    @property
-    def group_labels(self) -> tuple[str, ...]:
-        """What names a plane."""
-        return self._settings.group_labels
 
     def parameters(self) -> tuple[ParameterBlock, ...]:
         """The tip on the tool (m)."""
@@ -96,4 +85,4 @@ class PlaneContact(Contact):
 
     def _tip(self, arms: Mapping[str, ArmState], values: Mapping[str, Any]) -> Any:
         tip = ca.sparsify(ca.vertcat(*[values[f"tip_{axis}"] for axis in "xyz"]))
-        return arms[self._arm].base_T_tool.apply(tip)
+        return self.base_T_tool(arms).apply(tip)

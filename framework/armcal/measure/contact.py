@@ -8,7 +8,8 @@ import casadi as ca
 
 from armcal.arm.assembly import ArmState
 from armcal.base.parameters import ParameterBlock
-from armcal.base.se3 import Expression
+from armcal.base.se3 import Expression, Transform
+from armcal.base.settings import Settings
 from armcal.measure.measurement import Channel, Tie
 
 
@@ -36,6 +37,25 @@ class Contact:
     def ties(self, groups: Sequence[str]) -> tuple[Tie, ...]:
         """Nothing is known between groups."""
         return ()
+
+
+class ContactSettings(Settings):
+    """What all contacts of one arm are told: which arm, and the text columns that name what it touches."""
+
+    arm: str | None = None
+    group_labels: tuple[str, ...] = ()
+
+
+class OneArmContact(Contact):
+    """A contact of one arm."""
+
+    def __init__(self, settings: ContactSettings, arm_names: Sequence[str]) -> None:
+        self.arms = (named_arm(settings.arm, arm_names),)
+        self.group_labels = settings.group_labels
+
+    def base_T_tool(self, arms: Mapping[str, ArmState]) -> Transform:  # noqa: N802
+        """Where its tool is."""
+        return arms[self.arms[0]].base_T_tool
 
 
 class ArmsAlone(Contact):

@@ -28,7 +28,7 @@ from armcal.report.tables import (
 )
 from armcal.run.result import RunResult
 from armcal.solve.estimator import Estimate
-from armcal.solve.identifiability import CORRELATED, POOR_CONDITION, bound_blocks, correlated_pairs, correlations
+from armcal.solve.identifiability import CORRELATED, POOR_CONDITION, bound_together, correlated_pairs, correlations
 
 MOST_LISTED = 50
 """Of records set aside and of correlated pairs; the rest is counted."""
@@ -123,7 +123,7 @@ def _correlations(estimate: Estimate) -> dict[str, Any]:
     with np.errstate(invalid="ignore"):
         matrix = correlations(estimate.covariance)
     matrix = np.where(np.outer(estimate.determined, estimate.determined), matrix, 0.0)
-    pairs = correlated_pairs(matrix, names, CORRELATED, bound_blocks(estimate.parameters))
+    pairs = correlated_pairs(matrix, names, CORRELATED, bound_together(estimate.parameters))
     strongest = _strongest(matrix, names) if not pairs or len(names) > parameter_figures.MOST_MAPPED else ()
     return {
         "map": parameter_figures.correlation_map(matrix, names, estimate.determined),

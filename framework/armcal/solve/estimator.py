@@ -285,7 +285,7 @@ def require_solvable(problem: Problem, records: Sequence[FactorRecords], start: 
         unseen_scale = scale_is_unseen(problem, start, records, known)
         if held_by_nothing(parameters, known):
             first, mend = (f"{UNSEEN_SCALE}; ", f"{GIVE_A_LENGTH}. ") if unseen_scale else ("", "")
-            raise ProblemError(f"{first}{text}: {listed}.", hint=f"{mend}{_mend(explained)}".capitalize())
+            raise ProblemError(f"{first}{text}: {listed}.", hint=_sentence(f"{mend}{_mend(explained)}"))
         if unseen_scale:
             warnings.append(f"{UNSEEN_SCALE}; its priors hold it. To know it, {GIVE_A_LENGTH}.")
         told = listed if len(explained) <= FEW_HELD else "armcal identify lists them"
@@ -295,6 +295,10 @@ def require_solvable(problem: Problem, records: Sequence[FactorRecords], start: 
     return tuple(warnings)
 
 
+def _sentence(text: str) -> str:
+    return text[:1].upper() + text[1:]
+
+
 def _mend(undetermined: Sequence[Undetermined]) -> str:
     causes = {each.cause for each in undetermined}
     ways = ["fix one parameter of each", "give it a prior"]
@@ -302,7 +306,7 @@ def _mend(undetermined: Sequence[Undetermined]) -> str:
         ways.append("start from other values")
     if causes & {"poses", "unknown"}:
         ways.append("measure poses that tell them apart")
-    return f"{', '.join(ways[:-1])}, or {ways[-1]}.".capitalize()
+    return _sentence(f"{', '.join(ways[:-1])}, or {ways[-1]}.")
 
 
 def _poses(records: Sequence[FactorRecords]) -> int:

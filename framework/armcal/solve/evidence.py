@@ -15,8 +15,10 @@ from armcal.solve.estimator import Estimate
 from armcal.solve.leftover import Leftover
 from armcal.solve.misses import Misses
 from armcal.solve.problem import Problem
+from armcal.solve.tool_motion import along, apart_from, tools, unseen_motions
 
 UNSEEN = 400
+UP_TO_FRAMES = "where the base stands and which point of the tool is meant"
 _AXES = ["x", "y", "z"]
 _MM = 1000.0
 
@@ -28,10 +30,12 @@ class PriorsAlone:
     Attributes:
         worst_mm: the largest standard deviation of the tip that they leave, over the poses looked at.
         poses: how many unseen poses were looked at.
+        up_to: motions that were left out, because contacts do not see them either; empty where none were.
     """
 
     worst_mm: float
     poses: int
+    up_to: str = ""
 
 
 @dataclass(frozen=True)
@@ -72,19 +76,33 @@ def priors_alone(problem: Problem, estimate: Estimate, poses: Dataset) -> Priors
     Their covariance is what the priors give them, V (V'PV)^-1 V' over the undetermined directions V.
 
     Returns:
-        None if there are none, if no prior holds one of them, or if no measurement is a position.
+        None if there are none, if no prior holds one of them, or if measurements read something, but no position.
     """
     null = estimate.identifiability.null
     rows = _position_rows(problem)
     scales = estimate.parameters.scales()
     information = null * (scales**2 * estimate.parameters.prior_information()) @ null.T
-    if not len(null) or not len(rows) or not len(poses) or np.linalg.cond(information) > 1 / np.finfo(float).eps:
+    if not len(null) or not len(poses) or np.linalg.cond(information) > 1 / np.finfo(float).eps:
+        return None
+    if not any(kernel.factor.output_channels for kernel in problem.kernels):
+        return _of_tools(problem, estimate, poses, np.asarray(np.linalg.inv(information), dtype=float))
+    if not len(rows):
         return None
     noise = np.concatenate([kernel.factor.noise for kernel in problem.kernels])
     seen = whitened_rows(problem, estimate.values, poses)[rows] * noise[rows, None, None] @ null.T
     covariance: Array = np.asarray(np.linalg.inv(information), dtype=float)
     variance = np.einsum("rnk,kl,rnl->n", seen, covariance, seen)
     return PriorsAlone(float(np.sqrt(np.max(np.maximum(variance, 0.0)))) * _MM, len(poses))
+
+
+def _of_tools(problem: Problem, estimate: Estimate, poses: Dataset, covariance: Array) -> PriorsAlone:
+    """Where contacts read nothing: of the tools themselves, up to what no contact could see."""
+    records, values = problem.records(poses), estimate.values
+    at, axes = tools(problem, values, records)
+    moves = np.array([along(problem, values, records, way).ravel() for way in estimate.identifiability.null]).T
+    left = apart_from(np.array(unseen_motions(at, axes)).T, moves).reshape(len(at), 3, -1, moves.shape[1])
+    variance = np.einsum("trnk,kl,trnl->tn", left, covariance, left)
+    return PriorsAlone(float(np.sqrt(np.max(np.maximum(variance, 0.0)))) * _MM, len(poses), UP_TO_FRAMES)
 
 
 def _position_rows(problem: Problem) -> list[int]:

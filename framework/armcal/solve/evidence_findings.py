@@ -11,6 +11,8 @@ from armcal.solve.misses import MEDIANS, Misses
 from armcal.solve.noise_findings import Finding
 
 MOST_TOLD = 5
+FEW_NAMED = 2
+"""So many combinations that only priors hold are named in the verdict; of more, armcal identify tells."""
 NEGLIGIBLE_SHARE = 0.1
 """Of the typical error: what moves the tip by less than this does not matter to it."""
 _FOLLOW_UP = 0.025
@@ -34,7 +36,9 @@ def determined_told(estimate: Estimate, alone: PriorsAlone | None, typical_mm: f
         text = f"Not determined by the data, held by priors alone: {listed}{more}."
         return Finding("bad", text, test, "Free fewer parameters, or measure what armcal identify asks for.")
     held = f"{_plural(count, 'combination is', 'combinations are')} held by priors alone"
+    held += f" ({listed})" if count <= FEW_NAMED else ""
     test = f"{test}; the tip at {alone.poses} unseen poses, joints approached as in the records"
+    test += f"; up to {alone.up_to}, which no contact tells" if alone.up_to else ""
     if typical_mm is None or alone.worst_mm <= NEGLIGIBLE_SHARE * typical_mm:
         most = f"{alone.worst_mm:.2g}" if alone.worst_mm >= 0.001 else "0.001"
         text = f"{held}; the tip at unseen poses does not depend on them (at most {most} {_MM}, 1 sd)."

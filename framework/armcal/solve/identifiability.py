@@ -7,7 +7,7 @@ possible.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -136,30 +136,35 @@ def expected_covariance(triangle: Array, parameters: Parameters) -> Array:
 
 
 def correlated_pairs(
-    covariance: Array, names: tuple[str, ...], above: float = CORRELATED, bound: frozenset[str] = frozenset()
+    covariance: Array,
+    names: tuple[str, ...],
+    above: float = CORRELATED,
+    bound: Callable[[str, str], bool] | None = None,
 ) -> tuple[tuple[str, str, float], ...]:
     """Pairs of parameters whose estimates correlate by more than ``above``, the strongest first.
 
-    Entries of one block in ``bound`` are not paired: they hang together by what they are, as a quaternion's do.
+    Pairs that are ``bound`` are left out: see ``bound_together``.
     """
     correlation = correlations(covariance)
     rows, columns = np.triu_indices(len(names), 1)
     pairs = [
         (names[i], names[j], float(correlation[i, j]))
         for i, j in zip(rows, columns, strict=True)
-        if abs(correlation[i, j]) > above and not _of_one(names[i], names[j], bound)
+        if abs(correlation[i, j]) > above and not (bound and bound(names[i], names[j]))
     ]
     return tuple(sorted(pairs, key=lambda pair: -abs(pair[2])))
 
 
-def bound_blocks(parameters: Parameters) -> frozenset[str]:
-    """Names of the blocks with more entries than degrees of freedom."""
-    return frozenset(block.name for block in parameters.free if block.domain.dof < block.size)
+def bound_together(parameters: Parameters) -> Callable[[str, str], bool]:
+    """Whether two entries hang together by what they are: those of one rotation, or two sockets of one plate."""
+    fewer = {block.name for block in parameters.free if block.domain.dof < block.size}
+    of_groups = {block.name for block in parameters.nuisances}
 
+    def bound(one: str, other: str) -> bool:
+        first, second = (name.partition("[")[0] for name in (one, other))
+        return (first == second and first in fewer) or {first, second} <= of_groups
 
-def _of_one(one: str, other: str, bound: frozenset[str]) -> bool:
-    owner = one.partition("[")[0]
-    return owner in bound and owner == other.partition("[")[0]
+    return bound
 
 
 def correlations(covariance: Array) -> Array:

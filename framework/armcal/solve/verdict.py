@@ -13,7 +13,7 @@ from armcal.base.domains import Array
 from armcal.solve.estimator import Estimate
 from armcal.solve.evidence import Evidence
 from armcal.solve.evidence_findings import MOST_TOLD, determined_told, misses_told, neighbours_told, structures_told
-from armcal.solve.identifiability import POOR_CONDITION, bound_blocks, correlated_pairs
+from armcal.solve.identifiability import POOR_CONDITION, bound_together, correlated_pairs
 from armcal.solve.noise_findings import Finding, components_told, suspects_told
 from armcal.solve.suggestion import CANDIDATES, Suggestion
 from armcal.solve.weighing import WeighedFit
@@ -216,7 +216,7 @@ def _neighbours(whitened: Array, train: NDArray[np.intp]) -> list[Finding]:
 
 
 def _correlated(estimate: Estimate) -> list[Finding]:
-    pairs = correlated_pairs(estimate.covariance, estimate.names, bound=bound_blocks(estimate.parameters))
+    pairs = correlated_pairs(estimate.covariance, estimate.names, bound=bound_together(estimate.parameters))
     if not pairs:
         return []
     listed = _few([f"{a} with {b} ({value:+.3f})" for a, b, value in pairs])

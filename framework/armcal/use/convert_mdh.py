@@ -149,11 +149,11 @@ def _frame_on(frame: Array, direction: Array) -> Array:
 
 
 def _steps(pose: Array) -> list[dict[str, float]]:
-    """x, y, z, then yaw, pitch, roll; without those that are zero."""
+    """x, y, z, then yaw, pitch, roll; those that are zero too, so that a calibration may find what they really are."""
     roll, pitch, yaw = rpy_of(pose[:3, :3])
     lengths = {f"{axis}_mm": _millimetres(value) for axis, value in zip("xyz", pose[:3, 3], strict=True)}
     angles = {"rz_deg": _degrees(yaw), "ry_deg": _degrees(pitch), "rx_deg": _degrees(roll)}
-    return [{key: value} for key, value in {**lengths, **angles}.items() if value]
+    return [{key: value} for key, value in {**lengths, **angles}.items()]
 
 
 def _motion(axis: str, angle: float, distance: float) -> Array:
