@@ -102,7 +102,8 @@ def test_free_entries_stand_at_the_places_of_the_free_blocks():
         *(f"arm.axis2[{e}]" for e in ("wx", "wy", "wz", "vx", "vy", "vz")),
         "arm.mdh.d1",
     ]
-    assert some.coordinate_names == ("arm.mdh.theta1", *(f"arm.axis2<{i}>" for i in ("turn1", "turn2", "shift1", "shift2")), "arm.mdh.d1")
+    axis = [f"arm.axis2<{i}>" for i in ("turn1", "turn2", "shift1", "shift2")]
+    assert some.coordinate_names == ("arm.mdh.theta1", *axis, "arm.mdh.d1")
 
 
 def test_increments_of_mixed_domains_go_to_their_own_blocks():

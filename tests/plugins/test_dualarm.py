@@ -1,4 +1,4 @@
-"""Two arms in one frame: shared sockets tell where they stand, trackers help a closed chain, and what trades is named."""
+"""Two arms in one frame: shared sockets tell where they stand, trackers help a closed chain, trades are named."""
 
 from __future__ import annotations
 
@@ -143,6 +143,25 @@ def test_with_noise_the_placement_comes_back_within_its_intervals(in_sockets):
     assert 0.90 < np.mean(inside) < 0.99
     assert np.all(np.mean(off, axis=0) < 1.05 * np.mean(by_means, axis=0)), "plain means do better"
     assert np.all(np.mean(off, axis=0) > 0.2 * np.mean(by_means, axis=0)), "too good: the truth leaks in"
+
+
+@pytest.mark.parametrize("settings", [(), ("validation.holdout=0.3", "validation.folds=3")], ids=["all", "judged"])
+def test_records_that_only_one_arm_takes_part_in_run_from_a_file(in_sockets, tmp_path, settings):
+    """The other arm's cells are empty; judging, reports and tests of what is left pass over them."""
+    path = tmp_path / "touches.csv"
+    made = CliRunner().invoke(cli, ["simulate", str(in_sockets.path), "--out", str(path)])
+    assert made.exit_code == 0, made.output
+    assert ",,,,,,," in path.read_text()
+    told, kept = ran(in_sockets, tmp_path, f"data={json.dumps({'type': 'csv', 'path': str(path)})}", *settings)
+    assert told["solver"]["converged"] and told["records"]["used"] == 2 * 8 * len(SOCKETS)
+    true = dict(zip(in_sockets.problem.parameters.entry_names, in_sockets.true_values, strict=True))
+    assert all(abs(kept[n]["value"] - true[n]) < 4.5 * kept[n]["sd"] for n in kept)
+    assert set(PLACEMENT) <= {n for n, p in kept.items() if p["determined"]}
+    assert told["noise"]["scale"] == pytest.approx(1, abs=0.2)
+    assert not told["structure"]["leftover"]["structures"]
+    if settings:
+        held, trained = (told["error_mm"]["calibrated"][who]["mean"] for who in ("cross_validated", "train"))
+        assert held == pytest.approx(trained, rel=0.5)
 
 
 def test_sockets_of_their_own_tell_nothing_of_the_placement(in_sockets):

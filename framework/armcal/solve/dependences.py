@@ -139,19 +139,17 @@ def _of_order(here: _Records) -> Iterator[Dependence]:
 
 def _of_level(here: _Records, arm: str, channel: str, shown: str, dimension: str) -> Iterator[Dependence]:
     command = here.dataset.column(channel)
-    levels = np.unique(np.round(command, 9))
+    levels = np.unique(np.round(_stated(command), 9))
     if len(levels) < 2:
         return
     unit = display_unit(dimension)
     if len(levels) <= MOST_LEVELS:
-        features = (np.abs(command[:, None] - levels[None]) < 1e-8).astype(float)
-        features -= features.mean(axis=0)
+        features = _centred((np.abs(command[:, None] - levels[None]) < 1e-8).astype(float), command)
         labels = tuple(f"{to_unit(level, unit.name):.4g} {unit.name}" for level in levels)
         effect = f"servo_map on {shown}" if len(levels) <= _CUBIC else f"gear_error or servo_map on {shown}"
     else:
         middle, half = (levels[0] + levels[-1]) / 2, (levels[-1] - levels[0]) / 2
-        features = legendre.legvander((command - middle) / half, _CUBIC)[:, 1:]
-        features -= features.mean(axis=0)
+        features = _centred(legendre.legvander((command - middle) / half, _CUBIC)[:, 1:], command)
         labels, effect = (), f"gear_error or servo_map on {shown}"
     between = f"command {shown} to levels in between, from both sides"
     si = "rad" if dimension == "angle" else "m"
@@ -170,9 +168,9 @@ def _of_level(here: _Records, arm: str, channel: str, shown: str, dimension: str
 
 def _of_approach(here: _Records, arm: str, joint: str, shown: str, si: str) -> Iterator[Dependence]:
     channel = f"{arm}.approach.{joint}"
-    if not here.dataset.has(channel) or np.ptp(here.dataset.column(channel)) <= 0:
+    if not here.dataset.has(channel) or _spread(here.dataset.column(channel)) <= 0:
         return
-    sign = -here.dataset.column(channel)[:, None]
+    sign = np.nan_to_num(-here.dataset.column(channel)[:, None])
     effect, measure = f"approach_backlash on {shown}", _BOTH_SIDES.format(joint=shown)
     words = f"the side {shown} was approached from, along its own motion"
     along = here.along(f"{arm}.{joint}", sign)
@@ -184,8 +182,9 @@ def _of_approach(here: _Records, arm: str, joint: str, shown: str, si: str) -> I
 def _of_torque(
     here: _Records, arm: str, channel: str, shown: str, effort: Array, revolute: bool
 ) -> Iterator[Dependence]:
-    if np.ptp(effort) <= 1e-9 * max(1.0, float(np.abs(effort).max(initial=0.0))):
+    if _spread(effort) <= 1e-9 * max(1.0, float(np.abs(_stated(effort)).max(initial=0.0))):
         return
+    effort = np.nan_to_num(effort)
     load, per = ("torque about", "rad_per_Nm") if revolute else ("force along", "")
     si, cubic = ("rad", "rad_per_Nm3") if revolute else ("m", "")
     both = f"poses on both sides of zero {load.split()[0]} at {shown}, some with a second payload"
@@ -211,7 +210,7 @@ def _of_moments(problem: Problem, here: _Records, arm: Arm, loads: SiteLoads, al
         for j, k in _SYMMETRIC:
             one = lever[:, j] * moment[k]
             moved.append(one if j == k else one + lever[:, k] * moment[j])
-        tip = np.stack(moved, axis=2)
+        tip = np.nan_to_num(np.stack(moved, axis=2))
         if not np.any(tip):
             continue
         zeros = (np.zeros((size, tip.shape[1], tip.shape[2])) for size in here.sizes)
@@ -220,6 +219,25 @@ def _of_moments(problem: Problem, here: _Records, arm: Arm, loads: SiteLoads, al
         shown = name if alone else (f"{arm.name}.{name}" if site else f"the mount of {arm.name}")
         words = f"the moment that {shown} carries, in all directions"
         yield Dependence("moment", shown, arm.name, words, f"compliance on {shown}", _SECOND_LOAD, columns)
+
+
+def _stated(feature: Array) -> Array:
+    """Without the records that do not have it: those of another arm."""
+    return feature[np.isfinite(feature)]
+
+
+def _spread(feature: Array) -> float:
+    """From the smallest to the largest; 0 where no record has it."""
+    stated = _stated(feature)
+    return float(np.ptp(stated)) if len(stated) else 0.0
+
+
+def _centred(features: Array, command: Array) -> Array:
+    """About their mean (N x k) in the records that state the command, none in the others."""
+    known = np.isfinite(command)
+    centred = np.zeros_like(features)
+    centred[known] = features[known] - features[known].mean(axis=0)
+    return centred
 
 
 def _is_position_of(problem: Problem, factor: int, arm: str) -> bool:
