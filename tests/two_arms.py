@@ -181,8 +181,8 @@ class NumpyArm:
     """One arm at the truth of a case, with its joint angles; ``moved`` is one number changed a little."""
 
     def __init__(self, case, arm):
-        self.q = np.stack([case.postures.channels[f"{arm}.q{i}"] for i in JOINTS], axis=1)
-        truth = case.truth
+        q = np.stack([case.postures.channels[f"{arm}.q{i}"] for i in JOINTS], axis=1)
+        self.q, truth = q[:: max(1, len(q) // 40)], case.truth
         self.offsets = np.array([truth.get(f"{arm}.poe.offset{i}", 0.0) for i in JOINTS])
         self.twists = []
         for i, (point, axis) in enumerate(frida.AXES, start=1):

@@ -93,7 +93,14 @@ def table(path):
 # ---------------------------------------------------------------- as shipped
 
 
-@pytest.mark.parametrize("name", [n for n in WITH_TWISTS_AND_OFFSETS if n != "dual_twists_tools_held"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(n, marks=SLOW) if "dual_twists" in n else n
+        for n in WITH_TWISTS_AND_OFFSETS
+        if "tools_held" not in n
+    ],
+)
 def test_the_shipped_records_are_those_that_the_configuration_simulates(name, tmp_path):
     invoke("simulate", CONFIGS / f"{name}.yaml", "--out", tmp_path / "made.csv")
     shipped, made = table(CONFIGS / f"{name}.csv"), table(tmp_path / "made.csv")
@@ -101,7 +108,7 @@ def test_the_shipped_records_are_those_that_the_configuration_simulates(name, tm
     np.testing.assert_allclose(shipped[2], made[2], atol=1e-9)
 
 
-@pytest.mark.parametrize("name", [pytest.param(n, marks=SLOW) if "twists" in n else n for n in WITH_TWISTS_AND_OFFSETS])
+@pytest.mark.parametrize("name", [n if n in QUICK else pytest.param(n, marks=SLOW) for n in WITH_TWISTS_AND_OFFSETS])
 def test_a_run_tells_what_is_determined_and_names_the_rest(name, tmp_path):
     out = tmp_path / "out"
     told = json.loads(
@@ -159,7 +166,12 @@ def test_twists_and_offsets_leave_one_combination_and_it_is_named():
             35,
             marks=SLOW,
         ),
-        (('parameters.free=["arm.poe.axis*", "arm.poe.tool_*"]', "arms.arm.model.parametrisation=minimal"), 34, 34),
+        pytest.param(
+            ('parameters.free=["arm.poe.axis*", "arm.poe.tool_*"]', "arms.arm.model.parametrisation=minimal"),
+            34,
+            34,
+            marks=SLOW,
+        ),
     ],
     ids=["twists and tool", "axes and offsets", "axes and tool"],
 )

@@ -83,6 +83,7 @@ BEST = {
 }
 FIRST = (("panda", "front_center"), ("kinova", "left"))
 POLISHED = (("kuka", "front"), ("kinova", "left"))
+ROWS = (*FIRST, *POLISHED)
 SLOW = pytest.mark.slow
 
 
@@ -269,7 +270,7 @@ def _moved(urdf, x):
 # ---------------------------------------------------------------- the published figures
 
 
-@pytest.mark.parametrize(("name", "trained"), PUBLISHED)
+@pytest.mark.parametrize(("name", "trained"), [pytest.param(*k, marks=[] if k in ROWS else SLOW) for k in PUBLISHED])
 def test_every_row_of_the_published_table(run, name, trained):
     told, _ = published(run, name, trained)
     (*figures, distance), positions = PUBLISHED[name, trained]
@@ -370,6 +371,7 @@ def test_the_order_of_records_and_of_folders_means_nothing(run, tmp_path):
     )
 
 
+@SLOW
 def test_units_mean_nothing(run, tmp_path):
     """The same problem in other units: m for mm, um for mm, rad and deg for mrad."""
     shutil.copytree(CONFIGS, tmp_path / "mukca")

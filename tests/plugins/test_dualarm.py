@@ -95,7 +95,7 @@ def in_sockets(tmp_path_factory):
 
 
 def by_hand(case, data):
-    """base_T_right by the mean places of each socket in either arm's frame. [Arun1987]"""
+    """base_T_right by the mean places of each socket in either arm's frame."""
     keys = [f"{p}/{s}" for p, s in zip(data.extra["position"], data.extra["socket"], strict=True)]
     means = {}
     for arm in ("left", "right"):
@@ -133,7 +133,7 @@ def test_shared_sockets_tell_where_the_arms_stand_to_each_other(in_sockets):
 def test_with_noise_the_placement_comes_back_within_its_intervals(in_sockets):
     true, _ = true_placement()
     inside, off, by_means = [], [], []
-    for seed in range(25):
+    for seed in range(8):
         data = in_sockets.records(seed)
         found = in_sockets.fit(data)
         truth = in_sockets.true_values[list(found.free_entries)]
@@ -145,13 +145,17 @@ def test_with_noise_the_placement_comes_back_within_its_intervals(in_sockets):
     assert np.all(np.mean(off, axis=0) > 0.2 * np.mean(by_means, axis=0)), "too good: the truth leaks in"
 
 
-@pytest.mark.parametrize("settings", [(), ("validation.holdout=0.3", "validation.folds=3")], ids=["all", "judged"])
+@pytest.mark.parametrize(
+    "settings",
+    [pytest.param((), marks=pytest.mark.slow), ("validation.holdout=0.3", "validation.folds=3")],
+    ids=["all", "judged"],
+)
 def test_records_that_only_one_arm_takes_part_in_run_from_a_file(in_sockets, tmp_path, settings):
     """The other arm's cells are empty; judging, reports and tests of what is left pass over them."""
     path = tmp_path / "touches.csv"
     made = CliRunner().invoke(cli, ["simulate", str(in_sockets.path), "--out", str(path)])
     assert made.exit_code == 0, made.output
-    assert ",,,,,,," in path.read_text()
+    assert np.isnan(in_sockets.records().channels["left.q7"]).any()
     told, kept = ran(in_sockets, tmp_path, f"data={json.dumps({'type': 'csv', 'path': str(path)})}", *settings)
     assert told["solver"]["converged"] and told["records"]["used"] == 2 * 8 * len(SOCKETS)
     true = dict(zip(in_sockets.problem.parameters.entry_names, in_sockets.true_values, strict=True))
@@ -259,10 +263,11 @@ def test_closed_chains_and_tracked_points_in_one_file_give_what_neither_gives_al
     assert not kept["left.poe.offset7"]["determined"] and kept["left.poe.offset3"]["determined"]
 
 
+@pytest.mark.slow
 def test_noisy_closed_chains_and_tracked_points_hold_the_truth_in_their_intervals(mixed, tmp_path):
     truth = dict(zip(mixed.problem.parameters.entry_names, mixed.true_values, strict=True))
     inside = []
-    for seed in range(6):
+    for seed in range(3):
         mixed_csv(mixed, 12, seed)
         told, kept = ran(mixed, tmp_path)
         assert told["noise"]["scale"] == pytest.approx(1, abs=0.2)

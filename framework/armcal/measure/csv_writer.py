@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import math
 import os
 import secrets
 from collections.abc import Iterator, Mapping, Sequence
@@ -104,8 +105,13 @@ def _unit(dimension: str, units: Mapping[str, str]) -> str:
 def _texts(values: Array, unit: str) -> list[str]:
     numbers = to_unit(values, unit).tolist()
     if unit == "1":
-        return [str(int(x)) if x.is_integer() else repr(x) for x in numbers]
-    return [repr(x) for x in numbers]
+        return [_text(int(x) if x.is_integer() else x) for x in numbers]
+    return [_text(x) for x in numbers]
+
+
+def _text(number: float) -> str:
+    """In full; empty where there is no number."""
+    return "" if math.isnan(number) else repr(number)
 
 
 @contextmanager

@@ -11,6 +11,7 @@ from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.base.parameters import Parameters
 from armcal.errors import ConfigError, ProblemError
+from armcal.measure.groups import grouped_instances
 from armcal.run.experiment import Experiment
 from armcal.run.plan_poses import JointSpace
 from armcal.run.plan_settings import PlanSettings, RobustSettings
@@ -54,8 +55,19 @@ class Ground:
 
 
 def parameters_of(experiment: Experiment, calibration: Path | None) -> Parameters:
-    """Those of the experiment, about the values of a calibration if one is given."""
+    """Those of the experiment, about the values of a calibration if one is given.
+
+    Raises:
+        ProblemError: nothing is free, or what is measured is a contact, which only few postures can be in.
+        ConfigError: the calibration is of another arm.
+    """
     parameters = experiment.parameters
+    if touching := grouped_instances(experiment.system.measurements):
+        raise ProblemError(
+            f"{touching[0]} is a contact: poses that touch cannot be chosen from free space.",
+            hint="Take postures up by hand, varied as docs/ball_and_sockets.md says; armcal identify tells what they "
+            "determine, and what is missing.",
+        )
     if not parameters.free:
         raise ProblemError("no parameter is free: there is nothing to plan for.", hint="Set parameters.free.")
     if calibration is None:
