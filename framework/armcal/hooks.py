@@ -11,7 +11,7 @@ from typing import Any, Protocol
 import pluggy
 
 PROJECT = "armcal"
-CONTRACT_VERSION = "1.0"
+CONTRACT_VERSION = "1.1"
 """Version of the plugin contract: the major number changes when an existing plugin would break."""
 
 hookspec = pluggy.HookspecMarker(PROJECT)

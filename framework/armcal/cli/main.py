@@ -37,7 +37,14 @@ class LazyGroup(click.Group):
         if cmd_name not in COMMANDS:
             return None
         module, _, attribute = COMMANDS[cmd_name][0].partition(":")
-        command: click.Command = getattr(import_module(module), attribute)
+        try:
+            command: click.Command = getattr(import_module(module), attribute)
+        except ModuleNotFoundError as fault:
+            if (fault.name or "armcal").partition(".")[0] == "armcal":
+                raise  # a fault of ours, not of the installation
+            raise ArmcalError(
+                f"the library {fault.name} is missing.", hint="Install armcal anew, with all it needs: pip install armcal."
+            ) from fault
         return command
 
     def invoke(self, ctx: click.Context) -> object:
