@@ -43,7 +43,8 @@ class LazyGroup(click.Group):
             if (fault.name or "armcal").partition(".")[0] == "armcal":
                 raise  # a fault of ours, not of the installation
             raise ArmcalError(
-                f"the library {fault.name} is missing.", hint="Install armcal anew, with all it needs: pip install armcal."
+                f"the library {fault.name} is missing.",
+                hint="Install armcal anew with all it needs: pip install armcal.",
             ) from fault
         return command
 
