@@ -91,6 +91,12 @@ class BallInSocket(OneArmContact):
         place = self._ball(arms, values)
         return {axis: place[i] for i, axis in enumerate("xyz")}
 
+    def named_groups(self) -> tuple[str, ...]:
+        """Sockets at known places, and those at known distances."""
+        before = "*/" if len(self.group_labels) > 1 else ""
+        apart = [f"{before}{name}" for known in self._settings.distances for name in known.between]
+        return (*self._settings.sockets, *apart)
+
     def ties(self, groups: Sequence[str]) -> tuple[Tie, ...]:
         """Known distances, within each tool position."""
         if self._settings.sockets_of is not None:

@@ -63,6 +63,10 @@ class ClampedTool(OneArmContact):
         blocks = pose_blocks("point") if known is None else known.blocks("point")
         return tuple(replace(block, free=known is None) for block in blocks)
 
+    def named_groups(self) -> tuple[str, ...]:
+        """The known points."""
+        return tuple(self._settings.points)
+
     def told(self, arms: Mapping[str, ArmState], values: Mapping[str, Any]) -> dict[str, Any]:
         """The point is where the tool is."""
         here = pose_transform("fixture", values).inverse() @ self.base_T_tool(arms)

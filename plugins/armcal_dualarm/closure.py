@@ -77,6 +77,10 @@ class ClosedChain(Contact):
         blocks = pose_blocks("clamp") if known is None else known.blocks("clamp")
         return tuple(replace(block, free=known is None) for block in blocks)
 
+    def named_groups(self) -> tuple[str, ...]:
+        """The known clamps."""
+        return tuple(self._settings.clamps)
+
     def told(self, arms: Mapping[str, ArmState], values: Mapping[str, Any]) -> dict[str, Any]:
         """The clamp is how the tools stand to each other."""
         between = self._between(arms)

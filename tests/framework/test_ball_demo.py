@@ -61,3 +61,10 @@ def test_a_missing_library_is_named_without_a_traceback(tmp_path, monkeypatch):
     ran = armcal("run", DEMO, "--out", tmp_path / "run")
     assert ran.returncode == 1
     assert "the library casadi is missing" in ran.stderr and "Traceback" not in ran.stderr
+
+
+def test_a_socket_that_no_record_has_is_told(tmp_path):
+    change = "measurements.sockets.distances=[{between: [hole_0, hole_9], distance_mm: 50, noise_mm: 0.05}]"
+    ran = armcal("check", DEMO, "--set", change)
+    assert "states something of */hole_9, to which no record belongs" in ran.stderr
+    assert "hole_0, to which" not in ran.stderr

@@ -57,8 +57,14 @@ def test_without_noise_the_truth_comes_back(solver: str) -> None:
     assert away.max() < 1e-6, loaded.parameters.coordinate_names[int(np.argmax(away))]
 
 
-def test_intervals_hold_the_truth_as_often_as_they_say() -> None:
-    """95 % intervals over 200 noisy experiments: 94 to 96 % pooled, each parameter 90 to 99 %.
+@pytest.mark.parametrize(
+    ("seeds", "pooled", "single"),
+    [(50, (0.925, 0.975), (0.80, 1.0)), pytest.param(SEEDS, (0.94, 0.96), (0.90, 0.99), marks=pytest.mark.slow)],
+)
+def test_intervals_hold_the_truth_as_often_as_they_say(
+    seeds: int, pooled: tuple[float, float], single: tuple[float, float]
+) -> None:
+    """95 % intervals over 200 noisy experiments: 94 to 96 % pooled, each parameter 90 to 99 %; looser over 50.
 
     Parameters that are often within 3 deviations of a bound have one-sided intervals there and are judged apart:
     these hold the truth in at least 90 % of cases.
@@ -66,7 +72,7 @@ def test_intervals_hold_the_truth_as_often_as_they_say() -> None:
     loaded = experiment()
     expected = truth(loaded)[list(loaded.parameters.free_entries)]
     problem, held, one_sided = None, [], []
-    for seed in range(SEEDS):
+    for seed in range(seeds):
         dataset = simulated(loaded, seed)
         problem = problem or problem_for(loaded, dataset)
         records = problem.records(dataset)
@@ -79,9 +85,10 @@ def test_intervals_hold_the_truth_as_often_as_they_say() -> None:
     near = np.mean(one_sided, axis=0) > 0
     names = np.array(loaded.parameters.coordinate_names)
     assert list(names[near]) == ["arm.spring.k6"]
-    assert 0.94 <= share[~near].mean() <= 0.96
-    assert share[~near].min() >= 0.90 and share[~near].max() <= 0.99, dict(zip(names, share, strict=True))
-    assert share[near].min() >= 0.90
+    assert pooled[0] <= share[~near].mean() <= pooled[1]
+    inside = share[~near].min() >= single[0] and share[~near].max() <= single[1]
+    assert inside, dict(zip(names, share, strict=True))
+    assert share[near].min() >= single[0]
 
 
 def test_the_same_seed_gives_the_same_records_and_another_does_not() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fnmatch
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 from armcal.base.dataset import Dataset
 from armcal.base.parameters import ParameterBlock
 from armcal.errors import ConfigError, DataError, Location
-from armcal.measure.measurement import GroupedMeasurement, Measurement, Tie
+from armcal.measure.measurement import GroupedMeasurement, Measurement, NamesGroups, Tie
 
 Groups = Mapping[str, tuple[str, ...]]
 """Keys of the groups, in order, by the instance that owns them."""
@@ -53,6 +54,21 @@ def groups_of(dataset: Dataset, measurements: Mapping[str, Measurement]) -> dict
             keys = {key for key in record_keys(dataset, measurement) if key}
             found.setdefault(owner_of(instance, measurement), set()).update(keys)
     return {owner: tuple(sorted(keys)) for owner, keys in found.items()}
+
+
+def unmatched(measurements: Mapping[str, Measurement], groups: Groups) -> list[str]:
+    """What settings say of groups that no record belongs to, in sentences."""
+    found = []
+    for instance, measurement in measurements.items():
+        if isinstance(measurement, GroupedMeasurement) and isinstance(measurement, NamesGroups):
+            keys = groups.get(owner_of(instance, measurement), ())
+            for pattern in dict.fromkeys(measurement.named_groups()):
+                if not fnmatch.filter(keys, pattern):
+                    listed = ", ".join(keys[:4]) + (", ..." if len(keys) > 4 else "")
+                    found.append(
+                        f"{instance} states something of {pattern}, to which no record belongs: there are {listed}."
+                    )
+    return found
 
 
 def record_keys(dataset: Dataset, measurement: GroupedMeasurement) -> tuple[str, ...]:

@@ -102,6 +102,14 @@ class GroupedMeasurement(Protocol):
 
 
 @runtime_checkable
+class NamesGroups(Protocol):
+    """What a measurement may provide beside the rest if its settings speak of single groups."""
+
+    def named_groups(self) -> Sequence[str]:
+        """Globs over keys, each of which records should have; the user is told of those that none has."""
+
+
+@runtime_checkable
 class DimensionedResidual(Protocol):
     """What a measurement may provide beside the rest if its residual is not all lengths."""
 

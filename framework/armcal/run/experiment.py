@@ -19,7 +19,7 @@ from armcal.config.validate import validate
 from armcal.config.yaml_source import ConfigSource, load_config
 from armcal.errors import ConfigError
 from armcal.measure.environment import noticed
-from armcal.measure.groups import grouped_instances, groups_of
+from armcal.measure.groups import grouped_instances, groups_of, unmatched
 from armcal.measure.limits import warn_beyond_limits
 from armcal.measure.reader import Reader, ReadRequest, wanted_channels
 from armcal.plugins import PluginRegistry, discover
@@ -129,8 +129,10 @@ class Experiment:
         """
         if not grouped_instances(self.system.measurements):
             return self
-        blocks = self.system.parameters(groups_of(dataset, self.system.measurements))
-        return replace(self, parameters=select(blocks, self.settings.parameters, self.source))
+        groups = groups_of(dataset, self.system.measurements)
+        chosen = select(self.system.parameters(groups), self.settings.parameters, self.source)
+        told = unmatched(self.system.measurements, groups)
+        return replace(self, parameters=chosen, warnings=(*self.warnings, *told))
 
     def request(self, *, measured: bool) -> ReadRequest:
         """What a reader should look for; with ``measured`` the measured values are required."""
