@@ -6,6 +6,7 @@ import contact_oracle as co
 import numpy as np
 import pytest
 from armcal.base.dataset import Dataset
+from armcal.solve.evidence_findings import worse_than_nominal
 from armcal.solve.moved import FEWEST, moved_findings, moved_groups
 from armcal.solve.nuisance import settled, started, untrained
 from armcal_contact.ball import BallInSocket, BallInSocketSettings
@@ -56,3 +57,11 @@ def test_a_move_no_larger_than_the_scatter_is_not_claimed():
 
 def test_few_records_say_nothing():
     assert found(0.01, 3, count=FEWEST - 1) == ()
+
+
+def test_a_calibration_that_is_worse_than_none_is_told_by_the_records_that_judge():
+    judged, nominal = np.array([np.nan, 12.0, 9.0]), np.array([90.0, 6.0, 7.0])
+    (finding,) = worse_than_nominal(judged, nominal)
+    assert finding.grade == "bad" and "10.50 mm" in finding.text and "6.50" in finding.text
+    assert worse_than_nominal(nominal / 2, nominal) == []
+    assert worse_than_nominal(np.full(3, np.nan), nominal) == []

@@ -15,6 +15,7 @@ from armcal.run.intervals import IntervalResult
 from armcal.run.result import RecordErrors
 from armcal.solve.drift import residuals
 from armcal.solve.evidence import Evidence, priors_alone, unseen_poses
+from armcal.solve.evidence_findings import worse_than_nominal
 from armcal.solve.leftover import leftover
 from armcal.solve.misses import Judged, misses
 from armcal.solve.motion import Motion, recorded_position
@@ -68,7 +69,7 @@ def verdict_of(
         run.dataset.ids,
         suggest(run.problem, training, found, joints) if found.names and _reads(run.problem) else (),
         run.fitted,
-        [*intervals.findings(), *moved_findings(_moved(run))],
+        [*worse_than_nominal(judged, errors.nominal_mm), *intervals.findings(), *moved_findings(_moved(run))],
         evidence,
     )
     return verdict, evidence

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
+
+from armcal.base.domains import Array
 from armcal.solve.estimator import Estimate
 from armcal.solve.evidence import PriorsAlone
 from armcal.solve.leftover import Leftover, Structure
@@ -45,6 +48,21 @@ def determined_told(estimate: Estimate, alone: PriorsAlone | None, typical_mm: f
         return Finding("note", text, test, "Nothing for the tip; armcal identify names them.")
     text = f"{held}, and the tip at unseen poses depends on them, by up to {alone.worst_mm:.2g} {_MM} (1 sd)."
     return Finding("warning", text, test, "armcal identify names them, and armcal plan the poses that would tell.")
+
+
+def worse_than_nominal(judged_mm: Array, nominal_mm: Array) -> list[Finding]:
+    """Where records that did not train are missed by more than before calibration (N each; nan where not judged)."""
+    seen = np.isfinite(judged_mm) & np.isfinite(nominal_mm)
+    if not seen.any():
+        return []
+    after, before = float(np.mean(judged_mm[seen])), float(np.mean(nominal_mm[seen]))
+    if after <= before:
+        return []
+    text = (
+        f"Worse than the nominal arm on records that did not train it: {after:.2f} mm on average, {before:.2f} before."
+    )
+    action = "Do not use it. Look at what trained: too few postures, too much alike, or some of them wrong."
+    return [Finding("bad", text, "means over the same records", action)]
 
 
 def structures_told(found: Leftover | None) -> list[Finding]:
