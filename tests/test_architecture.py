@@ -45,6 +45,7 @@ ORDER = [
     "armcal.measure.layout",
     "armcal.measure.missing",
     "armcal.measure.checks",
+    "armcal.measure.cells",
     "armcal.measure.csv_writer",
     "armcal.measure.environment",
     "armcal.measure.id_list",

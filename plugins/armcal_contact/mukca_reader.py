@@ -19,6 +19,7 @@ from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.base.settings import InputPath, Settings
 from armcal.errors import DataError, Location
+from armcal.measure.cells import is_missing, is_number
 from armcal.measure.checks import check_dataset, layout_of
 from armcal.measure.contact import named_arm
 from armcal.measure.measurement import GroupedMeasurement, Measurement, noise_channels
@@ -28,7 +29,6 @@ from armcal.measure.reader import ReadRequest, WantedChannel
 from armcal_contact.mukca_folder import POSITION, SOCKET, SocketFile, found_files, hash_of
 
 _FULL_TURN = 2 * math.pi
-_MISSING = ("", "nan", "na", "null")
 _NOISE = "noise"
 
 
@@ -121,14 +121,13 @@ def _number(path: Path, line: int, index: int, cell: str, wanted: Sequence[Wante
     """One cell (rad, or m for a sliding joint)."""
     text, joint = cell.strip(), wanted[index]
     column = f"column {index + 1} ({joint.channel.partition('.')[2]})"
-    if text.lower() in _MISSING:
+    if is_missing(text):
         return math.nan
-    try:
-        value = float(text if text.isascii() and "_" not in text else "not a number")
-    except ValueError:
+    if not is_number(text):
         header = " These files have no header." if line == 1 else ""
         mend = f"Correct it, or leave the cell empty to set the record aside.{header}"
         _refuse(path, f"found {text[:40]!r}, expected a number.", mend, line, column)
+    value = float(text)
     if joint.dimension == "angle" and not joint.is_endless and _FULL_TURN * (1 + 1e-9) < abs(value) < math.inf:
         found = f"found {value:.10g} rad, more than one turn (2 pi rad): are these degrees?"
         _refuse(path, found, "Write the angles in rad.", line, column)

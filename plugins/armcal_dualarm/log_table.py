@@ -15,10 +15,10 @@ from typing import NoReturn
 import numpy as np
 from armcal.base.domains import Array
 from armcal.errors import DataError, Location
+from armcal.measure.cells import is_missing, is_number
 
 MAX_BYTES = 2 * 1024**3
 _ROWS_AT_ONCE = 256
-_MISSING = frozenset({"", "na", "n/a", "nan", "null", "none"})
 _DELIMITERS = "\t;|,"
 """The likeliest first: where columns are parted by semicolons, commas are decimal ones."""
 _SAVE_AS_TEXT = "Save the log as text in UTF-8."
@@ -108,9 +108,9 @@ def _with_first(first: tuple[int, list[str]], rows: Iterator[tuple[int, list[str
 def _is_header(cells: Sequence[str], numbers: Sequence[Column], texts: Sequence[Column]) -> bool:
     """Whether the first row holds names: asked for by name, no cell a number; by place, no number where one is due."""
     if any(isinstance(column, str) for column in (*numbers, *texts)):
-        return not any(_is_number(cell) for cell in cells)
+        return not any(is_number(cell) for cell in cells)
     due = [cells[column - 1] for column in numbers if isinstance(column, int) and 1 <= column <= len(cells)]
-    return not any(_is_number(cell) for cell in due) and any(cell.lower() not in _MISSING for cell in due)
+    return not any(is_number(cell) for cell in due) and any(not is_missing(cell) for cell in due)
 
 
 def _place(path: Path, line: int, header: Sequence[str], count: int, column: Column) -> int:
@@ -168,21 +168,11 @@ def _numbers(path: Path, lines: Sequence[int], cells: Sequence[str], name: str) 
 
 
 def _number(path: Path, line: int, cell: str, name: str) -> float:
-    if _is_number(cell):
+    if is_number(cell):
         return float(cell)
-    if cell.lower() in _MISSING:
+    if is_missing(cell):
         return math.nan
     _refuse(path, f"found {cell[:40]!r}, expected a number.", "Correct it, or leave the cell empty.", line, name)
-
-
-def _is_number(text: str) -> bool:
-    if not text.isascii() or "_" in text:
-        return False
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
 
 
 def _refuse(path: Path, message: str, hint: str, line: int | None = None, column: str | None = None) -> NoReturn:

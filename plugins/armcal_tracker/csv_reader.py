@@ -24,6 +24,7 @@ from armcal.base.domains import Array
 from armcal.base.settings import InputPath, Settings
 from armcal.base.units import DIMENSIONLESS, UNITS, from_unit, units_of
 from armcal.errors import DataError, Location
+from armcal.measure.cells import is_missing, is_number
 from armcal.measure.checks import check_dataset, layout_of, refuse_joint_count
 from armcal.measure.reader import ReadRequest, WantedChannel
 from pydantic import Field
@@ -34,7 +35,6 @@ MAX_COLUMNS = 1000
 
 _ROWS_AT_ONCE = 256  # small blocks stay in the processor's cache: faster than thousands
 _ID_NAMES = ("pose_id", "id")
-_MISSING = frozenset({"", "na", "n/a", "null", "none"})
 _UNIT_WORDS = frozenset({*UNITS, "°", "degree", "degrees", "radians", "meters", "metres", "m/s^2", "m/s2"} - {"1"})
 _DECIMAL_COMMA = re.compile(r"\s*[+-]?[0-9]+,[0-9]+(?:[eE][+-]?[0-9]+)?\s*")
 _NUMBER_AND_UNIT = re.compile(r"\s*[+-]?[0-9]*[.,]?[0-9]+\s*[^\W\d][\w/^]*\s*")
@@ -177,7 +177,7 @@ def _header(rows: Iterator[tuple[int, list[str]]], source: str, settings: CsvSet
         _refuse_delimiter(header, settings.delimiter, rows)
     if len(names) > MAX_COLUMNS:
         header.refuse(f"found {len(names)} columns, expected at most {MAX_COLUMNS}.", "Check the delimiter.")
-    if all(_is_number(name) for name in names):
+    if all(is_number(name) for name in names):
         header.refuse(
             f"found numbers ({', '.join(names[:3])}, ...), expected a header.",
             "Put the columns' names with their units, such as q1_deg, on the first line.",
@@ -369,9 +369,9 @@ def _numbers(cells: Sequence[str], lines: Sequence[int], column: _Column, header
 
 def _number(cell: str, line: int, column: _Column, header: _Header) -> float:
     """One cell; NaN if its value is missing."""
-    if _is_number(cell):
+    if is_number(cell):
         return float(cell)
-    if cell.strip().lower() in _MISSING:
+    if is_missing(cell):
         return float("nan")
     shown = repr(cell if len(cell) <= 40 else f"{cell[:40]}...")
     found, hint = f"found {shown}, expected a number.", "Correct it, or leave the cell empty to set the record aside."
@@ -383,16 +383,6 @@ def _number(cell: str, line: int, column: _Column, header: _Header) -> float:
     elif _NUMBER_AND_UNIT.fullmatch(cell):
         hint = "Write the number alone; its unit belongs in the column's name."
     raise DataError(found, where=Location(header.source, line=line, field=column.name), hint=hint)
-
-
-def _is_number(text: str) -> bool:
-    if not text.isascii() or "_" in text:
-        return False
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
 
 
 def _pointed(text: str) -> str:

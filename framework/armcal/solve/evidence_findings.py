@@ -41,7 +41,7 @@ def determined_told(estimate: Estimate, alone: PriorsAlone | None, typical_mm: f
     held = f"{_plural(count, 'combination is', 'combinations are')} held by priors alone"
     held += f" ({listed})" if count <= FEW_NAMED else ""
     test = f"{test}; the tip at {alone.poses} unseen poses, joints approached as in the records"
-    test += f"; up to {alone.up_to}, which no contact tells" if alone.up_to else ""
+    test += f"; positions, not orientations, up to {alone.up_to}, which no contact tells" if alone.up_to else ""
     if typical_mm is None or alone.worst_mm <= NEGLIGIBLE_SHARE * typical_mm:
         most = f"{alone.worst_mm:.2g}" if alone.worst_mm >= 0.001 else "0.001"
         text = f"{held}; the tip at unseen poses does not depend on them (at most {most} {_MM}, 1 sd)."
