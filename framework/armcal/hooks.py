@@ -11,7 +11,7 @@ from typing import Any, Protocol
 import pluggy
 
 PROJECT = "armcal"
-CONTRACT_VERSION = "1.1"
+CONTRACT_VERSION = "1.2"
 """Version of the plugin contract: the major number changes when an existing plugin would break."""
 
 hookspec = pluggy.HookspecMarker(PROJECT)
@@ -57,6 +57,11 @@ def armcal_register_estimators(register: Register) -> None:
 
 
 @hookspec
+def armcal_register_online_estimators(register: Register) -> None:
+    """Online estimators: built as ``Estimator(settings)``; see ``armcal.solve.online.OnlineEstimator``."""
+
+
+@hookspec
 def armcal_register_simulators(register: Register) -> None:
     """Simulators: built as ``Simulator(settings)``; see ``armcal.solve.simulation.Simulator``."""
 
@@ -92,6 +97,7 @@ KINDS = {
     "measurement": "armcal_register_measurements",
     "reader": "armcal_register_readers",
     "estimator": "armcal_register_estimators",
+    "online": "armcal_register_online_estimators",
     "simulator": "armcal_register_simulators",
     "exporter": "armcal_register_exporters",
 }

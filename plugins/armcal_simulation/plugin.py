@@ -8,3 +8,4 @@ def armcal_register_simulators(register: Register) -> None:
     """Announce the simulators."""
     register("elastic_arm", "armcal_simulation.simulator:ElasticArmSimulator", "an arm with a stated truth")
     register("contacts", "armcal_simulation.contacts:ContactsSimulator", "postures in sockets and clamps")
+    register("mission", "armcal_simulation.mission:MissionOfDays", "a rover's arm over some days, and what befalls it")

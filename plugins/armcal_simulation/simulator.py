@@ -20,6 +20,8 @@ from armcal.solve.simulation import SimulationRequest, measured_without_noise, w
 from armcal.testing import EXAMPLE_TRUTH
 from pydantic import Field, model_validator
 
+from armcal_simulation.motions import approach_of
+from armcal_simulation.outliers import OutlierSettings, with_outliers
 from armcal_simulation.readings import disturbed, is_orientation
 
 
@@ -52,13 +54,6 @@ class PoseSettings(Settings):
                     hint=f"Give one list for each of {', '.join(sorted(wanted)) or 'no joint'}.",
                 )
         return [np.array(self.levels.get(j) or self.travel[j]) for j in arm.commanded]
-
-
-class OutlierSettings(Settings):
-    """Some measurements are wrong: how many, and by how much at least (in a random direction)."""
-
-    fraction: Annotated[float, Field(ge=0, le=1)] = 0.0
-    size: Length = 0.03
 
 
 class ElasticArmSettings(Settings):
@@ -107,7 +102,7 @@ class ElasticArmSimulator:
             turning = [dimension == "angle" for dimension in arm.commanded.values()]
             reached[turning] = np.round(commands[turning] / step) * step
         named = [f"{arm.name}.{joint}" for joint in arm.commanded]
-        approach = _approach(commands)
+        approach = approach_of(commands)
         channels = {f"{arm.name}.approach.{j}": approach[i] for i, j in enumerate(arm.commanded)}
         standing = Dataset(
             tuple(str(i) for i in range(1, commands.shape[1] + 1)),
@@ -124,7 +119,7 @@ class ElasticArmSimulator:
         exact = measured_without_noise(true, standing)
         read = disturbed(request.measurements, exact, self._settings.noise, random)
         moved = {channel: values for channel, values in read.items() if not is_orientation(channel)}
-        return {**read, **_with_outliers(moved, self._settings.outliers, random)}
+        return {**read, **with_outliers(moved, self._settings.outliers, random)[0]}
 
 
 def _poses(poses: PoseSettings, levels: list[Array], random: np.random.Generator) -> Array:
@@ -142,26 +137,7 @@ def _poses(poses: PoseSettings, levels: list[Array], random: np.random.Generator
     return np.array([level[index] for level, index in zip(levels, indices, strict=True)])
 
 
-def _approach(commands: Array) -> Array:
-    """The sign of each joint's last motion; 0 before its first (joints x poses)."""
-    moves = np.sign(np.diff(commands, axis=1, prepend=commands[:, :1]))
-    for column in range(1, moves.shape[1]):
-        still = moves[:, column] == 0
-        moves[still, column] = moves[still, column - 1]
-    return np.asarray(moves)
-
-
 def _with_truth(request: SimulationRequest, settings: ElasticArmSettings) -> SimulationRequest:
     source = load_config(settings.truth)
     parameters = with_values(request.parameters, source.data, source, ())
     return SimulationRequest(request.arms, request.measurements, parameters, request.environment)
-
-
-def _with_outliers(
-    measured: Mapping[str, Array], outliers: OutlierSettings, random: np.random.Generator
-) -> dict[str, Array]:
-    count = len(next(iter(measured.values())))
-    wrong = random.random(count) < outliers.fraction
-    push = random.normal(size=(len(measured), count))
-    push *= outliers.size * (1 + random.random(count)) / np.linalg.norm(push, axis=0)
-    return {channel: values + np.where(wrong, push[row], 0.0) for row, (channel, values) in enumerate(measured.items())}

@@ -21,6 +21,10 @@ COMMANDS = {
     "plan": ("armcal.cli.plan:plan", "Which poses to measure: the best few, and how good any could be."),
     "convert": ("armcal.cli.convert:convert", "The geometry of an arm in another form: mdh, poe, urdf."),
     "simulate": ("armcal.cli.simulate:simulate", "Make measurements up from a stated truth."),
+    "recalibrate": ("armcal.cli.recalibrate:recalibrate", "Keep a calibration true, record by record, as they come."),
+    "control": ("armcal.cli.control:control", "Ask a running recalibration, or tell it what to do."),
+    "watch": ("armcal.cli.watch:watch", "Show a recalibration live, in the browser or the terminal."),
+    "mission": ("armcal.cli.mission:mission", "Simulate a mission, recalibrate over it, judge it by its truth."),
     "plugins": ("armcal.cli.plugins:plugins", "List plugins, or check one."),
 }
 

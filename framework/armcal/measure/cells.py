@@ -2,8 +2,25 @@
 
 from __future__ import annotations
 
+import re
+from dataclasses import dataclass
+
+from armcal.base.units import UNITS
+
 MISSING = frozenset({"", "na", "n/a", "nan", "null", "none"})
 """In small letters."""
+DECIMAL_COMMA = re.compile(r"\s*[+-]?[0-9]+,[0-9]+(?:[eE][+-]?[0-9]+)?\s*")
+
+_UNIT_WORDS = frozenset({*UNITS, "°", "degree", "degrees", "radians", "meters", "metres", "m/s^2", "m/s2"} - {"1"})
+_NUMBER_AND_UNIT = re.compile(r"\s*[+-]?[0-9]*[.,]?[0-9]+\s*[^\W\d][\w/^]*\s*")
+
+
+@dataclass(frozen=True)
+class CellFault:
+    """A cell that holds no number: what was found, and how to mend it; sentences."""
+
+    found: str
+    hint: str
 
 
 def is_number(text: str) -> bool:
@@ -20,3 +37,26 @@ def is_number(text: str) -> bool:
 def is_missing(text: str) -> bool:
     """Whether a cell says that its value is not known."""
     return text.strip().lower() in MISSING
+
+
+def read_cell(cell: str) -> float | CellFault:
+    """The number in a cell; NaN if its value is missing."""
+    if is_number(cell):
+        return float(cell)
+    if is_missing(cell):
+        return float("nan")
+    shown = repr(cell if len(cell) <= 40 else f"{cell[:40]}...")
+    if DECIMAL_COMMA.fullmatch(cell):
+        return CellFault(f"found {shown}, a decimal comma.", f"Write decimal points: {with_point(cell)}.")
+    if cell.strip(" []()").lower() in _UNIT_WORDS:
+        mend = "Remove it; each column's name ends in its unit, as in q1_deg."
+        return CellFault(f"found {shown}: this looks like a row of units.", mend)
+    hint = "Correct it, or leave the cell empty to set the record aside."
+    if _NUMBER_AND_UNIT.fullmatch(cell):
+        hint = "Write the number alone; its unit belongs in the column's name."
+    return CellFault(f"found {shown}, expected a number.", hint)
+
+
+def with_point(text: str) -> str:
+    """A decimal comma as a point."""
+    return text.strip().replace(",", ".")

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
 
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
+from armcal.solve.problem import Problem
+from armcal.solve.scatter import Scatter, scatter_of
 from armcal.solve.validation import Split
 from armcal.solve.variance import VarianceComponents
 from armcal.solve.weighing import WeighedFit
@@ -50,6 +53,7 @@ class NoiseResult:
         suspicious: the farthest first; not sought in plain least squares.
         components: estimated variances, or None.
         rounds: solves beyond the first.
+        scatter: of what the fit leaves unexplained, by measurement.
     """
 
     loss: str = "none"
@@ -57,6 +61,7 @@ class NoiseResult:
     suspicious: tuple[SuspiciousRecord, ...] = ()
     components: VarianceComponents | None = None
     rounds: int = 0
+    scatter: Mapping[str, Scatter] = field(default_factory=dict)
 
     @property
     def set_aside(self) -> tuple[SuspiciousRecord, ...]:
@@ -75,10 +80,16 @@ class NoiseResult:
             ]
             told["inseparable"] = [list(pair) for pair in self.components.inseparable]
             told["unseen_joints"] = list(self.components.unseen)
+        told["scatter"] = {
+            name: {"covariance": each.covariance.tolist(), "share": each.share, "over": each.over}
+            for name, each in self.scatter.items()
+        }
         return told
 
 
-def noise_result(fit: WeighedFit, dataset: Dataset, split: Split, errors_mm: Array) -> NoiseResult:
+def noise_result(
+    problem: Problem, fit: WeighedFit, dataset: Dataset, split: Split, errors_mm: Array
+) -> NoiseResult:
     """From a fit on the training records; errors are of all records (N)."""
     weights = np.full(len(dataset), np.nan)
     weights[split.train] = np.min(np.array(fit.weights), axis=0)
@@ -88,7 +99,8 @@ def noise_result(fit: WeighedFit, dataset: Dataset, split: Split, errors_mm: Arr
         row = dataset.rows[i] if dataset.rows else 0
         numbers = (suspect.distance, suspect.limit, suspect.weight, float(errors_mm[i]))
         suspicious.append(SuspiciousRecord(row, dataset.ids[i], suspect.measurement, *numbers))
-    return NoiseResult(fit.loss, weights, tuple(suspicious), fit.components, len(fit.rounds))
+    scatter = scatter_of(problem, fit.estimate, fit.records, dataset.subset(split.train))
+    return NoiseResult(fit.loss, weights, tuple(suspicious), fit.components, len(fit.rounds), scatter)
 
 
 def _finite(value: Any) -> Any:

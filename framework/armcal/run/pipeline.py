@@ -149,7 +149,7 @@ def calibrate(
         crossed = _crossed(experiment, ready, progress, executor)
         errors, intervals = _errors(ready, fitted, crossed), _intervals(experiment, ready, fitted, crossed)
     verdict, evidence = _judge(experiment, ready, fitted, errors, intervals, watch)
-    noise = noise_result(fitted, ready.dataset, ready.split, errors.calibrated_mm)
+    noise = noise_result(ready.problem, fitted, ready.dataset, ready.split, errors.calibrated_mm)
     faults += _tell_rejected(registry, [(s.row, s.record_id, s.reason) for s in noise.set_aside])
     return RunResult(
         name=experiment.name,

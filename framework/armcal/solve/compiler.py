@@ -51,7 +51,7 @@ def cache_directory() -> Path:
 
 def library_key(text: str) -> str:
     """A key for an expression's serialised text on this machine with this compiler."""
-    parts = (text, " ".join(FLAGS), _compiler_identity(), _processor())
+    parts = (text, " ".join(FLAGS), _compiler_identity(), processor())
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:40]
 
 
@@ -136,7 +136,7 @@ def _compiler_identity() -> str:
 
 
 @cache
-def _processor() -> str:
+def processor() -> str:
     """What ``-march=native`` depends on."""
     with suppress(OSError):
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()

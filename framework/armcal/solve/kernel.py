@@ -99,7 +99,7 @@ class _Mapped:
 
     def __call__(self, values: Array, inputs: Sequence[Array], outputs: Sequence[Array]) -> None:
         count = inputs[0].shape[1]
-        buffer, evaluate = _buffer(self._function)
+        buffer, evaluate = direct_access(self._function)
         given = [np.zeros((_BLOCK, size)) for size in self._in_sizes]
         taken = [np.zeros((_BLOCK, size)) for size in self._out_sizes]
         shared = np.ascontiguousarray(values)
@@ -122,7 +122,7 @@ class _Mapped:
         return block.reshape(len(block), rows).T
 
 
-def _buffer(function: ca.Function) -> tuple[Any, Callable[[], None]]:
+def direct_access(function: ca.Function) -> tuple[Any, Callable[[], None]]:
     """Direct access to a function's memory."""
     buffer, evaluate = function.buffer()
     return buffer, evaluate
@@ -153,10 +153,11 @@ class Compiled:
 
 @dataclass(frozen=True)
 class Kernel:
-    """A factor with the backend that evaluates it."""
+    """A factor with the backend that evaluates it; ``identity`` names the library (its key) or the interpreter."""
 
     factor: Factor
     backend: Backend
+    identity: str = f"casadi {ca.CasadiMeta.version()}"
 
     @cached_property
     def newton(self) -> ca.Function:
@@ -284,7 +285,7 @@ def build_kernel(factor: Factor, records: int, choice: EvaluatorChoice = "auto")
     if library is None:
         return Kernel(factor, machine)
     compiled = Compiled(library)
-    return Kernel(factor, compiled if _agree(factor, machine, compiled) else machine)
+    return Kernel(factor, compiled, key) if _agree(factor, machine, compiled) else Kernel(factor, machine)
 
 
 def kernel_source(factor: Factor, single_pass: ca.Function, linearise: ca.Function) -> str:

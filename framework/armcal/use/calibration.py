@@ -34,6 +34,8 @@ from armcal.solve.variance import Component
 from armcal.use.intervals import PlusMinus, PredictionRecord, Uncertainty
 
 SCHEMA = 1
+UNMOVED_SD = 1e-4
+"""In standard deviations: a step that ignores the bounds and is shorter than this is the solver's own tolerance."""
 _LINE_END = re.compile("[\n\r\x85\u2028\u2029]")
 
 
@@ -41,6 +43,8 @@ class ParameterRecord(Settings):
     """One canonical entry as it is kept; ``sd``, ``lower`` and ``upper`` are null where they are not known.
 
     ``determined`` is by the records alone; what they do not determine may be held by a prior, and is no finding.
+    ``unconstrained`` is where the records would have it if no bound held any parameter, where that differs: who goes on
+    from the calibration needs it, for a bound is no evidence.
     """
 
     name: str
@@ -54,6 +58,7 @@ class ParameterRecord(Settings):
     determined: bool | None = None
     held_by_prior: bool = False
     at_bound: bool = False
+    unconstrained: float | None = None
 
 
 class InformationRecord(Settings):
@@ -83,6 +88,7 @@ class CalibrationFile(Settings):
     parameters: tuple[ParameterRecord, ...]
     prediction: PredictionRecord | None = None
     information: InformationRecord
+    recalibrated: dict[str, Any] | None = None
 
 
 @dataclass(frozen=True)
@@ -224,10 +230,15 @@ class Calibration:
         predicted channels.
 
         Raises:
-            ConfigError: the calibration does not say.
+            ConfigError: the calibration does not say, or was recalibrated since.
             DataError: in the same recording, and the records do not say their place in it.
             NotConvergedError: a record has no equilibrium.
         """
+        if recording == "same" and self.record.recalibrated is not None:
+            raise ConfigError(
+                "the calibration was kept true since its recording, which no longer tells of its drift.",
+                hint="Predict for a new recording.",
+            )
         return self.uncertainty.plus_minus(commands, recording)
 
     def forward(self, joint_angles: Array, arm: str | None = None) -> Array:
@@ -297,8 +308,10 @@ _Dumper.add_representer(str, _quoted)
 
 
 def _uncertainty(estimate: Estimate, index: int) -> dict[str, Any]:
-    interval = estimate.intervals[index]
+    interval, free = estimate.intervals[index], float(estimate.unconstrained[index])
+    moved = abs(free - estimate.values[estimate.free_entries[index]])
     return {
+        "unconstrained": free if moved > UNMOVED_SD * estimate.deviations[index] else None,
         "sd": _finite(estimate.deviations[index]),
         "lower": _finite(interval.lower),
         "upper": _finite(interval.upper),

@@ -1,0 +1,155 @@
+"""What a journal asks of a file system, small enough that a test can stand in for it."""
+
+from __future__ import annotations
+
+import errno
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Protocol
+
+
+class FileLayer(Protocol):
+    """Files and folders. Every method raises OSError where the system does."""
+
+    def make_folder(self, folder: Path) -> None:
+        """The folder and those above it, durable; nothing if it is there."""
+
+    def names(self, folder: Path) -> tuple[str, ...]:
+        """What a folder holds, sorted; empty if there is no folder."""
+
+    def read(self, path: Path) -> bytes:
+        """The whole of a file."""
+
+    def size(self, path: Path) -> int:
+        """Bytes in a file."""
+
+    def open_append(self, path: Path) -> int:
+        """A descriptor that writes at the end; the file is made if it is not there."""
+
+    def write(self, descriptor: int, data: bytes) -> None:
+        """All of the data, or OSError after any part of it."""
+
+    def truncate(self, descriptor: int, size: int) -> None:
+        """Cut a file to ``size`` bytes."""
+
+    def sync(self, descriptor: int) -> None:
+        """Return when the file's bytes would outlast a power loss."""
+
+    def close(self, descriptor: int) -> None:
+        """Give a descriptor back."""
+
+    def sync_folder(self, folder: Path) -> None:
+        """Return when names made, removed or changed in the folder would outlast a power loss."""
+
+    def rename(self, old: Path, new: Path) -> None:
+        """Give a file another name, in place of what had it."""
+
+    def remove(self, path: Path) -> None:
+        """Take a file away."""
+
+
+class RealFiles:
+    """The operating system's files. Python itself repeats a call that a signal interrupted (PEP 475)."""
+
+    def make_folder(self, folder: Path) -> None:
+        """See FileLayer."""
+        missing = [place for place in (folder, *folder.parents) if not place.is_dir()]
+        folder.mkdir(parents=True, exist_ok=True)
+        for place in reversed(missing):
+            self.sync_folder(place.parent)
+
+    def names(self, folder: Path) -> tuple[str, ...]:
+        """See FileLayer."""
+        try:
+            return tuple(sorted(entry.name for entry in folder.iterdir()))
+        except FileNotFoundError:
+            return ()
+
+    def read(self, path: Path) -> bytes:
+        """See FileLayer."""
+        return path.read_bytes()
+
+    def size(self, path: Path) -> int:
+        """See FileLayer."""
+        return path.stat().st_size
+
+    def open_append(self, path: Path) -> int:
+        """See FileLayer."""
+        return os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o644)
+
+    def write(self, descriptor: int, data: bytes) -> None:
+        """See FileLayer. One call of the system; more only where it wrote a part."""
+        left = memoryview(data)
+        while left:
+            written = os.write(descriptor, left)
+            if not written:
+                raise OSError(errno.EIO, "the system wrote nothing and gave no reason")
+            left = left[written:]
+
+    def truncate(self, descriptor: int, size: int) -> None:
+        """See FileLayer."""
+        os.ftruncate(descriptor, size)
+
+    def sync(self, descriptor: int) -> None:
+        """See FileLayer."""
+        os.fsync(descriptor)
+
+    def close(self, descriptor: int) -> None:
+        """See FileLayer."""
+        os.close(descriptor)
+
+    def sync_folder(self, folder: Path) -> None:
+        """See FileLayer."""
+        descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+
+    def rename(self, old: Path, new: Path) -> None:
+        """See FileLayer."""
+        old.rename(new)
+
+    def remove(self, path: Path) -> None:
+        """See FileLayer."""
+        path.unlink()
+
+
+REAL_FILES = RealFiles()
+
+
+def is_full(fault: OSError) -> bool:
+    """Whether there is no room: a full disk or a quota."""
+    return fault.errno in (errno.ENOSPC, errno.EDQUOT)
+
+
+@contextmanager
+def opened(files: FileLayer, path: Path) -> Iterator[int]:
+    """A descriptor for appending, given back at the end."""
+    descriptor = files.open_append(path)
+    try:
+        yield descriptor
+    finally:
+        files.close(descriptor)
+
+
+def write_whole(files: FileLayer, path: Path, data: bytes) -> None:
+    """Put a file in place so that a power loss leaves the earlier one or this one, whole.
+
+    Raises:
+        OSError: it could not be; the earlier file is as it was.
+    """
+    staged = path.with_name(path.name + ".new")
+    try:
+        with opened(files, staged) as descriptor:
+            files.truncate(descriptor, 0)
+            files.write(descriptor, data)
+            files.sync(descriptor)
+        files.rename(staged, path)
+    except BaseException:
+        if staged.name in files.names(path.parent):
+            files.remove(staged)
+        raise
+    files.sync_folder(path.parent)

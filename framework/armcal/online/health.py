@@ -1,0 +1,60 @@
+"""How far the calibration can be trusted, and when that changes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from scipy.special import chdtrc, chdtri
+
+Level = Literal["nominal", "watch", "suspect", "lost"]
+LEVELS: tuple[Level, ...] = ("nominal", "watch", "suspect", "lost")
+"""From the best to the worst."""
+
+
+@dataclass(frozen=True)
+class Health:
+    """A level, since how many records nothing has troubled it, and why it is what it is."""
+
+    level: Level = "nominal"
+    calm: int = 0
+    sentence: str = "The records agree with the calibration."
+
+    def troubled(self, level: Level, sentence: str) -> Health:
+        """After trouble: at least that bad, and calm no more."""
+        if LEVELS.index(level) > LEVELS.index(self.level):
+            return Health(level, 0, sentence)
+        return replace(self, calm=0)
+
+    def calmed(self, after: int) -> Health:
+        """After a record without trouble: better by a level once ``after`` of them came in a row."""
+        if self.level == "nominal":
+            return self
+        if self.calm + 1 < after:
+            return replace(self, calm=self.calm + 1)
+        level = LEVELS[LEVELS.index(self.level) - 1]
+        return Health(level, 0, f"{after} records in a row agree with the calibration.")
+
+
+def surprise_limit(dof: int, probability: float) -> float:
+    """What NIS stays below with a probability, where all is as believed."""
+    return float(chdtri(float(dof), 1 - probability))
+
+
+def improbability(surprises: Sequence[tuple[float, int]]) -> float:
+    """How probable surprises (NIS and its degrees of freedom, in order) at least as large in sum are by chance.
+
+    Neighbours that resemble each other count for less than their number: by their first serial correlation.
+    """
+    if len(surprises) < 3:
+        return 1.0
+    total, freedom = (float(sum(column)) for column in zip(*surprises, strict=True))
+    relative = np.array([nis / dof for nis, dof in surprises])
+    centred = relative - relative.mean()
+    power = float(centred @ centred)
+    serial = float(centred[1:] @ centred[:-1]) / power if power > 0 else 0.0
+    serial = float(np.clip(serial, 0.0, 0.9))
+    shared = (1 + serial) / (1 - serial)
+    return float(chdtrc(freedom / shared, total / shared))

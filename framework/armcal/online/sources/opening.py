@@ -1,0 +1,42 @@
+"""Sources by what a user calls them."""
+
+from __future__ import annotations
+
+import re
+import sys
+import time
+from pathlib import Path
+
+from armcal.errors import InputError, Location
+from armcal.online.row_parser import RowParser
+from armcal.online.sources.csv_file import CsvFile
+from armcal.online.sources.folder import Folder
+from armcal.online.sources.lines import Lines
+from armcal.online.sources.source import AtEnd, Clock, Source
+from armcal.online.sources.udp import LOOPBACK, Udp
+
+KINDS = "- (standard input), udp:PORT, udp:HOST:PORT, a directory, or a CSV file"
+
+_UDP = re.compile(r"udp:(?:(?P<host>[^:\[\]]+|\[[0-9a-fA-F:.]+\]):)?(?P<port>[0-9]{1,5})")
+
+
+def open_source(text: str, rows: RowParser, at_end: AtEnd = "stop", clock: Clock = time.time) -> Source:
+    """A source by its name: ``-``, ``udp:PORT``, ``udp:HOST:PORT``, a directory, or a CSV file.
+
+    Raises:
+        InputError: it is none of these, or cannot be opened.
+        DataError: the header of a file cannot be used.
+    """
+    if text == "-":
+        return Lines(sys.stdin.fileno(), rows, clock)
+    if text.startswith("udp:"):
+        found = _UDP.fullmatch(text)
+        if found is None or int(found["port"]) > 65535:
+            raise InputError("it is no address.", where=Location(text), hint=f"Give {KINDS}.")
+        return Udp((found["host"] or LOOPBACK).strip("[]"), int(found["port"]), rows, clock)
+    path = Path(text)
+    if path.is_dir():
+        return Folder(path, rows, clock)
+    if not path.exists():
+        raise InputError("there is no such file or directory.", where=Location(text), hint=f"Give {KINDS}.")
+    return CsvFile(path, rows, at_end, clock)

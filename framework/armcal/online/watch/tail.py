@@ -1,0 +1,121 @@
+"""Following a file of lines that is appended to, rotated, cut and dropped while it is read."""
+
+from __future__ import annotations
+
+import os
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO
+
+LONGEST_LINE = 1 << 20
+"""Longer lines are passed over (bytes)."""
+_AT_ONCE = 1 << 20
+_HEAD = 256
+
+
+@dataclass(frozen=True)
+class _Mark:
+    """What a file is known again by, whatever it is called by then: device, number and how it begins."""
+
+    place: tuple[int, int]
+    head: bytes
+
+    def fits(self, file: BinaryIO | None) -> bool:
+        return file is not None and self.is_at(file) and os.pread(file.fileno(), len(self.head), 0) == self.head
+
+    def is_at(self, file: BinaryIO) -> bool:
+        return self.place == _place(file)
+
+
+class Tail:
+    """The complete lines of ``path``, oldest first, from the file it was last rotated to onwards.
+
+    A half-written line waits for its end. A file that was rotated is read to its end before the new one is begun; one
+    that became shorter, or begins otherwise than before, is read from its start. Files need not exist yet. None is
+    kept open, so that a file that is dropped to make room on a disk does make room.
+
+    Args:
+        path: the newest file.
+        rotated: where it goes when it is rotated; the only earlier file that is kept.
+    """
+
+    def __init__(self, path: Path, rotated: Path) -> None:
+        self._path, self._rotated = path, rotated
+        self._reading: _Mark | None = None
+        self._before: _Mark | None = None
+        self._position = 0
+        self._partial = b""
+        self._skipping = False
+        self.too_long = 0
+
+    def lines(self) -> list[bytes]:
+        """What was completed since the last call, at most about 1 MB of it; empty when all is read.
+
+        Raises:
+            OSError: a file is there and cannot be read.
+        """
+        with ExitStack() as opened:
+            newest = _open(self._path, opened)  # first: a rotation in between then shows the same file twice
+            earlier = _open(self._rotated, opened)
+            file = self._current(newest, earlier)
+            if file is None:
+                return []
+            found = self._read(file)
+            if found or newest is None or _place(file) == _place(newest):
+                return found
+            self._before = self._reading
+            self._begin(newest)
+            return self._read(newest)
+
+    def _current(self, newest: BinaryIO | None, earlier: BinaryIO | None) -> BinaryIO | None:
+        """The file that is being read, or else the one to begin."""
+        for file in (newest, earlier):
+            if file is not None and self._reading is not None and self._reading.fits(file):
+                if os.fstat(file.fileno()).st_size < self._position:
+                    self._begin(file)
+                return file
+        if newest is not None and self._reading is not None and self._reading.is_at(newest):
+            self._begin(newest)
+            return newest
+        was_read = self._before is not None and self._before.fits(earlier)
+        first = newest if earlier is None or was_read else earlier
+        if first is not None:
+            self._begin(first)
+        return first
+
+    def _begin(self, file: BinaryIO) -> None:
+        self._reading = _Mark(_place(file), b"")
+        self._position, self._partial, self._skipping = 0, b"", False
+
+    def _read(self, file: BinaryIO) -> list[bytes]:
+        found: list[bytes] = []
+        file.seek(self._position)
+        while not found and (data := file.read(_AT_ONCE)):
+            self._position += len(data)
+            found = self._completed(data)
+        head = os.pread(file.fileno(), min(_HEAD, self._position), 0)
+        self._reading = _Mark(_place(file), head)
+        return found
+
+    def _completed(self, data: bytes) -> list[bytes]:
+        *whole, rest = (self._partial + data).split(b"\n")
+        if whole and self._skipping:
+            whole, self._skipping = whole[1:], False
+        if self._skipping or len(rest) > LONGEST_LINE:
+            self.too_long += not self._skipping
+            rest, self._skipping = b"", True
+        self._partial = rest
+        return [line for line in whole if line.strip()]
+
+
+def _open(path: Path, opened: ExitStack) -> BinaryIO | None:
+    try:
+        return opened.enter_context(path.open("rb", buffering=0))
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+
+
+def _place(file: BinaryIO) -> tuple[int, int]:
+    known = os.fstat(file.fileno())
+    return known.st_dev, known.st_ino

@@ -1,0 +1,99 @@
+"""One record at a time: a factor's residual and Jacobian without the arrangements for many.
+
+The compiled functions work on a whole vector of records, so all its places hold the same one. Without a compiler
+CasADi's virtual machine evaluates a single record. The elastic equilibrium starts from rest each time: what comes out
+is a function of values and record alone, to the last bit.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import casadi as ca
+import numpy as np
+
+from armcal.base.domains import Array
+from armcal.solve.c_source import LANES
+from armcal.solve.kernel import MOST_DEFLECTION, MOST_PASSES, NEAR_REST_RAD, Compiled, Kernel, direct_access
+
+
+class OneRecord:
+    """Buffers of one kernel for one record; not to be shared between threads."""
+
+    def __init__(self, kernel: Kernel) -> None:
+        factor = kernel.factor
+        self._kernel, self._compiled = kernel, isinstance(kernel.backend, Compiled)
+        self._sizes = (factor.residual.numel(), factor.values.numel())
+        width = LANES if self._compiled else 1
+        self._record = np.zeros((factor.record.numel(), width))
+        self._state = np.zeros((factor.state.numel(), width))
+        self._residual = np.zeros((self._sizes[0], width))
+        self._jacobian = np.zeros((self._sizes[0] * self._sizes[1], width))
+
+    def linearise(self, values: Array, record: Array) -> tuple[Array, Array]:
+        """Residual (n_r) and its Jacobian by the kernel's values (n_r x n_v), in equilibrium.
+
+        Args:
+            values: of the kernel (n_v), contiguous.
+            record: its channels (n_c).
+
+        Raises:
+            NotConvergedError: the record has no equilibrium.
+        """
+        self._record[:] = record[:, None]
+        self._state[:] = 0.0
+        if self._compiled:
+            self._kernel.linearise(values, self._record, self._state, self._residual, self._jacobian)
+        else:
+            self._interpreted(values)
+        return self._residual[:, 0].copy(), self._jacobian[:, 0].reshape(self._sizes).copy()
+
+    def _interpreted(self, values: Array) -> None:
+        record, state = self._record[:, 0], self._state[:, 0]
+        if len(state) and not self._settled(values, record, state):
+            # The rare way: Newton, arranged for many records.
+            self._state[:] = 0.0
+            self._kernel.linearise(values, self._record, self._state, self._residual, self._jacobian)
+            return
+        _, residual, jacobian = self._linearise(values, record, state)
+        self._residual[:, 0], self._jacobian[:, 0] = residual, jacobian
+
+    def _settled(self, values: Array, record: Array, state: Array) -> bool:
+        for _ in range(MOST_PASSES):
+            following, _ = self._pass(values, record, state)
+            moved = np.abs(following - state).max()
+            state[:] = following
+            if moved <= NEAR_REST_RAD:
+                return bool(np.abs(state).max() <= MOST_DEFLECTION)
+        return False
+
+    @cached_property
+    def _pass(self) -> _Single:
+        return _Single(self._kernel.factor.pass_function())
+
+    @cached_property
+    def _linearise(self) -> _Single:
+        return _Single(self._kernel.factor.linearise_function())
+
+
+class _Single:
+    """A CasADi function with its memory: no conversion for each number."""
+
+    def __init__(self, function: ca.Function) -> None:
+        buffer, self._evaluate = direct_access(function)
+        self._buffer = buffer
+        self._given = [np.zeros(function.numel_in(i)) for i in range(function.n_in())]
+        self._taken = [np.zeros(function.numel_out(i)) for i in range(function.n_out())]
+        for position, array in enumerate(self._given):
+            if array.size:
+                buffer.set_arg(position, array.data)
+        for position, array in enumerate(self._taken):
+            if array.size:
+                buffer.set_res(position, array.data)
+
+    def __call__(self, *inputs: Array) -> list[Array]:
+        """The outputs, valid until the next call."""
+        for target, source in zip(self._given, inputs, strict=True):
+            target[:] = source
+        self._evaluate()
+        return self._taken

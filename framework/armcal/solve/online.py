@@ -1,0 +1,121 @@
+"""Online estimators: what is believed of a problem, and how one more record changes it.
+
+Beliefs are Gaussian in scaled coordinates about an origin: each number of a block's increment in its ordinary size,
+then the companions (drifts, a correlated model error) in their standard deviations. Scaled, a covariance keeps its
+small eigenvalues when angles stand beside compliances. [BarShalom2001]
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from armcal.base.domains import Array
+from armcal.errors import ProblemError
+
+
+@dataclass(frozen=True)
+class Gaussian:
+    """A belief: mean (N) and covariance (N x N) in scaled coordinates about an origin."""
+
+    mean: Array
+    covariance: Array
+
+
+@dataclass(frozen=True)
+class Linearised:
+    """A record seen from one place.
+
+    Attributes:
+        innovation: measured minus predicted there (m; m or rad).
+        slope: derivative of the prediction by the scaled coordinates (m x N).
+        noise: covariance of the record's own error (m x m).
+    """
+
+    innovation: Array
+    slope: Array
+    noise: Array
+
+
+class Observation(Protocol):
+    """One record, ready to be looked at from anywhere."""
+
+    def at(self, place: Array) -> Linearised:
+        """The record at scaled coordinates (N) about the origin.
+
+        Raises:
+            NotConvergedError: the arm has no elastic equilibrium there.
+        """
+
+
+@dataclass(frozen=True)
+class Update:
+    """What a record did to a belief.
+
+    Attributes:
+        posterior: the belief with it.
+        innovation: by which it surprised the belief before it, seen from where the update ended (m).
+        covariance: of that innovation, as expected (m x m).
+    """
+
+    posterior: Gaussian
+    innovation: Array
+    covariance: Array
+
+
+class OnlineEstimator(Protocol):
+    """What a plugin provides to take one record at a time. It keeps no state of its own."""
+
+    @property
+    def window(self) -> int:
+        """How many of the last records it wants to see again with each new one; 1 for a filter."""
+
+    def update(self, prior: Gaussian, observations: Sequence[Observation]) -> Update:
+        """The belief after the last observation; ``prior`` is the one before the first of them.
+
+        A covariance that is not positive is an error, never made positive by abs().
+
+        Raises:
+            NotConvergedError: the arm has no elastic equilibrium near the belief.
+            ProblemError: the covariance lost its positive diagonal.
+        """
+
+
+def surprise(innovation: Array, covariance: Array) -> float:
+    """The squared Mahalanobis distance, NIS: chi-square with as many degrees of freedom as numbers."""
+    return float(innovation @ np.linalg.solve(covariance, innovation))
+
+
+def log_likelihood(innovation: Array, covariance: Array) -> float:
+    """Of an innovation under its expected covariance."""
+    _, logarithm = np.linalg.slogdet(2 * np.pi * covariance)
+    return -0.5 * (surprise(innovation, covariance) + float(logarithm))
+
+
+def absorbed(prior: Gaussian, seen: Linearised, place: Array) -> Gaussian:
+    """The belief with a record as it looks from one place: a Kalman update in Joseph's form [Bucy1968]."""
+    innovation = seen.innovation + seen.slope @ (place - prior.mean)
+    across = prior.covariance @ seen.slope.T
+    gain = np.linalg.solve(seen.slope @ across + seen.noise, across.T).T
+    kept = np.eye(len(prior.mean)) - gain @ seen.slope
+    covariance = kept @ prior.covariance @ kept.T + gain @ seen.noise @ gain.T
+    return checked(Gaussian(prior.mean + gain @ innovation, covariance))
+
+
+def checked(belief: Gaussian) -> Gaussian:
+    """The belief with an exactly symmetric covariance.
+
+    Raises:
+        ProblemError: a variance is not positive, or a number is not finite.
+    """
+    covariance = 0.5 * (belief.covariance + belief.covariance.T)
+    lowest = float(np.min(np.diag(covariance), initial=np.inf))
+    if not (lowest >= 0 and np.isfinite(covariance).all() and np.isfinite(belief.mean).all()):
+        raise ProblemError(
+            f"a variance of the belief is {lowest:.3g}: its numbers are no longer sound.",
+            hint="Roll back to an earlier state, or start again from the calibration.",
+        )
+    return Gaussian(belief.mean, covariance)

@@ -1,0 +1,1 @@
+"""Online estimators: Kalman filters, and the last records solved together."""

@@ -1,0 +1,57 @@
+"""The unscented Kalman filter [Julier2004], on filterpy's [Labbe2020]."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any, ClassVar
+
+import numpy as np
+from armcal.base.domains import Array
+from armcal.base.settings import Settings
+from armcal.solve.online import Gaussian, Observation, Update, checked
+from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
+from pydantic import Field
+
+
+class UnscentedSettings(Settings):
+    """Where sigma points lie: ``alpha`` spreads them, ``beta`` is 2 for Gaussian beliefs, ``kappa`` is added to N."""
+
+    alpha: Annotated[float, Field(gt=0, le=1)] = 0.1
+    beta: Annotated[float, Field(ge=0)] = 2.0
+    kappa: Annotated[float, Field(ge=0)] = 0.0
+
+
+class UnscentedFilter:
+    """The online estimator ``unscented``: no Jacobian, two looks a state at each record."""
+
+    Settings: ClassVar[type[UnscentedSettings]] = UnscentedSettings
+    EXAMPLE: ClassVar[Mapping[str, Any]] = {}
+
+    def __init__(self, settings: UnscentedSettings) -> None:
+        self._settings = settings
+
+    @property
+    def window(self) -> int:
+        """One: a filter never looks back."""
+        return 1
+
+    def update(self, prior: Gaussian, observations: Sequence[Observation]) -> Update:
+        """As the protocol says."""
+        observation = observations[-1]
+        first, size = observation.at(prior.mean), len(prior.mean)
+        points = MerweScaledSigmaPoints(
+            size, self._settings.alpha, self._settings.beta, self._settings.kappa, sqrt_method=_root
+        )
+        # filterpy asks for a predicted and a measured value: their difference is all it uses.
+        measured = np.zeros(len(first.innovation))
+        one = UnscentedKalmanFilter(size, len(measured), 0.0, lambda x: -observation.at(x).innovation, None, points)
+        one.x, one.P, one.R = prior.mean, prior.covariance, first.noise
+        one.sigmas_f = points.sigma_points(one.x, one.P)
+        one.update(measured)
+        return Update(checked(Gaussian(one.x, one.P)), np.asarray(one.y), np.asarray(one.S))
+
+
+def _root(covariance: Array) -> Array:
+    """A root R with R'R the covariance; it may be singular, which Cholesky's factor does not allow."""
+    size, directions = np.linalg.eigh(covariance)
+    return np.asarray((directions * np.sqrt(np.maximum(size, 0.0))).T)

@@ -1,0 +1,194 @@
+"""The settings of a simulated mission: when records come, what the rover stands on, and what happens to the arm."""
+
+from __future__ import annotations
+
+import re
+from datetime import datetime
+from typing import Annotated, Literal
+
+from armcal.base.settings import Angle, Angle3, Duration, InputPath, Length, Length3, Settings, Temperature
+from pydantic import Field, field_validator, model_validator
+
+from armcal_simulation.outliers import OutlierSettings
+
+_CREEP = re.compile(r"\s*(?P<walk>walk\s+)?(?P<amount>\S.*?)\s+in\s+(?P<over>[0-9.]+)\s*(?P<unit>d|h|min|s)\s*")
+_SECONDS = {"d": 86400.0, "h": 3600.0, "min": 60.0, "s": 1.0}
+
+Fraction = Annotated[float, Field(ge=0, le=1)]
+Day = Annotated[float, Field(ge=0)]
+
+
+class RecordSettings(Settings):
+    """When the arm is measured, and where it stands then.
+
+    Records come in working ``hours`` of each day, with random gaps of ``every`` in the mean. Poses are uniform within
+    ``ranges`` of turning and ``travel`` of sliding joints; a joint without one is driven between its limits.
+    """
+
+    every: Duration = 600.0
+    hours: tuple[Annotated[float, Field(ge=0, le=24)], Annotated[float, Field(ge=0, le=24)]] = (8.0, 18.0)
+    ranges: dict[str, tuple[Angle, Angle]] = Field(default_factory=dict)
+    travel: dict[str, tuple[Length, Length]] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _sane(self) -> RecordSettings:
+        if self.every <= 0:
+            raise ValueError(f"found records every {self.every:g} s, expected a time above zero")
+        if self.hours[0] >= self.hours[1]:
+            raise ValueError("found hours that end before they begin, expected [from, to], such as [8, 18]")
+        for joint, (low, high) in {**self.ranges, **self.travel}.items():
+            if low >= high:
+                raise ValueError(f"found an empty range of {joint}, expected [from, to]")
+        return self
+
+
+class LossSettings(Settings):
+    """Which ``fraction`` of the records never arrives, and in which fraction of the ``hours`` there is no contact."""
+
+    fraction: Fraction = 0.0
+    hours: Fraction = 0.0
+
+
+class TiltSettings(Settings):
+    """How far the rover stands tilted at ``most``, how often it drives, and how well it knows its tilt.
+
+    ``error`` is the standard deviation about each axis, made anew at each stand.
+    """
+
+    most: Angle = 0.0
+    drives_per_day: Annotated[float, Field(ge=0)] = 3.0
+    error: Angle = 0.0
+
+    @model_validator(mode="after")
+    def _sane(self) -> TiltSettings:
+        if self.most < 0 or self.error < 0:
+            raise ValueError("found a tilt or an error below zero, expected 0 or more")
+        return self
+
+
+class TemperatureSettings(Settings):
+    """A sine about ``mean``: ``swing`` up and down in each ``period``, warmest at the hour ``warmest``."""
+
+    mean: Temperature = 20.0
+    swing: Temperature = 0.0
+    period: Duration = 86400.0
+    warmest: float = 14.0
+
+    @model_validator(mode="after")
+    def _sane(self) -> TemperatureSettings:
+        if self.period <= 0:
+            raise ValueError(f"found a period of {self.period:g} s, expected one above zero")
+        return self
+
+
+class ThermalSettings(Settings):
+    """How much a parameter changes for each K above ``reference``; a number with its unit (``0.002 deg``)."""
+
+    per_K: str | float
+    reference: Temperature = 20.0
+
+
+class SlipSettings(Settings):
+    """A horn slips on its shaft: a joint's offset ``parameter`` jumps by whole ``teeth`` or by an ``angle``."""
+
+    kind: Literal["slip"]
+    day: Day
+    joint: str
+    parameter: str
+    teeth: int | None = None
+    of_teeth: Annotated[int, Field(ge=1)] = 25
+    angle: Angle | None = None
+
+    @model_validator(mode="after")
+    def _one(self) -> SlipSettings:
+        if (self.teeth is None) == (self.angle is None):
+            raise ValueError("found both or neither of teeth and angle, expected one of them: write teeth: 1")
+        return self
+
+
+class SwapSettings(Settings):
+    """A servo is replaced: what changes by how much, with units (``{arm.mdh.theta3: 2 deg}``)."""
+
+    kind: Literal["swap"]
+    day: Day
+    joint: str
+    changes: Annotated[dict[str, str | float], Field(min_length=1)]
+
+
+class BumpSettings(Settings):
+    """The camera moves: what is measured is turned about the base's origin (a rotation vector), then shifted."""
+
+    kind: Literal["bump"]
+    day: Day
+    shift: Length3 = (0.0, 0.0, 0.0)
+    turn: Angle3 = (0.0, 0.0, 0.0)
+
+
+Event = Annotated[SlipSettings | SwapSettings | BumpSettings, Field(discriminator="kind")]
+
+
+class MissionSettings(Settings):
+    """The truth, and the mission over it; ``noise`` defaults to what each measurement declares.
+
+    ``creep`` moves parameters (globs) along a line (``0.05 deg in 30 d``) or at random (``walk 0.05 deg in 30 d``: the
+    standard deviation after that time). ``thermal`` moves them with the temperature. ``start`` is the date of the
+    mission's midnight; without one time counts from 0. The power is cut on the days ``power_cuts``.
+    """
+
+    truth: InputPath
+    days: Annotated[float, Field(gt=0, le=3660)]
+    start: str | None = None
+    seed: Annotated[int, Field(ge=0)] = 0
+    records: RecordSettings = Field(default_factory=RecordSettings)
+    losses: LossSettings = Field(default_factory=LossSettings)
+    tilt: TiltSettings = Field(default_factory=TiltSettings)
+    temperature: TemperatureSettings = Field(default_factory=TemperatureSettings)
+    thermal: dict[str, ThermalSettings] = Field(default_factory=dict)
+    creep: dict[str, str] = Field(default_factory=dict)
+    events: tuple[Event, ...] = ()
+    power_cuts: tuple[Day, ...] = ()
+    noise: Length | None = None
+    outliers: OutlierSettings = Field(default_factory=OutlierSettings)
+
+    @field_validator("creep")
+    @classmethod
+    def _readable(cls, value: dict[str, str]) -> dict[str, str]:
+        for text in value.values():
+            parsed_creep(text)
+        return value
+
+    @model_validator(mode="after")
+    def _sane(self) -> MissionSettings:
+        if (self.noise or 0) < 0:
+            raise ValueError("found a negative noise, expected 0 or more")
+        began_at(self.start)
+        return self
+
+
+def parsed_creep(text: str) -> tuple[str, float, bool]:
+    """The amount as written, over how many s, and whether it walks at random.
+
+    Raises:
+        ValueError: it is not written so.
+    """
+    found = _CREEP.fullmatch(text)
+    if found is None or not float(found["over"]) > 0:
+        raise ValueError(f"found {text!r}, expected an amount and a time, such as 0.05 deg in 30 d")
+    return found["amount"], float(found["over"]) * _SECONDS[found["unit"]], found["walk"] is not None
+
+
+def began_at(start: str | None) -> float:
+    """What the clock shows at the mission's midnight: unix seconds, or 0 without a date.
+
+    Raises:
+        ValueError: no date, or one without its zone.
+    """
+    if start is None:
+        return 0.0
+    try:
+        date = datetime.fromisoformat(start)
+    except ValueError:
+        raise ValueError(f"found the start {start!r}, expected a date such as 2031-03-01T00:00:00Z") from None
+    if date.tzinfo is None:
+        raise ValueError(f"found the start {start!r} without a zone: end it with Z for UTC")
+    return date.timestamp()

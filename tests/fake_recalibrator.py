@@ -1,0 +1,107 @@
+"""A recalibrator of a few lines, and a process that recalibrates with it: for tests of what is around it."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import sys
+from pathlib import Path
+
+from armcal.errors import DataError
+from armcal.measure.reader import ReadRequest, WantedChannel
+from armcal.online.loop import Pace
+from armcal.online.session import Setup, opened
+from armcal.online.sources.opening import open_source
+from armcal.online.standard_output import StandardOutput
+
+HEADER = "pose_id,q1_deg,q2_deg,x_mm,y_mm,z_mm"
+CALIBRATION = "armcal_calibration: 0\n"
+
+
+def request():
+    """Two joints and a tracker."""
+    joints = [WantedChannel(f"arm.q{i}", (f"arm.q{i}", f"q{i}"), "angle", True, parts=("tracker",)) for i in (1, 2)]
+    ways = [WantedChannel(f"arm.approach.q{i}", (f"approach{i}",), "dimensionless", False) for i in (1, 2)]
+    place = [WantedChannel("time", ("time",), "time", False), WantedChannel("payload", ("payload",), "mass", False)]
+    measured = [WantedChannel(f"tracker.{a}", (f"tracker.{a}", a), "length", True, parts=("tracker",)) for a in "xyz"]
+    return ReadRequest({}, {}, (*joints, *ways, *place, *measured))
+
+
+def row(number, note=None):
+    """A line of a CSV."""
+    cells = f"p{number},{number % 90}.5,{-number % 70}.25,{100 + number}.125,{number / 7!r},30"
+    return cells if note is None else f"{cells},{note}"
+
+
+class FakeRecalibrator:
+    """Sums that hang on the order and on every bit of what was taken."""
+
+    def __init__(self, differs=0.0):
+        self.request = request()
+        self.evaluator = {"name": "fake"}
+        self.ids = hashlib.sha256().hexdigest()
+        self.total = 0.1 + differs
+        self.count = 0
+
+    def take(self, incoming, sequence):
+        if incoming.record_id == "refused":
+            raise DataError("it is refused.")
+        if incoming.fault:
+            return (self._event(incoming, sequence, "ignored"),)
+        self.ids = hashlib.sha256(f"{self.ids} {incoming.record_id} {sequence}".encode()).hexdigest()
+        self.total = (self.total * 1.1 + sum(incoming.channels.values())) % 1000.0
+        self.count += 1
+        told = [self._event(incoming, sequence, "accepted")]
+        if self.count % 20 == 0:
+            sentence = f"Record {self.count} decides."
+            told.append({"event": "decision", "sequence": sequence, "at": 0.0, "kind": "drift", "sentence": sentence})
+        return tuple(told)
+
+    def _event(self, incoming, sequence, verdict):
+        event = {"event": "record", "sequence": sequence, "id": incoming.record_id, "at": incoming.arrived}
+        return {**event, "verdict": verdict, "why": incoming.fault, "nis": self.total}
+
+    def snapshot(self):
+        return {"ids": self.ids, "total": self.total, "count": self.count}
+
+    def restore(self, snapshot):
+        self.ids, self.total, self.count = snapshot["ids"], snapshot["total"], snapshot["count"]
+
+    def digest(self):
+        return hashlib.sha256(f"{self.ids} {self.total!r} {self.count}".encode()).hexdigest()
+
+    def status(self):
+        return {"level": "nominal", "count": self.count, "digest": self.digest()}
+
+    def calibration_text(self):
+        return json.dumps({"armcal_calibration": 1, "count": self.count, "total": self.total}) + "\n"
+
+    def what_if(self, joints):
+        return {"joints": dict(joints)}
+
+    def started_event(self, resumed):
+        return {"event": "started", "level": "nominal"}
+
+
+def setup(folder, pace=None, stream=None, **given):
+    """A setup whose calibration lies beside the folder."""
+    calibration = Path(folder).with_suffix(".start.yaml")
+    if not calibration.exists():
+        calibration.parent.mkdir(parents=True, exist_ok=True)
+        calibration.write_text(CALIBRATION)
+    pace = pace or Pace(
+        calibration_records=10, calibration_gap_s=0.0, status_s=0.05, checkpoint_records=25, digest_records=7
+    )
+    return Setup(Path(folder), calibration, pace=pace, stream=StandardOutput(stream), **given)
+
+
+def main(folder, source, at_end):
+    """Recalibrate with the fake, as the command does."""
+    with opened(
+        setup(folder, stream=sys.stdout.buffer), FakeRecalibrator(), lambda rows: open_source(source, rows, at_end)
+    ) as going:
+        going.run()
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

@@ -1,0 +1,163 @@
+"""The control socket: what it answers, whom it lets in, and that nobody can hold up a recalibration by it."""
+
+from __future__ import annotations
+
+import json
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+from armcal.cli.main import cli
+from armcal.errors import InputError
+from armcal.online.control import SOCKET, ControlServer, ask
+from armcal.online.requests import joint_values
+from click.testing import CliRunner
+from fake_recalibrator import request
+
+
+def echo(content: Mapping[str, Any]) -> Mapping[str, Any]:
+    if content["command"] == "rollback":
+        raise InputError("the journal does not reach there.", hint="Give a later one.")
+    return {"asked": dict(content)}
+
+
+@contextmanager
+def serving(folder: Path, answer: Callable[[Mapping[str, Any]], Mapping[str, Any]] = echo) -> Iterator[ControlServer]:
+    """A server in a thread of its own, as the loop would call it."""
+    server, ends = ControlServer(folder, answer), threading.Event()
+
+    def loop() -> None:
+        while not ends.is_set():
+            server.serve()
+            time.sleep(0.002)
+        server.close()
+
+    thread = threading.Thread(target=loop)
+    thread.start()
+    try:
+        yield server
+    finally:
+        ends.set()
+        thread.join()
+
+
+def raw(folder: Path, data: bytes) -> list[dict[str, Any]]:
+    with socket.socket(socket.AF_UNIX) as connection:
+        connection.settimeout(5.0)
+        connection.connect(str(folder / SOCKET))
+        connection.sendall(data)
+        connection.shutdown(socket.SHUT_WR)
+        with connection.makefile("rb") as replies:
+            return [json.loads(line) for line in replies]
+
+
+def test_a_request_is_answered_and_an_error_is_told(tmp_path: Path) -> None:
+    with serving(tmp_path):
+        assert (tmp_path / SOCKET).stat().st_mode & 0o777 == 0o600
+        assert ask(tmp_path, {"command": "status"}) == {"ok": True, "asked": {"command": "status"}}
+        told = ask(tmp_path, {"command": "rollback", "to": 3})
+        assert told == {"ok": False, "error": "the journal does not reach there. Give a later one."}
+    assert not (tmp_path / SOCKET).exists()
+
+
+@pytest.mark.parametrize(
+    "data",
+    [b"{\n", b"\xff\n", b"[]\n", b"7\n", b'{"command": "reboot"}\n', b'{"command": ["pause"]}\n', b"[" * 9000 + b"\n"],
+)
+def test_what_is_not_understood_gets_an_error(tmp_path: Path, data: bytes) -> None:
+    with serving(tmp_path):
+        (told,) = raw(tmp_path, data)
+        assert told["ok"] is False and told["error"]
+        assert ask(tmp_path, {"command": "status"})["ok"]
+
+
+def test_several_requests_in_one_go_and_one_in_pieces(tmp_path: Path) -> None:
+    line = json.dumps({"command": "status"}).encode() + b"\n"
+    with serving(tmp_path):
+        assert [told["ok"] for told in raw(tmp_path, line * 3 + b"{\n" + line)] == [True, True, True, False, True]
+        with socket.socket(socket.AF_UNIX) as connection:
+            connection.connect(str(tmp_path / SOCKET))
+            for i in range(len(line)):
+                connection.sendall(line[i : i + 1])
+                time.sleep(0.001)
+            assert json.loads(connection.recv(4096))["ok"]
+
+
+def test_a_request_without_an_end_is_refused_and_many_clients_do_no_harm(tmp_path: Path) -> None:
+    with serving(tmp_path):
+        (told,) = raw(tmp_path, b"x" * 70_000)
+        assert "64 KiB" in told["error"]
+        idle = []
+        for _ in range(20):
+            connection = socket.socket(socket.AF_UNIX)
+            connection.connect(str(tmp_path / SOCKET))
+            idle.append(connection)
+            time.sleep(0.004)
+        assert ask(tmp_path, {"command": "status"})["ok"]
+        for connection in idle:
+            connection.close()
+        assert ask(tmp_path, {"command": "status"})["ok"]
+
+
+def test_a_stale_socket_is_replaced_a_live_one_and_a_file_are_not(tmp_path: Path) -> None:
+    stale = socket.socket(socket.AF_UNIX)
+    stale.bind(str(tmp_path / SOCKET))
+    stale.close()
+    with pytest.raises(InputError, match="no recalibration answers here"):
+        ask(tmp_path, {"command": "status"})
+    with serving(tmp_path), pytest.raises(InputError, match="is running here"):
+        ControlServer(tmp_path, echo)
+    (tmp_path / SOCKET).write_text("mine")
+    with pytest.raises(InputError, match="not a socket"):
+        ControlServer(tmp_path, echo)
+    assert (tmp_path / SOCKET).read_text() == "mine"
+
+
+def test_a_folder_with_a_long_name_is_served_too(tmp_path: Path) -> None:
+    folder = tmp_path / ("a" * 120) / ("b" * 120)
+    folder.mkdir(parents=True)
+    before = [*Path("/proc/self/fd").iterdir()]
+    with serving(folder):
+        assert ask(folder, {"command": "status"})["ok"]
+        with pytest.raises(InputError, match="is running here"):
+            ControlServer(folder, echo)
+    assert len([*Path("/proc/self/fd").iterdir()]) == len(before)
+
+
+def test_nobody_there_and_nobody_answering(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"control\.sock: no recalibration answers here"):
+        ask(tmp_path, {"command": "status"})
+    server = ControlServer(tmp_path, echo)
+    with pytest.raises(InputError, match="no answer within"):
+        ask(tmp_path, {"command": "status"}, 0.1)
+    server.close()
+
+
+def test_joint_values_by_name_and_unit() -> None:
+    found = joint_values({"q1_deg": 180, "q2_mrad": -5, "arm.approach.q1": 1}, request())
+    assert found == {"arm.q1": pytest.approx(3.141592653589793), "arm.q2": -0.005, "arm.approach.q1": 1.0}
+    assert joint_values({"arm.q1": 0.5}, request()) == {"arm.q1": 0.5}
+    for wrong in (None, [], {}, {"q1": 1}, {"q9_deg": 1}, {"q1_deg": "1"}, {"q1_deg": True}, {"q1_deg": float("nan")}):
+        with pytest.raises(InputError):
+            joint_values(wrong, request())
+
+
+def test_the_command_asks_and_tells(tmp_path: Path) -> None:
+    def armcal(*arguments: str) -> Any:
+        return CliRunner().invoke(cli, ["control", str(tmp_path), *arguments])
+
+    with serving(tmp_path):
+        told = json.loads(armcal("what-if", "q1_deg=-10", "q2_deg=5.5").stdout)
+        assert told == {"asked": {"command": "what_if", "joints": {"q1_deg": -10.0, "q2_deg": 5.5}}}
+        assert armcal("pause", "-q").output == ""
+        refused = armcal("rollback", "7")
+        assert refused.exit_code == 2 and "does not reach there. Give a later one." in refused.output
+        for wrong in (["rollback"], ["rollback", "x"], ["pause", "3"], ["what-if", "q1_deg"], ["reboot"]):
+            assert armcal(*wrong).exit_code == 2, wrong
+    gone = armcal("status")
+    assert gone.exit_code == 2 and "armcal recalibrate" in gone.output

@@ -1,0 +1,365 @@
+"""A mission of three days: the judge against errors worked out apart, power cuts, and the command itself."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from armcal.base.dataset import Dataset
+from armcal.cli.main import cli
+from armcal.errors import ConfigError
+from armcal.online.mission import before_launch, recalibrated, simulated
+from armcal.online.mission_errors import error_curve
+from armcal.online.mission_files import curve_text, figures, schedule, truth_text
+from armcal.online.mission_judge import Judgement, judge
+from armcal.online.mission_settings import MissionPlan
+from armcal.online.mission_source import MissionSource, PowerCutError
+from armcal.online.mission_story import Story
+from armcal.online.mission_tips import random_poses
+from armcal.online.mission_truth import DAY_S, Mission
+from armcal.online.settings import RecalibrateSettings
+from armcal.report.mission_figure import mission_figure
+from armcal.solve.simulation import SimulationRequest, measured_without_noise
+from armcal.use.calibration import Calibration
+from click.testing import CliRunner, Result
+
+CONFIG = Path(__file__).resolve().parents[2] / "configs" / "lrm_arm" / "mission.yaml"
+SLIP = {"kind": "slip", "day": 0.6, "joint": "arm.q3", "parameter": "arm.mdh.theta3", "teeth": 1}
+SWAP = {"kind": "swap", "day": 1.5, "joint": "arm.q2", "changes": {"arm.mdh.theta2": "-3 deg"}}
+BUMP = {"kind": "bump", "day": 2.5, "shift_mm": [3, -2, 1], "turn_deg": [0.2, 0.4, -0.3]}
+EVENTS = yaml.safe_dump([SLIP, SWAP, BUMP], default_flow_style=True, width=10_000).strip()
+SHORT = (
+    "simulation.days=3",
+    "simulation.records.every_min=12",
+    f"simulation.events={EVENTS}",
+    "simulation.power_cuts=[0.7, 1.55]",
+    "mission.poses=20",
+)
+INTERPRETED = ("evaluator=interpreted", "recalibrate.evaluator=interpreted")
+DECIDED_AFTER = 3
+
+
+@lru_cache
+def plan() -> MissionPlan:
+    return MissionPlan.load(CONFIG, SHORT)
+
+
+@lru_cache
+def mission() -> Mission:
+    return simulated(plan())
+
+
+@pytest.fixture(scope="module")
+def start(tmp_path_factory: pytest.TempPathFactory) -> Calibration:
+    """The calibration before launch."""
+    return Calibration.load(before_launch(plan(), tmp_path_factory.mktemp("bench")))
+
+
+class Knowing:
+    """A recalibration that knows the truth of ``lag`` records ago, and says what it is told to say."""
+
+    def __init__(self, lag: int = 0, decisions: Mapping[str, Mapping[str, str]] | None = None) -> None:
+        self.lag, self.decisions = lag, decisions or {}
+        self.taken: list[str] = []
+        self.positions: dict[str, int] = {}
+        self.sessions = 0
+
+    def __call__(
+        self, calibration: Path, settings: RecalibrateSettings, source: MissionSource, folder: Path
+    ) -> Sequence[Mapping[str, Any]]:
+        assert settings.output.estimate_every_records == 1
+        events: list[Mapping[str, Any]] = []
+        if not self.sessions:
+            truth = dict(zip(mission().truth.names, mission().truth.values_at(np.zeros(1))[0].tolist(), strict=True))
+            parameters = [{"name": n, "value": truth[n]} for n in truth]
+            events.append({"event": "started", "level": "nominal", "parameters": parameters, "resumed": False})
+        else:
+            events.append({"event": "started", "level": "nominal", "parameters": [], "resumed": True})
+        self.sessions += 1
+        source.resume(self.positions)
+        try:
+            while not source.ended:
+                incoming = source.incoming(0)
+                assert incoming is not None
+                self.positions = {incoming.source_key: incoming.source_row}
+                self.taken.append(incoming.record_id)
+                events += self._told(incoming.source_row - 1, incoming.record_id)
+        except PowerCutError:
+            pass
+        return events
+
+    def _told(self, row: int, record_id: str) -> list[Mapping[str, Any]]:
+        made = mission()
+        verdict = "rejected" if made.outliers[row] else "accepted"
+        values = made.truth.values_at(made.times[[max(0, row - self.lag)]])[0]
+        estimate = {name: [float(x), 0.0] for name, x in zip(made.truth.names, values, strict=True)}
+        events: list[Mapping[str, Any]] = [
+            {"event": "record", "id": record_id, "verdict": verdict},
+            {"event": "estimate", "parameters": estimate},
+        ]
+        for event in made.events:
+            since = row - int(np.searchsorted(made.times, event.time))
+            if since == 0:
+                events.append({"event": "level", "to": "suspect"})
+            if since == DECIDED_AFTER and event.kind in self.decisions:
+                events.append({"event": "decision", "sentence": "So it is.", **self.decisions[event.kind]})
+            if since == 20:
+                events.append({"event": "level", "to": "watch"})
+        return events
+
+
+RIGHT = {
+    "slip": {"kind": "joint_slipped", "joint": "arm.q3"},
+    "swap": {"kind": "joint_replaced", "joint": "arm.q2"},
+    "bump": {"kind": "sensor_moved"},
+}
+
+
+def judged(start: Calibration, session: Knowing, recovered: float | None = None) -> tuple[Story, Judgement]:
+    story = recalibrated(mission(), Path("calibration.yaml"), plan().recalibrate, session, Path("folder"))
+    settings = plan().settings
+    curve = error_curve(plan().experiment.system, start.parameters, mission(), story, settings, "interpreted")
+    return story, judge(mission(), story, curve, settings.limit, recovered or settings.recovered)
+
+
+def tips(values: np.ndarray, poses: Dataset) -> np.ndarray:
+    """By the model that simulations use (N x 3, m)."""
+    experiment = plan().experiment
+    system, parameters = experiment.system, experiment.parameters.with_nominal(values)
+    exact = measured_without_noise(
+        SimulationRequest(system.arms, system.measurements, parameters, system.environment), poses
+    )
+    return np.array([exact[f"tracker.{axis}"] for axis in "xyz"]).T
+
+
+@pytest.fixture(scope="module")
+def knowing(start: Calibration) -> tuple[Story, Judgement]:
+    """Who knows the truth at each record, and names what happens."""
+    return judged(start, Knowing(0, RIGHT))
+
+
+def test_power_cuts_end_sessions_and_each_record_is_taken_once() -> None:
+    session = Knowing()
+    story = recalibrated(mission(), Path("c.yaml"), plan().recalibrate, session, Path("folder"))
+    assert session.sessions == 3 and story.resumed == 2
+    assert tuple(session.taken) == mission().records.ids
+
+
+def test_frozen_errors_are_distances_between_tips_worked_out_apart(
+    start: Calibration, knowing: tuple[Story, Judgement]
+) -> None:
+    curve, settings = knowing[1].curve, plan().settings
+    joints = tuple(f"q{i}" for i in range(1, 7))
+    poses = random_poses(mission().records, joints, "arm", settings.poses, settings.seed)
+    before = tips(start.parameters.nominal(), poses)
+    for i in np.linspace(0, len(curve.times) - 1, 7).astype(int):
+        at = curve.times[[i]]
+        camera = mission().truth.camera_T_base_at(at)[0]
+        true = tips(mission().truth.values_at(at)[0], poses) @ camera[:3, :3].T + camera[:3, 3]
+        assert curve.frozen[i] == pytest.approx(np.linalg.norm(before - true, axis=1).mean(), abs=1e-9)
+
+
+def test_who_knows_the_truth_has_no_error_until_the_camera_moves(knowing: tuple[Story, Judgement]) -> None:
+    curve = knowing[1].curve
+    bumped = curve.times >= 2.5 * DAY_S
+    assert curve.recalibrated[curve.is_record & ~bumped].max() < 1e-9
+    assert curve.recalibrated[bumped].min() > 0.001
+    assert np.all(np.diff(curve.times) > 0) and curve.is_hour.sum() == 72
+    assert curve.is_record.sum() == len(mission().records)
+
+
+def test_events_are_named_right_and_nothing_is_missed(knowing: tuple[Story, Judgement]) -> None:
+    story, judgement = knowing
+    assert [report.named for report in judgement.events] == ["right"] * 3
+    assert judgement.missed == 0 and judgement.false_alarms == ()
+    made = mission()
+    for report in judgement.events:
+        row = int(np.searchsorted(made.times, report.event.time)) + DECIDED_AFTER
+        assert report.decision is not None and report.decision.time == made.times[row]
+    counts = judgement.records
+    assert counts.rejected == counts.outliers == made.outliers.sum() and counts.good_rejected == 0
+    assert counts.accepted + counts.rejected + counts.ignored == counts.arrived == len(made.records)
+    assert counts.made == counts.arrived + made.lost
+    assert story.verdicts[made.records.ids[0]] in ("accepted", "rejected")
+
+
+def test_recovery_is_counted_in_records_that_arrived(start: Calibration) -> None:
+    """Who is ``lag`` records late has the new offset at the record after so many; warmth moves on meanwhile."""
+    lag = 6
+    _, judgement = judged(start, Knowing(lag, RIGHT), recovered=5.0)
+    slip, swap, bump = judgement.events
+    for report in (slip, swap):
+        row = int(np.searchsorted(mission().times, report.event.time))
+        assert report.records == lag + 1
+        assert report.seconds == pytest.approx(mission().times[row + lag] - report.event.time)
+        assert report.worst > 5 * report.before
+    assert bump.records is None and bump.seconds is None
+
+
+def test_wrong_names_missed_events_and_false_alarms_are_told_apart(start: Calibration) -> None:
+    wrong = {"slip": {"kind": "joint_slipped", "joint": "arm.q2"}, "swap": {"kind": "sensor_moved"}}
+    _, judgement = judged(start, Knowing(0, wrong))
+    assert [report.named for report in judgement.events] == ["wrong", "wrong", "missed"]
+    assert judgement.missed == 1
+    _, judgement = judged(start, Knowing(0, {"bump": {"kind": "general_change"}}))
+    assert [report.named for report in judgement.events] == ["missed", "missed", "seen"]
+    made, apart = mission(), Knowing(0, {})
+    told = apart._told
+
+    def crying(row: int, record_id: str) -> list[Mapping[str, Any]]:
+        alarm = {"event": "decision", "kind": "model_no_longer_fits", "sentence": "All is lost."}
+        return [*told(row, record_id), *([alarm] if row == 2 else [])]
+
+    apart._told = crying  # type: ignore[method-assign]
+    _, judgement = judged(start, apart)
+    (alarm,) = judgement.false_alarms
+    assert alarm.kind == "model_no_longer_fits" and alarm.time == made.times[2]
+
+
+def test_availability_needs_a_good_level_and_a_small_error(knowing: tuple[Story, Judgement]) -> None:
+    _, judgement = knowing
+    curve = judgement.curve
+    hours = [i for i in range(len(curve.times)) if curve.is_hour[i]]
+    used = [curve.levels[i] in ("nominal", "watch") and curve.recalibrated[i] <= 0.003 for i in hours]
+    assert judgement.availability == pytest.approx(np.mean(used))
+    assert 0 < judgement.availability < 1
+    made = mission()
+    row = int(np.searchsorted(made.times, made.events[0].time))
+    first = int(np.searchsorted(curve.times, made.times[row]))
+    assert curve.levels[first - 1] == "nominal" and curve.levels[first] == "suspect"
+
+
+def test_what_is_written_says_the_same_as_what_was_judged(knowing: tuple[Story, Judgement]) -> None:
+    story, judgement = knowing
+    told = json.loads(json.dumps(figures("short", mission(), story, judgement), allow_nan=False))
+    assert told["availability"] == judgement.availability and len(told["events"]) == 3
+    assert sum(told["hours_at_level"].values()) == 72
+    rows = list(csv.DictReader(truth_text(mission(), plan().experiment.parameters).splitlines()))
+    assert [row["pose_id"] for row in rows] == list(mission().records.ids)
+    slipped = [float(row["arm.mdh.theta3_deg"]) for row in rows]
+    place = int(np.searchsorted(mission().times, 0.6 * DAY_S))
+    assert slipped[place] - slipped[place - 1] == pytest.approx(14.4, abs=0.1)
+    assert [row["outlier"] == "yes" for row in rows] == mission().outliers.tolist()
+    planned = json.loads(json.dumps(schedule(mission())))
+    assert [event["day"] for event in planned["events"]] == [0.6, 1.5, 2.5]
+    assert planned["power_cuts"] == pytest.approx([0.7, 1.55])
+    temperature = mission().truth.temperature_at(judgement.curve.times)
+    lines = list(csv.DictReader(curve_text(judgement.curve, temperature).splitlines()))
+    assert [float(line["frozen_mm"]) for line in lines] == pytest.approx(1000 * judgement.curve.frozen, abs=1e-5)
+
+
+def test_the_figure_is_a_picture_of_fair_size(knowing: tuple[Story, Judgement]) -> None:
+    picture = mission_figure(mission(), knowing[1], "Three days")
+    assert picture.startswith(b"\x89PNG") and len(picture) > 20_000
+    assert int.from_bytes(picture[16:20], "big") >= 1200
+
+
+def test_a_calibration_of_another_arm_is_refused(start: Calibration) -> None:
+    story = Story({}, ((0.0, {}),), ((0.0, "nominal"),), (), 0)
+    fewer = replace(start.parameters, blocks=start.parameters.blocks[1:])
+    with pytest.raises(ConfigError, match="not those of the simulated arm"):
+        error_curve(plan().experiment.system, fewer, mission(), story, plan().settings, "interpreted")
+
+
+def armcal(*arguments: str) -> Result:
+    """One command in this process."""
+    return CliRunner().invoke(cli, list(arguments))
+
+
+def overridden(*settings: str) -> list[str]:
+    return [part for setting in settings for part in ("--set", setting)]
+
+
+@pytest.mark.parametrize(
+    ("settings", "told"),
+    [
+        (["mission=null"], "mission"),
+        (["mission.limit_mm=-1"], "limit"),
+        (["mission.calibration=arm.yaml"], "both or neither"),
+        (["simulation.days=0"], "days"),
+        (["recalibrate.no_such_key=1"], "no_such_key"),
+        (["simulation.losses.fraction=1"], "no record arrives"),
+    ],
+)
+def test_bad_missions_end_with_2_and_a_sentence(settings: list[str], told: str, tmp_path: Path) -> None:
+    result = armcal("mission", str(CONFIG), "--out", str(tmp_path / "out"), *overridden(*SHORT, *settings))
+    assert result.exit_code == 2 and told in result.output, result.output
+    assert "Traceback" not in result.output
+
+
+def test_a_simulator_without_a_truth_over_time_is_refused(tmp_path: Path) -> None:
+    other = tmp_path / "other.yaml"
+    other.write_text(
+        (CONFIG.parent / "mission_bench.yaml").read_text(encoding="utf-8") + "mission: {calibration: c.yaml}\n"
+    )
+    for name in ("mission_arm.yaml", "arm.yaml", "mission_truth.yaml"):
+        (tmp_path / name).write_text((CONFIG.parent / name).read_text(encoding="utf-8"))
+    result = armcal("mission", str(other), "--out", str(tmp_path / "out"))
+    assert result.exit_code == 2 and "no truth over time" in result.output and "type: mission" in result.output
+
+
+def test_a_mission_goes_to_no_folder_with_other_files(tmp_path: Path) -> None:
+    (tmp_path / "mine.txt").write_text("mine")
+    result = armcal("mission", str(CONFIG), "--out", str(tmp_path))
+    assert result.exit_code == 2 and "mine.txt" in result.output
+    assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
+
+
+@pytest.fixture(scope="module")
+def short(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
+    """Three days through the command, with a slip, a swap, a bump and two power cuts."""
+    folder = tmp_path_factory.mktemp("mission") / "out"
+    settings = overridden(*SHORT, *INTERPRETED)
+    result = armcal("mission", str(CONFIG), "--out", str(folder), "--json", *settings)
+    assert result.exit_code == 0, result.output
+    return folder, json.loads(result.stdout)
+
+
+def test_the_command_leaves_every_file(short: tuple[Path, dict[str, Any]]) -> None:
+    folder, told = short
+    texts = {"bench.csv", "records.csv", "calibration.yaml", "truth.csv", "truth.json", "mission.csv", "mission.json"}
+    assert {path.name for path in folder.iterdir()} == texts | {"mission.png", "recalibration"}
+    assert json.loads((folder / "mission.json").read_text())["error_mm"] == told["error_mm"]
+    assert Calibration.load(folder / "recalibration" / "calibration.yaml").parameters.names
+
+
+def test_the_recalibration_goes_on_after_power_cuts_and_sees_every_record(short: tuple[Path, dict[str, Any]]) -> None:
+    _, told = short
+    assert told["resumed"] == 2
+    counts = told["records"]
+    assert counts["accepted"] + counts["rejected"] + counts["ignored"] == counts["arrived"]
+    assert counts["ignored"] == 0
+
+
+def test_power_cuts_change_nothing(short: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
+    """To the last digit of every error at every moment: the journal is all that a restart needs."""
+    folder, _ = short
+    calibration = f"mission={{calibration: {folder / 'calibration.yaml'}, poses: 20}}"
+    settings = overridden(*SHORT, *INTERPRETED, "simulation.power_cuts=[]", calibration)
+    result = armcal("mission", str(CONFIG), "--out", str(tmp_path / "out"), "--json", *settings)
+    assert result.exit_code == 0, result.output
+    assert json.loads(result.stdout)["resumed"] == 0
+    assert (tmp_path / "out" / "mission.csv").read_bytes() == (folder / "mission.csv").read_bytes()
+
+
+def test_the_recalibrated_arm_is_better_than_the_frozen_one(short: tuple[Path, dict[str, Any]]) -> None:
+    _, told = short
+    assert told["error_mm"]["recalibrated"]["median"] < 0.2 * told["error_mm"]["frozen"]["median"]
+    slip = told["events"][0]
+    assert slip["named"] == "right" and slip["recovered_after_records"] is not None
+
+
+def test_records_of_the_mission_are_what_was_simulated(short: tuple[Path, dict[str, Any]]) -> None:
+    folder, _ = short
+    rows = list(csv.DictReader((folder / "records.csv").open()))
+    assert [row["pose_id"] for row in rows] == list(mission().records.ids)
+    read = np.array([[float(row[f"{axis}_mm"]) for axis in "xyz"] for row in rows]) / 1000
+    assert np.allclose(read.T, mission().records.stacked([f"tracker.{axis}" for axis in "xyz"]), atol=1e-12)

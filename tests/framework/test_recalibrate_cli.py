@@ -1,0 +1,146 @@
+"""The command ``armcal recalibrate`` as a user meets it: its events, exit codes, kills that change nothing."""
+
+from __future__ import annotations
+
+import json
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from armcal.cli.main import cli
+from armcal.online.control import ask
+from click.testing import CliRunner, Result
+
+ROOT = Path(__file__).resolve().parents[2]
+DEMO = ROOT / "configs" / "lrm_arm" / "demo.yaml"
+POSES = DEMO.with_suffix(".csv")
+
+
+def armcal(*arguments: object) -> Result:
+    return CliRunner().invoke(cli, [str(argument) for argument in arguments])
+
+
+@pytest.fixture(scope="module")
+def calibration(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The demonstration's."""
+    folder = tmp_path_factory.mktemp("demo") / "run"
+    fast = ["--set", "validation.folds=0", "--set", "evaluator=interpreted"]
+    assert armcal("run", DEMO, "--out", folder, "-q", *fast).exit_code == 0
+    return folder / "calibration.yaml"
+
+
+@pytest.fixture(scope="module")
+def config(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Without a compiler."""
+    path = tmp_path_factory.mktemp("config") / "online.yaml"
+    path.write_text("evaluator: interpreted\noutput: {calibration_every_records: 100000}\n")
+    return path
+
+
+@pytest.fixture(scope="module")
+def poses(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Some of the demonstration's poses, with times: what is estimated hangs on nothing else then."""
+    path = tmp_path_factory.mktemp("poses") / "poses.csv"
+    header, *rows = POSES.read_text().splitlines()[:81]
+    path.write_text("\n".join([f"{header},time_s", *(f"{row},{60 * i}" for i, row in enumerate(rows))]) + "\n")
+    return path
+
+
+@pytest.fixture(scope="module")
+def whole(calibration: Path, config: Path, poses: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Recalibrated without interruption."""
+    folder = tmp_path_factory.mktemp("whole") / "out"
+    done = armcal("recalibrate", calibration, "--from", poses, "--config", config, "--out", folder)
+    assert done.exit_code == 0, done.output
+    (folder / "stdout").write_text(done.stdout)
+    return folder
+
+
+def estimate(folder: Path) -> Any:
+    return yaml.safe_load((folder / "calibration.yaml").read_text())["parameters"]
+
+
+def test_the_stream_is_json_lines_and_the_calibration_can_be_used(whole: Path, tmp_path: Path) -> None:
+    told = [json.loads(line) for line in (whole / "stdout").read_text().splitlines()]
+    assert told == [json.loads(line) for line in (whole / "events.jsonl").read_text().splitlines()]
+    assert told[0]["event"] == "started" and told[-1]["event"] == "finished"
+    records = [event for event in told if event["event"] == "record"]
+    assert len(records) == 80 and sum(event["verdict"] == "accepted" for event in records) >= 75
+    assert json.loads((whole / "status.json").read_text())["counts"]["accepted"] >= 75
+    out = tmp_path / "predicted.csv"
+    assert armcal("predict", whole / "calibration.yaml", "--poses", POSES, "--out", out).exit_code == 0
+
+
+def test_kills_of_the_whole_command_change_no_bit(
+    calibration: Path, config: Path, poses: Path, whole: Path, tmp_path: Path
+) -> None:
+    random_, folder = random.Random(4), tmp_path / "out"
+    arguments = ["recalibrate", calibration, "--from", poses, "--config", config, "--out", folder]
+    for _ in range(3):
+        command = [sys.executable, "-m", "armcal.cli", *map(str, arguments), "--follow"]
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+        assert process.stdout is not None
+        for _ in range(random_.randint(2, 30)):
+            process.stdout.readline()
+        time.sleep(random_.uniform(0, 0.01))
+        process.send_signal(signal.SIGKILL)
+        process.communicate()
+    assert armcal(*arguments, "-q").output == ""
+    assert estimate(folder) == estimate(whole)
+    shutil.copy(folder / "calibration.yaml", tmp_path / "again.yaml")
+    again = armcal("recalibrate", tmp_path / "again.yaml", "--from", poses, "--config", config, "--out", folder)
+    assert again.exit_code == 2 and "begun with another calibration" in again.output
+
+
+def test_a_running_command_is_asked_and_told(calibration: Path, config: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "out"
+    command = ["recalibrate", calibration, "--from", "-", "--config", config, "--out", folder]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "armcal.cli", *map(str, command)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+    )
+    assert process.stdin is not None and process.stdout is not None
+    assert json.loads(process.stdout.readline())["event"] == "started"
+    process.stdin.write(b"\n".join(POSES.read_bytes().splitlines()[:12]) + b"\nnonsense\n")
+    process.stdin.flush()
+    verdicts = []
+    while len(verdicts) < 12:
+        event = json.loads(process.stdout.readline())
+        verdicts += [event["verdict"]] if event["event"] == "record" else []
+    assert verdicts[-1] == "ignored" and verdicts.count("accepted") >= 9
+    assert ask(folder, {"command": "status"})["records"] == 12
+    told = armcal("control", folder, "what-if", *(f"q{i}_deg={10 * i}" for i in range(1, 7)))
+    assert told.exit_code == 0 and json.loads(told.stdout)["bits"] > 0
+    assert armcal("control", folder, "what-if", "q1_deg=3").exit_code == 2
+    assert armcal("control", folder, "finish").exit_code == 0
+    _, wrong = process.communicate(timeout=30)
+    assert process.returncode == 0 and wrong == b""
+
+
+def test_bad_input_ends_with_2_and_leaves_nothing(calibration: Path, config: Path, tmp_path: Path) -> None:
+    (tmp_path / "bad.csv").write_text("a,b\n1,2\n")
+    (tmp_path / "bad.yaml").write_text("gaet: {}\n")
+    (tmp_path / "file").write_text("mine")
+    good = {"calibration": calibration, "--from": POSES, "--config": config, "--out": tmp_path / "out"}
+    for name, value, expected in (
+        ("calibration", tmp_path / "bad.yaml", "schema"),
+        ("calibration", tmp_path / "gone.yaml", "gone.yaml"),
+        ("--from", tmp_path / "bad.csv", "bad.csv:1"),
+        ("--from", tmp_path / "gone.csv", "udp:PORT"),
+        ("--from", "udp:70000", "no address"),
+        ("--config", tmp_path / "bad.yaml", "gate"),
+        ("--out", tmp_path / "file", "file"),
+    ):
+        first, *others = {**good, name: value}.items()
+        done = armcal("recalibrate", first[1], *(part for pair in others for part in pair))
+        assert done.exit_code == 2 and expected in done.stderr and done.stdout == "", (value, done.output)
+        assert isinstance(done.exception, SystemExit) and not (tmp_path / "out").exists()

@@ -1,0 +1,253 @@
+"""The loop of a recalibration: nothing acknowledged is lost, nothing counts twice, a restart changes no bit."""
+
+from __future__ import annotations
+
+import json
+import time
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import pytest
+from armcal.errors import InputError
+from armcal.online.course import ReplayDiffersError
+from armcal.online.incoming import Incoming
+from armcal.online.journal import JournalFullError
+from armcal.online.journal_reader import read_entries
+from armcal.online.loop import Pace, Recalibration
+from armcal.online.session import opened
+from armcal.online.sources.opening import open_source
+from fake_recalibrator import FakeRecalibrator, setup
+from recalibrations import (
+    FullFiles,
+    Listed,
+    PowerCutError,
+    events,
+    kinds,
+    made,
+    replayed,
+    run,
+    stepping,
+    steps,
+    table,
+    taken,
+)
+
+
+def test_every_record_is_journalled_used_and_told_of(tmp_path: Path) -> None:
+    folder, out = tmp_path / "out", BytesIO()
+    fake = run(folder, Listed(made(1, 61)), stream=out)
+    assert fake.count == 60 and taken(folder) == [f"p{i}" for i in range(1, 61)]
+    told = events(folder)
+    assert [json.loads(line) for line in out.getvalue().splitlines()] == told
+    assert [e["id"] for e in told if e["event"] == "record"] == taken(folder)
+    assert [told[0]["event"], told[-1]["event"]] == ["started", "finished"] and told[0]["resumed"] is False
+    assert kinds(folder).count("decision") == 3 and kinds(folder).count("calibration") >= 6
+    assert (folder / "calibration.yaml").read_text() == fake.calibration_text()
+    status = json.loads((folder / "status.json").read_text())
+    assert (status["count"], status["finished"], status["paused"], status["records"]) == (60, True, False, 60)
+    assert replayed(folder).digest() == fake.digest()
+    assert sorted(p.name for p in folder.iterdir()) == [
+        "calibration.reserve",
+        "calibration.yaml",
+        "events.jsonl",
+        "journal",
+        "status.json",
+    ]
+
+
+@pytest.mark.parametrize("cuts", [[1], [10, 11, 12], [25, 26, 50, 51, 99]])
+def test_a_power_cut_changes_no_bit(tmp_path: Path, cuts: list[int]) -> None:
+    folder = tmp_path / "out"
+    for cut in cuts:
+        with pytest.raises(PowerCutError):
+            run(folder, Listed(made(1, cut), cut=True))
+    fake = run(folder, Listed(made(1, 121)))
+    assert taken(folder) == [f"p{i}" for i in range(1, 121)] and fake.count == 120
+    assert replayed(folder).digest() == fake.digest()
+    assert [e["resumed"] for e in events(folder) if e["event"] == "started"] == [False, *[True] * len(cuts)]
+    again = run(folder, Listed(made(1, 121)))
+    assert again.digest() == fake.digest()
+
+
+def test_another_state_than_was_noted_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = tmp_path / "out"
+    with pytest.raises(PowerCutError):
+        run(folder, Listed(made(1, 20), cut=True))
+    before, take = (folder / "calibration.yaml").read_bytes(), FakeRecalibrator.take
+
+    def other(self: FakeRecalibrator, incoming: Incoming, sequence: int) -> Any:
+        self.total += 1e-13
+        return take(self, incoming, sequence)
+
+    monkeypatch.setattr(FakeRecalibrator, "take", other)
+    with pytest.raises(ReplayDiffersError, match=r"journal: after entry \d+ the state is .* expected .* was noted"):
+        run(folder, Listed(made(1, 21)))
+    assert (folder / "calibration.yaml").read_bytes() == before
+
+
+def test_a_folder_of_another_calibration_or_other_settings_is_refused(tmp_path: Path) -> None:
+    folder = tmp_path / "out"
+    run(folder, Listed(made(1, 5)), settings={"gate": 1})
+    with pytest.raises(InputError, match="begun with other settings"):
+        run(folder, Listed(made(1, 9)), settings={"gate": 2})
+    (tmp_path / "out.start.yaml").write_text("other: 1\n")
+    with pytest.raises(InputError, match="begun with another calibration"):
+        run(folder, Listed(made(1, 9)), settings={"gate": 1})
+    foreign = tmp_path / "foreign"
+    foreign.mkdir()
+    (foreign / "thesis.tex").write_text("mine")
+    with pytest.raises(InputError, match=r"thesis\.tex"):
+        run(foreign, Listed([]))
+    own = setup(tmp_path / "own")
+    (tmp_path / "own").mkdir()
+    (tmp_path / "own" / "calibration.yaml").symlink_to(own.calibration)
+    with pytest.raises(InputError, match="would be replaced"), opened(own, FakeRecalibrator(), lambda rows: Listed([])):
+        pass
+
+
+def test_a_second_one_in_the_folder_is_refused(tmp_path: Path) -> None:
+    with opened(setup(tmp_path / "out"), FakeRecalibrator(), lambda rows: Listed([])), pytest.raises(InputError):
+        run(tmp_path / "out", Listed([]))
+
+
+def test_a_record_that_the_recalibrator_refuses_is_passed_over_for_good(tmp_path: Path) -> None:
+    folder = tmp_path / "out"
+    records = made(1, 9)
+    records[4] = Incoming("refused", {}, {}, 0.0, "list", 5)
+    fake = run(folder, Listed(records))
+    (ignored,) = [e for e in events(folder) if e.get("verdict") == "ignored"]
+    assert "it is refused" in ignored["why"] and fake.count == 7 and replayed(folder).digest() == fake.digest()
+
+
+def test_a_record_of_a_stream_that_is_sent_again_counts_once(tmp_path: Path) -> None:
+    folder = tmp_path / "out"
+    a, b, c = made(1, 4, key="")
+    source = Listed([a, b, a, b, Incoming("p1", {"arm.q1": 9.0}, {}, 1e9)], keeps_records=False)
+    run(folder, source)
+    assert taken(folder) == ["p1", "p2", "p1"]
+    first, second, third, fourth, _ = source.acknowledged
+    assert (first, second) == (third, fourth)
+    again = Listed([b, c], keeps_records=False)
+    run(folder, again)
+    assert taken(folder)[3:] == ["p3"] and again.acknowledged[0] == second
+
+
+def test_while_paused_files_keep_their_records_and_those_of_streams_are_passed_over(tmp_path: Path) -> None:
+    with stepping(tmp_path / "file", Listed(made(1, 9))) as (going, fake):
+        steps(going, 3)
+        going.recalibration.pause()
+        steps(going, 3)
+        assert fake.count == 3
+        going.recalibration.resume()
+        steps(going, 9)
+        assert fake.count == 8
+    with stepping(tmp_path / "stream", Listed(made(1, 9, key=""), keeps_records=False)) as (going, fake):
+        steps(going, 2)
+        going.recalibration.pause()
+        steps(going, 3)
+        going.recalibration.resume()
+        steps(going, 3)
+        assert fake.count == 5
+    assert len(taken(tmp_path / "stream")) == 8
+    passed = [e for e in events(tmp_path / "stream") if e.get("verdict") == "ignored"]
+    assert len(passed) == 3 and "paused" in passed[0]["why"]
+    assert replayed(tmp_path / "stream").digest() == fake.digest()
+
+
+def test_a_pause_outlasts_a_restart(tmp_path: Path) -> None:
+    with stepping(tmp_path / "out", Listed(made(1, 9))) as (going, _):
+        steps(going, 3)
+        going.recalibration.pause()
+    with stepping(tmp_path / "out", Listed(made(1, 9))) as (going, fake):
+        assert going.recalibration.paused
+        steps(going, 3)
+        assert fake.count == 3
+
+
+def test_a_rollback_restores_every_bit_and_a_replay_does_the_same(tmp_path: Path) -> None:
+    folder, states = tmp_path / "out", {}
+    with stepping(folder, Listed(made(1, 120), cut=True)) as (going, fake):
+        loop = going.recalibration
+        for _ in range(90):
+            loop.step(0.0)
+            states[loop.sequence] = fake.digest()
+        for target in (loop.sequence, *list(states)[70:80:3], *list(states)[:30:7]):
+            loop.roll_back(target)
+            assert fake.digest() == states[target]
+        before = fake.digest()
+        for wrong in (0, 10**6):
+            with pytest.raises(InputError, match="found no entry"):
+                loop.roll_back(wrong)
+            assert fake.digest() == before
+        loop.step(0.0)
+        loop.roll_back(loop.sequence - 5)
+        with pytest.raises(PowerCutError):
+            steps(going, 100)
+    after = run(folder, Listed(made(1, 120)))
+    assert after.digest() == fake.digest() == replayed(folder).digest()
+    assert len(taken(folder)) == 119
+
+
+def test_a_rollback_that_no_checkpoint_followed_is_made_again_after_a_restart(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Recalibration, "_checkpoint", lambda self: None)
+    with stepping(tmp_path / "out", Listed(made(1, 50))) as (going, fake):
+        steps(going, 10)
+        target = going.recalibration.sequence
+        digest = fake.digest()
+        steps(going, 20)
+        going.recalibration.roll_back(target)
+        going.recalibration.roll_back(going.recalibration.sequence)
+    with stepping(tmp_path / "out", Listed(made(1, 50))) as (going, again):
+        assert again.digest() == digest
+        steps(going, 1)
+        assert again.count == 11
+
+
+def test_records_wait_unacknowledged_while_the_journal_is_full(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("armcal.online.loop.FULL_WAIT_S", 0.0)
+    files, fake, source, out = FullFiles(), FakeRecalibrator(), Listed(made(1, 9)), BytesIO()
+    with opened(setup(tmp_path / "out", files=files, stream=out), fake, lambda rows: source) as going:
+        steps(going, 3)
+        files.full = {"journal-"}
+        steps(going, 5)
+        assert fake.count == 3 and len(source.acknowledged) == 3 and len(source.records) == 4
+        assert going.recalibration.status()["journal"] == "full"
+        with pytest.raises(JournalFullError):
+            going.recalibration.pause()
+        digest = fake.digest()
+        with pytest.raises(JournalFullError):
+            going.recalibration.roll_back(going.recalibration.sequence - 1)
+        assert fake.digest() == digest
+        files.full = set()
+        steps(going, 5)
+        assert fake.count == 8 and going.recalibration.status()["journal"] == "good"
+    told = [json.loads(line).get("sentence", "") for line in out.getvalue().splitlines()]
+    assert sum("The journal is full, and records wait" in s for s in told) == 1
+    assert sum("has room again" in s for s in told) == 1
+    found = taken(tmp_path / "out")  # older entries gave room
+    assert found == [f"p{i}" for i in range(9 - len(found), 9)] and len(found) >= 4
+    assert replayed(tmp_path / "out").digest() == fake.digest()
+
+
+def test_the_pace_of_what_is_written(tmp_path: Path) -> None:
+    pace = Pace(calibration_records=1000, calibration_s=1e9, status_s=1e9, checkpoint_records=10, digest_records=1000)
+    folder = tmp_path / "out"
+    run(folder, Listed(made(1, 20)), pace=pace)
+    assert kinds(folder).count("calibration") == 2
+    found = [e.sequence for e in read_entries(folder / "journal") if e.kind == "checkpoint"]
+    assert len(found) == 4
+
+
+def test_the_real_source_in_the_real_loop(tmp_path: Path) -> None:
+    (tmp_path / "in").mkdir()
+    (tmp_path / "in" / "a.csv").write_text(table(10))
+    with opened(
+        setup(tmp_path / "out"), FakeRecalibrator(), lambda rows: open_source(str(tmp_path / "in"), rows)
+    ) as going:
+        ends = time.monotonic() + 10
+        while len(taken(tmp_path / "out")) < 10 and time.monotonic() < ends:
+            going.recalibration.step(0.1)
+    assert taken(tmp_path / "out") == [f"p{i}" for i in range(1, 11)]

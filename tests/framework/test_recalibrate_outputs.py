@@ -1,0 +1,82 @@
+"""What a recalibration writes for others, on disks that are full and to readers that are gone or asleep."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from io import BytesIO
+from pathlib import Path
+
+import pytest
+from armcal.online.event_file import EventFile
+from armcal.online.outputs import Outputs, as_line
+from armcal.online.standard_output import StandardOutput
+from recalibrations import (
+    FullFiles,
+)
+
+
+def test_a_full_disk_costs_events_first_and_the_calibration_stays_whole(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("armcal.online.outputs.RETRY_S", 0.0)
+    files, out = FullFiles(), BytesIO()
+    outputs = Outputs(tmp_path, StandardOutput(out), EventFile(tmp_path), files)
+    assert outputs.calibration("one")
+    outputs.event({"event": "record"})
+    files.full = {"calibration", "status"}
+    assert not outputs.calibration("two")
+    outputs.status({"a": 1})
+    outputs.status({"a": 2})
+    assert (tmp_path / "calibration.yaml").read_text() == "one" and not (tmp_path / "status.json").exists()
+    files.full = set()
+    assert outputs.calibration("three") and (tmp_path / "calibration.yaml").read_text() == "three"
+    outputs.status({"a": float("nan")})
+    assert json.loads((tmp_path / "status.json").read_text()) == {"a": None}
+    told = [json.loads(line).get("sentence", "") for line in out.getvalue().splitlines()]
+    for part in ("events of the past were dropped", "one before stands", "status is not", "written again"):
+        assert any(part in sentence for sentence in told), part
+    assert len(told) < 10
+    outputs.close()
+
+
+def test_events_that_cannot_be_written_to_a_file_still_go_to_standard_output(tmp_path: Path) -> None:
+    (tmp_path / "events.jsonl").symlink_to("/dev/full")
+    out = BytesIO()
+    outputs = Outputs(tmp_path, StandardOutput(out), EventFile(tmp_path))
+    for i in range(5):
+        outputs.event({"event": "record", "n": i})
+    told = [json.loads(line) for line in out.getvalue().splitlines()]
+    assert [e["n"] for e in told if e["event"] == "record"] == [0, 1, 2, 3, 4]
+    assert ["not written to a file" in e["sentence"] for e in told if e["event"] == "alarm"] == [True]
+    outputs.close()
+
+
+def test_the_file_of_events_is_kept_short_and_half_a_line_is_ended(tmp_path: Path) -> None:
+    (tmp_path / "events.jsonl").write_text('{"event": "rec')
+    file = EventFile(tmp_path, max_bytes=1000)
+    for i in range(200):
+        file.write(as_line({"event": "record", "n": i}))
+    file.close()
+    assert (tmp_path / "events.jsonl").stat().st_size <= 1000 >= (tmp_path / "events.1.jsonl").stat().st_size
+    lines = [(tmp_path / name).read_text().splitlines() for name in ("events.1.jsonl", "events.jsonl")]
+    assert json.loads(lines[1][-1])["n"] == 199 and json.loads(lines[1][0])["n"] == json.loads(lines[0][-1])["n"] + 1
+
+
+def test_a_reader_that_sleeps_loses_lines_and_is_told_so(tmp_path: Path) -> None:
+    reading, writing = os.pipe()
+    with os.fdopen(writing, "wb", buffering=0) as stream, os.fdopen(reading, "rb", buffering=0) as reader:
+        outputs = Outputs(tmp_path, StandardOutput(stream, patience_s=0.05), EventFile(tmp_path))
+        for i in range(3000):
+            outputs.event({"event": "record", "n": i, "text": "x" * 100})
+        got = reader.read(10**6)
+        outputs.event({"event": "record", "n": 3000})
+        time.sleep(0.01)
+        got += reader.read(10**6)
+    whole = [json.loads(line) for line in got.splitlines() if line.endswith(b"}") and line.startswith(b"{")]
+    numbers = [e["n"] for e in whole if e["event"] == "record"]
+    assert numbers[-1] == 3000 and numbers[:-1] == [*range(len(numbers) - 1)] and len(numbers) < 2000
+    assert "were left out here" in whole[-1]["sentence"]
+    assert len((tmp_path / "events.jsonl").read_text().splitlines()) == 3001
+    outputs.close()

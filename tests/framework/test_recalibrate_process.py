@@ -1,0 +1,186 @@
+"""A recalibration as a process: killed at any moment, told things by signals, its output closed, its disk full."""
+
+from __future__ import annotations
+
+import json
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from armcal.online.control import ask
+from fake_recalibrator import row
+from recalibrations import (
+    events,
+    kinds,
+    replayed,
+    table,
+    taken,
+)
+
+TESTS = Path(__file__).resolve().parents[1]
+
+
+def process(folder: Path, source: str, at_end: str = "stop", **given: Any) -> subprocess.Popen[bytes]:
+    command = [sys.executable, str(TESTS / "fake_recalibrator.py"), str(folder), source, at_end]
+    return subprocess.Popen(command, **{"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, **given})
+
+
+def wait_for(folder: Path, what: str, timeout_s: float = 20.0) -> None:
+    ends = time.monotonic() + timeout_s
+    while time.monotonic() < ends:
+        path = folder / "events.jsonl"
+        if path.exists() and what in path.read_text():
+            return
+        time.sleep(0.01)
+    raise AssertionError(f"{what} did not come")
+
+
+def test_a_closed_standard_output_does_not_stop_it(tmp_path: Path) -> None:
+    (tmp_path / "poses.csv").write_text(table(300))
+    going = process(tmp_path / "out", str(tmp_path / "poses.csv"), stdout=subprocess.PIPE)
+    assert going.stdout is not None and going.stderr is not None
+    going.stdout.readline()
+    going.stdout.close()
+    assert (going.wait(60), going.stderr.read()) == (0, b"")
+    assert kinds(tmp_path / "out")[-1] == "finished" and len(taken(tmp_path / "out")) == 300
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_signals_and_control_of_a_running_process(tmp_path: Path, number: signal.Signals) -> None:
+    folder = tmp_path / "out"
+    (tmp_path / "poses.csv").write_text(table(30))
+    going = process(folder, str(tmp_path / "poses.csv"), "wait")
+    wait_for(folder, '"p30"')
+    assert ask(folder, {"command": "status"})["records"] == 30
+    assert ask(folder, {"command": "pause"})["paused"] is True
+    with (tmp_path / "poses.csv").open("a") as file:
+        file.write(f"{row(31)}\n")
+    target = next(e["sequence"] for e in events(folder) if e.get("id") == "p7")
+    assert ask(folder, {"command": "rollback", "to": target})["count"] == 7
+    assert ask(folder, {"command": "what_if", "joints": {"q1_mrad": 500}})["joints"] == {"arm.q1": 0.5}
+    assert "expected a sequence number" in ask(folder, {"command": "rollback"})["error"]
+    assert ask(folder, {"command": "resume"})["ok"]
+    wait_for(folder, '"p31"')
+    going.send_signal(signal.SIGHUP)
+    going.send_signal(signal.SIGUSR1)
+    while not (folder / "events.1.jsonl").exists():
+        time.sleep(0.01)
+    going.send_signal(number)
+    assert going.wait(20) == 0
+    assert "asked to finish by a signal" in events(folder)[-1]["sentence"]
+    assert json.loads((folder / "calibration.yaml").read_text())["count"] == 8
+    assert replayed(folder).calibration_text() == (folder / "calibration.yaml").read_text()
+
+
+def killed(tmp_path: Path, kills: int, rows: int) -> None:
+    """Kill many times; then every row was taken once, in order, and a replay gives the calibration that was left."""
+    folder, poses = tmp_path / "out", tmp_path / "poses.csv"
+    poses.write_text(table(rows))
+    command = [sys.executable, str(TESTS / "kill_recalibrations.py"), str(folder), str(poses), str(kills), "7", "0.25"]
+    done = subprocess.run(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, timeout=1000, check=False)
+    assert (done.returncode, done.stderr) == (0, b"")
+    assert taken(folder) == [f"p{i}" for i in range(1, rows + 1)]
+    assert replayed(folder).calibration_text() == (folder / "calibration.yaml").read_text()
+
+
+def test_fifty_kills_lose_nothing_and_repeat_nothing(tmp_path: Path) -> None:
+    killed(tmp_path, 50, 600)
+
+
+@pytest.mark.slow
+def test_a_thousand_kills_lose_nothing_and_repeat_nothing(tmp_path: Path) -> None:
+    killed(tmp_path, 1000, 12000)
+
+
+def test_what_was_acknowledged_to_a_sender_outlasts_kills_and_counts_once(tmp_path: Path) -> None:
+    folder = tmp_path / "out"
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        address = probe.getsockname()
+    ends, acknowledged = threading.Event(), []
+
+    def send() -> None:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+            sender.settimeout(0.05)
+            sender.connect(address)
+            number = 1
+            while not ends.is_set():
+                record = {"id": f"p{number}", "q1_deg": number, "q2_deg": 2, "x_mm": number / 7, "y_mm": 4, "z_mm": 5}
+                try:
+                    sender.send(json.dumps(record).encode())
+                    reply = json.loads(sender.recv(1000))
+                except OSError:
+                    time.sleep(0.01)
+                    continue
+                if reply["id"] == f"p{number}":
+                    acknowledged.append(reply["id"])
+                    number += 1
+
+    thread = threading.Thread(target=send)
+    thread.start()
+    try:
+        for kill in range(6):
+            going = process(folder, f"udp:127.0.0.1:{address[1]}")
+            target = len(acknowledged) + 15
+            while len(acknowledged) < target and going.poll() is None:
+                time.sleep(0.001)
+            if kill < 5:
+                going.kill()
+                going.wait()
+        ends.set()
+        thread.join()
+        going.send_signal(signal.SIGTERM)
+        assert going.wait(20) == 0 and going.stderr is not None and going.stderr.read() == b""
+    finally:
+        ends.set()
+    found = taken(folder)
+    assert found[: len(acknowledged)] == acknowledged and len(found) <= len(acknowledged) + 1
+    assert len(acknowledged) >= 90 and replayed(folder).count == len(found)
+
+
+@pytest.fixture()
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """A disk of 3 MiB."""
+    place = tmp_path / "disk"
+    place.mkdir()
+    mounted = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=3m", "tmpfs", place], capture_output=True, check=False
+    )
+    if mounted.returncode:
+        pytest.skip("no tmpfs can be mounted here")
+    try:
+        yield place
+    finally:
+        subprocess.run(["umount", "-l", place], check=True)
+
+
+def test_a_full_disk_does_not_stop_it(tmp_path: Path, small_disk: Path) -> None:
+    """It lives in what the events and older entries leave; the calibration and the newest entries are whole."""
+    (tmp_path / "poses.csv").write_text(table(20))
+    folder, out = small_disk / "out", tmp_path / "stdout"
+    with out.open("wb") as stream:
+        going = process(folder, str(tmp_path / "poses.csv"), "wait", stdout=stream)
+        wait_for(folder, '"p20"')
+        with (small_disk / "filler").open("wb", buffering=0) as filler, pytest.raises(OSError):
+            while True:
+                filler.write(b"x" * 4096)
+        (tmp_path / "new").write_text(table(3000))
+        with (tmp_path / "new").open() as new, (tmp_path / "poses.csv").open("a") as file:
+            file.writelines([*new][21:])
+        ends = time.monotonic() + 60
+        while '"p3000"' not in out.read_text() and time.monotonic() < ends:
+            time.sleep(0.1)
+        assert going.poll() is None and ask(folder, {"command": "status"})["records"] == 3000
+        going.terminate()
+        assert going.wait(20) == 0
+    found = taken(folder)
+    assert found == [f"p{i}" for i in range(3001 - len(found), 3001)]
+    assert json.loads((folder / "calibration.yaml").read_text())["count"] == 3000
+    assert '"alarm"' in out.read_text()

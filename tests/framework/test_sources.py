@@ -1,0 +1,393 @@
+"""Sources of records: they read what the csv reader reads, survive any input, and are gone on with where they were."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import random
+import socket
+import threading
+import time
+from pathlib import Path
+
+import pytest
+from armcal.base.dataset import Dataset
+from armcal.errors import DataError, InputError
+from armcal.online.incoming import Incoming, Place
+from armcal.online.progress import MAX_FILES, Progress
+from armcal.online.row_parser import RowParser
+from armcal.online.sources.csv_file import CsvFile
+from armcal.online.sources.folder import Folder
+from armcal.online.sources.line_cutter import LineCutter
+from armcal.online.sources.lines import Lines
+from armcal.online.sources.opening import open_source
+from armcal.online.sources.source import Source
+from armcal.online.sources.udp import Udp
+from armcal_tracker.csv_reader import CsvReader, CsvSettings
+from fake_recalibrator import HEADER, request, row
+
+PLACE = Place(0.0, "", 1)
+
+
+def rows(**columns: str) -> RowParser:
+    return RowParser(request(), columns)
+
+
+def everything(source: Source, patience_s: float = 0.3) -> list[Incoming]:
+    found: list[Incoming] = []
+    while not source.ended:
+        incoming = source.incoming(patience_s)
+        if incoming is None:
+            break
+        found.append(incoming)
+    return found
+
+
+def ids(found: list[Incoming]) -> list[str]:
+    return [incoming.record_id for incoming in found]
+
+
+def table(count: int, first: int = 1) -> str:
+    return "\n".join([HEADER, *(row(i) for i in range(first, first + count))]) + "\n"
+
+
+def test_a_csv_file_gives_what_the_csv_reader_gives(tmp_path: Path) -> None:
+    path = tmp_path / "poses.csv"
+    header = f"{HEADER},approach1,payload_g,note"
+    path.write_text("\n".join([header, *(f'{row(i)},{i % 3 - 1},{i}.5,"a, ""b"" {i}"' for i in range(1, 40))]))
+    dataset: Dataset = CsvReader(CsvSettings(path=path)).read(request())
+    found = everything(CsvFile(path, rows(), "stop"))
+    assert ids(found) == list(dataset.ids) and [r.source_row for r in found] == list(dataset.rows)
+    for name, values in dataset.channels.items():
+        assert [r.channels[name] for r in found] == values.tolist(), name
+    assert [r.labels["note"] for r in found] == list(dataset.extra["note"])
+
+
+def test_an_object_gives_what_a_row_gives() -> None:
+    content = {
+        "id": "p7",
+        "q1_deg": 10,
+        "q2_rad": -0.5,
+        "x_mm": 3,
+        "y_m": 0.25,
+        "z_mm": 1.5,
+        "socket": "B",
+        "time_s": 1,
+    }
+    found = rows().object(content, PLACE)
+    assert found.record_id == "p7" and found.labels == {"socket": "B"} and not found.fault
+    expected = {"arm.q1": math.radians(10), "arm.q2": -0.5, "time": 1.0}
+    assert found.channels == {**expected, "tracker.x": 0.003, "tracker.y": 0.25, "tracker.z": 0.0015}
+    named = RowParser(request(), {"q1_deg": "J1", "pose_id": "nr"})
+    renamed = {("J1" if k == "q1_deg" else "nr" if k == "id" else k): v for k, v in content.items()}
+    assert named.object(renamed, PLACE) == found
+
+
+def test_a_record_is_the_same_after_it_was_written_as_json() -> None:
+    channels = {"a": 0.1, "b": 1e-320, "c": -0.0, "d": math.inf, "e": -math.inf, "f": 1 / 3}
+    first = Incoming("p1", channels, {"socket": "\u00e9"}, 1.7e9 + 0.1, "f.csv", 7)
+    again = Incoming.from_dict(json.loads(json.dumps(first.as_dict(), allow_nan=False)))
+    assert again == first and math.copysign(1, again.channels["c"]) == -1
+    assert math.isnan(Incoming.from_dict(Incoming("p", {"a": math.nan}, {}, 0.0).as_dict()).channels["a"])
+
+
+WHOLE = {"id": "p", "q1_deg": 1, "q2_deg": 2, "x_mm": 3, "y_mm": 4, "z_mm": 5}
+FAULTY_OBJECTS = {
+    "[1, 2]": "expected a JSON object",
+    "{": "not JSON",
+    '{"q1_deg": 1, "q1_deg": 2}': "given twice",
+    "[" * 100_000: "not JSON",
+    json.dumps({**WHOLE, "x_mm": "abc"}): "x_mm: found 'abc', expected a number",
+    json.dumps({**WHOLE, "x_mm": True}): "x_mm: found true",
+    json.dumps({**WHOLE, "x_mm": [1]}): "x_mm: found [1]",
+    json.dumps({**WHOLE, "x_mm": 10**400}): "too large",
+    json.dumps(WHOLE).replace("5}", "9" * 5000 + "}"): "not JSON",
+    json.dumps({**WHOLE, "approach1": 2}): "approach 2, expected -1, 0 or 1",
+    json.dumps({k: v for k, v in WHOLE.items() if k != "x_mm"}): "no column for tracker.x",
+    json.dumps({**WHOLE, "q1_rad": 1}): "both",
+    json.dumps({("x" if k == "x_mm" else k): v for k, v in WHOLE.items()}): "x has no unit",
+    json.dumps({**WHOLE, "id": " "}): "id is empty",
+    json.dumps({**WHOLE, "": 1}): "no name",
+    "{}": "",
+}
+
+
+@pytest.mark.parametrize("text", FAULTY_OBJECTS, ids=range(len(FAULTY_OBJECTS)))
+def test_what_cannot_be_read_is_a_fault_that_says_why(text: str) -> None:
+    found = rows().json_text(text, PLACE)
+    assert found.fault and FAULTY_OBJECTS[text] in found.fault and not found.channels and len(found.fault) <= 500
+    json.dumps(found.as_dict(), allow_nan=False).encode()
+
+
+def test_missing_and_infinite_values_are_kept_as_they_are() -> None:
+    found = rows().json_text(json.dumps({**WHOLE, "x_mm": None, "y_mm": "nan", "z_mm": math.inf}), PLACE)
+    assert math.isnan(found.channels["tracker.x"]) and math.isnan(found.channels["tracker.y"])
+    assert found.channels["tracker.z"] == math.inf and not found.fault
+
+
+def test_half_a_surrogate_can_be_written() -> None:
+    found = rows().json_text(
+        '{"id": "\\ud800", "q1_deg": 1, "q2_deg": 2, "x_mm": 3, "y_mm": 4, "z_mm": 5, "\\udfff": "\\ud801"}', PLACE
+    )
+    json.dumps(found.as_dict(), ensure_ascii=False).encode("utf-8")
+
+
+def test_lines_are_cut_however_they_come() -> None:
+    random_ = random.Random(3)
+    text = b"".join(random_.choice([b"\n", b"\r\n", b"abc", b"\0", b"\xff", b"x" * 50]) for _ in range(2000))
+    whole = [line.removesuffix(b"\r") if len(line) <= 120 else None for line in text.split(b"\n")]
+    for size in (1, 7, 1000):
+        cutter = LineCutter(120)
+        found = [line for i in range(0, len(text), size) for line in cutter.feed(text[i : i + size])]
+        assert [*found, cutter.rest()] == whole
+
+
+HOSTILE = [
+    b"a" * 10_000_000,
+    b"\0" * 50,
+    b"\xff\xfe,1",
+    HEADER.encode(),
+    b"1,2",
+    b'p1,"1',
+    b"p1,1,2,3,4,abc",
+    b"\xef\xbb\xbf",
+]
+
+
+def test_a_file_with_anything_in_it_gives_its_good_rows_and_a_fault_for_each_bad_one(tmp_path: Path) -> None:
+    path = tmp_path / "poses.csv"
+    path.write_bytes(b"\n".join([HEADER.encode(), row(1).encode(), *HOSTILE, row(2).encode(), b""]))
+    found = everything(CsvFile(path, rows(), "stop"))
+    assert [r.record_id for r in found if not r.fault] == ["p1", "p2"]
+    assert [r.source_row for r in found if r.fault] == [3, 4, 5, 7, 8, 9]
+    assert found[-1].source_row == 11
+
+
+def test_bytes_at_random_never_raise(tmp_path: Path) -> None:
+    random_ = random.Random(20)
+    base = table(10).encode() + b"\n".join(json.dumps(WHOLE).encode() for _ in range(5))
+    for trial in range(300):
+        data = bytearray(base)
+        for _ in range(random_.randint(1, 6)):
+            at = random_.randrange(len(data))
+            data[at : at + random_.randint(0, 3)] = bytes(random_.randrange(256) for _ in range(random_.randint(0, 4)))
+        path = tmp_path / f"{trial}.txt"
+        path.write_bytes(data)
+        with path.open("rb") as file:
+            for found in everything(Lines(file.fileno(), rows())):
+                json.dumps(found.as_dict(), allow_nan=False).encode()
+
+
+def test_a_growing_file_is_followed_and_half_a_line_waited_for(tmp_path: Path) -> None:
+    path = tmp_path / "poses.csv"
+    path.write_text(HEADER[:10])
+    source = CsvFile(path, rows(), "wait")
+    assert everything(source, 0.06) == []
+    with path.open("a") as file:
+        file.write(f"{HEADER[10:]}\n{row(1)}\n{row(2)[:-1]}")
+        file.flush()
+        assert ids(everything(source, 0.06)) == ["p1"]
+        file.write(f"{row(2)[-1:]}\n")
+        file.flush()
+        (second,) = everything(source, 0.06)
+    assert second.record_id == "p2" and second.channels["tracker.z"] == 0.03 and not source.ended
+
+
+def test_a_file_that_takes_the_place_of_another_is_read_from_its_beginning(tmp_path: Path) -> None:
+    path = tmp_path / "poses.csv"
+    path.write_text(table(5))
+    source = CsvFile(path, rows(), "wait")
+    first = everything(source, 0.06)
+    (tmp_path / "new").write_text(table(3, first=10))
+    os.replace(tmp_path / "new", path)
+    second = everything(source, 0.12)
+    path.write_text(table(2, first=20))
+    third = everything(source, 0.12)
+    assert ids(first + second + third) == ["p1", "p2", "p3", "p4", "p5", "p10", "p11", "p12", "p20", "p21"]
+    assert len({r.source_key for r in first + second + third}) == 3
+    again = CsvFile(path, rows(), "wait")
+    again.resume({first[0].source_key: 6})  # of another file of that name
+    assert ids(everything(again, 0.06)) == ["p20", "p21"]
+
+
+@pytest.mark.parametrize("taken", [0, 1, 4, 9])
+def test_a_file_is_gone_on_with_after_the_last_row_that_was_taken(tmp_path: Path, taken: int) -> None:
+    path = tmp_path / "poses.csv"
+    path.write_text(table(4) + "\nbad\n" + "\n".join(row(i) for i in range(5, 9)))
+    progress, first = Progress(), CsvFile(path, rows(), "stop")
+    found = [first.incoming(0.1) for _ in range(taken)]
+    for sequence, incoming in enumerate(found):
+        assert incoming is not None
+        progress.take(incoming, sequence)
+    second = CsvFile(path, rows(), "stop")
+    second.resume(Progress.from_dict(json.loads(json.dumps(progress.as_dict()))).positions)
+    both = [*(r for r in found if r is not None), *everything(second)]
+    assert [r.record_id for r in both if not r.fault] == [f"p{i}" for i in range(1, 9)] and len(both) == 9
+
+
+def test_a_file_that_cannot_be_used_is_refused_at_once(tmp_path: Path) -> None:
+    path = tmp_path / "poses.csv"
+    for content, expected in {"": "it is empty", "a,b\n1,2\n": "no column for", "1,2\n": "expected a header"}.items():
+        path.write_text(content)
+        with pytest.raises(DataError, match=expected):
+            CsvFile(path, rows(), "stop")
+    with pytest.raises(InputError, match="no such file"):
+        open_source(str(tmp_path / "gone.csv"), rows())
+    for text in ("udp:", "udp:x:y", "udp:99999", "udp:1:2:3"):
+        with pytest.raises(InputError, match="udp:PORT, udp:HOST:PORT, a directory, or a CSV file"):
+            open_source(text, rows())
+    assert isinstance(open_source(str(tmp_path), rows()), Folder)
+
+
+def folder(path: Path) -> Folder:
+    return Folder(path, rows(), settled_s=0.15)
+
+
+def test_files_of_a_folder_come_in_the_order_of_their_names_and_new_ones_at_any_time(tmp_path: Path) -> None:
+    (tmp_path / "b.csv").write_text(table(2, first=3))
+    (tmp_path / "a.csv").write_text(table(2))
+    (tmp_path / "c.jsonl").write_text(f"{json.dumps({**WHOLE, 'id': 'p5'})}\n\nnonsense\n")
+    (tmp_path / ".d.csv.part").write_text(table(2))
+    (tmp_path / "notes.txt").write_text("nothing")
+    (tmp_path / "d.csv").mkdir()
+    source = folder(tmp_path)
+    assert ids(everything(source, 0.5)) == ["p1", "p2", "p3", "p4", "p5", "3"]
+    (tmp_path / "new").write_text(json.dumps([{**WHOLE, "id": "p6"}, 7, {**WHOLE, "id": "p7"}]))
+    os.replace(tmp_path / "new", tmp_path / "aa.json")
+    found = everything(source, 0.5)
+    assert ids(found) == ["p6", "2", "p7"] and found[1].fault and not source.ended
+    with (tmp_path / "b.csv").open("a") as file:
+        file.write(f"{row(8)}\n{row(9)[:-2]}")
+    assert ids(everything(source, 0.5)) == ["p8"]
+
+
+def test_a_file_that_is_being_written_holds_up_those_after_it(tmp_path: Path) -> None:
+    source = folder(tmp_path)
+    with (tmp_path / "a.csv").open("w") as file:
+        (tmp_path / "b.csv").write_text(table(1, first=50))
+        for piece in (HEADER, f"\n{row(1)}\n{row(2)[:5]}", f"{row(2)[5:]}\n"):
+            file.write(piece)
+            file.flush()
+            assert source.incoming(0.05) is None
+    assert ids(everything(source, 0.4)) == ["p1", "p2", "p50"]
+
+
+def test_a_json_file_that_is_cut_short_is_read_when_it_is_whole(tmp_path: Path) -> None:
+    path, text = tmp_path / "a.json", json.dumps([WHOLE, WHOLE])
+    path.write_text(text[:-20])
+    source = folder(tmp_path)
+    assert everything(source, 0.4) == []
+    path.write_text(text)
+    assert len(everything(source, 0.5)) == 2
+
+
+def test_a_folder_is_gone_on_with_and_a_bad_header_costs_its_file_one_fault(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text(table(3))
+    (tmp_path / "b.csv").write_text("no,header\n1,2\n3,4\n")
+    (tmp_path / "c.csv").write_text(table(3, first=4))
+    progress, first = Progress(), folder(tmp_path)
+    taken = [first.incoming(0.5) for _ in range(5)]
+    for sequence, incoming in enumerate(taken):
+        assert incoming is not None
+        progress.take(incoming, sequence)
+    second = folder(tmp_path)
+    second.resume(progress.positions)
+    assert ids([r for r in taken if r]) == ["p1", "p2", "p3", "1", "p4"]
+    assert ids(everything(second, 0.5)) == ["p5", "p6"]
+
+
+def test_what_is_remembered_of_files_does_not_grow(tmp_path: Path) -> None:
+    progress = Progress()
+    for i in range(3 * MAX_FILES):
+        progress.take(Incoming("p", {}, {}, 0.0, f"{i:06d}.csv", 5), i)
+    positions = progress.positions
+    assert len(positions) == MAX_FILES + 1
+    for i in (0, 2 * MAX_FILES - 1, 2 * MAX_FILES, 3 * MAX_FILES - 1, 3 * MAX_FILES):
+        (tmp_path / f"{i:06d}.csv").write_text("\n" + table(5, first=i))
+    source = folder(tmp_path)
+    source.resume(positions)
+    last = 3 * MAX_FILES
+    assert ids(everything(source, 0.5)) == [f"p{n}" for i in (last - MAX_FILES, last - 1) for n in (i + 3, i + 4)] + [
+        f"p{last + i}" for i in range(5)
+    ]
+
+
+def test_a_file_that_becomes_shorter_is_told_once(tmp_path: Path) -> None:
+    path = tmp_path / "a.csv"
+    path.write_text(table(5))
+    source = folder(tmp_path)
+    assert len(everything(source, 0.4)) == 5
+    path.write_text(table(1))
+    (fault,) = everything(source, 0.4)
+    assert "became shorter" in fault.fault
+
+
+def piped(*pieces: bytes) -> list[Incoming]:
+    reading, writing = os.pipe()
+
+    def write() -> None:
+        for piece in pieces:
+            os.write(writing, piece)
+            time.sleep(0.01)
+        os.close(writing)
+
+    thread = threading.Thread(target=write)
+    thread.start()
+    source = Lines(reading, rows())
+    found = everything(source, 2.0)
+    thread.join()
+    os.close(reading)
+    assert source.ended
+    return found
+
+
+def test_a_pipe_of_json_lines_or_of_csv() -> None:
+    line = json.dumps(WHOLE).encode()
+    assert ids(piped(line[:9], line[9:] + b"\r\n\n" + line, b"\n")) == ["p", "p"]
+    text = table(3).encode()
+    assert ids(piped(text[:20], text[20:90], text[90:])) == ["p1", "p2", "p3"]
+    found = piped(b"hello\n", text, line + b"\n", row(4).encode())
+    assert [bool(r.fault) for r in found] == [True, False, False, False, False, True]
+    assert "may have been cut short" in found[-1].fault
+
+
+def test_datagrams_are_acknowledged_to_their_sender() -> None:
+    source = Udp("127.0.0.1", 0, rows())
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        sender.settimeout(2.0)
+        for data, fault in (
+            (json.dumps(WHOLE).encode(), ""),
+            (b"\xff\xfe", "not UTF-8"),
+            (b"", "not JSON"),
+            (b"x" * 20_000, "more than 16 KiB"),
+            (b"[]", "expected a JSON object"),
+        ):
+            sender.sendto(data, source.address)
+            incoming = source.incoming(2.0)
+            assert incoming is not None and fault in incoming.fault and bool(fault) == bool(incoming.fault)
+            source.acknowledge(incoming, 12)
+            reply = json.loads(sender.recv(2000))
+            assert reply["acknowledged"] == 12 and reply["id"] == incoming.record_id
+            assert reply.get("fault", "") == incoming.fault
+        assert source.incoming(0.0) is None
+    with pytest.raises(InputError, match="cannot be had"):
+        Udp("127.0.0.1", source.address[1], rows())
+    source.close()
+    assert source.ended and source.incoming(0.0) is None
+
+
+def test_memory_stays_flat_over_a_long_line_and_many_records(tmp_path: Path) -> None:
+    import tracemalloc
+
+    path = tmp_path / "poses.csv"
+    with path.open("w") as file:
+        file.write(f"{HEADER}\n{'x' * 30_000_000}\n")
+        file.writelines(f"{row(i)}\n" for i in range(5000))
+    tracemalloc.start()
+    source, count = CsvFile(path, rows(), "stop"), 0
+    while source.incoming(0.0) is not None:
+        count += 1
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert count == 5001 and peak < 12_000_000

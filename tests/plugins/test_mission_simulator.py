@@ -1,0 +1,290 @@
+"""The simulated mission: each thing that befalls the arm, against an oracle that does not go through the simulator."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from armcal.errors import ConfigError
+from armcal.online.mission_truth import DAY_S, Mission, MissionSimulator
+from armcal.run.experiment import Experiment
+from armcal.solve.simulation import SimulationRequest, measured_without_noise
+from armcal_simulation.mission_schedule import Stands
+from armcal_simulation.mission_settings import MissionSettings, TiltSettings, parsed_creep
+from armcal_simulation.motions import approach_of
+from scipy.spatial.transform import Rotation
+
+CONFIG = Path(__file__).resolve().parents[2] / "configs" / "lrm_arm" / "mission.yaml"
+MOON = np.array([0.0, 0.0, -1.62])
+TIP = [f"tracker.{axis}" for axis in "xyz"]
+GRAVITY = [f"gravity_{axis}" for axis in "xyz"]
+QUIET = {
+    "noise": 0.0,
+    "creep": {},
+    "thermal": {},
+    "events": [],
+    "power_cuts": [],
+    "outliers.fraction": 0,
+    "losses.fraction": 0,
+    "losses.hours": 0,
+    "tilt.most_deg": 0,
+    "tilt.error_deg": 0,
+}
+
+
+@lru_cache
+def experiment() -> Experiment:
+    """The shipped mission's, without the sections that are not an experiment's."""
+    from armcal.online.mission_settings import MissionPlan
+
+    return MissionPlan.load(CONFIG).experiment
+
+
+def request() -> SimulationRequest:
+    system = experiment().system
+    return SimulationRequest(system.arms, system.measurements, experiment().parameters, system.environment)
+
+
+def mission(quiet: bool = True, **changes: object) -> Mission:
+    """The shipped simulation with other settings (SI); quiet is without anything that disturbs."""
+    built = experiment().simulator()
+    config = built._settings.to_config()
+    for key, value in {**(QUIET if quiet else {}), **changes}.items():
+        section, _, name = key.rpartition(".")
+        target = config[section] if section else config
+        for old in [k for k in target if k.partition("_")[0] == name.partition("_")[0]]:
+            del target[old]
+        target["noise_m" if key == "noise" else name] = value
+    config.pop("noise") if config.get("noise", 1) is None else None
+    made = type(built)(MissionSettings.model_validate(config))
+    assert isinstance(made, MissionSimulator)
+    return made.mission(request())
+
+
+def tips(made: Mission) -> np.ndarray:
+    return made.records.stacked(TIP).T
+
+
+def tips_at(made: Mission, values: np.ndarray) -> np.ndarray:
+    """What the ordinary simulator's forward model gives for one value vector (N x 3)."""
+    asked = request()
+    fixed = replace(asked, parameters=asked.parameters.with_nominal(values))
+    exact = measured_without_noise(fixed, made.records)
+    return np.array([exact[name] for name in TIP]).T
+
+
+def test_the_same_seed_gives_the_same_mission_and_another_does_not() -> None:
+    one, two, other = (mission(quiet=False, days=4, seed=seed) for seed in (3, 3, 4))
+    assert one.records.ids == two.records.ids and np.array_equal(one.outliers, two.outliers)
+    assert all(np.array_equal(one.records.channels[name], two.records.channels[name]) for name in one.records.channels)
+    assert len(other.records) != len(one.records) or not np.array_equal(tips(one), tips(other))
+
+
+def test_records_come_in_order_in_working_hours_at_about_the_stated_rate() -> None:
+    made = mission(days=20)
+    times = made.times
+    assert np.all(np.diff(times) > 0)
+    hours = times % DAY_S / 3600
+    assert hours.min() >= 8 and hours.max() < 18
+    expected = 20 * 10 * 60 / 8
+    assert abs(len(times) - expected) < 4 * np.sqrt(expected)
+    assert np.all(np.diff(made.records.column("sequence")) == 1)
+    assert np.allclose(made.records.column("time"), made.began + times)
+    assert made.began == 1930089600.0  # date -d 2031-03-01T00:00:00Z +%s
+    assert np.all(made.records.column("payload") == 0)
+
+
+def test_a_still_mission_is_what_the_ordinary_forward_model_gives() -> None:
+    made = mission(days=1)
+    values = made.truth.values_at(np.zeros(1))[0]
+    assert np.abs(tips(made) - tips_at(made, values)).max() < 1e-12
+
+
+def test_parameters_that_move_are_those_of_each_record() -> None:
+    """Record by record through a model that knows one value vector at a time."""
+    made = mission(quiet=False, days=8, noise=0.0, **{"outliers.fraction": 0, "tilt.error_deg": 0})
+    values = made.truth.values_at(made.times)
+    for i in np.linspace(0, len(made.times) - 1, 12).astype(int):
+        alone = replace(made, records=made.records.subset([i]))
+        assert np.abs(tips(made)[i] - tips_at(alone, values[i])[0]).max() < 1e-10
+
+
+def test_gravity_is_turned_into_the_tilted_base_frame() -> None:
+    """A rover that pitches nose down by 20 deg about y feels gravity towards its nose, +x."""
+    level = np.array([0.0, 0.0, -1.62])
+    turn = np.array([[0.0, np.deg2rad(20), 0.0]])
+    felt = Stands(np.zeros(1), turn, turn).gravity(np.array([5.0]), level, turn)[:, 0]
+    assert np.allclose(felt, [1.62 * np.sin(np.deg2rad(20)), 0, -1.62 * np.cos(np.deg2rad(20))])
+    drawn = Stands.drawn(50, TiltSettings(most_deg=20, drives_per_day=4, error_deg=0.2), (8, 18), level, random())
+    times = np.linspace(0, 50 * DAY_S, 500)
+    felt = drawn.gravity(times, level, drawn.turns)
+    for i in range(0, 500, 50):
+        stand = np.flatnonzero(drawn.since <= times[i])[-1]
+        matrix = Rotation.from_rotvec(drawn.turns[stand]).as_matrix()  # level_R_rover
+        assert np.allclose(matrix @ felt[:, i], level)
+    off = np.degrees(np.arccos(-felt[2] / 1.62))
+    assert off.max() < 20 and off.max() > 15
+    assert np.allclose(np.degrees(np.linalg.norm(drawn.turns, axis=1))[np.searchsorted(drawn.since, 0)], off[0])
+
+
+def test_the_rover_reads_its_tilt_as_wrong_as_stated() -> None:
+    tilt = TiltSettings(most_deg=20, drives_per_day=20, error_deg=0.2)
+    drawn = Stands.drawn(100, tilt, (8, 18), MOON, random())
+    true, read = Rotation.from_rotvec(drawn.turns), Rotation.from_rotvec(drawn.readings)
+    off = np.degrees((true.inv() * read).as_rotvec())
+    assert np.abs(off.mean(axis=0)).max() < 0.02
+    assert np.allclose(off.std(axis=0), 0.2, rtol=0.08)
+
+
+def test_records_have_gravity_as_it_is_read_and_the_arm_bends_under_the_true_one() -> None:
+    changes = {"tilt.most_deg": 20}
+    right = mission(days=3, **changes, **{"tilt.error_deg": 0})
+    wrong = mission(days=3, **changes, **{"tilt.error_deg": 1})
+    assert np.allclose(tips(right), tips(wrong), atol=1e-12)
+    assert not np.allclose(right.records.stacked(GRAVITY), wrong.records.stacked(GRAVITY), atol=1e-3)
+    assert np.allclose(np.linalg.norm(wrong.records.stacked(GRAVITY), axis=0), 1.62)
+    assert len({tuple(g) for g in right.records.stacked(GRAVITY).T}) > 3
+
+
+def test_a_slip_shifts_tips_as_the_offset_parameter_does() -> None:
+    slip = {"kind": "slip", "day": 1.0, "joint": "arm.q3", "parameter": "arm.mdh.theta3", "teeth": 1}
+    plain, slipped = mission(days=2), mission(days=2, events=[slip])
+    before = plain.times < DAY_S
+    assert np.array_equal(tips(plain)[before], tips(slipped)[before])
+    values = plain.truth.values_at(np.zeros(1))[0]
+    values[plain.truth.names.index("arm.mdh.theta3")] += np.deg2rad(14.4)
+    assert np.abs(tips(slipped)[~before] - tips_at(plain, values)[~before]).max() < 1e-10
+    (event,) = slipped.events
+    assert (event.kind, event.joint, event.time) == ("slip", "arm.q3", DAY_S)
+    assert slipped.truth.moving == ("arm.mdh.theta3",)
+
+
+def test_a_swap_changes_offset_gain_and_play() -> None:
+    changes = {"arm.mdh.theta2": "-3 deg", "arm.servo.gain2": 0.01, "arm.lag.lag2": "0.15 deg"}
+    swap = {"kind": "swap", "day": 0.5, "joint": "arm.q2", "changes": changes}
+    made = mission(days=1, events=[swap])
+    values = made.truth.values_at(np.array([0.0, 0.9 * DAY_S]))
+    moved = dict(zip(made.truth.names, values[1] - values[0], strict=True))
+    assert {name for name, change in moved.items() if change} == set(changes)
+    assert moved["arm.mdh.theta2"] == pytest.approx(np.deg2rad(-3))
+    assert moved["arm.servo.gain2"] == pytest.approx(0.01) and moved["arm.lag.lag2"] == pytest.approx(np.deg2rad(0.15))
+
+
+def test_a_bump_is_a_rigid_motion_of_what_is_measured() -> None:
+    bump = {"kind": "bump", "day": 1.0, "shift_mm": [3, -2, 1], "turn_deg": [0.2, 0.4, -0.3]}
+    plain, bumped = mission(days=2), mission(days=2, events=[bump])
+    after = plain.times >= DAY_S
+    assert np.array_equal(tips(plain)[~after], tips(bumped)[~after])
+    turned = Rotation.from_rotvec([0.2, 0.4, -0.3], degrees=True).apply(tips(plain)[after])
+    assert np.abs(turned + np.array([0.003, -0.002, 0.001]) - tips(bumped)[after]).max() < 1e-12
+    assert bumped.truth.moving == ()
+    poses = bumped.truth.camera_T_base_at(np.array([0.0, DAY_S]))
+    assert np.array_equal(poses[0], np.eye(4)) and np.allclose(poses[1, :3, 3], [0.003, -0.002, 0.001])
+
+
+def test_losses_and_outliers_come_in_the_stated_fractions() -> None:
+    whole = mission(days=60)
+    made = mission(days=60, **{"losses.fraction": 0.1, "losses.hours": 0.2, "outliers.fraction": 0.05})
+    count = len(whole.records)
+    assert made.lost + len(made.records) == count
+    assert made.lost / count == pytest.approx(1 - 0.9 * 0.8, abs=0.04)
+    assert set(made.records.ids) < set(whole.records.ids)
+    hours = {int(time // 3600) for time in whole.times} - {int(time // 3600) for time in made.times}
+    assert len(hours) / 600 == pytest.approx(0.2, abs=0.06)
+    assert made.outliers.mean() == pytest.approx(0.05, abs=0.015)
+    kept = [whole.records.ids.index(each) for each in made.records.ids]
+    away = np.linalg.norm(tips(made) - tips(whole)[kept], axis=1)
+    assert np.array_equal(away > 1e-9, made.outliers)
+    assert away[made.outliers].min() >= 0.0299 and away[made.outliers].max() <= 0.0601
+
+
+def test_noise_is_as_large_as_stated() -> None:
+    clean, noisy = mission(days=20), mission(days=20, noise=0.0005)
+    assert np.allclose((tips(noisy) - tips(clean)).std(axis=0), 0.0005, rtol=0.06)
+
+
+def test_temperature_goes_by_day_and_night_and_acts() -> None:
+    thermal = {"arm.mdh.theta1": {"per_K": "0.01 deg", "reference_C": 20}}
+    still, made = mission(days=2), mission(days=2, thermal=thermal)
+    temperature = made.truth.temperature_at(np.array([2, 14, 20]) * 3600.0)
+    assert np.allclose(temperature, [-20, 40, 10])
+    warmth = made.records.column("temperature")
+    assert np.allclose(warmth, made.truth.temperature_at(made.times))
+    values = still.truth.values_at(np.zeros(1))[0]
+    for i in (0, len(warmth) // 2, len(warmth) - 1):
+        moved = values.copy()
+        moved[made.truth.names.index("arm.mdh.theta1")] += np.deg2rad(0.01) * (warmth[i] - 20)
+        alone = replace(made, records=made.records.subset([i]))
+        assert np.abs(tips(made)[i] - tips_at(alone, moved)[0]).max() < 1e-10
+
+
+def test_creep_goes_along_a_line_or_walks_at_random() -> None:
+    assert parsed_creep("0.05 deg in 30 d") == ("0.05 deg", 30 * DAY_S, False)
+    assert parsed_creep("walk 2 mm in 12 h") == ("2 mm", 12 * 3600.0, True)
+    line = mission(days=30, creep={"arm.mdh.theta2": "-0.6 deg in 30 d"})
+    at = line.truth.names.index("arm.mdh.theta2")
+    moved = np.degrees(np.diff(line.truth.values_at(np.array([0, 10, 30]) * DAY_S)[:, at]))
+    assert np.allclose(moved, [-0.2, -0.4])
+    ends = []
+    for seed in range(25):
+        walk = mission(days=9, seed=seed, creep={"arm.mdh.theta[1-6]": "walk 0.3 deg in 9 d"})
+        places = [walk.truth.names.index(f"arm.mdh.theta{i}") for i in range(1, 7)]
+        ends.append(np.degrees(np.diff(walk.truth.values_at(np.array([0.0, 9 * DAY_S]))[:, places], axis=0)[0]))
+    assert np.std(ends) == pytest.approx(0.3, rel=0.2)
+    assert abs(np.corrcoef(np.array(ends).T)[0, 1]) < 0.6
+
+
+def test_approach_is_the_sign_of_the_last_motion_also_where_a_record_was_lost() -> None:
+    whole = mission(days=3)
+    angles = np.array([whole.records.column(f"arm.q{i}") for i in range(1, 7)])
+    expected = np.hstack([np.zeros((6, 1)), np.sign(np.diff(angles))])
+    assert np.array_equal(approach_of(angles), expected)
+    made = mission(days=3, **{"losses.fraction": 0.3})
+    kept = [whole.records.ids.index(each) for each in made.records.ids]
+    assert np.array_equal(made.records.column("arm.approach.q4"), expected[3, kept])
+
+
+def test_joints_stay_within_their_ranges() -> None:
+    made = mission(days=10)
+    for joint, most in {"q1": 100, "q2": 50, "q6": 50}.items():
+        angles = np.degrees(made.records.column(f"arm.{joint}"))
+        assert angles.min() > -most and angles.max() < most and np.ptp(angles) > 1.9 * most
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({"creep": {"arm.mdh.theta9": "1 deg in 3 d"}}, "theta9"),
+        ({"creep": {"arm.mdh.theta1": "1 mm in 3 d"}}, "length"),
+        ({"events": [{"kind": "slip", "day": 1, "joint": "arm.q9", "parameter": "arm.mdh.theta3", "teeth": 1}]}, "q9"),
+        ({"events": [{"kind": "slip", "day": 1, "joint": "arm.q3", "parameter": "arm.mdh.a3", "teeth": 1}]}, "angle"),
+        ({"records.ranges_rad": {"q1": [-1, 1]}}, "q2"),
+        ({"records.ranges_rad": {"q7": [-1, 1]}}, "q7"),
+    ],
+)
+def test_what_does_not_fit_the_arm_is_refused(changes: dict[str, object], told: str) -> None:
+    with pytest.raises(ConfigError, match=told):
+        mission(days=2, **changes)
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({"creep": {"arm.mdh.theta1": "1 deg"}}, "amount and a time"),
+        ({"start": "2031-03-01"}, "zone"),
+        ({"start": "soon"}, "date"),
+        ({"records": {"hours": [18, 8]}}, "end before they begin"),
+        ({"events": [{"kind": "slip", "day": 1, "joint": "arm.q3", "parameter": "arm.mdh.theta3"}]}, "teeth"),
+        ({"events": [{"kind": "quake", "day": 1}]}, "quake"),
+    ],
+)
+def test_settings_that_make_no_sense_are_refused_in_words(changes: dict[str, object], told: str) -> None:
+    with pytest.raises(ValueError, match=told):
+        MissionSettings.model_validate({"truth": "truth.yaml", "days": 1, **changes})
+
+
+def random() -> np.random.Generator:
+    return np.random.default_rng(5)
