@@ -12,7 +12,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from benchmarks import batch, fit_elastic, fit_rigid, large, plan, startup
+from benchmarks import batch, fit_elastic, fit_rigid, large, online, plan, startup
 from benchmarks.report import Row, print_table, write_json
 
 
@@ -29,6 +29,7 @@ def main() -> None:
         "batch": batch.run,
         "large": partial(large.run, long=chosen.long),
         "plan": plan.run,
+        "online": online.run,
         "startup": startup.run,
     }
     names = fnmatch.filter(benchmarks, chosen.only)

@@ -8,11 +8,16 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "tests"))  # for `import oracle`
+
+# BLAS keeps to one thread, as the command line has it. It reads this when NumPy is loaded, so nothing above loads
+# NumPy. Its threads wait by turning: two test workers on two processors would wait for each other, and factorising
+# a small matrix would take a hundred times as long.
+for _variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(_variable, "1")
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -59,6 +64,7 @@ class LrmArm:
     @staticmethod
     def dataset(q, measured=None, **channels):
         """Joint angles (N x 6), measured points (N x 3; zeros by default) and further channels."""
+        import numpy as np
         from armcal.base.dataset import Dataset
 
         measured = np.zeros((len(q), 3)) if measured is None else measured

@@ -58,15 +58,25 @@ def random_poses(random: np.random.Generator, count: int) -> np.ndarray:
 
 def free_names(held_base: bool) -> tuple[str, ...]:
     """The 35 parameters."""
-    return tuple(f"arm.mdh.{AWAY[n]}" if held_base and (n := name.rpartition(".")[2]) in AWAY else name for name in FREE)
+    return tuple(
+        f"arm.mdh.{AWAY[n]}" if held_base and (n := name.rpartition(".")[2]) in AWAY else name for name in FREE
+    )
 
 
 @cache
 def calibration(
-    noise_mm: float = 0.3, sd_factor: float = 1.0, held_base: bool = False, compliance: float = _COMPLIANCE
+    noise_mm: float = 0.3,
+    sd_factor: float = 1.0,
+    held_base: bool = False,
+    compliance: float = _COMPLIANCE,
+    placement: tuple[str, ...] = (),
 ) -> Calibration:
-    """Of a few bench poses and what was known before; ``sd_factor`` makes it claim more or less than it knows."""
-    source = load_config(CONFIG, [f"measurements.tracker.noise_mm={noise_mm}"])
+    """Of a few bench poses and what was known before; ``sd_factor`` makes it claim more or less than it knows.
+
+    ``placement`` (``position_mm=[300, 0, 0]``) says where the arm stands in the frame that the instrument measures in.
+    """
+    placed = [f"arms.arm.placement.{each}" for each in placement]
+    source = load_config(CONFIG, [f"measurements.tracker.noise_mm={noise_mm}", *placed])
     system = build_system(source, discover())
     parameters = system.parameters({}).with_free(free_names(held_base))
     values = parameters.nominal()
@@ -119,8 +129,8 @@ def _prior(system, parameters) -> np.ndarray:
 
 def walk_of(factor: float = 1.0, held_base: bool = False) -> dict[str, str]:
     """The random walk made faster by a factor; none for zero."""
-    amounts = {} if factor == 0 else {"arm.mdh.theta[1-6]": f"{0.2 * factor} deg in 1 d"}
-    return amounts if held_base or factor == 0 else {**amounts, "arm.mdh.base_[xyz]": f"{0.2 * factor} mm in 1 d"}
+    amounts = {} if factor == 0 else {"arm.mdh.theta[1-6]": f"{0.3 * factor} deg in 30 d"}
+    return amounts if held_base or factor == 0 else {**amounts, "arm.mdh.base_[xyz]": f"{1.0 * factor} mm in 30 d"}
 
 
 def settings(**changed) -> RecalibrateSettings:

@@ -188,6 +188,7 @@ ORDER = [
     "armcal.online.window_evidence",
     "armcal.online.hypotheses",
     "armcal.online.what_if",
+    "armcal.online.pose_worth",
     "armcal.online.health",
     "armcal.online.clock",
     "armcal.online.snapshot",

@@ -8,7 +8,7 @@ from typing import Annotated, Any, ClassVar
 import numpy as np
 from armcal.base.domains import Array
 from armcal.base.settings import Settings
-from armcal.solve.online import Gaussian, Linearised, Observation, Update, checked
+from armcal.solve.online import Gaussian, Linearised, Observation, Update, checked, weighed
 from filterpy.kalman import ExtendedKalmanFilter
 from pydantic import Field
 
@@ -54,13 +54,13 @@ class ExtendedFilter:
         seen = observation.at(place)
         if self._settings.iterations == 1:
             return seen, place
-        deviations = np.sqrt(np.diag(prior.covariance))
+        enough = self._settings.moved * np.sqrt(prior.covariance.diagonal())
         for _ in range(self._settings.iterations - 1):
             across = prior.covariance @ seen.slope.T
             innovation = seen.innovation + seen.slope @ (place - prior.mean)
-            gained = np.linalg.solve(seen.slope @ across + seen.noise, innovation)
+            gained = weighed(seen.slope @ across + seen.noise, innovation)
             following = prior.mean + across @ gained
-            if np.all(np.abs(following - place) <= self._settings.moved * deviations):
+            if (np.abs(following - place) <= enough).all():
                 break
             place = following
             seen = observation.at(place)

@@ -8,16 +8,17 @@ window is taken for good, from a place that those after it have mended.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar
 
 import numpy as np
 from armcal.base.domains import Array
 from armcal.base.settings import Settings
 from armcal.errors import NotConvergedError
-from armcal.solve.online import Gaussian, Linearised, Observation, Update, checked
+from armcal.solve.online import Gaussian, Observation, Update, checked
 from pydantic import Field
 
-_HALVINGS = 8
+_HALVINGS = 4
 
 
 class WindowSettings(Settings):
@@ -26,9 +27,9 @@ class WindowSettings(Settings):
     Solving ends when no coordinate moves by more than ``moved`` standard deviations.
     """
 
-    records: Annotated[int, Field(ge=1, le=2000)] = 60
-    iterations: Annotated[int, Field(ge=1, le=100)] = 10
-    moved: Annotated[float, Field(gt=0)] = 0.01
+    records: Annotated[int, Field(ge=1, le=2000)] = 40
+    iterations: Annotated[int, Field(ge=1, le=100)] = 3
+    moved: Annotated[float, Field(gt=0)] = 0.1
 
 
 class WindowEstimator:
@@ -46,72 +47,68 @@ class WindowEstimator:
         return self._settings.records
 
     def update(self, prior: Gaussian, observations: Sequence[Observation]) -> Update:
-        """As the protocol says: Gauss-Newton with steps halved until the cost falls."""
-        pull = np.zeros(len(prior.mean))  # the place is mean + covariance @ pull, so that no inverse is needed
-        seen = _stacked([each.at(prior.mean) for each in observations])
-        cost = _cost(prior, pull, seen)
+        """As the protocol says: Gauss-Newton, with steps halved until the cost falls."""
+        # The place is mean + covariance @ pull: a covariance that is singular needs no inverse.
+        pull = np.zeros(len(prior.mean))
+        seen = _together(observations, prior.mean)
         for _ in range(self._settings.iterations):
-            place = prior.mean + prior.covariance @ pull
-            wanted = _step(prior, seen, place)
+            wanted, covariance = _solved(prior, seen, prior.covariance @ pull)
             moved = prior.covariance @ (wanted - pull)
-            pull, seen, cost = self._descended(prior, observations, pull, wanted, cost, seen)
-            deviations = np.sqrt(np.diag(_posterior(prior, seen)))
-            if np.all(np.abs(moved) <= self._settings.moved * deviations):
+            pull, seen = self._descended(prior, observations, pull, wanted, seen)
+            if np.all(np.abs(moved) <= self._settings.moved * np.sqrt(np.maximum(np.diag(covariance), 0.0))):
                 break
-        place = prior.mean + prior.covariance @ _step(prior, seen, prior.mean + prior.covariance @ pull)
-        posterior = checked(Gaussian(place, _posterior(prior, seen)))
-        last = observations[-1].at(prior.mean + prior.covariance @ pull)
-        innovation = last.innovation + last.slope @ (prior.covariance @ pull)
-        return Update(posterior, innovation, last.slope @ prior.covariance @ last.slope.T + last.noise)
+        step = prior.covariance @ pull
+        wanted, covariance = _solved(prior, seen, step)
+        last = observations[-1].at(prior.mean + step)
+        innovation = last.innovation + last.slope @ step
+        expected = last.slope @ prior.covariance @ last.slope.T + last.noise
+        return Update(checked(Gaussian(prior.mean + prior.covariance @ wanted, covariance)), innovation, expected)
 
     def _descended(
-        self,
-        prior: Gaussian,
-        observations: Sequence[Observation],
-        pull: Array,
-        wanted: Array,
-        cost: float,
-        seen: Linearised,
-    ) -> tuple[Array, Linearised, float]:
+        self, prior: Gaussian, observations: Sequence[Observation], pull: Array, wanted: Array, seen: Seen
+    ) -> tuple[Array, Seen]:
         """A step towards what is wanted, as far as the cost allows."""
+        cost = _cost(prior, pull, seen)
         for halving in range(_HALVINGS):
             tried = pull + (wanted - pull) * 0.5**halving
-            place = prior.mean + prior.covariance @ tried
             try:
-                there = _stacked([each.at(place) for each in observations])
+                there = _together(observations, prior.mean + prior.covariance @ tried)
             except NotConvergedError:
                 continue
-            reached = _cost(prior, tried, there)
-            if reached <= cost * (1 + 1e-9):
-                return tried, there, reached
-        return pull, seen, cost
+            if _cost(prior, tried, there) <= cost * (1 + 1e-9):
+                return tried, there
+        return pull, seen
 
 
-def _stacked(each: Sequence[Linearised]) -> Linearised:
-    if len(each) == 1:
-        return each[0]
-    rows = sum(len(one.innovation) for one in each)
-    noise, start = np.zeros((rows, rows)), 0
-    for one in each:
-        noise[start : start + len(one.innovation), start : start + len(one.innovation)] = one.noise
-        start += len(one.innovation)
-    return Linearised(np.concatenate([e.innovation for e in each]), np.vstack([e.slope for e in each]), noise)
+@dataclass(frozen=True)
+class Seen:
+    """All records from one place, each in units of its noise: information (N x N), its pull there (N), and the cost."""
+
+    information: Array
+    pull: Array
+    cost: float
 
 
-def _cost(prior: Gaussian, pull: Array, seen: Linearised) -> float:
-    return float(pull @ prior.covariance @ pull + seen.innovation @ np.linalg.solve(seen.noise, seen.innovation))
+def _together(observations: Sequence[Observation], place: Array) -> Seen:
+    slopes, innovations = [], []
+    for each in observations:
+        one = each.at(place)
+        whitened = np.linalg.solve(np.linalg.cholesky(one.noise), np.column_stack([one.slope, one.innovation]))
+        slopes.append(whitened[:, :-1])
+        innovations.append(whitened[:, -1])
+    slope, innovation = np.vstack(slopes), np.concatenate(innovations)
+    return Seen(slope.T @ slope, slope.T @ innovation, float(innovation @ innovation))
 
 
-def _step(prior: Gaussian, seen: Linearised, place: Array) -> Array:
-    """The pull that the linearised records ask for."""
-    across = prior.covariance @ seen.slope.T
-    innovation = seen.innovation + seen.slope @ (place - prior.mean)
-    return np.asarray(seen.slope.T @ np.linalg.solve(seen.slope @ across + seen.noise, innovation))
+def _cost(prior: Gaussian, pull: Array, seen: Seen) -> float:
+    return float(pull @ prior.covariance @ pull) + seen.cost
 
 
-def _posterior(prior: Gaussian, seen: Linearised) -> Array:
-    """In Joseph's form."""
-    across = prior.covariance @ seen.slope.T
-    gain = np.linalg.solve(seen.slope @ across + seen.noise, across.T).T
-    kept = np.eye(len(prior.mean)) - gain @ seen.slope
-    return np.asarray(kept @ prior.covariance @ kept.T + gain @ seen.noise @ gain.T)
+def _solved(prior: Gaussian, seen: Seen, step: Array) -> tuple[Array, Array]:
+    """The pull that the linearised records ask for, and the covariance with them; ``step`` is where they were seen."""
+    mixed = np.eye(len(step)) + seen.information @ prior.covariance
+    both = np.linalg.solve(mixed, np.column_stack([seen.pull + seen.information @ step, seen.information]))
+    kept = np.eye(len(step)) - prior.covariance @ both[:, 1:]
+    # As Joseph's form: positive by construction, not by rounding alone.
+    seen_by_prior = prior.covariance @ seen.information @ prior.covariance
+    return both[:, 0], kept @ (prior.covariance + seen_by_prior) @ kept.T

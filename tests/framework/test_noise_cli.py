@@ -51,6 +51,27 @@ def run(repository, data, out, *overrides):
     return json.loads((out / "metrics.json").read_text()), done.output
 
 
+@pytest.fixture(scope="module")
+def robust_run(repository, spoilt, tmp_path_factory):
+    """A function of a loss: the folder of the run on the spoilt data with it, its metrics and what it shows."""
+    done = {}
+
+    def by(loss):
+        if loss not in done:
+            out = tmp_path_factory.mktemp(loss) / "out"
+            done[loss] = (out, *run(repository, spoilt[0], out, f"noise.loss={loss}", "validation.folds=3"))
+        return done[loss]
+
+    return by
+
+
+@pytest.fixture(scope="module")
+def plain_run(repository, spoilt, tmp_path_factory):
+    """The same by least squares: folder, metrics, what it shows."""
+    out = tmp_path_factory.mktemp("plain") / "out"
+    return out, *run(repository, spoilt[0], out, "validation.folds=0")
+
+
 def compliances(out):
     """Values and stated deviations of the springs away from their bound."""
     kept = yaml.safe_load((out / "calibration.yaml").read_text())["parameters"]
@@ -59,11 +80,11 @@ def compliances(out):
 
 
 @pytest.mark.parametrize("loss", ["huber", "cauchy", "reject"])
-def test_every_output_tells_of_the_wrong_records(repository, spoilt, tmp_path, loss):
-    data, wrong = spoilt
-    told, shown = run(repository, data, tmp_path / "out", f"noise.loss={loss}", "validation.folds=3")
-    plain, _ = run(repository, data, tmp_path / "plain", "validation.folds=0")
-    with (tmp_path / "out" / "residuals.csv").open() as file:
+def test_every_output_tells_of_the_wrong_records(spoilt, robust_run, plain_run, loss):
+    _, wrong = spoilt
+    out, told, shown = robust_run(loss)
+    by_least_squares, plain, _ = plain_run
+    with (out / "residuals.csv").open() as file:
         rows = {row["pose_id"]: row for row in csv.DictReader(file)}
     held = {name for name, row in rows.items() if row["set"] == "holdout"}
     listed = {s["record_id"]: s for s in told["noise"]["suspicious_records"]}
@@ -81,22 +102,21 @@ def test_every_output_tells_of_the_wrong_records(repository, spoilt, tmp_path, l
     assert told["error_mm"]["calibrated"]["train"]["count"] == 150
     assert told["error_mm"]["calibrated"]["holdout"]["max"] > 0.9 * OFF_MM
     assert all(re.search(rf"suspicious: row \d+, record {name}:", shown) for name in listed)
-    text = (tmp_path / "out" / "report.html").read_text()
+    text = (out / "report.html").read_text()
     heading = "<h3>Suspicious records</h3>"
-    assert heading in text and heading not in (tmp_path / "plain" / "report.html").read_text()
-    kept = yaml.safe_load((tmp_path / "out" / "calibration.yaml").read_text())["noise"]
+    assert heading in text and heading not in (by_least_squares / "report.html").read_text()
+    kept = yaml.safe_load((out / "calibration.yaml").read_text())["noise"]
     assert kept == told["noise"]
     assert plain["noise"]["scale"] > 3 and told["noise"]["scale"] == pytest.approx(1, abs=0.1)
-    Calibration.load(tmp_path / "out" / "calibration.yaml")
+    Calibration.load(out / "calibration.yaml")
 
 
-def test_robust_compliances_are_the_simulated_truths(repository, spoilt, tmp_path):
+def test_robust_compliances_are_the_simulated_truths(repository, robust_run):
     truth = dict(
         re.findall(r"^(arm\.spring\.k\d): (\S+) rad/Nm$", (repository / "configs/lrm_arm/truth.yaml").read_text(), re.M)
     )
     for loss in ("huber", "cauchy", "reject"):
-        run(repository, spoilt[0], tmp_path / loss, f"noise.loss={loss}", "validation.folds=0")
-        for name, (value, sd) in compliances(tmp_path / loss).items():
+        for name, (value, sd) in compliances(robust_run(loss)[0]).items():
             assert abs(value - float(truth[name])) < 4 * sd, (loss, name)
             assert sd < 0.2 * float(truth[name])
 
@@ -174,12 +194,14 @@ def test_the_report_escapes_what_a_suspicious_record_is_called(repository, spoil
     assert json.dumps(outputs.metrics(result))
 
 
-def test_the_real_arm_under_every_loss(repository, shared_data, tmp_path):
+@pytest.mark.parametrize("folds", [2, pytest.param(5, marks=pytest.mark.slow)])
+def test_the_real_arm_under_every_loss(repository, shared_data, folds):
     """No loss makes the real arm's errors worse than least squares by much; its folds all converge."""
     config, data = repository / "configs" / "lrm_arm" / "option1.yaml", shared_data / "lrm_arm" / "poses.csv"
     errors = {}
     for loss in ("none", "huber", "cauchy", "reject"):
-        done = calibrate(Experiment.load(config, [f"noise.loss={loss}"], data))
+        settings = [f"noise.loss={loss}", f"validation.folds={folds}", "evaluator=compiled"]
+        done = calibrate(Experiment.load(config, settings, data))
         assert done.estimate.verdict.converged and done.errors.failed_folds == 0
         errors[loss] = done.table.calibrated["cross_validated"].mean
     assert max(errors.values()) < 1.02 * errors["none"]

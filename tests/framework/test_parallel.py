@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from armcal.cli.main import cli
+from armcal.cli.main import cli, main
 from armcal.errors import ArmcalError, ConfigError, InputError, Location
 from armcal.solve import parallel
 from armcal.solve.estimator import spread
@@ -178,9 +178,25 @@ def test_starts_of_one_fit_can_be_spread(lrm) -> None:
     assert found[0].verdict.starts == 4
 
 
-def test_workers_keep_blas_to_one_thread() -> None:
+def test_workers_keep_blas_to_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever this process was told."""
+    monkeypatch.setenv("OPENBLAS_NUM_THREADS", "2")
     found = Workers("loky", 2).map(_blas, [None])
     assert found == ["1"]
+
+
+@pytest.mark.parametrize(("given", "kept"), [(None, "1"), ("2", "2")])
+def test_the_command_keeps_blas_to_one_thread_unless_told(
+    monkeypatch: pytest.MonkeyPatch, given: str | None, kept: str
+) -> None:
+    if given is None:
+        monkeypatch.delenv("OPENBLAS_NUM_THREADS", raising=False)
+    else:
+        monkeypatch.setenv("OPENBLAS_NUM_THREADS", given)
+    monkeypatch.setattr(sys, "argv", ["armcal", "--version"])
+    with pytest.raises(SystemExit):
+        main()
+    assert os.environ["OPENBLAS_NUM_THREADS"] == kept
 
 
 def _blas(task: None) -> str | None:

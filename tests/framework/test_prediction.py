@@ -14,7 +14,7 @@ from armcal.cli.main import cli
 from armcal.errors import DataError
 from armcal.measure.reader import ReadRequest, wanted_channels
 from armcal.run.experiment import Experiment
-from armcal.run.pipeline import calibrate
+from armcal.run.pipeline import Stopwatch, calibrate, prepare
 from armcal.solve.coverage import (
     FEWEST,
     Coverage,
@@ -414,10 +414,10 @@ def test_what_is_kept_predicts_as_the_fit_itself(extra: tuple[str, ...], tmp_pat
     kept = Calibration.load(folder / "calibration.yaml")
     loaded = Experiment.load(DEMO, settings, poses)
     dataset = loaded.read()
-    result = calibrate(loaded)
+    split = prepare(loaded, Stopwatch()).split
     problem = problem_of(loaded, dataset)
     records = with_drift(problem, problem.records(dataset), dataset, loaded.parameters.nominal())
-    train = problem.subset(records, result.split.train)
+    train = problem.subset(records, split.train)
     fitted = fit(problem, train, loaded.estimator, loaded.parameters.nominal())
     by = predictor(problem, fitted)
     alike = whitened_like(problem, fitted, records, loaded.estimator)

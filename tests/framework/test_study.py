@@ -164,8 +164,22 @@ def _run(path: Path, *overrides: str, executor=None):
     return compare(Study.load(path, [*FAST, *overrides]), executor or Sequential())
 
 
-def test_errors_are_those_of_a_run_with_the_same_folds(place: Path) -> None:
-    result = _run(_write(place, SMALL))
+@pytest.fixture(scope="module")
+def ladder(tmp_path_factory: pytest.TempPathFactory):
+    """The result of the small study as it stands."""
+    place = Path(shutil.copytree(CONFIGS, tmp_path_factory.mktemp("ladder") / "configs"))
+    return _run(_write(place, SMALL))
+
+
+@pytest.fixture(scope="module")
+def close_choices(tmp_path_factory: pytest.TempPathFactory):
+    """The result of the study whose choices are close."""
+    place = Path(shutil.copytree(CONFIGS, tmp_path_factory.mktemp("close") / "configs"))
+    return _run(_few(place), *COMPILED)
+
+
+def test_errors_are_those_of_a_run_with_the_same_folds(place: Path, ladder) -> None:
+    result = ladder
     overrides = [*FAST, "parameters.free=['arm.mdh.theta[1-3]', 'arm.spring.k[0-2]']"]
     overrides += ["validation.holdout=0", "validation.folds=3", "validation.seed=2"]
     run = calibrate(Experiment.load(place / "demo.yaml", overrides))
@@ -179,9 +193,8 @@ def test_errors_are_those_of_a_run_with_the_same_folds(place: Path) -> None:
     assert nothing.crossed == nothing.train == nothing.nominal
 
 
-def test_each_rung_is_compared_with_the_one_before_or_with_one_reference(place: Path) -> None:
-    path = _write(place, SMALL)
-    ladder, against = _run(path), _run(path, "study.reference=springs")
+def test_each_rung_is_compared_with_the_one_before_or_with_one_reference(place: Path, ladder) -> None:
+    against = _run(_write(place, SMALL), "study.reference=springs")
     assert [v.change and v.change.against for v in ladder.variants] == [None, "none", "angles", "springs"]
     assert [v.change and v.change.against for v in against.variants] == ["springs", "springs", None, "springs"]
     errors = {v.name: v.errors_mm for v in ladder.variants}
@@ -195,10 +208,10 @@ def test_each_rung_is_compared_with_the_one_before_or_with_one_reference(place: 
     assert ladder.best == ladder.variants[int(np.argmin(means))].name
 
 
-def test_repeats_draw_the_folds_anew_and_average(place: Path) -> None:
+def test_repeats_draw_the_folds_anew_and_average(place: Path, ladder) -> None:
     path = _write(place, SMALL)
     both = _run(path, "study.repeats=2")
-    singles = [_run(path), _run(path, "study.seed=3")]
+    singles = [ladder, _run(path, "study.seed=3")]
     for name in ("angles", "lengths"):
         rows = [each.variant(name) for each in singles]
         assert not np.array_equal(rows[0].errors_mm, rows[1].errors_mm)
@@ -241,8 +254,8 @@ def _few(place: Path, spoilt: tuple[int, ...] = ()) -> Path:
     return _write(place, CLOSE)
 
 
-def test_a_nested_choice_is_made_without_the_records_that_judge_it(place: Path) -> None:
-    clean = _run(_few(place), *COMPILED)
+def test_a_nested_choice_is_made_without_the_records_that_judge_it(place: Path, close_choices) -> None:
+    clean = close_choices
     assert len(set(clean.nested.chosen)) > 1, "the choices are too clear to test anything"
     for number, outer in enumerate(folds(40, 3, 1)):
         spoilt = _run(_few(place, tuple(outer.holdout.tolist())), *COMPILED)
@@ -250,9 +263,8 @@ def test_a_nested_choice_is_made_without_the_records_that_judge_it(place: Path) 
         assert np.all(spoilt.nested.errors_mm[outer.holdout] > 40)
 
 
-def test_a_nested_choice_is_that_of_a_plain_loop(place: Path) -> None:
-    path = _few(place)
-    result, study = _run(path, *COMPILED), Study.load(path, COMPILED)
+def test_a_nested_choice_is_that_of_a_plain_loop(place: Path, close_choices) -> None:
+    result, study = close_choices, Study.load(_few(place), COMPILED)
     experiments = study.experiments
     made = {}
     for name, e in experiments.items():
@@ -316,11 +328,10 @@ def test_a_variant_whose_fits_fail_is_never_chosen(place: Path) -> None:
         _run(_write(place, alone), "estimator.max_iterations=1", "study.seed=1", "statics.payload_g=500")
 
 
-def test_a_study_judges_by_every_record_whatever_a_run_would_hold_out(place: Path) -> None:
+def test_a_study_judges_by_every_record_whatever_a_run_would_hold_out(place: Path, ladder) -> None:
     path = _write(place, SMALL + "validation: {holdout: 0.5, folds: 9, seed: 5}\n")
     held = _run(path)
-    plain = _run(_write(place, SMALL))
-    assert all(np.array_equal(a.errors_mm, b.errors_mm) for a, b in zip(held.variants, plain.variants, strict=True))
+    assert all(np.array_equal(a.errors_mm, b.errors_mm) for a, b in zip(held.variants, ladder.variants, strict=True))
 
 
 def test_a_study_leaves_files_that_agree(place: Path) -> None:

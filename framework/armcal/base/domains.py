@@ -365,11 +365,8 @@ class Semidefinite:
 
 
 def symmetric(entries: Array) -> Array:
-    """The 3x3 matrix of six canonical entries."""
-    matrix = np.zeros((3, 3))
-    for value, (row, col) in zip(entries, _SYMMETRIC, strict=True):
-        matrix[row, col] = matrix[col, row] = value
-    return matrix
+    """The 3x3 matrices (... x 3 x 3) of six canonical entries each (... x 6)."""
+    return np.asarray(entries, dtype=float)[..., _PLACES]
 
 
 def _root(entries: Array) -> Array:
@@ -382,6 +379,8 @@ def _entries(matrix: Array) -> Array:
     return np.array([matrix[row, col] for row, col in _SYMMETRIC])
 
 
+_PLACES = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
+"""Where each entry of a symmetric matrix stands among the six."""
 _UNITS = tuple(symmetric(unit) for unit in np.eye(6))
 
 

@@ -23,6 +23,8 @@ COMMANDS = {
     "simulate": ("armcal.cli.simulate:simulate", "Make measurements up from a stated truth."),
     "recalibrate": ("armcal.cli.recalibrate:recalibrate", "Keep a calibration true, record by record, as they come."),
     "control": ("armcal.cli.control:control", "Ask a running recalibration, or tell it what to do."),
+    "replay": ("armcal.cli.replay:replay_command", "Make every state of a recalibration again from its journal."),
+    "what-if": ("armcal.cli.what_if:what_if", "How much one more record would tell, by pose."),
     "watch": ("armcal.cli.watch:watch", "Show a recalibration live, in the browser or the terminal."),
     "mission": ("armcal.cli.mission:mission", "Simulate a mission, recalibrate over it, judge it by its truth."),
     "plugins": ("armcal.cli.plugins:plugins", "List plugins, or check one."),

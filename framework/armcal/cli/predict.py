@@ -47,7 +47,7 @@ def predict(voice: Voice, calibration: Path, poses: Path, out: Path, recording: 
     voice.plugin_faults(registry)
     loaded = Calibration.load(calibration, registry)
     system = loaded.system
-    commands = _read(registry, loaded, poses, columns)
+    commands = read_commands(registry, loaded, poses, columns)
     _tell_missing(voice, loaded, commands, recording)
     channels, placed = loaded.predict(commands)
     found = None
@@ -103,7 +103,7 @@ def _tool_channels(arms: Sequence[str]) -> Iterator[WantedChannel]:
             yield WantedChannel(own, (own, name) if len(arms) == 1 else (own,), dimension, required=False)
 
 
-def _read(registry: PluginRegistry, loaded: Calibration, poses: Path, columns: Sequence[str]) -> Dataset:
+def read_commands(registry: PluginRegistry, loaded: Calibration, poses: Path, columns: Sequence[str]) -> Dataset:
     """The commands. Measured columns, if there are any, are not read: every row gets its prediction."""
     arms = loaded.system.arms
     wanted = wanted_channels(arms, {}, measured=False)

@@ -147,15 +147,23 @@ class Chart:
         """The nearest values within the domains, each block by itself: where the model can be evaluated."""
         place, _, lower, upper = self.bounds
         near = values.copy()
-        near[place] = np.clip(values[place], lower, upper)
-        for entries, _ in self.cones:
-            near[entries] = nearest_semidefinite(values[entries])
+        if len(place):
+            near[place] = np.minimum(np.maximum(values[place], lower), upper)
+        if len(self._matrices):
+            near[self._matrices] = nearest_semidefinite(values[self._matrices])
         return near
+
+    @cached_property
+    def _matrices(self) -> NDArray[np.intp]:
+        """Of semidefinite blocks, the places of their entries in a value vector (blocks x 6)."""
+        return np.array([range(*entries.indices(1 << 30)) for entries, _ in self.cones], dtype=np.intp)
 
 
 def nearest_semidefinite(entries: Array) -> Array:
-    """The six entries of the nearest semidefinite matrix [Higham1989]; the same ones if they are of such a matrix."""
+    """The entries (... x 6) of the nearest semidefinite matrices [Higham1989]; those of such matrices as they are."""
     size, directions = np.linalg.eigh(symmetric(entries))
-    if size[0] >= 0:
+    outside = size[..., 0] < 0
+    if not outside.any():
         return entries
-    return np.asarray(((directions * np.maximum(size, 0.0)) @ directions.T)[_ENTRIES])
+    nearest = (directions * np.maximum(size, 0.0)[..., None, :]) @ np.swapaxes(directions, -1, -2)
+    return np.where(outside[..., None], nearest[..., _ENTRIES[0], _ENTRIES[1]], entries)

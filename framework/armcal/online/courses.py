@@ -42,7 +42,9 @@ def compared(one: Walk, other: Walk) -> Comparison:
     known = np.array([size for size in sizes if np.isfinite(size).all()]).reshape(-1, 2)
     means = known.mean(axis=0).tolist() if len(known) else [np.nan, np.nan]
     first, second = _numbers(one.session), _numbers(other.session)
-    apart = {name: abs(second[name][0] - value) / sd for name, (value, sd) in first.items() if name in second and sd > 0}
+    apart = {
+        name: abs(second[name][0] - value) / sd for name, (value, sd) in first.items() if name in second and sd > 0
+    }
     farthest = max(apart, key=lambda name: apart[name], default="")
     return Comparison((means[0], means[1]), len(known), apart.get(farthest, 0.0), farthest)
 

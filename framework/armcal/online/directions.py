@@ -97,7 +97,7 @@ def find_steps(observer: Observer, values: Array, predicted: Mapping[str, Array]
 
 
 def probing_poses(arms: Mapping[str, Arm]) -> Dataset:
-    """Poses about zero, always the same ones, within the joints' limits."""
+    """Poses about zero within the joints' limits, approached from either side; always the same ones."""
     random, channels = np.random.default_rng(0), {}
     for arm in arms.values():
         limits = {joint.name: joint.limits for joint in arm.nominal_chain.joints}
@@ -105,6 +105,7 @@ def probing_poses(arms: Mapping[str, Arm]) -> Dataset:
             reach = _REACH[dimension]
             low, high = limits.get(joint) or (-reach, reach)
             channels[f"{arm.name}.{joint}"] = random.uniform(max(low, -reach), max(min(high, reach), low), _POSES)
+            channels[f"{arm.name}.approach.{joint}"] = random.choice([-1.0, 1.0], _POSES)
     return Dataset(tuple(str(i) for i in range(_POSES)), channels)
 
 

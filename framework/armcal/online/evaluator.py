@@ -39,7 +39,7 @@ def differences(one: object, other: object, name: str = "") -> tuple[str, ...]:
     if isinstance(one, dict) and isinstance(other, dict):
         keys = dict.fromkeys([*one, *other])
         return tuple(t for k in keys for t in differences(one.get(k), other.get(k), f"{name}.{k}" if name else str(k)))
-    return () if one == other else (f"{name} {one} here, {other} there",)
+    return () if one == other else (f"{name} {one or 'none'} here, {other or 'none'} there",)
 
 
 def _version(library: str) -> str:

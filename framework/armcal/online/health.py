@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from scipy.special import chdtrc, chdtri
+from scipy.special import bdtrc, chdtrc, chdtri
 
 Level = Literal["nominal", "watch", "suspect", "lost"]
 LEVELS: tuple[Level, ...] = ("nominal", "watch", "suspect", "lost")
@@ -41,6 +41,11 @@ class Health:
 def surprise_limit(dof: int, probability: float) -> float:
     """What NIS stays below with a probability, where all is as believed."""
     return float(chdtri(float(dof), 1 - probability))
+
+
+def many_outliers(count: int, records: int, fraction: float) -> float:
+    """How probable at least ``count`` outliers among some records are, if ``fraction`` of all are."""
+    return float(bdtrc(count - 1, records, fraction)) if count > 0 else 1.0
 
 
 def improbability(surprises: Sequence[tuple[float, int]]) -> float:

@@ -13,7 +13,7 @@ from armcal.online import sentences
 from armcal.online.belief import Belief, widened
 from armcal.online.chart import Chart
 from armcal.online.directions import Steps
-from armcal.online.health import improbability, surprise_limit
+from armcal.online.health import improbability, many_outliers, surprise_limit
 from armcal.online.hypotheses import Candidate, Explained, Follower, Hypothesis, Recent
 from armcal.online.sentences import Decision
 from armcal.online.settings import RecalibrateSettings
@@ -66,8 +66,8 @@ class Judge:
         full = len(odd) >= self._settings.gate.window - 1
         told = total > math.log(self._settings.changes.odds)
         if told and (full or margin >= math.log(self._settings.changes.naming_odds)):
-            return self._followed(state, alike, margin, others)
-        state = replace(state, wary=best.log_odds > 0)
+            return self._followed(state, alike, margin, found)
+        state = replace(state, wary=bool(best.log_odds > 0))
         return state, self._unexplained(state, found)
 
     def _alike(self, found: Sequence[Explained]) -> list[Explained]:
@@ -75,27 +75,32 @@ class Judge:
         best = found[0]
         if not best.hypothesis.kind.startswith("joint"):
             return [best]
-        near: list[Explained] = []
-        seen: set[str] = set()
+        near: dict[str, Explained] = {}
         for each in found:
             close = best.log_odds - each.log_odds < math.log(self._settings.changes.naming_odds)
-            if close and each.hypothesis.kind.startswith("joint") and each.hypothesis.subject not in seen:
-                near.append(each)
-                seen.add(each.hypothesis.subject)
-        return near
+            if close and each.hypothesis.kind.startswith("joint"):
+                near.setdefault(each.hypothesis.subject, each)
+        return list(near.values())
+
+    def _kinds(self, joints: Sequence[Explained]) -> list[Hypothesis]:
+        """Of each joint, that it slipped, and that its servo was replaced."""
+        names = [each.hypothesis.subject for each in joints]
+        return [h for h in self._changes if h.subject in names and h.kind in ("joint_slipped", "joint_replaced")]
 
     def _followed(
-        self, state: State, alike: Sequence[Explained], margin: float, others: Sequence[Explained]
+        self, state: State, alike: Sequence[Explained], margin: float, found: Sequence[Explained]
     ) -> tuple[State, Decision]:
         """The state with what a change reopens, from before it on."""
         best = alike[0]
+        others = [each for each in found if each.hypothesis.subject not in {a.hypothesis.subject for a in alike}]
         since = state.recent[best.onset :]
         directions = np.hstack([each.hypothesis.directions for each in alike])
         _, belief = self._follower.follow(since, directions, best.hypothesis.factor)
         suspects: tuple[Candidate, ...] = ()
-        if len(alike) > 1:
-            followed = [(e, *self._follower.follow(since, e.hypothesis.directions, 1.0)) for e in alike]
-            suspects = tuple(Candidate(self._changes.index(e.hypothesis), total, b) for e, total, b in followed)
+        if best.hypothesis.kind.startswith("joint"):
+            kinds = self._kinds(alike)
+            followed = [(self._place(each), *self._follower.follow(since, each.directions, 1.0)) for each in kinds]
+            suspects = tuple(Candidate(*each) for each in followed)
         after = replace(
             state,
             belief=belief,
@@ -120,35 +125,50 @@ class Judge:
             return after, sentences.no_longer_fits(state, self._steps, text)
         return after, decision
 
+    def _place(self, hypothesis: Hypothesis) -> int:
+        return next(i for i, each in enumerate(self._changes) if each is hypothesis)
+
     def _named(self, state: State) -> tuple[State, Decision | None]:
-        """Which of several joints it was, once a record tells."""
+        """Which of several joints it was, and whether its servo is another one, once the records tell."""
         if not state.suspects or not state.recent:
             return state, None
-        record, followed = state.recent[-1], []
-        for each in state.suspects:
-            belief = self._follower.fade(each.belief, record)
-            gained, belief = self._follower.step(belief, record)
-            followed.append(Candidate(each.place, each.log_evidence + gained, belief))
-        followed.sort(key=lambda each: -each.log_evidence)
-        margin = followed[0].log_evidence - followed[1].log_evidence
-        if margin < math.log(self._settings.changes.naming_odds):
-            keep = state.sequence - state.suspected < _LONGEST_NAMING
-            return replace(state, suspects=tuple(followed) if keep else ()), None
-        best, others = followed[0], followed[1:]
+        followed = sorted((self._stepped(each, state.recent[-1]) for each in state.suspects), key=_evidence)
+        best, subject = followed[0], self._changes[followed[0].place].subject
+        others = [each for each in followed if self._changes[each.place].subject != subject]
+        odds = math.log(self._settings.changes.naming_odds)
+        if state.sequence - state.suspected > _LONGEST_NAMING:
+            return replace(state, suspects=(), before_change=None), None
+        if others:
+            margin = best.log_evidence - others[0].log_evidence
+            if margin < odds:
+                return replace(state, suspects=tuple(followed)), None
+            names = tuple(dict.fromkeys(self._changes[each.place].subject for each in others))
+            left = tuple(each for each in followed if each not in others)
+            after = self._taken(state, best, left if len(left) > 1 else ())
+            return after, self._told(state, best, names, margin)
+        margin = best.log_evidence - followed[1].log_evidence if len(followed) > 1 else math.inf
+        if margin < odds:
+            return replace(state, suspects=tuple(followed)), None
+        if self._changes[best.place].kind == "joint_slipped":
+            return replace(state, suspects=(), before_change=None), None
+        return self._taken(state, best, ()), self._told(state, best, (), margin)
+
+    def _stepped(self, each: Candidate, record: Recent) -> Candidate:
+        gained, belief = self._follower.step(self._follower.fade(each.belief, record), record)
+        return Candidate(each.place, each.log_evidence + gained, belief)
+
+    def _taken(self, state: State, best: Candidate, left: tuple[Candidate, ...]) -> State:
+        """The state with what a hypothesis believes."""
+        before = state.before_change if left else None
+        after = replace(state, belief=best.belief, anchor=best.belief, held=(), recent=(), wary=False)
+        return replace(after, suspects=left, before_change=before)
+
+    def _told(self, state: State, best: Candidate, others: tuple[str, ...], margin: float) -> Decision:
         hypothesis = self._changes[best.place]
         size = self._size(state.before_change or best.belief, best.belief, hypothesis)
-        after = replace(
-            state,
-            belief=best.belief,
-            anchor=best.belief,
-            held=(),
-            suspects=(),
-            recent=(),
-            wary=False,
-            before_change=None,
-        )
-        names = [self._changes[each.place].subject for each in others]
-        return after, sentences.named(state, self._steps, hypothesis, names, margin, size)
+        if others:
+            return sentences.named(state, self._steps, hypothesis, others, margin, size)
+        return sentences.replaced(state, self._steps, hypothesis, margin, size)
 
     def _drifted(self, state: State) -> tuple[State, Decision | None]:
         """Whether surprise as a whole is too large, though no record's is."""
@@ -172,7 +192,13 @@ class Judge:
         if rejected >= gate.window - 1 and len(state.recent) >= gate.window:
             text = f"{rejected} of the last {len(state.recent)} records do not fit"
             return sentences.no_longer_fits(state, self._steps, text)
-        return sentences.unexplained(state, rejected, found[0]) if rejected >= gate.rejected else None
+        if rejected < gate.rejected or self._by_chance(rejected) >= self._settings.changes.probability:
+            return None
+        return sentences.unexplained(state, rejected, found[0])
+
+    def _by_chance(self, rejected: int) -> float:
+        """How probable so many outliers among the last records are, or more."""
+        return many_outliers(rejected, self._settings.gate.window, self._settings.outliers.fraction)
 
     def _size(self, before: Belief, after: Belief, hypothesis: Hypothesis) -> tuple[float, float]:
         """How far a joint stepped (rad or m), and its standard deviation."""
@@ -183,6 +209,11 @@ class Judge:
         along = step / float(step @ step)
         covariance = after.gaussian.covariance[:n, :n]
         return float(along @ moved), math.sqrt(max(float(along @ covariance @ along), 0.0))
+
+
+def _evidence(candidate: Candidate) -> float:
+    """The likeliest first."""
+    return -candidate.log_evidence
 
 
 def _surprising(record: Recent) -> bool:

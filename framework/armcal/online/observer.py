@@ -199,12 +199,13 @@ class Seen:
             np.add.at(wanted, coordinate, size * beside[which])
         values = chart.moved(self.origin, wanted)
         inside = chart.inside(values)
-        outside = self.base[:n] if np.array_equal(inside, values) else self.base[:n] + chart.between(inside, values)
+        outside = self.base[:n] if (inside == values).all() else self.base[:n] + chart.between(inside, values)
         innovations, slopes, scattered = [], [], []
         for reading in self.readings:
             innovation, slope = observer.look(inside, reading)
             innovation = innovation - slope @ outside
-            scattered.append(slope[:, observer.noisy_drifts[1]] * observer.noisy_drifts[2])
+            if len(observer.noisy_drifts[1]):
+                scattered.append(slope[:, observer.noisy_drifts[1]] * observer.noisy_drifts[2])
             if len(beside):
                 shift = observer.shift(reading.factor).copy()
                 innovation = innovation - shift @ beside
@@ -212,11 +213,13 @@ class Seen:
                 slope = np.hstack([slope, shift])
             innovations.append(innovation)
             slopes.append(slope)
+        noise = self._noise_of(0) if len(innovations) == 1 else self._all_noise()
+        if scattered:
+            drifted = np.vstack(scattered)
+            noise = noise + drifted @ drifted.T
         if len(innovations) == 1:
-            noise = self._noise_of(0) + scattered[0] @ scattered[0].T
             return Linearised(innovations[0], slopes[0], noise)
-        drifted = np.vstack(scattered)
-        return Linearised(np.concatenate(innovations), np.vstack(slopes), self._all_noise() + drifted @ drifted.T)
+        return Linearised(np.concatenate(innovations), np.vstack(slopes), noise)
 
     def _noise_of(self, place: int) -> Array:
         own = self.readings[place].noise

@@ -25,7 +25,7 @@ from armcal.online.advance import Advance
 from armcal.online.clock import Tick, ticked
 from armcal.online.directions import Steps, find_steps, probing_poses
 from armcal.online.evaluator import identity
-from armcal.online.health import Health, surprise_limit
+from armcal.online.health import Health, many_outliers, surprise_limit
 from armcal.online.hypotheses import Follower, Recent, hypotheses
 from armcal.online.incoming import Incoming
 from armcal.online.judge import Judge
@@ -41,6 +41,8 @@ from armcal.plugins import PluginRegistry, discover
 from armcal.solve.online import Linearised, OnlineEstimator, surprise
 from armcal.use.calibration import Calibration
 
+_TOO_MANY = 1e-3
+"""More outliers than chance makes with this probability are a reason to watch."""
 _FARTHEST_TURN = 100.0
 """rad; no joint stands there."""
 
@@ -220,8 +222,11 @@ class Recalibrator:
         if decisions:
             return health
         if recent.rejected:
-            shown = f"{rejected} of the last {self._settings.gate.window} records do not fit."
-            return health.troubled("watch" if rejected >= 3 else "nominal", shown)
+            window = self._settings.gate.window
+            odd = many_outliers(rejected, window, self._settings.outliers.fraction) < _TOO_MANY
+            return health.troubled(
+                "watch" if odd else "nominal", f"{rejected} of the last {window} records do not fit."
+            )
         limit = self._settings.levels.tip_sd
         if limit is not None:
             foretold = first.slope @ recent.before.gaussian.covariance @ first.slope.T

@@ -72,6 +72,21 @@ def kept(folder: Path) -> Kept:
     return Kept(folder, first, entries, last.link.sequence, tuple(targets), last.cut, damage)
 
 
+def check_until(journal: Kept, until: int | None) -> None:
+    """Whether a journal holds the entry that a replay is to end with.
+
+    Raises:
+        InputError: it does not.
+    """
+    start = journal.first.checkpoint.sequence
+    if until is not None and not start <= until <= journal.last:
+        raise InputError(
+            f"found no entry {until}; the journal goes from {start} to {journal.last}.",
+            where=Location("--until"),
+            hint="Give the sequence number of an entry that is kept.",
+        )
+
+
 def replay(
     journal: Kept, session: Recalibrator, witness: Witness, until: int | None, progress: Progress, what: str = "replay"
 ) -> Replayed:
@@ -81,21 +96,13 @@ def replay(
         journal: see ``kept``.
         session: at its beginning.
         witness: compares.
-        until: the last entry; None for all.
+        until: the last entry, which the journal holds; None for all.
         progress: is told how far it is.
         what: the name for that.
 
     Raises:
-        InputError: the journal does not hold ``until``.
         DataError: the state it begins with is none of this session's.
     """
-    start = journal.first.checkpoint.sequence
-    if until is not None and not start <= until <= journal.last:
-        raise InputError(
-            f"found no entry {until}; the journal goes from {start} to {journal.last}.",
-            where=Location("--until"),
-            hint="Give the sequence number of an entry that is kept.",
-        )
     walk = Walk(session, journal.targets, witness, until)
     try:
         for segment in good_segments(journal.folder):

@@ -59,14 +59,23 @@ class Comparer:
 
     def checkpoint(self, checkpoint: Entry, session: Recalibrator) -> None:
         """As the protocol says. Where the journal's evaluator changes, the session goes on from its state."""
-        noted = checkpoint.content
+        noted, is_new, self._is_new = checkpoint.content, self._is_new, False
         self.states += 1
         if noted["digest"] == session.digest():
             self.equal += 1
             return
         written = State.of(noted["state"])
-        self._measure(checkpoint.sequence, session, written)
-        if self._is_new:
+        apart = distance(session.ground.chart, written, session.state)
+        self.measured += 1
+        self.widest = self.widest.widest(apart)
+        text = f"The state differs by {apart.values:.3g} sd ({apart.covariance:.3g} in its covariance)"
+        if self._is_ours and not is_new:
+            raise DiffersError(checkpoint.sequence, f"{text}, and the evaluator is the same.")
+        if not apart.is_small:
+            raise DiffersError(checkpoint.sequence, f"{text}; {BOUND:g} is what another evaluator explains.")
+        if _judged(written) != _judged(session.state):
+            raise DiffersError(checkpoint.sequence, f"Found {_judged(session.state)}; noted was {_judged(written)}.")
+        if is_new:
             session.restore(noted["state"])
 
     def digest(self, sequence: int, noted: str, session: Recalibrator) -> None:
@@ -74,7 +83,7 @@ class Comparer:
         found = session.digest()
         self.states += 1
         self.equal += found == noted
-        if self._is_ours and not self._is_new and found != noted:
+        if self._is_ours and found != noted:
             raise DiffersError(sequence, f"The state is {found}, {noted} was noted.")
 
     def told(self, sequence: int, noted: list[Event], found: list[Event]) -> None:
@@ -88,23 +97,6 @@ class Comparer:
         """As the protocol says. A full disk takes notes too, and where all bits are the same a state tells more."""
         if not self._is_ours:
             raise DiffersError(sequence, f"Found {_listed(found)}; noted was nothing.")
-
-    def _measure(self, sequence: int, session: Recalibrator, written: State) -> None:
-        found = session.state
-        apart = distance(session.ground.chart, written, found)
-        self.measured += 1
-        self.widest = self.widest.widest(apart)
-        if self._is_ours and not self._is_new:
-            text = f"The state differs by {apart.values:.3g} sd ({apart.covariance:.3g} in its covariance)"
-            raise DiffersError(sequence, f"{text}, and the evaluator is the same.")
-        if not apart.is_small:
-            text = f"The state differs by {apart.values:.3g} sd ({apart.covariance:.3g} in its covariance)"
-            raise DiffersError(sequence, f"{text}; {BOUND:g} is what another evaluator explains.")
-        if dict(found.counts) != dict(written.counts) or found.health.level != written.health.level:
-            raise DiffersError(
-                sequence,
-                f"Found {_judged(found)}; noted was {_judged(written)}.",
-            )
 
 
 def _named(events: Sequence[Event]) -> list[dict[str, Any]]:

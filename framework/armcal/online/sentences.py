@@ -95,6 +95,17 @@ def named(
     return Decision("joint_named", text, "watch", joint, (joint,), size[0], dimension, state.suspected)
 
 
+def replaced(state: State, steps: Steps, hypothesis: Hypothesis, margin: float, size: tuple[float, float]) -> Decision:
+    """A joint that stepped is another one."""
+    joint = hypothesis.subject
+    dimension = next(each.dimension for each in steps.joints if each.joint == joint)
+    text = (
+        f"Joint {joint}, {_shown(size, dimension)} off since record {state.suspected}, acts like a new servo: that "
+        f"makes the records since {margin:.1f} in log odds likelier than a slip alone. All that is its own was reopened."
+    )
+    return Decision("joint_replaced", text, "watch", joint, (joint,), size[0], dimension, state.suspected)
+
+
 def drift(state: State, count: int, ratio: float, factor: float) -> Decision:
     """Surprise as a whole is too large."""
     text = (

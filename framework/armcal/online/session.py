@@ -170,12 +170,11 @@ def _tell_start(
     journal: Journal, outputs: Outputs, session: Recalibrating, header: Mapping[str, Any], resumed: bool
 ) -> None:
     sequence = journal.record(STARTED, {"at": time.time(), "resumed": resumed, "evaluator": header["evaluator"]})
-    outputs.event({**session.started_event(resumed), "sequence": sequence, "resumed": resumed})
+    told = {**session.started_event(resumed), "sequence": sequence, "at": time.time(), "calibration": header["path"]}
+    outputs.event(told)
     cut = journal.recovered.cut
     if cut is not None:
-        outputs.alarm(
-            f"The journal's last entry was torn and was cut off; it had not been acknowledged ({cut.reason})."
-        )
+        outputs.alarm(cut.sentence)
     before = journal.recovered.header.get("evaluator", header["evaluator"])
     if before != header["evaluator"]:
         outputs.alarm("Another evaluator than before is used: a replay has to go over from one to the other here.")

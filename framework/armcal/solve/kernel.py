@@ -9,7 +9,7 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, Literal, Protocol
 
 import casadi as ca
@@ -146,9 +146,15 @@ class Compiled:
         self, values: Array, record: Array, state: Array, residual: Array, jacobian: Array, rest: float = NEAR_REST_RAD
     ) -> int:
         """As the protocol says."""
+        return self.prepared(values, record, state, residual, jacobian, rest)()
+
+    def prepared(
+        self, values: Array, record: Array, state: Array, residual: Array, jacobian: Array, rest: float = NEAR_REST_RAD
+    ) -> Callable[[], int]:
+        """``linearise`` again and again, of arrays that the caller keeps: their addresses are taken once."""
         pointers = [*_pointers(values, record, state), residual.ctypes.data, _stride(residual)]
         pointers += [jacobian.ctypes.data, _stride(jacobian)]
-        return int(self._linearise(record.shape[1], _stride(record), *pointers, rest, MOST_PASSES))
+        return partial(self._linearise, record.shape[1], _stride(record), *pointers, rest, MOST_PASSES)
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ is a function of values and record alone, to the last bit.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cached_property
 
 import casadi as ca
@@ -22,41 +23,46 @@ class OneRecord:
 
     def __init__(self, kernel: Kernel) -> None:
         factor = kernel.factor
-        self._kernel, self._compiled = kernel, isinstance(kernel.backend, Compiled)
+        self._kernel = kernel
         self._sizes = (factor.residual.numel(), factor.values.numel())
-        width = LANES if self._compiled else 1
+        width = LANES if isinstance(kernel.backend, Compiled) else 1
+        self._values = np.zeros(self._sizes[1])
         self._record = np.zeros((factor.record.numel(), width))
         self._state = np.zeros((factor.state.numel(), width))
         self._residual = np.zeros((self._sizes[0], width))
         self._jacobian = np.zeros((self._sizes[0] * self._sizes[1], width))
+        self._evaluate: Callable[[], int] = self._interpreted
+        if isinstance(kernel.backend, Compiled):
+            arrays = self._values, self._record, self._state, self._residual, self._jacobian
+            self._evaluate = kernel.backend.prepared(*arrays)
 
     def linearise(self, values: Array, record: Array) -> tuple[Array, Array]:
         """Residual (n_r) and its Jacobian by the kernel's values (n_r x n_v), in equilibrium.
 
         Args:
-            values: of the kernel (n_v), contiguous.
+            values: of the kernel (n_v).
             record: its channels (n_c).
 
         Raises:
             NotConvergedError: the record has no equilibrium.
         """
+        self._values[:] = values
         self._record[:] = record[:, None]
         self._state[:] = 0.0
-        if self._compiled:
-            self._kernel.linearise(values, self._record, self._state, self._residual, self._jacobian)
-        else:
-            self._interpreted(values)
-        return self._residual[:, 0].copy(), self._jacobian[:, 0].reshape(self._sizes).copy()
-
-    def _interpreted(self, values: Array) -> None:
-        record, state = self._record[:, 0], self._state[:, 0]
-        if len(state) and not self._settled(values, record, state):
+        if self._evaluate() or not np.abs(self._state).max(initial=0.0) <= MOST_DEFLECTION:
             # The rare way: Newton, arranged for many records.
             self._state[:] = 0.0
-            self._kernel.linearise(values, self._record, self._state, self._residual, self._jacobian)
-            return
-        _, residual, jacobian = self._linearise(values, record, state)
+            self._kernel.linearise(self._values, self._record, self._state, self._residual, self._jacobian)
+        return self._residual[:, 0].copy(), self._jacobian[:, 0].reshape(self._sizes).copy()
+
+    def _interpreted(self) -> int:
+        """As a compiled function does it: how many records did not settle."""
+        record, state = self._record[:, 0], self._state[:, 0]
+        if len(state) and not self._settled(self._values, record, state):
+            return 1
+        _, residual, jacobian = self._linearise(self._values, record, state)
         self._residual[:, 0], self._jacobian[:, 0] = residual, jacobian
+        return 0
 
     def _settled(self, values: Array, record: Array, state: Array) -> bool:
         for _ in range(MOST_PASSES):
@@ -64,7 +70,7 @@ class OneRecord:
             moved = np.abs(following - state).max()
             state[:] = following
             if moved <= NEAR_REST_RAD:
-                return bool(np.abs(state).max() <= MOST_DEFLECTION)
+                return True
         return False
 
     @cached_property

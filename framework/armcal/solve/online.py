@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
+from scipy.linalg.lapack import dposv
 
 from armcal.base.domains import Array
 from armcal.errors import ProblemError
@@ -86,7 +87,13 @@ class OnlineEstimator(Protocol):
 
 def surprise(innovation: Array, covariance: Array) -> float:
     """The squared Mahalanobis distance, NIS: chi-square with as many degrees of freedom as numbers."""
-    return float(innovation @ np.linalg.solve(covariance, innovation))
+    return float(innovation @ weighed(covariance, innovation))
+
+
+def weighed(covariance: Array, right: Array) -> Array:
+    """``covariance^-1 right`` for a small positive definite matrix (m x m) and a vector (m), with little around it."""
+    _, found, fault = dposv(covariance, right)
+    return np.asarray(np.linalg.solve(covariance, right) if fault else found, dtype=np.float64)
 
 
 def log_likelihood(innovation: Array, covariance: Array) -> float:
@@ -111,8 +118,9 @@ def checked(belief: Gaussian) -> Gaussian:
     Raises:
         ProblemError: a variance is not positive, or a number is not finite.
     """
-    covariance = 0.5 * (belief.covariance + belief.covariance.T)
-    lowest = float(np.min(np.diag(covariance), initial=np.inf))
+    covariance = belief.covariance + belief.covariance.T
+    covariance *= 0.5
+    lowest = float(covariance.diagonal().min(initial=np.inf))
     if not (lowest >= 0 and np.isfinite(covariance).all() and np.isfinite(belief.mean).all()):
         raise ProblemError(
             f"a variance of the belief is {lowest:.3g}: its numbers are no longer sound.",

@@ -13,6 +13,7 @@ from armcal.testing.estimator_checks import check_estimator
 from armcal.testing.exporter_checks import check_exporter
 from armcal.testing.measurement_checks import check_measurement
 from armcal.testing.model_checks import check_model
+from armcal.testing.online_checks import check_online
 from armcal.testing.results import CheckResult, ContractError, Recorder, expect
 from armcal.testing.settings_checks import Subject, check_settings
 from armcal.testing.source_checks import check_reader, check_simulator
@@ -30,6 +31,7 @@ _CHECKS: Mapping[str, Callable[[Recorder, Subject], None]] = MappingProxyType(
         "measurement": check_measurement,
         "reader": check_reader,
         "estimator": check_estimator,
+        "online": check_online,
         "simulator": check_simulator,
         "exporter": check_exporter,
     }

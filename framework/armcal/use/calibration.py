@@ -295,7 +295,7 @@ def dump(content: Mapping[str, Any]) -> str:
     return yaml.dump(plain(dict(content)), Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=110)
 
 
-class _Dumper(yaml.SafeDumper):
+class _Dumper(getattr(yaml, "CSafeDumper", yaml.SafeDumper)):  # type: ignore[misc]
     """Puts text of several lines in double quotes, the only style that keeps every kind of line end."""
 
 

@@ -1,0 +1,152 @@
+"""Checks on online estimators: a small linear problem whose answer is a sum of information."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from armcal.base.domains import Array
+from armcal.errors import ProblemError
+from armcal.solve.online import Gaussian, Linearised, OnlineEstimator, Update
+from armcal.testing.results import ContractError, Recorder, expect
+from armcal.testing.settings_checks import Subject
+
+RECORDS, STATES, ROWS = 12, 4, 2
+TOLERANCE = 1e-7
+"""Of a number in its standard deviation."""
+
+
+@dataclass(frozen=True)
+class _Line:
+    """A record whose prediction is linear in the state, so that it looks alike from anywhere."""
+
+    measured: Array
+    slope: Array
+    noise: Array
+
+    def at(self, place: Array) -> Linearised:
+        """As the protocol of observations says."""
+        return Linearised(self.measured - self.slope @ place, self.slope, self.noise)
+
+
+def check_online(record: Recorder, subject: Subject) -> None:
+    """The information of prior and records, once each; nothing that it was given is changed, nothing is kept."""
+    estimator: Any = record.check("it builds", lambda: subject.made(subject.settings))
+    if estimator is None:
+        return
+    window = record.check("it says how many records it wants to see again", lambda: _window(estimator))
+    if window is None:
+        return
+    prior, lines = _case()
+    updates = record.check("it takes a record", lambda: _taken(estimator, window, prior, lines))
+    if updates is None:
+        return
+    record.check("its covariance is exactly symmetric and positive", lambda: _sound(updates))
+    record.check("it finds what prior and records say together", lambda: _near(updates, prior, lines))
+    record.check("it tells the surprise of the last record", lambda: _surprise(updates[0], prior, lines[0]))
+    record.check("it changes nothing that it is given", lambda: _untouched(estimator, prior, lines))
+    record.check("it keeps nothing from one update to the next", lambda: _repeats(estimator, window, updates))
+    record.check("a variance below zero is an error", lambda: _refuses(estimator, prior, lines))
+
+
+def _case() -> tuple[Gaussian, tuple[_Line, ...]]:
+    random = np.random.default_rng(3)
+    root = random.normal(size=(STATES, STATES))
+    prior = Gaussian(random.normal(size=STATES), root @ root.T + np.eye(STATES))
+    noise = np.array([[0.2, 0.05], [0.05, 0.1]])
+    truth = prior.mean + root @ random.normal(size=STATES)
+    slopes = random.normal(size=(RECORDS, ROWS, STATES))
+    return prior, tuple(_Line(s @ truth + 0.3 * random.normal(size=ROWS), s, noise) for s in slopes)
+
+
+def _window(estimator: OnlineEstimator) -> int:
+    window = estimator.window
+    expect(isinstance(window, int) and window >= 1, f"found window = {window!r}, expected a number of records from 1")
+    return window
+
+
+def _taken(estimator: OnlineEstimator, window: int, prior: Gaussian, lines: Sequence[_Line]) -> list[Update]:
+    """Each record in turn: a filter goes on from its posterior, a window from the prior of its first record."""
+    updates, known, belief = [], prior, prior
+    held: list[_Line] = []
+    for line in lines:
+        held.append(line)
+        update = estimator.update(belief if window == 1 else known, held if window > 1 else [line])
+        belief = update.posterior
+        shapes = belief.mean.shape, belief.covariance.shape, update.innovation.shape, update.covariance.shape
+        wanted = (STATES,), (STATES, STATES), (ROWS,), (ROWS, ROWS)
+        expect(shapes == wanted, f"found arrays of the shapes {shapes}, expected {wanted}")
+        updates.append(update)
+        if len(held) == window > 1:
+            known = _known(known, held[:1])
+            held = held[1:]
+    return updates
+
+
+def _known(prior: Gaussian, lines: Sequence[_Line]) -> Gaussian:
+    """By information: what prior and records say."""
+    information = np.linalg.inv(prior.covariance)
+    told = information @ prior.mean
+    for line in lines:
+        weighted = line.slope.T @ np.linalg.inv(line.noise)
+        information, told = information + weighted @ line.slope, told + weighted @ line.measured
+    covariance = np.linalg.inv(information)
+    return Gaussian(covariance @ told, covariance)
+
+
+def _sound(updates: Sequence[Update]) -> None:
+    for place, update in enumerate(updates):
+        covariance = update.posterior.covariance
+        expect(bool((covariance == covariance.T).all()), f"found a covariance that is not symmetric after {place + 1}")
+        lowest = float(np.linalg.eigvalsh(covariance)[0])
+        expect(lowest > 0, f"found the eigenvalue {lowest:.2g} after record {place + 1}, expected all above zero")
+
+
+def _near(updates: Sequence[Update], prior: Gaussian, lines: Sequence[_Line]) -> None:
+    for place, update in enumerate(updates):
+        known = _known(prior, lines[: place + 1])
+        deviations = np.sqrt(np.diag(known.covariance))
+        off = float(np.abs((update.posterior.mean - known.mean) / deviations).max())
+        expect(off < TOLERANCE, f"found a mean {off:.1e} standard deviations off after record {place + 1}")
+        wide = float(np.abs((update.posterior.covariance - known.covariance) / np.outer(deviations, deviations)).max())
+        expect(wide < TOLERANCE, f"found a covariance {wide:.1e} off after record {place + 1}, in units of variances")
+
+
+def _surprise(update: Update, prior: Gaussian, first: _Line) -> None:
+    """Of the first record, where what was believed before it is the prior whatever the window."""
+    innovation = first.measured - first.slope @ prior.mean
+    covariance = first.slope @ prior.covariance @ first.slope.T + first.noise
+    off = max(float(np.abs(update.innovation - innovation).max()), float(np.abs(update.covariance - covariance).max()))
+    expect(off < TOLERANCE, f"found an innovation or its covariance {off:.1e} off for the first record")
+
+
+def _untouched(estimator: OnlineEstimator, prior: Gaussian, lines: Sequence[_Line]) -> None:
+    mean, covariance = prior.mean.copy(), prior.covariance.copy()
+    estimator.update(prior, lines[:1])
+    kept = bool(np.array_equal(mean, prior.mean) and np.array_equal(covariance, prior.covariance))
+    expect(kept, "it changed the prior that it was given")
+
+
+def _repeats(estimator: OnlineEstimator, window: int, updates: Sequence[Update]) -> None:
+    again = _taken(estimator, window, *_case())
+    same = all(
+        np.array_equal(a.posterior.mean, b.posterior.mean)
+        and np.array_equal(a.posterior.covariance, b.posterior.covariance)
+        for a, b in zip(updates, again, strict=True)
+    )
+    expect(same, "the same records gave other beliefs the second time")
+
+
+def _refuses(estimator: OnlineEstimator, prior: Gaussian, lines: Sequence[_Line]) -> None:
+    """A direction that no record sees keeps the variance that it had."""
+    covariance = np.diag([1.0, 1.0, 1.0, -0.5])
+    blind = [_Line(line.measured, line.slope * [1, 1, 1, 0], line.noise) for line in lines[:1]]
+    try:
+        with np.errstate(invalid="ignore"):
+            estimator.update(Gaussian(prior.mean, covariance), blind)
+    except (ProblemError, np.linalg.LinAlgError):
+        return
+    raise ContractError("found a belief made of a variance of -0.5, expected armcal.errors.ProblemError")

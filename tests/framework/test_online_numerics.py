@@ -1,0 +1,382 @@
+"""Whether a recalibration's numbers stay sound: over many updates, odd records, restarts, and against a batch."""
+
+from __future__ import annotations
+
+import json
+import math
+import tracemalloc
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from armcal.base.parameters import Parameters
+from armcal.online.belief import Belief
+from armcal.online.chart import Chart
+from armcal.online.incoming import Incoming
+from armcal.online.observer import Observer
+from armcal.online.recalibrator import Recalibrator
+from armcal.online.settings import DAY
+from armcal.online.start import Footing
+from armcal.solve.online import Gaussian
+from armcal_kalman.extended import ExtendedFilter, ExtendedSettings
+from online_arm import (
+    AXES,
+    JOINTS,
+    STATES,
+    Filtered,
+    World,
+    begun,
+    ground_of,
+    random_poses,
+    settings,
+    told,
+)
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+POSE = np.array([0.4, 0.3, -0.5, 0.7, -0.6, 0.4])
+
+
+def extended(ground: Footing) -> Filtered:
+    return Filtered.fresh(ExtendedFilter(ExtendedSettings()), ground)
+
+
+def still(seed: int, count: int, **given) -> tuple[World, list[dict[str, float]]]:
+    """Records of an arm that does not change."""
+    arm = World.drawn(seed, wanders=False, **given)
+    records = []
+    for _ in range(count):
+        arm.step()
+        records.append(arm.measured())
+    return arm, records
+
+
+@pytest.mark.parametrize(
+    ("updates", "walk"),
+    [
+        (6_000, 1.0),
+        pytest.param(1_000_000, 1.0, marks=pytest.mark.slow),
+        pytest.param(1_000_000, 0.0, marks=pytest.mark.slow),
+    ],
+)
+def test_the_covariance_stays_sound_over_many_updates(updates: int, walk: float) -> None:
+    _, records = still(3, 400)
+    one, lowest = extended(ground_of(walk=walk)), math.inf
+    for k in range(updates):
+        one.take(records[k % len(records)])
+        covariance = one.belief.gaussian.covariance
+        assert (covariance == covariance.T).all()
+        if k % max(1, updates // 200) == 0:
+            lowest = min(lowest, float(np.linalg.eigvalsh(covariance)[0]))
+    lowest = min(lowest, float(np.linalg.eigvalsh(one.belief.gaussian.covariance)[0]))
+    print(f"\n{updates} updates, walk {walk:g}: smallest eigenvalue {lowest:.2e}")
+    assert lowest > 1e-12
+
+
+def test_a_repeated_pose_tells_nothing_of_what_it_does_not_determine() -> None:
+    arm = World.drawn(5, wanders=False)
+    one = extended(ground_of(walk=0.0))
+    root = np.linalg.cholesky(one.belief.gaussian.covariance)
+    for _ in range(100):
+        arm.step()
+        one.take(arm.measured(POSE))
+    inverse = np.linalg.inv(root)
+    left = np.linalg.eigvalsh(inverse @ one.belief.gaussian.covariance @ inverse.T)
+    print(
+        f"\n100 times one pose: variance left of its three directions {left[:3]}, of the others at least {left[3]:.5f}"
+    )
+    assert (left[:3] < 0.2).all()
+    assert left[3] > 0.99
+    assert left[-1] <= 1 + 1e-9
+
+
+def belief_of(recalibrator: Recalibrator) -> bytes:
+    belief = recalibrator.state.belief
+    return b"".join(a.tobytes() for a in (belief.origin, belief.gaussian.mean, belief.gaussian.covariance))
+
+
+def record(arm: World, sequence: int, **changed: float) -> Incoming:
+    channels = {**arm.measured(POSE), **{name.replace("_", "."): value for name, value in changed.items()}}
+    return Incoming(f"odd{sequence}", channels, {}, arm.now, "list", sequence)
+
+
+@pytest.fixture(scope="module")
+def warm() -> tuple[Recalibrator, dict, World]:
+    recalibrator, arm = begun(settings(clock={"longest_age": "2 h"})), World.drawn(11)
+    for sequence in range(1, 31):
+        recalibrator.take(arm.record(), sequence)
+    return recalibrator, recalibrator.snapshot(), arm
+
+
+ODD = {
+    "an hour back": lambda arm: {"time": arm.now - 3600},
+    "a second back": lambda arm: {"time": arm.now - 1},
+    "a joint not a number": lambda arm: {"arm_q3": math.nan},
+    "a joint infinite": lambda arm: {"arm_q3": math.inf},
+    "a joint where none stands": lambda arm: {"arm_q3": 1e4},
+    "a position not a number": lambda arm: {"tracker_y": math.nan},
+    "a position infinite": lambda arm: {"tracker_y": -math.inf},
+}
+
+
+@pytest.mark.parametrize("what", ODD)
+def test_an_odd_record_leaves_the_belief_as_it_was(what: str, warm) -> None:
+    recalibrator, snapshot, arm = warm
+    recalibrator.restore(snapshot)
+    before = belief_of(recalibrator)
+    (event,) = recalibrator.take(record(arm, 31, **ODD[what](arm)), 31)
+    assert event["verdict"] == "ignored" and event["why"]
+    assert belief_of(recalibrator) == before
+    assert recalibrator.state.counts["ignored"] == 1
+
+
+def test_a_stale_record_leaves_the_belief_as_it_was(warm) -> None:
+    recalibrator, snapshot, arm = warm
+    recalibrator.restore(snapshot)
+    before = belief_of(recalibrator)
+    late = replace(record(arm, 31, time=arm.now + 60), arrived=arm.now + 60 + 3 * 3600)
+    (event,) = recalibrator.take(late, 31)
+    assert event["verdict"] == "ignored" and belief_of(recalibrator) == before
+
+
+def test_a_position_far_beyond_any_reach_is_rejected_without_a_trace(warm) -> None:
+    recalibrator, snapshot, arm = warm
+    recalibrator.restore(snapshot)
+    before = recalibrator.state.belief
+    first = recalibrator.take(record(arm, 31, tracker_y=1e9, time=arm.now), 31)[0]
+    assert first["verdict"] == "rejected"
+    after = recalibrator.state.belief
+    assert (after.gaussian.mean == before.gaussian.mean).all() and (after.origin == before.origin).all()
+
+
+@pytest.mark.parametrize("ahead", [365.25 * DAY, 50 * 365.25 * DAY])
+def test_a_clock_that_jumps_ahead_counts_as_its_longest_step(ahead: float, warm) -> None:
+    recalibrator, snapshot, arm = warm
+    read, beliefs = record(arm, 31), []
+    for step in (DAY, ahead):
+        recalibrator.restore(snapshot)
+        jumped = replace(read, channels={**read.channels, "time": arm.now + step}, arrived=arm.now + step)
+        events = recalibrator.take(jumped, 31)
+        assert told(events, "record")[0]["verdict"] == "accepted"
+        beliefs.append(belief_of(recalibrator))
+    assert beliefs[0] == beliefs[1]
+
+
+def test_a_time_that_is_no_number_counts_as_none(warm) -> None:
+    recalibrator, snapshot, arm = warm
+    recalibrator.restore(snapshot)
+    (event, *_) = recalibrator.take(record(arm, 31, time=math.nan), 31)
+    assert event["verdict"] == "accepted"
+    assert recalibrator.state.clock.now == arm.now
+    assert np.isfinite(recalibrator.state.belief.gaussian.covariance).all()
+
+
+def _steadily(recalibrator: Recalibrator, fresh: dict, count: int) -> tuple[str, list[int]]:
+    """The digest after so many records with outliers, 15 s apart, and memory in use at tenths of them."""
+    recalibrator.restore(fresh)
+    arm, used = World.drawn(21, outliers=0.02), []
+    for sequence in range(1, count + 1):
+        recalibrator.take(arm.record(seconds=15.0), sequence)
+        if sequence % (count // 10) == 0 and tracemalloc.is_tracing():
+            used.append(tracemalloc.get_traced_memory()[0])
+    return recalibrator.digest(), used
+
+
+@pytest.mark.parametrize("count", [400, pytest.param(7 * 24 * 240, marks=pytest.mark.slow)])
+def test_seven_days_need_no_more_memory_and_come_out_the_same_twice(count: int) -> None:
+    recalibrator = begun()
+    fresh = recalibrator.snapshot()
+    tracemalloc.start()
+    try:
+        digest, used = _steadily(recalibrator, fresh, count)
+    finally:
+        tracemalloc.stop()
+    print(f"\n{count} records: memory {[round(u / 1024) for u in used]} KiB at tenths of them")
+    assert used[-1] <= 1.05 * used[1]
+    assert _steadily(recalibrator, fresh, count)[0] == digest
+
+
+RUNS = {"extended": {"type": "extended"}, "window": {"type": "window", "records": 6}}
+
+
+@pytest.mark.parametrize("estimator", RUNS)
+def test_a_restored_state_goes_on_as_if_nothing_had_been(estimator: str) -> None:
+    """At every record of a run in which a joint slips: a snapshot as a journal keeps it, taken up by another."""
+    given = settings(estimator=RUNS[estimator])
+    one, other, arm = begun(given), begun(given), World.drawn(31, outliers=0.05)
+    records, snapshots, digests, decided = [], [], [], 0
+    for sequence in range(1, 41):
+        if sequence == 22:
+            arm.moved("arm.mdh.theta2", math.radians(8))
+        snapshots.append(json.dumps(one.snapshot()))
+        records.append(arm.record())
+        decided += len(told(one.take(records[-1], sequence), "decision"))
+        digests.append(one.digest())
+    assert decided
+    for k, kept in enumerate(snapshots):
+        other.restore(json.loads(kept))
+        far = len(records) if k in (21, 22, 24) else min(k + 3, len(records))
+        for i in range(k, far):
+            other.take(Incoming.from_dict(json.loads(json.dumps(records[i].as_dict()))), i + 1)
+            assert other.digest() == digests[i], (k, i)
+
+
+def test_both_evaluators_agree() -> None:
+    one, other = ground_of(), ground_of(evaluator="interpreted")
+    if one.problem.backend != "compiled":
+        pytest.skip("no compiler here: there is one evaluator")
+    random, worst = np.random.default_rng(1), 0.0
+    for _ in range(60):
+        spread = np.sqrt(np.diag(one.belief.gaussian.covariance)) * random.normal(size=STATES)
+        values = one.chart.inside(one.chart.moved(one.belief.origin, 3 * spread))
+        angles = dict(zip(JOINTS, random_poses(random, 1)[0].tolist(), strict=True))
+        (reading,) = one.observer.readings(angles | dict.fromkeys(AXES, 0.0), {})
+        for a, b in zip(one.observer.look(values, reading), other.observer.look(values, reading), strict=True):
+            worst = max(worst, float(np.abs(a - b).max() / np.abs(a).max()))
+    filters = extended(one), extended(other)
+    arm = World.drawn(2)
+    for _ in range(300):
+        arm.step()
+        channels = arm.measured()
+        for each in filters:
+            each.take(channels)
+    sd = np.sqrt(np.diag(filters[0].belief.gaussian.covariance))
+    off = one.chart.between(filters[0].belief.values(one.chart), filters[1].belief.values(one.chart))
+    apart = float(np.abs(off / sd).max())
+    print(f"\ncompiled against interpreted: {worst:.1e} relative; after 300 updates {apart:.1e} standard deviations")
+    assert worst < 1e-12
+    assert apart < 1e-8
+
+
+def ended(ground: Footing, records: Sequence[dict[str, float]]) -> tuple[np.ndarray, np.ndarray]:
+    """Mean (about the calibration) and covariance after records, with no process noise."""
+    one = extended(ground)
+    for channels in records:
+        one.take(channels)
+    return ground.chart.between(ground.belief.origin, one.belief.values(ground.chart)), one.belief.gaussian.covariance
+
+
+def test_the_order_of_records_does_not_matter_where_nothing_wanders() -> None:
+    _, records = still(8, 80)
+    mean, covariance = ended(ground_of(walk=0.0), records)
+    for order in (records[::-1], [records[i] for i in np.random.default_rng(0).permutation(len(records))]):
+        other, others = ended(ground_of(walk=0.0), order)
+        off = np.abs(other - mean) / np.sqrt(np.diag(covariance))
+        print(f"\nanother order: {off.max():.3f} standard deviations")
+        assert off.max() < 0.1
+        assert np.sqrt(np.diag(others)) == pytest.approx(np.sqrt(np.diag(covariance)), rel=0.05)
+
+
+def test_the_unit_of_length_does_not_matter() -> None:
+    """Lengths counted in another unit are coordinates scaled otherwise."""
+    ground = ground_of()
+    blocks = [replace(b, scale=b.scale * (1000.0 if b.unit == "m" else 0.1)) for b in ground.chart.parameters.blocks]
+    chart = Chart(Parameters(tuple(blocks)).with_free([b.name for b in ground.chart.parameters.free]))
+    ratio = ground.chart.scales / chart.scales
+    old = ground.observer
+    scaled = replace(
+        ground,
+        chart=chart,
+        observer=Observer(
+            ground.problem, chart, old.companions, type(old.companions)(), ground.noise, {**old._defaults}
+        ),
+        belief=Belief(
+            ground.belief.origin,
+            Gaussian(ground.belief.gaussian.mean * ratio, ground.belief.gaussian.covariance * np.outer(ratio, ratio)),
+        ),
+        fading=replace(ground.fading, rates=ground.fading.rates * ratio**2),
+    )
+    one, other, arm = extended(ground), extended(scaled), World.drawn(4)
+    for _ in range(100):
+        arm.step()
+        channels = arm.measured()
+        one.take(channels), other.take(channels)
+    sd = np.sqrt(np.diag(one.belief.gaussian.covariance))
+    off = ground.chart.between(one.belief.values(ground.chart), other.belief.values(chart)) / sd
+    assert np.abs(off).max() < 1e-6
+    assert np.sqrt(np.diag(other.belief.gaussian.covariance)) / ratio == pytest.approx(sd, rel=1e-6)
+
+
+def test_where_the_instrument_stands_does_not_matter() -> None:
+    """The same arm measured in a frame that is shifted and turned about the upright."""
+    moved = begun(settings(), placement=("position_mm=[700, -250, 120]", "rpy_deg=[0, 0, 130]"))
+    plain, arm = begun(), World.drawn(6)
+    turn = Rotation.from_euler("z", 130, degrees=True).as_matrix()
+    for sequence in range(1, 81):
+        taken = arm.record()
+        plain.take(taken, sequence)
+        read = turn @ [taken.channels[a] for a in AXES] + [0.7, -0.25, 0.12]
+        channels = {**taken.channels, **dict(zip(AXES, read.tolist(), strict=True))}
+        moved.take(replace(taken, channels=channels), sequence)
+    sd = np.sqrt(np.diag(plain.state.belief.gaussian.covariance))
+    chart = plain.ground.chart
+    one, other = (r.state.belief.values(r.ground.chart)[r.ground.chart.entries] for r in (plain, moved))
+    assert plain.state.counts == moved.state.counts
+    assert np.abs((one - other) / chart.scales / sd).max() < 1e-6
+
+
+SMALL = 0.004
+"""rad/Nm; half a standard deviation of what is known of a compliance."""
+
+
+def batch(ground: Footing, records: Sequence[dict[str, float]]) -> np.ndarray:
+    """The values that all records and the prior make likeliest within the bounds, by scipy."""
+    prior = np.linalg.cholesky(np.linalg.inv(ground.belief.gaussian.covariance)).T
+    chart, origin, mean = ground.chart, ground.belief.origin, ground.belief.gaussian.mean
+    readings = [ground.observer.readings(each, {})[0] for each in records]
+    weight = np.linalg.inv(np.linalg.cholesky(readings[0].noise))
+
+    def residual(place: np.ndarray) -> np.ndarray:
+        values = chart.moved(origin, place)
+        return np.concatenate(
+            [prior @ (place - mean), *(weight @ ground.observer.look(values, r)[0] for r in readings)]
+        )
+
+    def jacobian(place: np.ndarray) -> np.ndarray:
+        values = chart.moved(origin, place)
+        return np.vstack([prior, *(-weight @ ground.observer.look(values, r)[1] for r in readings)])
+
+    lower, upper = np.full(STATES, -np.inf), np.full(STATES, np.inf)
+    at, coordinates, low, high = chart.bounds
+    lower[coordinates] = (low - origin[at]) / chart.scales[coordinates]
+    upper[coordinates] = (high - origin[at]) / chart.scales[coordinates]
+    start = np.clip(np.zeros(STATES), lower + 1e-6, upper - 1e-6)
+    found = least_squares(residual, start, jacobian, bounds=(lower, upper), xtol=1e-14, ftol=1e-14, gtol=1e-10)
+    return chart.moved(origin, found.x)
+
+
+def stiff(ground: Footing, seed: int) -> World:
+    """An arm that does not bend, whose other parameters are as likely as that leaves them."""
+    arm, chart, belief = World.drawn(seed, ground, wanders=False), ground.chart, ground.belief
+    springs = [chart.names.index(f"arm.spring.k{i}") for i in range(7)]
+    place = np.linalg.cholesky(belief.gaussian.covariance) @ np.random.default_rng(seed).normal(size=STATES)
+    wanted = -SMALL / chart.scales[springs]
+    own = belief.gaussian.covariance[np.ix_(springs, springs)]
+    place += belief.gaussian.covariance[:, springs] @ np.linalg.solve(own, wanted - place[springs])
+    arm.values = chart.inside(chart.moved(belief.origin, place))
+    return arm
+
+
+@pytest.mark.parametrize("bounded", [False, True])
+def test_the_filter_ends_where_a_batch_of_all_records_does(bounded: bool) -> None:
+    compliance = {"compliance": SMALL} if bounded else {}
+    one = begun(settings(process_noise={}, gating="off"), **compliance)
+    arm = stiff(one.ground, 11) if bounded else World.drawn(9, one.ground, wanders=False)
+    springs, records = [one.ground.chart.parameters.entries_of(f"arm.spring.k{i}").start for i in range(7)], []
+    for sequence in range(1, 121):
+        taken = arm.record()
+        records.append(taken.channels)
+        one.take(taken, sequence)
+        assert (one.values[springs] >= 0).all()
+    chart, covariance = one.ground.chart, one.state.belief.gaussian.covariance
+    off = chart.between(batch(one.ground, records), one.values) / np.sqrt(np.diag(covariance))
+    held = int(np.sum(chart.inside(one.state.belief.values(chart)) != one.state.belief.values(chart)))
+    print(f"\n120 records, {held} compliances beyond their bounds: {np.abs(off).max():.3f} sd from the batch at most")
+    assert bool(held) == bounded
+    assert np.abs(off).max() < 0.1
+    # The covariance is that of the belief without bounds: the information of prior and records.
+    slopes = [one.ground.observer.look(one.values, one.ground.observer.readings(each, {})[0])[1] for each in records]
+    whole = np.linalg.inv(one.ground.belief.gaussian.covariance) + sum(s.T @ s for s in slopes) / 0.0003**2
+    expected = np.sqrt(np.diag(np.linalg.inv(whole)))
+    assert np.sqrt(np.diag(covariance)) == pytest.approx(expected, rel=0.05)
