@@ -75,19 +75,17 @@ def find_steps(observer: Observer, values: Array, predicted: Mapping[str, Array]
     records = problem.records(complete)
     slopes = -np.concatenate([_rows(jacobian) for jacobian in problem.jacobians(values, records)])
     slopes = chart.by_coordinates(values, slopes)
+    arms = problem.blueprint.arms.values()
+    commanded = {f"{arm.name}.{joint}": dimension for arm in arms for joint, dimension in arm.commanded.items()}
+    motions = -_whitened(problem, values, records, list(commanded))
     joints, unfollowed = [], []
-    for arm in problem.blueprint.arms.values():
-        for joint, dimension in arm.commanded.items():
-            channel = f"{arm.name}.{joint}"
-            moved = -_whitened(problem, values, records, [channel])[:, 0]
-            if float(moved @ moved) < _CUT * len(moved):
-                unfollowed.append(channel)
-                continue
-            step = _joint_step(channel, dimension, moved, slopes, chart.names)
-            if step is None:
-                unfollowed.append(channel)
-            else:
-                joints.append(step)
+    for (channel, dimension), moved in zip(commanded.items(), motions.T, strict=True):
+        seen = float(moved @ moved) >= _CUT * len(moved)
+        step = _joint_step(channel, dimension, moved, slopes, chart.names) if seen else None
+        if step is None:
+            unfollowed.append(channel)
+        else:
+            joints.append(step)
     sensors = {
         kernel.factor.name: found
         for kernel in problem.kernels

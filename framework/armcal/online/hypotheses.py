@@ -23,12 +23,17 @@ from armcal.online.settings import ChangeSettings, OutlierSettings
 from armcal.online.window_evidence import RecordsSince
 from armcal.solve.online import OnlineEstimator, log_likelihood
 
+_SCALES = (1.0, 0.1)
+"""A change is of the stated size, or small: to a prior wide enough for a slipped tooth a small step is unlikely."""
 Kind = Literal["none", "joint_slipped", "joint_replaced", "sensor_moved", "general_change"]
 
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """A change: what it is, whom it concerns, what it reopens (N x k; a column a standard deviation), how likely."""
+    """A change: what it is, whom it concerns, what it reopens (N x k; a column a standard deviation), how likely.
+
+    ``scale`` is 1 for one of the stated size, less for a small one; ``step`` (n) is a step of 1 rad or m.
+    """
 
     kind: Kind
     subject: str
@@ -36,6 +41,7 @@ class Hypothesis:
     factor: float
     log_prior: float
     step: Array
+    scale: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -91,20 +97,22 @@ class Candidate:
 
 def hypotheses(chart: Chart, steps: Steps, settings: ChangeSettings, size: int) -> tuple[Hypothesis, ...]:
     """All changes that are looked for; ``size`` is that of beliefs."""
-    n, found = len(chart.scales), []
+    n = len(chart.scales)
+    found: list[tuple[Kind, str, Array, Array, float]] = []
     for each in steps.joints:
         deviation = settings.joint if each.dimension == "angle" else settings.slide
         offset = _columns([each.direction * deviation], size)
-        found.append(("joint_slipped", each.joint, offset, each.direction))
+        found += [("joint_slipped", each.joint, offset * scale, each.direction, scale) for scale in _SCALES]
         if each.local:
             units = [np.eye(n)[i] for i in each.local]
-            found.append(("joint_replaced", each.joint, np.hstack([offset, _columns(units, size)]), each.direction))
+            both = np.hstack([offset, _columns(units, size)])
+            found.append(("joint_replaced", each.joint, both, each.direction, 1.0))
     for name, (columns, which) in steps.sensors.items():
         deviations = [settings.sensor_turn if axis.startswith("r") else settings.sensor_shift for axis in which]
         moved = _columns([c * d for c, d in zip(columns.T, deviations, strict=True)], size)
-        found.append(("sensor_moved", name, moved, columns[:, 0]))
-    share = np.log(settings.probability / max(len(found), 1))
-    listed = [Hypothesis(kind, who, d, 1.0, share, step) for kind, who, d, step in found]  # type: ignore[arg-type]
+        found += [("sensor_moved", name, moved * scale, columns[:, 0], scale) for scale in _SCALES]
+    share = float(np.log(settings.probability / max(len(found), 1)))
+    listed = [Hypothesis(kind, who, d, 1.0, share, step, scale) for kind, who, d, step, scale in found]
     rare = float(np.log(settings.probability / 10))
     listed.append(Hypothesis("general_change", "", np.zeros((size, 0)), settings.factor, rare, np.zeros(n)))
     return tuple(listed)

@@ -21,6 +21,8 @@ from armcal.online.state import State
 
 _SURPRISING = 0.01
 """A record as surprising as this is one in a hundred: two of them near each other are looked into."""
+_MOST_ONSETS = 5
+"""So many of the last surprising records are tried as the first after a change."""
 _MOST_WIDENING = 3.0
 _UNEXPLAINED = 3
 """So many changes that nothing explains, or windows of too large surprise: the model no longer fits."""
@@ -55,7 +57,7 @@ class Judge:
         odd = [i for i, each in enumerate(state.recent) if _surprising(each)]
         if len(odd) < 2 or not (state.wary or odd[-1] == len(state.recent) - 1):
             return (replace(state, wary=False) if len(odd) < 2 else state), None
-        found = self._follower.compare(state.recent, odd, self._changes)
+        found = self._follower.compare(state.recent, odd[-_MOST_ONSETS:], self._changes)
         if not found:
             return state, None
         best = found[0]
@@ -79,13 +81,17 @@ class Judge:
         for each in found:
             close = best.log_odds - each.log_odds < math.log(self._settings.changes.naming_odds)
             if close and each.hypothesis.kind.startswith("joint"):
-                near.setdefault(each.hypothesis.subject, each)
+                # A slip is the simpler tale; a new servo is told from it later, if it is one.
+                known = near.setdefault(each.hypothesis.subject, each)
+                if known.hypothesis.kind == "joint_replaced" and each.hypothesis.kind == "joint_slipped":
+                    near[each.hypothesis.subject] = each
         return list(near.values())
 
     def _kinds(self, joints: Sequence[Explained]) -> list[Hypothesis]:
         """Of each joint, that it slipped, and that its servo was replaced."""
         names = [each.hypothesis.subject for each in joints]
-        return [h for h in self._changes if h.subject in names and h.kind in ("joint_slipped", "joint_replaced")]
+        kinds = ("joint_slipped", "joint_replaced")
+        return [h for h in self._changes if h.subject in names and h.kind in kinds and h.scale == 1.0]
 
     def _followed(
         self, state: State, alike: Sequence[Explained], margin: float, found: Sequence[Explained]

@@ -58,7 +58,7 @@ class Recalibrator:
         ground: Footing,
         steps: Steps,
     ) -> None:
-        self._calibration, self._settings = calibration, settings
+        self._calibration, self._settings, self._estimator = calibration, settings, estimator
         self._ground, self.steps = ground, steps
         follower = Follower(ground.observer, estimator, ground.fading, settings.outliers)
         changes = hypotheses(ground.chart, steps, settings.changes, ground.observer.size)
@@ -93,7 +93,7 @@ class Recalibrator:
     @property
     def evaluator(self) -> dict[str, Any]:
         """What evaluates it: with the same, a replay gives the same bits."""
-        return identity(self._ground.problem)
+        return identity(self._ground.problem, self._estimator)
 
     @property
     def values(self) -> Array:

@@ -101,7 +101,7 @@ def replaced(state: State, steps: Steps, hypothesis: Hypothesis, margin: float, 
     dimension = next(each.dimension for each in steps.joints if each.joint == joint)
     text = (
         f"Joint {joint}, {_shown(size, dimension)} off since record {state.suspected}, acts like a new servo: that "
-        f"makes the records since {margin:.1f} in log odds likelier than a slip alone. All that is its own was reopened."
+        f"makes the records since {margin:.1f} in log odds likelier than a slip alone. All of it was reopened."
     )
     return Decision("joint_replaced", text, "watch", joint, (joint,), size[0], dimension, state.suspected)
 

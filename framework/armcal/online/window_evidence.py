@@ -123,7 +123,7 @@ class RecordsSince:
         def judged(chosen: NDArray[np.bool_]) -> tuple[float, float]:
             whole = covariance.copy()
             for i in np.flatnonzero(~chosen).tolist():
-                whole[np.ix_(rows[i], rows[i])] += self._outlying[i]
+                whole[rows[i], rows[i]] += self._outlying[i]
             total, surprise = _gaussian(innovation, whole)
             return total + float(chosen.sum() * self._logs[1] + (~chosen).sum() * self._logs[0]), surprise
 
@@ -138,22 +138,18 @@ class RecordsSince:
             if top <= best + 1e-9:
                 break
             best, chosen[i] = top, not chosen[i]
-        inside = (
-            np.concatenate([rows[i] for i in np.flatnonzero(chosen).tolist()])
-            if chosen.any()
-            else np.zeros(0, dtype=int)
-        )
-        surprise = _gaussian(innovation[inside], covariance[np.ix_(inside, inside)])[1] if len(inside) else 0.0
+        inside = np.concatenate([np.full(rows[i].stop - rows[i].start, fit) for i, fit in enumerate(chosen.tolist())])
+        surprise = _gaussian(innovation[inside], covariance[np.ix_(inside, inside)])[1] if inside.any() else 0.0
         return Weighed(best, shift, chosen, surprise)
 
     def _stacked(
         self, views: Sequence[Linearised], chosen: NDArray[np.bool_], factor: float
-    ) -> tuple[Array, Array, Array, list[NDArray[np.intp]]]:
+    ) -> tuple[Array, Array, Array, list[slice]]:
         """Innovations of chosen records, their slopes by a shift at the first, covariance without it, rows of each."""
         places = [int(i) for i in np.flatnonzero(chosen)]
         rows, start = [], 0
         for i in places:
-            rows.append(np.arange(start, start + len(views[i].innovation)))
+            rows.append(slice(start, start + len(views[i].innovation)))
             start += len(views[i].innovation)
         covariance = np.zeros((start, start))
         for a, i in enumerate(places):
@@ -164,9 +160,9 @@ class RecordsSince:
                 for k in range((places[b - 1] if b > a else j) + 1, j + 1):
                     kept = kept * self._kept[k]
                 part = views[i].slope @ (prior * kept) @ views[j].slope.T
-                covariance[np.ix_(rows[a], rows[b])] = part
-                covariance[np.ix_(rows[b], rows[a])] = part.T
-            covariance[np.ix_(rows[a], rows[a])] += views[i].noise
+                covariance[rows[a], rows[b]] = part
+                covariance[rows[b], rows[a]] = part.T
+            covariance[rows[a], rows[a]] += views[i].noise
         innovation = np.concatenate([views[i].innovation for i in places])
         return innovation, np.vstack([views[i].slope for i in places]), covariance, rows
 
