@@ -12,10 +12,10 @@ import numpy as np
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.base.parameters import Parameters
-from armcal.online.belief import Belief
-from armcal.online.chart import Chart
-from armcal.online.companions import Companions
-from armcal.online.observer import Observer, Reading, Seen
+from armcal.online.tracking.belief import Belief
+from armcal.online.tracking.chart import Chart
+from armcal.online.tracking.companions import Companions
+from armcal.online.tracking.observer import Observer, Reading, Seen
 from armcal.run.experiment import Experiment
 from armcal.solve.kernel import NEAR_REST_RAD, EvaluatorChoice
 from armcal.solve.online import Gaussian

@@ -9,10 +9,10 @@ from pathlib import Path
 
 from armcal.errors import DataError
 from armcal.measure.reader import ReadRequest, WantedChannel
-from armcal.online.loop import Pace
-from armcal.online.session import Setup, opened
+from armcal.online.running.loop import Pace
+from armcal.online.running.session import Setup, opened
+from armcal.online.running.standard_output import StandardOutput
 from armcal.online.sources.opening import open_source
-from armcal.online.standard_output import StandardOutput
 
 HEADER = "pose_id,q1_deg,q2_deg,x_mm,y_mm,z_mm"
 CALIBRATION = "armcal_calibration: 0\n"

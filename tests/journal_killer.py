@@ -13,8 +13,8 @@ import sys
 import time
 from pathlib import Path
 
-from armcal.online.journal import Journal, JournalLimits
-from armcal.online.journal_reader import read_entries, verify
+from armcal.online.journal.journal import Journal, JournalLimits
+from armcal.online.journal.reader import read_entries, verify
 
 LIMITS = JournalLimits(segment_bytes=4000, total_bytes=60_000)
 

@@ -17,12 +17,12 @@ from armcal.base.config_text import plain
 from armcal.base.dataset import Dataset
 from armcal.config.system import build_system
 from armcal.config.yaml_source import load_config
-from armcal.online.belief import Belief
-from armcal.online.incoming import Incoming
-from armcal.online.observer import Seen
-from armcal.online.recalibrator import Recalibrator
-from armcal.online.settings import RecalibrateSettings
-from armcal.online.start import Footing, footing
+from armcal.online.sources.incoming import Incoming
+from armcal.online.tracking.belief import Belief
+from armcal.online.tracking.observer import Seen
+from armcal.online.tracking.recalibrator import Recalibrator
+from armcal.online.tracking.settings import RecalibrateSettings
+from armcal.online.tracking.start import Footing, footing
 from armcal.plugins import discover
 from armcal.solve.online import OnlineEstimator, Update
 from armcal.solve.problem import Problem

@@ -16,16 +16,16 @@ import yaml
 from armcal.base.dataset import Dataset
 from armcal.cli.main import cli
 from armcal.errors import ConfigError
-from armcal.online.mission import before_launch, recalibrated, simulated
-from armcal.online.mission_errors import error_curve
-from armcal.online.mission_files import curve_text, figures, schedule, truth_text
-from armcal.online.mission_judge import Judgement, judge
-from armcal.online.mission_settings import MissionPlan
-from armcal.online.mission_source import MissionSource, PowerCutError
-from armcal.online.mission_story import Story
-from armcal.online.mission_tips import random_poses
-from armcal.online.mission_truth import DAY_S, Mission
-from armcal.online.settings import RecalibrateSettings
+from armcal.online.mission.errors import error_curve
+from armcal.online.mission.files import curve_text, figures, schedule, truth_text
+from armcal.online.mission.judge import Judgement, judge
+from armcal.online.mission.mission import before_launch, recalibrated, simulated
+from armcal.online.mission.settings import MissionPlan
+from armcal.online.mission.source import MissionSource, PowerCutError
+from armcal.online.mission.story import Story
+from armcal.online.mission.tips import random_poses
+from armcal.online.mission.truth import DAY_S, Mission
+from armcal.online.tracking.settings import RecalibrateSettings
 from armcal.report.mission_figure import mission_figure
 from armcal.solve.simulation import SimulationRequest, measured_without_noise
 from armcal.use.calibration import Calibration

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from armcal.base.domains import Array
 from armcal.errors import NotConvergedError
-from armcal.online.chart import nearest_semidefinite
+from armcal.online.tracking.chart import nearest_semidefinite
 from armcal.run.experiment import Experiment
 from armcal.solve.compiler import find_compiler
 from armcal.solve.kernel import EvaluatorChoice

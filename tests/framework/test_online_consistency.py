@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from armcal.online.start import Footing
+from armcal.online.tracking.start import Footing
 from armcal.solve.online import surprise
 from armcal_kalman.extended import ExtendedFilter, ExtendedSettings
 from online_arm import STATES, Filtered, World, begun, ground_of, nees, settings, told, walk_of

@@ -11,13 +11,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from armcal.base.parameters import Parameters
-from armcal.online.belief import Belief
-from armcal.online.chart import Chart
-from armcal.online.incoming import Incoming
-from armcal.online.observer import Observer
-from armcal.online.recalibrator import Recalibrator
-from armcal.online.settings import DAY
-from armcal.online.start import Footing
+from armcal.online.sources.incoming import Incoming
+from armcal.online.tracking.belief import Belief
+from armcal.online.tracking.chart import Chart
+from armcal.online.tracking.observer import Observer
+from armcal.online.tracking.recalibrator import Recalibrator
+from armcal.online.tracking.settings import DAY
+from armcal.online.tracking.start import Footing
 from armcal.solve.online import Gaussian
 from armcal_kalman.extended import ExtendedFilter, ExtendedSettings
 from online_arm import (

@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from armcal.base.dataset import Dataset
-from armcal.online.belief import Belief
-from armcal.online.incoming import Incoming
-from armcal.online.recalibrator import Recalibrator
-from armcal.online.settings import RecalibrateSettings
+from armcal.online.sources.incoming import Incoming
+from armcal.online.tracking.belief import Belief
+from armcal.online.tracking.recalibrator import Recalibrator
+from armcal.online.tracking.settings import RecalibrateSettings
 from armcal.run.experiment import Experiment
 from armcal.run.outputs import calibration_content
 from armcal.run.pipeline import calibrate

@@ -16,19 +16,19 @@ from armcal.base.settings import Settings
 from armcal.cli.main import cli
 from armcal.cli.recalibrate import setup_of
 from armcal.errors import DataError
-from armcal.online.incoming import Incoming
-from armcal.online.journal import JournalLimits
-from armcal.online.journal_reader import read_entries, read_segments, read_until
-from armcal.online.loop import Pace
-from armcal.online.recalibrator import Recalibrator
-from armcal.online.replay import kept, replay
-from armcal.online.replay_walk import NoWitness
-from armcal.online.replay_witness import Comparer, DiffersError
-from armcal.online.session import Open, opened
-from armcal.online.settings import RecalibrateSettings
-from armcal.online.standard_output import StandardOutput
-from armcal.online.state import State
-from armcal.online.state_distance import BOUND, distance
+from armcal.online.journal.journal import JournalLimits
+from armcal.online.journal.reader import read_entries, read_segments, read_until
+from armcal.online.replaying.replay import kept, replay
+from armcal.online.replaying.state_distance import BOUND, distance
+from armcal.online.replaying.walk import NoWitness
+from armcal.online.replaying.witness import Comparer, DiffersError
+from armcal.online.running.loop import Pace
+from armcal.online.running.session import Open, opened
+from armcal.online.running.standard_output import StandardOutput
+from armcal.online.sources.incoming import Incoming
+from armcal.online.tracking.recalibrator import Recalibrator
+from armcal.online.tracking.settings import RecalibrateSettings
+from armcal.online.tracking.state import State
 from armcal.plugins import discover
 from armcal.run.experiment import Experiment
 from armcal.solve.compiler import find_compiler
@@ -292,7 +292,7 @@ def sequence_of_first(done: Any) -> int:
 
 
 def test_a_journal_without_its_calibration_is_refused(whole: Path) -> None:
-    from armcal.online.replay_begin import kept_calibration
+    from armcal.online.replaying.begin import kept_calibration
 
     header = next(read_segments(whole / "journal")).header
     for changed in ({"text": None}, {"text": header["text"] + " "}):

@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 import yaml
 from armcal.cli.main import cli
-from armcal.online.event_file import EventFile
+from armcal.online.running.event_file import EventFile
 from armcal.online.watch.events import record_of, told_of
 from armcal.online.watch.feed import Feed
 from armcal.online.watch.history import OLDER_ACCEPTED, OLDER_OTHERS, RECENT_RECORDS, History

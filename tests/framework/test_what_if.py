@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 import pytest
 from armcal.cli.main import cli
-from armcal.online.settings import RecalibrateSettings
-from armcal.online.start import footing
+from armcal.online.tracking.settings import RecalibrateSettings
+from armcal.online.tracking.start import footing
 from armcal.run.experiment import Experiment
 from armcal.use.calibration import Calibration
 from click.testing import CliRunner, Result

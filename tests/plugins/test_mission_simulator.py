@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from armcal.errors import ConfigError
-from armcal.online.mission_truth import DAY_S, Mission, MissionSimulator
+from armcal.online.mission.truth import DAY_S, Mission, MissionSimulator
 from armcal.run.experiment import Experiment
 from armcal.solve.simulation import SimulationRequest, measured_without_noise
 from armcal_simulation.mission_schedule import Stands
@@ -38,7 +38,7 @@ QUIET = {
 @lru_cache
 def experiment() -> Experiment:
     """The shipped mission's, without the sections that are not an experiment's."""
-    from armcal.online.mission_settings import MissionPlan
+    from armcal.online.mission.settings import MissionPlan
 
     return MissionPlan.load(CONFIG).experiment
 

@@ -11,7 +11,7 @@ import click
 
 from armcal.cli.common import Voice, speaking
 from armcal.errors import InputError, Location
-from armcal.online.control import ask
+from armcal.online.running.control import ask
 
 _COMMANDS = ("status", "pause", "resume", "finish", "rollback", "what-if")
 

@@ -12,9 +12,9 @@ from rich.table import Table
 from armcal.cli.common import Voice, overrides, speaking
 from armcal.cli.mission_session import loop_session
 from armcal.errors import InputError, Location
-from armcal.online.mission import BENCH, CALIBRATION, RECALIBRATION, RECORDS, MissionResult, run_mission
-from armcal.online.mission_files import curve_text, figures, schedule, truth_text
-from armcal.online.mission_settings import MissionPlan
+from armcal.online.mission.files import curve_text, figures, schedule, truth_text
+from armcal.online.mission.mission import BENCH, CALIBRATION, RECALIBRATION, RECORDS, MissionResult, run_mission
+from armcal.online.mission.settings import MissionPlan
 from armcal.plugins import discover
 from armcal.report.mission_figure import mission_figure
 from armcal.run.folder import check_folder, place

@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import Any
 
 from armcal.cli.recalibrate import setup_of
-from armcal.online.mission import Session
-from armcal.online.mission_source import MissionSource, PowerCutError
-from armcal.online.recalibrator import Recalibrator
-from armcal.online.session import opened
-from armcal.online.settings import RecalibrateSettings
-from armcal.online.standard_output import StandardOutput
+from armcal.online.mission.mission import Session
+from armcal.online.mission.source import MissionSource, PowerCutError
+from armcal.online.running.session import opened
+from armcal.online.running.standard_output import StandardOutput
+from armcal.online.tracking.recalibrator import Recalibrator
+from armcal.online.tracking.settings import RecalibrateSettings
 from armcal.plugins import PluginRegistry
 from armcal.use.calibration import Calibration
 

@@ -9,14 +9,14 @@ from typing import Any
 import click
 
 from armcal.cli.common import Voice, overrides, speaking
-from armcal.online.journal import JournalLimits
-from armcal.online.loop import Pace
-from armcal.online.recalibrator import Recalibrator
-from armcal.online.session import Setup, opened
-from armcal.online.settings import RecalibrateSettings, load_settings
+from armcal.online.journal.journal import JournalLimits
+from armcal.online.running.loop import Pace
+from armcal.online.running.session import Setup, opened
+from armcal.online.running.standard_output import StandardOutput
 from armcal.online.sources.opening import open_source
 from armcal.online.sources.source import AtEnd
-from armcal.online.standard_output import StandardOutput
+from armcal.online.tracking.recalibrator import Recalibrator
+from armcal.online.tracking.settings import RecalibrateSettings, load_settings
 from armcal.plugins import discover
 from armcal.use.calibration import Calibration
 

@@ -14,15 +14,15 @@ from rich.table import Table
 
 from armcal.cli.common import Voice, overrides, speaking
 from armcal.errors import EXIT_BAD_INPUT, EXIT_FAULT, InputError, Location
-from armcal.online.courses import WARM_UP, Comparison, compared, side_by_side
-from armcal.online.files import REAL_FILES, write_whole
-from armcal.online.outputs import finite
-from armcal.online.replay import Kept, Replayed, check_until, kept, replay
-from armcal.online.replay_begin import begun, journal_folder, kept_calibration, kept_settings
-from armcal.online.replay_walk import NoWitness, Walk
-from armcal.online.replay_witness import Comparer
-from armcal.online.session import OURS
-from armcal.online.settings import RecalibrateSettings, load_settings
+from armcal.online.journal.files import REAL_FILES, write_whole
+from armcal.online.replaying.begin import begun, journal_folder, kept_calibration, kept_settings
+from armcal.online.replaying.courses import WARM_UP, Comparison, compared, side_by_side
+from armcal.online.replaying.replay import Kept, Replayed, check_until, kept, replay
+from armcal.online.replaying.walk import NoWitness, Walk
+from armcal.online.replaying.witness import Comparer
+from armcal.online.running.outputs import finite
+from armcal.online.running.session import OURS
+from armcal.online.tracking.settings import RecalibrateSettings, load_settings
 from armcal.plugins import discover
 
 _Evaluator = Literal["auto", "compiled", "interpreted"]

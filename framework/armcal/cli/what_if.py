@@ -15,9 +15,9 @@ from armcal.base.dataset import Dataset
 from armcal.cli.common import Voice, speaking
 from armcal.cli.predict import read_commands
 from armcal.errors import InputError, Location
-from armcal.online.pose_worth import PoseWorth, ranked
-from armcal.online.settings import RecalibrateSettings
-from armcal.online.start import footing
+from armcal.online.tracking.pose_worth import PoseWorth, ranked
+from armcal.online.tracking.settings import RecalibrateSettings
+from armcal.online.tracking.start import footing
 from armcal.plugins import discover
 from armcal.use.calibration import Calibration
 

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from armcal.online.mission_judge import ErrorCurve, Judgement
-from armcal.online.mission_truth import DAY_S, Mission
+from armcal.online.mission.judge import ErrorCurve, Judgement
+from armcal.online.mission.truth import DAY_S, Mission
 
 _MM = 1000.0
 _FROZEN, _RECALIBRATED, _INK, _GRID, _FAINT = "#b5542a", "#1f5fa8", "#333333", "#d9d9d9", "#6a6a6a"

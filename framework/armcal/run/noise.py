@@ -87,9 +87,7 @@ class NoiseResult:
         return told
 
 
-def noise_result(
-    problem: Problem, fit: WeighedFit, dataset: Dataset, split: Split, errors_mm: Array
-) -> NoiseResult:
+def noise_result(problem: Problem, fit: WeighedFit, dataset: Dataset, split: Split, errors_mm: Array) -> NoiseResult:
     """From a fit on the training records; errors are of all records (N)."""
     weights = np.full(len(dataset), np.nan)
     weights[split.train] = np.min(np.array(fit.weights), axis=0)

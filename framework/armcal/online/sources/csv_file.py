@@ -10,10 +10,10 @@ from stat import S_ISREG
 from zlib import crc32
 
 from armcal.errors import DataError, InputError, Location
-from armcal.online.incoming import Incoming
-from armcal.online.row_parser import RowParser
+from armcal.online.sources.incoming import Incoming
 from armcal.online.sources.line_parser import Kind, LineParser
 from armcal.online.sources.reading import LineReading
+from armcal.online.sources.row_parser import RowParser
 from armcal.online.sources.source import MAX_LINE_BYTES, AtEnd, Clock, key_of, wait_until
 
 _LINE_END = b"\n"

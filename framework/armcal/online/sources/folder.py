@@ -8,10 +8,10 @@ import time
 from collections.abc import Mapping
 from pathlib import Path
 
-from armcal.online.incoming import Incoming, Place
-from armcal.online.row_parser import RowParser, faulty
+from armcal.online.sources.incoming import Incoming, Place
 from armcal.online.sources.line_parser import Kind, LineParser
 from armcal.online.sources.reading import LineReading, Reading, WholeReading
+from armcal.online.sources.row_parser import RowParser, faulty
 from armcal.online.sources.source import THROUGH, Clock, key_of, wait_until
 
 SETTLED_S = 1.0

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Literal
 
 from armcal.errors import DataError
-from armcal.online.incoming import Incoming, Place
-from armcal.online.row_parser import RowParser, Table, faulty
+from armcal.online.sources.incoming import Incoming, Place
+from armcal.online.sources.row_parser import RowParser, Table, faulty
 
 Kind = Literal["csv", "json", "either"]
 

@@ -8,10 +8,10 @@ import time
 from collections import deque
 from collections.abc import Mapping
 
-from armcal.online.incoming import Incoming, Place
-from armcal.online.row_parser import RowParser, faulty
+from armcal.online.sources.incoming import Incoming, Place
 from armcal.online.sources.line_cutter import LineCutter
 from armcal.online.sources.line_parser import LineParser
+from armcal.online.sources.row_parser import RowParser, faulty
 from armcal.online.sources.source import Clock
 
 _CHUNK = 64 * 1024

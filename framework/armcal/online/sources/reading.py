@@ -7,10 +7,10 @@ import os
 from collections import deque
 from typing import Any, BinaryIO, Protocol
 
-from armcal.online.incoming import Incoming, Place
-from armcal.online.row_parser import RowParser, faulty
+from armcal.online.sources.incoming import Incoming, Place
 from armcal.online.sources.line_cutter import LineCutter
 from armcal.online.sources.line_parser import LineParser
+from armcal.online.sources.row_parser import RowParser, faulty
 from armcal.online.sources.source import Clock
 
 MAX_JSON_BYTES = 4 * 1024**2

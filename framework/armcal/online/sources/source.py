@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Literal, Protocol
 
-from armcal.online.incoming import Incoming
+from armcal.online.sources.incoming import Incoming
 
 Clock = Callable[[], float]
 """Unix seconds."""

@@ -12,8 +12,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from armcal.errors import InputError, Location
-from armcal.online.incoming import Incoming, Place
-from armcal.online.row_parser import RowParser, faulty
+from armcal.online.sources.incoming import Incoming, Place
+from armcal.online.sources.row_parser import RowParser, faulty
 from armcal.online.sources.source import Clock
 
 MAX_DATAGRAM_BYTES = 16 * 1024

@@ -1,0 +1,1 @@
+"""The durable journal: what was acknowledged outlives kills and power cuts."""

@@ -1,0 +1,1 @@
+"""A simulated mission, judged against its truth."""

@@ -1,0 +1,1 @@
+"""What is believed of an arm while it works, record by record, and how records are judged."""
