@@ -86,6 +86,42 @@ def test_another_state_than_was_noted_is_an_error(tmp_path: Path, monkeypatch: p
     assert (folder / "calibration.yaml").read_bytes() == before
 
 
+def test_an_update_of_armcal_goes_on_where_it_was_though_the_last_bits_differ(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "out"
+    with pytest.raises(PowerCutError):
+        run(folder, Listed(made(1, 20), cut=True))
+    take = FakeRecalibrator.take
+
+    def other(self: FakeRecalibrator, incoming: Incoming, sequence: int) -> Any:
+        self.total += 1e-13
+        return take(self, incoming, sequence)
+
+    monkeypatch.setattr(FakeRecalibrator, "take", other)
+    begin = FakeRecalibrator.__init__
+
+    def updated(self: FakeRecalibrator) -> None:
+        begin(self)
+        self.evaluator = {"name": "the next"}
+
+    monkeypatch.setattr(FakeRecalibrator, "__init__", updated)
+    assert run(folder, Listed(made(1, 30))).count == 29
+    assert any("Another evaluator" in event.get("sentence", "") for event in events(folder))
+
+
+def test_damage_before_the_newest_checkpoint_is_told_and_stops_nothing(tmp_path: Path) -> None:
+    folder = tmp_path / "out"
+    run(folder, Listed(made(1, 120)))
+    oldest = sorted((folder / "journal").glob("journal-*.log"))[1]
+    written = bytearray(oldest.read_bytes())
+    written[len(written) // 2] ^= 1
+    oldest.write_bytes(written)
+    assert run(folder, Listed(made(1, 130))).count == 129
+    told = [event["sentence"] for event in events(folder) if event["event"] == "alarm"]
+    assert any("damaged" in sentence and "not touched" in sentence for sentence in told)
+
+
 def test_a_folder_of_another_calibration_or_other_settings_is_refused(tmp_path: Path) -> None:
     folder = tmp_path / "out"
     run(folder, Listed(made(1, 5)), settings={"gate": 1})

@@ -81,7 +81,12 @@ class NoiseResult:
             told["inseparable"] = [list(pair) for pair in self.components.inseparable]
             told["unseen_joints"] = list(self.components.unseen)
         told["scatter"] = {
-            name: {"covariance": each.covariance.tolist(), "share": each.share, "over": each.over}
+            name: {
+                "covariance": each.covariance.tolist(),
+                "share": each.share,
+                "over": each.over,
+                "channel": each.channel,
+            }
             for name, each in self.scatter.items()
         }
         return told

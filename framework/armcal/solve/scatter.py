@@ -31,12 +31,14 @@ class Scatter:
     Attributes:
         covariance: of the raw residual (n_r x n_r; m or rad).
         share: of it that neighbours have in common, 0 to 1.
-        over: records over which the common part falls by e, in units of the channel.
+        over: distance over which the common part falls by e.
+        channel: what counts it: ``sequence`` where the records say their place, else ``record``, one by one.
     """
 
     covariance: Array
     share: float
     over: float
+    channel: str = "record"
 
 
 def scatter_of(
@@ -68,7 +70,9 @@ def scatter_of(
         covariance = roots @ roots.T / max(float(weight.sum()) * freedom, 1e-9)
         whitened = _whitened(covariance, residual[:, kept])
         share, over = _shared(whitened, _places(dataset)[kept])
-        found[kernel.factor.name] = Scatter(covariance, share, over)
+        found[kernel.factor.name] = Scatter(
+            covariance, share, over, "sequence" if dataset.has("sequence") else "record"
+        )
     return found
 
 

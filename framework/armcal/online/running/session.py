@@ -11,13 +11,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
-from armcal.errors import InputError, Location
+from armcal.errors import DataError, InputError, Location
 from armcal.measure.reader import ReadRequest
 from armcal.online.journal.files import REAL_FILES, FileLayer
 from armcal.online.journal.journal import Journal, JournalLimits
-from armcal.online.journal.reader import read_until
+from armcal.online.journal.reader import read_until, verify
 from armcal.online.running.control import SOCKET, ControlServer
-from armcal.online.running.course import STARTED, Course, Event
+from armcal.online.running.course import STARTED, Course, Event, ReplayDiffersError
 from armcal.online.running.event_file import EARLIER, EVENTS, EventFile
 from armcal.online.running.loop import Pace, Recalibration
 from armcal.online.running.loop import Session as LoopSession
@@ -115,6 +115,7 @@ def opened(setup: Setup, session: Recalibrating, source_of: SourceOf) -> Iterato
         outputs = Outputs(setup.folder, setup.stream, EventFile(setup.folder), setup.files)
         stack.callback(outputs.close)
         _tell_start(journal, outputs, session, header, resumed)
+        _tell_damage(setup, outputs)
         left = len(journal.recovered.entries) if resumed else 0
         recalibration = Recalibration(source, journal, session, course, outputs, setup.pace, left)
         control = ControlServer(setup.folder, Requests(recalibration, session).answer)
@@ -159,9 +160,15 @@ def _recover(setup: Setup, journal: Journal, course: Course, header: Mapping[str
                 hint="Give what it was begun with, or a new --out (perhaps from a copy of its calibration.yaml).",
             )
     course.restore(found.checkpoint, found.checkpoint_sequence)
+    same_evaluator = found.header.get("evaluator") == header["evaluator"]
     for entry in found.entries:
-        course.apply(entry.sequence, entry.kind, entry.content)
-    if found.header.get("evaluator") != header["evaluator"]:
+        try:
+            course.apply(entry.sequence, entry.kind, entry.content)
+        except ReplayDiffersError:
+            # Another version gives other last bits: no reason for a rover to stand still after an update.
+            if same_evaluator:
+                raise
+    if not same_evaluator:
         journal.checkpoint(course.checkpoint())
     return True
 
@@ -170,14 +177,22 @@ def _tell_start(
     journal: Journal, outputs: Outputs, session: Recalibrating, header: Mapping[str, Any], resumed: bool
 ) -> None:
     sequence = journal.record(STARTED, {"at": time.time(), "resumed": resumed, "evaluator": header["evaluator"]})
-    told = {**session.started_event(resumed), "sequence": sequence, "at": time.time(), "calibration": header["path"]}
-    outputs.event(told)
+    told = {"sequence": sequence, "at": time.time(), "resumed": resumed, "calibration": header["path"]}
+    outputs.event({**session.started_event(resumed), **told})
     cut = journal.recovered.cut
     if cut is not None:
         outputs.alarm(cut.sentence)
     before = journal.recovered.header.get("evaluator", header["evaluator"])
     if before != header["evaluator"]:
         outputs.alarm("Another evaluator than before is used: a replay has to go over from one to the other here.")
+
+
+def _tell_damage(setup: Setup, outputs: Outputs) -> None:
+    """The estimate goes on from the newest checkpoint, which was checked; what is damaged before it is told of."""
+    try:
+        verify(setup.folder / JOURNAL, setup.files)
+    except DataError as fault:
+        outputs.alarm(f"{fault.message} The estimate is not touched by it: only what lies before is out of reach.")
 
 
 def _reach(folder: Path, sequence: int) -> Any:

@@ -23,7 +23,7 @@ class Companion:
     Attributes:
         name: for people.
         over: the distance over which it forgets, in units of the channel.
-        channel: ``sequence`` (records) or ``time`` (s).
+        channel: ``sequence`` (places in a recording), ``record`` (one by one) or ``time`` (s).
         coordinate: of the parameter that it moves; None for a shift of readings.
         size: its standard deviation: in scaled coordinates of the parameter.
         instance: the measurement whose readings it shifts.

@@ -150,8 +150,8 @@ class Recalibrator:
         place = incoming.channels.get("sequence", math.nan)
         before = self.state.place
         if not math.isfinite(place):
-            return {"time": tick.passed, "sequence": 1.0}
-        return {"time": tick.passed, "sequence": 1e9 if before is None else abs(place - before)}
+            return {"time": tick.passed, "record": 1.0, "sequence": 1.0}
+        return {"time": tick.passed, "record": 1.0, "sequence": 1e9 if before is None else abs(place - before)}
 
     def _judged(
         self, incoming: Incoming, state: State, readings: tuple[Reading, ...], passed: Mapping[str, float]

@@ -169,7 +169,9 @@ def _errors(
         if told is not None:
             covariance = np.array(told["covariance"])
             if followed and told["share"] > 0:
-                companions += shared_error(name, told["share"] * covariance, told["over"], "sequence")
+                companions += shared_error(
+                    name, told["share"] * covariance, told["over"], told.get("channel", "record")
+                )
                 covariance = (1 - told["share"]) * covariance
         white[name] = covariance
     drifts = tuple(_drifts(calibration, chart))
