@@ -101,7 +101,7 @@ class PluginRegistry:
         if self.faults:
             failed = "; ".join(f"{p.name}: {p.fault}" for p in self.faults)
             hint += f" These plugins failed to load and may have had it: {failed}."
-        raise PluginError(f"no plugin offers a {kind} called {name!r}.", hint=hint)
+        raise PluginError(f"no plugin offers {_spoken(kind)} called {name!r}.", hint=hint)
 
     def notify(self, event: str, **what: Any) -> list[str]:
         """Tell every observer of an event; gives what went wrong in those that failed, which stops nothing."""
@@ -112,6 +112,12 @@ class PluginRegistry:
             except Exception as fault:  # an observer must not cost anybody a calibration
                 faults.append(f"plugin {observer.plugin_name}: {event} raised {type(fault).__name__}: {fault}.")
         return faults
+
+
+def _spoken(kind: str) -> str:
+    """A kind with its article."""
+    name = "online estimator" if kind == "online" else kind
+    return f"{'an' if name[0] in 'aeiou' else 'a'} {name}"
 
 
 def discover(found: Iterable[EntryPoint] | None = None) -> PluginRegistry:
