@@ -38,7 +38,7 @@ class ExtendedFilter:
         """One: a filter never looks back."""
         return 1
 
-    def update(self, prior: Gaussian, observations: Sequence[Observation]) -> Update:
+    def update(self, prior: Gaussian, observations: Sequence[Observation], start: Array | None = None) -> Update:
         """As the protocol says."""
         seen, place = self._settled(prior, observations[-1])
         innovation = seen.innovation + seen.slope @ (place - prior.mean)

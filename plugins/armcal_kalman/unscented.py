@@ -35,7 +35,7 @@ class UnscentedFilter:
         """One: a filter never looks back."""
         return 1
 
-    def update(self, prior: Gaussian, observations: Sequence[Observation]) -> Update:
+    def update(self, prior: Gaussian, observations: Sequence[Observation], start: Array | None = None) -> Update:
         """As the protocol says."""
         observation = observations[-1]
         first, size = observation.at(prior.mean), len(prior.mean)

@@ -14,7 +14,7 @@ from typing import Annotated, Any, ClassVar
 import numpy as np
 from armcal.base.domains import Array
 from armcal.base.settings import Settings
-from armcal.errors import NotConvergedError
+from armcal.errors import NotConvergedError, ProblemError
 from armcal.solve.online import Gaussian, Observation, Update, checked
 from pydantic import Field
 
@@ -28,8 +28,8 @@ class WindowSettings(Settings):
     """
 
     records: Annotated[int, Field(ge=1, le=2000)] = 40
-    iterations: Annotated[int, Field(ge=1, le=100)] = 3
-    moved: Annotated[float, Field(gt=0)] = 0.1
+    iterations: Annotated[int, Field(ge=1, le=100)] = 10
+    moved: Annotated[float, Field(gt=0)] = 0.01
 
 
 class WindowEstimator:
@@ -46,11 +46,12 @@ class WindowEstimator:
         """As configured."""
         return self._settings.records
 
-    def update(self, prior: Gaussian, observations: Sequence[Observation]) -> Update:
+    def update(self, prior: Gaussian, observations: Sequence[Observation], start: Array | None = None) -> Update:
         """As the protocol says: Gauss-Newton, with steps halved until the cost falls."""
         # The place is mean + covariance @ pull: a covariance that is singular needs no inverse.
-        pull = np.zeros(len(prior.mean))
-        seen = _together(observations, prior.mean)
+        pull, seen = _begun(prior, observations, start)
+        if not np.isfinite(seen.cost):
+            raise ProblemError("a record is not finite.", hint="Leave it out.")
         for _ in range(self._settings.iterations):
             wanted, covariance = _solved(prior, seen, prior.covariance @ pull)
             moved = prior.covariance @ (wanted - pull)
@@ -59,10 +60,16 @@ class WindowEstimator:
                 break
         step = prior.covariance @ pull
         wanted, covariance = _solved(prior, seen, step)
+        # A last step that nothing guards is for one that is small beside what is not known.
+        last_step = prior.covariance @ wanted - step
+        if np.all(np.abs(last_step) <= np.sqrt(np.maximum(np.diag(covariance), 0.0))):
+            mean = prior.mean + step + last_step
+        else:
+            mean = prior.mean + step
         last = observations[-1].at(prior.mean + step)
         innovation = last.innovation + last.slope @ step
         expected = last.slope @ prior.covariance @ last.slope.T + last.noise
-        return Update(checked(Gaussian(prior.mean + prior.covariance @ wanted, covariance)), innovation, expected)
+        return Update(checked(Gaussian(mean, covariance)), innovation, expected)
 
     def _descended(
         self, prior: Gaussian, observations: Sequence[Observation], pull: Array, wanted: Array, seen: Seen
@@ -78,6 +85,19 @@ class WindowEstimator:
             if _cost(prior, tried, there) <= cost * (1 + 1e-9):
                 return tried, there
         return pull, seen
+
+
+def _begun(prior: Gaussian, observations: Sequence[Observation], start: Array | None) -> tuple[Array, Seen]:
+    """A pull to begin with, and the records from there: that which leads to where they led before."""
+    none = np.zeros(len(prior.mean))
+    if start is None:
+        return none, _together(observations, prior.mean)
+    try:
+        wanted, _ = _solved(prior, _together(observations, start), start - prior.mean)
+        seen = _together(observations, prior.mean + prior.covariance @ wanted)
+    except NotConvergedError:
+        return none, _together(observations, prior.mean)
+    return wanted, seen
 
 
 @dataclass(frozen=True)

@@ -74,9 +74,10 @@ class OnlineEstimator(Protocol):
     def window(self) -> int:
         """How many of the last records it wants to see again with each new one; 1 for a filter."""
 
-    def update(self, prior: Gaussian, observations: Sequence[Observation]) -> Update:
+    def update(self, prior: Gaussian, observations: Sequence[Observation], start: Array | None = None) -> Update:
         """The belief after the last observation; ``prior`` is the one before the first of them.
 
+        ``start`` (N) is where all observations but the last have led; one that looks again may begin there.
         A covariance that is not positive is an error, never made positive by abs().
 
         Raises:

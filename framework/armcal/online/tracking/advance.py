@@ -53,14 +53,14 @@ class Advance:
 
     def _held(self, state: State, recent: Recent) -> State:
         """With the last records held back; one that leaves them is taken for good, as it looks from where they led."""
-        chart, anchor, held = self._ground.chart, state.anchor, (*state.held, recent)
-        observations = [self.seen(anchor, each.readings, each.joint_noise) for each in held]
-        update = self._estimator.update(anchor.gaussian, observations)
-        belief = anchor.updated(chart, update.posterior)
+        chart, believed, held = self._ground.chart, state.belief, (*state.held, recent)
+        prior = state.anchor.about(chart, believed.origin).gaussian
+        observations = [self.seen(believed, each.readings, each.joint_noise) for each in held]
+        update = self._estimator.update(prior, observations, believed.gaussian.mean)
+        belief, anchor = believed.updated(chart, update.posterior), Belief(believed.origin, prior)
         if len(held) >= self._estimator.window:
             place = update.posterior.mean
-            taken = absorbed(anchor.gaussian, observations[0].at(place), place)
-            anchor, held = anchor.updated(chart, taken), held[1:]
+            anchor, held = Belief(believed.origin, absorbed(prior, observations[0].at(place), place)), held[1:]
         return replace(state, belief=belief, anchor=anchor, held=held)
 
     def _refreshed(self, state: State) -> State:

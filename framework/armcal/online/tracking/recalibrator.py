@@ -78,6 +78,12 @@ class Recalibrator:
         """
         estimator = _estimator(settings, registry or discover())
         ground = footing(calibration, settings, shares=estimator.window == 1)
+        if estimator.window > 1 and ground.chart.cones:
+            raise ConfigError(
+                "found an estimator that holds records back, and 3x3 compliances: together they may come to no answer.",
+                where=Location("estimator.type"),
+                hint="Take extended, which looks at each record again from where it leads.",
+            )
         return cls(calibration, settings, estimator, ground, _steps(calibration, ground))
 
     @property
