@@ -99,6 +99,27 @@ def test_kills_of_the_whole_command_change_no_bit(
     assert again.exit_code == 2 and "begun with another calibration" in again.output
 
 
+@pytest.mark.slow
+def test_fifty_kills_at_any_moment_of_a_long_run_change_no_bit(calibration: Path, config: Path, tmp_path: Path) -> None:
+    """Of 6,000 records, in starting, in reading, in writing: the command takes about as long as all kills together."""
+    header, *rows = POSES.read_text().splitlines()
+    many = [f"{turn}x{row},{60 * (200 * turn + i)}" for turn in range(30) for i, row in enumerate(rows)]
+    poses = tmp_path / "poses.csv"
+    poses.write_text("\n".join([f"{header},time_s", *many]) + "\n")
+    arguments = ["recalibrate", calibration, "--from", poses, "--config", config, "-q", "--out"]
+    assert armcal(*arguments, tmp_path / "whole").exit_code == 0
+    random_, folder = random.Random(7), tmp_path / "killed"
+    for _ in range(50):
+        process = subprocess.Popen([sys.executable, "-m", "armcal.cli", *map(str, arguments), str(folder), "--follow"])
+        time.sleep(random_.uniform(0.5, 2.5))
+        assert process.poll() is None
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+    assert armcal(*arguments, folder).exit_code == 0
+    assert estimate(folder) == estimate(tmp_path / "whole")
+    assert armcal("replay", folder).exit_code == 0
+
+
 def test_a_running_command_is_asked_and_told(calibration: Path, config: Path, tmp_path: Path) -> None:
     folder = tmp_path / "out"
     command = ["recalibrate", calibration, "--from", "-", "--config", config, "--out", folder]
