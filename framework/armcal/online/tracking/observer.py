@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.errors import DataError
-from armcal.measure.groups import NO_GROUP, group_numbers
+from armcal.measure.groups import NO_GROUP, group_key, group_name, group_numbers, owner_of
 from armcal.measure.measurement import GroupedMeasurement
 from armcal.online.tracking.chart import Chart
 from armcal.online.tracking.companions import Companions
@@ -50,6 +50,8 @@ class Observer:
         noisy: drifts that are not followed: each record has its own.
         noise: covariance of each measurement's error (n_r x n_r), where a record does not say its own.
         defaults: channels that a record may leave out, and what then holds.
+        unfound: parameters of groups that the calibration never found: what is measured there says nothing.
+        joint_scale: of the joints' own noise, against what each arm states.
     """
 
     def __init__(
@@ -60,9 +62,11 @@ class Observer:
         noisy: Companions,
         noise: Mapping[str, Array],
         defaults: Mapping[str, float],
+        unfound: Collection[str] = (),
+        joint_scale: float = 1.0,
     ) -> None:
         self.problem, self.chart, self.companions = problem, chart, companions
-        self._noise, self._defaults = noise, defaults
+        self._noise, self._defaults, self._unfound = noise, defaults, frozenset(unfound)
         self._factors = [OneRecord(kernel) for kernel in problem.kernels]
         self._plain = [slots.entries[0] if slots.is_plain else None for slots in problem.slots]
         rows = [kernel.factor.residual.numel() for kernel in problem.kernels]
@@ -70,7 +74,7 @@ class Observer:
         self._shifts = [companions.shifts(name, count) for name, count in zip(names, rows, strict=True)]
         self.drifts, self.noisy_drifts = companions.drifts, noisy.drifts
         self._noisy_joints = {
-            f"{arm.name}.{joint}": arm.joint_noise
+            f"{arm.name}.{joint}": joint_scale * arm.joint_noise
             for arm in problem.blueprint.arms.values()
             for joint, dimension in arm.commanded.items()
             if arm.joint_noise and dimension == "angle"
@@ -102,7 +106,17 @@ class Observer:
             numbers = group_numbers(alone, instance, measurement, plan.groups)
         except DataError:
             return NO_GROUP
-        return NO_GROUP if numbers is None else int(numbers[0])
+        number = NO_GROUP if numbers is None else int(numbers[0])
+        return NO_GROUP if number == NO_GROUP or self._is_unfound(instance, measurement, number) else number
+
+    def _is_unfound(self, instance: str, measurement: GroupedMeasurement, number: int) -> bool:
+        """Whether the calibration had no record of a group, and so does not know it."""
+        if not self._unfound:
+            return False
+        plan = self.problem.blueprint
+        owner, key = owner_of(instance, measurement), group_key(plan.measurements, plan.groups, instance, number)
+        names = (group_name(owner, key, block.name) for block in measurement.group_parameters(key))
+        return any(name in self._unfound for name in names)
 
     def _own_noise(self, kernel: Kernel, known: Mapping[str, float]) -> Array:
         factor = kernel.factor

@@ -115,7 +115,7 @@ class Recalibrator:
         state, tick, why = self._admitted(incoming, sequence)
         readings = () if why else self._ground.observer.readings(incoming.channels, incoming.labels)
         if not why and not readings:
-            why = "it has not all that any measurement needs"
+            why = "no measurement can use it: numbers are missing, or its group is none that the calibration found"
         if why:
             self.state = _counted(state, "ignored")
             return (events.ignored(incoming, self.state, why),)
@@ -168,7 +168,7 @@ class Recalibrator:
         place = incoming.channels.get("sequence", math.nan)
         state = replace(state, place=place if math.isfinite(place) else state.place)
         try:
-            noise = self._joint_noise(incoming, before.values(chart), readings)
+            noise = self._ground.observer.joint_noise(chart.inside(before.values(chart)), readings)
             first = self._advance.seen(before, readings, noise).at(before.gaussian.mean)
         except ArmcalError as fault:
             self.state = _counted(replace(state, belief=before, anchor=anchor), "ignored")
@@ -241,11 +241,6 @@ class Recalibrator:
                 text = f"What is predicted is known to {1000 * sd:.2f} mm only; {1000 * limit:.2f} mm are tolerable."
                 return health.troubled("watch", text)
         return health.calmed(self._settings.levels.calm)
-
-    def _joint_noise(
-        self, incoming: Incoming, values: Array, readings: tuple[Reading, ...]
-    ) -> tuple[Array | None, ...]:
-        return self._ground.observer.joint_noise(self._ground.chart.inside(values), readings)
 
     def _estimate(self) -> dict[str, Any]:
         chart, belief = self._ground.chart, self.state.belief

@@ -40,7 +40,6 @@ class Footing:
         observer: makes observations of records.
         belief: that of the calibration.
         fading: how beliefs fade between records.
-        noise: covariance of each measurement's whole error (n_r x n_r), shared part included.
         request: what a source should look for.
         left_out: measurements that cannot be taken one record at a time.
     """
@@ -50,7 +49,6 @@ class Footing:
     observer: Observer
     belief: Belief
     fading: Fading
-    noise: Mapping[str, Array]
     request: ReadRequest
     left_out: tuple[str, ...]
 
@@ -80,7 +78,6 @@ def footing(calibration: Calibration, settings: RecalibrateSettings, shares: boo
     )
     covariance = _covariance(calibration, chart, opened)
     white, companions, noisy = _errors(calibration, measurements, chart, settings, shares)
-    whole = {name: white[name] + _shared(companions, name, len(white[name])) for name in white}
     size = len(chart.scales) + len(companions)
     mean, start = np.zeros(size), np.eye(size)
     mean[: len(chart.scales)] = _unconstrained(calibration, chart)
@@ -88,10 +85,11 @@ def footing(calibration: Calibration, settings: RecalibrateSettings, shares: boo
     return Footing(
         problem,
         chart,
-        Observer(problem, chart, companions, noisy, white, _defaults(calibration)),
+        Observer(
+            problem, chart, companions, noisy, white, _defaults(calibration), _unfound(calibration), _scale(calibration)
+        ),
         Belief(parameters.nominal(), Gaussian(mean, start)),
         Fading(variance_rates(parameters, settings.process_noise), companions),
-        whole,
         ReadRequest(
             calibration.system.arms, measurements, wanted_channels(calibration.system.arms, measurements, measured=True)
         ),
@@ -159,12 +157,14 @@ def _errors(
     """Each measurement's own error from record to record, what moves beside the parameters, and drifts
     that count as noise."""
     kept: Mapping[str, Any] = calibration.record.noise.get("scatter") or {}
-    scale = float(calibration.record.noise.get("scale") or 1.0)
+    scale = _scale(calibration)
     followed = shares and settings.model_error == "calibrated"
     companions: list[Companion] = []
     white = {}
     for name, measurement in measurements.items():
-        told = kept.get(name)
+        # Where joints are noisy the residuals scatter with the pose: their noise is carried over to each record.
+        noisy = any(calibration.system.arms[arm].joint_noise for arm in measurement.arms)
+        told = None if noisy else kept.get(name)
         covariance = np.diag((np.array(measurement.noise()) * scale) ** 2)
         if told is not None:
             covariance = np.array(told["covariance"])
@@ -192,9 +192,15 @@ def _drifts(calibration: Calibration, chart: Chart) -> list[Companion]:
     ]
 
 
-def _shared(companions: Companions, instance: str, rows: int) -> Array:
-    shifts = companions.shifts(instance, rows)
-    return np.asarray(shifts @ shifts.T)
+def _unfound(calibration: Calibration) -> set[str]:
+    """Parameters of groups that are not known and that no record of the calibration told of."""
+    found = {entry.name.partition("[")[0] for entry in calibration.record.parameters if entry.free}
+    return {block.name for block in calibration.parameters.nuisances if block.free} - found
+
+
+def _scale(calibration: Calibration) -> float:
+    """Of the residuals against the noise that was stated."""
+    return float(calibration.record.noise.get("scale") or 1.0)
 
 
 def _channels(calibration: Calibration, measurements: Mapping[str, Measurement]) -> Dataset:
