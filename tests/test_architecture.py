@@ -239,6 +239,16 @@ ORDER = [
     "armcal.online.mission.files",
     "armcal.online.mission.source",
     "armcal.online.mission.mission",
+    "armcal.bench.clock",
+    "armcal.bench.faults",
+    "armcal.bench.link",
+    "armcal.bench.device",
+    "armcal.bench.tracker",
+    "armcal.bench.joint_stream",
+    "armcal.bench.simulated",
+    "armcal.bench.acquisition.settings",
+    "armcal.bench.settings",
+    "armcal.bench.bench",
 ]
 """Lowest first. ``report``, ``testing`` and ``cli`` stand above all of these, in that order."""
 

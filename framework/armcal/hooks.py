@@ -11,7 +11,7 @@ from typing import Any, Protocol
 import pluggy
 
 PROJECT = "armcal"
-CONTRACT_VERSION = "1.2"
+CONTRACT_VERSION = "1.3"
 """Version of the plugin contract: the major number changes when an existing plugin would break."""
 
 hookspec = pluggy.HookspecMarker(PROJECT)
@@ -72,6 +72,31 @@ def armcal_register_exporters(register: Register) -> None:
 
 
 @hookspec
+def armcal_register_links(register: Register) -> None:
+    """Links to servo boards: built as ``Link(settings)``; see ``armcal.bench.link.Link``."""
+
+
+@hookspec
+def armcal_register_devices(register: Register) -> None:
+    """What moves joints: built as ``Device(settings, joint_names, link)``; see ``armcal.bench.device.JointDevice``."""
+
+
+@hookspec
+def armcal_register_trackers(register: Register) -> None:
+    """Live trackers: built as ``Tracker(settings)``; see ``armcal.bench.tracker.Tracker``."""
+
+
+@hookspec
+def armcal_register_joint_streams(register: Register) -> None:
+    """Live joint readings: built as ``Stream(settings)``; see ``armcal.bench.joint_stream.JointStream``."""
+
+
+@hookspec
+def armcal_register_benches(register: Register) -> None:
+    """Simulated benches: built as ``Bench(settings)``; see ``armcal.bench.simulated.SimulatedBench``."""
+
+
+@hookspec
 def armcal_run_started(name: str, records: int) -> None:
     """A calibration run begins; observers may log it. What they return is ignored."""
 
@@ -100,5 +125,10 @@ KINDS = {
     "online": "armcal_register_online_estimators",
     "simulator": "armcal_register_simulators",
     "exporter": "armcal_register_exporters",
+    "link": "armcal_register_links",
+    "device": "armcal_register_devices",
+    "tracker": "armcal_register_trackers",
+    "joints": "armcal_register_joint_streams",
+    "bench": "armcal_register_benches",
 }
 """The kinds of component and the hook that registers each."""

@@ -116,7 +116,7 @@ class PluginRegistry:
 
 def _spoken(kind: str) -> str:
     """A kind with its article."""
-    name = "online estimator" if kind == "online" else kind
+    name = {"online": "online estimator", "joints": "joint stream", "bench": "simulated bench"}.get(kind, kind)
     return f"{'an' if name[0] in 'aeiou' else 'a'} {name}"
 
 

@@ -66,3 +66,4 @@ class ExperimentSettings(Settings):
     noise: NoiseSettings = Field(default_factory=NoiseSettings)
     uncertainty: UncertaintySettings = Field(default_factory=UncertaintySettings)
     plan: PlanSettings | None = None
+    bench: dict[str, Any] | None = None

@@ -1,0 +1,1 @@
+"""The bench: servo boards, trackers, and measuring runs that cannot hurt the arm."""

@@ -1,0 +1,1 @@
+"""Measuring runs: a pose plan driven, measured and journalled."""

@@ -1,0 +1,70 @@
+"""The settings of a measuring run."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from armcal.base.settings import Angle, Duration, Length, Settings, Torque
+
+Positive = Annotated[float, Field(gt=0)]
+
+
+class ServoHeatSettings(Settings):
+    """How a servo heats: steadily under ``continuous`` torque it comes to its limit, with this time constant.
+
+    A servo may be given as much of its limit as ``budget``; what is left is for what these numbers do not know.
+    """
+
+    continuous: Torque
+    time_constant: Duration = 600.0
+    budget: Annotated[float, Field(gt=0, le=1)] = 0.6
+
+    @model_validator(mode="after")
+    def _physical(self) -> ServoHeatSettings:
+        if self.continuous <= 0 or self.time_constant <= 0:
+            raise ValueError("found a torque or a time that is not above zero")
+        return self
+
+
+class SettleSettings(Settings):
+    """When the arm stands: the mean of the last ``window`` is taken once positions scatter by less than ``spread``.
+
+    ``spread`` is of the mean's halves: they differ by less. ``wait`` passes first; after ``longest`` the pose is left.
+    """
+
+    wait: Duration = 0.5
+    window: Duration = 1.0
+    spread: Length = 0.0005
+    longest: Duration = 15.0
+    frames: Annotated[int, Field(ge=2)] = 10
+
+
+class LostSettings(Settings):
+    """A tracker that is silent, frozen or blind for ``hold`` makes the arm hold; for ``park``, park."""
+
+    hold: Duration = 0.5
+    park: Duration = 30.0
+
+
+class AcquisitionSettings(Settings):
+    """How the plan is driven.
+
+    ``limits`` of joints are those of ``plan`` where none are given here. ``park`` is where the arm is safe, cool and
+    stays when it is left alone; joints that it does not name park at zero. Without ``heat`` no heat is reckoned with.
+    ``order`` is the plan's, or ``cool``: the next pose is then the one that the servos can best bear. The board waits
+    for ``silence`` of the host before it parks the arm by itself, where its link can.
+    """
+
+    rate_deg_per_s: Annotated[float, Field(gt=0, le=180)] = 20.0
+    period: Duration = 0.02
+    limits: dict[str, tuple[Angle, Angle]] = Field(default_factory=dict)
+    park: dict[str, Angle] = Field(default_factory=dict)
+    path_step: Angle = 0.0175
+    settle: SettleSettings = Field(default_factory=SettleSettings)
+    lost: LostSettings = Field(default_factory=LostSettings)
+    heat: dict[str, ServoHeatSettings] = Field(default_factory=dict)
+    order: Literal["plan", "cool"] = "plan"
+    silence: Duration = 1.0
+    seed: Annotated[int, Field(ge=0)] = 0

@@ -1,0 +1,110 @@
+"""The time that a bench goes by: the machine's, or a simulated bench's."""
+
+from __future__ import annotations
+
+import json
+import socket
+import time
+from pathlib import Path
+from typing import Any, Protocol
+
+from armcal.errors import InputError, Location
+
+_LONGEST_ANSWER_S = 60.0
+
+
+class Clock(Protocol):
+    """Seconds; every wait of a bench goes through ``sleep``, so that a simulated bench can make time pass."""
+
+    def now(self) -> float:
+        """Seconds since some moment; it never goes back."""
+
+    def wall(self) -> float:
+        """Unix seconds."""
+
+    def sleep(self, seconds: float) -> None:
+        """Wait."""
+
+
+class RealClock:
+    """The machine's own."""
+
+    def now(self) -> float:
+        """See ``Clock``."""
+        return time.monotonic()
+
+    def wall(self) -> float:
+        """See ``Clock``."""
+        return time.time()
+
+    def sleep(self, seconds: float) -> None:
+        """See ``Clock``."""
+        if seconds > 0:
+            time.sleep(seconds)
+
+
+class SimulatedClock:
+    """The clock of a simulated bench: time passes there, and only there, while this one sleeps.
+
+    Everything else takes no time at all. When ``sleep`` returns, the bench has done all that it does in that time:
+    its arm has moved and its tracker has sent. A request is a JSON object a line on a Unix socket, and so is its
+    answer: ``{"advance": s}`` is answered by ``{"now": s, "wall": unix_s}``.
+
+    Raises:
+        InputError: no simulated bench answers there.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        self._socket.settimeout(_LONGEST_ANSWER_S)
+        try:
+            self._socket.connect(str(path))
+        except OSError as fault:
+            self._socket.close()
+            raise self._refusal(str(fault)) from fault
+        self._answers = self._socket.makefile("r", encoding="utf-8")
+        self._read = self.ask({"advance": 0.0})
+
+    def now(self) -> float:
+        """See ``Clock``."""
+        return float(self._read["now"])
+
+    def wall(self) -> float:
+        """See ``Clock``."""
+        return float(self._read["wall"])
+
+    def sleep(self, seconds: float) -> None:
+        """See ``Clock``."""
+        if seconds > 0:
+            self._read = self.ask({"advance": seconds})
+
+    def ask(self, request: dict[str, Any]) -> dict[str, Any]:
+        """Any request to the simulated bench, and its answer.
+
+        Raises:
+            InputError: the bench is gone, or refuses.
+        """
+        try:
+            self._socket.sendall(json.dumps(request).encode() + b"\n")
+            line = self._answers.readline()
+        except OSError as fault:
+            raise self._refusal(str(fault)) from fault
+        if not line:
+            raise self._refusal("it closed the connection")
+        answer: dict[str, Any] = json.loads(line)
+        if "error" in answer:
+            raise self._refusal(str(answer["error"]))
+        return answer
+
+    def close(self) -> None:
+        """Let go of the bench; its time stands still."""
+        self._answers.close()
+        self._socket.close()
+
+    def _refusal(self, why: str) -> InputError:
+        return InputError(
+            f"the simulated bench does not answer ({why}).",
+            where=Location(str(self._path)),
+            hint="Start one with armcal simulated-bench, or leave bench.clock out for a real bench.",
+        )

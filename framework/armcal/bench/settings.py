@@ -1,0 +1,32 @@
+"""The section ``bench`` of a configuration: what moves and measures the arm, and how a measuring run goes."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+from pydantic import Field
+
+from armcal.base.settings import InputPath, Settings
+from armcal.bench.acquisition.settings import AcquisitionSettings
+
+
+class SimulatedClockSettings(Settings):
+    """The clock of a simulated bench: the path of its socket."""
+
+    simulated: InputPath
+
+
+class BenchSettings(Settings):
+    """Components keep their own settings under ``type``.
+
+    ``clock`` is the machine's, unless a simulated bench is at the other end.
+    """
+
+    clock: Literal["real"] | SimulatedClockSettings = "real"
+    link: dict[str, Any] | None = None
+    device: dict[str, Any] | None = None
+    tracker: dict[str, Any] | None = None
+    joints: dict[str, Any] | None = None
+    acquisition: AcquisitionSettings = Field(default_factory=AcquisitionSettings)
+    servo: dict[str, Any] | None = None
+    simulator: dict[str, Any] | None = None
