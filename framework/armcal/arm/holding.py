@@ -18,6 +18,14 @@ def holding_efforts(
 
     Gravity (m/s^2) in the base frame; the payload (kg) in the tool frame.
     """
+    function = holding_function(arm, gravity, payload, payload_com)
+    return np.asarray(function.map(joint_angles.shape[1])(joint_angles).full())
+
+
+def holding_function(
+    arm: Arm, gravity: Vector3, payload: float = 0.0, payload_com: Vector3 = (0.0, 0.0, 0.0)
+) -> ca.Function:
+    """From commands (joints) to what ``holding_efforts`` gives of them, to be called often."""
     chain = arm.nominal_chain
     commands = ca.SX.sym("commands", len(arm.commanded))
     told = arm.joint_commands(ca.vertsplit(commands))
@@ -31,5 +39,4 @@ def holding_efforts(
         if joint.mimic is not None:
             continue
         efforts.append(effort(joint, frames.sites[index], acting[index]))
-    function = ca.Function("efforts", [commands], [ca.densify(ca.vertcat(*efforts))], {"cse": True})
-    return np.asarray(function.map(joint_angles.shape[1])(joint_angles).full())
+    return ca.Function("efforts", [commands], [ca.densify(ca.vertcat(*efforts))], {"cse": True})

@@ -8,6 +8,7 @@ from pydantic import Field
 
 from armcal.base.settings import InputPath, Settings
 from armcal.bench.acquisition.settings import AcquisitionSettings
+from armcal.bench.body_settings import BodySettings
 
 
 class SimulatedClockSettings(Settings):
@@ -19,7 +20,8 @@ class SimulatedClockSettings(Settings):
 class BenchSettings(Settings):
     """Components keep their own settings under ``type``.
 
-    ``clock`` is the machine's, unless a simulated bench is at the other end.
+    ``bodies`` says which of the tracker's bodies is what. ``clock`` is the machine's, unless a simulated bench is at
+    the other end.
     """
 
     clock: Literal["real"] | SimulatedClockSettings = "real"
@@ -27,6 +29,7 @@ class BenchSettings(Settings):
     device: dict[str, Any] | None = None
     tracker: dict[str, Any] | None = None
     joints: dict[str, Any] | None = None
+    bodies: BodySettings = Field(default_factory=BodySettings)
     acquisition: AcquisitionSettings = Field(default_factory=AcquisitionSettings)
     servo: dict[str, Any] | None = None
     simulator: dict[str, Any] | None = None

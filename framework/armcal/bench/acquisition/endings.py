@@ -1,0 +1,24 @@
+"""How a measuring run ends, and what makes it stop on its way."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+How = Literal["done", "held", "parked"]
+
+
+@dataclass(frozen=True)
+class Ending:
+    """How a run ended, and a sentence why."""
+
+    how: How
+    sentence: str
+
+
+class ParkWish(Exception):  # noqa: N818 - no error: somebody or something wants the arm parked
+    """The arm is to be parked, and the run to end. The message says why."""
+
+
+class TooHot(Exception):  # noqa: N818 - see above
+    """A servo has come to its budget before its time."""

@@ -1,0 +1,82 @@
+"""A measuring run against a simulated bench, in a process of its own."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from armcal.bench.clock import SimulatedClock
+from armcal.bench.simulated import BOARD, CLOCK
+from armcal.errors import ArmcalError, InputError
+
+_STARTED_IN_S = 60.0
+_ENDED_IN_S = 10.0
+
+
+def overrides_for(folder: Path) -> tuple[str, ...]:
+    """What a configuration must say instead to work with the simulated bench in a folder."""
+    there = folder.absolute()
+    return (f"bench.clock={{simulated: {there / CLOCK}}}", f"bench.link.port={there / BOARD}")
+
+
+@contextmanager
+def simulated_bench(config: Path, overrides: Sequence[str], folder: Path) -> Iterator[None]:
+    """A simulated bench, from when it answers until it is told to stop.
+
+    Raises:
+        InputError: it does not start; its own words are told.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    sets = [word for text in overrides for word in ("--set", text)]
+    command = [sys.executable, "-m", "armcal.cli", "simulated-bench", str(config), "--dir", str(folder), *sets]
+    with (folder / "said.txt").open("w+", encoding="utf-8") as said:
+        process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=said, stderr=said)
+        try:
+            _wait_for(process, folder, folder / "said.txt")
+            yield
+        finally:
+            _stop(process, folder)
+
+
+def truth(folder: Path) -> dict[str, Any]:
+    """What the simulated bench knows: the arm's true state, and what was unsafe.
+
+    Raises:
+        InputError: it does not answer.
+    """
+    clock = SimulatedClock(folder / CLOCK)
+    try:
+        return clock.ask({"state": True})
+    finally:
+        clock.close()
+
+
+def _wait_for(process: subprocess.Popen[bytes], folder: Path, said: Path) -> None:
+    until = time.monotonic() + _STARTED_IN_S
+    while time.monotonic() < until:
+        if process.poll() is not None:
+            raise ArmcalError(
+                "the simulated bench ended before it began: " + said.read_text(encoding="utf-8").strip()[-2000:],
+            )
+        if (folder / CLOCK).exists():
+            try:
+                SimulatedClock(folder / CLOCK).close()
+                return
+            except InputError:
+                pass
+        time.sleep(0.05)
+    raise ArmcalError(f"the simulated bench did not start in {_STARTED_IN_S:.0f} s.")
+
+
+def _stop(process: subprocess.Popen[bytes], folder: Path) -> None:
+    process.terminate()
+    try:
+        process.wait(_ENDED_IN_S)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()

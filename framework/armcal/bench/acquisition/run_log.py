@@ -1,0 +1,62 @@
+"""The journal of a measuring run: begun, or gone on with."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Literal
+
+from armcal.bench.acquisition.outputs import JOURNAL, OURS
+from armcal.bench.acquisition.progress import HERE, STARTED, Progress, progress_of
+from armcal.errors import InputError, Location
+from armcal.online.journal.journal import Journal
+from armcal.run.folder import check_folder
+
+Start = Literal["anew", "resume"]
+
+
+class RunLog:
+    """An open journal and what it held."""
+
+    def __init__(self, journal: Journal) -> None:
+        self._journal = journal
+        self.progress: Progress = progress_of(journal.recovered.entries)
+        started = [entry.content for entry in journal.recovered.entries if entry.kind == STARTED]
+        self.device: str | None = started[0]["device"] if started else None
+
+    def record(self, kind: str, content: Mapping[str, Any]) -> None:
+        """Write an entry that outlasts a power loss; see ``Journal.record`` for what it raises."""
+        self._journal.record(kind, dict(content))
+
+    def note_angles(self, angles: Mapping[str, float], heat: Mapping[str, float], wall: float) -> None:
+        """Write where the arm is told to be; a power loss may take the last of these."""
+        self._journal.note(HERE, {"angles": dict(angles), "heat": dict(heat), "at": wall})
+
+
+@contextmanager
+def opened_log(folder: Path, start: Start, header: Mapping[str, Any]) -> Iterator[RunLog]:
+    """The journal in a run's folder.
+
+    Raises:
+        InputError: there is a run and it was not said to resume it, or none and it was; or it was begun with another
+            plan or configuration.
+        JournalDamagedError: it cannot be read.
+    """
+    where, there = Location(str(folder)), (folder / JOURNAL).is_dir()
+    if there and start == "anew":
+        raise InputError(
+            "it holds a measuring run already.", where=where, hint="Go on with it by --resume, or give another --out."
+        )
+    if start == "resume" and not there:
+        raise InputError("it holds no run to resume.", where=where, hint="Leave --resume out to begin one.")
+    if not there:
+        check_folder(folder, OURS)
+    with Journal.open(folder / JOURNAL, header) as journal:
+        begun = journal.recovered.header
+        for key, name in (("plan", "plan"), ("config", "configuration")):
+            if begun and begun.get(key) != header[key]:
+                raise InputError(
+                    f"it was begun with another {name}.", where=where, hint=f"Give the same {name}, or another --out."
+                )
+        yield RunLog(journal)

@@ -1,0 +1,174 @@
+"""A measuring run in its folder, from opening the devices to what it leaves behind."""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from armcal.base.config_text import plain
+from armcal.bench.acquisition import progress as entry
+from armcal.bench.acquisition.conduct import Conduct, Parts
+from armcal.bench.acquisition.drive import Drive
+from armcal.bench.acquisition.endings import Ending
+from armcal.bench.acquisition.eyes import TrackerEyes
+from armcal.bench.acquisition.outputs import measured_by, write_outputs
+from armcal.bench.acquisition.preparation import Prepared
+from armcal.bench.acquisition.progress import Progress
+from armcal.bench.acquisition.recovery import Recovery
+from armcal.bench.acquisition.run_log import RunLog, Start, opened_log
+from armcal.bench.acquisition.watch import Patient, Watch
+from armcal.bench.clock import Clock
+from armcal.bench.device import DeviceIdentity, JointDevice
+from armcal.bench.faults import DeviceRefusedError
+from armcal.errors import InputError, Location
+from armcal.use.calibration import identity_of
+
+_FIRST_FRAME_S = 3.0
+
+
+@dataclass(frozen=True)
+class Course:
+    """What a run is told, and whom it tells.
+
+    Attributes:
+        folder: where everything of it is kept.
+        start: ``anew``, or ``resume`` what is there.
+        asked_to_end: whether somebody wants it parked.
+        may_energise: asked once, with the joints that hang free, before they get their first pulses.
+        told: called after each pose.
+    """
+
+    folder: Path
+    start: Start
+    asked_to_end: Callable[[], bool]
+    may_energise: Callable[[tuple[str, ...]], bool]
+    told: Callable[[Progress], None]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a run ended, and its summary as it was written."""
+
+    ending: Ending
+    summary: dict[str, Any]
+
+
+def acquire(prepared: Prepared, plan: Path, course: Course) -> Outcome:
+    """Drive the plan.
+
+    Raises:
+        InputError: the folder, the board or the tracker is refused; nothing was moved.
+        DeviceError: the board does not answer at all.
+        ArmcalError: the journal cannot be written; the arm was parked.
+    """
+    measured_by(prepared.bench.experiment)
+    with prepared.bench.clock() as clock, opened_log(course.folder, course.start, _header(prepared, plan)) as log:
+        with _opened(prepared, clock, log) as (device, eyes, identity):
+            log.record(entry.STARTED, {"at": clock.wall(), "device": identity.digest, "name": identity.name})
+            ending, progress = _conducted(prepared, course, clock, log, device, eyes)
+        summary = _summary(prepared, progress, ending, identity)
+        write_outputs(course.folder, prepared.bench.experiment, progress, summary)
+        return Outcome(ending, summary)
+
+
+@contextmanager
+def _opened(prepared: Prepared, clock: Clock, log: RunLog) -> Iterator[tuple[JointDevice, TrackerEyes, DeviceIdentity]]:
+    """Device and tracker, both alive; nothing moves."""
+    device, settings = prepared.device, prepared.settings
+    eyes = TrackerEyes(prepared.bench, clock)
+    try:
+        identity = device.open(clock)
+        if log.device not in (None, identity.digest):
+            raise InputError(
+                f"the run was begun with another board, or another calibration of it, than {identity.name}.",
+                hint="Connect the board that the run began with, with the servo file that it began with.",
+            )
+        eyes.open()
+        until = clock.now() + _FIRST_FRAME_S
+        while eyes.trouble()[0] and clock.now() < until:
+            clock.sleep(settings.period)
+            eyes.look()
+        if eyes.trouble()[0]:
+            raise DeviceRefusedError(
+                f"the tracker tells nothing that could be used ({eyes.trouble()[1]}); nothing was moved.",
+                hint="Start it, check its address and the names of its bodies, and let it see them.",
+            )
+        yield device, eyes, identity
+    finally:
+        eyes.close()
+        device.close()
+
+
+def _conducted(
+    prepared: Prepared, course: Course, clock: Clock, log: RunLog, device: JointDevice, eyes: TrackerEyes
+) -> tuple[Ending, Progress]:
+    """The run itself; everything is written down as it goes."""
+    settings, progress = prepared.settings, log.progress
+
+    def note(angles: Any, heat: Any) -> None:
+        log.note_angles(angles, heat, clock.wall())
+
+    def announce(joint: str, angle: float) -> None:
+        log.record(entry.ENERGISED, {"joint": joint, "angle": angle, "at": clock.wall()})
+
+    drive = Drive(device, clock, prepared.ways, settings, prepared.heat, note)
+    _warmed(drive, progress, clock)
+    free = tuple(joint for joint in device.joint_names if joint not in device.state().angles)
+    if free and not course.may_energise(free):
+        raise InputError("the joints may not be energised; nothing was moved.", hint="Say yes, or give --yes.")
+    parts = Parts(
+        drive=drive,
+        recovery=Recovery(device, drive, clock, settings, announce, course.asked_to_end),
+        scheduler=prepared.scheduler,
+        eyes=eyes,
+        clock=clock,
+        settings=settings,
+        log=log,
+        watch=Watch(clock, eyes, settings.lost, course.asked_to_end),
+        patient=Patient(eyes, course.asked_to_end),
+        told=course.told,
+    )
+    conduct = Conduct(parts, replace(progress, ended=""))
+    return conduct.run(), conduct.progress
+
+
+def _warmed(drive: Drive, progress: Progress, clock: Clock) -> None:
+    """The heat that an earlier part of the run has left."""
+    if progress.heat:
+        drive.found(progress.angles)
+        drive.heat = np.array([progress.heat.get(joint, 0.0) for joint in drive.angles])
+        drive.cool(max(clock.wall() - progress.at, 0.0))
+
+
+def _header(prepared: Prepared, plan: Path) -> dict[str, Any]:
+    try:
+        text = plan.read_bytes()
+    except OSError as fault:
+        raise InputError(f"it cannot be read ({fault}).", where=Location(str(plan)), hint="Give the plan.") from fault
+    return {"plan": hashlib.sha256(text).hexdigest(), "config": _config_digest(prepared), "began": time.time()}
+
+
+def _config_digest(prepared: Prepared) -> str:
+    """Of all that is configured but where the bench's parts are plugged in."""
+    data = dict(plain(prepared.bench.experiment.source.data))
+    bench = {k: v for k, v in data.get("bench", {}).items() if k not in ("clock", "link", "simulator")}
+    return identity_of({**data, "bench": bench})
+
+
+def _summary(prepared: Prepared, progress: Progress, ending: Ending, identity: DeviceIdentity) -> dict[str, Any]:
+    return {
+        "how": ending.how,
+        "why": ending.sentence,
+        "poses": len(prepared.plan),
+        "measured": len(progress.measured),
+        "left_out": dict(progress.left_out),
+        "board": identity.name,
+        "digests": {"board": identity.digest[:16], "config": _config_digest(prepared)[:16]},
+    }

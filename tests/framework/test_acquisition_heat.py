@@ -1,0 +1,101 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from armcal.bench.acquisition.heat import NEVER, HeatModel
+from armcal.bench.acquisition.schedule import LeaveOut, Measure, Rest, Scheduler, foretell
+from armcal.bench.acquisition.settings import ServoHeatSettings
+from armcal.bench.acquisition.ways import Ways, travel
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.integrate import solve_ivp
+
+JOINTS = ("q1", "q2")
+HEAT = HeatModel.of(JOINTS, {"q2": ServoHeatSettings.si(continuous=1.0, time_constant=600.0, budget=0.6)})
+
+
+def torques(pose: np.ndarray) -> np.ndarray:
+    """A level arm: joint 2 carries 2 N m when it lies flat and nothing when it hangs."""
+    return np.array([0.1, 2.0 * np.sin(pose[1])])
+
+
+def scheduler(poses: np.ndarray, order: str = "plan", model: HeatModel = HEAT, check=None) -> Scheduler:
+    limits = np.array([[-np.pi, np.pi]] * 2)
+    park = np.zeros(2)
+    ways = Ways(check, limits, np.vstack([park, poses]), 0.02)
+    names = tuple(f"p{i}" for i in range(len(poses)))
+    return Scheduler(poses, names, park, ways, model, torques, np.deg2rad(20), 8.0, order)
+
+
+def test_heat_follows_its_differential_equation() -> None:
+    heat, torque = np.array([0.0, 0.2]), np.array([0.3, 0.9])
+    found = HEAT.after(heat, torque, 400.0)
+    oracle = solve_ivp(lambda t, h: (0.9**2 - h) / 600.0, (0, 400), [0.2], rtol=1e-10, atol=1e-12).y[0, -1]
+    assert found[1] == pytest.approx(oracle, rel=1e-8)
+    assert found[0] == 0.0, "a joint that is not reckoned with stays cold"
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.floats(0.1, 3.0), st.floats(0.0, 0.9), st.floats(1.0, 300.0), st.floats(1.0, 300.0))
+def test_heat_does_not_hang_on_how_time_is_cut(torque: float, heat: float, first: float, second: float) -> None:
+    load, now = np.array([0.0, torque]), np.array([0.0, heat])
+    whole = HEAT.after(now, load, first + second)
+    assert np.allclose(HEAT.after(HEAT.after(now, load, first), load, second), whole, rtol=1e-12)
+
+
+def test_the_time_to_cool_is_the_time_after_which_it_is_cool() -> None:
+    hot, wanted, at_rest = np.array([0.0, 0.9]), np.array([0.5, 0.3]), np.array([0.0, 0.2])
+    seconds = HEAT.cooled_in(hot, at_rest, wanted)
+    assert HEAT.after(hot, at_rest, seconds)[1] == pytest.approx(0.3)
+    assert HEAT.cooled_in(hot, np.array([0.0, 0.8]), wanted) == NEVER, "held torque keeps it above 0.3"
+
+
+def test_a_joint_that_is_not_there_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"'q9'; the joints are q1, q2"):
+        HeatModel.of(JOINTS, {"q9": ServoHeatSettings.si(continuous=1.0)})
+
+
+def test_rests_come_before_the_budget_is_spent() -> None:
+    poses = np.array([[0.1 * i, 1.2] for i in range(-15, 15)])
+    outlook = foretell(scheduler(poses), np.zeros(2), HEAT.cold, list(range(30)))
+    assert sum(isinstance(step, Measure) for step in outlook.steps) == 30
+    assert any(isinstance(step, Rest) for step in outlook.steps)
+    assert outlook.hottest[1] <= 0.6
+    never = replace(HEAT, budget=np.array([np.inf, np.inf]))
+    hot = foretell(scheduler(poses, model=never), np.zeros(2), HEAT.cold, list(range(30)))
+    assert hot.hottest[1] > 0.6 and hot.resting == 0, "without a budget there would have been no rest"
+    assert outlook.seconds > hot.seconds
+
+
+def test_a_pose_that_no_servo_bears_is_left_out_and_the_others_are_not() -> None:
+    weak = replace(HEAT, continuous=np.array([np.inf, 0.05]), time_constant=np.array([600.0, 5.0]))
+    poses = np.array([[0.5, 0.0], [0.5, 1.5], [1.0, 0.0]])
+    outlook = foretell(scheduler(poses, model=weak), np.zeros(2), weak.cold, [0, 1, 2])
+    left = [step for step in outlook.steps if isinstance(step, LeaveOut)]
+    assert [step.pose for step in left] == [1] and "even from cold" in left[0].why
+    assert sorted(step.pose for step in outlook.steps if isinstance(step, Measure)) == [0, 2]
+
+
+def test_a_cool_order_takes_no_longer_than_the_plans() -> None:
+    random = np.random.default_rng(3)
+    poses = random.uniform([-2, -1.5], [2, 1.5], (40, 2))
+    times = {
+        order: foretell(scheduler(poses, order), np.zeros(2), HEAT.cold, list(range(40))) for order in ("plan", "cool")
+    }
+    assert times["cool"].seconds < times["plan"].seconds
+    assert times["cool"].hottest[1] <= 0.6
+    for outlook in times.values():
+        assert sorted(step.pose for step in outlook.steps if isinstance(step, Measure)) == list(range(40))
+
+
+def test_each_step_begins_where_the_one_before_ended() -> None:
+    poses = np.array([[0.1 * i, 1.2 * (-1) ** i] for i in range(-8, 8)])
+    at = np.zeros(2)
+    for step in foretell(scheduler(poses), at, HEAT.cold, list(range(16))).steps:
+        assert not isinstance(step, LeaveOut)
+        assert np.array_equal(step.way[0], at)
+        at = step.way[-1]
+        expected = travel(step.way) / np.deg2rad(20)
+        assert step.seconds >= expected
