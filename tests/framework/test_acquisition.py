@@ -40,14 +40,14 @@ class Run:
         self.device = device or FakeDevice(self.clock)
         self.settings = settings or AcquisitionSettings()
         self.eyes, self.log, self.asked = FakeEyes(self.clock, self.device), FakeLog(), False
-        self.progress = progress or Progress()
+        self.progress, self.poses = progress or Progress(), POSES
         self.model = HeatModel.of(self.device.joint_names, heat or {})
 
     def conduct(self) -> Conduct:
         settings, clock, device = self.settings, self.clock, self.device
-        ways = Ways(None, np.array([[-2.0, 2.0]] * 2), POSES, 0.02)
+        ways = Ways(None, np.array([[-2.0, 2.0]] * 2), self.poses, 0.02)
         drive = Drive(device, clock, ways, settings, (self.model, torques), lambda angles, heat: None)
-        scheduler = Scheduler(POSES, IDS, drive.park, ways, self.model, torques, RATE, 2.0, settings.order)
+        scheduler = Scheduler(self.poses, IDS, drive.park, ways, self.model, torques, RATE, 2.0, settings.order)
         recovery = Recovery(device, drive, clock, settings, self.announce, lambda: self.asked)
         recovery.open()
         parts = Parts(
@@ -114,6 +114,25 @@ def test_the_way_to_the_first_pose_begins_at_the_park_pose_and_joints_are_energi
     assert len(times) == 2 and times[1] - times[0] >= 0.5
     first = next(angles for _, what, angles in run.device.log if what == "command")
     assert first["q1"] == pytest.approx(0.3, abs=2 * COUNT_RAD)
+
+
+def test_every_joint_has_come_from_a_known_side_even_where_it_stays_where_it_parks() -> None:
+    run = Run()
+    run.poses = POSES * [1, 0]
+    assert run.run() == "done"
+    sides = [content["approach"] for kind, content in run.log.entries if kind == "measured"]
+    assert all(side["q1"] and side["q2"] for side in sides)
+    moved = [t for t, what, angles in run.device.log if what == "command" and angles["q2"]]
+    first = next(c["at"] for kind, c in run.log.entries if kind == "measured") - 1.7e9
+    assert moved and max(moved) < first, "only once"
+
+
+def test_a_joint_that_stays_keeps_the_side_it_came_from() -> None:
+    run, signs = Run(), np.sign(np.diff(np.vstack([np.zeros(2), POSES]), axis=0))
+    run.poses = np.repeat(POSES[:4], 2, axis=0) + [[0.0, 0.0], [0.0, 0.5]] * 4
+    assert run.run() == "done"
+    sides = [content["approach"]["q1"] for kind, content in run.log.entries if kind == "measured"]
+    assert sides[0::2] == sides[1::2] == signs[:4, 0].tolist()
 
 
 def test_the_board_is_always_told_a_way_home_that_begins_on_the_leg_that_is_driven() -> None:

@@ -130,6 +130,7 @@ class Conduct:
         self._record(entry.GOING, {"pose": name, **self._here()})
         try:
             drive.go(step.way, self._parts.watch)
+            drive.take_up_play(self._parts.watch)
             drive.note()
             capture = self._capture()
         except TooHot as heat:

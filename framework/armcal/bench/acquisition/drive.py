@@ -21,6 +21,9 @@ _LONGEST_STEP = 2.0
 _ALIVE_EVERY_S = 0.1
 _NOTED_EVERY_S = 1.0
 _HEATED_EVERY_S = 0.25
+_STILL_RAD = 1e-9
+_PLAY_RAD = np.deg2rad(3.0)
+"""More than servos have play."""
 
 Note = Callable[[Mapping[str, float], Mapping[str, float]], None]
 """Told angles (rad) and heat by joint, now and then while the arm moves."""
@@ -72,6 +75,10 @@ class Drive:
         """Where the device says that it is told to be."""
         self.at = np.array([angles.get(joint, self.at[i]) for i, joint in enumerate(self._joints)])
 
+    def forget_approach(self, joint: str) -> None:
+        """A joint was energised: it may have jumped from either side."""
+        self.approach[self._joints.index(joint)] = 0.0
+
     def go(self, way: Sequence[Array], looker: Looker) -> None:
         """Through a way that begins where the arm is.
 
@@ -83,6 +90,18 @@ class Drive:
             self._guard(start)
             self._leg(start, goal, looker)
         self._guard(way[-1])
+
+    def take_up_play(self, looker: Looker) -> None:
+        """Give joints a direction of approach that have none since they were energised: a little away, and back.
+
+        Which side a servo's play lies on is not known before it has moved. See ``go`` for what it raises.
+        """
+        unknown, here = self.approach == 0, self.at
+        for away in (-_PLAY_RAD, _PLAY_RAD):
+            there = here + away * unknown
+            if unknown.any() and self._ways.within(there) and self._ways.clear(here, there):
+                self.go((here, there, here), looker)
+                return
 
     def stand(self, seconds: float, looker: Looker) -> None:
         """Hold for some time; see ``go``."""
@@ -128,7 +147,8 @@ class Drive:
         """A straight line in joint space, all joints in proportion."""
         length, gone, before = float(np.max(np.abs(goal - start))), 0.0, self._clock.now()
         told = self._device.standing(self.angles)
-        self.approach = np.where(goal != start, np.sign(goal - start), self.approach)
+        moved = goal - start
+        self.approach = np.where(np.abs(moved) > _STILL_RAD, np.sign(moved), self.approach)
         while gone < length:
             moves = self.tick(looker)
             now = self._clock.now()
@@ -137,7 +157,7 @@ class Drive:
             if not moves:
                 continue
             gone = min(gone + step, length)
-            self.at = start + (gone / length) * (goal - start)
+            self.at = start + (gone / length) * moved if gone < length else goal.copy()
             wanted = self._device.standing(self.angles)
             if wanted != told:
                 self._device.command(wanted)

@@ -60,6 +60,7 @@ class Recovery:
             if joint not in self._device.state().angles:
                 self._announce(joint, angle)
                 self._device.energise(joint, angle)
+                self._drive.forget_approach(joint)
                 self._drive.stand(self._settings.between_joints, Blind())
 
     def back(self, fault: DeviceError, known: Mapping[str, float]) -> None:

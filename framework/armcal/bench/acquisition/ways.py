@@ -42,6 +42,10 @@ class Ways:
         """Whether nothing is too near there (joints, rad)."""
         return self._check is None or bool(self._check(pose[:, None]).allowed[0])
 
+    def within(self, pose: Array) -> bool:
+        """Whether it lies within the limits (joints, rad)."""
+        return bool(np.all((pose >= self._limits[:, 0]) & (pose <= self._limits[:, 1])))
+
     def clear(self, start: Array, goal: Array) -> bool:
         """Whether the straight line between two poses is clear, its ends included."""
         if self._check is None:
