@@ -12,7 +12,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from benchmarks import batch, fit_elastic, fit_rigid, large, online, plan, startup
+from benchmarks import batch, fit_elastic, fit_rigid, large, links, online, plan, startup, tracker
 from benchmarks.report import Row, print_table, write_json
 
 
@@ -30,7 +30,9 @@ def main() -> None:
         "large": partial(large.run, long=chosen.long),
         "plan": plan.run,
         "online": online.run,
+        "links": links.run,
         "startup": startup.run,
+        "tracker": tracker.run,
     }
     names = fnmatch.filter(benchmarks, chosen.only)
     if not names:

@@ -16,3 +16,9 @@ def armcal_register_measurements(register: Register) -> None:
 def armcal_register_readers(register: Register) -> None:
     """Announce the reader."""
     register("mukca", "armcal_contact.mukca_reader:MukcaReader", "folders of postures with a ball in two sockets")
+
+
+@hookimpl
+def armcal_register_joint_streams(register: Register) -> None:
+    """Announce the joint stream."""
+    register("json_lines", "armcal_contact.json_joints:JsonLinesJoints", "a JSON object a line: UDP, a pipe, a file")

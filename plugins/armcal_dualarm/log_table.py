@@ -61,8 +61,8 @@ def read_table(path: Path, delimiter: str, numbers: Sequence[Column], texts: Seq
     if first is None:
         _refuse(path, "it is empty.", "Give a row a moment.")
     line, cells = first
-    header = cells if _is_header(cells, numbers, texts) else []
-    places = [_place(path, line, header, len(cells), column) for column in (*numbers, *texts)]
+    header = cells if is_header(cells, numbers, texts) else []
+    places = [place_of(path, line, header, len(cells), column) for column in (*numbers, *texts)]
     body = rows if header else _with_first(first, rows)
     names = [header[place] if header else f"column {place + 1}" for place in places]
     lines, columns, words = _load(path, body, len(cells), places[: len(numbers)], places[len(numbers) :], names)
@@ -94,10 +94,19 @@ def _rows(path: Path, raw: bytes, delimiter: str) -> Iterator[tuple[int, list[st
             _refuse(path, "found a NUL byte, expected text.", _SAVE_AS_TEXT, line)
         if not text.strip():
             continue
-        if delimiter == "auto":
-            delimiter = next((each for each in _DELIMITERS if each in text), " ")
-        parts = text.split() if delimiter == " " else text.split(delimiter)
-        yield line, [part.strip().strip('"').strip() for part in parts]
+        delimiter = delimiter_of(text) if delimiter == "auto" else delimiter
+        yield line, cells_of(text, delimiter)
+
+
+def delimiter_of(text: str) -> str:
+    """What parts the cells of a row; a blank stands for any blanks."""
+    return next((each for each in _DELIMITERS if each in text), " ")
+
+
+def cells_of(text: str, delimiter: str) -> list[str]:
+    """The cells of a row."""
+    parts = text.split() if delimiter == " " else text.split(delimiter)
+    return [part.strip().strip('"').strip() for part in parts]
 
 
 def _with_first(first: tuple[int, list[str]], rows: Iterator[tuple[int, list[str]]]) -> Iterator[tuple[int, list[str]]]:
@@ -105,7 +114,7 @@ def _with_first(first: tuple[int, list[str]], rows: Iterator[tuple[int, list[str
     yield from rows
 
 
-def _is_header(cells: Sequence[str], numbers: Sequence[Column], texts: Sequence[Column]) -> bool:
+def is_header(cells: Sequence[str], numbers: Sequence[Column], texts: Sequence[Column]) -> bool:
     """Whether the first row holds names: asked for by name, no cell a number; by place, no number where one is due."""
     if any(isinstance(column, str) for column in (*numbers, *texts)):
         return not any(is_number(cell) for cell in cells)
@@ -113,8 +122,12 @@ def _is_header(cells: Sequence[str], numbers: Sequence[Column], texts: Sequence[
     return not any(is_number(cell) for cell in due) and any(not is_missing(cell) for cell in due)
 
 
-def _place(path: Path, line: int, header: Sequence[str], count: int, column: Column) -> int:
-    """Where a column stands, from 0."""
+def place_of(path: Path, line: int | None, header: Sequence[str], count: int, column: Column) -> int:
+    """Where a column stands, from 0.
+
+    Raises:
+        DataError: it is not there, or several times.
+    """
     if isinstance(column, int):
         if not 1 <= column <= count:
             _refuse(path, f"found {count} columns, expected a column {column}.", "Columns count from 1.", line)
@@ -164,10 +177,15 @@ def _numbers(path: Path, lines: Sequence[int], cells: Sequence[str], name: str) 
             return np.array(cells, dtype=np.float64)
         except ValueError:  # a cell is empty, or is no number
             pass
-    return np.array([_number(path, line, cell, name) for line, cell in zip(lines, cells, strict=True)])
+    return np.array([number_of(path, line, cell, name) for line, cell in zip(lines, cells, strict=True)])
 
 
-def _number(path: Path, line: int, cell: str, name: str) -> float:
+def number_of(path: Path, line: int | None, cell: str, name: str) -> float:
+    """A cell's number; NaN where it is empty.
+
+    Raises:
+        DataError: it is none.
+    """
     if is_number(cell):
         return float(cell)
     if is_missing(cell):

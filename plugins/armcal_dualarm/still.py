@@ -54,7 +54,7 @@ def rests(joints: Array, labels: Sequence[Sequence[str]], time: Array | None, se
         time: of each row (N, s); needed for a window in seconds. A rest ends where it jumps back or by a window.
         settings: what still means.
     """
-    breaks = _breaks(joints, labels, time, settings)
+    breaks = breaks_of(joints, labels, time, settings)
     edges = [0, *np.flatnonzero(breaks).tolist(), joints.shape[1]]
     found: list[Rest] = []
     for start, stop in pairwise(edges):
@@ -64,7 +64,7 @@ def rests(joints: Array, labels: Sequence[Sequence[str]], time: Array | None, se
     return found
 
 
-def _breaks(joints: Array, labels: Sequence[Sequence[str]], time: Array | None, settings: StillSettings) -> Mask:
+def breaks_of(joints: Array, labels: Sequence[Sequence[str]], time: Array | None, settings: StillSettings) -> Mask:
     """Before which rows a rest ends, whatever the joints do (N)."""
     missing = np.isnan(joints)
     breaks = np.zeros(joints.shape[1], dtype=bool)

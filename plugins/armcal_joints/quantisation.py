@@ -7,10 +7,13 @@ from typing import Annotated, Any, ClassVar
 
 from armcal.arm.effects import JointCommand, Spring
 from armcal.arm.servo import PulseClock, PulseTable, quantised
+from armcal.base.config_text import resolve_path
 from armcal.base.parameters import ParameterBlock
 from armcal.base.quantities import UnitOf
 from armcal.base.settings import Settings
-from pydantic import Field, model_validator
+from armcal.config.servo_file import CalibratedServo, load_servo_file
+from armcal.errors import ConfigError
+from pydantic import BeforeValidator, Field, model_validator
 
 from armcal_joints.joints import chosen
 
@@ -30,19 +33,58 @@ class PulseTableSettings(Settings):
         return self
 
 
-class QuantisationSettings(Settings):
-    """A pulse table a joint, the board's measured oscillator, and its pulse rate or prescale."""
+def _read_file(value: Any) -> Any:
+    """A servo file's name becomes what stands in it, so that the settings say everything themselves."""
+    if not isinstance(value, str):
+        return value
+    try:
+        file = load_servo_file(resolve_path(value))
+    except ConfigError as fault:  # pydantic places it; it would not catch an error of ours
+        raise ValueError(str(fault)) from fault
+    return {joint: file.calibrated(joint).to_config() for joint in file.servos}
 
-    tables: dict[str, PulseTableSettings]
+
+Servos = Annotated[dict[str, CalibratedServo], BeforeValidator(_read_file)]
+
+
+class QuantisationSettings(Settings):
+    """Which angles the board can set: ``servos``, the servo file that drives the board too, or ``tables``.
+
+    ``tables`` have a pulse table a joint, one measured oscillator for all, and its pulse rate or prescale.
+    """
+
+    servos: Servos = Field(default_factory=dict)
+    tables: dict[str, PulseTableSettings] = Field(default_factory=dict)
     oscillator_hz: Annotated[float, Field(ge=20e6, le=30e6)] = 25e6
     rate_hz: Annotated[float, Field(ge=24, le=1526)] = 50.0
     prescale: Annotated[int, Field(ge=3, le=255)] | None = None
+
+    @model_validator(mode="after")
+    def _one(self) -> QuantisationSettings:
+        if bool(self.servos) == bool(self.tables):
+            found = "both servos and tables" if self.tables else "neither servos nor tables"
+            raise ValueError(f"found {found}, expected one of them: write servos: servos.yaml")
+        if self.servos and (self.oscillator_hz, self.rate_hz, self.prescale) != (25e6, 50.0, None):
+            raise ValueError("found a clock beside servos, expected none: the servo file has each board's clock")
+        return self
+
+    def clocked(self) -> dict[str, tuple[PulseTable, PulseClock]]:
+        """Each joint's table, and the clock of its board.
+
+        Raises:
+            ValueError: no board can make these pulses.
+        """
+        if self.servos:
+            return {joint: (servo.table, servo.clock) for joint, servo in self.servos.items()}
+        prescale = self.prescale or PulseClock.prescale_for(self.oscillator_hz, self.rate_hz)
+        clock = PulseClock(self.oscillator_hz, prescale)
+        return {joint: (PulseTable(table.angles, table.pulses), clock) for joint, table in self.tables.items()}
 
 
 class Quantisation:
     """The effect ``quantisation``: no parameters; the difference between what was told and what the board can set.
 
-    A joint without a table is not quantised.
+    A joint without a table is not quantised. A servo file has all joints, and may have servos that are none.
     """
 
     Settings: ClassVar[type[QuantisationSettings]] = QuantisationSettings
@@ -52,16 +94,17 @@ class Quantisation:
 
     def __init__(self, settings: QuantisationSettings, joint_names: Sequence[str]) -> None:
         chosen(tuple(settings.tables), joint_names)
-        prescale = settings.prescale or PulseClock.prescale_for(settings.oscillator_hz, settings.rate_hz)
-        self._clock = PulseClock(settings.oscillator_hz, prescale)
-        self._tables = {
-            joint_names.index(name): PulseTable(table.angles, table.pulses) for name, table in settings.tables.items()
-        }
-        longest, limit = max((max(t.pulses) for t in self._tables.values()), default=0.0), self._clock.longest_pulse
-        if longest > limit:
-            raise ValueError(
-                f"a pulse of {1e6 * longest:g} us is longer than the board's longest, {1e6 * limit:.0f} us"
-            )
+        missing = [joint for joint in joint_names if settings.servos and joint not in settings.servos]
+        if missing:
+            raise ValueError(f"the servo file has no servo {', '.join(missing)}; it has {', '.join(settings.servos)}")
+        found = settings.clocked()
+        self._servos = {joint_names.index(joint): found[joint] for joint in found if joint in joint_names}
+        for table, clock in self._servos.values():
+            longest, limit = max(table.pulses), clock.longest_pulse
+            if longest > limit:
+                raise ValueError(
+                    f"a pulse of {1e6 * longest:g} us is longer than the board's longest, {1e6 * limit:.0f} us"
+                )
 
     def parameters(self) -> tuple[ParameterBlock, ...]:
         """None: the table is known, or it is the servo map's to find."""
@@ -69,8 +112,8 @@ class Quantisation:
 
     def displacement(self, command: JointCommand, values: Mapping[str, Any]) -> Any:
         """From the commanded angle to the one that is set (rad)."""
-        table = self._tables.get(command.index)
-        return 0 if table is None else quantised(command.commanded, table, self._clock) - command.commanded
+        servo = self._servos.get(command.index)
+        return 0 if servo is None else quantised(command.commanded, *servo) - command.commanded
 
     def springs(self, values: Mapping[str, Any]) -> tuple[Spring, ...]:
         """None."""

@@ -1,1 +1,1 @@
-"""Trackers: tip positions, and the CSV files they are kept in."""
+"""Trackers: tip positions and poses, the CSV files they are kept in, and live frames."""

@@ -15,3 +15,11 @@ def armcal_register_readers(register: Register) -> None:
     """Announce the readers."""
     register("csv", "armcal_tracker.csv_reader:CsvReader", "columns by name with their unit as suffix")
     register("pose_csv", "armcal_tracker.pose_csv_reader:PoseCsvReader", "as csv, with orientations in it")
+
+
+@hookimpl
+def armcal_register_trackers(register: Register) -> None:
+    """Announce the live trackers."""
+    register("dtrack", "armcal_tracker.dtrack:DTrackTracker", "DTrack's ASCII output over UDP")
+    register("json_lines", "armcal_tracker.json_lines:JsonLinesTracker", "a JSON object a line: UDP, or a growing file")
+    register("csv", "armcal_tracker.growing_csv:GrowingCsvTracker", "a table of frames in a growing file")

@@ -46,7 +46,7 @@ class Run:
     def conduct(self) -> Conduct:
         settings, clock, device = self.settings, self.clock, self.device
         ways = Ways(None, np.array([[-2.0, 2.0]] * 2), self.poses, 0.02)
-        drive = Drive(device, clock, ways, settings, (self.model, torques), lambda angles, heat: None)
+        drive = Drive(device, clock, ways, settings, (self.model, torques), lambda angles, warmth: None)
         scheduler = Scheduler(self.poses, IDS, drive.park, ways, self.model, torques, RATE, 2.0, settings.order)
         recovery = Recovery(device, drive, clock, settings, self.announce, lambda: self.asked)
         recovery.open()
@@ -234,17 +234,17 @@ def test_a_pose_that_never_settles_is_tried_again_at_the_end_and_then_left_out()
 
 
 def test_hot_servos_rest_where_the_arm_parks() -> None:
-    heat = {"q2": ServoHeatSettings.si(continuous=1.3, time_constant=20.0, budget=0.5)}
+    heat = {"q2": ServoHeatSettings.si(continuous=1.3, winding_time=20.0, case_time=20.0, budget=0.5)}
     run = Run(heat=heat)
     assert run.run() == "done"
     assert set(run.measured()) == set(IDS)
     assert any(c["what"] == "rest" for kind, c in run.log.entries if kind == "told")
-    heats = [c["heat"]["q2"] for kind, c in run.log.entries if "heat" in c]
+    heats = [float(np.dot([0.3, 0.7], c["warmth"]["q2"])) for kind, c in run.log.entries if "warmth" in c]
     assert 0.3 < max(heats) <= 0.5
 
 
 def test_where_parking_is_too_much_as_well_poses_are_left_out_and_none_is_lost() -> None:
-    heat = {"q2": ServoHeatSettings.si(continuous=0.9, time_constant=60.0, budget=0.5)}
+    heat = {"q2": ServoHeatSettings.si(continuous=0.9, case_time=60.0, budget=0.5)}
     parked_torque = torques(np.zeros(2))[1]
     assert (parked_torque / 0.9) ** 2 > 0.5
     run = Run(heat=heat)

@@ -9,6 +9,7 @@ from pydantic import Field
 from armcal.base.settings import InputPath, Settings
 from armcal.bench.acquisition.settings import AcquisitionSettings
 from armcal.bench.body_settings import BodySettings
+from armcal.bench.recording.settings import RecordingSettings
 
 
 class SimulatedClockSettings(Settings):
@@ -31,5 +32,6 @@ class BenchSettings(Settings):
     joints: dict[str, Any] | None = None
     bodies: BodySettings = Field(default_factory=BodySettings)
     acquisition: AcquisitionSettings = Field(default_factory=AcquisitionSettings)
+    recording: RecordingSettings = Field(default_factory=RecordingSettings)
     servo: dict[str, Any] | None = None
     simulator: dict[str, Any] | None = None

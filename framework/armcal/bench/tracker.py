@@ -9,6 +9,9 @@ from typing import Protocol
 from armcal.base.domains import Array
 from armcal.bench.clock import Clock
 
+REPEATED = "a repeated frame number"
+"""The reason in ``Tracker.refused`` for frames that came before, by their number."""
+
 
 @dataclass(frozen=True)
 class TrackerFrame:

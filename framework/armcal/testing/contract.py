@@ -8,15 +8,19 @@ from collections.abc import Callable, Mapping
 from types import MappingProxyType
 
 from armcal.plugins import Component, PluginInfo, PluginRegistry
+from armcal.testing.bench_checks import check_bench
+from armcal.testing.board_checks import check_device, check_link
 from armcal.testing.effect_checks import check_effect
 from armcal.testing.estimator_checks import check_estimator
 from armcal.testing.exporter_checks import check_exporter
+from armcal.testing.joint_stream_checks import check_joint_stream
 from armcal.testing.measurement_checks import check_measurement
 from armcal.testing.model_checks import check_model
 from armcal.testing.online_checks import check_online
 from armcal.testing.results import CheckResult, ContractError, Recorder, expect
 from armcal.testing.settings_checks import Subject, check_settings
 from armcal.testing.source_checks import check_reader, check_simulator
+from armcal.testing.tracker_checks import check_tracker
 
 __all__ = ["CheckResult", "check_component", "check_plugin"]
 
@@ -34,6 +38,11 @@ _CHECKS: Mapping[str, Callable[[Recorder, Subject], None]] = MappingProxyType(
         "online": check_online,
         "simulator": check_simulator,
         "exporter": check_exporter,
+        "joints": check_joint_stream,
+        "bench": check_bench,
+        "tracker": check_tracker,
+        "link": check_link,
+        "device": check_device,
     }
 )
 

@@ -109,7 +109,7 @@ class Conduct:
 
     def _step(self) -> None:
         drive = self._parts.drive
-        step = self._parts.scheduler.next(drive.at, drive.heat, self._left)
+        step = self._parts.scheduler.next(drive.at, drive.warmth, self._left)
         if isinstance(step, LeaveOut):
             self._leave_out(step.pose, step.why)
         elif isinstance(step, Rest):
@@ -122,7 +122,7 @@ class Conduct:
         self._told("rest", f"the servos rest for {step.seconds / 60:.1f} min")
         drive.go(step.way, self._parts.patient)
         drive.note()
-        while np.any(drive.heat > step.heat * (1 + 1e-3) + 1e-6):
+        while drive.hotter_than(step.warmth):
             drive.stand(1.0, self._parts.patient)
 
     def _measure(self, step: Measure) -> None:
@@ -174,8 +174,7 @@ class Conduct:
 
     def _here(self) -> dict[str, Any]:
         drive = self._parts.drive
-        heat = dict(zip(drive.angles, drive.heat.tolist(), strict=True))
-        return {"angles": drive.angles, "heat": heat, "at": self._parts.clock.wall()}
+        return {"angles": drive.angles, "warmth": drive.named_warmth(), "at": self._parts.clock.wall()}
 
     def _try_later(self, pose: int, why: str) -> None:
         """At the end of what is left; after the last try it is left out."""

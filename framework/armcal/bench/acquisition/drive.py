@@ -15,6 +15,7 @@ from armcal.bench.acquisition.settings import AcquisitionSettings
 from armcal.bench.acquisition.ways import Way, Ways
 from armcal.bench.clock import Clock
 from armcal.bench.device import JointDevice
+from armcal.bench.faults import DeviceRefusedError
 
 _LONGEST_STEP = 2.0
 """Periods: after a pause of the host, the arm goes on from where it is and does not catch up."""
@@ -22,11 +23,13 @@ _ALIVE_EVERY_S = 0.1
 _NOTED_EVERY_S = 1.0
 _HEATED_EVERY_S = 0.25
 _STILL_RAD = 1e-9
+_SAME_HEAT = 1e-4
+_FEW = 6
 _PLAY_RAD = np.deg2rad(3.0)
 """More than servos have play."""
 
-Note = Callable[[Mapping[str, float], Mapping[str, float]], None]
-"""Told angles (rad) and heat by joint, now and then while the arm moves."""
+Note = Callable[[Mapping[str, float], Mapping[str, Sequence[float]]], None]
+"""Told angles (rad) and warmth (winding, case) by joint, now and then while the arm moves."""
 
 
 class Looker(Protocol):
@@ -43,7 +46,7 @@ class Drive:
 
     Attributes:
         at: where it was told to be (joints, rad).
-        heat: by the model (joints).
+        warmth: of the servos, by the model (joints x 2).
         approach: the sign of each joint's last motion, 0 before its first (joints).
     """
 
@@ -63,7 +66,7 @@ class Drive:
         self._alive = self._noted = self._heated = clock.now()
         self.park = np.array([settings.park.get(joint, 0.0) for joint in self._joints])
         self.at = self.park.copy()
-        self.heat = self._model.cold
+        self.warmth = self._model.cold
         self.approach = np.zeros(len(self._joints))
 
     @property
@@ -137,11 +140,11 @@ class Drive:
     def note(self) -> None:
         """Write down where it is and how hot."""
         self._noted = self._clock.now()
-        self._note(self.angles, self._named(self.heat))
+        self._note(self.angles, self.named_warmth())
 
     def cool(self, seconds: float) -> None:
         """The servos had this time to cool, with the torque of where the arm is."""
-        self.heat = self._model.after(self.heat, self._torques(self.at), seconds)
+        self.warmth = self._model.after(self.warmth, self._torques(self.at), seconds)
 
     def _leg(self, start: Array, goal: Array, looker: Looker) -> None:
         """A straight line in joint space, all joints in proportion."""
@@ -166,9 +169,13 @@ class Drive:
     def _guard(self, start: Array) -> None:
         """Should the host fall silent: back to where this leg began, which is clear, and home from there."""
         home = self.way_home(start)
-        if home is not None:
-            waypoints = [self._named(pose) for pose in home]
+        if home is None:
+            return
+        waypoints = [self._named(pose) for pose in home]
+        try:
             self._device.guard(waypoints, self._rate, self._settings.silence)
+        except DeviceRefusedError:  # more than its memory holds: as far as that goes, which is clear too
+            self._device.guard(waypoints[:_FEW], self._rate, self._settings.silence)
 
     def _warm(self) -> None:
         now = self._clock.now()
@@ -184,9 +191,17 @@ class Drive:
         Raises:
             TooHot: they are not.
         """
-        if self._model.over(self.heat):
-            hottest = self._joints[int(np.argmax(self.heat / self._model.budget))]
+        if self._model.over(self.warmth):
+            hottest = self._joints[int(np.argmax(self._model.heat(self.warmth) / self._model.budget))]
             raise TooHot(f"the servo of {hottest} has come to its budget")
+
+    def hotter_than(self, warmth: Array) -> bool:
+        """Whether a servo is hotter than with some warmth (joints x 2)."""
+        return bool(np.any(self._model.heat(self.warmth) > self._model.heat(warmth) + _SAME_HEAT))
+
+    def named_warmth(self) -> dict[str, list[float]]:
+        """Of winding and case, by joint."""
+        return dict(zip(self._joints, self.warmth.tolist(), strict=True))
 
     def _named(self, values: Array) -> dict[str, float]:
         return dict(zip(self._joints, values.tolist(), strict=True))

@@ -1,4 +1,4 @@
-"""How hot servos run: a first-order model of each, driven by the square of its torque."""
+"""How hot servos run: winding and case of each, warmed by the square of its torque."""
 
 from __future__ import annotations
 
@@ -11,23 +11,28 @@ from armcal.base.domains import Array
 from armcal.bench.acquisition.settings import ServoHeatSettings
 
 NEVER = float("inf")
+_TIMES_OVER = 20.0
+_RESOLUTION_S = 0.01
 
 
 @dataclass(frozen=True)
 class HeatModel:
     """All servos, by joint. Heat is a part of what a servo bears: 0 at rest for long, 1 at its limit.
 
-    The winding's loss goes with the square of the current, and the current with the torque; what it heats cools with
-    one time constant: ``heat' = ((torque / continuous)^2 - heat) / time_constant``.
+    What a servo loses goes with the square of its current, and the current with its torque. It warms the winding, which
+    is quick, and the case, which is slow; each has a share of the heat and a time constant:
+    ``warmth' = ((torque / continuous)^2 - warmth) / time``, and heat is the sum of share times warmth.
 
     Attributes:
         continuous: N m (joints; infinite where a servo is not reckoned with).
-        time_constant: s (joints).
+        times: s (joints x 2: winding, case).
+        shares: of the heat (joints x 2).
         budget: the heat that each may come to (joints).
     """
 
     continuous: Array
-    time_constant: Array
+    times: Array
+    shares: Array
     budget: Array
 
     @classmethod
@@ -40,40 +45,51 @@ class HeatModel:
         if unknown := sorted(set(settings) - set(joints)):
             raise ValueError(f"no joint is called {unknown[0]!r}; the joints are {', '.join(joints)}")
         given = [settings.get(joint) for joint in joints]
+        usual = ServoHeatSettings.si(continuous=1.0)
         return cls(
             np.array([s.continuous if s else NEVER for s in given]),
-            np.array([s.time_constant if s else 600.0 for s in given]),
+            np.array([[(s or usual).winding_time, (s or usual).case_time] for s in given]),
+            np.array([[(s or usual).winding_share, 1 - (s or usual).winding_share] for s in given]),
             np.array([s.budget if s else NEVER for s in given]),
         )
 
     @property
     def cold(self) -> Array:
-        """Heat of servos that have rested for long (joints)."""
-        return np.zeros(len(self.continuous))
+        """Warmth of servos that have rested for long (joints x 2)."""
+        return np.zeros(self.times.shape)
+
+    def heat(self, warmth: Array) -> Array:
+        """Of each joint, from the warmth of its parts (joints x 2)."""
+        return np.asarray((self.shares * warmth).sum(axis=1))
 
     def steady(self, torque: Array) -> Array:
-        """The heat that a torque (joints, N m) leads to in the end."""
-        return np.asarray((torque / self.continuous) ** 2)
+        """The warmth of all parts (joints x 1) that a torque (joints, N m) leads to in the end."""
+        return np.asarray((torque / self.continuous) ** 2)[:, None]
 
-    def after(self, heat: Array, torque: Array, seconds: float) -> Array:
-        """Heat (joints) after holding a torque (joints, N m) for some time."""
+    def after(self, warmth: Array, torque: Array, seconds: float) -> Array:
+        """Warmth (joints x 2) after holding a torque (joints, N m) for some time."""
         steady = self.steady(torque)
-        return np.asarray(steady + (heat - steady) * np.exp(-seconds / self.time_constant))
+        return np.asarray(steady + (warmth - steady) * np.exp(-seconds / self.times))
 
-    def over(self, heat: Array) -> bool:
+    def over(self, warmth: Array) -> bool:
         """Whether a servo is above its budget."""
-        return bool(np.any(heat > self.budget))
+        return bool(np.any(self.heat(warmth) > self.budget))
 
-    def cooled_in(self, heat: Array, torque: Array, wanted: Array) -> float:
+    def cooled_in(self, warmth: Array, torque: Array, wanted: Array) -> float:
         """Seconds of holding a torque until no heat is above what is wanted (joints); infinite if it never comes so."""
-        steady, longest = self.steady(torque), 0.0
-        for now, end, most, constant in zip(heat, steady, wanted, self.time_constant, strict=True):
-            if now <= most:
-                continue
-            if end >= most:
-                return NEVER
-            longest = max(longest, float(constant * np.log((now - end) / (most - end))))
-        return longest
+
+        def hot(seconds: float) -> bool:
+            return bool(np.any(self.heat(self.after(warmth, torque, seconds)) > wanted))
+
+        if not hot(0.0):
+            return 0.0
+        low, high = 0.0, _TIMES_OVER * float(self.times.max())
+        if hot(high):
+            return NEVER
+        while high - low > _RESOLUTION_S:
+            middle = (low + high) / 2
+            low, high = (middle, high) if hot(middle) else (low, middle)
+        return high
 
 
 Torques = Callable[[Array], Array]

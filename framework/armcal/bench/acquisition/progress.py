@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -29,16 +29,15 @@ class Progress:
         measured: what was written of each pose, by its id, in the order of measuring.
         left_out: why, by pose id.
         angles: the angles that were commanded last (rad, by joint); empty before the first.
-        heat: of each joint, when ``angles`` were written.
+        warmth: of winding and case, by joint, when ``angles`` were written.
         at: unix s of that.
-        resting_until: nothing but the end of a rest that was going on, unix s; 0: none was.
         ended: how it ended, if it did: ``done``, ``held`` or ``parked``.
     """
 
     measured: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     left_out: Mapping[str, str] = field(default_factory=dict)
     angles: Mapping[str, float] = field(default_factory=dict)
-    heat: Mapping[str, float] = field(default_factory=dict)
+    warmth: Mapping[str, Sequence[float]] = field(default_factory=dict)
     at: float = 0.0
     ended: str = ""
 
@@ -53,7 +52,7 @@ class Progress:
         if kind == ENERGISED:
             return replace(self, angles={**self.angles, content["joint"]: content["angle"]})
         if kind in (HERE, GOING):
-            return replace(self, angles=content["angles"], heat=content["heat"], at=content["at"])
+            return replace(self, angles=content["angles"], warmth=content["warmth"], at=content["at"])
         if kind == ENDED:
             return replace(self, ended=content["how"])
         return self

@@ -29,9 +29,9 @@ class RunLog:
         """Write an entry that outlasts a power loss; see ``Journal.record`` for what it raises."""
         self._journal.record(kind, dict(content))
 
-    def note_angles(self, angles: Mapping[str, float], heat: Mapping[str, float], wall: float) -> None:
+    def note_angles(self, angles: Mapping[str, float], warmth: Mapping[str, Any], wall: float) -> None:
         """Write where the arm is told to be; a power loss may take the last of these."""
-        self._journal.note(HERE, {"angles": dict(angles), "heat": dict(heat), "at": wall})
+        self._journal.note(HERE, {"angles": dict(angles), "warmth": dict(warmth), "at": wall})
 
 
 @contextmanager

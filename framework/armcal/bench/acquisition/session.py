@@ -112,8 +112,8 @@ def _conducted(
     """The run itself; everything is written down as it goes."""
     settings, progress = prepared.settings, log.progress
 
-    def note(angles: Any, heat: Any) -> None:
-        log.note_angles(angles, heat, clock.wall())
+    def note(angles: Any, warmth: Any) -> None:
+        log.note_angles(angles, warmth, clock.wall())
 
     def announce(joint: str, angle: float) -> None:
         log.record(entry.ENERGISED, {"joint": joint, "angle": angle, "at": clock.wall()})
@@ -140,10 +140,10 @@ def _conducted(
 
 
 def _warmed(drive: Drive, progress: Progress, clock: Clock) -> None:
-    """The heat that an earlier part of the run has left."""
-    if progress.heat:
+    """The warmth that an earlier part of the run has left."""
+    if progress.warmth:
         drive.found(progress.angles)
-        drive.heat = np.array([progress.heat.get(joint, 0.0) for joint in drive.angles])
+        drive.warmth = np.array([progress.warmth.get(joint, (0.0, 0.0)) for joint in drive.angles])
         drive.cool(max(clock.wall() - progress.at, 0.0))
 
 

@@ -1,0 +1,256 @@
+"""The messages of the framed protocol, version 1, and their payloads; docs/link_protocol.md specifies them.
+
+Every class packs its payload and reads it back; ``read`` raises ``ValueError`` for bytes that are no such payload.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from enum import IntEnum, IntFlag
+from typing import NamedTuple
+
+VERSION = 1
+LATE = 128
+"""A sequence that is ahead of the last one by this or more, modulo 256, is an old frame that came late."""
+
+
+class Kind(IntEnum):
+    """Types of frames; a reply has the request's plus ``REPLY``, but for ``REFUSED``."""
+
+    HELLO = 0x01
+    TAKE = 0x02
+    WRITE = 0x10
+    READ = 0x11
+    SET = 0x12
+    BEAT = 0x20
+    GUARD = 0x21
+    REPLY = 0x80
+    REFUSED = 0xFF
+
+
+class Flag(IntFlag):
+    """What a board says of itself in every reply."""
+
+    TOOK_OVER = 1
+    GUARDED = 2
+    STUCK = 4
+
+
+class Code(IntEnum):
+    """Why a request is refused."""
+
+    UNKNOWN_TYPE = 1
+    BAD_PAYLOAD = 2
+    NO_ADDRESS = 3
+    NO_DATA = 4
+    TOOK_OVER = 5
+    WRONG_BOOTS = 6
+    STUCK = 7
+
+
+class Head(NamedTuple):
+    """What every reply begins with: how often the board has started, and its flags."""
+
+    boots: int
+    flags: Flag
+
+
+_HEAD = struct.Struct("<IB")
+_CHANNEL = struct.Struct("<BBHH")
+_GUARD_HEAD = struct.Struct("<HB")
+_GUARD_CHANNEL = struct.Struct("<BBH")
+
+
+def packed_head(head: Head) -> bytes:
+    """A reply's first bytes."""
+    return _HEAD.pack(head.boots, int(head.flags))
+
+
+def read_head(payload: bytes) -> tuple[Head, bytes]:
+    """A reply's head, and what follows."""
+    if len(payload) < _HEAD.size:
+        raise ValueError("the reply is shorter than its head")
+    boots, flags = _HEAD.unpack_from(payload)
+    return Head(boots, Flag(flags)), payload[_HEAD.size :]
+
+
+@dataclass(frozen=True)
+class HelloReply:
+    """Who the board is; ``oscillator_hz`` is 0 where it does not know."""
+
+    version: int
+    oscillator_hz: int
+    board_id: str
+    firmware: str
+
+    def pack(self) -> bytes:
+        """After the head."""
+        name = self.board_id.encode()
+        return struct.pack("<BIB", self.version, self.oscillator_hz, len(name)) + name + self.firmware.encode()
+
+    @staticmethod
+    def read(payload: bytes) -> HelloReply:
+        """From what follows the head."""
+        if len(payload) < 6 or len(payload) < 6 + payload[5]:
+            raise ValueError("the greeting is too short")
+        version, oscillator_hz, length = struct.unpack_from("<BIB", payload)
+        text = payload[6 : 6 + length].decode(errors="replace"), payload[6 + length :].decode(errors="replace")
+        return HelloReply(version, oscillator_hz, *text)
+
+
+@dataclass(frozen=True)
+class Hello:
+    """The host's greeting, with its version of the protocol."""
+
+    version: int = VERSION
+
+    def pack(self) -> bytes:
+        """The payload."""
+        return bytes((self.version,))
+
+    @staticmethod
+    def read(payload: bytes) -> Hello:
+        """From the payload."""
+        return Hello(_exactly(payload, 1)[0])
+
+
+@dataclass(frozen=True)
+class Take:
+    """The host takes over again from the board that has started so often."""
+
+    boots: int
+
+    def pack(self) -> bytes:
+        """The payload."""
+        return self.boots.to_bytes(4, "little")
+
+    @staticmethod
+    def read(payload: bytes) -> Take:
+        """From the payload."""
+        return Take(int.from_bytes(_exactly(payload, 4), "little"))
+
+
+@dataclass(frozen=True)
+class Write:
+    """One I2C write (7-bit address)."""
+
+    address: int
+    data: bytes
+
+    def pack(self) -> bytes:
+        """The payload."""
+        return bytes((self.address,)) + self.data
+
+    @staticmethod
+    def read(payload: bytes) -> Write:
+        """From the payload."""
+        if not payload:
+            raise ValueError("the write has no address")
+        return Write(payload[0], payload[1:])
+
+
+@dataclass(frozen=True)
+class Read:
+    """One I2C read of ``count`` bytes from a register."""
+
+    address: int
+    register: int
+    count: int
+
+    def pack(self) -> bytes:
+        """The payload."""
+        return bytes((self.address, self.register, self.count))
+
+    @staticmethod
+    def read(payload: bytes) -> Read:
+        """From the payload."""
+        return Read(*_exactly(payload, 3))
+
+
+class ChannelTarget(NamedTuple):
+    """ON and OFF counts of a channel; each is what the two registers hold, full-on and full-off bits included."""
+
+    address: int
+    channel: int
+    on: int
+    off: int
+
+
+@dataclass(frozen=True)
+class Set:
+    """Absolute channel targets."""
+
+    targets: tuple[ChannelTarget, ...]
+
+    def pack(self) -> bytes:
+        """The payload."""
+        return b"".join(_CHANNEL.pack(*target) for target in self.targets)
+
+    @staticmethod
+    def read(payload: bytes) -> Set:
+        """From the payload."""
+        if not payload or len(payload) % _CHANNEL.size:
+            raise ValueError("the targets are not whole")
+        return Set(tuple(ChannelTarget(*fields) for fields in _CHANNEL.iter_unpack(payload)))
+
+
+class GuardedChannel(NamedTuple):
+    """A channel that the board drives by itself, and how fast at most, in sixteenths of a count per second."""
+
+    address: int
+    channel: int
+    rate: int
+
+
+@dataclass(frozen=True)
+class Guard:
+    """What to do after a silence: each waypoint has the counts (OFF minus ON) of all channels, in their order."""
+
+    after_ms: int
+    channels: tuple[GuardedChannel, ...] = ()
+    waypoints: tuple[tuple[int, ...], ...] = ()
+
+    def pack(self) -> bytes:
+        """The payload."""
+        channels = b"".join(_GUARD_CHANNEL.pack(*channel) for channel in self.channels)
+        counts = [count for waypoint in self.waypoints for count in waypoint]
+        head = _GUARD_HEAD.pack(self.after_ms, len(self.channels))
+        return head + channels + bytes((len(self.waypoints),)) + struct.pack(f"<{len(counts)}H", *counts)
+
+    @staticmethod
+    def read(payload: bytes) -> Guard:
+        """From the payload."""
+        if len(payload) < _GUARD_HEAD.size + 1:
+            raise ValueError("the guard is too short")
+        after_ms, n = _GUARD_HEAD.unpack_from(payload)
+        at = _GUARD_HEAD.size + n * _GUARD_CHANNEL.size
+        if len(payload) <= at or len(payload) != at + 1 + 2 * n * payload[at]:
+            raise ValueError("the guard is not whole")
+        channels = tuple(GuardedChannel(*c) for c in _GUARD_CHANNEL.iter_unpack(payload[_GUARD_HEAD.size : at]))
+        counts = struct.unpack(f"<{n * payload[at]}H", payload[at + 1 :])
+        return Guard(after_ms, channels, tuple(counts[i * n : (i + 1) * n] for i in range(payload[at])))
+
+
+@dataclass(frozen=True)
+class Refusal:
+    """Why a request was refused; ``detail`` is the index of the byte that was not acknowledged."""
+
+    request: int
+    code: int
+    detail: int = 0
+
+    def pack(self) -> bytes:
+        """After the head."""
+        return bytes((self.request, self.code, self.detail))
+
+    @staticmethod
+    def read(payload: bytes) -> Refusal:
+        """From what follows the head."""
+        return Refusal(*_exactly(payload, 3))
+
+
+def _exactly(payload: bytes, count: int) -> bytes:
+    if len(payload) != count:
+        raise ValueError(f"found {len(payload)} bytes, expected {count}")
+    return payload

@@ -1,0 +1,260 @@
+"""The servo file: which joint hangs on which channel of which board, the boards' clocks, and the pulse tables.
+
+One file is read by what drives the boards and by what calibrates the arm, so that both mean the same angles.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import Field, model_validator
+
+from armcal.arm.servo import PulseClock, PulseTable
+from armcal.base.quantities import UnitOf
+from armcal.base.settings import Settings
+from armcal.base.units import from_unit
+from armcal.config.validate import validate
+from armcal.config.yaml_scalars import read_plain
+from armcal.config.yaml_source import load_config
+from armcal.errors import ConfigError
+
+ALL_CALL = 0x70
+ADDRESSES = (0x40, 0x77)
+"""The lowest and the highest that a board's pins may set; 0x78 to 0x7f are reserved. [PCA9685]"""
+CHANNELS = 16
+
+_PLAIN = re.compile(r"[A-Za-z_]\w*")
+
+Angles = Annotated[tuple[float, ...], UnitOf("angle")]
+Pulses = Annotated[tuple[float, ...], UnitOf("time")]
+Oscillator = Annotated[float, Field(ge=20e6, le=30e6)]
+Place = tuple[str | int, ...]
+
+
+def usable_address(address: int) -> int:
+    """The address itself.
+
+    Raises:
+        ValueError: no board can have it.
+    """
+    if not ADDRESSES[0] <= address <= ADDRESSES[1] or address == ALL_CALL:
+        raise ValueError(
+            f"found the address 0x{address:02x}, expected 0x40 to 0x77 and not 0x70, to which all boards listen"
+        )
+    return address
+
+
+class BoardSettings(Settings):
+    """A board: its I2C address, its measured oscillator, the rate of its pulses, and what tells it from others.
+
+    ``id`` is the adapter's that the board was calibrated with; empty: not known yet.
+    """
+
+    address: int = 0x40
+    oscillator_hz: Oscillator = 25e6
+    rate_hz: Annotated[float, Field(ge=24, le=1526)] = 50.0
+    id: str = ""
+
+    @model_validator(mode="after")
+    def _usable(self) -> BoardSettings:
+        usable_address(self.address)
+        PulseClock(self.oscillator_hz, self.prescale)
+        return self
+
+    @property
+    def prescale(self) -> int:
+        """The one nearest to the rate. [PCA9685]"""
+        return PulseClock.prescale_for(self.oscillator_hz, self.rate_hz)
+
+    @property
+    def clock(self) -> PulseClock:
+        """What its pulses are counted by."""
+        return PulseClock(self.oscillator_hz, self.prescale)
+
+
+class ServoSettings(Settings):
+    """A servo: its board, its channel (0 to 15), and its pulse lengths at known angles."""
+
+    board: str
+    channel: Annotated[int, Field(ge=0, le=CHANNELS - 1)]
+    angles: Angles
+    pulses: Pulses
+
+    @model_validator(mode="after")
+    def _usable(self) -> ServoSettings:
+        PulseTable(self.angles, self.pulses)
+        return self
+
+    @property
+    def table(self) -> PulseTable:
+        """Its pulse table."""
+        return PulseTable(self.angles, self.pulses)
+
+
+class CalibratedServo(Settings):
+    """All of one servo and its board that a calibration hangs on."""
+
+    board_id: str = ""
+    address: int
+    channel: Annotated[int, Field(ge=0, le=CHANNELS - 1)]
+    oscillator_hz: Oscillator
+    prescale: Annotated[int, Field(ge=3, le=255)]
+    angles: Angles
+    pulses: Pulses
+
+    @model_validator(mode="after")
+    def _usable(self) -> CalibratedServo:
+        usable_address(self.address)
+        _check_longest(self.table, self.clock)
+        return self
+
+    @property
+    def table(self) -> PulseTable:
+        """Its pulse table."""
+        return PulseTable(self.angles, self.pulses)
+
+    @property
+    def clock(self) -> PulseClock:
+        """What its pulses are counted by."""
+        return PulseClock(self.oscillator_hz, self.prescale)
+
+
+class ServoFileSettings(Settings):
+    """The file as it is written; ``ServoFile`` has it checked as a whole."""
+
+    boards: dict[str, BoardSettings]
+    servos: dict[str, ServoSettings]
+
+
+class ServoFileError(ValueError):
+    """Parts of a servo file do not fit each other; ``place`` is the part that is to be changed."""
+
+    def __init__(self, message: str, place: Place) -> None:
+        super().__init__(message)
+        self.place = place
+
+
+@dataclass(frozen=True)
+class ServoFile:
+    """Boards by name and servos by joint.
+
+    Raises:
+        ServoFileError: a board is not there, two parts are in the same place, or a pulse is too long.
+    """
+
+    boards: Mapping[str, BoardSettings]
+    servos: Mapping[str, ServoSettings]
+
+    def __post_init__(self) -> None:
+        addresses: dict[int, str] = {}
+        for name, board in self.boards.items():
+            first = addresses.setdefault(board.address, name)
+            if first != name:
+                found = f"found 0x{board.address:02x}, the address of the board {first!r} too, expected its own"
+                raise ServoFileError(found, ("boards", name, "address"))
+        channels: dict[tuple[str, int], str] = {}
+        for joint, servo in self.servos.items():
+            if servo.board not in self.boards:
+                known = ", ".join(self.boards) or "none"
+                found = f"found the board {str(servo.board)!r}, expected one of the boards: {known}"
+                raise ServoFileError(found, ("servos", joint, "board"))
+            first = channels.setdefault((servo.board, servo.channel), joint)
+            if first != joint:
+                found = f"found channel {servo.channel}, which {first!r} has, expected its own"
+                raise ServoFileError(found, ("servos", joint, "channel"))
+            try:
+                _check_longest(servo.table, self.boards[servo.board].clock)
+            except ValueError as fault:
+                raise ServoFileError(str(fault), ("servos", joint, "pulses")) from fault
+
+    def calibrated(self, joint: str) -> CalibratedServo:
+        """All of a servo that a calibration hangs on."""
+        servo = self.servos[joint]
+        board = self.boards[servo.board]
+        return CalibratedServo.si(
+            board_id=board.id,
+            address=board.address,
+            channel=servo.channel,
+            oscillator_hz=board.oscillator_hz,
+            prescale=board.prescale,
+            angles=servo.angles,
+            pulses=servo.pulses,
+        )
+
+
+def load_servo_file(path: str | Path) -> ServoFile:
+    """Read and check a servo file.
+
+    Raises:
+        ConfigError: with file, line and field.
+    """
+    source = load_config(path)
+    settings = validate(ServoFileSettings, source)
+    try:
+        return ServoFile(settings.boards, settings.servos)
+    except ServoFileError as fault:
+        where = source.where(fault.place)
+        raise ConfigError(f"{fault}.", where=where, hint="Correct this line of the servo file.") from fault
+
+
+def servo_file_text(file: ServoFile) -> str:
+    """The file as YAML; reading it gives equal numbers, to the last bit."""
+    lines = ["boards:"]
+    for name, board in file.boards.items():
+        clock = f"oscillator_hz: {_number(board.oscillator_hz)}, rate_hz: {_number(board.rate_hz)}"
+        lines.append(f"  {_word(name)}: {{address: 0x{board.address:02x}, {clock}, id: {_quoted(board.id)}}}")
+    lines.append("servos:")
+    for joint, servo in file.servos.items():
+        angles = _in_unit("angles", servo.angles, "deg", math.degrees, "rad")
+        pulses = _in_unit("pulses", servo.pulses, "us", lambda pulse: 1e6 * pulse, "s")
+        place = f"board: {_word(servo.board)}, channel: {servo.channel}"
+        lines.append(f"  {_word(joint)}: {{{place}, {angles}, {pulses}}}")
+    return "\n".join(lines) + "\n"
+
+
+def digest(servos: Mapping[str, CalibratedServo]) -> str:
+    """A fingerprint (hex) of all that a calibration hangs on; another number anywhere gives another one."""
+    parts = {joint: servo.to_config() for joint, servo in servos.items()}
+    return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
+
+
+def _check_longest(table: PulseTable, clock: PulseClock) -> None:
+    longest, limit = max(table.pulses), clock.longest_pulse
+    if longest > limit:
+        raise ValueError(f"a pulse of {1e6 * longest:g} us is longer than the board's longest, {1e6 * limit:.0f} us")
+
+
+def _in_unit(name: str, values: tuple[float, ...], unit: str, convert: Callable[[float], float], si: str) -> str:
+    """The numbers in a customary unit if every one can be read back from it to the last bit, in SI otherwise."""
+    written = [_exact(value, unit, convert(value)) for value in values]
+    found = [number for number in written if number is not None]
+    key, numbers = (f"{name}_{unit}", found) if len(found) == len(values) else (f"{name}_{si}", list(values))
+    return f"{key}: [{', '.join(map(_number, numbers))}]"
+
+
+def _number(value: float) -> str:
+    """A number that the strict reader takes: with a point, also before an exponent."""
+    mantissa, e, exponent = repr(float(value)).partition("e")
+    return f"{mantissa}{'' if '.' in mantissa or not e else '.0'}{e}{exponent}"
+
+
+def _word(text: str) -> str:
+    return str(text) if _PLAIN.fullmatch(text) and read_plain(text) == text else _quoted(text)
+
+
+def _quoted(text: str) -> str:
+    return json.dumps(str(text), ensure_ascii=False)
+
+
+def _exact(value: float, unit: str, near: float) -> float | None:
+    """The shortest number next to ``near`` that is read as exactly ``value``."""
+    tried = [round(near, digits) for digits in range(1, 13)]
+    tried += [near, math.nextafter(near, math.inf), math.nextafter(near, -math.inf)]
+    return next((number for number in tried if from_unit(number, unit) == value), None)

@@ -1,0 +1,181 @@
+"""One PCA9685 on a link: set up, checked, and set channel by channel. [PCA9685]"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Literal
+
+from armcal.bench.clock import Clock
+from armcal.bench.faults import DeviceError, DeviceRefusedError, DeviceResetError
+from armcal.bench.link import Link
+from armcal.errors import Location
+
+from armcal_pca9685.registers import (
+    ALL_CALL,
+    ALL_LED,
+    AUTO_INCREMENT,
+    CHANNEL_BYTES,
+    CHANNELS,
+    EXTCLK,
+    FULL,
+    MODE1,
+    MODE2,
+    OSCILLATOR_STARTS_S,
+    OUTDRV,
+    PRE_SCALE,
+    RESTART,
+    SLEEP,
+    SUB_ADDRESSES,
+    Channel,
+    channel_register,
+)
+
+ForeignPulses = Literal["refuse", "end"]
+
+_AT_ONCE = 16  # bytes a read: small adapters have buffers of 32
+_TRIES = 3
+
+
+class Chip:
+    """The chip at an address, with the prescale that it must have."""
+
+    def __init__(self, link: Link, clock: Clock, address: int, prescale: int) -> None:
+        self._link, self._clock, self._address, self._prescale = link, clock, address, prescale
+
+    @property
+    def where(self) -> Location:
+        """For messages."""
+        return Location(f"PCA9685 at 0x{self._address:02x}")
+
+    def prepare(self, foreign_pulses: ForeignPulses) -> None:
+        """Make it ready. Pulses that run with the right prescale go on untouched; none begins.
+
+        Args:
+            foreign_pulses: what becomes of pulses of another set-up: they are a reason to refuse, or are ended (the
+                servos let go).
+
+        Raises:
+            DeviceRefusedError: it is set up otherwise while it makes pulses, or it counts an external clock.
+            DeviceError: its set-up does not read back.
+        """
+        mode1 = self._read(MODE1, 1)[0]
+        if mode1 & EXTCLK:
+            found = "it counts an external clock, expected its own oscillator."
+            hint = "Switch the board's power off and on: nothing less undoes this."
+            raise DeviceRefusedError(found, where=self.where, hint=hint)
+        if not mode1 & AUTO_INCREMENT:  # without it neither several registers can be read, nor a channel be written
+            self._write(MODE1, mode1 & (SLEEP | SUB_ADDRESSES | ALL_CALL) | AUTO_INCREMENT)
+        is_running = not mode1 & (SLEEP | RESTART)
+        prescale, mode2 = self._read(PRE_SCALE, 1)[0], self._read(MODE2, 1)[0]
+        if not is_running or (prescale, mode2) != (self._prescale, OUTDRV):
+            if is_running and foreign_pulses == "refuse":
+                self._refuse_pulses(prescale, mode2)
+            self._set_up()
+        elif mode1 & (SUB_ADDRESSES | ALL_CALL):
+            self._write(MODE1, AUTO_INCREMENT)
+        self._check_set_up()
+
+    def check(self) -> None:
+        """Find out whether it is still as ``prepare`` left it.
+
+        Raises:
+            DeviceResetError: it is not; its power failed, probably.
+        """
+        for _ in range(_TRIES):
+            mode1 = self._read(MODE1, 1)[0]
+            if mode1 == AUTO_INCREMENT:
+                return
+        raise DeviceResetError(
+            f"found MODE1 = 0x{mode1:02x}, expected 0x{AUTO_INCREMENT:02x}: it has forgotten its set-up.",
+            where=self.where,
+            hint="Look at its supply: did the servos pull it down?",
+        )
+
+    def channels(self, wanted: Iterable[int]) -> dict[int, Channel]:
+        """What stands in these channels' registers; read until two readings agree, for links without a checksum."""
+        chosen = sorted(set(wanted))
+        before = self._channels(chosen)
+        for _ in range(_TRIES):
+            again = self._channels(chosen)
+            if again == before:
+                return again
+            before = again
+        raise DeviceError(
+            "its channels read differently each time.", where=self.where, hint="Look at the bus: wires, pull-ups."
+        )
+
+    def set_channel(self, channel: int, wanted: Channel) -> None:
+        """Write a channel's four registers in one transaction, and read them back; once more if they differ.
+
+        Raises:
+            DeviceError: they differ still.
+        """
+        register, data = channel_register(channel), wanted.pack()
+        for _ in range(2):
+            self._link.write(self._address, bytes((register,)) + data)
+            found = self._link.read(self._address, register, CHANNEL_BYTES)
+            if found == data:
+                return
+        raise DeviceError(
+            f"found {found.hex(' ')} in channel {channel}, expected {data.hex(' ')}, which was written twice.",
+            where=self.where,
+            hint="Look at the bus: wires, pull-ups, and whether another program uses it.",
+        )
+
+    def _channels(self, chosen: list[int]) -> dict[int, Channel]:
+        found: dict[int, Channel] = {}
+        block = _AT_ONCE // CHANNEL_BYTES
+        for first in sorted({channel // block * block for channel in chosen}):
+            data = self._read(channel_register(first), _AT_ONCE)
+            for channel in range(first, first + block):
+                found[channel] = Channel.unpack(data[CHANNEL_BYTES * (channel - first) :])
+        return {channel: found[channel] for channel in chosen}
+
+    def _refuse_pulses(self, prescale: int, mode2: int) -> None:
+        """Refuse if there are pulses: to set it up anew would let go of what they hold."""
+        pulsed = [channel for channel, set_to in self.channels(range(CHANNELS)).items() if set_to.counts is not None]
+        if not pulsed:
+            return
+        listed = ", ".join(map(str, pulsed))
+        found = f"found prescale {prescale} and MODE2 0x{mode2:02x} with pulses on channels {listed}"
+        raise DeviceRefusedError(
+            f"{found}, expected prescale {self._prescale} and MODE2 0x{OUTDRV:02x}.",
+            where=self.where,
+            hint="Hold the arm, and switch the servos' power and the board off and on; or set foreign_pulses: end, "
+            "which lets go of the arm.",
+        )
+
+    def _set_up(self) -> None:
+        """Prescale and modes, while no channel has pulses."""
+        self._link.write(self._address, bytes((ALL_LED,)) + Channel(0, FULL).pack())
+        if any(set_to.counts is not None for set_to in self.channels(range(CHANNELS)).values()):
+            raise DeviceError("its pulses did not end when they were told to.", where=self.where, hint="Try again.")
+        self._write(MODE1, AUTO_INCREMENT | SLEEP)
+        self._write(PRE_SCALE, self._prescale)
+        self._write(MODE2, OUTDRV)
+        self._write(MODE1, AUTO_INCREMENT)
+        self._read(MODE1, 1)  # links may only queue what is written: once this is answered, it has arrived
+        self._clock.sleep(OSCILLATOR_STARTS_S)
+        if self._read(MODE1, 1)[0] & RESTART:
+            self._write(MODE1, AUTO_INCREMENT | RESTART)
+
+    def _check_set_up(self) -> None:
+        wanted = {MODE1: AUTO_INCREMENT, MODE2: OUTDRV, PRE_SCALE: self._prescale}
+        found = {register: self._read(register, 1)[0] for register in wanted}
+        if found != wanted:
+            raise DeviceError(
+                f"found {_listed(found)}, expected {_listed(wanted)}: its set-up does not read back.",
+                where=self.where,
+                hint="Is it a PCA9685, and alone at this address? Look at the bus: wires, pull-ups.",
+            )
+
+    def _read(self, register: int, count: int) -> bytes:
+        return self._link.read(self._address, register, count)
+
+    def _write(self, register: int, value: int) -> None:
+        self._link.write(self._address, bytes((register, value)))
+
+
+def _listed(values: dict[int, int]) -> str:
+    names = {MODE1: "MODE1", MODE2: "MODE2", PRE_SCALE: "PRE_SCALE"}
+    return ", ".join(f"{names[register]} = 0x{value:02x}" for register, value in values.items())

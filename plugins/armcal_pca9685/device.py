@@ -1,0 +1,205 @@
+"""The device ``pca9685``: joints by name, on the channels and pulse tables of the servo file."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, ClassVar
+
+from armcal.arm.servo import COUNTS
+from armcal.base.settings import InputPath, Settings
+from armcal.bench.clock import Clock
+from armcal.bench.device import DeviceIdentity, DeviceState
+from armcal.bench.faults import DeviceLostError, DeviceRefusedError
+from armcal.bench.link import GuardedLink, Link, LinkIdentity
+from armcal.config.servo_file import ServoFile, digest, load_servo_file
+from armcal.errors import Location
+
+from armcal_pca9685.chip import Chip, ForeignPulses
+from armcal_pca9685.guard import Guard
+from armcal_pca9685.registers import no_pulse, pulse_on
+from armcal_pca9685.servo import Servo
+
+
+class Pca9685Settings(Settings):
+    """The servo file, and what becomes of pulses that another set-up has begun: ``refuse`` to open, or ``end`` them."""
+
+    servos: InputPath
+    foreign_pulses: ForeignPulses = "refuse"
+
+
+class Pca9685Device:
+    """The device ``pca9685``; see ``JointDevice`` and ``PulseDevice`` in ``armcal.bench.device``."""
+
+    Settings: ClassVar[type[Pca9685Settings]] = Pca9685Settings
+    EXAMPLE: ClassVar[Mapping[str, Any]] = {"servos": str(Path(__file__).with_name("example_servos.yaml"))}
+
+    def __init__(self, settings: Pca9685Settings, joint_names: Sequence[str], link: Link) -> None:
+        self._settings, self._link = settings, link
+        self._file: ServoFile = load_servo_file(settings.servos)
+        missing = [joint for joint in joint_names if joint not in self._file.servos]
+        if missing:
+            known = ", ".join(self._file.servos) or "none"
+            raise ValueError(f"the servo file {settings.servos} has no servo {', '.join(missing)}; it has {known}")
+        self._servos = {joint: Servo(self._file.calibrated(joint)) for joint in joint_names}
+        self._chips: dict[int, Chip] = {}
+        self._counts: dict[str, int] = {}  # of joints with pulses, as last read or written
+        self._guard = Guard((), 0.0, 0.0)
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """See ``JointDevice``."""
+        return tuple(self._servos)
+
+    def open(self, clock: Clock) -> DeviceIdentity:
+        """See ``JointDevice``."""
+        identity = self._link.open(clock)
+        try:
+            self._check_identity(identity)
+            self._guard = Guard((), 0.0, 0.0)
+            clocks = {servo.place[0]: servo.clock.prescale for servo in self._servos.values()}
+            self._chips = {a: Chip(self._link, clock, a, prescale) for a, prescale in clocks.items()}
+            for chip in self._chips.values():
+                chip.prepare(self._settings.foreign_pulses)
+            self._read_counts()
+        except BaseException:
+            self.close()
+            raise
+        boards = ", ".join(f"0x{address:02x}" for address in self._chips)
+        name = f"PCA9685 {boards} on {identity.adapter or 'an adapter without an id'} ({identity.firmware})"
+        return DeviceIdentity(
+            name, digest({joint: servo.calibrated for joint, servo in self._servos.items()}), identity.boots
+        )
+
+    def state(self) -> DeviceState:
+        """See ``JointDevice``."""
+        self._read_counts()
+        angles = {joint: self._servos[joint].angle(counts) for joint, counts in self._counts.items()}
+        return DeviceState(angles, isinstance(self._link, GuardedLink) and self._link.took_over)
+
+    def standing(self, angles: Mapping[str, float]) -> dict[str, float]:
+        """See ``JointDevice``."""
+        return {joint: self._servos[joint].angle(self._counts_of(joint, angle)) for joint, angle in angles.items()}
+
+    def energise(self, joint: str, angle: float) -> None:
+        """See ``JointDevice``."""
+        self._begin(joint, self._counts_of(joint, angle))
+
+    def command(self, angles: Mapping[str, float]) -> None:
+        """See ``JointDevice``."""
+        targets = {joint: self._counts_of(joint, angle) for joint, angle in angles.items()}
+        limp = [joint for joint in targets if joint not in self._counts]
+        if limp:
+            found = f"found commands for {', '.join(limp)}, which hang free."
+            raise DeviceRefusedError(found, where=self._where, hint="Energise them first, one at a time.")
+        if isinstance(self._link, GuardedLink):
+            places = {joint: self._servos[joint].place for joint in targets}
+            self._link.set_counts({places[joint]: pulse_on(places[joint][1], n) for joint, n in targets.items()})
+            self._counts.update(targets)
+            return
+        for joint, counts in targets.items():
+            if counts != self._counts[joint]:
+                self._set_counts(joint, counts)
+
+    def keep_alive(self) -> None:
+        """See ``JointDevice``. Asking a guarded link anything tells it that the host lives."""
+        self._check_open()
+        for chip in self._chips.values():
+            chip.check()
+
+    def guard(self, waypoints: Sequence[Mapping[str, float]], rate: float, after_s: float) -> bool:
+        """See ``JointDevice``. Joints without pulses stay without; a joint that gets them later is looked after too."""
+        if not isinstance(self._link, GuardedLink):
+            return False
+        ways = tuple({joint: self._counts_of(joint, a) for joint, a in way.items()} for way in waypoints)
+        self._guard = Guard(ways, rate, after_s)
+        self._guard.tell(self._link, self._servos, self._counts)
+        return True
+
+    def release(self, joint: str) -> None:
+        """See ``JointDevice``."""
+        address, channel = self._known(joint).place
+        self._counts.pop(joint, None)
+        self._renew_guard()  # before the pulses end: the board must not begin them anew
+        self._chip(address).set_channel(channel, no_pulse(channel))
+
+    def set_pulse(self, joint: str, pulse: float) -> float:
+        """See ``PulseDevice``."""
+        clock = self._known(joint).clock
+        counts = int(clock.counts(pulse)) if math.isfinite(pulse) else 0
+        if not 1 <= counts < COUNTS:
+            asked, longest = 1e6 * pulse, 1e6 * clock.longest_pulse
+            found = f"found a pulse of {asked:g} us for {joint}, expected up to {longest:.0f} us."
+            raise DeviceRefusedError(found, where=self._where, hint="Ask for a pulse within the period.")
+        self._begin(joint, counts)
+        return counts * clock.tick
+
+    def close(self) -> None:
+        """See ``JointDevice``."""
+        self._chips, self._counts = {}, {}
+        self._link.close()
+
+    @property
+    def _where(self) -> Location:
+        return Location(str(self._settings.servos))
+
+    def _check_identity(self, identity: LinkIdentity) -> None:
+        for name in {self._file.servos[joint].board for joint in self._servos}:
+            wanted = self._file.boards[name].id
+            if wanted and identity.adapter and wanted != identity.adapter:
+                raise DeviceRefusedError(
+                    f"found the adapter {identity.adapter!r}, expected {wanted!r}, with which the board {name!r} was "
+                    "calibrated.",
+                    where=Location(str(self._settings.servos), field=f"boards.{name}.id"),
+                    hint="Connect the calibrated one, or calibrate this one: armcal servo.",
+                )
+
+    def _counts_of(self, joint: str, angle: float) -> int:
+        servo = self._known(joint)
+        if not servo.has(angle):
+            raise DeviceRefusedError(
+                f"found {math.degrees(angle):.3f} deg for {joint}, expected {servo.told_span}, its pulse table.",
+                where=Location(str(self._settings.servos), field=f"servos.{joint}"),
+                hint="Keep the plan within the table, or measure the servo further: armcal servo.",
+            )
+        return servo.counts(angle)
+
+    def _known(self, joint: str) -> Servo:
+        if joint not in self._servos:
+            found = f"found the joint {joint!r}, expected one of {', '.join(self._servos)}."
+            raise DeviceRefusedError(found, where=self._where, hint="Name a joint of the arm.")
+        return self._servos[joint]
+
+    def _begin(self, joint: str, counts: int) -> None:
+        is_new = joint not in self._counts
+        self._set_counts(joint, counts)
+        if is_new:
+            self._renew_guard()
+
+    def _set_counts(self, joint: str, counts: int) -> None:
+        address, channel = self._servos[joint].place
+        self._chip(address).set_channel(channel, pulse_on(channel, counts))
+        self._counts[joint] = counts
+
+    def _read_counts(self) -> None:
+        self._check_open()
+        found: dict[str, int] = {}
+        for address, chip in self._chips.items():
+            own = {joint: servo.place[1] for joint, servo in self._servos.items() if servo.place[0] == address}
+            channels = chip.channels(own.values())
+            pulses = {joint: channels[channel].counts for joint, channel in own.items()}
+            found |= {joint: counts for joint, counts in pulses.items() if counts is not None}
+        self._counts = {joint: found[joint] for joint in self._servos if joint in found}
+
+    def _renew_guard(self) -> None:
+        if isinstance(self._link, GuardedLink) and self._guard.waypoints:
+            self._guard.tell(self._link, self._servos, self._counts)
+
+    def _chip(self, address: int) -> Chip:
+        self._check_open()
+        return self._chips[address]
+
+    def _check_open(self) -> None:
+        if not self._chips:
+            raise DeviceLostError("the device is not open.", where=self._where, hint="Open it.")

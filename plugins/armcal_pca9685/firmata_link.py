@@ -1,0 +1,126 @@
+"""A board with stock Firmata on a serial port. [Firmata]
+
+It has no watchdog, no acknowledgement of writes and no checksum: pulses go on when the host dies, and whoever writes
+must read back.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+from armcal.base.settings import Duration
+from armcal.bench.clock import Clock
+from armcal.bench.faults import DeviceError, DeviceLostError, DeviceRefusedError, DeviceResetError
+from armcal.bench.link import LinkIdentity
+from armcal.bench.serial_port import SerialPort, SerialPortSettings
+from armcal.errors import Location
+
+from armcal_pca9685 import firmata_messages as firmata
+from armcal_pca9685.firmata_messages import FirmataDecoder, Message
+
+_TRIES = 4
+_REPLY_S = 0.1
+_PROTOCOL = 2
+
+
+class FirmataSettings(SerialPortSettings):
+    """The port, and how long a board may take to start when its port is opened."""
+
+    baud: int = 57_600
+    start: Duration = 4.0
+
+
+class FirmataLink:
+    """The link ``firmata``."""
+
+    Settings: ClassVar[type[FirmataSettings]] = FirmataSettings
+    EXAMPLE: ClassVar[Mapping[str, Any]] = {"port": "/dev/ttyACM0"}
+
+    def __init__(self, settings: FirmataSettings) -> None:
+        self._settings = settings
+        self._where = Location(settings.meant)
+        self._port = SerialPort(settings)
+        self._decoder = FirmataDecoder()
+
+    def open(self, clock: Clock) -> LinkIdentity:
+        """See ``armcal.bench.link.Link``. Many boards start anew when their port is opened; it waits for them."""
+        adapter = self._port.open()
+        self._decoder.forget()
+        try:
+            firmware = self._greet(clock)
+            self._port.write(firmata.i2c_config())
+        except BaseException:
+            self._port.close()
+            raise
+        return LinkIdentity(adapter, firmware)
+
+    def write(self, address: int, data: bytes) -> None:
+        """See ``Link``. Nobody says whether it arrived: read it back."""
+        self._heard(0.0)
+        self._port.write(firmata.i2c_write(address, data))
+
+    def read(self, address: int, register: int, count: int) -> bytes:
+        """See ``Link``."""
+        complaint = ""
+        for _ in range(_TRIES):
+            self._heard(0.0)  # an answer that came too late would be taken for this one
+            self._port.write(firmata.i2c_read(address, register, count))
+            data, complaint = self._answer(address, register, count)
+            if data is not None and not complaint:
+                return data
+        if complaint:
+            raise DeviceError(
+                f"the device at 0x{address:02x} does not answer; the board says {complaint!r}.",
+                where=self._where,
+                hint="Check its address, power and wires.",
+            )
+        self._port.close()
+        raise DeviceLostError("the board does not answer.", where=self._where, hint="Look at its cable and power.")
+
+    def close(self) -> None:
+        """See ``Link``."""
+        self._port.close()
+
+    def _answer(self, address: int, register: int, count: int) -> tuple[bytes | None, str]:
+        """What was read, if it comes, and what the board complained of: then what was read is not to be used."""
+        complaint, until = "", time.monotonic() + _REPLY_S
+        while (left := until - time.monotonic()) > 0:
+            for message in self._heard(left):
+                if message.kind == firmata.STRING:
+                    complaint = firmata.text_of(message.data)
+                reply = firmata.i2c_reply(message.data) if message.kind == firmata.I2C_REPLY else None
+                if reply is not None and reply[:2] == (address, register):
+                    return (reply.data if len(reply.data) == count else None), complaint
+        return None, complaint
+
+    def _heard(self, longest_s: float) -> list[Message]:
+        """What the board said; that it started anew, if it tells its versions unasked."""
+        messages = self._decoder.feed(self._port.read(longest_s))
+        if any(message.kind in (firmata.VERSION, firmata.FIRMWARE) for message in messages):
+            self._port.close()
+            raise DeviceResetError("the board has started anew.", where=self._where, hint="Look at its power.")
+        return messages
+
+    def _greet(self, clock: Clock) -> str:
+        """Who it is; afterwards the line is quiet, so that versions told again mean a reset."""
+        version, firmware = b"", ""
+        until = clock.now() + self._settings.start
+        while not (version and firmware):
+            self._port.write(firmata.QUERY_VERSIONS)
+            while data := self._port.read(_REPLY_S):
+                for message in self._decoder.feed(data):
+                    if message.kind == firmata.VERSION:
+                        version = message.data
+                    elif message.kind == firmata.FIRMWARE:
+                        firmware = f"{firmata.text_of(message.data[2:])} {'.'.join(map(str, message.data[:2]))}"
+            if not (version and firmware):
+                if clock.now() >= until:
+                    found = "it tells no version of Firmata, expected a board with the sketch StandardFirmata."
+                    raise DeviceLostError(found, where=self._where, hint="Load the sketch, and check port and baud.")
+                clock.sleep(_REPLY_S)
+        if version[0] != _PROTOCOL:
+            found = f"found version {version[0]}.{version[1]} of Firmata, expected {_PROTOCOL}.x."
+            raise DeviceRefusedError(found, where=self._where, hint="Load a newer StandardFirmata.")
+        return f"{firmware}, Firmata {version[0]}.{version[1]}"

@@ -1,0 +1,202 @@
+"""A board that speaks the framed protocol: answers to everything, and looks after the arm by itself."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar, NoReturn
+
+from armcal.base.settings import Duration
+from armcal.bench.clock import Clock
+from armcal.bench.faults import DeviceError, DeviceLostError, DeviceRefusedError, DeviceResetError
+from armcal.bench.framed import messages
+from armcal.bench.framed.frames import DELIMITER, MAX_PAYLOAD, Frame, FrameDecoder, encoded
+from armcal.bench.framed.messages import Code, Flag, Kind
+from armcal.bench.link import Counts, LinkIdentity
+from armcal.bench.serial_port import SerialPort, SerialPortSettings
+from armcal.errors import Location
+
+_TRIES = 4
+_REPLY_S = 0.1
+_RATE_STEPS = 16  # a count per second has so many
+_LARGEST = 0xFFFF
+_TARGETS_AT_ONCE = MAX_PAYLOAD // 6
+
+
+class FramedSettings(SerialPortSettings):
+    """The port, and how long a board may take to start when its port is opened."""
+
+    start: Duration = 4.0
+
+
+class FramedLink:
+    """The link ``framed``, version 1 of the protocol."""
+
+    Settings: ClassVar[type[FramedSettings]] = FramedSettings
+    EXAMPLE: ClassVar[Mapping[str, Any]] = {"port": "/dev/ttyACM0"}
+
+    def __init__(self, settings: FramedSettings) -> None:
+        self._settings = settings
+        self._where = Location(settings.meant)
+        self._port = SerialPort(settings)
+        self._decoder = FrameDecoder()
+        self._boots: int | None = None
+        self._sequence = os.urandom(1)[0]  # so that answers to another program's questions are not taken for ours
+        self._took_over = False
+
+    @property
+    def took_over(self) -> bool:
+        """See ``GuardedLink``; what the board did before ``open`` counts too."""
+        return self._took_over
+
+    def open(self, clock: Clock) -> LinkIdentity:
+        """See ``armcal.bench.link.Link``. A board that has taken over gives the arm back: it stops where it is."""
+        adapter = self._port.open()
+        self._decoder.forget()
+        self._boots, self._took_over = None, False
+        try:
+            hello = self._greet_starting(clock)
+            if hello.version != messages.VERSION:
+                found = f"found version {hello.version} of the protocol, expected {messages.VERSION}."
+                raise DeviceRefusedError(found, where=self._where, hint="Load the board's firmware anew.")
+            if self._took_over:
+                self._ask(Kind.TAKE, messages.Take(self._boots or 0).pack())
+        except BaseException:
+            self._port.close()
+            raise
+        return LinkIdentity(hello.board_id or adapter, hello.firmware, self._boots)
+
+    def write(self, address: int, data: bytes) -> None:
+        """See ``Link``."""
+        self._ask(Kind.WRITE, messages.Write(address, data).pack())
+
+    def read(self, address: int, register: int, count: int) -> bytes:
+        """See ``Link``."""
+        data = self._ask(Kind.READ, messages.Read(address, register, count).pack())
+        if len(data) != count:
+            found = f"found {len(data)} bytes of 0x{address:02x}, expected {count}."
+            raise DeviceError(found, where=self._where, hint="Load the board's firmware anew.")
+        return data
+
+    def beat(self) -> None:
+        """See ``GuardedLink``."""
+        self._ask(Kind.BEAT, b"")
+
+    def guard(self, waypoints: Sequence[Counts], counts_per_s: Mapping[tuple[int, int], float], after_s: float) -> None:
+        """See ``GuardedLink``.
+
+        Raises:
+            DeviceRefusedError: the waypoints are more than a frame holds.
+        """
+        places = list(counts_per_s)
+        most = (MAX_PAYLOAD - 4 - 4 * len(places)) // (2 * len(places)) if places else 0
+        if places and len(waypoints) > most:
+            found = f"found {len(waypoints)} waypoints of {len(places)} joints, expected at most {most}."
+            raise DeviceRefusedError(found, where=self._where, hint="Leave out waypoints.")
+        channels = tuple(
+            messages.GuardedChannel(*place, min(max(int(counts_per_s[place] * _RATE_STEPS), 1), _LARGEST))
+            for place in places
+        )
+        ways = tuple(tuple(waypoint[place] for place in places) for waypoint in waypoints) if places else ()
+        after_ms = min(max(round(after_s * 1000), 1), _LARGEST)
+        self._ask(Kind.GUARD, messages.Guard(after_ms, channels, ways).pack())
+
+    def set_counts(self, targets: Mapping[tuple[int, int], tuple[int, int]]) -> None:
+        """See ``GuardedLink``."""
+        listed = [messages.ChannelTarget(*place, *registers) for place, registers in targets.items()]
+        for first in range(0, len(listed), _TARGETS_AT_ONCE):
+            self._ask(Kind.SET, messages.Set(tuple(listed[first : first + _TARGETS_AT_ONCE])).pack())
+
+    def close(self) -> None:
+        """See ``Link``."""
+        self._port.close()
+
+    def _greet_starting(self, clock: Clock) -> messages.HelloReply:
+        """Greet a board that may only be starting."""
+        until = clock.now() + self._settings.start
+        while True:
+            while self._port.read(0.0):
+                pass  # what was said to another program
+            hello = self._greet()
+            if hello is not None:
+                return hello
+            if clock.now() >= until:
+                found = "nobody answers in the framed protocol."
+                hint = "Check port and baud, and that the board runs the framed firmware."
+                raise DeviceLostError(found, where=self._where, hint=hint)
+            clock.sleep(_REPLY_S)
+
+    def _greet(self) -> messages.HelloReply | None:
+        reply = self._tried(Kind.HELLO, messages.Hello().pack())
+        return None if reply is None else self._read_hello(reply)
+
+    def _read_hello(self, reply: bytes) -> messages.HelloReply:
+        try:
+            return messages.HelloReply.read(reply)
+        except ValueError as fault:
+            found = f"the board's greeting cannot be read ({fault})."
+            raise DeviceRefusedError(found, where=self._where, hint="Load the board's firmware anew.") from fault
+
+    def _ask(self, kind: Kind, payload: bytes) -> bytes:
+        """The answer to a request, without its head.
+
+        A request that stays without answer is made again under its number, which the board does once. If that does
+        not help either, an old greeting may have set the board's count back: greet it, and ask anew.
+        """
+        reply = self._tried(kind, payload)
+        if reply is None and self._greet() is not None:
+            reply = self._tried(kind, payload)
+        if reply is None:
+            self._port.close()
+            raise DeviceLostError("the board does not answer.", where=self._where, hint="Look at its cable and power.")
+        return reply
+
+    def _tried(self, kind: Kind, payload: bytes) -> bytes | None:
+        self._sequence = (self._sequence + 1) % 256
+        request = encoded(Frame(kind, self._sequence, payload))
+        for attempt in range(_TRIES):
+            ends_what_was_cut = DELIMITER if attempt or kind == Kind.HELLO else b""
+            self._port.write(ends_what_was_cut + request)
+            until = time.monotonic() + _REPLY_S
+            while (left := until - time.monotonic()) > 0:
+                for frame in self._decoder.feed(self._port.read(left)):
+                    if frame.sequence == self._sequence and frame.kind in (kind | Kind.REPLY, Kind.REFUSED):
+                        return self._read_reply(frame, kind)
+        return None
+
+    def _read_reply(self, frame: Frame, kind: Kind) -> bytes:
+        try:
+            head, rest = messages.read_head(frame.payload)
+            refusal = messages.Refusal.read(rest) if frame.kind == Kind.REFUSED else None
+        except ValueError as fault:
+            raise DeviceError(
+                f"the board's answer cannot be read ({fault}).", where=self._where, hint="Load its firmware anew."
+            ) from fault
+        if self._boots is not None and head.boots != self._boots:
+            self._port.close()
+            raise DeviceResetError("the board has started anew.", where=self._where, hint="Look at its power.")
+        self._boots = head.boots
+        self._took_over |= Flag.TOOK_OVER in head.flags
+        if refusal is not None:
+            self._refuse(refusal, kind)
+        return rest
+
+    def _refuse(self, refusal: messages.Refusal, kind: Kind) -> NoReturn:
+        if refusal.code == Code.TOOK_OVER:
+            self._port.close()
+            found = "the board has heard nothing for too long and drives the arm by itself."
+            raise DeviceLostError(found, where=self._where, hint="Open it again, and read where the arm is.")
+        if refusal.code == Code.WRONG_BOOTS:
+            self._port.close()
+            raise DeviceResetError("the board has started anew.", where=self._where, hint="Look at its power.")
+        meanings = {
+            Code.UNKNOWN_TYPE: ("its firmware does not know this request", "Load newer firmware."),
+            Code.BAD_PAYLOAD: ("its firmware does not understand this request", "Load newer firmware."),
+            Code.NO_ADDRESS: ("no device answers at this I2C address", "Check address, power and wires."),
+            Code.NO_DATA: (f"the device refuses byte {refusal.detail}", "Check its power and wires."),
+            Code.STUCK: ("its I2C bus is stuck: a line is held low", "Switch the servo board off and on."),
+        }
+        unknown = f"it gives code {refusal.code}", "Load newer firmware."
+        meaning, hint = meanings.get(refusal.code, unknown) if refusal.code in list(Code) else unknown
+        raise DeviceError(f"the board refuses {kind.name}: {meaning}.", where=self._where, hint=hint)

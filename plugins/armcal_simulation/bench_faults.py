@@ -1,0 +1,90 @@
+"""Faults of a simulated bench as requests name them: checked, and kept until their time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from heapq import heappop, heappush
+from typing import Annotated, Any, Literal
+
+from armcal.base.settings import Settings
+from pydantic import Field, ValidationError
+
+from armcal_simulation.board_firmware import NEVER
+
+Count = Annotated[int, Field(ge=0, le=1_000_000)]
+Seconds = Annotated[float, Field(ge=0)]
+Kind = Literal[
+    "drop", "duplicate", "reorder", "flip", "split",
+    "unplug", "replug", "reset", "brown_out", "nack", "stuck",
+    "lost", "silent", "frozen", "skew", "seen",
+]  # fmt: skip
+
+
+class FaultRequest(Settings):
+    """One fault.
+
+    Attributes:
+        kind: which.
+        at: when (simulated s; now by default).
+        after: serial faults and ``nack``: how many messages or writes pass before it.
+        count: serial faults: to how many messages or bytes it happens.
+        direction: serial faults.
+        unit: serial faults: whole frames, or single bytes.
+        byte: ``nack``: the index in the data; -1 is the address.
+        seconds: ``stuck``: for so long.
+        body: ``lost`` and ``seen``: which; all by default.
+        counter: ``frozen``: what the frame counter does.
+        ppm: ``skew``: how much the tracker's clock gains.
+    """
+
+    kind: Kind
+    at: Seconds | None = None
+    after: Count = 0
+    count: Annotated[int, Field(ge=1, le=1_000_000)] = 1
+    direction: Literal["to_host", "to_board"] = "to_board"
+    unit: Literal["frames", "bytes"] = "frames"
+    byte: Annotated[int, Field(ge=-1, le=240)] = -1
+    seconds: Seconds = 0.05
+    body: str | None = None
+    counter: Literal["rising", "same"] = "rising"
+    ppm: float = 0.0
+
+
+class FaultCalendar:
+    """Faults that wait for their time.
+
+    Args:
+        clock: seconds.
+        apply: does one.
+    """
+
+    def __init__(self, clock: Callable[[], float], apply: Callable[[FaultRequest], None]) -> None:
+        self._clock, self._apply = clock, apply
+        self._waiting: list[tuple[float, int, FaultRequest]] = []
+        self._planned = 0
+
+    def plan(self, content: Any) -> None:
+        """Take a request; one without a time is done now.
+
+        Raises:
+            ValueError: it is none.
+        """
+        try:
+            fault = FaultRequest.model_validate(content)
+        except ValidationError as refused:
+            first = refused.errors()[0]
+            raise ValueError(f"fault: {'.'.join(map(str, first['loc']))}: {first['msg']}") from refused
+        if fault.at is None:
+            self._apply(fault)
+        else:
+            self._planned += 1
+            heappush(self._waiting, (fault.at, self._planned, fault))
+
+    def next_event(self) -> float:
+        """When the next is due."""
+        return self._waiting[0][0] if self._waiting else NEVER
+
+    def run(self) -> None:
+        """Do what is due."""
+        while self._waiting and self._waiting[0][0] <= self._clock():
+            self._apply(heappop(self._waiting)[2])

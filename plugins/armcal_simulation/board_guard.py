@@ -1,0 +1,132 @@
+"""What a board does by itself when its host falls silent: it drives channels through waypoints, in proportion."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from armcal.bench.framed.messages import Guard, GuardedChannel
+
+from armcal_simulation.board_firmware import NEVER
+from armcal_simulation.i2c_bus import BusStuckError, I2cBus
+from armcal_simulation.pca9685_model import COUNTS, FULL, LED0
+
+TICK_S = 0.02
+_RATE_UNIT = 16
+"""Rates come in so many parts of a count per second."""
+
+
+@dataclass(frozen=True)
+class _Leg:
+    """From where to where (counts by channel), and when."""
+
+    begin: float
+    seconds: float
+    start: dict[GuardedChannel, int]
+    end: dict[GuardedChannel, int]
+
+    def counts(self, channel: GuardedChannel, now: float) -> int:
+        share = 1.0 if self.seconds <= 0 else min(1.0, (now - self.begin) / self.seconds)
+        start, end = self.start[channel], self.end[channel]
+        return start + round(share * (end - start))
+
+
+class BoardGuard:
+    """The watchdog of a framed board.
+
+    Attributes:
+        took_over: it has begun to drive, and the host has not taken over again.
+
+    Args:
+        clock: seconds.
+        bus: where the channels are.
+    """
+
+    def __init__(self, clock: Callable[[], float], bus: I2cBus) -> None:
+        self.took_over = False
+        self._clock, self._bus = clock, bus
+        self._guard: Guard | None = None
+        self._heard = clock()
+        self._leg: _Leg | None = None
+        self._left: list[tuple[int, ...]] = []
+        self._on: dict[GuardedChannel, int] = {}
+        self._next_tick = NEVER
+
+    @property
+    def is_set(self) -> bool:
+        """Whether it watches."""
+        return self._guard is not None
+
+    def heard(self) -> None:
+        """The host lives."""
+        self._heard = self._clock()
+
+    def set(self, guard: Guard) -> None:
+        """Replace what was told before; without channels, watch no more. A drive under way goes on.
+
+        Raises:
+            ValueError: a channel is none, or could never arrive.
+        """
+        for channel in guard.channels:
+            if channel.channel > 15 or not channel.rate:
+                raise ValueError("a channel above 15, or a rate of zero")
+        if any(count >= COUNTS for waypoint in guard.waypoints for count in waypoint):
+            raise ValueError("a waypoint beyond the period")
+        self._guard = guard if guard.channels else None
+
+    def take(self) -> None:
+        """The host takes over again: the drive stops where it stands."""
+        self.took_over = False
+        self._leg, self._left, self._next_tick = None, [], NEVER
+
+    def next_event(self) -> float:
+        """When it next acts."""
+        if self.took_over or self._guard is None:
+            return self._next_tick
+        return self._heard + self._guard.after_ms / 1000
+
+    def run(self) -> None:
+        """Do what is due."""
+        now = self._clock()
+        if not self.took_over and self._guard is not None and now >= self.next_event():
+            self.took_over, self._left = True, list(self._guard.waypoints)
+            self._next_tick = now
+        if self.took_over and now >= self._next_tick:
+            self._next_tick = now + TICK_S
+            try:
+                self._drive(now)
+            except BusStuckError:
+                return  # it tries again at the next tick
+
+    def _drive(self, now: float) -> None:
+        if self._leg is None:
+            if not self._left or self._guard is None:
+                self._next_tick = NEVER
+                return
+            self._leg = self._begin(now, self._guard, self._left[0])
+            self._left.pop(0)  # not before: on a stuck bus nothing begins
+        leg = self._leg
+        for channel in leg.end:
+            self._write(channel, leg.counts(channel, now))
+        if now >= leg.begin + leg.seconds:
+            self._leg = None
+
+    def _begin(self, now: float, guard: Guard, waypoint: tuple[int, ...]) -> _Leg:
+        """Channels without pulses stay without: nobody knows where their servos stand."""
+        start: dict[GuardedChannel, int] = {}
+        end: dict[GuardedChannel, int] = {}
+        for channel, target in zip(guard.channels, waypoint, strict=True):
+            registers = self._bus.read(channel.address, LED0 + 4 * channel.channel, 4)
+            if registers is None or registers[3] & FULL or registers[1] & FULL:
+                continue
+            self._on[channel] = registers[0] | (registers[1] & 0x0F) << 8
+            start[channel] = ((registers[2] | (registers[3] & 0x0F) << 8) - self._on[channel]) % COUNTS
+            end[channel] = target
+        seconds = max((abs(end[c] - start[c]) * _RATE_UNIT / c.rate for c in end), default=0.0)
+        return _Leg(now, seconds, start, end)
+
+    def _write(self, channel: GuardedChannel, counts: int) -> None:
+        on = self._on[channel]
+        off = (on + counts) % COUNTS
+        data = bytes((LED0 + 4 * channel.channel, on & 0xFF, on >> 8, off & 0xFF, off >> 8))
+        self._bus.write(channel.address, data)

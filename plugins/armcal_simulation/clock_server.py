@@ -1,0 +1,151 @@
+"""The socket by which clients of a simulated bench let its time pass: a JSON object a line, and one back."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import select
+import socket
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from armcal.errors import InputError, Location
+
+Answer = Callable[[dict[str, Any]], dict[str, Any]]
+Port = tuple[int, int]
+"""A descriptor, and a number that tells it from an earlier one of the same name."""
+_AT_ONCE = 65536
+_LONGEST_LINE = 1 << 20
+_LOOK_UP_S = 0.25
+_PATIENCE_S = 5.0
+"""A client that does not read its answers for so long is let go."""
+_AWAKE_S = 0.0003
+
+
+class ClockServer:
+    """Listens on a Unix socket, beside one more descriptor that changes now and then.
+
+    Args:
+        path: of the socket; what an earlier bench left there is removed.
+        answer: gives the answer to a request; ``ValueError`` refuses it.
+
+    Raises:
+        InputError: another bench is listening there, or the path is too long for a socket.
+    """
+
+    def __init__(self, path: Path, answer: Answer) -> None:
+        self._path, self._answer = path, answer
+        self._clients: dict[int, tuple[socket.socket, bytearray]] = {}
+        self._watched: Port | None = None
+        _remove_dead(path)
+        self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        try:
+            self._listener.bind(str(path))
+        except OSError as fault:
+            self._listener.close()
+            raise InputError(
+                f"the clock's socket cannot be made ({fault}).",
+                where=Location(str(path)),
+                hint="Give a folder with a short path (a socket's has at most 107 characters) that can be written.",
+            ) from fault
+        self._listener.listen()
+        self._listener.setblocking(False)
+        self._poll = select.epoll()
+        self._poll.register(self._listener.fileno(), select.EPOLLIN)
+
+    def serve(self, port: Callable[[], Port | None], readable: Callable[[], None], ended: Callable[[], bool]) -> None:
+        """Answer until ``ended``; call ``readable`` whenever something happens at the port."""
+        while not ended():
+            self._watch(port())
+            for number, _ in self._awaited():
+                if number == self._listener.fileno():
+                    self._accept()
+                elif number in self._clients:
+                    self._read(number)
+                else:
+                    readable()
+
+    def close(self) -> None:
+        """Let all clients go."""
+        for number in list(self._clients):
+            self._drop(number)
+        self._poll.close()
+        self._listener.close()
+        self._path.unlink(missing_ok=True)
+
+    def _awaited(self) -> list[tuple[int, int]]:
+        """What happens next. A client that works with the bench asks again at once: it is not worth falling asleep."""
+        until = time.perf_counter() + _AWAKE_S
+        while self._clients and time.perf_counter() < until:
+            if found := self._poll.poll(0):
+                return found
+        return self._poll.poll(_LOOK_UP_S)
+
+    def _watch(self, port: Port | None) -> None:
+        """Edges only: a port that nobody has open is at its end all the time."""
+        if port == self._watched:
+            return
+        self._watched = port  # a descriptor that was closed has left the poll by itself
+        if port is not None:
+            self._poll.register(port[0], select.EPOLLIN | select.EPOLLHUP | select.EPOLLET)
+
+    def _accept(self) -> None:
+        client, _ = self._listener.accept()
+        client.settimeout(_PATIENCE_S)
+        self._clients[client.fileno()] = client, bytearray()
+        self._poll.register(client.fileno(), select.EPOLLIN)
+
+    def _read(self, number: int) -> None:
+        client, buffer = self._clients[number]
+        try:
+            data = client.recv(_AT_ONCE)
+        except OSError:
+            data = b""
+        if not data:
+            self._drop(number)  # what was no whole line is forgotten with it
+            return
+        buffer += data
+        while (end := buffer.find(b"\n")) >= 0:
+            line = bytes(buffer[:end])
+            del buffer[: end + 1]
+            try:
+                client.sendall(json.dumps(self._answered(line)).encode() + b"\n")
+            except OSError:
+                self._drop(number)
+                return
+        if len(buffer) > _LONGEST_LINE:
+            self._drop(number)
+
+    def _answered(self, line: bytes) -> dict[str, Any]:
+        try:
+            request = json.loads(line)
+            if not isinstance(request, dict):
+                raise ValueError("found no JSON object")
+            return self._answer(request)
+        except (ValueError, RecursionError) as fault:
+            return {"error": str(fault)}
+
+    def _drop(self, number: int) -> None:
+        client, _ = self._clients.pop(number)
+        with contextlib.suppress(OSError):
+            self._poll.unregister(number)
+        client.close()
+
+
+def _remove_dead(path: Path) -> None:
+    """A socket that nobody listens on is what is left of a bench that was killed."""
+    if not path.exists():
+        return
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
+        try:
+            probe.connect(str(path))
+        except OSError:
+            path.unlink(missing_ok=True)
+            return
+    raise InputError(
+        "another simulated bench is running here.",
+        where=Location(str(path)),
+        hint="Stop it first, or give another folder.",
+    )

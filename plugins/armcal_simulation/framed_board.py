@@ -1,0 +1,210 @@
+"""A board with the framed firmware: docs/link_protocol.md, the board's side."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from armcal.bench.framed.frames import MAX_PAYLOAD, Frame, FrameDecoder, encoded
+from armcal.bench.framed.messages import (
+    LATE,
+    VERSION,
+    ChannelTarget,
+    Code,
+    Flag,
+    Guard,
+    Head,
+    Hello,
+    HelloReply,
+    Kind,
+    Read,
+    Refusal,
+    Set,
+    Take,
+    Write,
+    packed_head,
+)
+
+from armcal_simulation.board_guard import BoardGuard
+from armcal_simulation.i2c_bus import BusStuckError, I2cBus
+from armcal_simulation.pca9685_model import LED0
+
+FIRMWARE = "armcal board 1"
+_HEAD_SIZE = 5
+
+
+@dataclass(frozen=True)
+class BoardIdentity:
+    """What the board says of itself; the oscillator is 0 where it does not know."""
+
+    board_id: str
+    oscillator_hz: int = 0
+    firmware: str = FIRMWARE
+
+
+class _RefusedError(Exception):
+    def __init__(self, code: Code, detail: int = 0) -> None:
+        super().__init__(code.name)
+        self.code, self.detail = code, detail
+
+
+class FramedBoard:
+    """The firmware.
+
+    Attributes:
+        boots: how often it has started.
+        guard: its watchdog.
+
+    Args:
+        clock: seconds.
+        bus: what it is wired to.
+        send: bytes to the host.
+        identity: see there.
+        boots: how often it has started before.
+    """
+
+    delimiter = 0
+
+    def __init__(
+        self,
+        clock: Callable[[], float],
+        bus: I2cBus,
+        send: Callable[[bytes], None],
+        identity: BoardIdentity,
+        boots: int = 0,
+    ) -> None:
+        self.boots = boots
+        self._clock, self._bus, self._send, self._identity = clock, bus, send, identity
+        self._forget()
+
+    def boot(self) -> None:
+        """Forget all but the counter; say nothing until asked."""
+        self.boots += 1
+        self._forget()
+
+    def receive(self, data: bytes) -> None:
+        """Frames from the host; what is damaged is dropped."""
+        for frame in self._decoder.feed(data):
+            self._take(frame)
+
+    def next_event(self) -> float:
+        """The watchdog's."""
+        return self.guard.next_event()
+
+    def run_timers(self) -> None:
+        """The watchdog's."""
+        self.guard.run()
+
+    @property
+    def dropped(self) -> int:
+        """How many frames arrived damaged since it started."""
+        return self._decoder.dropped
+
+    def _forget(self) -> None:
+        self.guard = BoardGuard(self._clock, self._bus)
+        self._decoder = FrameDecoder()
+        self._last: int | None = None
+        self._reply = b""
+
+    def _take(self, frame: Frame) -> None:
+        self.guard.heard()
+        if self._last is not None and frame.kind != Kind.HELLO:
+            ahead = (frame.sequence - self._last) % 256
+            if ahead == 0:
+                self._send(self._reply)
+                return
+            if ahead >= LATE:
+                return
+        self._last = frame.sequence
+        try:
+            kind, content = frame.kind | Kind.REPLY, self._done(frame)
+        except _RefusedError as refused:
+            kind, content = int(Kind.REFUSED), Refusal(frame.kind, refused.code, refused.detail).pack()
+        except BusStuckError:
+            kind, content = int(Kind.REFUSED), Refusal(frame.kind, Code.STUCK).pack()
+        self._reply = encoded(Frame(kind, frame.sequence, packed_head(Head(self.boots, self._flags())) + content))
+        self._send(self._reply)
+
+    def _flags(self) -> Flag:
+        flags = Flag(0)
+        flags |= Flag.TOOK_OVER if self.guard.took_over else Flag(0)
+        flags |= Flag.GUARDED if self.guard.is_set else Flag(0)
+        return flags | (Flag.STUCK if self._bus.stuck else Flag(0))
+
+    def _done(self, frame: Frame) -> bytes:
+        """Do what is asked; the reply's content."""
+        does = {
+            Kind.HELLO: self._hello,
+            Kind.TAKE: self._take_over,
+            Kind.WRITE: self._write,
+            Kind.READ: self._read,
+            Kind.SET: self._set,
+            Kind.BEAT: self._beat,
+            Kind.GUARD: self._guard,
+        }
+        if frame.kind not in does:
+            raise _RefusedError(Code.UNKNOWN_TYPE)
+        try:
+            return does[Kind(frame.kind)](frame.payload)
+        except ValueError:
+            raise _RefusedError(Code.BAD_PAYLOAD) from None
+
+    def _hello(self, payload: bytes) -> bytes:
+        Hello.read(payload)
+        who = self._identity
+        return HelloReply(VERSION, who.oscillator_hz, who.board_id, who.firmware).pack()
+
+    def _take_over(self, payload: bytes) -> bytes:
+        if Take.read(payload).boots != self.boots:
+            raise _RefusedError(Code.WRONG_BOOTS)
+        self.guard.take()
+        return b""
+
+    def _write(self, payload: bytes) -> bytes:
+        request = Write.read(payload)
+        self._require_host()
+        self._transaction(request.address, request.data)
+        return b""
+
+    def _read(self, payload: bytes) -> bytes:
+        request = Read.read(payload)
+        if request.count > MAX_PAYLOAD - _HEAD_SIZE:
+            raise ValueError("more than a reply holds")
+        found = self._bus.read(request.address, request.register, request.count)
+        if found is None:
+            raise _RefusedError(Code.NO_ADDRESS)
+        return found
+
+    def _set(self, payload: bytes) -> bytes:
+        targets = Set.read(payload).targets
+        if any(target.channel > 15 for target in targets):
+            raise ValueError("no such channel")
+        self._require_host()
+        for target in targets:
+            self._transaction(target.address, _channel_bytes(target))
+        return b""
+
+    def _beat(self, payload: bytes) -> bytes:
+        if payload:
+            raise ValueError("a beat says nothing")
+        return b""
+
+    def _guard(self, payload: bytes) -> bytes:
+        self.guard.set(Guard.read(payload))
+        return b""
+
+    def _require_host(self) -> None:
+        if self.guard.took_over:
+            raise _RefusedError(Code.TOOK_OVER)
+
+    def _transaction(self, address: int, data: bytes) -> None:
+        acknowledged = self._bus.write(address, data)
+        if acknowledged == 0:
+            raise _RefusedError(Code.NO_ADDRESS)
+        if acknowledged <= len(data):
+            raise _RefusedError(Code.NO_DATA, acknowledged - 1)
+
+
+def _channel_bytes(target: ChannelTarget) -> bytes:
+    register = LED0 + 4 * target.channel
+    return bytes((register,)) + target.on.to_bytes(2, "little") + target.off.to_bytes(2, "little")

@@ -1,0 +1,167 @@
+"""What an arm was made to do, judged from the pulses at the pins alone, and what of it was unsafe."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter, deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from armcal.arm.clearance import ClearanceCheck
+
+from armcal_simulation.bench_settings import SafetySettings
+from armcal_simulation.pca9685_model import COUNTS, Commit
+from armcal_simulation.servo_model import ServoModel
+
+SPEED_SLACK = 1.05
+_TICK_S = 0.02
+"""Hosts command at ticks: what was told at a window's first moment may have been told one tick before."""
+_AT_ONCE = 512
+_AT_REST_S = 1.0
+_NO_TIME = -1e9
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """What the experiment allows: joint limits (rad) and clearances, where it states them."""
+
+    limits: Mapping[str, tuple[float, float]]
+    clearance: ClearanceCheck | None
+
+
+class Safety:
+    """Keeps the log.
+
+    Attributes:
+        offences: how many, by kind.
+        events: how often pulses began (``first_pulse``) and ended under load (``drop``).
+
+    Args:
+        settings: what is unsafe.
+        bounds: see there.
+        servos: by joint.
+        log: a line of JSON for the first offence of each kind and joint, and for every event.
+    """
+
+    def __init__(
+        self, settings: SafetySettings, bounds: Bounds, servos: Mapping[str, ServoModel], log: Callable[[str], None]
+    ) -> None:
+        self.offences: Counter[str] = Counter()
+        self.events: Counter[str] = Counter()
+        self._settings, self._bounds, self._servos, self._log = settings, bounds, servos, log
+        self._told: dict[str, float] = {}
+        self._past: dict[str, deque[tuple[float, float]]] = {joint: deque() for joint in servos}
+        self._first_pulse: tuple[float, str] = (_NO_TIME, "")
+        self._logged: set[tuple[str, str]] = set()
+        self._moved = False
+        self._poses: list[tuple[float, list[float]]] = []
+
+    def committed(self, joint: str, commit: Commit, period: float, torque: float, friction: float) -> None:
+        """A change at a joint's pin, while its servo carried a torque (N m) that its friction may hold."""
+        if commit.after is None:
+            self._ended(joint, commit.time, torque, friction)
+            return
+        angle = self._servos[joint].angle_of(commit.after)
+        if commit.before is None:
+            self._began(joint, commit.time, angle)
+        else:
+            self._judge_speed(joint, commit, angle, period)
+        self._told[joint] = angle
+        self._past[joint].append((commit.time, angle))
+        self._judge_limits(joint, commit.time, angle)
+        self._moved = True
+
+    def failed(self, joint: str, now: float, heat: float) -> None:
+        """A servo burnt out."""
+        self._offend("heat", joint, now, heat, 1.0)
+
+    def passed(self, now: float) -> None:
+        """Time goes on from here: what the pins ask for now is what the arm is driven to."""
+        if not self._moved or self._bounds.clearance is None:
+            if self._poses and now - self._poses[-1][0] > _AT_REST_S:
+                self.judge_clearance()
+            return
+        self._moved = False
+        if len(self._told) == len(self._servos):
+            self._poses.append((now, [self._told[joint] for joint in self._servos]))
+            if len(self._poses) >= _AT_ONCE:
+                self.judge_clearance()
+
+    def judge_clearance(self) -> None:
+        """Judge the poses that wait for it; many at once are cheaper."""
+        check, poses = self._bounds.clearance, self._poses
+        if check is None or not poses:
+            return
+        margins = check(np.array([angles for _, angles in poses]).T).margins.min(axis=0)
+        self._poses = []
+        for (now, _), margin in zip(poses, margins, strict=True):
+            if margin < -self._settings.clearance_slack:
+                self._offend("clearance", "", now, float(margin), -self._settings.clearance_slack)
+
+    def summary(self) -> dict[str, dict[str, int]]:
+        """Both counters."""
+        self.judge_clearance()
+        return {"offences": dict(self.offences), "events": dict(self.events)}
+
+    def _judge_speed(self, joint: str, commit: Commit, angle: float, period: float) -> None:
+        window, now, past = self._settings.window, commit.time, self._past[joint]
+        while len(past) > 1 and past[1][0] <= now - window:
+            past.popleft()
+        servo, pulse = self._servos[joint], commit.after or 0.0
+        count = abs(servo.angle_of(pulse + period / COUNTS) - angle)
+        most = np.radians(self._settings.rate_deg_per_s)
+        worst = 0.0
+        for since, before in past:
+            seconds = min(max(now - since, window), window + _TICK_S)
+            worst = max(worst, (abs(angle - before) - count) / seconds)
+        if worst > SPEED_SLACK * most:
+            self._offend("speed", joint, now, worst, SPEED_SLACK * most)
+
+    def _judge_limits(self, joint: str, now: float, angle: float) -> None:
+        if joint not in self._bounds.limits:
+            return
+        low, high = self._bounds.limits[joint]
+        slack = self._settings.limits_slack
+        if angle < low - slack or angle > high + slack:
+            self._offend("limits", joint, now, angle, low - slack if angle < low else high + slack)
+
+    def _began(self, joint: str, now: float, angle: float) -> None:
+        last, other = self._first_pulse
+        if other != joint and now - last < self._settings.together * (1 - 1e-9):
+            self._offend("energised_together", joint, now, now - last, self._settings.together)
+        self._first_pulse = now, joint
+        jump = angle - self._servos[joint].angle
+        self._note("first_pulse", joint, now, jump)
+
+    def _ended(self, joint: str, now: float, torque: float, friction: float) -> None:
+        self._told.pop(joint, None)
+        self._past[joint].clear()
+        if abs(torque) > friction:
+            self._note("drop", joint, now, torque)
+
+    def _offend(self, kind: str, joint: str, now: float, value: float, limit: float) -> None:
+        self.offences[kind] += 1
+        if (kind, joint) in self._logged:
+            return
+        self._logged.add((kind, joint))
+        self._log(_line(time=now, offence=kind, joint=joint or None, value=value, limit=limit))
+
+    def _note(self, kind: str, joint: str, now: float, value: float) -> None:
+        self.events[kind] += 1
+        self._log(_line(time=now, event=kind, joint=joint, value=value))
+
+
+def appended_to(path: Path) -> Callable[[str], None]:
+    """A log that appends lines to a file."""
+
+    def log(line: str) -> None:
+        with path.open("a", encoding="utf-8") as file:
+            file.write(line + "\n")
+
+    return log
+
+
+def _line(**content: object) -> str:
+    return json.dumps({key: value for key, value in content.items() if value is not None})

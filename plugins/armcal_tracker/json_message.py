@@ -1,0 +1,110 @@
+"""One frame as a line of JSON.
+
+    {"frame": 1, "t": 0.1, "bodies": {"tool": {"p_mm": [1, 2, 3], "q": [1, 0, 0, 0]}, "base": null}}
+
+``t`` (s, the tracker's clock) may be left out, and ``q`` (w, x, y, z) where only positions are known; ``p_m`` stands in
+place of ``p_mm`` for metres; ``null`` is a body that is not seen.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, NoReturn
+
+from armcal.base.domains import Array
+from armcal.base.units import from_unit
+
+from armcal_tracker.body_pose import body_pose
+from armcal_tracker.unreadable import UnreadableError
+
+MOST_BODIES = 100
+LONGEST_NAME = 100
+_MOST_FRAMES = 2**63
+_MOST_DIGITS = 20
+_POSITIONS = {"p_m": "m", "p_mm": "mm"}
+
+
+@dataclass(frozen=True)
+class JsonFrame:
+    """A frame: its number, its time where it says so (s), its bodies, and why some that it lists are not believed."""
+
+    counter: int
+    stamp: float | None
+    bodies: Mapping[str, Array | None]
+    wrong: tuple[str, ...]
+
+
+def json_frame(line: bytes) -> JsonFrame:
+    """The frame in a line.
+
+    Raises:
+        UnreadableError: it is none.
+    """
+    content = _parsed(line)
+    if not isinstance(content, dict) or not {"frame", "bodies"} <= set(content) <= {"frame", "t", "bodies"}:
+        raise UnreadableError("not an object with frame, bodies, and perhaps t")
+    counter, bodies = content["frame"], content["bodies"]
+    if type(counter) is not int or not 0 <= counter < _MOST_FRAMES:
+        raise UnreadableError("a frame that is no whole number")
+    if not isinstance(bodies, dict) or len(bodies) > MOST_BODIES or max(map(len, bodies), default=0) > LONGEST_NAME:
+        raise UnreadableError("bodies that are no object of bodies by name")
+    stamp = None if content.get("t") is None else _numbers([content["t"]], 1)[0]
+    found: dict[str, Array | None] = {}
+    wrong: list[str] = []
+    for name, body in bodies.items():
+        pose = None if body is None else _pose(body)
+        if isinstance(pose, str):
+            wrong.append(pose)
+            pose = None
+        found[name] = pose
+    return JsonFrame(counter, stamp, found, tuple(wrong))
+
+
+def _parsed(line: bytes) -> Any:
+    try:
+        return json.loads(
+            line.decode("utf-8"), parse_constant=_not_finite, parse_int=_integer, object_pairs_hook=_without_repeats
+        )
+    except UnreadableError:
+        raise
+    except UnicodeDecodeError:
+        raise UnreadableError("not UTF-8 text") from None
+    except (ValueError, RecursionError):
+        raise UnreadableError("not JSON") from None
+
+
+def _pose(body: Any) -> Array | str:
+    given = [name for name in _POSITIONS if isinstance(body, dict) and name in body]
+    if len(given) != 1 or set(body) - {"q", given[0]}:
+        raise UnreadableError("a body without one of p_mm and p_m, or with more than that and q")
+    position = [from_unit(x, _POSITIONS[given[0]]) for x in _numbers(body[given[0]], 3)]
+    return body_pose(position, _numbers(body["q"], 4) if body.get("q") is not None else None)
+
+
+def _numbers(values: Any, count: int) -> list[float]:
+    if not isinstance(values, list) or len(values) != count or any(type(x) not in (int, float) for x in values):
+        raise UnreadableError("a time, position or quaternion that is not so many numbers as it has")
+    found = [float(x) for x in values]
+    if not all(map(math.isfinite, found)):
+        raise UnreadableError("a number that is not finite")
+    return found
+
+
+def _integer(text: str) -> int:
+    if len(text) > _MOST_DIGITS:
+        raise UnreadableError("a number of too many digits")
+    return int(text)
+
+
+def _not_finite(_: str) -> NoReturn:
+    raise UnreadableError("a number that is not finite")
+
+
+def _without_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found = dict(pairs)
+    if len(found) != len(pairs):
+        raise UnreadableError("a name that is given twice")
+    return found

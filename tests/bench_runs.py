@@ -1,0 +1,183 @@
+"""Measuring runs against a simulated bench in a process of its own, over its pty and its sockets."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import socket
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from armcal.base.dataset import Dataset
+from armcal.bench.acquisition.outputs import dataset_of
+from armcal.bench.acquisition.preparation import Prepared, prepare
+from armcal.bench.acquisition.progress import Progress, progress_of
+from armcal.bench.acquisition.rehearsal import overrides_for
+from armcal.bench.acquisition.session import Course, Outcome, acquire
+from armcal.bench.bench import Bench
+from armcal.bench.clock import SimulatedClock
+from armcal.bench.simulated import CLOCK, BenchRequest
+from armcal.errors import ArmcalError, InputError
+from armcal.online.journal.journal import Journal
+from armcal.run.experiment import Experiment
+
+ROOT = Path(__file__).resolve().parents[1]
+CONFIG = ROOT / "configs" / "lrm_arm" / "bench.yaml"
+POSES = ((0, 0, 0, 0, 0, 0), (40, -30, 60, -50, 30, 20), (-60, 20, 90, 40, -40, -30), (20, 40, -50, 80, 60, 10))
+"""Degrees."""
+
+
+def free_port() -> int:
+    """A UDP port that nobody has."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def write_plan(path: Path, poses: tuple[tuple[float, ...], ...] = POSES) -> Path:
+    """A plan in degrees."""
+    rows = [f"p{i}," + ",".join(map(str, pose)) for i, pose in enumerate(poses, start=1)]
+    path.write_text("pose_id,q1_deg,q2_deg,q3_deg,q4_deg,q5_deg,q6_deg\n" + "\n".join(rows) + "\n")
+    return path
+
+
+@dataclass
+class BenchRun:
+    """A bench's folder, and a configuration that meets it there.
+
+    Attributes:
+        folder: of everything.
+        sets: overrides beside those that a simulated bench needs.
+    """
+
+    folder: Path
+    sets: tuple[str, ...] = ()
+    config: Path = CONFIG
+    experiment: Experiment = field(init=False)
+    plan: Path = field(init=False)
+
+    def __post_init__(self) -> None:
+        port = free_port()
+        self.bench.mkdir(parents=True, exist_ok=True)
+        ports = (f"bench.tracker.port={port}", f"bench.simulator.tracker.port={port}")
+        self.experiment = Experiment.load(self.config, (*ports, *self.sets, *overrides_for(self.bench)))
+        self.plan = write_plan(self.folder / "plan.csv")
+
+    @property
+    def bench(self) -> Path:
+        return self.folder / "bench"
+
+    @property
+    def out(self) -> Path:
+        return self.folder / "out"
+
+    def clean(self) -> None:
+        """As if nothing had been done."""
+        for path in (self.bench, self.out):
+            shutil.rmtree(path, ignore_errors=True)
+        self.bench.mkdir()
+
+    @contextmanager
+    def simulated(self) -> Iterator[SimulatedClock]:
+        """The bench, forked off; the clock is one more client of it."""
+        child = os.fork()
+        if child == 0:
+            _in_child(lambda: Bench.of(self.experiment).simulator().serve(BenchRequest(self.experiment, self.bench)))
+        try:
+            clock = self._connected()
+            try:
+                yield clock
+            finally:
+                clock.close()
+        finally:
+            os.kill(child, signal.SIGTERM)
+            _wait(child)
+
+    def _connected(self) -> SimulatedClock:
+        until = time.monotonic() + 30
+        while True:
+            try:
+                return SimulatedClock(self.bench / CLOCK)
+            except InputError:
+                if time.monotonic() > until:
+                    raise
+                time.sleep(0.01)
+
+    def prepared(self) -> Prepared:
+        """The plan, ready to be driven."""
+        return prepare(self.experiment, self.plan)
+
+    def acquire(self, asked: Callable[[], bool] = lambda: False, prepared: Prepared | None = None) -> Outcome:
+        """Begin or go on."""
+        there = (self.out / "journal").is_dir()
+        course = Course(self.out, "resume" if there else "anew", asked, lambda joints: True, lambda progress: None)
+        return acquire(prepared or self.prepared(), self.plan, course)
+
+    def acquire_until_killed(self, sleeps: int) -> bool:
+        """In a child that is killed (SIGKILL) when it sleeps for the n-th time; False if it ended before."""
+        child = os.fork()
+        if child == 0:
+            _in_child(lambda: self._deadly(sleeps))
+        return os.WIFSIGNALED(_wait(child))
+
+    def _deadly(self, sleeps: int) -> None:
+        left, sleep = [sleeps], SimulatedClock.sleep
+
+        def counted(clock: SimulatedClock, seconds: float) -> None:
+            left[0] -= 1
+            if left[0] <= 0:
+                os.kill(os.getpid(), signal.SIGKILL)
+            sleep(clock, seconds)
+
+        SimulatedClock.sleep = counted  # type: ignore[method-assign]
+        self.acquire()
+
+    def progress(self) -> Progress:
+        """By the journal."""
+        with Journal.open(self.out / "journal", {}) as journal:
+            return progress_of(journal.recovered.entries)
+
+    def entries(self, kind: str) -> list[Any]:
+        """Of the journal, of a kind."""
+        with Journal.open(self.out / "journal", {}) as journal:
+            return [entry.content for entry in journal.recovered.entries if entry.kind == kind]
+
+    def measured(self) -> Dataset:
+        """As the data are written."""
+        return dataset_of(self.experiment, self.progress(), {})
+
+
+def positions(dataset: Dataset) -> dict[str, np.ndarray]:
+    """Measured positions by pose (m)."""
+    xyz = dataset.stacked(["tracker.x", "tracker.y", "tracker.z"]).T
+    return dict(zip(dataset.ids, xyz, strict=True))
+
+
+def _in_child(action: Callable[[], object]) -> None:
+    """Do it and end, whatever happens; no cleaning up of what belongs to the parent."""
+    code = 1
+    try:
+        action()
+        code = 0
+    except ArmcalError:
+        code = 2
+    finally:
+        os._exit(code)
+
+
+def _wait(child: int) -> int:
+    until = time.monotonic() + 60
+    while time.monotonic() < until:
+        found, status = os.waitpid(child, os.WNOHANG)
+        if found:
+            return status
+        time.sleep(0.002)
+    with suppress(ProcessLookupError):
+        os.kill(child, signal.SIGKILL)
+    return os.waitpid(child, 0)[1]

@@ -1,0 +1,180 @@
+"""Measuring runs over real ptys and sockets while everything goes wrong that can: the arm is never unsafe."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from armcal.bench.clock import SimulatedClock
+from armcal.bench.faults import DeviceLostError, DeviceRefusedError
+from armcal.bench.serial_port import SerialPort, SerialPortSettings
+
+from tests.bench_runs import BenchRun, positions
+
+QUICK, MANY = 8, 200
+SECONDS = 28.0
+"""What the run takes when nothing goes wrong."""
+SERIAL = ("drop", "duplicate", "reorder", "flip", "split")
+BOARD = ("unplug", "reset", "brown_out", "nack", "stuck")
+KINDS = (*SERIAL, *BOARD, "lost", "silent", "frozen", "second", "asked", "kill")
+UNCHECKED = ("drop", "duplicate", *BOARD, "lost", "frozen", "second", "kill")
+"""What a link without checksums survives."""
+AGREE_M = 0.0015
+"""Backlash of 0.1 deg on either side, at 0.4 m."""
+
+
+SETS = ("bench.acquisition.lost.park_s=6", "bench.acquisition.period_s=0.04")
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> BenchRun:
+    return BenchRun(tmp_path_factory.mktemp("bench"), SETS)
+
+
+@pytest.fixture(scope="module")
+def firmata(tmp_path_factory: pytest.TempPathFactory) -> BenchRun:
+    """A link without checksums: whole messages may get lost, none is damaged."""
+    link = ("bench.link.type=firmata", "bench.simulator.firmware=firmata")
+    return BenchRun(tmp_path_factory.mktemp("firmata"), (*SETS, *link))
+
+
+@pytest.fixture(scope="module")
+def undisturbed(run: BenchRun) -> dict[str, np.ndarray]:
+    run.clean()
+    with run.simulated() as clock:
+        outcome = run.acquire()
+        state = clock.ask({"state": True})
+    assert outcome.ending.how == "done"
+    assert state["offences"] == {} and state["violations"] == 0
+    return positions(run.measured())
+
+
+def faults(random: np.random.Generator, kind: str, units: tuple[str, ...]) -> list[dict[str, Any]]:
+    """One trouble as requests to the bench."""
+    at = float(random.uniform(3, SECONDS))
+    if kind in SERIAL:
+        way, unit = random.choice(["to_host", "to_board"]), random.choice(units)
+        return [{"kind": kind, "at": at, "count": int(random.integers(1, 30)), "direction": way, "unit": unit}]
+    if kind == "unplug":
+        return [{"kind": "unplug", "at": at}, {"kind": "replug", "at": at + float(random.uniform(0.2, 9))}]
+    if kind == "nack":
+        return [{"kind": "nack", "at": at, "byte": int(random.integers(-1, 5)), "count": int(random.integers(1, 4))}]
+    if kind == "stuck":
+        return [{"kind": "stuck", "at": at, "seconds": float(random.uniform(0.01, 1))}]
+    if kind in ("lost", "silent", "frozen"):
+        return [{"kind": kind, "at": at}, {"kind": "seen", "at": at + float(random.uniform(0.1, 9))}]
+    return [{"kind": kind, "at": at}]
+
+
+class Troubled:
+    """One run through random troubles, gone on with until it is done."""
+
+    def __init__(self, run: BenchRun, seed: int, kinds: tuple[str, ...]) -> None:
+        self.run, self.random = run, np.random.default_rng(seed)
+        self.units = ("frames", "bytes") if "flip" in kinds else ("frames",)
+        self.kinds = [str(k) for k in self.random.choice(kinds, int(self.random.integers(1, 4)), replace=False)]
+        self.said: list[str] = []
+
+    def go(self) -> dict[str, Any]:
+        """Through the troubles and to the end; gives the bench's own account."""
+        with self.run.simulated() as clock:
+            for kind in self.kinds:
+                if kind not in ("second", "asked", "kill"):
+                    for fault in faults(self.random, kind, self.units):
+                        clock.ask({"fault": fault})
+            if "kill" in self.kinds:
+                self.run.acquire_until_killed(int(self.random.integers(3, 700)))
+                clock.ask({"advance": float(self.random.uniform(0, 8))})
+            self._once(self._asked(clock))
+            for _ in range(5):
+                if self.said[-1].startswith("done"):
+                    break
+                clock.ask({"advance": 12.0})
+                self._once(lambda: False)
+            return clock.ask({"state": True})
+
+    def _once(self, asked: Any) -> None:
+        outcome = self.run.acquire(asked)
+        assert outcome.ending.how in ("done", "held", "parked") and outcome.ending.sentence
+        self.said.append(f"{outcome.ending.how}: {outcome.ending.sentence}")
+
+    def _asked(self, clock: SimulatedClock) -> Any:
+        """Looked at now and then by the run: a second program tries the port, or somebody presses Ctrl-C."""
+        when, seen = float(self.random.uniform(5, SECONDS)), [0]
+
+        def asked() -> bool:
+            seen[0] += 1
+            if "second" in self.kinds and seen[0] == 100:
+                assert refused_to_another(self.run.bench / "board")
+            return "asked" in self.kinds and seen[0] > when * 20
+
+        return asked
+
+
+def refused_to_another(port: Path) -> bool:
+    """Whether one more opening of the port is refused while it is in use."""
+    second = SerialPort(SerialPortSettings(port=port))
+    try:
+        second.open()
+    except DeviceRefusedError:
+        return True
+    except DeviceLostError:
+        return not port.exists()
+    second.close()
+    return False
+
+
+def judge(run: BenchRun, seed: int, undisturbed: dict[str, np.ndarray], kinds: tuple[str, ...] = KINDS) -> Troubled:
+    run.clean()
+    troubled = Troubled(run, seed, kinds)
+    state = troubled.go()
+    told = f"seed {seed}, {troubled.kinds}: {troubled.said}"
+    assert state["offences"] == {}, told
+    assert state["failed"] == [], told
+    assert troubled.said[-1].startswith("done"), told
+    measured = [content["pose"] for content in run.entries("measured")]
+    left_out = run.progress().left_out
+    assert sorted([*measured, *left_out]) == sorted(undisturbed), told
+    assert not left_out or any("settle" in why or "mov" in why or "frame" in why for why in left_out.values()), told
+    for name, position in positions(run.measured()).items():
+        assert np.linalg.norm(position - undisturbed[name]) < AGREE_M, f"{told}, {name}"
+    return troubled
+
+
+@pytest.mark.parametrize("seed", range(QUICK))
+def test_random_troubles_never_make_the_arm_unsafe(
+    run: BenchRun, undisturbed: dict[str, np.ndarray], seed: int
+) -> None:
+    judge(run, seed, undisturbed)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(QUICK, MANY))
+def test_many_random_troubles_never_make_the_arm_unsafe(
+    run: BenchRun, undisturbed: dict[str, np.ndarray], seed: int
+) -> None:
+    judge(run, seed, undisturbed)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_a_link_without_checksums_survives_all_but_damage(
+    firmata: BenchRun, undisturbed: dict[str, np.ndarray], seed: int
+) -> None:
+    judge(firmata, seed, undisturbed, UNCHECKED)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(2, 50))
+def test_a_link_without_checksums_survives_all_but_damage_often(
+    firmata: BenchRun, undisturbed: dict[str, np.ndarray], seed: int
+) -> None:
+    judge(firmata, seed, undisturbed, UNCHECKED)
+
+
+def test_an_arm_that_is_driven_too_fast_is_seen(tmp_path: Path) -> None:
+    fast = BenchRun(tmp_path, (*SETS, "bench.acquisition.rate_deg_per_s=30"))
+    with fast.simulated() as clock:
+        fast.acquire()
+        assert set(clock.ask({"state": True})["offences"]) == {"speed"}

@@ -1,0 +1,276 @@
+"""Trackers that speak JSON or write a table: datagrams, files that grow, are cut and replaced, and what is refused."""
+
+from __future__ import annotations
+
+import json
+import random
+import socket
+from pathlib import Path
+
+import numpy as np
+import pytest
+from armcal.bench.clock import RealClock
+from armcal.bench.faults import DeviceRefusedError
+from armcal.errors import DataError
+from armcal_tracker.frame_table import frame_table, row_of
+from armcal_tracker.growing_csv import GrowingCsvSettings, GrowingCsvTracker
+from armcal_tracker.json_lines import JsonLinesSettings, JsonLinesTracker
+from armcal_tracker.json_message import json_frame
+from armcal_tracker.unreadable import UnreadableError
+from pydantic import ValidationError
+from scipy.spatial.transform import Rotation
+
+HEADER = "frame,t_s,tool_x_mm,tool_y_mm,tool_z_mm,tool_qw,tool_qx,tool_qy,tool_qz,base_x_m,base_y_m,base_z_m\n"
+
+
+def line(counter: int, **bodies: object) -> bytes:
+    content = {"frame": counter, "t": 0.1 * counter, "bodies": bodies or {"tool": {"p_mm": [1, 2, 3]}}}
+    return json.dumps(content).encode() + b"\n"
+
+
+def row(counter: int) -> str:
+    return f"{counter},{counter / 10},1,2,3,1,0,0,0,0.1,0.2,0.3\n"
+
+
+def growing(path: Path, **settings: object) -> JsonLinesTracker | GrowingCsvTracker:
+    chosen = {"path": path, **settings}
+    tracker: JsonLinesTracker | GrowingCsvTracker = (
+        GrowingCsvTracker(GrowingCsvSettings.model_validate(chosen))
+        if path.suffix == ".csv"
+        else JsonLinesTracker(JsonLinesSettings.model_validate(chosen))
+    )
+    tracker.open(RealClock())
+    return tracker
+
+
+def append(path: Path, data: str | bytes) -> None:
+    with path.open("ab") as file:
+        file.write(data.encode() if isinstance(data, str) else data)
+
+
+def test_a_frame_of_json() -> None:
+    quaternion = Rotation.from_rotvec([0.1, -0.2, 0.3]).as_quat(scalar_first=True)
+    found = json_frame(line(7, tool={"p_mm": [1, 2.5, -3], "q": quaternion.tolist()}, base={"p_m": [1, 2, 3]}, x=None))
+    assert (found.counter, found.stamp, found.wrong) == (7, pytest.approx(0.7), ())
+    tool, base = found.bodies["tool"], found.bodies["base"]
+    assert tool is not None and base is not None and found.bodies["x"] is None
+    np.testing.assert_allclose(tool[:3, 3], [0.001, 0.0025, -0.003], atol=1e-15)
+    np.testing.assert_allclose(Rotation.from_matrix(tool[:3, :3]).as_rotvec(), [0.1, -0.2, 0.3], atol=1e-12)
+    np.testing.assert_array_equal(base[:3, 3], [1, 2, 3])
+    assert np.isnan(base[:3, :3]).all()
+
+
+def test_a_frame_without_time() -> None:
+    assert json_frame(b'{"frame": 0, "bodies": {}}').stamp is None
+
+
+@pytest.mark.parametrize("body", [{"p_mm": [1, 2, 3], "q": [0, 0, 0, 0]}, {"p_m": [1, 2, 3], "q": [1, 1, 0, 0]}])
+def test_a_quaternion_that_is_none_loses_the_body(body: object) -> None:
+    found = json_frame(line(1, tool=body))
+    assert found.bodies == {"tool": None} and len(found.wrong) == 1
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "[]",
+        "null",
+        "{}",
+        "nonsense",
+        '{"frame": 1}',
+        '{"frame": 1, "bodies": {}, "more": 1}',
+        '{"frame": 1.5, "bodies": {}}',
+        '{"frame": true, "bodies": {}}',
+        '{"frame": -1, "bodies": {}}',
+        '{"frame": 99999999999999999999999999, "bodies": {}}',
+        '{"frame": 1, "frame": 2, "bodies": {}}',
+        '{"frame": 1, "t": "now", "bodies": {}}',
+        '{"frame": 1, "bodies": []}',
+        '{"frame": 1, "bodies": {"tool": {}}}',
+        '{"frame": 1, "bodies": {"tool": 3}}',
+        '{"frame": 1, "bodies": {"tool": "p_mm"}}',
+        '{"frame": 1, "bodies": {"tool": ["p_mm"]}}',
+        '{"frame": 1, "bodies": {"tool": {"p_mm": [1, 2]}}}',
+        '{"frame": 1, "bodies": {"tool": {"p_mm": [1, 2, "3"]}}}',
+        '{"frame": 1, "bodies": {"tool": {"p_mm": [1, 2, true]}}}',
+        '{"frame": 1, "bodies": {"tool": {"p_mm": [1, 2, NaN]}}}',
+        '{"frame": 1, "bodies": {"tool": {"p_mm": [1, 2, 1e999]}}}',
+        '{"frame": 1, "bodies": {"tool": {"p_mm": [1, 2, 3], "p_m": [1, 2, 3]}}}',
+        '{"frame": 1, "bodies": {"tool": {"p_mm": [1, 2, 3], "q": [1, 0, 0]}}}',
+        '{"frame": 1, "bodies": {"tool": {"p_mm": [1, 2, 3], "r": 1}}}',
+        json.dumps({"frame": 1, "bodies": {"x" * 200: None}}),
+        json.dumps({"frame": 1, "bodies": dict.fromkeys(map(str, range(200)))}),
+        '{"frame": 1, "bodies": ' + '{"a":' * 9000 + "1" + "}" * 9000 + "}",
+        "[" * 60000,
+    ],
+)
+def test_what_is_no_frame(text: str) -> None:
+    with pytest.raises(UnreadableError):
+        json_frame(text.encode())
+
+
+def test_no_line_is_an_exception_and_reasons_are_few() -> None:
+    source = random.Random(1)
+    good, reasons = line(3, tool={"p_mm": [1, 2, 3], "q": [1, 0, 0, 0]}), set()
+    table = frame_table(HEADER, "a")
+    for _ in range(10_000):
+        for text, read in ((good, json_frame), (row(4).encode().strip(), lambda data: row_of(table, data))):
+            data = bytearray(text)
+            for _ in range(source.randrange(1, 5)):
+                at = source.randrange(len(data) + 1)
+                data[at : at + source.randrange(4)] = source.choice((b"", b"9e99", b'"', b"{", source.randbytes(2)))
+            try:
+                read(bytes(data))
+            except UnreadableError as fault:
+                reasons.add(str(fault))
+    assert len(reasons) < 30
+
+
+def test_datagrams_of_lines() -> None:
+    tracker = JsonLinesTracker(JsonLinesSettings(port=0))
+    tracker.open(RealClock())
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        for data in (line(1), line(2).strip(), line(3) + line(4), b"x\n" + line(5), line(5), line(9)):
+            sender.sendto(data, tracker.address)
+    assert [f.counter for f in tracker.frames()] == [1, 2, 3, 4, 5, 9]
+    assert sum(tracker.refused.values()) == 2
+    assert tracker.missing == 3
+    with pytest.raises(DeviceRefusedError):
+        JsonLinesTracker(JsonLinesSettings(port=tracker.address[1])).open(RealClock())
+    tracker.close()
+    assert tracker.frames() == []
+
+
+@pytest.mark.parametrize("settings", [{}, {"port": 5, "path": "/a"}, {"port": -1}, {"port": 5, "host": "x"}])
+def test_bad_settings(settings: dict[str, object]) -> None:
+    with pytest.raises(ValidationError):
+        JsonLinesSettings.model_validate(settings)
+
+
+@pytest.fixture(params=["frames.jsonl", "frames.csv"])
+def path(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
+    made = tmp_path / request.param
+    made.write_text(HEADER if made.suffix == ".csv" else "")
+    return made
+
+
+def text(path: Path, counter: int) -> str:
+    return row(counter) if path.suffix == ".csv" else line(counter).decode()
+
+
+def test_only_what_comes_after_opening_counts(path: Path) -> None:
+    append(path, text(path, 1) + text(path, 2))
+    tracker = growing(path)
+    assert tracker.frames() == []
+    append(path, text(path, 3))
+    [found] = tracker.frames()
+    assert found.counter == 3 and found.stamp == pytest.approx(0.3)
+    np.testing.assert_allclose(found.bodies["tool"][:3, 3], [0.001, 0.002, 0.003])  # type: ignore[index]
+
+
+def test_all_of_it_counts_where_that_is_asked_for(path: Path) -> None:
+    append(path, text(path, 1) + text(path, 2))
+    assert [f.counter for f in growing(path, begin="start").frames()] == [1, 2]
+
+
+def test_a_torn_line_waits_for_its_end(path: Path) -> None:
+    begun = text(path, 1)
+    append(path, begun[:8])
+    tracker = growing(path)
+    rest = begun[8:] + text(path, 2)
+    found = []
+    for i in range(0, len(rest), 7):
+        append(path, rest[i : i + 7])
+        found += [f.counter for f in tracker.frames()]
+    assert found == [1, 2] and tracker.refused == {}
+
+
+def test_a_file_that_is_cut_or_replaced_is_read_from_its_start(path: Path) -> None:
+    tracker = growing(path)
+    for counter in (10, 11, 12, 13):
+        append(path, text(path, counter))
+    assert len(tracker.frames()) == 4
+    header = HEADER if path.suffix == ".csv" else ""
+    path.write_text(header)
+    tracker.frames()
+    append(path, text(path, 1))
+    assert [f.counter for f in tracker.frames() + tracker.frames()] == [1]
+    other = path.with_name("other")
+    other.write_text(header + text(path, 1) + text(path, 2))
+    other.replace(path)
+    assert [f.counter for f in tracker.frames() + tracker.frames()] == [1, 2]
+    path.unlink()
+    assert tracker.frames() == []
+    path.write_text(header + text(path, 1))
+    assert [f.counter for f in tracker.frames() + tracker.frames()] == [1]
+
+
+def test_long_lines_and_noise_are_counted(path: Path) -> None:
+    tracker = growing(path)
+    append(path, b"x" * 200_000 + b"\n" + b"\xff\xfe,\n\n" + text(path, 5).encode())
+    assert [f.counter for f in tracker.frames()] == [5]
+    assert sum(tracker.refused.values()) == 2
+
+
+def test_files_that_are_none(tmp_path: Path) -> None:
+    for name in ("gone.csv", "gone.jsonl"):
+        with pytest.raises(DeviceRefusedError, match="gone"):
+            growing(tmp_path / name)
+    folder = tmp_path / "folder.csv"
+    folder.mkdir()
+    with pytest.raises(DeviceRefusedError, match="not a regular file"):
+        growing(folder)
+
+
+def test_a_header_may_come_later(tmp_path: Path) -> None:
+    path = tmp_path / "a.csv"
+    path.write_text("")
+    tracker = growing(path)
+    append(path, HEADER[:20])
+    assert tracker.frames() == []
+    append(path, HEADER[20:] + row(1))
+    assert [f.counter for f in tracker.frames()] == [1]
+
+
+def test_columns_of_bodies() -> None:
+    table = frame_table("frame;t_ms;x_mm;y_mm;z_cm;left_arm_x_m;left_arm_y_m;left_arm_z_m;note", "a.csv")
+    found = row_of(table, b"4;250;1;2;3;;;;hello")
+    assert found is not None and found.stamp == pytest.approx(0.25)
+    np.testing.assert_allclose(found.bodies["tool"][:3, 3], [0.001, 0.002, 0.03])  # type: ignore[index]
+    assert found.bodies["left_arm"] is None
+    assert row_of(table, ";".join(table.cells).encode()) is None
+
+
+def test_orientations_in_a_table() -> None:
+    table = frame_table(HEADER.strip(), "a.csv")
+    turned = row_of(table, b"1,0,1,2,3,0,1,0,0,1,2,3")
+    missing = row_of(table, b"1,0,1,2,3,,,,,1,2,3")
+    wrong = row_of(table, b"1,0,1,2,3,0.5,0,0,0,1,2,3")
+    assert turned is not None and missing is not None and wrong is not None
+    np.testing.assert_allclose(turned.bodies["tool"][:3, :3], np.diag([1, -1, -1]))  # type: ignore[index]
+    assert np.isnan(missing.bodies["tool"][0, 0])  # type: ignore[index]
+    assert wrong.bodies["tool"] is None and len(wrong.wrong) == 1
+    for cells in (b"1,0,1,2", b"x,0,1,2,3,1,0,0,0,1,2,3", b"1,0,inf,2,3,1,0,0,0,1,2,3", b'1,"0,1'):
+        with pytest.raises(UnreadableError):
+            row_of(table, cells)
+
+
+@pytest.mark.parametrize(
+    ("header", "why"),
+    [
+        ("t,x_mm,y_mm,z_mm", "no column frame"),
+        ("frame,x,y,z", "no column of positions"),
+        ("frame,x_mm,y_mm", "no z"),
+        ("frame,x_mm,y_mm,z_mm,qw", "1 columns of the quaternion"),
+        ("frame,x_mm,x_mm,y_mm,z_mm", "two columns of one name"),
+        ("1,2,3", "no column frame"),
+        ('frame,"x_mm', "not CSV"),
+    ],
+)
+def test_headers_that_are_refused(header: str, why: str, tmp_path: Path) -> None:
+    path = tmp_path / "a.csv"
+    path.write_text(header + "\n")
+    with pytest.raises(DataError, match=why) as caught:
+        growing(path)
+    assert str(path) in str(caught.value)

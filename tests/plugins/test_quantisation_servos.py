@@ -1,0 +1,76 @@
+"""The effect ``quantisation`` from a servo file: every board's own clock, and settings that need no file."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from armcal.arm.effects import JointCommand
+from armcal.arm.servo import PulseClock, PulseTable, quantised
+from armcal.base.config_text import ConfigText
+from armcal.config.servo_file import digest
+from armcal_joints.quantisation import Quantisation
+from board_bench import JOINTS, LRM_PULSES_US, servo_file, written
+from pydantic import ValidationError
+
+OSCILLATORS = (24.1e6, 26.9e6)
+ARM = JOINTS[:6]
+
+
+def settings_from(folder):
+    written(folder, servo_file(OSCILLATORS, ids=("A", "B")))
+    return Quantisation.Settings.model_validate({"servos": ConfigText("servos.yaml", None, folder, folder)})
+
+
+def displacement(effect, index, angle):
+    fields = {"index": index, "commanded": angle}
+    command = object.__new__(JointCommand)
+    for name, value in fields.items():
+        object.__setattr__(command, name, value)
+    return float(effect.displacement(command, {}))
+
+
+def test_each_joint_is_counted_by_its_boards_clock(tmp_path):
+    effect = Quantisation(settings_from(tmp_path), ARM)
+    for index, joint in enumerate(ARM):
+        hz = OSCILLATORS[index % 2]
+        clock = PulseClock(hz, round(hz / (4096 * 50)) - 1)
+        table = PulseTable(tuple(map(math.radians, (-100, 0, 100))), tuple(p / 1e6 for p in LRM_PULSES_US[joint]))
+        for angle in np.linspace(-1.7, 1.7, 41):
+            assert displacement(effect, index, angle) == pytest.approx(
+                float(quantised(angle, table, clock)) - angle, abs=1e-13
+            )
+
+
+def test_the_settings_need_no_file(tmp_path):
+    settings = settings_from(tmp_path)
+    config = settings.to_config()
+    (tmp_path / "servos.yaml").unlink()
+    again = Quantisation.Settings.model_validate(config)
+    assert again == settings
+    assert digest(again.servos) == digest(settings.servos)
+    assert config["servos"]["q2"]["board_id"] == "B" and config["servos"]["q2"]["address"] == 0x41
+
+
+def test_what_is_refused(tmp_path):
+    settings_from(tmp_path)
+    path = str(tmp_path / "servos.yaml")
+    tables = {"q1": {"angles_deg": [-100, 100], "pulses_us": [600, 2400]}}
+    for bad, word in (
+        ({}, "neither servos nor tables"),
+        ({"servos": path, "tables": tables}, "both servos and tables"),
+        ({"servos": path, "oscillator_hz": 26e6}, "clock beside servos"),
+        ({"servos": str(tmp_path / "none.yaml")}, "no such file"),
+        ({"servos": 3}, "servos"),
+    ):
+        with pytest.raises(ValidationError, match=word):
+            Quantisation.Settings.model_validate(bad)
+    (tmp_path / "servos.yaml").write_text("boards: {}\nservos: {q1: {board: x, channel: 99}}\n")
+    with pytest.raises(ValidationError, match=r"servos\.yaml:2, servos\.q1\.channel"):
+        Quantisation.Settings.model_validate({"servos": path})
+
+
+def test_a_joint_that_the_file_lacks_is_refused(tmp_path):
+    with pytest.raises(ValueError, match="no servo elbow"):
+        Quantisation(settings_from(tmp_path), ("q1", "elbow"))
