@@ -15,14 +15,14 @@ class ServoHeatSettings(Settings):
     """How a servo heats: steadily under ``continuous`` torque it comes to its limit in the end.
 
     ``winding_share`` of that comes within ``winding_time``, the rest with the slow ``case_time``. A servo may be given
-    as much of its limit as ``budget``: 0.35 is safe where each of these numbers is wrong by 30 %, 0.6 where by 10 %.
+    as much of its limit as ``budget``: 0.5 is safe where each of these numbers is wrong by 30 %.
     """
 
     continuous: Torque
     winding_time: Duration = 60.0
     case_time: Duration = 900.0
     winding_share: Annotated[float, Field(ge=0, le=1)] = 0.3
-    budget: Annotated[float, Field(gt=0, le=1)] = 0.35
+    budget: Annotated[float, Field(gt=0, le=1)] = 0.5
 
     @model_validator(mode="after")
     def _physical(self) -> ServoHeatSettings:
