@@ -86,5 +86,5 @@ def test_with_rests_it_stays_below_its_limit_though_every_constant_is_wrong_by_u
     assert course[:, 2].max() < 1.0
     left_out = [step.why for step in outlook.steps if isinstance(step, LeaveOut)]
     assert sum(isinstance(step, Measure) for step in outlook.steps) + len(left_out) == POSES
-    assert all("even from cold" in why for why in left_out), "only what the planner holds for too much at once"
+    assert all("even from cold" in why or "do not cool enough" in why for why in left_out)
     assert len(left_out) < 0.25 * POSES and not (left_out and wrong[0] > 1)
