@@ -51,12 +51,7 @@ class LazyGroup(click.Group):
         try:
             command: click.Command = getattr(import_module(module), attribute)
         except ModuleNotFoundError as fault:
-            if (fault.name or "armcal").partition(".")[0] == "armcal":
-                raise  # a fault of ours, not of the installation
-            raise ArmcalError(
-                f"the library {fault.name} is missing.",
-                hint="Install armcal anew with all it needs: pip install armcal.",
-            ) from fault
+            raise _missing(fault) from fault
         return command
 
     def invoke(self, ctx: click.Context) -> object:
@@ -66,6 +61,9 @@ class LazyGroup(click.Group):
         except ArmcalError as fault:
             _report(fault)
             ctx.exit(fault.exit_code)
+        except ModuleNotFoundError as fault:  # of a library that is imported where it is needed
+            _report(_missing(fault))
+            ctx.exit(EXIT_FAULT)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Help from the table, without importing anything."""
@@ -89,6 +87,19 @@ def main() -> None:
     except BrokenPipeError:
         sys.stderr.close()
         sys.exit(EXIT_FAULT)
+
+
+def _missing(fault: ModuleNotFoundError) -> ArmcalError:
+    """The refusal where a library is not there.
+
+    Raises:
+        ModuleNotFoundError: it is a module of armcal: a fault of ours, not of the installation.
+    """
+    if (fault.name or "armcal").partition(".")[0] == "armcal":
+        raise fault
+    return ArmcalError(
+        f"the library {fault.name} is missing.", hint="Install armcal anew with all it needs: pip install armcal."
+    )
 
 
 def _report(fault: ArmcalError) -> None:
