@@ -138,8 +138,8 @@ def false_findings(lrm, seeds, **how):
 
 
 def test_data_of_the_model_itself_show_no_structure(lrm):
-    """At 5 % family-wise five in thirty happen once in fifty such tests."""
-    assert false_findings(lrm, range(30), count=100) <= 4
+    """At 5 % family-wise three in ten happen once in eighty such tests."""
+    assert false_findings(lrm, range(10), count=100) <= 2
 
 
 @pytest.mark.slow
@@ -151,7 +151,7 @@ def test_the_family_wise_level_holds(lrm):
 def test_errors_that_resemble_their_neighbours_do_not_pass_for_dependence_on_the_pose(lrm):
     """Long-lived errors: neighbours are found to correlate, with time, and poses are not blamed more often than 5 %."""
     blamed = 0
-    for seed in range(12):
+    for seed in range(6):
         rng = np.random.default_rng(seed)
         slow = np.zeros((150, 3))
         for i in range(1, 150):
@@ -159,7 +159,7 @@ def test_errors_that_resemble_their_neighbours_do_not_pass_for_dependence_on_the
         found = looked_at(*recording(lrm, 150, seed, moved=lambda q, came, slow=slow: slow))
         blamed += any(s.kind != "order" for s in found.structures)
         assert found.lag_p <= LEVEL and found.lag_one > 0.3 and found.block > 3
-    assert blamed <= 3
+    assert blamed <= 2
 
 
 def test_the_order_of_the_rows_does_not_matter_where_the_recording_is_numbered(lrm):

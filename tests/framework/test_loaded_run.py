@@ -75,7 +75,7 @@ def test_without_reckoning_with_heat_joint_4_fails_after_about_half_an_hour(sche
     assert len(failed) and 20 < failed[0] / 60 < 40
 
 
-@pytest.mark.parametrize("wrong", product([0.7, 1.3], repeat=4))
+@pytest.mark.parametrize("wrong", list(product([0.7, 1.3], repeat=4)))
 def test_with_rests_it_stays_below_its_limit_though_every_constant_is_wrong_by_up_to_30_percent(
     scheduler: Scheduler, wrong: tuple[float, ...]
 ) -> None:

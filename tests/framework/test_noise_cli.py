@@ -194,7 +194,8 @@ def test_the_report_escapes_what_a_suspicious_record_is_called(repository, spoil
     assert json.dumps(outputs.metrics(result))
 
 
-@pytest.mark.parametrize("folds", [2, pytest.param(5, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("folds", [2, 5])
 def test_the_real_arm_under_every_loss(repository, shared_data, folds):
     """No loss makes the real arm's errors worse than least squares by much; its folds all converge."""
     config, data = repository / "configs" / "lrm_arm" / "option1.yaml", shared_data / "lrm_arm" / "poses.csv"

@@ -308,7 +308,7 @@ def test_without_still_each_row_is_a_reading_whatever_parts_the_cells(tmp_path):
     reasons = stream.refused
     assert reasons["found 3 cells, expected 14 as in the first row"] == 1
     assert any("expected a number" in reason for reason in reasons)
-    assert reasons["it has no reading of right.q6"] == 1 and sum(reasons.values()) == 3
+    assert reasons["it has no reading of right.q3"] == 1 and sum(reasons.values()) == 3
 
 
 def test_other_arms_or_counts_are_refused_when_it_is_opened(tmp_path):

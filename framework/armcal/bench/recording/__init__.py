@@ -1,0 +1,1 @@
+"""Postures recorded while a person guides the arms by hand."""
