@@ -18,6 +18,7 @@ STATED = PulseTable(KNOTS, (620 * US, 1540 * US, 2460 * US))
 TRUE = PulseTable(KNOTS, (604 * US, 1540 * US, 2491 * US))
 REVERSED = PulseTable(KNOTS, (2440 * US, 1535 * US, 640 * US))
 CLOCK = PulseClock(25e6, 121)
+ONE = (KnownServo("q1", "front", STATED),)
 
 
 def angle_at(table, pulse):
@@ -51,7 +52,7 @@ def angle_pulse(table, angle):
     return float(np.interp(angle, table.angles, table.pulses))
 
 
-def task(observations, zero="measured", servos=(KnownServo("q1", "front", STATED),), measured=(), clock=CLOCK):
+def task(observations, zero="measured", servos=ONE, measured=(), clock=CLOCK):
     return FitTask(tuple(servos), {"front": KnownBoard(clock, tuple(measured))}, KNOTS, tuple(observations), zero)
 
 
@@ -101,7 +102,9 @@ def test_a_measured_pulse_tells_the_oscillator(seed: int) -> None:
     found = fit_servos(task(observed(clock=true, seed=seed), measured=[measured]))
     sd = found.oscillator_sds["front"]
     assert abs(found.clocks["front"].oscillator_hz - 26.1e6) < 4 * sd < 20e3
-    for pulse, pulse_sd, planted in zip(found.servos["q1"].pulses, found.servos["q1"].pulse_sds, TRUE.pulses, strict=True):
+    for pulse, pulse_sd, planted in zip(
+        found.servos["q1"].pulses, found.servos["q1"].pulse_sds, TRUE.pulses, strict=True
+    ):
         assert abs(pulse - planted) < 4 * pulse_sd
 
 

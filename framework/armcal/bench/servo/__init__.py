@@ -1,0 +1,1 @@
+"""Servo calibration: which pulse makes which angle."""

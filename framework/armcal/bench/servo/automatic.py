@@ -1,0 +1,109 @@
+"""Servos measured by a tracker, one joint at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from armcal.bench.acquisition.eyes import TrackerEyes
+from armcal.bench.faults import DeviceError
+from armcal.bench.servo.mover import Mover, StoppedError
+from armcal.bench.servo.record import LEFT_OUT, POSE, Record
+from armcal.bench.servo.setup import Setup
+from armcal.bench.servo.sweep import Point, angles_told, come_to, left, sweep, to_base
+from armcal.bench.settling import Settled
+
+_MOST_FAULTS = 10
+
+Told = Callable[[str, int, int], None]
+"""Told the joint, and how many of its points are done and planned."""
+
+
+@dataclass
+class Automatic:
+    """A tracked calibration. What is in the record is not measured again."""
+
+    setup: Setup
+    mover: Mover
+    eyes: TrackerEyes
+    record: Record
+    told: Told
+    faults: int = 0
+
+    def run(self) -> None:
+        """Measure all that is left; the arm ends in its base pose.
+
+        Raises:
+            StoppedError: it was asked for, or the tracker stays away; the arm holds.
+            DeviceError: the device is gone and does not come back.
+        """
+        if not any(left(sweep(self.setup, self.mover, joint), self.record.entries) for joint in self.setup.joints):
+            return
+        self._persist(lambda: to_base(self.setup, self.mover))
+        self.mover.guard(self.setup.base)
+        for joint in self.setup.joints:
+            points = sweep(self.setup, self.mover, joint)
+            for point in left(points, self.record.entries):
+                self._persist(lambda at=point: self._measure(at))  # type: ignore[misc]
+                self.told(joint, len(points) - len(left(points, self.record.entries)), len(points))
+            self._persist(lambda: to_base(self.setup, self.mover))
+        self.mover.guard({})
+
+    def capture(self) -> Settled | str:
+        """Where the tool stands, once it does; or why that is not known.
+
+        Raises:
+            StoppedError: the tracker has told nothing of use for too long.
+        """
+        settings = self.setup.bench.settings.acquisition
+        self.eyes.begin()
+        until = self.mover.clock.now() + settings.settle.longest
+        while self.mover.clock.now() < until:
+            self.mover.tick()
+            found = self.eyes.settled()
+            if found is not None:
+                return found
+            seconds, why = self.eyes.trouble()
+            if seconds >= settings.lost.park:
+                raise StoppedError(f"the tracker has told nothing for {seconds:.0f} s ({why})")
+            if seconds >= settings.lost.hold:
+                until = self.mover.clock.now() + settings.settle.longest
+        return self.eyes.why or "the arm did not come to stand"
+
+    def _measure(self, point: Point) -> None:
+        come_to(self.setup, self.mover, point)
+        found = self.capture()
+        here: dict[str, Any] = {"joint": point.joint, "counts": point.counts, "came": point.came}
+        here["at"] = self.mover.clock.wall()
+        if isinstance(found, str):
+            self.record.append(LEFT_OUT, {**here, "why": found})
+            return
+        self.record.append(POSE, {**here, **pose_entry(found), "told": angles_told(self.mover)})
+        self.faults = 0
+
+    def _persist(self, action: Callable[[], None]) -> None:
+        """Do it; when the device fails, do it again once it is back."""
+        while True:
+            try:
+                action()
+                return
+            except DeviceError as fault:
+                self.faults += 1
+                if self.faults > _MOST_FAULTS:
+                    raise
+                self.mover.recover(fault)
+
+
+def pose_entry(found: Settled) -> dict[str, Any]:
+    """A settled pose as a line of the record tells it."""
+    pose = found.base_T_target
+    seen = not np.isnan(pose[:3, :3]).any()
+    return {
+        "position": pose[:3, 3].tolist(),
+        "rotation": pose[:3, :3].tolist() if seen else None,
+        "deviations": [float(d) if np.isfinite(d) else None for d in found.deviations],
+        "frames": found.frames,
+    }

@@ -1,0 +1,212 @@
+"""Servos moved by their pulses, slowly, one at a time."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+
+from armcal.arm.servo import PulseClock
+from armcal.bench.clock import Clock
+from armcal.bench.device import DeviceIdentity, JointDevice, PulseDevice
+from armcal.bench.faults import DeviceError, DeviceRefusedError
+from armcal.bench.servo.known import KnownServo
+from armcal.errors import InputError
+
+_ALIVE_EVERY_S = 0.1
+_BETWEEN_JOINTS_S = 0.5
+_AGAIN_EVERY_S = 0.25
+_LONGEST_LOSS_S = 30.0
+
+
+class ServoDevice(JointDevice, PulseDevice, Protocol):
+    """What a servo calibration needs: joints moved by pulses."""
+
+
+class StoppedError(Exception):
+    """Somebody asked for the end; the arm holds where it is."""
+
+
+@dataclass(frozen=True)
+class Motion:
+    """How servos may be moved.
+
+    Attributes:
+        rate: the fastest (rad/s, by the stated tables).
+        period: between steps (s).
+        pulses: the shortest and the longest pulse (s).
+        silence: of the host, after which a board that can goes back to the base pose (s).
+    """
+
+    rate: float
+    period: float
+    pulses: tuple[float, float]
+    silence: float = 1.0
+
+
+@dataclass
+class Mover:
+    """Moves servos; ``told`` holds each one's counts as they were set, and ``came`` the sign of its last step.
+
+    Args:
+        device: opened by ``open``.
+        clock: for all waiting.
+        servos: by joint, with the clock of their board: what angles are turned into pulses by.
+        read_by: the same as the device has them, by which it tells its angles.
+        motion: how fast, and how far.
+        asked_to_stop: looked at in every step.
+        look: called after every pause, for who watches the arm meanwhile.
+    """
+
+    device: ServoDevice
+    clock: Clock
+    servos: Mapping[str, tuple[KnownServo, PulseClock]]
+    read_by: Mapping[str, tuple[KnownServo, PulseClock]]
+    motion: Motion
+    asked_to_stop: Callable[[], bool]
+    look: Callable[[], None] = field(default=lambda: None)
+    told: dict[str, int] = field(default_factory=dict)
+    came: dict[str, int] = field(default_factory=dict)
+    _alive: float = -math.inf
+
+    def open(self) -> DeviceIdentity:
+        """Open the device and learn which pulses it makes; nothing moves.
+
+        Raises:
+            DeviceRefusedError: it cannot set pulses, or is not the right one.
+        """
+        if not hasattr(self.device, "set_pulse"):
+            raise DeviceRefusedError(
+                "this device cannot set pulses by their length.", hint="Calibrate servos with a device like pca9685."
+            )
+        identity = self.device.open(self.clock)
+        self.told |= self._running()
+        return identity
+
+    def counts_at(self, joint: str, angle: float) -> int:
+        """The counts that the stated table gives for an angle (rad)."""
+        return _counts(*self.servos[joint], angle)
+
+    def pulse(self, joint: str, counts: int) -> float:
+        """The pulse of so many counts (s), by the stated oscillator."""
+        return counts * self.servos[joint][1].tick
+
+    def energise(self, joint: str, counts: int) -> None:
+        """A joint's first pulse; nothing if it gets pulses already."""
+        if joint not in self.told:
+            self._set(joint, counts)
+            self.stand(_BETWEEN_JOINTS_S)
+
+    def go(self, joint: str, counts: int) -> None:
+        """Move a joint to a pulse, no faster than allowed.
+
+        Raises:
+            InputError: the pulse is outside the range that is allowed.
+            StoppedError: on the way; the joint holds.
+        """
+        self.check(joint, counts)
+        at = float(self.told[joint])
+        if counts != self.told[joint]:
+            self.came[joint] = 1 if counts > at else -1
+        while self.told[joint] != counts:
+            self._pause(self.motion.period)
+            step = self._counts_per_s(joint) * self.motion.period
+            at += math.copysign(min(step, abs(counts - at)), counts - at)
+            if (near := math.floor(at + 0.5)) != self.told[joint]:
+                self._set(joint, near)
+
+    def check(self, joint: str, counts: int) -> None:
+        """Whether a pulse is allowed.
+
+        Raises:
+            InputError: it is not.
+        """
+        low, high = self.motion.pulses
+        if not low <= self.pulse(joint, counts) <= high:
+            raise InputError(
+                f"{joint}: found a pulse of {1e6 * self.pulse(joint, counts):.0f} us, expected {1e6 * low:.0f} to "
+                f"{1e6 * high:.0f} us.",
+                hint="Narrow bench.servo.ranges, or widen bench.servo.pulses if the servo bears it.",
+            )
+
+    def stand(self, seconds: float) -> None:
+        """Wait, and say now and then that the host lives.
+
+        Raises:
+            StoppedError: it was asked for.
+        """
+        until = self.clock.now() + seconds
+        while (left := until - self.clock.now()) > 1e-9:
+            self._pause(min(left, _ALIVE_EVERY_S))
+
+    def tick(self) -> None:
+        """One period of standing still. See ``stand``."""
+        self._pause(self.motion.period)
+
+    def guard(self, base: Mapping[str, float]) -> bool:
+        """What the board is to do when the host falls silent: back to a pose (rad by joint), slowly."""
+        return self.device.guard([base] if base else [], self.motion.rate, self.motion.silence)
+
+    def recover(self, fault: DeviceError) -> None:
+        """After a fault of the device: open it again, and let every joint have the pulse that it had.
+
+        Raises:
+            DeviceError: it does not come back.
+        """
+        until, last = self.clock.now() + _LONGEST_LOSS_S, fault
+        while self.clock.now() < until:
+            self._stop_if_asked()
+            self.clock.sleep(_AGAIN_EVERY_S)
+            try:
+                self._taken_up()
+                return
+            except DeviceError as again:
+                last = again
+        raise last
+
+    def _taken_up(self) -> None:
+        before = dict(self.told)
+        self.device.open(self.clock)
+        running = self._running()
+        for joint in before:
+            if joint in running:
+                self.told[joint] = running[joint]
+            else:
+                self._set(joint, before[joint])
+                self.clock.sleep(_BETWEEN_JOINTS_S)
+
+    def _running(self) -> dict[str, int]:
+        """The counts of the joints that get pulses."""
+        angles = self.device.state().angles
+        return {joint: _counts(*self.read_by[joint], angle) for joint, angle in angles.items() if joint in self.read_by}
+
+    def _set(self, joint: str, counts: int) -> None:
+        self.check(joint, counts)
+        self.device.set_pulse(joint, self.pulse(joint, counts))
+        self.told[joint] = counts
+        self._alive = self.clock.now()
+
+    def _counts_per_s(self, joint: str) -> float:
+        servo, clock = self.servos[joint]
+        slopes = np.abs(np.diff(servo.table.pulses) / np.diff(servo.table.angles))
+        return float(self.motion.rate * slopes.min() / clock.tick)
+
+    def _pause(self, seconds: float) -> None:
+        self._stop_if_asked()
+        self.clock.sleep(seconds)
+        now = self.clock.now()
+        if now - self._alive >= _ALIVE_EVERY_S:
+            self._alive = now
+            self.device.keep_alive()
+        self.look()
+
+    def _stop_if_asked(self) -> None:
+        if self.asked_to_stop():
+            raise StoppedError("it was asked to stop")
+
+
+def _counts(servo: KnownServo, clock: PulseClock, angle: float) -> int:
+    return math.floor(float(servo.pulses_at(np.array([angle]))[0]) / clock.tick + 0.5)

@@ -1,0 +1,262 @@
+"""A servo calibration from opening the devices to what it leaves behind."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, cast
+
+from armcal.arm.servo import PulseClock, PulseTable
+from armcal.bench.acquisition.eyes import TrackerEyes
+from armcal.bench.clock import Clock
+from armcal.bench.faults import DeviceRefusedError
+from armcal.bench.servo.automatic import Automatic, Told
+from armcal.bench.servo.guided import Guided
+from armcal.bench.servo.keys import QUIT, Wishes
+from armcal.bench.servo.known import KnownBoard, KnownServo
+from armcal.bench.servo.mover import Motion, Mover, ServoDevice, StoppedError
+from armcal.bench.servo.outcome import Outcome, outcome_of
+from armcal.bench.servo.record import BEGUN, Record
+from armcal.bench.servo.setup import Setup
+from armcal.bench.servo.sweep import angles_told, to_base
+from armcal.bench.servo.trial import Move, Verdict, answered, judged, wrapped
+from armcal.errors import InputError, Location
+
+_FIRST_FRAME_S = 3.0
+_LOOK_S = 0.1
+
+
+@dataclass(frozen=True)
+class Conversation:
+    """How a calibration speaks with whom it is for.
+
+    Attributes:
+        asked_to_stop: whether somebody wants it to hold and end.
+        may_energise: asked once, with the joints that hang free, before they get their first pulses.
+        told: how far a tracked calibration is.
+        say: a line, of a guided one.
+        wishes: what somebody presses or writes, while it is asked for.
+    """
+
+    asked_to_stop: Callable[[], bool]
+    may_energise: Callable[[tuple[str, ...]], bool]
+    told: Told
+    say: Callable[[str], None]
+    wishes: Callable[[], AbstractContextManager[Wishes]]
+
+
+def measure(setup: Setup, folder: Path, talk: Conversation, how: str) -> None:
+    """Measure all that the record in a folder does not hold yet: ``automatic`` by the tracker, or ``guided``.
+
+    Raises:
+        InputError: the folder, the board or the tracker is refused.
+        StoppedError: it was stopped before its end; the arm holds, and what was measured is kept.
+        DeviceError: the device is gone; what was measured is kept.
+    """
+    record = Record(folder)
+    with setup.bench.clock() as clock, _opened(setup, clock, talk, record) as mover:
+        if how == "guided":
+            with talk.wishes() as wishes:
+                Guided(setup, mover, wishes, record, talk.say).run()
+            return
+        with _eyes(setup, mover) as eyes:
+            Automatic(setup, mover, eyes, record, talk.told).run()
+
+
+def evaluated(setup: Setup, folder: Path) -> Outcome:
+    """What the record in a folder tells, by the tables that it was begun with.
+
+    Raises:
+        InputError: there is no record, or nothing in it.
+    """
+    record = Record(folder)
+    begun = record.of_kind(BEGUN)
+    if not begun:
+        raise InputError("it holds nothing measured.", where=Location(str(folder)), hint="Measure first.")
+    servos, boards = _stated(setup, begun[0], setup.joints)
+    return outcome_of(record.entries, servos, boards, setup.nominal, setup.settings)
+
+
+def tried(setup: Setup, talk: Conversation, seen: str) -> list[Verdict]:
+    """Move each joint a little, and say what it did; ``seen`` by the ``tracker`` or by ``somebody``.
+
+    Raises: as ``measure``.
+    """
+    away = [verdict for verdict in (_wrapped(setup, joint) for joint in setup.joints) if verdict is not None]
+    if away:  # by such a table no joint can be moved
+        return away
+    with setup.bench.clock() as clock, _opened(setup, clock, talk, None) as mover:
+        if seen == "tracker":
+            with _eyes(setup, mover) as eyes:
+                to_base(setup, mover)
+                return _tracked(setup, mover, eyes)
+        to_base(setup, mover)
+        with talk.wishes() as wishes:
+            return [_by_eye(setup, mover, joint, talk, wishes) for joint in setup.joints]
+
+
+def park(setup: Setup, talk: Conversation, how: str) -> None:
+    """Bring the servos to the base pose, and with ``release`` end their pulses, the tip's first.
+
+    Raises: as ``measure``.
+    """
+    with setup.bench.clock() as clock, _opened(setup, clock, talk, None) as mover:
+        to_base(setup, mover)
+        mover.guard({})
+        for joint in reversed(tuple(setup.base)) if how == "release" else ():
+            mover.device.release(joint)
+            mover.clock.sleep(_LOOK_S)
+
+
+@contextmanager
+def _opened(setup: Setup, clock: Clock, talk: Conversation, record: Record | None) -> Iterator[Mover]:
+    device = cast(ServoDevice, setup.bench.device())
+    settings = setup.settings
+    motion = Motion(math.radians(settings.rate_deg_per_s), settings.period, settings.pulses, settings.silence)
+    read_by = {joint: (setup.known(joint), _clock(setup, joint)) for joint in setup.base}
+    servos = read_by
+    if record is not None and (begun := record.of_kind(BEGUN)):
+        stated = _stated(setup, begun[0], tuple(setup.base))[0]
+        servos = {each.joint: (each, _clock(setup, each.joint)) for each in stated}
+    mover = Mover(device, clock, servos, read_by, motion, talk.asked_to_stop)
+    try:
+        identity = mover.open()
+        if record is not None:
+            _begin(setup, record, identity.name)
+        free = tuple(joint for joint in setup.base if joint not in mover.told)
+        if free and not talk.may_energise(free):
+            raise InputError("the joints may not be energised; nothing was moved.", hint="Say yes, or give --yes.")
+        yield mover
+    except StoppedError:
+        mover.guard({})
+        raise
+    finally:
+        device.close()
+
+
+def _clock(setup: Setup, joint: str) -> PulseClock:
+    return setup.file.boards[setup.file.servos[joint].board].clock
+
+
+@contextmanager
+def _eyes(setup: Setup, mover: Mover) -> Iterator[TrackerEyes]:
+    """The tracker, once it tells something of use."""
+    eyes = TrackerEyes(setup.bench, mover.clock)
+    try:
+        eyes.open()
+        mover.look = eyes.look
+        until = mover.clock.now() + _FIRST_FRAME_S
+        while eyes.trouble()[0] and mover.clock.now() < until:
+            mover.tick()
+        if eyes.trouble()[0]:
+            raise DeviceRefusedError(
+                f"the tracker tells nothing that could be used ({eyes.trouble()[1]}); nothing was moved.",
+                hint="Start it, check its address and the names of its bodies; or calibrate with --guided.",
+            )
+        yield eyes
+    finally:
+        mover.look = _nothing
+        eyes.close()
+
+
+def _begin(setup: Setup, record: Record, device: str) -> None:
+    """The first line of a record: by which tables it is measured. A record of other ones is refused."""
+    servos = {joint: _as_stated(setup, joint) for joint in setup.base}
+    begun = record.of_kind(BEGUN)
+    if not begun:
+        record.append(BEGUN, {"servos": servos, "device": device, "base": dict(setup.base)})
+        return
+    for joint, stated in servos.items():
+        before = begun[0]["servos"].get(joint, {})
+        if any(stated[key] != before.get(key) for key in ("board", "channel", "oscillator_hz", "prescale")):
+            raise InputError(
+                f"it was begun with another board, channel or oscillator of {joint}.",
+                where=Location(str(record.path)),
+                hint="Give a new --out.",
+            )
+
+
+def _as_stated(setup: Setup, joint: str) -> dict[str, Any]:
+    servo = setup.file.servos[joint]
+    clock = setup.file.boards[servo.board].clock
+    return {
+        "board": str(servo.board),
+        "channel": servo.channel,
+        "oscillator_hz": clock.oscillator_hz,
+        "prescale": clock.prescale,
+        "angles": list(servo.angles),
+        "pulses": list(servo.pulses),
+    }
+
+
+def _stated(setup: Setup, begun: Any, joints: tuple[str, ...]) -> tuple[list[KnownServo], dict[str, KnownBoard]]:
+    """Servos and boards as they were when the record was begun."""
+    servos, boards = [], setup.boards()
+    for joint in joints:
+        stated = begun["servos"].get(joint)
+        if stated is None:
+            servos.append(setup.known(joint))
+            continue
+        table = PulseTable(tuple(stated["angles"]), tuple(stated["pulses"]))
+        servos.append(replace(setup.known(joint), table=table))
+        clock = PulseClock(stated["oscillator_hz"], stated["prescale"])
+        boards[stated["board"]] = KnownBoard(clock, boards[stated["board"]].measured)
+    return servos, boards
+
+
+def _wrapped(setup: Setup, joint: str) -> Verdict | None:
+    return wrapped(joint, setup.file.servos[joint].angles, setup.ranges[joint])
+
+
+def _tracked(setup: Setup, mover: Mover, eyes: TrackerEyes) -> list[Verdict]:
+    look = Automatic(setup, mover, eyes, cast(Record, None), _silent)
+    base, moves, unseen = angles_told(mover), [], []
+    for joint in setup.joints:
+        told, at = _small(setup, joint), mover.told[joint]
+        before = look.capture()
+        mover.go(joint, mover.counts_at(joint, setup.base[joint] + told))
+        after = look.capture()
+        mover.go(joint, at)
+        if isinstance(before, str) or isinstance(after, str):
+            why = before if isinstance(before, str) else after
+            unseen.append(Verdict(joint, "unclear", f"{joint}: it was not seen to stand ({why})."))
+        else:
+            moves.append(Move(joint, told, before.base_T_target, after.base_T_target))
+    return [*judged(moves, base, setup.nominal), *unseen]
+
+
+def _by_eye(setup: Setup, mover: Mover, joint: str, talk: Conversation, wishes: Wishes) -> Verdict:
+    told, base = _small(setup, joint), mover.told[joint]
+    mover.go(joint, mover.counts_at(joint, setup.base[joint] + told))
+
+    def ask(question: str) -> str:
+        talk.say(question)
+        while True:
+            wish = wishes.next(_LOOK_S)
+            if wish == QUIT or talk.asked_to_stop():
+                raise StoppedError("it was asked to stop")
+            if wish is not None:
+                return wish
+            mover.device.keep_alive()
+
+    verdict = answered(joint, told, ask)
+    mover.go(joint, base)
+    return verdict
+
+
+def _small(setup: Setup, joint: str) -> float:
+    """A turn that the joint's range has room for."""
+    low, high = setup.ranges[joint]
+    at, size = setup.base[joint], setup.settings.check
+    return size if high - at >= size or high - at >= at - low else -size
+
+
+def _silent(joint: str, done: int, planned: int) -> None:
+    """Nobody is told."""
+
+
+def _nothing() -> None:
+    """Nothing is looked at."""

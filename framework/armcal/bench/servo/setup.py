@@ -1,0 +1,164 @@
+"""What a servo calibration is about: the servos of a file, the arm that they move, and where it may go."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from armcal.arm.clearance import ClearanceCheck
+from armcal.base.config_text import resolve_path
+from armcal.bench.acquisition.preparation import joint_limits
+from armcal.bench.bench import SECTION, Bench
+from armcal.bench.servo.known import KnownBoard, KnownServo, MeasuredPulse
+from armcal.bench.servo.nominal import NominalArm
+from armcal.bench.servo.settings import ServoCalibrationSettings
+from armcal.config.servo_file import ServoFile, load_servo_file
+from armcal.config.validate import validate
+from armcal.errors import ConfigError
+from armcal.run.experiment import Experiment
+from armcal.run.plan_clearance import clearance_check
+
+AT = (SECTION, "servo")
+_LOOK_STEP = math.radians(2.0)
+
+
+@dataclass(frozen=True)
+class Setup:
+    """All that is known before anything moves.
+
+    Attributes:
+        bench: the configured one.
+        settings: of the calibration.
+        path: of the servo file.
+        file: what it states.
+        joints: those to calibrate.
+        base: where every servo's joint stands while others are measured (rad).
+        ranges: over which each joint may be moved from there (rad).
+        nominal: what the model says.
+    """
+
+    bench: Bench
+    settings: ServoCalibrationSettings
+    path: Path
+    file: ServoFile
+    joints: tuple[str, ...]
+    base: Mapping[str, float]
+    ranges: Mapping[str, tuple[float, float]]
+    nominal: NominalArm
+
+    @classmethod
+    def of(cls, experiment: Experiment) -> Setup:
+        """Of an experiment's bench.
+
+        Raises:
+            ConfigError: the bench, its servo section or the servo file is refused, or the base pose is not clear.
+        """
+        bench = Bench.of(experiment)
+        settings = ServoCalibrationSettings()
+        if bench.settings.servo is not None:
+            settings = validate(ServoCalibrationSettings, experiment.source, AT)
+        path = settings.servos or _path_of_device(experiment, bench)
+        file = load_servo_file(path)
+        arm = bench.arm
+        moved = tuple(joint for joint in arm.commanded if joint in file.servos)
+        _check_names(experiment, settings, file, moved)
+        base = {joint: settings.base.get(joint, 0.0) for joint in moved}
+        limited = {**bench.settings.acquisition.limits, **settings.ranges}
+        acquisition = bench.settings.acquisition.model_copy(update={"limits": limited})
+        limits = dict(zip(arm.commanded, joint_limits(experiment, acquisition, arm).tolist(), strict=True))
+        nominal = NominalArm.of(arm, experiment.parameters, experiment.system.environment)
+        joints = settings.joints or moved
+        found = cls(bench, settings, path, file, joints, base, {}, nominal)
+        return cls(bench, settings, path, file, joints, base, found.clear_ranges(experiment, limits), nominal)
+
+    def known(self, joint: str) -> KnownServo:
+        """A servo as the file states it."""
+        servo = self.file.servos[joint]
+        return KnownServo(joint, servo.board, servo.table, self.settings.trusted.get(joint))
+
+    def boards(self) -> dict[str, KnownBoard]:
+        """The boards as the file states them, with the pulses measured at their pins."""
+        return {name: KnownBoard(board.clock, self._measured(name)) for name, board in self.file.boards.items()}
+
+    def _measured(self, board: str) -> tuple[MeasuredPulse, ...]:
+        stated = [each for each in self.settings.measured_pulses if each.board == board]
+        return tuple(MeasuredPulse(m.counts, 1e-6 * m.microseconds, 1e-6 * m.sd_microseconds) for m in stated)
+
+    def clear_ranges(self, experiment: Experiment, limits: Mapping[str, Any]) -> dict[str, tuple[float, float]]:
+        """How far each joint may go from the base pose, within its limits and table and without coming too near."""
+        plan = experiment.settings.plan
+        check = None
+        if plan is not None and plan.clearance is not None:
+            check = clearance_check(plan.clearance, {self.bench.arm.name: self.bench.arm}, experiment.source)
+        where = experiment.source.where((*AT, "base"))
+        found = {}
+        for joint in self.base:
+            low, high = (float(limit) for limit in limits[joint])
+            if not low <= self.base[joint] <= high:
+                raise ConfigError(
+                    f"{joint} stands at {math.degrees(self.base[joint]):.1f} deg in the base pose, expected "
+                    f"{math.degrees(low):.1f} to {math.degrees(high):.1f} deg.",
+                    where=where,
+                    hint="Choose another base pose, or another range.",
+                )
+            found[joint] = (self._end(check, joint, low), self._end(check, joint, high))
+        if check is not None and not check(self._pose({}).reshape(-1, 1)).allowed[0]:
+            raise ConfigError(
+                "the base pose is too near to something, by plan.clearance.", where=where, hint="Choose another."
+            )
+        return found
+
+    def _end(self, check: ClearanceCheck | None, joint: str, limit: float) -> float:
+        """The last angle before something comes too near, on the way from the base pose to a limit."""
+        start = self.base[joint]
+        count = math.ceil(abs(limit - start) / _LOOK_STEP) + 1
+        way = np.linspace(start, limit, max(count, 2))
+        if check is None:
+            return limit
+        allowed = check(np.array([self._pose({joint: angle}) for angle in way]).T).allowed
+        blocked = np.flatnonzero(~allowed)
+        return limit if not len(blocked) else float(way[max(blocked[0] - 1, 0)])
+
+    def _pose(self, other: Mapping[str, float]) -> Any:
+        return np.array([{**self.base, **other}.get(joint, 0.0) for joint in self.bench.arm.commanded])
+
+
+def _path_of_device(experiment: Experiment, bench: Bench) -> Path:
+    stated = (bench.settings.device or {}).get("servos")
+    if not isinstance(stated, str):
+        raise ConfigError(
+            "found no servo file.",
+            where=experiment.source.where((SECTION, "device")),
+            hint="Name it in bench.device.servos, or in bench.servo.servos.",
+        )
+    return resolve_path(stated)
+
+
+def _check_names(
+    experiment: Experiment, settings: ServoCalibrationSettings, file: ServoFile, moved: tuple[str, ...]
+) -> None:
+    for key in ("joints", "base", "ranges", "trusted"):
+        if unknown := [joint for joint in getattr(settings, key) if joint not in moved]:
+            raise ConfigError(
+                f"no servo of the arm is called {unknown[0]!r}.",
+                where=experiment.source.where((*AT, key)),
+                hint=f"Servos of this arm are {', '.join(moved) or 'none'}; see the servo file.",
+            )
+    if not moved:
+        raise ConfigError(
+            "the servo file has no servo of a joint of this arm.",
+            where=experiment.source.where((SECTION, "device")),
+            hint=f"Name them as the joints: {', '.join(file.servos)} are not in the model.",
+        )
+    for index, measured in enumerate(settings.measured_pulses):
+        if measured.board not in file.boards:
+            raise ConfigError(
+                f"no board is called {str(measured.board)!r}.",
+                where=experiment.source.where((*AT, "measured_pulses", index)),
+                hint=f"Boards are {', '.join(file.boards)}.",
+            )

@@ -1,0 +1,188 @@
+"""``armcal servo``."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import click
+from rich.markup import escape
+from rich.table import Table
+
+from armcal.bench.faults import DeviceError
+from armcal.bench.servo.keys import wishes_from
+from armcal.bench.servo.mover import StoppedError
+from armcal.bench.servo.outcome import Outcome
+from armcal.bench.servo.outputs import improved, results, write_results, write_servo_file
+from armcal.bench.servo.record import NAME
+from armcal.bench.servo.session import Conversation, evaluated, measure, park, tried
+from armcal.bench.servo.setup import Setup
+from armcal.bench.servo.trial import Verdict, swapped
+from armcal.cli.common import Voice, overrides, speaking
+from armcal.errors import EXIT_FAULT, EXIT_STOPPED, InputError
+from armcal.online.running.signals import Signals
+from armcal.plugins import discover
+from armcal.run.experiment import Experiment
+from armcal.solve.estimator import Progress
+
+_FOLDER = click.Path(path_type=Path)
+
+
+@click.command("servo")
+@click.argument("config", type=_FOLDER)
+@click.option(
+    "--out", type=_FOLDER, help="The folder to keep what is measured in; what it holds is not measured again."
+)
+@click.option("--guided", is_flag=True, help="Without a tracker: you say when a joint is at an angle.")
+@click.option("--check", is_flag=True, help="Only move each joint a little, and say whether it is the right one.")
+@click.option("--park", "parks", is_flag=True, help="Only bring the servos to the base pose.")
+@click.option("--release", is_flag=True, help="Let go of the servos, from the base pose, at the end.")
+@click.option("--evaluate", is_flag=True, help="Measure nothing: fit what the folder holds, and write the tables.")
+@click.option("--keep", is_flag=True, help="Leave the servo file as it is.")
+@click.option("--yes", is_flag=True, help="Energise the joints without asking.")
+@overrides
+@speaking
+def servo(
+    voice: Voice,
+    config: Path,
+    out: Path | None,
+    guided: bool,
+    check: bool,
+    parks: bool,
+    release: bool,
+    evaluate: bool,
+    keep: bool,
+    yes: bool,
+    overrides: tuple[str, ...],
+) -> None:
+    """Find which pulse makes which angle of each servo on the bench of CONFIG, and write the servo file."""
+    registry = discover()
+    voice.plugin_faults(registry)
+    setup = Setup.of(Experiment.load(config, overrides, registry=registry))
+    how = "guided" if guided else "automatic"
+    with _talking(voice, setup, yes) as talk:
+        if check:
+            _checked(voice, setup, talk, "somebody" if guided else "tracker")
+        elif not parks and not (release and out is None):
+            _calibrated(voice, setup, _given(out), None if evaluate else how, keep, talk)
+        if parks or release:
+            _stoppable(voice, lambda: park(setup, talk, "release" if release else "hold"))
+
+
+def _given(out: Path | None) -> Path:
+    if out is None:
+        raise InputError("found no --out.", hint="Say where what is measured is to be kept, or give --check.")
+    return out
+
+
+def _calibrated(voice: Voice, setup: Setup, out: Path, how: str | None, keep: bool, talk: Conversation) -> None:
+    if how is not None:
+        _stoppable(voice, lambda: measure(setup, out, talk, how))
+    outcome = evaluated(setup, out)
+    changed = improved(setup.file, outcome)
+    content = results(outcome, changed)
+    write_results(out, content)
+    kept = None if keep else write_servo_file(setup.path, changed)
+    written = {"servo_file": str(setup.path), "before": None if kept is None else str(kept)}
+    voice.result({**content, **written})
+    _show(voice, outcome, content)
+    if kept is not None:
+        voice.out.print(f"{setup.path}: written; the one before is {kept.name}", markup=False, soft_wrap=True)
+
+
+def _checked(voice: Voice, setup: Setup, talk: Conversation, seen: str) -> None:
+    verdicts: list[Verdict] = []
+    _stoppable(voice, lambda: verdicts.extend(tried(setup, talk, seen)))
+    pairs = swapped(verdicts)
+    shown = [{**asdict(v), "turned": v.turned if v.turned == v.turned else None} for v in verdicts]
+    voice.result({"joints": shown, "swapped": pairs})
+    for verdict in verdicts:
+        style = "green" if verdict.kind == "right" else "red"
+        voice.out.print(f"{verdict.sentence} {verdict.mend}".rstrip(), style=style, markup=False, soft_wrap=True)
+    for sentence in pairs:
+        voice.out.print(sentence, style="red", markup=False, soft_wrap=True)
+    if any(verdict.kind != "right" for verdict in verdicts):
+        sys.exit(EXIT_FAULT)
+
+
+def _stoppable(voice: Voice, action: Callable[[], None]) -> None:
+    """Do it; where it was stopped, say what that means."""
+    try:
+        action()
+    except StoppedError as stop:
+        voice.err.print(
+            f"stopped: {stop}. The arm holds, and what was measured is kept: give the same command again to go on.",
+            markup=False,
+            soft_wrap=True,
+        )
+        sys.exit(EXIT_STOPPED)
+    except DeviceError as fault:
+        hint = f"{fault.hint} What was measured is kept: give the same command again to go on.".strip()
+        raise type(fault)(fault.message, where=fault.where, hint=hint) from fault
+
+
+@contextmanager
+def _talking(voice: Voice, setup: Setup, yes: bool) -> Iterator[Conversation]:
+    def say(text: str) -> None:
+        click.echo(text, err=voice.json)
+
+    with Signals() as signals, voice.progress() as show:
+        yield Conversation(lambda: signals.finish, _question(yes), _teller(show), say, lambda: wishes_from(0))
+
+
+def _question(yes: bool) -> Callable[[tuple[str, ...]], bool]:
+    def ask(joints: tuple[str, ...]) -> bool:
+        if yes:
+            return True
+        if not sys.stdin.isatty():
+            raise InputError(
+                f"{', '.join(joints)} get no pulses yet, and nobody can be asked whether they may; nothing was moved.",
+                hint="Stand clear of the arm and give --yes.",
+            )
+        click.echo(
+            f"{', '.join(joints)} get no pulses yet. A servo tells nobody where it stands, so each may jump when its "
+            "first pulse comes, one after the other.",
+            err=True,
+        )
+        return click.confirm("Is everybody clear of the arm?", err=True)
+
+    return ask
+
+
+def _teller(show: Progress) -> Callable[[str, int, int], None]:
+    def tell(joint: str, done: int, planned: int) -> None:
+        show(f"measuring {joint}", done / max(planned, 1))
+
+    return tell
+
+
+def _show(voice: Voice, outcome: Outcome, content: Mapping[str, Any]) -> None:
+    table = Table(title="Pulses at angles, and what changed", title_justify="left")
+    for column in ("servo", "deg", "us", "sd", "before", "change, us", "change, deg", "backlash, deg"):
+        table.add_column(column, justify="left" if column == "servo" else "right")
+    for joint, found in content["servos"].items():
+        for i, knot in enumerate(found["knots"]):
+            lag = found["backlash_deg"]
+            play = "-" if lag is None else f"{lag:.2f} +- {found['backlash_sd_deg'] or 0:.2f}"
+            table.add_row(
+                escape(joint) if i == 0 else "",
+                f"{knot['angle_deg']:g}",
+                f"{knot['pulse_us']:.1f}",
+                "-" if knot["sd_us"] is None else f"{knot['sd_us']:.1f}",
+                f"{knot['before_us']:.1f}",
+                f"{knot['change_us']:+.1f}",
+                f"{knot['change_deg']:+.2f}",
+                play if i == 0 else "",
+            )
+    voice.out.print(table)
+    for name, board in content["boards"].items():
+        if board["oscillator_sd_hz"] is not None:
+            text = f"{name}: oscillator {board['oscillator_hz'] / 1e6:.4f} +- {board['oscillator_sd_hz'] / 1e6:.4f} MHz"
+            voice.out.print(text, markup=False)
+    for sentence in content["findings"]:
+        voice.out.print(sentence, markup=False, soft_wrap=True)
+    voice.detail(f"{len(outcome.task.observations)} angles, in {NAME}.")

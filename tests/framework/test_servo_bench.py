@@ -1,0 +1,194 @@
+"""``armcal servo`` as a user gives it: on the simulated bench, through its port and real datagrams; refusals."""
+
+from __future__ import annotations
+
+import json
+import signal
+import socket
+import subprocess
+import sys
+import time
+
+import pytest
+import yaml
+
+from tests.servo_fakes import config_in
+
+ARMCAL = [sys.executable, "-m", "armcal.cli"]
+JOINTS = ("q3", "q5")
+
+
+def free_port():
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp:
+        udp.bind(("127.0.0.1", 0))
+        return udp.getsockname()[1]
+
+
+def armcal(*words, **more):
+    return subprocess.run([*ARMCAL, *map(str, words)], capture_output=True, text=True, timeout=120, **more)
+
+
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory):
+    """A running simulated bench and its configuration."""
+    folder = tmp_path_factory.mktemp("servo")
+    port = free_port()
+    config = config_in(
+        folder,
+        "bench:\n"
+        "  clock: {simulated: run/clock}\n"
+        "  link: {type: framed, port: run/board}\n"
+        f"  tracker: {{port: {port}}}\n"
+        f"  simulator: {{tracker: {{port: {port}}}}}\n"
+        f"  servo: {{joints: [{', '.join(JOINTS)}], step: 24 deg}}\n",
+    )
+    serving = subprocess.Popen(
+        [*ARMCAL, "simulated-bench", str(config), "--dir", str(folder / "run")], stdout=subprocess.PIPE, text=True
+    )
+    try:
+        assert serving.stdout.readline()
+        yield config
+    finally:
+        serving.terminate()
+        serving.wait(10)
+
+
+def ask(config, request):
+    with socket.socket(socket.AF_UNIX) as link:
+        link.connect(str(config.parent / "run" / "clock"))
+        link.sendall(json.dumps(request).encode() + b"\n")
+        return json.loads(link.makefile().readline())
+
+
+@pytest.fixture(scope="module")
+def calibrated(bench):
+    """One calibration, interrupted once and finished; what it said, and what it wrote."""
+    out = bench.parent / "out"
+    first = subprocess.Popen(
+        [*ARMCAL, "servo", str(bench), "--out", str(out), "--yes"], stderr=subprocess.PIPE, text=True
+    )
+    record, until = out / "observations.jsonl", time.monotonic() + 60
+    while (not record.exists() or record.read_text().count("\n") < 8) and time.monotonic() < until:
+        time.sleep(0.02)
+    first.send_signal(signal.SIGINT)
+    said = first.communicate(timeout=60)[1]
+    kept = record.read_text()
+    done = armcal("servo", bench, "--out", out, "--yes", "--json")
+    return first.returncode, said, kept, done, out
+
+
+def test_interrupted_it_holds_and_keeps_what_it_measured(calibrated):
+    code, said, kept, done, out = calibrated
+    assert code == 4 and "The arm holds" in said
+    assert done.returncode == 0, done.stderr
+    assert (out / "observations.jsonl").read_text().startswith(kept)
+    rows = [json.loads(line) for line in (out / "observations.jsonl").read_text().splitlines()]
+    keys = [(r["joint"], r["counts"], r["came"]) for r in rows if r["kind"] == "pose"]
+    assert len(keys) == len(set(keys)) and {k[0] for k in keys} == set(JOINTS)
+
+
+def test_it_finds_what_the_servos_truly_are(calibrated, bench):
+    found = json.loads(calibrated[3].stdout)
+    truth = yaml.safe_load((bench.parent / "bench_servos.yaml").read_text())
+    longer = truth["boards"]["front"]["oscillator_hz"] / 25e6
+    for joint in JOINTS:
+        knots = found["servos"][joint]["knots"]
+        true = [pulse * longer for pulse in truth["servos"][joint]["pulses_us"]]
+        # The zero is kept, so that pulses count from it; two joints alone tell the springs only so well.
+        spans = [knots[2]["pulse_us"] - knots[1]["pulse_us"], knots[1]["pulse_us"] - knots[0]["pulse_us"]]
+        assert spans == pytest.approx([true[2] - true[1], true[1] - true[0]], abs=8.0)
+        assert found["servos"][joint]["backlash_deg"] == pytest.approx(0.1, abs=0.05)
+    assert any("cannot be told" in sentence for sentence in found["findings"])
+
+
+def test_the_servo_file_is_written_and_the_one_before_is_kept(calibrated, bench):
+    before = yaml.safe_load((bench.parent / "servos.yaml.before-1").read_text())
+    after = yaml.safe_load((bench.parent / "servos.yaml").read_text())
+    assert after["servos"]["q1"] == before["servos"]["q1"]
+    assert after["servos"]["q3"]["pulses_us"] != before["servos"]["q3"]["pulses_us"]
+    again = armcal("servo", bench, "--out", calibrated[4], "--yes", "--json")
+    assert again.returncode == 0, again.stderr
+    assert json.loads(again.stdout)["before"] is None
+
+
+def test_the_arm_was_never_unsafe(calibrated, bench):
+    events = [json.loads(line) for line in (bench.parent / "run" / "safety.jsonl").read_text().splitlines()]
+    assert {event["event"] for event in events} <= {"first_pulse", "drop"}
+
+
+def test_an_unplugged_board_that_comes_back_is_gone_on_with(calibrated, bench, tmp_path):
+    now = ask(bench, {"advance": 0.0})["now"]
+    for kind, at in (("unplug", now + 20.0), ("replug", now + 23.0)):
+        assert "error" not in ask(bench, {"fault": {"kind": kind, "at": at}})
+    words = ("--out", tmp_path / "out", "--yes", "--keep", "--set", "bench.servo.step=40 deg", "--json")
+    done = armcal("servo", bench, *words)
+    assert done.returncode == 0, done.stderr
+    assert ask(bench, {"advance": 0.0})["now"] > now + 23.0
+    assert not json.loads(done.stdout)["not_told"]["servos"]
+
+
+def test_check_says_that_all_is_right(calibrated, bench):
+    bent = "bench.servo.base={q2: 30 deg, q4: -40 deg}"
+    done = armcal("servo", bench, "--check", "--yes", "--json", "--set", bent)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert {v["kind"] for v in json.loads(done.stdout)["joints"]} == {"right"}
+
+
+def test_check_finds_a_planted_swap(calibrated, bench):
+    servos = yaml.safe_load((bench.parent / "servos.yaml").read_text())
+    servos["servos"]["q2"]["channel"], servos["servos"]["q4"]["channel"] = 3, 1
+    (bench.parent / "swapped.yaml").write_text(yaml.safe_dump(servos))
+    options = (
+        "bench.servo.base={q2: 30 deg, q4: -40 deg}",
+        "bench.servo.joints=[q2, q4]",
+        "bench.device.servos=swapped.yaml",
+    )
+    done = armcal(
+        "servo", bench, "--check", "--yes", *(word for o in options for word in ("--set", o)), cwd=bench.parent
+    )
+    assert done.returncode == 1
+    assert "q2 and q4 are swapped" in done.stdout
+
+
+def test_guided_by_lines_of_a_pipe(calibrated, bench, tmp_path):
+    words = ("--set", "bench.servo.joints=[q6]", "--guided", "--yes", "--out", tmp_path / "out", "--keep", "--json")
+    done = armcal("servo", bench, *words, input="+10\nok\n-10\nok\nquit\n")
+    assert done.returncode == 4, done.stderr
+    done = armcal("servo", bench, *words, input="skip\nskip\nok\nok\n")
+    assert done.returncode == 0, done.stderr
+    knots = json.loads(done.stdout)["servos"]["q6"]["knots"]
+    assert knots[2]["change_us"] == pytest.approx(0.0, abs=6.0)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("bench:\n  servo: {joints: [q9]}\n", ("own.yaml:3", "bench.servo.joints", "q1, q2")),
+        ("bench:\n  servo: {knots_deg: [10, 0]}\n", ("bench.servo", "do not rise")),
+        ("bench:\n  servo: {step: 10}\n", ("bench.servo.step", "step_deg")),
+        ("bench:\n  servo: {measured_pulses: [{board: back, counts: 300, microseconds: 1480}]}\n", ("back", "front")),
+        ("bench:\n  servo: {base: {q2: 80 deg}}\n", ("80.0 deg", "-50.0 to 50.0")),
+        ("bench:\n  device: {servos: nowhere.yaml}\n", ("nowhere.yaml",)),
+    ],
+)
+def test_what_is_refused_says_where_and_moves_nothing(tmp_path, text, said):
+    config = config_in(tmp_path, text)
+    done = armcal("servo", config, "--out", tmp_path / "out", "--yes")
+    assert done.returncode == 2, done.stderr
+    assert "Traceback" not in done.stderr
+    for word in said:
+        assert word in done.stderr, done.stderr
+
+
+def test_without_a_folder_or_a_bench_it_says_what_to_give(tmp_path):
+    config = config_in(tmp_path)
+    assert "--out" in armcal("servo", config, "--yes").stderr
+    done = armcal("servo", tmp_path / "option1.yaml", "--out", tmp_path / "out")
+    assert done.returncode == 2 and "found no bench" in done.stderr
+
+
+def test_nobody_is_there_to_be_asked(bench, tmp_path):
+    done = armcal("servo", bench, "--park", "--release", "--yes")
+    assert done.returncode == 0, done.stderr
+    done = armcal("servo", bench, "--out", tmp_path / "out", stdin=subprocess.DEVNULL)
+    assert done.returncode == 2 and "--yes" in done.stderr and "nothing was moved" in done.stderr

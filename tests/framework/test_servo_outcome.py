@@ -1,0 +1,177 @@
+"""Tables from a tracked record of an arm that sags, whose axes are not where its model has them."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from armcal.arm.servo import PulseClock, PulseTable
+from armcal.bench.servo.findings import findings
+from armcal.bench.servo.known import KnownBoard, KnownServo, MeasuredPulse
+from armcal.bench.servo.nominal import NominalArm
+from armcal.bench.servo.outcome import outcome_of
+from armcal.bench.servo.outputs import improved, results, write_servo_file
+from armcal.bench.servo.settings import ServoCalibrationSettings
+from armcal.config.servo_file import load_servo_file
+from armcal.config.yaml_source import load_config
+from armcal.run.experiment import Experiment
+from scipy.spatial.transform import Rotation
+
+from tests.servo_fakes import CONFIGS
+
+US = 1e-6
+CLOCK = PulseClock(25e6, 121)
+REACH = {"q1": 90, "q2": 46, "q3": 90, "q4": 90, "q5": 90, "q6": 46}
+LAG = math.radians(0.15)
+STATED = load_servo_file(CONFIGS / "servos.yaml")
+SLOPES = {
+    "q1": (1.006, 0.992),
+    "q2": (0.99, 1.004),
+    "q3": (1, 1.01),
+    "q4": (0.985, 1),
+    "q5": (1, 0.99),
+    "q6": (1.01, 1),
+}
+TRUE = {
+    joint: (p[1] - SLOPES[joint][0] * (p[1] - p[0]), p[1], p[1] + SLOPES[joint][1] * (p[2] - p[1]))
+    for joint, p in ((joint, servo.pulses) for joint, servo in STATED.servos.items())
+}
+
+
+def arm_with(values):
+    experiment = Experiment.load(CONFIGS / "option1.yaml", values)
+    (arm,) = experiment.system.arms.values()
+    return NominalArm.of(arm, experiment.parameters, experiment.system.environment)
+
+
+@pytest.fixture(scope="module")
+def nominal():
+    return arm_with([])
+
+
+@pytest.fixture(scope="module")
+def truth():
+    values = {name: str(text) for name, text in load_config(CONFIGS / "truth.yaml").data.items()}
+    return arm_with([f'parameters.values."{name}"={text}' for name, text in values.items()])
+
+
+def record_of(arm, seen="rotation", noise_deg=0.01, joints=REACH, step=23):
+    """What a tracker sees of sweeps up and down, with play that a joint stands in, and a body that sits askew."""
+    rng, lines = np.random.default_rng(11), []
+    seat = Rotation.from_rotvec([0.05, -0.1, 0.02]).as_matrix()
+    for joint in joints:
+        table = PulseTable(tuple(np.radians([-100, 0, 100])), TRUE[joint])
+        stand = {other: rng.normal(0, math.radians(0.05)) for other in REACH}
+        for came in (1, -1):
+            for angle in np.arange(-REACH[joint], REACH[joint] + 1, step)[::came]:
+                counts = round(float(table.pulse(math.radians(angle))) / CLOCK.tick)
+                true = float(table.angle(counts * CLOCK.tick)) - came * LAG
+                pose = arm._bent({**stand, joint: true})[0]
+                shake = Rotation.from_rotvec(rng.normal(0, math.radians(noise_deg), 3)).as_matrix()
+                at = pose[:3, 3] + rng.normal(0, 1e-4, 3)
+                lines.append(
+                    {
+                        "kind": "pose",
+                        "joint": joint,
+                        "counts": counts,
+                        "came": came,
+                        "position": at.tolist(),
+                        "rotation": (shake @ pose[:3, :3] @ seat).tolist() if seen == "rotation" else None,
+                        "deviations": [1e-4] * 3 + [math.radians(noise_deg)] * 3,
+                        "told": dict.fromkeys(REACH, 0.0),
+                    }
+                )
+    return lines
+
+
+def evaluated(record, nominal, joints=REACH, **settings):
+    known = [KnownServo(joint, "front", STATED.servos[joint].table) for joint in joints]
+    return outcome_of(record, known, {"front": KnownBoard(CLOCK)}, nominal, ServoCalibrationSettings.si(**settings))
+
+
+def worst_us(outcome):
+    """The largest difference of a pulse at the ends of what was measured, where tables matter."""
+    off = []
+    for joint, servo in outcome.fit.servos.items():
+        for angle in (-REACH[joint], REACH[joint]):
+            found, true = (np.interp(angle, [-100, 0, 100], pulses) for pulses in (servo.pulses, TRUE[joint]))
+            off.append(abs(found - true) / US)
+    return max(off)
+
+
+@pytest.fixture(scope="module")
+def whole(truth, nominal):
+    return evaluated(record_of(truth), nominal)
+
+
+def test_tables_come_back_though_nobody_knew_springs_or_axes(whole):
+    assert worst_us(whole) < 3.0
+    for servo in whole.fit.servos.values():
+        assert servo.lag == pytest.approx(LAG, abs=math.radians(0.03))
+        assert not servo.outliers
+
+
+def test_the_springs_that_matter_are_found_with_them(whole, truth):
+    for name in ("arm.spring.k2", "arm.spring.k4"):
+        value, sd = whole.compliances[name]
+        assert abs(value - truth.compliance(name)) < max(4 * sd, 0.1 * truth.compliance(name))
+
+
+def test_what_is_taken_for_stiff_is_far_off_and_that_is_said(truth, nominal):
+    stiff = evaluated(record_of(truth, joints=("q4",)), nominal, ("q4",), sag="none")
+    assert worst_us(stiff) > 10
+    assert any("is not reckoned with" in sentence for sentence in findings(stiff))
+
+
+def test_positions_alone_do_where_the_arm_is_stiff(nominal):
+    found = evaluated(record_of(nominal, seen="position", joints=("q2",)), nominal, ("q2",), sag="none")
+    assert found.sweeps["q2"].by == "position"
+    assert worst_us(found) < 4.0
+
+
+def test_a_joint_that_positions_do_not_show_is_left_as_it_was(nominal):
+    found = evaluated(record_of(nominal, seen="position", joints=("q5",)), nominal, ("q5",), sag="none")
+    assert not found.fit.servos
+    assert "circle" in found.silent["q5"] or "line or a point" in found.silent["q5"]
+    changed = improved(STATED, found)
+    assert changed == STATED
+    assert any("left as it was" in sentence for sentence in results(found, changed)["findings"])
+
+
+def test_writing_keeps_every_file_before_and_the_numbers_that_were_found(whole, tmp_path):
+    path = tmp_path / "servos.yaml"
+    path.write_bytes((CONFIGS / "servos.yaml").read_bytes())
+    changed = improved(STATED, whole)
+    assert write_servo_file(path, changed) == tmp_path / "servos.yaml.before-1"
+    assert load_servo_file(path) == changed
+    assert write_servo_file(path, changed) is None
+    assert write_servo_file(path, STATED) == tmp_path / "servos.yaml.before-2"
+    assert (tmp_path / "servos.yaml.before-1").read_bytes() == (CONFIGS / "servos.yaml").read_bytes()
+
+
+def test_by_a_new_oscillator_servos_that_were_not_measured_stand_where_they_stood(nominal):
+    record = record_of(nominal, joints=("q1",))
+    known = [KnownServo("q1", "front", STATED.servos["q1"].table)]
+    true_tick = PulseClock(25.4e6, 121).tick
+    board = KnownBoard(CLOCK, (MeasuredPulse(300, 300 * true_tick, 0.05 * US),))
+    found = outcome_of(record, known, {"front": board}, nominal, ServoCalibrationSettings(sag="none"))
+    changed = improved(STATED, found)
+    assert changed.boards["front"].oscillator_hz == pytest.approx(25.4e6, rel=1e-4)
+    # A pulse of as many counts is shorter by a faster oscillator, whatever prescale the board gets next time.
+    shorter = CLOCK.oscillator_hz / changed.boards["front"].oscillator_hz
+    assert changed.servos["q1"].pulses[1] == pytest.approx(STATED.servos["q1"].pulses[1] * shorter, rel=1e-5)
+    for before, after in zip(STATED.servos["q2"].pulses, changed.servos["q2"].pulses, strict=True):
+        assert after == pytest.approx(before * shorter, rel=1e-9)
+
+
+def test_a_servo_that_lets_go_is_left_out_and_spoils_no_other(truth, nominal):
+    record = record_of(truth, joints=("q3", "q5"))
+    dropped = [i for i, line in enumerate(record) if line["joint"] == "q5"][8:]
+    limp = record[dropped[0]]
+    for i in dropped:
+        record[i] = {**limp, "counts": record[i]["counts"], "came": record[i]["came"]}
+    both = evaluated(record, nominal, ("q3", "q5"))
+    alone = evaluated([line for line in record if line["joint"] == "q3"], nominal, ("q3",))
+    assert "let go" in both.silent["q5"] and set(both.fit.servos) == {"q3"}
+    assert both.fit.servos["q3"].pulses == alone.fit.servos["q3"].pulses
