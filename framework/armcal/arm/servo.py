@@ -6,6 +6,7 @@ The board counts ticks of an oscillator, divided by ``prescale + 1``, and takes 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -47,12 +48,12 @@ class PulseTable:
 
     def pulse(self, angle: Expression) -> Expression:
         """The pulse (s) that sets an angle (rad)."""
-        return _interpolated(angle, self.angles, self.pulses)
+        return piecewise_linear(angle, self.angles, self.pulses)
 
     def angle(self, pulse: Expression) -> Expression:
         """The angle (rad) that a pulse (s) sets."""
         order = slice(None) if self.pulses[0] < self.pulses[-1] else slice(None, None, -1)
-        return _interpolated(pulse, self.pulses[order], self.angles[order])
+        return piecewise_linear(pulse, self.pulses[order], self.angles[order])
 
 
 @dataclass(frozen=True)
@@ -96,7 +97,8 @@ def quantised(angle: Expression, table: PulseTable, clock: PulseClock) -> Expres
     return table.angle(clock.counts(table.pulse(angle)) * clock.tick)
 
 
-def _interpolated(x: Expression, at: tuple[float, ...], values: tuple[float, ...]) -> Expression:
+def piecewise_linear(x: Expression, at: Sequence[float], values: Sequence[Expression]) -> Expression:
+    """Linear between points (``at`` rises), and beyond the ends as before them."""
     slopes = [(v1 - v0) / (a1 - a0) for a0, a1, v0, v1 in zip(at, at[1:], values, values[1:], strict=False)]
     result = values[0] + slopes[0] * (x - at[0])
     for knot, before, after in zip(at[1:-1], slopes, slopes[1:], strict=False):

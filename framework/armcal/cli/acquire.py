@@ -16,6 +16,7 @@ from armcal.bench.acquisition.progress import Progress
 from armcal.bench.acquisition.schedule import LeaveOut, Measure, Outlook, foretell
 from armcal.bench.acquisition.session import Course, Outcome, acquire
 from armcal.cli.common import Voice, overrides, speaking
+from armcal.cli.energising import Question, energise_option
 from armcal.errors import EXIT_DONE, EXIT_STOPPED, InputError
 from armcal.online.running.signals import Signals
 from armcal.plugins import discover
@@ -32,7 +33,7 @@ _ANGLE = 180 / np.pi
 @click.option("--out", type=_FILE, help="The folder to keep data and journal in.")
 @click.option("--resume", is_flag=True, help="Go on with the run in that folder.")
 @click.option("--dry-run", is_flag=True, help="Say what the run would take, and open nothing.")
-@click.option("--yes", is_flag=True, help="Energise the joints without asking.")
+@energise_option
 @overrides
 @speaking
 def acquire_command(
@@ -42,7 +43,7 @@ def acquire_command(
     out: Path | None,
     resume: bool,
     dry_run: bool,
-    yes: bool,
+    may_energise: Question,
     overrides: tuple[str, ...],
 ) -> None:
     """Drive a plan's poses with the bench of CONFIG, and measure each when the arm stands."""
@@ -59,7 +60,7 @@ def acquire_command(
         raise InputError("found no --out.", hint="Say where data and journal are to be kept, or give --dry-run.")
     if not voice.json:
         show_outlook(voice, prepared, outlook)
-    outcome = driven(voice, prepared, plan, out, "resume" if resume else "anew", _question(yes))
+    outcome = driven(voice, prepared, plan, out, "resume" if resume else "anew", may_energise)
     show_outcome(voice, outcome, config, out)
     sys.exit(EXIT_DONE if outcome.ending.how == "done" else EXIT_STOPPED)
 
@@ -70,9 +71,7 @@ def outlook_of(prepared: Prepared) -> Outlook:
     return foretell(scheduler, scheduler.park, scheduler.model.cold, list(range(len(scheduler.ids))))
 
 
-def driven(
-    voice: Voice, prepared: Prepared, plan: Path, out: Path, start: Any, question: Callable[[tuple[str, ...]], bool]
-) -> Outcome:
+def driven(voice: Voice, prepared: Prepared, plan: Path, out: Path, start: Any, question: Question) -> Outcome:
     """The run, with a progress line, and signals that park the arm."""
     with Signals() as signals, voice.progress() as show:
         course = Course(out, start, lambda: signals.finish, question, _teller(prepared, show))
@@ -115,25 +114,6 @@ def show_outcome(voice: Voice, outcome: Outcome, config: Path, out: Path) -> Non
         voice.out.print("Go on with --resume.", markup=False)
     elif summary["measured"]:
         voice.out.print(f"next: armcal run {config} --data {out / DATASET} --out DIR", markup=False, soft_wrap=True)
-
-
-def _question(yes: bool) -> Callable[[tuple[str, ...]], bool]:
-    def ask(joints: tuple[str, ...]) -> bool:
-        if yes:
-            return True
-        if not sys.stdin.isatty():
-            raise InputError(
-                f"{', '.join(joints)} get no pulses yet, and nobody can be asked whether they may; nothing was moved.",
-                hint="Stand clear of the arm and give --yes.",
-            )
-        click.echo(
-            f"{', '.join(joints)} get no pulses yet. A servo tells nobody where it stands, so each may jump when its "
-            "first pulse comes, one after the other.",
-            err=True,
-        )
-        return click.confirm("Is everybody clear of the arm?", err=True)
-
-    return ask
 
 
 def _teller(prepared: Prepared, show: ShowProgress) -> Callable[[Progress], None]:

@@ -13,6 +13,7 @@ from armcal.bench.acquisition.preparation import prepare
 from armcal.bench.acquisition.rehearsal import overrides_for, simulated_bench, truth
 from armcal.cli.acquire import driven, outlook_of, show_outcome, show_outlook
 from armcal.cli.common import Voice, overrides, speaking
+from armcal.cli.energising import always
 from armcal.errors import EXIT_DONE, EXIT_STOPPED
 from armcal.plugins import discover
 from armcal.run.experiment import Experiment
@@ -38,7 +39,7 @@ def rehearse(voice: Voice, config: Path, plan: Path, out: Path, overrides: tuple
     if not voice.json:
         show_outlook(voice, prepared, outlook_of(prepared))
     with simulated_bench(config, overrides, bench):
-        outcome = driven(voice, prepared, plan, out, "anew", lambda joints: True)
+        outcome = driven(voice, prepared, plan, out, "anew", always)
         found = truth(bench)
     outcome.summary["truth"] = found
     show_outcome(voice, outcome, config, out)

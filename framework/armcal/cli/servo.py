@@ -23,6 +23,7 @@ from armcal.bench.servo.session import Conversation, evaluated, measure, park, t
 from armcal.bench.servo.setup import Setup
 from armcal.bench.servo.trial import Verdict, swapped
 from armcal.cli.common import Voice, overrides, speaking
+from armcal.cli.energising import Question, energise_option
 from armcal.errors import EXIT_FAULT, EXIT_STOPPED, InputError
 from armcal.online.running.signals import Signals
 from armcal.plugins import discover
@@ -43,7 +44,7 @@ _FOLDER = click.Path(path_type=Path)
 @click.option("--release", is_flag=True, help="Let go of the servos, from the base pose, at the end.")
 @click.option("--evaluate", is_flag=True, help="Measure nothing: fit what the folder holds, and write the tables.")
 @click.option("--keep", is_flag=True, help="Leave the servo file as it is.")
-@click.option("--yes", is_flag=True, help="Energise the joints without asking.")
+@energise_option
 @overrides
 @speaking
 def servo(
@@ -56,7 +57,7 @@ def servo(
     release: bool,
     evaluate: bool,
     keep: bool,
-    yes: bool,
+    may_energise: Question,
     overrides: tuple[str, ...],
 ) -> None:
     """Find which pulse makes which angle of each servo on the bench of CONFIG, and write the servo file."""
@@ -64,7 +65,7 @@ def servo(
     voice.plugin_faults(registry)
     setup = Setup.of(Experiment.load(config, overrides, registry=registry))
     how = "guided" if guided else "automatic"
-    with _talking(voice, setup, yes) as talk:
+    with _talking(voice, setup, may_energise) as talk:
         if check:
             _checked(voice, setup, talk, "somebody" if guided else "tracker")
         elif not parks and not (release and out is None):
@@ -126,31 +127,12 @@ def _stoppable(voice: Voice, action: Callable[[], None]) -> None:
 
 
 @contextmanager
-def _talking(voice: Voice, setup: Setup, yes: bool) -> Iterator[Conversation]:
+def _talking(voice: Voice, setup: Setup, may_energise: Question) -> Iterator[Conversation]:
     def say(text: str) -> None:
         click.echo(text, err=voice.json)
 
     with Signals() as signals, voice.progress() as show:
-        yield Conversation(lambda: signals.finish, _question(yes), _teller(show), say, lambda: wishes_from(0))
-
-
-def _question(yes: bool) -> Callable[[tuple[str, ...]], bool]:
-    def ask(joints: tuple[str, ...]) -> bool:
-        if yes:
-            return True
-        if not sys.stdin.isatty():
-            raise InputError(
-                f"{', '.join(joints)} get no pulses yet, and nobody can be asked whether they may; nothing was moved.",
-                hint="Stand clear of the arm and give --yes.",
-            )
-        click.echo(
-            f"{', '.join(joints)} get no pulses yet. A servo tells nobody where it stands, so each may jump when its "
-            "first pulse comes, one after the other.",
-            err=True,
-        )
-        return click.confirm("Is everybody clear of the arm?", err=True)
-
-    return ask
+        yield Conversation(lambda: signals.finish, may_energise, _teller(show), say, lambda: wishes_from(0))
 
 
 def _teller(show: Progress) -> Callable[[str, int, int], None]:

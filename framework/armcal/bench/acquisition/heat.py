@@ -7,8 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from armcal.arm.assembly import Arm
+from armcal.arm.holding import holding_function
 from armcal.base.domains import Array
 from armcal.bench.acquisition.settings import ServoHeatSettings
+from armcal.solve.factor import Environment
 
 NEVER = float("inf")
 _TIMES_OVER = 20.0
@@ -94,3 +97,13 @@ class HeatModel:
 
 Torques = Callable[[Array], Array]
 """Holding torques (joints, N m) at joint angles (joints, rad)."""
+
+
+def holding_torques(arm: Arm, environment: Environment) -> Torques:
+    """What the joints of an arm hold against gravity and its configured load."""
+    function = holding_function(arm, environment.gravity, environment.payload_mass, environment.payload_com)
+
+    def torques(pose: Array) -> Array:
+        return np.asarray(function(pose).full()).ravel()
+
+    return torques

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import os
 import select
-import termios
-import tty
 from collections.abc import Callable
-from contextlib import suppress
 from types import TracebackType
 from typing import Protocol, Self
 
+from armcal.bench.terminal import keep_single_keys, single_keys
 from armcal.online.sources.line_cutter import LineCutter
 
 END = "q"
@@ -87,22 +85,20 @@ class TerminalKeys:
 
     def __init__(self, descriptor: int, echo: Callable[[str], None]) -> None:
         self._descriptor, self._echo = descriptor, echo
-        self._before: list[object] = []
         self._typed: str | None = None
         self.ended = False
 
     def __enter__(self) -> Self:
-        self._before = termios.tcgetattr(self._descriptor)
-        tty.setcbreak(self._descriptor)
+        self._mode = single_keys(self._descriptor)
+        self._mode.__enter__()
         return self
 
     def __exit__(self, kind: type[BaseException] | None, fault: BaseException | None, at: TracebackType | None) -> None:
-        with suppress(termios.error):  # the terminal is gone
-            termios.tcsetattr(self._descriptor, termios.TCSADRAIN, self._before)  # type: ignore[arg-type]
+        self._mode.__exit__(kind, fault, at)
 
     def commands(self) -> list[str]:
         """See ``Keys``."""
-        self._set_again()
+        keep_single_keys(self._descriptor)
         found = []
         while not self.ended and select.select([self._descriptor], [], [], 0)[0]:
             try:
@@ -112,12 +108,6 @@ class TerminalKeys:
             self.ended = not data
             found += [command for key in data.decode("utf-8", "replace") if (command := self._key(key)) is not None]
         return found
-
-    def _set_again(self) -> None:
-        """After a stop and a continuation the shell has set the terminal its own way."""
-        with suppress(termios.error):
-            if termios.tcgetattr(self._descriptor)[3] & termios.ICANON:
-                tty.setcbreak(self._descriptor)
 
     def _key(self, key: str) -> str | None:
         """The command that a key completes."""

@@ -14,9 +14,11 @@ from armcal.bench.servo.mover import Mover, StoppedError
 from armcal.bench.servo.record import LEFT_OUT, POSE, Record
 from armcal.bench.servo.setup import Setup
 from armcal.bench.servo.sweep import Point, angles_told, come_to, left, sweep, to_base
+from armcal.bench.servo.warmth import Warmth
 from armcal.bench.settling import Settled
 
 _MOST_FAULTS = 10
+_LOOKED_AT_EVERY_S = 1.0
 
 Told = Callable[[str, int, int], None]
 """Told the joint, and how many of its points are done and planned."""
@@ -31,6 +33,7 @@ class Automatic:
     eyes: TrackerEyes
     record: Record
     told: Told
+    warmth: Warmth
     faults: int = 0
 
     def run(self) -> None:
@@ -73,7 +76,20 @@ class Automatic:
                 until = self.mover.clock.now() + settings.settle.longest
         return self.eyes.why or "the arm did not come to stand"
 
+    def look(self) -> None:
+        """What is done after every pause: the tracker's frames, and the servos' warmth."""
+        self.eyes.look()
+        self.warmth.pass_to_now(angles_told(self.mover))
+
+    def _rest(self) -> None:
+        """In the base pose, once a servo is near its budget."""
+        if self.warmth.must_rest:
+            to_base(self.setup, self.mover)
+            while (left_s := self.warmth.rest_s) > 0:
+                self.mover.stand(min(left_s, _LOOKED_AT_EVERY_S))
+
     def _measure(self, point: Point) -> None:
+        self._rest()
         come_to(self.setup, self.mover, point)
         found = self.capture()
         here: dict[str, Any] = {"joint": point.joint, "counts": point.counts, "came": point.came}

@@ -16,7 +16,8 @@ from scipy.optimize import least_squares
 from armcal.arm.servo import PulseClock
 from armcal.base.domains import Array
 from armcal.bench.servo.known import KnownServo, Observation
-from armcal.bench.servo.unknowns import WEAK_PULSE_SD, FitTask, Residuals, Unknowns
+from armcal.bench.servo.residuals import Residuals
+from armcal.bench.servo.unknowns import WEAK_PULSE_SD, FitTask, Unknowns
 
 _FAR_OFF = 5.0
 _ROUNDS = 3
@@ -99,7 +100,9 @@ def fit_servos(task: FitTask) -> ServoFit:
         kept = _kept(unknowns, x)
         scales = _scales(unknowns, kept, x)
     residuals = Residuals(unknowns, kept, {joint: max(1.0, scale) for joint, scale in scales.items()}, x)
-    found = least_squares(residuals, x, jac="3-point", x_scale="jac", method="trf", xtol=1e-13, ftol=1e-13, gtol=1e-13)
+    found = least_squares(
+        residuals, x, jac=residuals.jacobian, x_scale="jac", method="trf", xtol=1e-13, ftol=1e-13, gtol=1e-13
+    )
     slopes = np.asarray(found.jac)
     covariance = np.linalg.pinv(slopes.T @ slopes, hermitian=True)
     return _fit(unknowns, found.x, covariance, kept, scales)
@@ -111,7 +114,9 @@ def _in_order(observations: Sequence[Observation]) -> tuple[Observation, ...]:
 
 
 def _solved(residuals: Residuals, x: Array, loss: Literal["linear", "soft_l1"]) -> Array:
-    done = least_squares(residuals, x, jac="2-point", x_scale="jac", loss=loss, xtol=1e-9, ftol=1e-9, gtol=1e-9)
+    done = least_squares(
+        residuals, x, jac=residuals.jacobian, x_scale="jac", loss=loss, xtol=1e-9, ftol=1e-9, gtol=1e-9
+    )
     return np.asarray(done.x)
 
 
@@ -141,7 +146,8 @@ def _fit(
     task = unknowns.task
     sds = np.sqrt(np.diag(covariance))
     at = unknowns.place
-    servos = {s.joint: _servo(unknowns, s, x, sds, kept, scales) for s in task.servos if task.of(s.joint)}
+    off = Residuals(unknowns, kept, {}, x).observed(x)
+    servos = {s.joint: _servo(unknowns, s, x, sds, kept, scales, off) for s in task.servos if task.of(s.joint)}
     clocks = {name: unknowns.clock(x, name) for name in task.boards}
     stated = {name: board.clock.oscillator_hz for name, board in task.boards.items()}
     oscillators = {name: float(sds[at[name, "clock"]]) * hz for name, hz in stated.items() if (name, "clock") in at}
@@ -162,6 +168,7 @@ def _servo(
     sds: Array,
     kept: Sequence[bool],
     scales: Mapping[str, float],
+    observed: Mapping[str, Array],
 ) -> FittedServo:
     task, at, joint = unknowns.task, unknowns.place, servo.joint
     knots = task.knots_of(servo)
@@ -171,7 +178,7 @@ def _servo(
     pulses = np.where(told, unknowns.pulses(x, servo), servo.pulses_at(knots))
     mine = [o for o, keep in zip(task.observations, kept, strict=True) if keep and o.joint == joint]
     outliers = [o for o, keep in zip(task.observations, kept, strict=True) if not keep and o.joint == joint]
-    off = Residuals(unknowns, kept, {}, x).observed(x)[joint] * np.array([o.sd for o in mine])
+    off = observed[joint] * np.array([o.sd for o in mine])
     zero = unknowns.one(x, joint, "zero")
     angles = [o.angle - o.sag - zero for o in mine] or [0.0]
     has_lag = (joint, "lag") in at

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import os
 import select
-import termios
-import tty
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from typing import Protocol
+
+from armcal.bench.terminal import keep_single_keys, single_keys
 
 QUIT = "quit"
 _KEYS = {
@@ -46,13 +46,14 @@ class Wishes(Protocol):
 
 
 class Keys:
-    """Single keys of a terminal; see ``raw`` for the mode that it must be in."""
+    """Single keys of a terminal; see ``terminal.single_keys`` for the mode that it must be in."""
 
     def __init__(self, descriptor: int) -> None:
         self._descriptor, self._read = descriptor, b""
 
     def next(self, seconds: float) -> str | None:
         """See ``Wishes``."""
+        keep_single_keys(self._descriptor)
         while (wish := self._taken()) is None:
             if not select.select([self._descriptor], [], [], seconds)[0]:
                 # An escape with nothing after it is no key.
@@ -107,13 +108,8 @@ def wishes_from(descriptor: int) -> Iterator[Wishes]:
     if not os.isatty(descriptor):
         yield Lines(descriptor)
         return
-    before = termios.tcgetattr(descriptor)
-    try:
-        tty.setcbreak(descriptor, termios.TCSANOW)
+    with single_keys(descriptor):
         yield Keys(descriptor)
-    finally:
-        with suppress(termios.error):  # the terminal may be gone
-            termios.tcsetattr(descriptor, termios.TCSANOW, before)
 
 
 def _said(line: bytes) -> str:

@@ -23,6 +23,7 @@ from armcal.bench.servo.record import BEGUN, Record
 from armcal.bench.servo.setup import Setup
 from armcal.bench.servo.sweep import angles_told, to_base
 from armcal.bench.servo.trial import Move, Verdict, answered, judged, wrapped
+from armcal.bench.servo.warmth import Warmth
 from armcal.errors import InputError, Location
 
 _FIRST_FRAME_S = 3.0
@@ -63,7 +64,9 @@ def measure(setup: Setup, folder: Path, talk: Conversation, how: str) -> None:
                 Guided(setup, mover, wishes, record, talk.say).run()
             return
         with _eyes(setup, mover) as eyes:
-            Automatic(setup, mover, eyes, record, talk.told).run()
+            look = Automatic(setup, mover, eyes, record, talk.told, _cooling(setup, mover))
+            mover.look = look.look
+            look.run()
 
 
 def evaluated(setup: Setup, folder: Path) -> Outcome:
@@ -162,6 +165,26 @@ def _eyes(setup: Setup, mover: Mover) -> Iterator[TrackerEyes]:
         eyes.close()
 
 
+def _warmth(setup: Setup, mover: Mover) -> Warmth:
+    """From cold servos on."""
+    return Warmth(setup.heat, tuple(setup.bench.arm.commanded), setup.base, mover.clock)
+
+
+def _cooling(setup: Setup, mover: Mover) -> Warmth:
+    """The same, where the servos may have to rest.
+
+    Raises:
+        InputError: one would not cool where it is to rest.
+    """
+    warmth = _warmth(setup, mover)
+    if joint := warmth.base_is_too_heavy:
+        raise InputError(
+            f"the servo of {joint} would not cool in the base pose, by bench.acquisition.heat; nothing was moved.",
+            hint="Give bench.servo.base a pose in which it carries less.",
+        )
+    return warmth
+
+
 def _begin(setup: Setup, record: Record, device: str) -> None:
     """The first line of a record: by which tables it is measured. A record of other ones is refused."""
     servos = {joint: _as_stated(setup, joint) for joint in setup.base}
@@ -212,7 +235,7 @@ def _wrapped(setup: Setup, joint: str) -> Verdict | None:
 
 
 def _tracked(setup: Setup, mover: Mover, eyes: TrackerEyes) -> list[Verdict]:
-    look = Automatic(setup, mover, eyes, cast(Record, None), _silent)
+    look = Automatic(setup, mover, eyes, cast(Record, None), _silent, _warmth(setup, mover))
     base, moves, unseen = angles_told(mover), [], []
     for joint in setup.joints:
         told, at = _small(setup, joint), mover.told[joint]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,8 @@ import numpy as np
 
 from armcal.arm.clearance import ClearanceCheck
 from armcal.base.config_text import resolve_path
-from armcal.bench.acquisition.preparation import joint_limits
+from armcal.bench.acquisition.heat import HeatModel, Torques
+from armcal.bench.acquisition.preparation import clearance_of, heat_of, joint_limits
 from armcal.bench.bench import SECTION, Bench
 from armcal.bench.servo.known import KnownBoard, KnownServo, MeasuredPulse
 from armcal.bench.servo.nominal import NominalArm
@@ -21,7 +22,6 @@ from armcal.config.servo_file import ServoFile, load_servo_file
 from armcal.config.validate import validate
 from armcal.errors import ConfigError
 from armcal.run.experiment import Experiment
-from armcal.run.plan_clearance import clearance_check
 
 AT = (SECTION, "servo")
 _LOOK_STEP = math.radians(2.0)
@@ -40,6 +40,8 @@ class Setup:
         base: where every servo's joint stands while others are measured (rad).
         ranges: over which each joint may be moved from there (rad).
         nominal: what the model says.
+        heat: of the servos, and the torques that heat them.
+        check: what is too near, if that is stated.
     """
 
     bench: Bench
@@ -50,6 +52,8 @@ class Setup:
     base: Mapping[str, float]
     ranges: Mapping[str, tuple[float, float]]
     nominal: NominalArm
+    heat: tuple[HeatModel, Torques]
+    check: ClearanceCheck | None
 
     @classmethod
     def of(cls, experiment: Experiment) -> Setup:
@@ -67,14 +71,17 @@ class Setup:
         arm = bench.arm
         moved = tuple(joint for joint in arm.commanded if joint in file.servos)
         _check_names(experiment, settings, file, moved)
-        base = {joint: settings.base.get(joint, 0.0) for joint in moved}
+        stated = settings.base or bench.settings.acquisition.park
+        base = {joint: stated.get(joint, 0.0) for joint in moved}
         limited = {**bench.settings.acquisition.limits, **settings.ranges}
         acquisition = bench.settings.acquisition.model_copy(update={"limits": limited})
         limits = dict(zip(arm.commanded, joint_limits(experiment, acquisition, arm).tolist(), strict=True))
         nominal = NominalArm.of(arm, experiment.parameters, experiment.system.environment)
         joints = settings.joints or moved
-        found = cls(bench, settings, path, file, joints, base, {}, nominal)
-        return cls(bench, settings, path, file, joints, base, found.clear_ranges(experiment, limits), nominal)
+        heat = heat_of(experiment, bench.settings.acquisition, arm)
+        check = clearance_of(experiment, arm)
+        found = cls(bench, settings, path, file, joints, base, {}, nominal, heat, check)
+        return replace(found, ranges=found.clear_ranges(experiment, limits))
 
     def known(self, joint: str) -> KnownServo:
         """A servo as the file states it."""
@@ -91,10 +98,7 @@ class Setup:
 
     def clear_ranges(self, experiment: Experiment, limits: Mapping[str, Any]) -> dict[str, tuple[float, float]]:
         """How far each joint may go from the base pose, within its limits and table and without coming too near."""
-        plan = experiment.settings.plan
-        check = None
-        if plan is not None and plan.clearance is not None:
-            check = clearance_check(plan.clearance, {self.bench.arm.name: self.bench.arm}, experiment.source)
+        check = self.check
         where = experiment.source.where((*AT, "base"))
         found = {}
         for joint in self.base:
@@ -123,6 +127,15 @@ class Setup:
         allowed = check(np.array([self._pose({joint: angle}) for angle in way]).T).allowed
         blocked = np.flatnonzero(~allowed)
         return limit if not len(blocked) else float(way[max(blocked[0] - 1, 0)])
+
+    def clear_between(self, start: Mapping[str, float], goal: Mapping[str, float]) -> bool:
+        """Whether nothing comes too near on the straight way between two poses (rad by joint)."""
+        if self.check is None:
+            return True
+        ends = np.array([self._pose(start), self._pose(goal)])
+        count = math.ceil(float(np.abs(ends[1] - ends[0]).max()) / _LOOK_STEP) + 2
+        way = ends[0][:, None] + np.linspace(0.0, 1.0, count) * (ends[1] - ends[0])[:, None]
+        return bool(self.check(way).allowed.all())
 
     def _pose(self, other: Mapping[str, float]) -> Any:
         return np.array([{**self.base, **other}.get(joint, 0.0) for joint in self.bench.arm.commanded])

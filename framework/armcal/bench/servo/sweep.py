@@ -5,10 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from itertools import permutations
 from typing import Any
 
 import numpy as np
 
+from armcal.bench.faults import DeviceRefusedError
 from armcal.bench.servo.mover import Mover
 from armcal.bench.servo.setup import Setup
 
@@ -64,11 +66,34 @@ def come_to(setup: Setup, mover: Mover, point: Point) -> None:
 
 
 def to_base(setup: Setup, mover: Mover) -> None:
-    """Every servo to the base pose, one by one; those without pulses get their first."""
+    """Every servo to the base pose, one by one; those without pulses get their first.
+
+    Raises:
+        DeviceRefusedError: no order of the joints keeps clear on the way from where the arm stands.
+    """
     for joint, angle in setup.base.items():
-        counts = mover.counts_at(joint, angle)
-        mover.energise(joint, counts)
-        mover.go(joint, counts)
+        if joint not in mover.told:
+            mover.energise(joint, mover.counts_at(joint, angle))
+    for joint in _clear_order(setup, mover):
+        mover.go(joint, mover.counts_at(joint, setup.base[joint]))
+
+
+def _clear_order(setup: Setup, mover: Mover) -> tuple[str, ...]:
+    """Joints that are not at the base pose, in an order in which they may go there."""
+    start = angles_told(mover)
+    away = [j for j, angle in setup.base.items() if mover.told[j] != mover.counts_at(j, angle)]
+    for order in permutations(away):
+        here, clear = dict(start), True
+        for joint in order:
+            there = {**here, joint: setup.base[joint]}
+            clear = clear and setup.clear_between(here, there)
+            here = there
+        if clear:
+            return order
+    raise DeviceRefusedError(
+        "no way to the base pose is clear from where the arm stands.",
+        hint="Bring it nearer by armcal servo --guided, or release it and put it there by hand.",
+    )
 
 
 def angles_told(mover: Mover) -> dict[str, float]:

@@ -1,8 +1,7 @@
-"""The numbers that a servo fit looks for, and how far observations are from them."""
+"""The numbers that a servo fit looks for."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -10,13 +9,11 @@ import numpy as np
 
 from armcal.arm.servo import PulseClock
 from armcal.base.domains import Array
-from armcal.bench.servo.known import KnownBoard, KnownServo, Observation, Zero, interpolated, slopes_at
+from armcal.bench.servo.known import KnownBoard, KnownServo, Observation, Zero, interpolated
 
 US = 1e-6
 WEAK_PULSE_SD = 300.0 * US
 """How far a table's pulse may well be from the stated one: what no observation tells stays there."""
-WEAK_ZERO_SD = 1.0
-_KEPT_SD = 1e-3 * US
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,86 +109,3 @@ class Unknowns:
             first = self.place[servo.joint, "pulse0"]
             x[first : first + len(knots)] = np.linalg.lstsq(rows, right, rcond=None)[0] / US
         return x
-
-
-@dataclass(frozen=True)
-class _Seen:
-    """A servo's observations as arrays."""
-
-    servo: KnownServo
-    counts: Array
-    approach: Array
-    angle: Array
-    sd: Array
-    slopes: Array
-
-
-class Residuals:
-    """Weighted residuals of a vector of unknowns: the observations', in their order by servo, then the priors'."""
-
-    def __init__(self, unknowns: Unknowns, kept: Sequence[bool], scales: dict[str, float], about: Array) -> None:
-        self._u = unknowns
-        task = unknowns.task
-        chosen = [o for o, keep in zip(task.observations, kept, strict=True) if keep]
-        self._seen = [_seen(s, [o for o in chosen if o.joint == s.joint], unknowns.compliances) for s in task.servos]
-        self._sds = [self._pulse_sds(seen, about) * scales.get(seen.servo.joint, 1.0) for seen in self._seen]
-
-    def _pulse_sds(self, seen: _Seen, x: Array) -> Array:
-        """Deviations of angles as deviations of pulses, by the slopes of the tables at x."""
-        steep = slopes_at(self._angles(seen, x), self._u.task.knots_of(seen.servo), self._u.pulses(x, seen.servo))
-        return np.asarray(seen.sd * np.maximum(np.abs(steep), 50 * US))
-
-    def _angles(self, seen: _Seen, x: Array) -> Array:
-        """Where the servos stood, by what was measured."""
-        joint = seen.servo.joint
-        given = seen.slopes @ np.array([self._u.one(x, name, "compliance") for name in self._u.compliances])
-        lag = self._u.one(x, joint, "lag") * seen.approach
-        return np.asarray(seen.angle - given - self._u.one(x, joint, "zero") + lag)
-
-    def observed(self, x: Array) -> dict[str, Array]:
-        """By joint."""
-        found = {}
-        for seen, sd in zip(self._seen, self._sds, strict=True):
-            servo = seen.servo
-            pulses = seen.counts * self._u.clock(x, servo.board).tick
-            by_table = interpolated(self._angles(seen, x), self._u.task.knots_of(servo), self._u.pulses(x, servo))
-            found[servo.joint] = (pulses - by_table) / sd
-        return found
-
-    def __call__(self, x: Array) -> Array:
-        """All."""
-        return np.concatenate([*self.observed(x).values(), np.array(list(self._priors(x)))])
-
-    def _priors(self, x: Array) -> list[float]:
-        task = self._u.task
-        rows: list[float] = []
-        for servo in task.servos:
-            knots, pulses = task.knots_of(servo), self._u.pulses(x, servo)
-            rows += list((pulses - servo.pulses_at(knots)) / (servo.trusted_sd or WEAK_PULSE_SD))
-            if task.zero == "kept":
-                rows.append(self._u.one(x, servo.joint, "zero") / WEAK_ZERO_SD)
-                if servo.trusted_sd is None:
-                    # In counts: by another oscillator the same pulse is stated longer or shorter.
-                    longer = self._u.clock(x, servo.board).tick / task.boards[servo.board].clock.tick
-                    stated = servo.pulses_at(np.zeros(1))[0] * longer
-                    rows.append((interpolated(np.zeros(1), knots, pulses)[0] - stated) / _KEPT_SD)
-        for name, board in task.boards.items():
-            tick = self._u.clock(x, name).tick
-            rows += [(each.counts * tick - each.length) / each.sd for each in board.measured]
-        changes = np.array([self._u.one(x, name, "compliance") for name in self._u.compliances])
-        rows += (changes / task.compliance_sd).tolist()
-        if task.springs is not None:
-            rows += (task.springs.slopes @ changes - task.springs.sizes).tolist()
-        return rows
-
-
-def _seen(servo: KnownServo, seen: Sequence[Observation], compliances: Sequence[str]) -> _Seen:
-    slopes = np.array([[o.sag_slopes.get(name, 0.0) for name in compliances] for o in seen])
-    return _Seen(
-        servo,
-        np.array([float(o.counts) for o in seen]),
-        np.array([float(o.approach) for o in seen]),
-        np.array([o.angle - o.sag for o in seen]),
-        np.array([o.sd for o in seen]),
-        slopes.reshape(len(seen), len(compliances)),
-    )

@@ -1,0 +1,58 @@
+"""How warm the servos get while they are calibrated, and when they have to rest."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from armcal.base.domains import Array
+from armcal.bench.acquisition.heat import HeatModel, Torques
+from armcal.bench.clock import Clock
+
+_ENOUGH = 0.8
+"""Of the budget: one more point warms a servo by less than the rest of it."""
+_COOLED_TO = 0.5
+
+
+class Warmth:
+    """Followed from cold on.
+
+    Args:
+        heat: the servos' model, and the torques that heat them.
+        joints: in the arm's order.
+        base: where the servos rest (rad by joint; others at zero).
+        clock: the bench's.
+    """
+
+    def __init__(
+        self, heat: tuple[HeatModel, Torques], joints: tuple[str, ...], base: Mapping[str, float], clock: Clock
+    ) -> None:
+        (self._model, self._torques), self._joints, self._clock = heat, joints, clock
+        self._warmth, self._since = self._model.cold, clock.now()
+        self._base = self._pose(base)
+
+    def pass_to_now(self, angles: Mapping[str, float]) -> None:
+        """The servos have stood at these angles (rad) since the last call."""
+        now = self._clock.now()
+        self._warmth = self._model.after(self._warmth, self._torques(self._pose(angles)), now - self._since)
+        self._since = now
+
+    @property
+    def must_rest(self) -> bool:
+        """Whether a servo is near its budget."""
+        return bool(np.any(self._model.heat(self._warmth) > _ENOUGH * self._model.budget))
+
+    @property
+    def rest_s(self) -> float:
+        """How long to rest in the base pose; infinite where that pose is itself too heavy."""
+        return self._model.cooled_in(self._warmth, self._torques(self._base), _COOLED_TO * self._model.budget)
+
+    @property
+    def base_is_too_heavy(self) -> str:
+        """The joint that would not cool in the base pose; empty if all do."""
+        over = self._model.steady(self._torques(self._base))[:, 0] > _COOLED_TO * self._model.budget
+        return self._joints[int(np.argmax(over))] if over.any() else ""
+
+    def _pose(self, angles: Mapping[str, float]) -> Array:
+        return np.array([angles.get(joint, 0.0) for joint in self._joints])
