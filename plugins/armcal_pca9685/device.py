@@ -103,8 +103,10 @@ class Pca9685Device:
                 self._set_counts(joint, counts)
 
     def keep_alive(self) -> None:
-        """See ``JointDevice``. Asking a guarded link anything tells it that the host lives."""
+        """See ``JointDevice``. A guarded link says, too, whether its other end drives by itself meanwhile."""
         self._check_open()
+        if isinstance(self._link, GuardedLink):
+            self._link.beat()
         for chip in self._chips.values():
             chip.check()
 

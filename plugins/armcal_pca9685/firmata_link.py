@@ -105,12 +105,17 @@ class FirmataLink:
 
     def _greet(self, clock: Clock) -> str:
         """Who it is; afterwards the line is quiet, so that versions told again mean a reset."""
-        version, firmware = b"", ""
+        version, firmware, asked = b"", "", 0
         until = clock.now() + self._settings.start
         while not (version and firmware):
             self._port.write(firmata.QUERY_VERSIONS)
-            while data := self._port.read(_REPLY_S):
+            asked += 1
+            quiet = time.monotonic() + _REPLY_S
+            while (left := quiet - time.monotonic()) > 0:
+                data = self._port.read(left)  # readings of pins may come all the time: they make no line unquiet
                 for message in self._decoder.feed(data):
+                    if message.kind in (firmata.VERSION, firmata.FIRMWARE):
+                        quiet = time.monotonic() + _REPLY_S * asked  # a slow line brings an answer for each
                     if message.kind == firmata.VERSION:
                         version = message.data
                     elif message.kind == firmata.FIRMWARE:

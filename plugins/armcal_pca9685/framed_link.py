@@ -44,6 +44,7 @@ class FramedLink:
         self._boots: int | None = None
         self._sequence = os.urandom(1)[0]  # so that answers to another program's questions are not taken for ours
         self._took_over = False
+        self._flags = Flag(0)
 
     @property
     def took_over(self) -> bool:
@@ -80,8 +81,14 @@ class FramedLink:
         return data
 
     def beat(self) -> None:
-        """See ``GuardedLink``."""
+        """See ``GuardedLink``.
+
+        Raises:
+            DeviceLostError: the board drives by itself.
+        """
         self._ask(Kind.BEAT, b"")
+        if Flag.TOOK_OVER in self._flags:
+            self._lose_to_board()
 
     def guard(self, waypoints: Sequence[Counts], counts_per_s: Mapping[tuple[int, int], float], after_s: float) -> None:
         """See ``GuardedLink``.
@@ -177,6 +184,7 @@ class FramedLink:
             self._port.close()
             raise DeviceResetError("the board has started anew.", where=self._where, hint="Look at its power.")
         self._boots = head.boots
+        self._flags = head.flags
         self._took_over |= Flag.TOOK_OVER in head.flags
         if refusal is not None:
             self._refuse(refusal, kind)
@@ -184,9 +192,7 @@ class FramedLink:
 
     def _refuse(self, refusal: messages.Refusal, kind: Kind) -> NoReturn:
         if refusal.code == Code.TOOK_OVER:
-            self._port.close()
-            found = "the board has heard nothing for too long and drives the arm by itself."
-            raise DeviceLostError(found, where=self._where, hint="Open it again, and read where the arm is.")
+            self._lose_to_board()
         if refusal.code == Code.WRONG_BOOTS:
             self._port.close()
             raise DeviceResetError("the board has started anew.", where=self._where, hint="Look at its power.")
@@ -200,3 +206,8 @@ class FramedLink:
         unknown = f"it gives code {refusal.code}", "Load newer firmware."
         meaning, hint = meanings.get(refusal.code, unknown) if refusal.code in list(Code) else unknown
         raise DeviceError(f"the board refuses {kind.name}: {meaning}.", where=self._where, hint=hint)
+
+    def _lose_to_board(self) -> NoReturn:
+        self._port.close()
+        found = "the board has heard nothing for too long and drives the arm by itself."
+        raise DeviceLostError(found, where=self._where, hint="Open it again, and read where the arm is.")

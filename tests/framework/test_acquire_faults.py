@@ -13,7 +13,7 @@ from armcal.bench.serial_port import SerialPort, SerialPortSettings
 
 from tests.bench_runs import BenchRun, positions
 
-QUICK, MANY = 8, 200
+QUICK, MANY = 5, 200
 SECONDS = 28.0
 """What the run takes when nothing goes wrong."""
 SERIAL = ("drop", "duplicate", "reorder", "flip", "split")
@@ -158,7 +158,7 @@ def test_many_random_troubles_never_make_the_arm_unsafe(
     judge(run, seed, undisturbed)
 
 
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("seed", range(1))
 def test_a_link_without_checksums_survives_all_but_damage(
     firmata: BenchRun, undisturbed: dict[str, np.ndarray], seed: int
 ) -> None:
@@ -166,7 +166,7 @@ def test_a_link_without_checksums_survives_all_but_damage(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(2, 50))
+@pytest.mark.parametrize("seed", range(1, 50))
 def test_a_link_without_checksums_survives_all_but_damage_often(
     firmata: BenchRun, undisturbed: dict[str, np.ndarray], seed: int
 ) -> None:

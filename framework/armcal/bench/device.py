@@ -76,7 +76,11 @@ class JointDevice(Protocol):
         """
 
     def keep_alive(self) -> None:
-        """Say that the host lives; to be called at least every 0.2 s."""
+        """Say that the host lives; to be called at least every 0.2 s.
+
+        Raises:
+            DeviceLostError: it has begun to drive by itself; ``open`` takes over again.
+        """
 
     def guard(self, waypoints: Sequence[Mapping[str, float]], rate: float, after_s: float) -> bool:
         """Where to go after a silence of the host: through waypoints, no joint faster than ``rate`` (rad/s).

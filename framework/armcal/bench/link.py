@@ -57,7 +57,7 @@ class GuardedLink(Protocol):
     """A link whose other end looks after the arm by itself when the host falls silent."""
 
     def beat(self) -> None:
-        """Say that the host lives."""
+        """Say that the host lives; ``DeviceLostError`` where the other end drives by itself."""
 
     def guard(self, waypoints: Sequence[Counts], counts_per_s: Mapping[tuple[int, int], float], after_s: float) -> None:
         """What to do after so many seconds without a beat: drive through waypoints, no channel faster than told.

@@ -21,9 +21,14 @@ def check_folder(folder: Path, ours: Collection[str]) -> None:
         InputError: a file, or a directory with anything that is not called as ours are.
     """
     where = Location(str(folder))
-    if folder.exists() and not folder.is_dir():
+    try:
+        is_folder = folder.is_dir()
+        is_other = folder.exists() and not is_folder
+        names = {path.name for path in folder.iterdir()} if is_folder else set()
+    except OSError as fault:
+        raise InputError(f"it cannot be used ({fault.strerror}).", where=where, hint="Give another --out.") from fault
+    if is_other:
         raise InputError("it is a file, expected a directory.", where=where, hint="Give another --out.")
-    names = {path.name for path in folder.iterdir()} if folder.is_dir() else set()
     foreign = sorted(name for name in names - {*ours, EARLIER} if not name.startswith(_STAGING))
     if foreign:
         raise InputError(

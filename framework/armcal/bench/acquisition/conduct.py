@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
+from armcal.base.domains import Array
 from armcal.bench.acquisition import progress as entry
+from armcal.bench.acquisition.arrival import Arrival
 from armcal.bench.acquisition.drive import Drive
-from armcal.bench.acquisition.endings import Ending, ParkWish, TooHot
+from armcal.bench.acquisition.endings import Ending, OutOfSight, ParkWish, TooHot
 from armcal.bench.acquisition.progress import Progress
 from armcal.bench.acquisition.recovery import Recovery, StaysLost
 from armcal.bench.acquisition.schedule import LeaveOut, Measure, Rest, Scheduler
@@ -65,6 +68,7 @@ class Parts:
     watch: Watch
     patient: Patient
     told: Callable[[Progress], None]
+    arrival: Arrival | None = None
 
 
 class Conduct:
@@ -73,6 +77,7 @@ class Conduct:
     def __init__(self, parts: Parts, progress: Progress) -> None:
         self._parts, self.progress = parts, progress
         self._tries: dict[int, int] = {}
+        self._astray = 0
         ids = parts.scheduler.ids
         self._left = [
             i for i, name in enumerate(ids) if name not in progress.measured and name not in progress.left_out
@@ -82,8 +87,17 @@ class Conduct:
         """To its end; whatever happens on the way, the arm is held or parked.
 
         Raises:
-            ArmcalError: the journal cannot be written; the arm is parked by then.
+            ArmcalError: the journal cannot be written, for one; the arm is parked by then, where it can be.
         """
+        try:
+            return self._to_its_end()
+        except Exception as fault:
+            # Nothing is known of what went wrong here, but an arm that is left standing heats up.
+            with suppress(Exception):
+                self._home("parked", str(fault))
+            raise
+
+    def _to_its_end(self) -> Ending:
         try:
             self._persist(self._energised)
             while self._left:
@@ -97,15 +111,18 @@ class Conduct:
     def _energised(self) -> None:
         self._parts.recovery.energise(self.progress.angles)
 
-    def _persist(self, action: Callable[[], T]) -> T:
+    def _persist(self, action: Callable[[], T], again: Callable[[DeviceError], None] | None = None) -> T:
         """Do it; when the device fails, hold until it is back, and do it again from where the arm is then."""
         while True:
             try:
                 return action()
             except DeviceError as fault:
                 self._told("trouble", str(fault))
-                self._parts.recovery.back(fault, self.progress.angles)
+                (again or self._energised_again)(fault)
                 self._told("back", "the device is back")
+
+    def _energised_again(self, fault: DeviceError) -> None:
+        self._parts.recovery.back(fault, self.progress.angles)
 
     def _step(self) -> None:
         drive = self._parts.drive
@@ -122,8 +139,10 @@ class Conduct:
         self._told("rest", f"the servos rest for {step.seconds / 60:.1f} min")
         drive.go(step.way, self._parts.patient)
         drive.note()
-        while drive.hotter_than(step.warmth):
+        while True:  # a second at least: whoever comes to rest here again and again must let time pass
             drive.stand(1.0, self._parts.patient)
+            if not drive.hotter_than(step.warmth):
+                return
 
     def _measure(self, step: Measure) -> None:
         drive, name = self._parts.drive, self._parts.scheduler.ids[step.pose]
@@ -136,27 +155,65 @@ class Conduct:
         except TooHot as heat:
             self._try_later(step.pose, str(heat))
             return
+        except OutOfSight as wish:
+            self._seen_again(wish)
+            self._try_later(step.pose, str(wish))
+            return
         if capture is None:
             self._try_later(step.pose, self._parts.eyes.why or "the arm did not come to stand")
             return
-        self._record(entry.MEASURED, {"pose": name, **self._here(), **self._written(capture)})
+        content = self._written(capture)
+        doubt = self._doubt(step.pose, capture)
+        if doubt:
+            self._astray += 1
+            self._try_later(step.pose, doubt)
+            if self._astray >= self._parts.settings.arrival.in_a_row:
+                raise ParkWish(f"{doubt}, {self._astray} times in a row; look at servos, gears and bodies")
+            return
+        self._astray = 0
+        self._record(entry.MEASURED, {"pose": name, **self._here(), **content})
         self._left.remove(step.pose)
         self._parts.told(self.progress)
+
+    def _seen_again(self, wish: OutOfSight) -> None:
+        """Park, and look whether the tracker is well there: then it was the pose, or the way to it, that hid the body.
+
+        Raises:
+            ParkWish: it is not.
+        """
+        if not self._persist(self._parked):
+            raise wish
+        until = self._parts.clock.now() + self._parts.settings.settle.longest
+        while self._parts.clock.now() < until:
+            self._parts.drive.tick(self._parts.patient)
+            if not self._parts.eyes.trouble()[0]:
+                return
+        raise wish
 
     def _capture(self) -> Settled | None:
         drive, eyes, settle = self._parts.drive, self._parts.eyes, self._parts.settings.settle
         eyes.begin()
-        until = self._parts.clock.now() + settle.longest
-        while self._parts.clock.now() < until:
-            if not drive.tick(self._parts.watch):
-                until = self._parts.clock.now() + settle.longest
+        now = self._parts.clock.now
+        until, last = now() + settle.longest, now() + settle.longest + self._parts.settings.lost.park
+        while now() < min(until, last):
+            goes_on = drive.tick(self._parts.watch)
+            drive.check_heat()
+            if not goes_on:  # a tracker that comes and goes must not keep the arm here for ever: hence the last
+                until = now() + settle.longest
                 eyes.begin()
                 continue
-            drive.check_heat()
             capture = eyes.settled()
             if capture is not None:
                 return capture
         return None
+
+    def _doubt(self, pose: int, settled: Settled) -> str:
+        """Why the arm is not where it was told to be; empty if nothing speaks against it."""
+        if self._parts.arrival is None:
+            return ""
+        ids, measured = self._parts.scheduler.ids, self.progress.measured
+        known = {i: _pose_of(measured[name]) for i, name in enumerate(ids) if name in measured}
+        return self._parts.arrival.doubt(pose, settled.base_T_target, known)
 
     def _written(self, settled: Settled) -> dict[str, Any]:
         joints = list(self._parts.drive.angles)
@@ -202,7 +259,7 @@ class Conduct:
             if not parked:
                 return self._end(Ending("held", f"{why}; no clear way to where it parks was found"))
             if self._parts.settings.at_end == "release":
-                self._persist(self._parts.recovery.release)
+                self._persist(self._parts.recovery.release, self._parts.recovery.reopened)
         except StaysLost as loss:
             return self._end(Ending("held", f"{why}; then {loss}"))
         return self._end(Ending("done" if how == "done" else "parked", why))
@@ -226,3 +283,11 @@ class Conduct:
     def _record(self, kind: str, content: Mapping[str, Any]) -> None:
         self._parts.log.record(kind, content)
         self.progress = self.progress.after(kind, content)
+
+
+def _pose_of(record: Mapping[str, Any]) -> Array:
+    """What was written of a pose (4 x 4, m); NaN for a rotation that is not known."""
+    pose = np.eye(4)
+    pose[:3, 3] = record["position"]
+    pose[:3, :3] = np.nan if record["rotation"] is None else record["rotation"]
+    return pose

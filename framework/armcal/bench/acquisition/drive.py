@@ -94,6 +94,14 @@ class Drive:
             self._leg(start, goal, looker)
         self._guard(way[-1])
 
+    def guard_here(self) -> None:
+        """Should the host fall silent from now on: home from where the arm stands; see ``go``."""
+        self._guard(self.at)
+
+    def guard_still(self) -> None:
+        """Should the host fall silent from now on: stay, for joints that hang free make every way unknown."""
+        self._device.guard([self.angles], self._rate, self._settings.silence)
+
     def take_up_play(self, looker: Looker) -> None:
         """Give joints a direction of approach that have none since they were energised: a little away, and back.
 
@@ -123,7 +131,7 @@ class Drive:
         return looker.may_go_on()
 
     def keep_alive(self) -> None:
-        """Often enough for the device, not more often."""
+        """Often enough for the device, not more often; while the arm moves too, for it also tells how the device is."""
         now = self._clock.now()
         if now - self._alive >= _ALIVE_EVERY_S:
             self._alive = now
@@ -158,20 +166,21 @@ class Drive:
             step = min(now - before, _LONGEST_STEP * self._settings.period) * self._rate
             before = now
             if not moves:
+                self.check_heat()
                 continue
             gone = min(gone + step, length)
             self.at = start + (gone / length) * moved if gone < length else goal.copy()
             wanted = self._device.standing(self.angles)
             if wanted != told:
                 self._device.command(wanted)
-                self._alive, told = now, wanted
+                told = wanted
 
     def _guard(self, start: Array) -> None:
-        """Should the host fall silent: back to where this leg began, which is clear, and home from there."""
-        home = self.way_home(start)
-        if home is None:
-            return
-        waypoints = [self._named(pose) for pose in home]
+        """Should the host fall silent: back to where this leg began, which is clear, and home from there.
+
+        Where no way home is found it stays there; what was told before, of another leg, must not remain.
+        """
+        waypoints = [self._named(pose) for pose in self.way_home(start) or (start,)]
         try:
             self._device.guard(waypoints, self._rate, self._settings.silence)
         except DeviceRefusedError:  # more than its memory holds: as far as that goes, which is clear too
@@ -196,8 +205,13 @@ class Drive:
             raise TooHot(f"the servo of {hottest} has come to its budget")
 
     def hotter_than(self, warmth: Array) -> bool:
-        """Whether a servo is hotter than with some warmth (joints x 2)."""
-        return bool(np.any(self._model.heat(self.warmth) > self._model.heat(warmth) + _SAME_HEAT))
+        """Whether a servo is hotter than with some warmth (joints x 2), and cools still where the arm stands."""
+        heat, settled = self._model.heat(self.warmth), self._model.heat(self._steady())
+        return bool(np.any(heat > np.maximum(self._model.heat(warmth), settled) + _SAME_HEAT))
+
+    def _steady(self) -> Array:
+        """The warmth (joints x 2) that the servos come to where the arm stands."""
+        return np.repeat(self._model.steady(self._torques(self.at)), 2, axis=1)
 
     def named_warmth(self) -> dict[str, list[float]]:
         """Of winding and case, by joint."""

@@ -20,5 +20,9 @@ class ParkWish(Exception):  # noqa: N818 - no error: somebody or something wants
     """The arm is to be parked, and the run to end. The message says why."""
 
 
+class OutOfSight(ParkWish):
+    """The tracker has told nothing of use for long, be it for where the arm is or for good."""
+
+
 class TooHot(Exception):  # noqa: N818 - see above
     """A servo has come to its budget before its time."""

@@ -15,7 +15,10 @@ class TrackerEyes:
         self._clock = clock
         self._tracker = bench.tracker()
         self._settling = Settling(bench.settings.acquisition.settle, bench.settings.bodies)
-        self._health = TrackerHealth(bench.settings.bodies, clock.now())
+        bodies = bench.settings.bodies
+        self._health = TrackerHealth(bodies, clock.now())
+        self._with_base = TrackerHealth(bodies.model_copy(update={"base_motion": "moving"}), clock.now())
+        self._longest = bench.settings.acquisition.lost.park
         self.why = ""
 
     def open(self) -> None:
@@ -25,15 +28,21 @@ class TrackerEyes:
     def look(self) -> None:
         """Take in the frames that came."""
         frames = self._tracker.frames()
-        self._health.feed(frames, self._tracker.refused)
+        for health in (self._health, self._with_base):
+            health.feed(frames, self._tracker.refused)
         self._settling.feed(frames)
 
     def trouble(self) -> tuple[float, str]:
-        """Seconds since the last frame that could be used, and why there was none since; (0, "") if all is well."""
-        return self._health.trouble(self._clock.now())
+        """Seconds since the last frame that could be used, and why there was none since; (0, "") if all is well.
+
+        A base body that stands still may be out of sight while the arm moves, but not for as long as makes it park.
+        """
+        found, with_base = (health.trouble(self._clock.now()) for health in (self._health, self._with_base))
+        return with_base if with_base[0] >= self._longest else found
 
     def begin(self) -> None:
-        """The arm has just been told to stand."""
+        """The arm has just been told to stand; frames that have come already were seen before that."""
+        self.look()
         self._settling.begin(self._clock.now())
 
     def settled(self) -> Settled | None:

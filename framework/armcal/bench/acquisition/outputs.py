@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -56,7 +57,8 @@ def dataset_of(experiment: Experiment, progress: Progress, digests: Mapping[str,
         channels[f"{arm}.approach.{joint}"] = np.array([float(r["approach"][joint]) for r in records])
     rows = np.array([_values(record, len(local)) for record in records]).reshape(len(records), len(local))
     channels |= {f"{instance}.{name}": rows[:, i] for i, name in enumerate(local)}
-    channels["time"] = np.array([float(r["at"]) for r in records])
+    if in_order(progress):
+        channels["time"] = np.array([float(r["at"]) for r in records])
     channels["sequence"] = np.arange(1.0, len(records) + 1)
     temperatures = [r.get("temperature") for r in records]
     if records and all(t is not None for t in temperatures):
@@ -67,6 +69,12 @@ def dataset_of(experiment: Experiment, progress: Progress, digests: Mapping[str,
         **{name: (digest,) * len(records) for name, digest in digests.items()},
     }
     return Dataset(tuple(progress.measured), channels, extra, source="acquired")
+
+
+def in_order(progress: Progress) -> bool:
+    """Whether the wall clock went forward from pose to pose; where it was set back, times mean nothing."""
+    times = [float(record["at"]) for record in progress.measured.values()]
+    return all(before < after for before, after in pairwise(times))
 
 
 def write_outputs(folder: Path, experiment: Experiment, progress: Progress, summary: Mapping[str, Any]) -> None:

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from armcal.arm.assembly import Arm
 from armcal.arm.clearance import ClearanceCheck
-from armcal.arm.holding import holding_function
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
-from armcal.bench.acquisition.heat import HeatModel, Torques
+from armcal.bench.acquisition.arrival import Arrival, tool_poses
+from armcal.bench.acquisition.heat import HeatModel, Torques, holding_torques
 from armcal.bench.acquisition.schedule import Scheduler
 from armcal.bench.acquisition.settings import AcquisitionSettings
 from armcal.bench.acquisition.ways import Ways
@@ -38,6 +38,7 @@ class Prepared:
         scheduler: over the angles that the device can set nearest to them.
         ways: between poses.
         heat: the servos' model, and the torques that heat them.
+        arrival: whether the arm is where it was told to be.
     """
 
     bench: Bench
@@ -46,6 +47,7 @@ class Prepared:
     scheduler: Scheduler
     ways: Ways
     heat: tuple[HeatModel, Torques]
+    arrival: Arrival
 
     @property
     def settings(self) -> AcquisitionSettings:
@@ -66,11 +68,12 @@ def prepare(experiment: Experiment, plan: Path) -> Prepared:
     commands = commands_of(read_poses(experiment, plan), space)
     device = bench.device()
     limits = joint_limits(experiment, settings, arm)
-    check = _clearance(experiment, arm)
+    check = clearance_of(experiment, arm)
     asked = commands.stacked(space.channels).T
     _within(asked, limits, plan, commands)
     poses, standing_park = _standing(device, asked, plan, commands), _park(experiment, settings, device, limits)
-    ways = Ways(check, limits, np.vstack([standing_park, poses]), settings.path_step, settings.seed)
+    settable = _settable(device, limits, standing_park)
+    ways = Ways(check, settable, np.vstack([standing_park, poses]), settings.path_step, settings.seed)
     _all_allowed(ways, poses, commands, plan)
     if not ways.allowed(standing_park):
         raise ConfigError(
@@ -78,7 +81,7 @@ def prepare(experiment: Experiment, plan: Path) -> Prepared:
             where=experiment.source.where((*_AT, "park")),
             hint="Choose another.",
         )
-    heat = _heat(experiment, settings, arm)
+    heat = heat_of(experiment, settings, arm)
     settle = settings.settle
     scheduler = Scheduler(
         poses=poses,
@@ -91,7 +94,8 @@ def prepare(experiment: Experiment, plan: Path) -> Prepared:
         capture=settle.wait + settle.window + 0.5,
         order=settings.order,
     )
-    return Prepared(bench, device, commands, scheduler, ways, heat)
+    arrival = Arrival(tool_poses(arm, poses), settings.arrival)
+    return Prepared(bench, device, commands, scheduler, ways, heat, arrival)
 
 
 def joint_limits(experiment: Experiment, settings: AcquisitionSettings, arm: Arm) -> Array:
@@ -141,11 +145,37 @@ def _park(experiment: Experiment, settings: AcquisitionSettings, device: JointDe
     return np.array([standing[joint] for joint in joints])
 
 
+def _settable(device: JointDevice, limits: Array, inside: Array) -> Array:
+    """The part of the limits, around a pose inside, that the device has pulses for (joints x 2, rad)."""
+    found = limits.copy()
+    for row, joint in enumerate(device.joint_names):
+        for end in (0, 1):
+            found[row, end] = _last_settable(device, joint, float(inside[row]), float(limits[row, end]))
+    return found
+
+
+def _last_settable(device: JointDevice, joint: str, inside: float, beyond: float) -> float:
+    try:
+        device.standing({joint: beyond})
+        return beyond
+    except DeviceRefusedError:
+        pass
+    while abs(beyond - inside) > _SLACK:
+        middle = (inside + beyond) / 2
+        try:
+            device.standing({joint: middle})
+            inside = middle
+        except DeviceRefusedError:
+            beyond = middle
+    return inside
+
+
 def _outside(pose: Array, limits: Array) -> NDArray[np.bool_]:
     return np.asarray((pose < limits[:, 0] - _SLACK) | (pose > limits[:, 1] + _SLACK))
 
 
-def _clearance(experiment: Experiment, arm: Arm) -> ClearanceCheck | None:
+def clearance_of(experiment: Experiment, arm: Arm) -> ClearanceCheck | None:
+    """What ``plan.clearance`` asks for; None where it is not given. See ``clearance_check`` for what it raises."""
     plan = experiment.settings.plan
     if plan is None or plan.clearance is None:
         return None
@@ -192,15 +222,14 @@ def _row(plan: Path, commands: Dataset, row: int) -> Location:
     return Location(str(plan), row=commands.rows[row] if commands.rows else None)
 
 
-def _heat(experiment: Experiment, settings: AcquisitionSettings, arm: Arm) -> tuple[HeatModel, Torques]:
+def heat_of(experiment: Experiment, settings: AcquisitionSettings, arm: Arm) -> tuple[HeatModel, Torques]:
+    """The servos' model, and the torques that heat them.
+
+    Raises:
+        ConfigError: the settings name no such joint.
+    """
     try:
         model = HeatModel.of(tuple(arm.commanded), settings.heat)
     except ValueError as fault:
         raise ConfigError(f"{fault}.", where=experiment.source.where((*_AT, "heat"))) from fault
-    environment = experiment.system.environment
-    function = holding_function(arm, environment.gravity, environment.payload_mass, environment.payload_com)
-
-    def torques(pose: Array) -> Array:
-        return np.asarray(function(pose).full()).ravel()
-
-    return model, torques
+    return model, holding_torques(arm, experiment.system.environment)

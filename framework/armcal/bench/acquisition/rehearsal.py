@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 import time
@@ -12,10 +13,11 @@ from typing import Any
 
 from armcal.bench.clock import SimulatedClock
 from armcal.bench.simulated import BOARD, CLOCK
-from armcal.errors import ArmcalError, InputError
+from armcal.errors import ArmcalError, InputError, Location
 
 _STARTED_IN_S = 60.0
 _ENDED_IN_S = 10.0
+_LONGEST_SOCKET_PATH = 107
 
 
 def overrides_for(folder: Path) -> tuple[str, ...]:
@@ -31,7 +33,7 @@ def simulated_bench(config: Path, overrides: Sequence[str], folder: Path) -> Ite
     Raises:
         InputError: it does not start; its own words are told.
     """
-    folder.mkdir(parents=True, exist_ok=True)
+    _make(folder)
     sets = [word for text in overrides for word in ("--set", text)]
     command = [sys.executable, "-m", "armcal.cli", "simulated-bench", str(config), "--dir", str(folder), *sets]
     with (folder / "said.txt").open("w+", encoding="utf-8") as said:
@@ -54,6 +56,23 @@ def truth(folder: Path) -> dict[str, Any]:
         return clock.ask({"state": True})
     finally:
         clock.close()
+
+
+def _make(folder: Path) -> None:
+    """Make the folder, where sockets can be."""
+    where = Location(str(folder))
+    if len(os.fsencode(folder.absolute() / CLOCK)) > _LONGEST_SOCKET_PATH:
+        raise InputError(
+            f"the path of the simulated bench's socket would be longer than {_LONGEST_SOCKET_PATH} bytes.",
+            where=where,
+            hint="Give --out a short path.",
+        )
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as fault:
+        raise InputError(
+            f"it cannot be made ({fault.strerror}).", where=where, hint="Give --out a folder that can be written."
+        ) from fault
 
 
 def _wait_for(process: subprocess.Popen[bytes], folder: Path, said: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -9,8 +10,9 @@ from typing import Any, Literal
 
 from armcal.bench.acquisition.outputs import JOURNAL, OURS
 from armcal.bench.acquisition.progress import HERE, STARTED, Progress, progress_of
-from armcal.errors import InputError, Location
-from armcal.online.journal.journal import Journal
+from armcal.bench.device import DeviceIdentity
+from armcal.errors import ArmcalError, InputError, Location
+from armcal.online.journal.journal import Journal, JournalFailedError, JournalFullError
 from armcal.run.folder import check_folder
 
 Start = Literal["anew", "resume"]
@@ -23,15 +25,31 @@ class RunLog:
         self._journal = journal
         self.progress: Progress = progress_of(journal.recovered.entries)
         started = [entry.content for entry in journal.recovered.entries if entry.kind == STARTED]
-        self.device: str | None = started[0]["device"] if started else None
+        self.identity = DeviceIdentity(started[-1]["name"], started[0]["device"]) if started else None
+        self._failed = False
 
     def record(self, kind: str, content: Mapping[str, Any]) -> None:
-        """Write an entry that outlasts a power loss; see ``Journal.record`` for what it raises."""
-        self._journal.record(kind, dict(content))
+        """Write an entry that outlasts a power loss.
+
+        Raises:
+            JournalFullError, JournalFailedError: it cannot. Only the first time: what comes after that is the way home.
+        """
+        with self._once():
+            self._journal.record(kind, dict(content))
 
     def note_angles(self, angles: Mapping[str, float], warmth: Mapping[str, Any], wall: float) -> None:
-        """Write where the arm is told to be; a power loss may take the last of these."""
-        self._journal.note(HERE, {"angles": dict(angles), "warmth": dict(warmth), "at": wall})
+        """Write where the arm is told to be; a power loss may take the last of these. See ``record``."""
+        with self._once():
+            self._journal.note(HERE, {"angles": dict(angles), "warmth": dict(warmth), "at": wall})
+
+    @contextmanager
+    def _once(self) -> Iterator[None]:
+        try:
+            yield
+        except (JournalFullError, JournalFailedError):
+            if not self._failed:
+                self._failed = True
+                raise
 
 
 @contextmanager
@@ -43,7 +61,16 @@ def opened_log(folder: Path, start: Start, header: Mapping[str, Any]) -> Iterato
             plan or configuration.
         JournalDamagedError: it cannot be read.
     """
-    where, there = Location(str(folder)), (folder / JOURNAL).is_dir()
+    where = Location(str(folder))
+    try:
+        there = (folder / JOURNAL).is_dir()
+    except OSError as fault:
+        raise InputError(
+            f"it cannot be used ({fault.strerror}).", where=where, hint="Give a folder that can be written."
+        ) from fault
+    if there and start == "anew" and _began_nothing(folder / JOURNAL):
+        shutil.rmtree(folder / JOURNAL)
+        there = False
     if there and start == "anew":
         raise InputError(
             "it holds a measuring run already.", where=where, hint="Go on with it by --resume, or give another --out."
@@ -60,3 +87,12 @@ def opened_log(folder: Path, start: Start, header: Mapping[str, Any]) -> Iterato
                     f"it was begun with another {name}.", where=where, hint=f"Give the same {name}, or another --out."
                 )
         yield RunLog(journal)
+
+
+def _began_nothing(folder: Path) -> bool:
+    """Whether a journal has no entries: its run was refused before anything moved. One in use or damaged is kept."""
+    try:
+        with Journal.open(folder, {}) as journal:
+            return not journal.recovered.entries and journal.recovered.checkpoint is None
+    except ArmcalError:
+        return False

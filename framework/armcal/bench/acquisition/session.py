@@ -18,11 +18,12 @@ from armcal.bench.acquisition.conduct import Conduct, Parts
 from armcal.bench.acquisition.drive import Drive
 from armcal.bench.acquisition.endings import Ending
 from armcal.bench.acquisition.eyes import TrackerEyes
-from armcal.bench.acquisition.outputs import measured_by, write_outputs
+from armcal.bench.acquisition.outputs import in_order, measured_by, write_outputs
 from armcal.bench.acquisition.preparation import Prepared
 from armcal.bench.acquisition.progress import Progress
 from armcal.bench.acquisition.recovery import Recovery
 from armcal.bench.acquisition.run_log import RunLog, Start, opened_log
+from armcal.bench.acquisition.settings import AcquisitionSettings
 from armcal.bench.acquisition.watch import Patient, Watch
 from armcal.bench.clock import Clock
 from armcal.bench.device import DeviceIdentity, JointDevice
@@ -70,12 +71,27 @@ def acquire(prepared: Prepared, plan: Path, course: Course) -> Outcome:
     """
     measured_by(prepared.bench.experiment)
     with prepared.bench.clock() as clock, opened_log(course.folder, course.start, _header(prepared, plan)) as log:
+        if log.identity is not None and _is_over(prepared, log):
+            return _written(prepared, course, log.progress, Ending("done", "it was done before"), log.identity)
         with _opened(prepared, clock, log) as (device, eyes, identity):
             log.record(entry.STARTED, {"at": clock.wall(), "device": identity.digest, "name": identity.name})
-            ending, progress = _conducted(prepared, course, clock, log, device, eyes)
-        summary = _summary(prepared, progress, ending, identity)
-        write_outputs(course.folder, prepared.bench.experiment, progress, summary)
-        return Outcome(ending, summary)
+            ending, progress = _conducted(prepared, course, clock, log, (device, eyes, identity))
+        return _written(prepared, course, progress, ending, identity)
+
+
+def _is_over(prepared: Prepared, log: RunLog) -> bool:
+    """Whether every pose is done and the arm was left parked: then nothing needs to move, nor to be there."""
+    progress = log.progress
+    done = {*progress.measured, *progress.left_out}
+    return progress.ended in ("done", "parked") and done >= set(prepared.scheduler.ids)
+
+
+def _written(
+    prepared: Prepared, course: Course, progress: Progress, ending: Ending, identity: DeviceIdentity
+) -> Outcome:
+    summary = _summary(prepared, progress, ending, identity)
+    write_outputs(course.folder, prepared.bench.experiment, progress, summary)
+    return Outcome(ending, summary)
 
 
 @contextmanager
@@ -85,7 +101,7 @@ def _opened(prepared: Prepared, clock: Clock, log: RunLog) -> Iterator[tuple[Joi
     eyes = TrackerEyes(prepared.bench, clock)
     try:
         identity = device.open(clock)
-        if log.device not in (None, identity.digest):
+        if log.identity is not None and log.identity.digest != identity.digest:
             raise InputError(
                 f"the run was begun with another board, or another calibration of it, than {identity.name}.",
                 hint="Connect the board that the run began with, with the servo file that it began with.",
@@ -94,6 +110,7 @@ def _opened(prepared: Prepared, clock: Clock, log: RunLog) -> Iterator[tuple[Joi
         until = clock.now() + _FIRST_FRAME_S
         while eyes.trouble()[0] and clock.now() < until:
             clock.sleep(settings.period)
+            device.keep_alive()
             eyes.look()
         if eyes.trouble()[0]:
             raise DeviceRefusedError(
@@ -107,10 +124,14 @@ def _opened(prepared: Prepared, clock: Clock, log: RunLog) -> Iterator[tuple[Joi
 
 
 def _conducted(
-    prepared: Prepared, course: Course, clock: Clock, log: RunLog, device: JointDevice, eyes: TrackerEyes
+    prepared: Prepared,
+    course: Course,
+    clock: Clock,
+    log: RunLog,
+    opened: tuple[JointDevice, TrackerEyes, DeviceIdentity],
 ) -> tuple[Ending, Progress]:
     """The run itself; everything is written down as it goes."""
-    settings, progress = prepared.settings, log.progress
+    settings, progress, (device, eyes, identity) = prepared.settings, log.progress, opened
 
     def note(angles: Any, warmth: Any) -> None:
         log.note_angles(angles, warmth, clock.wall())
@@ -119,13 +140,12 @@ def _conducted(
         log.record(entry.ENERGISED, {"joint": joint, "angle": angle, "at": clock.wall()})
 
     drive = Drive(device, clock, prepared.ways, settings, prepared.heat, note)
+    prepared.ways.meanwhile = drive.keep_alive  # the board would take a host that plans for one that died
     _warmed(drive, progress, clock)
-    free = tuple(joint for joint in device.joint_names if joint not in device.state().angles)
-    if free and not course.may_energise(free):
-        raise InputError("the joints may not be energised; nothing was moved.", hint="Say yes, or give --yes.")
+    _permitted(device, course, settings)
     parts = Parts(
         drive=drive,
-        recovery=Recovery(device, drive, clock, settings, announce, course.asked_to_end),
+        recovery=Recovery(device, drive, clock, settings, announce, course.asked_to_end, identity),
         scheduler=prepared.scheduler,
         eyes=eyes,
         clock=clock,
@@ -134,9 +154,23 @@ def _conducted(
         watch=Watch(clock, eyes, settings.lost, course.asked_to_end),
         patient=Patient(eyes, course.asked_to_end),
         told=course.told,
+        arrival=prepared.arrival,
     )
     conduct = Conduct(parts, replace(progress, ended=""))
     return conduct.run(), conduct.progress
+
+
+def _permitted(device: JointDevice, course: Course, settings: AcquisitionSettings) -> None:
+    """Ask before joints get their first pulses."""
+    angles = device.state().angles
+    free = tuple(joint for joint in device.joint_names if joint not in angles)
+    if not free:
+        return
+    if angles:  # nobody beats while somebody thinks: joints that hold are to stay where they are
+        device.guard([angles], float(np.deg2rad(settings.rate_deg_per_s)), settings.silence)
+    before = course.asked_to_end()
+    if not course.may_energise(free) or (course.asked_to_end() and not before):
+        raise InputError("the joints may not be energised; nothing was moved.", hint="Say yes, or give --yes.")
 
 
 def _warmed(drive: Drive, progress: Progress, clock: Clock) -> None:
@@ -169,6 +203,7 @@ def _summary(prepared: Prepared, progress: Progress, ending: Ending, identity: D
         "poses": len(prepared.plan),
         "measured": len(progress.measured),
         "left_out": dict(progress.left_out),
+        "times": "written" if in_order(progress) else "left out: the clock was set back during the run",
         "board": identity.name,
         "digests": {"board": identity.digest[:16], "config": _config_digest(prepared)[:16]},
     }

@@ -45,6 +45,26 @@ class SettleSettings(Settings):
     frames: Annotated[int, Field(ge=2)] = 10
 
 
+class ArrivalSettings(Settings):
+    """How far the arm may be from where it was told to be, by distances and turns between measured poses.
+
+    More than ``astray``, or ``astray_turned``, is no error of the model but a servo that failed, stalls or lost a
+    tooth, or a body that slipped: such a pose is tried again, then left out. After ``in_a_row`` of them the arm parks
+    and the run ends.
+    """
+
+    astray: Length = 0.1
+    astray_turned: Angle = 0.45
+    in_a_row: Annotated[int, Field(ge=1)] = 3
+
+    @model_validator(mode="after")
+    def _positive(self) -> ArrivalSettings:
+        for name in ("astray", "astray_turned"):
+            if getattr(self, name) <= 0:
+                raise ValueError(f"found {name} that is not above zero")
+        return self
+
+
 class LostSettings(Settings):
     """A tracker that is silent, frozen or blind for ``hold`` makes the arm hold; for ``park``, park."""
 
@@ -69,6 +89,7 @@ class AcquisitionSettings(Settings):
     park: dict[str, Angle] = Field(default_factory=dict)
     path_step: Angle = 0.0175
     settle: SettleSettings = Field(default_factory=SettleSettings)
+    arrival: ArrivalSettings = Field(default_factory=ArrivalSettings)
     lost: LostSettings = Field(default_factory=LostSettings)
     heat: dict[str, ServoHeatSettings] = Field(default_factory=dict)
     order: Literal["plan", "cool"] = "plan"

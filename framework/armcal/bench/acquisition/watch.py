@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Protocol
 
-from armcal.bench.acquisition.endings import ParkWish
+from armcal.bench.acquisition.endings import OutOfSight, ParkWish
 from armcal.bench.acquisition.settings import LostSettings
 from armcal.bench.clock import Clock
 
@@ -41,7 +41,7 @@ class Watch:
             raise ParkWish("it was asked to stop")
         seconds, why = self._sight.trouble()
         if seconds >= self._lost.park:
-            raise ParkWish(f"the tracker has told nothing for {seconds:.0f} s: {why}")
+            raise OutOfSight(f"the tracker has told nothing for {seconds:.0f} s: {why}")
         self.why_held = why if seconds >= self._lost.hold else ""
         return not self.why_held
 

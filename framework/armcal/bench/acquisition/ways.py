@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import heapq
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from itertools import pairwise
 
@@ -14,6 +14,8 @@ from armcal.base.domains import Array
 
 _SPREAD = 256
 _TRIED_AT_ONCE = 24
+_ESCAPES = 32
+_NEARER_M = 1e-6
 
 Way = tuple[Array, ...]
 """Joint angles to go through in turn, in straight lines of joint space; the start is the first."""
@@ -23,6 +25,9 @@ class Ways:
     """Straight lines where they are clear; else the shortest way through known poses and poses spread over joint space.
 
     A lazy roadmap: a line is checked only when a shortest way would use it. [Bohlin2000]
+
+    Attributes:
+        meanwhile: called now and then while a way is looked for, which may take seconds.
     """
 
     def __init__(self, check: ClearanceCheck | None, limits: Array, known: Array, step: float, seed: int = 0) -> None:
@@ -37,6 +42,7 @@ class Ways:
         """
         self._check, self._limits, self._known, self._step, self._seed = check, limits, known, step, seed
         self._clear: dict[tuple[bytes, bytes], bool] = {}
+        self.meanwhile: Callable[[], None] = lambda: None
 
     def allowed(self, pose: Array) -> bool:
         """Whether nothing is too near there (joints, rad)."""
@@ -53,17 +59,43 @@ class Ways:
         low, high = sorted((start.tobytes(), goal.tobytes()))
         key = (low, high)
         if key not in self._clear:
-            count = int(np.ceil(np.max(np.abs(goal - start)) / self._step)) + 1
-            line = start[:, None] + np.linspace(0.0, 1.0, max(count, 2)) * (goal - start)[:, None]
-            self._clear[key] = bool(self._check(line).allowed.all())
+            self.meanwhile()
+            self._clear[key] = bool(self._check(self._line(start, goal)).allowed.all())
         return self._clear[key]
 
+    def _line(self, start: Array, goal: Array) -> Array:
+        """Poses of a straight line (joints x N)."""
+        count = int(np.ceil(np.max(np.abs(goal - start)) / self._step)) + 1
+        return np.asarray(start[:, None] + np.linspace(0.0, 1.0, max(count, 2)) * (goal - start)[:, None])
+
     def find(self, start: Array, goal: Array) -> Way | None:
-        """A clear way, or None if there is none that was found."""
+        """A clear way, or None if there is none that was found.
+
+        An arm that stands too near to something, by a board's rounding or after a fault, goes away from it first.
+        """
         if self.clear(start, goal):
             return (start, goal)
+        if not self.allowed(start):
+            return self._escape(start, goal)
         nodes = np.vstack([start[None], goal[None], self._roadmap])
         return self._shortest(nodes)
+
+    def _escape(self, start: Array, goal: Array) -> Way | None:
+        """Straight to a pose that is clear, on a line that comes nowhere nearer than where the arm stands."""
+        nodes = np.vstack([goal[None], self._roadmap])
+        away = np.max(np.abs(nodes - start), axis=1)
+        for there in np.argsort(away, kind="stable")[:_ESCAPES]:
+            if self.allowed(nodes[there]) and self._leads_away(start, nodes[there]):
+                onward = self.find(nodes[there], goal)
+                if onward is not None:
+                    return (start, *onward)
+        return None
+
+    def _leads_away(self, start: Array, goal: Array) -> bool:
+        if self._check is None:
+            return True
+        margins = np.minimum(self._check(self._line(start, goal)).margins, 0.0)
+        return bool(np.all(np.diff(margins, axis=1) >= -_NEARER_M))
 
     @cached_property
     def _roadmap(self) -> Array:
