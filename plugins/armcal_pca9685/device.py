@@ -68,9 +68,8 @@ class Pca9685Device:
             raise
         boards = ", ".join(f"0x{address:02x}" for address in self._chips)
         name = f"PCA9685 {boards} on {identity.adapter or 'an adapter without an id'} ({identity.firmware})"
-        return DeviceIdentity(
-            name, digest({joint: servo.calibrated for joint, servo in self._servos.items()}), identity.boots
-        )
+        calibrated = digest({joint: servo.calibrated for joint, servo in self._servos.items()})
+        return DeviceIdentity(name, calibrated, identity.boots, identity.adapter)
 
     def state(self) -> DeviceState:
         """See ``JointDevice``."""

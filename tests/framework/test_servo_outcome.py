@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -175,3 +176,10 @@ def test_a_servo_that_lets_go_is_left_out_and_spoils_no_other(truth, nominal):
     alone = evaluated([line for line in record if line["joint"] == "q3"], nominal, ("q3",))
     assert "let go" in both.silent["q5"] and set(both.fit.servos) == {"q3"}
     assert both.fit.servos["q3"].pulses == alone.fit.servos["q3"].pulses
+
+
+def test_a_board_without_an_id_gets_the_one_it_was_measured_on_and_others_keep_theirs(whole):
+    board = STATED.boards["front"]
+    nameless = replace(STATED, boards={"front": type(board).si(**{**board.model_dump(), "id": ""})})
+    assert improved(nameless, whole, "A5069RR4").boards["front"].id == "A5069RR4"
+    assert improved(STATED, whole, "A5069RR4").boards["front"].id == "LRM-1"

@@ -17,11 +17,13 @@ class DeviceIdentity:
         name: for people, one line.
         digest: of everything that a calibration hangs on (board identity, oscillator, prescale, pulse tables), hex.
         boots: how often it has started, where it counts that.
+        adapter: what tells its adapter from all others, as ``LinkIdentity`` has it; empty if nothing does.
     """
 
     name: str
     digest: str
     boots: int | None = None
+    adapter: str = ""
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from armcal.bench.servo.mover import StoppedError
 from armcal.bench.servo.outcome import Outcome
 from armcal.bench.servo.outputs import improved, results, write_results, write_servo_file
 from armcal.bench.servo.record import NAME
-from armcal.bench.servo.session import Conversation, evaluated, measure, park, tried
+from armcal.bench.servo.session import Conversation, adapter_of, evaluated, measure, park, tried
 from armcal.bench.servo.setup import Setup
 from armcal.bench.servo.trial import Verdict, swapped
 from armcal.cli.common import Voice, overrides, speaking
@@ -84,7 +84,7 @@ def _calibrated(voice: Voice, setup: Setup, out: Path, how: str | None, keep: bo
     if how is not None:
         _stoppable(voice, lambda: measure(setup, out, talk, how))
     outcome = evaluated(setup, out)
-    changed = improved(setup.file, outcome)
+    changed = improved(setup.file, outcome, adapter_of(out))
     content = results(outcome, changed)
     write_results(out, content)
     kept = None if keep else write_servo_file(setup.path, changed)

@@ -13,19 +13,22 @@ import numpy as np
 from armcal.bench.servo.findings import findings, is_usable
 from armcal.bench.servo.fit import FittedServo
 from armcal.bench.servo.outcome import Outcome
-from armcal.config.servo_file import ServoFile, ServoSettings, servo_file_text
+from armcal.config.servo_file import BoardSettings, ServoFile, ServoSettings, servo_file_text
 from armcal.errors import InputError, Location
 from armcal.online.journal.files import REAL_FILES, write_whole
 
 RESULTS = "servo.json"
 
 
-def improved(file: ServoFile, outcome: Outcome) -> ServoFile:
-    """The servo file with what was found; servos whose board has another oscillator now keep their counts."""
-    boards = dict(file.boards)
+def improved(file: ServoFile, outcome: Outcome, adapter: str = "") -> ServoFile:
+    """The servo file with what was found; servos whose board has another oscillator now keep their counts.
+
+    Boards whose adapter was not stated get the one that they were measured on (empty: not known).
+    """
+    boards = {name: board if board.id else _changed(board, id=adapter) for name, board in file.boards.items()}
     for name in outcome.fit.oscillator_sds:
         hz = outcome.fit.clocks[name].oscillator_hz
-        boards[name] = type(boards[name]).si(**{**boards[name].model_dump(), "oscillator_hz": hz})
+        boards[name] = _changed(boards[name], oscillator_hz=hz)
     servos: dict[str, ServoSettings] = {}
     for joint, servo in file.servos.items():
         found = outcome.fit.servos.get(joint)
@@ -38,6 +41,10 @@ def improved(file: ServoFile, outcome: Outcome) -> ServoFile:
             table = {"angles": servo.angles, "pulses": tuple(pulse * longer for pulse in servo.pulses)}
         servos[joint] = ServoSettings.si(board=str(servo.board), channel=servo.channel, **table)
     return ServoFile(boards, servos)
+
+
+def _changed(board: BoardSettings, **values: Any) -> BoardSettings:
+    return BoardSettings.si(**{**board.model_dump(), **values})
 
 
 def write_servo_file(path: Path, file: ServoFile) -> Path | None:

@@ -12,6 +12,7 @@ from typing import Any, cast
 from armcal.arm.servo import PulseClock, PulseTable
 from armcal.bench.acquisition.eyes import TrackerEyes
 from armcal.bench.clock import Clock
+from armcal.bench.device import DeviceIdentity
 from armcal.bench.faults import DeviceRefusedError
 from armcal.bench.servo.automatic import Automatic, Told
 from armcal.bench.servo.guided import Guided
@@ -83,6 +84,12 @@ def evaluated(setup: Setup, folder: Path) -> Outcome:
     return outcome_of(record.entries, servos, boards, setup.nominal, setup.settings)
 
 
+def adapter_of(folder: Path) -> str:
+    """The adapter that the record in a folder was measured on; empty if that is not known."""
+    begun = Record(folder).of_kind(BEGUN)
+    return str(begun[0].get("adapter", "")) if begun else ""
+
+
 def tried(setup: Setup, talk: Conversation, seen: str) -> list[Verdict]:
     """Move each joint a little, and say what it did; ``seen`` by the ``tracker`` or by ``somebody``.
 
@@ -128,7 +135,7 @@ def _opened(setup: Setup, clock: Clock, talk: Conversation, record: Record | Non
     try:
         identity = mover.open()
         if record is not None:
-            _begin(setup, record, identity.name)
+            _begin(setup, record, identity)
         free = tuple(joint for joint in setup.base if joint not in mover.told)
         if free and not talk.may_energise(free):
             raise InputError("the joints may not be energised; nothing was moved.", hint="Say yes, or give --yes.")
@@ -185,12 +192,13 @@ def _cooling(setup: Setup, mover: Mover) -> Warmth:
     return warmth
 
 
-def _begin(setup: Setup, record: Record, device: str) -> None:
+def _begin(setup: Setup, record: Record, device: DeviceIdentity) -> None:
     """The first line of a record: by which tables it is measured. A record of other ones is refused."""
     servos = {joint: _as_stated(setup, joint) for joint in setup.base}
     begun = record.of_kind(BEGUN)
     if not begun:
-        record.append(BEGUN, {"servos": servos, "device": device, "base": dict(setup.base)})
+        told = {"device": device.name, "adapter": device.adapter}
+        record.append(BEGUN, {"servos": servos, **told, "base": dict(setup.base)})
         return
     for joint, stated in servos.items():
         before = begun[0]["servos"].get(joint, {})
