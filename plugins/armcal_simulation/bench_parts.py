@@ -46,7 +46,7 @@ def true_servos(settings: ServoBenchSettings, arm: Arm) -> ServoFile:
         raise ConfigError(
             f"no joint of {arm.name} is called {(unknown or named)[0]!r}.",
             where=Location(str(settings.servos)) if unknown else None,
-            hint=f"The joints are {', '.join(known)}.",
+            hint=f"The joints are {', '.join(arm.commanded)}.",
         )
     return file
 

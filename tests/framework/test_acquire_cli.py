@@ -75,8 +75,8 @@ class TestRefusedBeforeAnythingMoves:
     @pytest.mark.parametrize(
         ("change", "said"),
         [
-            ("q2=51", "pose p2 has joint 2 at 51.0 deg, expected -50.0 to 50.0"),
-            ("q4=101", "joint 4 at 101.0 deg"),
+            ("q2=51", "pose p2 has q2 at 51.0 deg, expected -50.0 to 50.0"),
+            ("q4=101", "q4 at 101.0 deg"),
             ("q1=nan", "q1"),
         ],
     )
@@ -176,17 +176,31 @@ class TestRefusedBeforeAnythingMoves:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory, plan: Path) -> Path:
-    """A rehearsal's."""
+    """A rehearsal's, of a bench whose real adapter is known by its serial number."""
     folder = tmp_path_factory.mktemp("rehearsal") / "out"
     port = free_port()
     ports = (f"bench.tracker.port={port}", f"bench.simulator.tracker.port={port}")
-    result = armcal("rehearse", CONFIG, "--plan", plan, "--out", folder, sets=(*SETS, *ports))
+    link = "bench.link={type: framed, serial_number: A5069RR4}"
+    result = armcal("rehearse", CONFIG, "--plan", plan, "--out", folder, sets=(*SETS, *ports, link))
     assert result.exit_code == 0, result.output
     assert "unsafe was: nothing" in result.output and "armcal run" in result.output
     return folder
 
 
 class TestRehearsal:
+    @pytest.mark.parametrize(
+        ("change", "said"),
+        [
+            ("bench.link={type: linux_i2c}", "--set bench.link='{type: framed}'"),
+            ("bench.simulator.joints={q9: {backlash_deg: 1}}", "The joints are q1, q2, q3, q4, q5, q6."),
+            ("bench=null", "found no bench"),
+        ],
+    )
+    def test_what_cannot_be_rehearsed(self, plan: Path, tmp_path: Path, change: str, said: str) -> None:
+        result = armcal("rehearse", CONFIG, "--plan", plan, "--out", tmp_path / "out", sets=(change,))
+        assert result.exit_code == 2, result.output
+        assert said in result.output and "Traceback" not in result.output
+
     def test_data_can_be_read_as_they_are(self, folder: Path) -> None:
         from armcal.run.experiment import Experiment
 
@@ -237,3 +251,9 @@ def test_a_missing_library_is_named(tmp_path: Path, plan: Path) -> None:
     environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
     done = subprocess.run([*command, "--yes"], capture_output=True, text=True, env=environment)
     assert done.returncode in (1, 2) and "serial" in done.stderr and "Traceback" not in done.stderr
+
+
+def test_heat_of_an_arm_that_weighs_nothing_is_refused(plan: Path) -> None:
+    weightless = tuple(f"arms.arm.links.{n}=null" for n in (*(f"link{i}" for i in range(1, 7)), "target", "holder"))
+    result = armcal("acquire", CONFIG, "--plan", plan, "--dry-run", sets=weightless)
+    assert result.exit_code == 2 and "no part of the arm has a mass" in result.output

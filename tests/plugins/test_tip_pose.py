@@ -7,9 +7,13 @@ import numpy as np
 import pytest
 from armcal.arm.assembly import ArmState
 from armcal.base import se3
+from armcal.base.dataset import Dataset
 from armcal.base.parameters import Parameters
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import calibrate
+from armcal.run.plan_ground import ground_of
+from armcal.run.plan_poses import JointSpace
+from armcal.run.plan_settings import PlanSettings
 from armcal.solve.simulation import SimulationRequest, measured_without_noise
 from armcal_tracker.pose import TipPose, TipPoseSettings
 from pydantic import ValidationError
@@ -223,3 +227,20 @@ def test_simulated_orientations_are_turned_by_the_declared_noise_and_stay_quater
     truth = Rotation.from_quat(np.array([exact[f"tracker.q{part}"] for part in "xyzw"]).T)
     turned = (truth.inv() * Rotation.from_quat(np.array([x, y, z, w]).T)).as_rotvec()
     np.testing.assert_allclose(turned.std(axis=0), 2e-4, rtol=0.15)
+
+
+def test_a_plan_counts_what_measured_orientations_would_tell(tmp_path):
+    """Rows of poses of which nothing is measured, against differences of scipy's rotations and of the positions."""
+    (tmp_path / "arm.yaml").write_text(CONFIG.replace("a_mm: 300", "a_mm: 302"), encoding="utf-8")
+    experiment = Experiment.load(tmp_path / "arm.yaml", ("parameters.free=['arm.mdh.theta[2-4]']",))
+    q = np.random.default_rng(5).uniform(-1.5, 1.5, (20, 5))
+    poses = Dataset(tuple(map(str, range(20))), {f"arm.q{i + 1}": q[:, i] for i in range(5)})
+    ground = ground_of(experiment, PlanSettings(), JointSpace.of(experiment), experiment.parameters, None)
+    step, found = 1e-6, ground.rows(poses)[0]
+    scales = experiment.parameters.scales()
+    for n, angles in enumerate(q):
+        turn, place = turned_and_placed(angles, np.zeros(5), Rotation.identity())
+        for j in range(3):
+            turned, placed = turned_and_placed(angles, step * np.eye(5)[j + 1], Rotation.identity())
+            expected = np.concatenate([(placed - place) / 1e-4, (turn.inv() * turned).as_rotvec() / 2e-4])
+            np.testing.assert_allclose(-found[:, n, j], expected / step * scales[j], rtol=0, atol=3e-2 * scales[j])

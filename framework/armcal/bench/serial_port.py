@@ -44,9 +44,10 @@ class SerialPortSettings(Settings):
 
     @model_validator(mode="after")
     def _one(self) -> SerialPortSettings:
-        if (self.port is None) == (self.serial_number is None):
-            found = "neither port nor serial_number" if self.port is None else "both port and serial_number"
-            raise ValueError(f"found {found}, expected one of them: which serial port is meant?")
+        if self.port is None and self.serial_number is None:
+            raise ValueError("found neither port nor serial_number, expected one of them: which serial port is meant?")
+        if self.port is not None and self.serial_number is not None:
+            raise ValueError("found both port and serial_number, expected one of them: set the other one to null")
         return self
 
     @property

@@ -10,7 +10,7 @@ import click
 
 from armcal.bench.acquisition.outputs import BENCH, OURS
 from armcal.bench.acquisition.preparation import prepare
-from armcal.bench.acquisition.rehearsal import overrides_for, simulated_bench, truth
+from armcal.bench.acquisition.rehearsal import overrides_for, port_instead_of_adapter, simulated_bench, truth
 from armcal.cli.acquire import driven, outlook_of, show_outcome, show_outlook
 from armcal.cli.common import Voice, overrides, speaking
 from armcal.cli.energising import always
@@ -33,7 +33,8 @@ def rehearse(voice: Voice, config: Path, plan: Path, out: Path, overrides: tuple
     registry = discover()
     voice.plugin_faults(registry)
     bench = out / BENCH
-    experiment = Experiment.load(config, (*overrides, *overrides_for(bench)), registry=registry)
+    adapter = port_instead_of_adapter(Experiment.load(config, overrides, registry=registry))
+    experiment = Experiment.load(config, (*overrides, *overrides_for(bench), *adapter), registry=registry)
     prepared = prepare(experiment, plan)
     check_folder(out, OURS)
     if not voice.json:

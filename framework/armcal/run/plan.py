@@ -13,7 +13,7 @@ from armcal.base.parameters import Parameters
 from armcal.errors import ProblemError
 from armcal.run.experiment import Experiment
 from armcal.run.plan_clearance import clearance_check
-from armcal.run.plan_ground import Ground, draws_of, ground_of, parameters_of, problem_of
+from armcal.run.plan_ground import Ground, as_if_measured, draws_of, ground_of, parameters_of, problem_of
 from armcal.run.plan_poses import JointSpace, Pool, dataset_of, given_records, pool_of, same_poses, told
 from armcal.run.plan_settings import PlanSettings
 from armcal.run.plan_visit import visit
@@ -171,10 +171,10 @@ def _refined(ground: Ground, task: Task, plan: Plan, pool: Pool, allowed: Allowe
     """The chosen poses moved through joint space, and chosen again from all candidates and these."""
     channels, limits = ground.space.channels, ground.space.limits(ground.settings)
     before = pool.dataset.stacked(channels)[:, plan.chosen]
-    problem = problem_of(ground.experiment, ground.parameters, pool.dataset)
+    problem = problem_of(ground.experiment, ground.parameters, as_if_measured(ground.experiment, pool.dataset))
 
     def rows(poses: Array) -> Array:
-        return over_draws(problem, ground.draws, dataset_of(poses, ground.space))
+        return over_draws(problem, ground.draws, as_if_measured(ground.experiment, dataset_of(poses, ground.space)))
 
     known, by = task.candidates.known(), task.criterion
     after = refine(before, limits, known, by, rows, allowed, ground.settings.sweeps)

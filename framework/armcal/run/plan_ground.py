@@ -17,6 +17,7 @@ from armcal.run.plan_poses import JointSpace
 from armcal.run.plan_settings import PlanSettings, RobustSettings
 from armcal.solve.candidates import over_draws, parameter_draws
 from armcal.solve.problem import Problem, triangular
+from armcal.solve.simulation import with_channels
 from armcal.use.calibration import Calibration
 
 
@@ -51,7 +52,8 @@ class Ground:
 
     def rows(self, dataset: Dataset) -> Array:
         """Whitened Jacobians at every draw (draws x n_r x N x n)."""
-        return over_draws(problem_of(self.experiment, self.parameters, dataset), self.draws, dataset)
+        records = as_if_measured(self.experiment, dataset)
+        return over_draws(problem_of(self.experiment, self.parameters, records), self.draws, records)
 
 
 def parameters_of(experiment: Experiment, calibration: Path | None) -> Parameters:
@@ -86,6 +88,13 @@ def problem_of(experiment: Experiment, parameters: Parameters, dataset: Dataset)
     """Compiled for a dataset's channels."""
     system, evaluator = experiment.system, experiment.settings.evaluator
     return Problem.build(system.arms, system.measurements, parameters, system.environment, dataset, evaluator)
+
+
+def as_if_measured(experiment: Experiment, dataset: Dataset) -> Dataset:
+    """Poses with the channels of all that would be measured there; which numbers they hold does not matter."""
+    measured = [f"{name}.{c.name}" for name, m in experiment.system.measurements.items() for c in m.channels()]
+    missing = [channel for channel in measured if channel not in dataset.channels]
+    return with_channels(dataset, {channel: np.zeros(len(dataset)) for channel in missing})
 
 
 def ground_of(

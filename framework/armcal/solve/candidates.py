@@ -13,6 +13,7 @@ from armcal.base.domains import Array
 from armcal.base.parameters import Parameters
 from armcal.solve.linearised import BLOCK_RECORDS
 from armcal.solve.problem import Problem, triangular
+from armcal.solve.projection import as_predicted
 
 Indices = NDArray[np.intp]
 RIDGE = 1e-9
@@ -101,10 +102,13 @@ def deviations(triangle: Array) -> Array:
 
 
 def whitened_rows(problem: Problem, values: Array, dataset: Dataset) -> Array:
-    """Whitened Jacobians by coordinates in ordinary sizes, all factors stacked (n_r x N x n)."""
+    """Whitened Jacobians by coordinates in ordinary sizes, all factors stacked (n_r x N x n).
+
+    Of poses that are only thought of nothing was measured: what the model predicts stands in for it.
+    """
     scales = problem.parameters.scales()
     chain = problem.parameters.entries_jacobian(values) * scales
-    records = problem.records(dataset)
+    records = as_predicted(problem, values, problem.records(dataset))
     blocks = problem.jacobians(values, records)
     parts: list[Array] = []
     for each in records:

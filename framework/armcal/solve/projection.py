@@ -35,16 +35,25 @@ def projected(problem: Problem, values: Array, records: Sequence[FactorRecords])
     Raises:
         NotConvergedError: a record has no elastic equilibrium at these values.
     """
-    result = tuple(records)
-    if any(_bilinear(kernel.factor) for kernel in problem.kernels):
-        shown = problem.predict(values, records)
-        result = tuple(
-            _as_predicted(kernel.factor, each, outputs) if _bilinear(kernel.factor) else each
-            for kernel, each, outputs in zip(problem.kernels, records, shown, strict=True)
-        )
+    result = as_predicted(problem, values, records)
     return tuple(
         _fitting_joints(kernel, slots, values, each) if _measures_nothing(kernel.factor) else each
         for kernel, slots, each in zip(problem.kernels, problem.slots, result, strict=True)
+    )
+
+
+def as_predicted(problem: Problem, values: Array, records: Sequence[FactorRecords]) -> tuple[FactorRecords, ...]:
+    """Records with what the model predicts in the place of measured numbers, wherever a Jacobian depends on these.
+
+    Raises:
+        NotConvergedError: a record has no elastic equilibrium at these values.
+    """
+    if not any(_bilinear(kernel.factor) for kernel in problem.kernels):
+        return tuple(records)
+    shown = problem.predict(values, records)
+    return tuple(
+        _as_predicted(kernel.factor, each, outputs) if _bilinear(kernel.factor) else each
+        for kernel, each, outputs in zip(problem.kernels, records, shown, strict=True)
     )
 
 

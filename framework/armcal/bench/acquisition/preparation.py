@@ -70,7 +70,7 @@ def prepare(experiment: Experiment, plan: Path) -> Prepared:
     limits = joint_limits(experiment, settings, arm)
     check = clearance_of(experiment, arm)
     asked = commands.stacked(space.channels).T
-    _within(asked, limits, plan, commands)
+    _within(device.joint_names, asked, limits, plan, commands)
     poses, standing_park = _standing(device, asked, plan, commands), _park(experiment, settings, device, limits)
     settable = _settable(device, limits, standing_park)
     ways = Ways(check, settable, np.vstack([standing_park, poses]), settings.path_step, settings.seed)
@@ -182,14 +182,14 @@ def clearance_of(experiment: Experiment, arm: Arm) -> ClearanceCheck | None:
     return clearance_check(plan.clearance, {arm.name: arm}, experiment.source)
 
 
-def _within(poses: Array, limits: Array, plan: Path, commands: Dataset) -> None:
+def _within(joints: tuple[str, ...], poses: Array, limits: Array, plan: Path, commands: Dataset) -> None:
     """What is asked for lies within limits; half a count beyond is the board's affair."""
     for row, pose in enumerate(poses):
         if (outside := _outside(pose, limits)).any():
             joint = int(np.argmax(outside))
             low, high = np.rad2deg(limits[joint])
             raise DataError(
-                f"pose {commands.ids[row]} has joint {joint + 1} at {np.rad2deg(pose[joint]):.1f} deg, "
+                f"pose {commands.ids[row]} has {joints[joint]} at {np.rad2deg(pose[joint]):.1f} deg, "
                 f"expected {low:.1f} to {high:.1f}.",
                 where=_row(plan, commands, row),
                 hint="Nothing was moved. Plan anew with these limits, or take the pose out.",
@@ -226,8 +226,14 @@ def heat_of(experiment: Experiment, settings: AcquisitionSettings, arm: Arm) -> 
     """The servos' model, and the torques that heat them.
 
     Raises:
-        ConfigError: the settings name no such joint.
+        ConfigError: the settings name no such joint, or nothing weighs anything.
     """
+    if settings.heat and not arm.masses and not experiment.system.environment.payload_mass:
+        raise ConfigError(
+            "heat is to be reckoned with, and no part of the arm has a mass: no joint would hold anything.",
+            where=experiment.source.where((*_AT, "heat")),
+            hint="Give the masses of the links (arms.NAME.links), or leave heat out.",
+        )
     try:
         model = HeatModel.of(tuple(arm.commanded), settings.heat)
     except ValueError as fault:

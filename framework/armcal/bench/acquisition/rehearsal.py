@@ -11,9 +11,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from armcal.bench.bench import SECTION, Bench
 from armcal.bench.clock import SimulatedClock
 from armcal.bench.simulated import BOARD, CLOCK
-from armcal.errors import ArmcalError, InputError, Location
+from armcal.errors import EXIT_BAD_INPUT, ArmcalError, ConfigError, InputError, Location, PluginError
+from armcal.run.experiment import Experiment
 
 _STARTED_IN_S = 60.0
 _ENDED_IN_S = 10.0
@@ -24,6 +26,27 @@ def overrides_for(folder: Path) -> tuple[str, ...]:
     """What a configuration must say instead to work with the simulated bench in a folder."""
     there = folder.absolute()
     return (f"bench.clock={{simulated: {there / CLOCK}}}", f"bench.link.port={there / BOARD}")
+
+
+def port_instead_of_adapter(experiment: Experiment) -> tuple[str, ...]:
+    """What it must say besides, if its link names an adapter: simulated ones have no serial number.
+
+    Raises:
+        ConfigError: its link has no serial port, or there is no bench.
+    """
+    link = Bench.of(experiment).settings.link or {}
+    try:
+        component = experiment.registry.find("link", str(link.get("type")))
+    except PluginError:
+        return ()  # whoever builds it says so, and where
+    settings = getattr(component.load(), "Settings", None)
+    if "port" not in getattr(settings, "model_fields", ("port",)):
+        raise ConfigError(
+            f"found the link {component.name}, expected one with a serial port: simulated boards have nothing else.",
+            where=experiment.source.where((SECTION, "link")),
+            hint=f"Rehearse with the link of the simulated firmware: --set {SECTION}.link='{{type: framed}}'.",
+        )
+    return (f"{SECTION}.link.serial_number=null",) if "serial_number" in link else ()
 
 
 @contextmanager
@@ -79,9 +102,9 @@ def _wait_for(process: subprocess.Popen[bytes], folder: Path, said: Path) -> Non
     until = time.monotonic() + _STARTED_IN_S
     while time.monotonic() < until:
         if process.poll() is not None:
-            raise ArmcalError(
-                "the simulated bench ended before it began: " + said.read_text(encoding="utf-8").strip()[-2000:],
-            )
+            fault = InputError if process.returncode == EXIT_BAD_INPUT else ArmcalError
+            words = said.read_text(encoding="utf-8").strip()[-2000:]
+            raise fault(f"the simulated bench ended before it began: {words}")
         if (folder / CLOCK).exists():
             try:
                 SimulatedClock(folder / CLOCK).close()

@@ -73,7 +73,9 @@ def opened_log(folder: Path, start: Start, header: Mapping[str, Any]) -> Iterato
         there = False
     if there and start == "anew":
         raise InputError(
-            "it holds a measuring run already.", where=where, hint="Go on with it by --resume, or give another --out."
+            "it holds a measuring run already.",
+            where=where,
+            hint="Give another --out, or go on with it: armcal acquire --resume.",
         )
     if start == "resume" and not there:
         raise InputError("it holds no run to resume.", where=where, hint="Leave --resume out to begin one.")
