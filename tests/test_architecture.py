@@ -301,9 +301,12 @@ ORDER = [
     "armcal.bench.servo.turning",
     "armcal.bench.servo.nominal",
     "armcal.bench.servo.settings",
+    "armcal.bench.servo.entries",
     "armcal.bench.servo.record",
     "armcal.bench.servo.angles",
     "armcal.bench.servo.alignment",
+    "armcal.bench.servo.trial",
+    "armcal.bench.servo.mixup",
     "armcal.bench.servo.outcome",
     "armcal.bench.servo.findings",
     "armcal.bench.servo.outputs",
@@ -314,7 +317,6 @@ ORDER = [
     "armcal.bench.servo.automatic",
     "armcal.bench.servo.keys",
     "armcal.bench.servo.guided",
-    "armcal.bench.servo.trial",
     "armcal.bench.servo.session",
 ]
 """Lowest first. ``report``, ``testing`` and ``cli`` stand above all of these, in that order."""

@@ -22,6 +22,8 @@ from tests.servo_fakes import config_in, setup_on
 
 SERVO = "bench:\n  servo: {joints: [q1, q3], approach: 4 deg}\n"
 TRUE_US = {"q1": (604.0, 1533.0, 2491.0), "q3": (650.0, 1560.0, 2420.0)}
+STATED = {"board": "front", "channel": 0, "oscillator_hz": 25e6, "prescale": 121}
+STATED |= {"angles": [-1.0, 1.0], "pulses": [1e-3, 2e-3]}
 KNOTS = (-100.0, 0.0, 100.0)
 
 
@@ -67,7 +69,7 @@ def test_somebody_who_knows_the_angles_finds_the_tables(tmp_path, monkeypatch):
     assert outcome.zero == "measured"
     for joint, pulses in TRUE_US.items():
         found = outcome.fit.servos[joint]
-        assert 1e6 * np.array(found.pulses) == pytest.approx(pulses, abs=2.6)  # half a count
+        assert 1e6 * np.array(found.pulses) == pytest.approx(pulses, abs=3.7)  # half a count, and on to the end
     changed = improved(setup.file, outcome)
     assert changed.servos["q2"].pulses == setup.file.servos["q2"].pulses
 
@@ -118,7 +120,7 @@ def test_stopped_after_any_angle_and_given_again_it_finds_the_same(tmp_path, mon
 
 def test_a_line_that_is_no_observation_is_refused_with_its_place(tmp_path):
     record = Record(tmp_path)
-    record.append("left_out", {"joint": "q1"})
+    record.append("begun", {"servos": {"q1": STATED}, "base": {"q1": 0.0}})
     record.path.write_bytes(record.path.read_bytes() + b"what\n" + record.path.read_bytes())
     with pytest.raises(DataError, match=r"observations.jsonl:2"):
         Record(tmp_path)

@@ -115,8 +115,9 @@ def _stoppable(voice: Voice, action: Callable[[], None]) -> None:
     try:
         action()
     except StoppedError as stop:
+        arm = f"{stop.arm[:1].upper()}{stop.arm[1:]}"
         voice.err.print(
-            f"stopped: {stop}. The arm holds, and what was measured is kept: give the same command again to go on.",
+            f"stopped: {stop}. {arm}, and what was measured is kept: give the same command again to go on.",
             markup=False,
             soft_wrap=True,
         )

@@ -17,6 +17,10 @@ from armcal.bench.servo.settings import ServoCalibrationSettings
 from armcal.bench.servo.turning import NoTurnError, Turning, mean_angle, turning_of_positions, turning_of_rotations
 
 _LEAST_SEEN_M = 1e-4
+_FARTHEST_AXIS = math.radians(30.0)
+_MOST_OFF_AXIS = math.radians(10.0)
+"""Springs, and axes that are not as drawn, give less."""
+_CHECK_IT = "is another servo on its channel? Look with armcal servo --check"
 Entry = Mapping[str, Any]
 
 
@@ -122,7 +126,9 @@ def _by_rotations(
 ) -> Sweeps:
     others = _others(poses, joint)
     rotations = [np.array(e["rotation"]) @ g[:3, :3].T for e, g in zip(poses, given, strict=True)]
-    turning = turning_of_rotations(rotations, nominal.axis(joint, {**others, joint: 0.0})[0])
+    axis = nominal.axis(joint, {**others, joint: 0.0})[0]
+    turning = turning_of_rotations(rotations, axis)
+    _check_axis(turning, axis, turning.off_axis)
     absolute = np.array([nominal.angle_of_rotation(joint, others, r) for r in rotations])
     angles = turning.angles + mean_angle(absolute - turning.angles)
     seen = [_about(e, r, turning.axis) for e, r in zip(poses, rotations, strict=True)]
@@ -134,12 +140,29 @@ def _by_positions(
 ) -> Sweeps:
     others = _others(poses, joint)
     positions = np.array([np.array(e["position"]) - g[:3, 3] for e, g in zip(poses, given, strict=True)])
-    turning = turning_of_positions(positions, nominal.axis(joint, {**others, joint: 0.0})[0], settings.least_radius)
+    axis = nominal.axis(joint, {**others, joint: 0.0})[0]
+    turning = turning_of_positions(positions, axis, settings.least_radius)
     radius = turning.radius or math.inf
+    _check_axis(turning, axis, turning.off_axis / radius)
     absolute = np.array([nominal.angle_of_position(joint, others, p) for p in positions])
     angles = turning.angles + mean_angle(absolute - turning.angles)
     seen = [max(_rms([d or 0.0 for d in e["deviations"][:3]]), _LEAST_SEEN_M) / radius for e in poses]
     return Sweeps(tuple(poses), angles, np.hypot(seen, settings.rotation_sd), "position", turning)
+
+
+def _check_axis(turning: Turning, axis: Array, off_axis: float) -> None:
+    """Whether it is this joint that turned.
+
+    Raises:
+        NoTurnError: it is not.
+    """
+    apart = math.acos(min(abs(float(turning.axis @ axis)), 1.0))
+    if apart > _FARTHEST_AXIS:
+        raise NoTurnError(
+            f"the tool turned about an axis that is {math.degrees(apart):.0f} deg from this joint's: {_CHECK_IT}"
+        )
+    if off_axis > _MOST_OFF_AXIS:
+        raise NoTurnError(f"the tool did not turn about one axis (it is {math.degrees(off_axis):.0f} deg off it)")
 
 
 def _about(entry: Entry, rotation: Array, axis: Array) -> float:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,10 +18,20 @@ from armcal.bench.servo.warmth import Warmth
 from armcal.bench.settling import Settled
 
 _MOST_FAULTS = 10
+_MOST_RESTLESS = 3
 _LOOKED_AT_EVERY_S = 1.0
+_WARM = "a servo had to rest before the tracker was back"
 
 Told = Callable[[str, int, int], None]
 """Told the joint, and how many of its points are done and planned."""
+
+
+class OutOfSightError(StoppedError):
+    """The tracker stays away."""
+
+
+class RestlessError(StoppedError):
+    """Time after time the arm does not come to stand: a servo stalls, or has let go."""
 
 
 @dataclass
@@ -35,31 +45,49 @@ class Automatic:
     told: Told
     warmth: Warmth
     faults: int = 0
+    restless: int = 0
+    first: int = 0
 
     def run(self) -> None:
         """Measure all that is left; the arm ends in its base pose.
 
         Raises:
-            StoppedError: it was asked for, or the tracker stays away; the arm holds.
+            StoppedError: it was asked for, and the arm holds; or the tracker stays away, or the arm does not come to
+                stand: then it is in its base pose.
             DeviceError: the device is gone and does not come back.
         """
-        if not any(left(sweep(self.setup, self.mover, joint), self.record.entries) for joint in self.setup.joints):
+        try:
+            self._run()
+        except (OutOfSightError, RestlessError):
+            # Nobody may be there for hours, and it could hold a heavy pose.
+            self._persist(lambda: to_base(self.setup, self.mover))
+            raise
+
+    def _run(self) -> None:
+        self.first = len(self.record.entries)
+        if not any(left(sweep(self.setup, self.mover, joint), self._done) for joint in self.setup.joints):
             return
         self._persist(lambda: to_base(self.setup, self.mover))
         self.mover.guard(self.setup.base)
         for joint in self.setup.joints:
             points = sweep(self.setup, self.mover, joint)
-            for point in left(points, self.record.entries):
+            for point in left(points, self._done):
                 self._persist(lambda at=point: self._measure(at))  # type: ignore[misc]
-                self.told(joint, len(points) - len(left(points, self.record.entries)), len(points))
+                self.told(joint, len(points) - len(left(points, self._done)), len(points))
             self._persist(lambda: to_base(self.setup, self.mover))
         self.mover.guard({})
+
+    @property
+    def _done(self) -> list[Mapping[str, Any]]:
+        """Lines of points that are not to be measured now; what an earlier run left out is tried once more."""
+        lines = enumerate(self.record.entries)
+        return [line for i, line in lines if i >= self.first or line["kind"] != LEFT_OUT]
 
     def capture(self) -> Settled | str:
         """Where the tool stands, once it does; or why that is not known.
 
         Raises:
-            StoppedError: the tracker has told nothing of use for too long.
+            OutOfSightError: the tracker has told nothing of use for too long.
         """
         settings = self.setup.bench.settings.acquisition
         self.eyes.begin()
@@ -71,8 +99,11 @@ class Automatic:
                 return found
             seconds, why = self.eyes.trouble()
             if seconds >= settings.lost.park:
-                raise StoppedError(f"the tracker has told nothing for {seconds:.0f} s ({why})")
+                told = f"the tracker has told nothing for {seconds:.0f} s ({why})"
+                raise OutOfSightError(told, "the arm holds its base pose")
             if seconds >= settings.lost.hold:
+                if self.warmth.must_rest:
+                    return _WARM
                 until = self.mover.clock.now() + settings.settle.longest
         return self.eyes.why or "the arm did not come to stand"
 
@@ -89,16 +120,22 @@ class Automatic:
                 self.mover.stand(min(left_s, _LOOKED_AT_EVERY_S))
 
     def _measure(self, point: Point) -> None:
-        self._rest()
-        come_to(self.setup, self.mover, point)
-        found = self.capture()
+        found: Settled | str = _WARM
+        while found == _WARM:
+            self._rest()
+            come_to(self.setup, self.mover, point)
+            found = self.capture()
         here: dict[str, Any] = {"joint": point.joint, "counts": point.counts, "came": point.came}
-        here["at"] = self.mover.clock.wall()
+        here |= {"at": self.mover.clock.wall(), "warmth": self.warmth.by_joint, "told": angles_told(self.mover)}
         if isinstance(found, str):
             self.record.append(LEFT_OUT, {**here, "why": found})
+            self.restless += 1
+            if self.restless >= _MOST_RESTLESS:
+                told = f"{point.joint} did not come to stand {self.restless} times in a row ({found})"
+                raise RestlessError(f"{told}: does a servo stall, or let go?", "the arm is told to hold its base pose")
             return
-        self.record.append(POSE, {**here, **pose_entry(found), "told": angles_told(self.mover)})
-        self.faults = 0
+        self.record.append(POSE, {**here, **pose_entry(found)})
+        self.faults = self.restless = 0
 
     def _persist(self, action: Callable[[], None]) -> None:
         """Do it; when the device fails, do it again once it is back."""

@@ -66,13 +66,19 @@ class Guided:
                 done.add(targets[place].key)
 
     def targets(self) -> list[Target]:
-        """Each joint at its knots, as far as its range goes, once from either side."""
+        """Each joint at its knots, as far as its range leaves room to come from aside, once from either side."""
         found = []
         for joint in self.setup.joints:
-            low, high = self.setup.ranges[joint]
+            low, high = self._inner(joint)
             for angle in sorted({float(np.clip(knot, low, high)) for knot in self.setup.settings.knots}):
                 found += [Target(joint, angle, 1), Target(joint, angle, -1)]
         return found
+
+    def _inner(self, joint: str) -> tuple[float, float]:
+        """The range (rad) less what an angle is come to from aside; its middle where there is no such room."""
+        low, high = self.setup.ranges[joint]
+        margin = min(self.setup.settings.approach, (high - low) / 2)
+        return low + margin, high - margin
 
     def _ask(self, target: Target) -> str:
         """One target: the wish that ended it, ``ok``, ``skip`` or ``back``."""

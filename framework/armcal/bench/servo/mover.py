@@ -27,7 +27,15 @@ class ServoDevice(JointDevice, PulseDevice, Protocol):
 
 
 class StoppedError(Exception):
-    """Somebody asked for the end; the arm holds where it is."""
+    """The end before everything is measured: somebody asked for it, or the tracker stays away.
+
+    Attributes:
+        arm: what the arm does now, in words.
+    """
+
+    def __init__(self, why: str, arm: str = "the arm holds") -> None:
+        super().__init__(why)
+        self.arm = arm
 
 
 @dataclass(frozen=True)
@@ -68,9 +76,11 @@ class Mover:
     motion: Motion
     asked_to_stop: Callable[[], bool]
     look: Callable[[], None] = field(default=lambda: None)
+    identity: DeviceIdentity | None = None
     told: dict[str, int] = field(default_factory=dict)
     came: dict[str, int] = field(default_factory=dict)
     _alive: float = -math.inf
+    _guarded: Mapping[str, float] = field(default_factory=dict)
 
     def open(self) -> DeviceIdentity:
         """Open the device and learn which pulses it makes; nothing moves.
@@ -82,9 +92,11 @@ class Mover:
             raise DeviceRefusedError(
                 "this device cannot set pulses by their length.", hint="Calibrate servos with a device like pca9685."
             )
-        identity = self.device.open(self.clock)
+        self.identity = self.device.open(self.clock)
+        # What the board was told by another run must not be done now: ways home of that time are none today.
+        self.device.guard([], self.motion.rate, self.motion.silence)
         self.told |= self._running()
-        return identity
+        return self.identity
 
     def counts_at(self, joint: str, angle: float) -> int:
         """The counts that the stated table gives for an angle (rad)."""
@@ -93,6 +105,12 @@ class Mover:
     def pulse(self, joint: str, counts: int) -> float:
         """The pulse of so many counts (s), by the stated oscillator."""
         return counts * self.servos[joint][1].tick
+
+    def counts_per_rad(self, joint: str) -> float:
+        """By the stated table, where it is least."""
+        servo, clock = self.servos[joint]
+        slopes = np.abs(np.diff(servo.table.pulses) / np.diff(servo.table.angles))
+        return float(slopes.min() / clock.tick)
 
     def energise(self, joint: str, counts: int) -> None:
         """A joint's first pulse; nothing if it gets pulses already."""
@@ -148,12 +166,22 @@ class Mover:
 
     def guard(self, base: Mapping[str, float]) -> bool:
         """What the board is to do when the host falls silent: back to a pose (rad by joint), slowly."""
+        self._guarded = dict(base)
         return self.device.guard([base] if base else [], self.motion.rate, self.motion.silence)
+
+    def hold(self) -> bool:
+        """The board is to stay where it is when the host falls silent. False: it could not be told, for it is lost."""
+        try:
+            self.guard({})
+        except DeviceError:
+            return False
+        return True
 
     def recover(self, fault: DeviceError) -> None:
         """After a fault of the device: open it again, and let every joint have the pulse that it had.
 
         Raises:
+            StoppedError: it was asked for.
             DeviceError: it does not come back.
         """
         until, last = self.clock.now() + _LONGEST_LOSS_S, fault
@@ -163,20 +191,35 @@ class Mover:
             try:
                 self._taken_up()
                 return
+            except DeviceRefusedError as refused:
+                # Another program or another board may hold the port for a while.
+                last = DeviceError(str(refused))
             except DeviceError as again:
                 last = again
         raise last
 
     def _taken_up(self) -> None:
         before = dict(self.told)
-        self.device.open(self.clock)
+        self._same(self.device.open(self.clock))
+        # No way home is known while joints hang free.
+        self.device.guard([], self.motion.rate, self.motion.silence)
         running = self._running()
+        self.told |= running
+        self.came.clear()
         for joint in before:
-            if joint in running:
-                self.told[joint] = running[joint]
-            else:
+            if joint not in running:
                 self._set(joint, before[joint])
-                self.clock.sleep(_BETWEEN_JOINTS_S)
+                self.stand(_BETWEEN_JOINTS_S)
+        if self._guarded:
+            self.guard(self._guarded)
+
+    def _same(self, found: DeviceIdentity) -> None:
+        begun = self.identity
+        if begun is not None and (found.digest, found.name) != (begun.digest, begun.name):
+            raise DeviceRefusedError(
+                f"found {found.name}, expected {begun.name}, with which the calibration began.",
+                hint="Connect the board that it began with.",
+            )
 
     def _running(self) -> dict[str, int]:
         """The counts of the joints that get pulses."""
@@ -187,12 +230,9 @@ class Mover:
         self.check(joint, counts)
         self.device.set_pulse(joint, self.pulse(joint, counts))
         self.told[joint] = counts
-        self._alive = self.clock.now()
 
     def _counts_per_s(self, joint: str) -> float:
-        servo, clock = self.servos[joint]
-        slopes = np.abs(np.diff(servo.table.pulses) / np.diff(servo.table.angles))
-        return float(self.motion.rate * slopes.min() / clock.tick)
+        return self.motion.rate * self.counts_per_rad(joint)
 
     def _pause(self, seconds: float) -> None:
         self._stop_if_asked()

@@ -13,6 +13,7 @@ from armcal.bench.servo.alignment import Alignment, aligned, begin, seat_of, shi
 from armcal.bench.servo.angles import Entry, Springs, Sweeps, sweeps_of, told_by
 from armcal.bench.servo.fit import ServoFit, fit_servos
 from armcal.bench.servo.known import KnownBoard, KnownServo, Zero, interpolated
+from armcal.bench.servo.mixup import mixed_up
 from armcal.bench.servo.nominal import NominalArm
 from armcal.bench.servo.settings import ServoCalibrationSettings
 from armcal.bench.servo.unknowns import FitTask
@@ -56,7 +57,7 @@ def outcome_of(
 
     One whose angles scatter as no servo's do is left out: it has let go, and would spoil what is found of the springs.
     """
-    left_out: dict[str, str] = {}
+    left_out = mixed_up(entries, [servo.joint for servo in servos], nominal)
     while True:
         found = _fitted(entries, [s for s in servos if s.joint not in left_out], boards, nominal, settings)
         worst = max(found.fit.servos.values(), key=lambda servo: servo.scatter, default=None)

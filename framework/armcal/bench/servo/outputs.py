@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import math
 from collections.abc import Mapping, Sequence
@@ -33,7 +34,9 @@ def improved(file: ServoFile, outcome: Outcome, adapter: str = "") -> ServoFile:
     for joint, servo in file.servos.items():
         found = outcome.fit.servos.get(joint)
         if found is not None and found.known.trusted_sd is None and is_usable(found):
-            table = {"angles": found.angles, "pulses": tuple(round(p, 9) for p in found.pulses)}
+            # Counts stay what they are: the file's board may have another oscillator than that of the record.
+            same = outcome.fit.clocks[servo.board].oscillator_hz / boards[servo.board].oscillator_hz
+            table = {"angles": found.angles, "pulses": tuple(round(p * same, 9) for p in found.pulses)}
         elif found is not None and found.known.trusted_sd is not None:
             table = {"angles": servo.angles, "pulses": servo.pulses}
         else:
@@ -55,9 +58,12 @@ def write_servo_file(path: Path, file: ServoFile) -> Path | None:
     """
     text = servo_file_text(file).encode()
     try:
+        path = path.resolve()  # of a link, what it leads to
         before = path.read_bytes()
         if before == text:
             return None
+        if not path.stat().st_mode & 0o222:
+            raise PermissionError(errno.EACCES, "it is read-only")
         kept = _next_name(path)
         write_whole(REAL_FILES, kept, before)
         write_whole(REAL_FILES, path, text)

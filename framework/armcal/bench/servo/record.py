@@ -7,20 +7,22 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from armcal.bench.servo.entries import ANGLE as ANGLE
+from armcal.bench.servo.entries import BEGUN as BEGUN
+from armcal.bench.servo.entries import LEFT_OUT as LEFT_OUT
+from armcal.bench.servo.entries import POSE as POSE
+from armcal.bench.servo.entries import fault_of
 from armcal.errors import DataError, InputError, Location
 from armcal.online.journal.files import REAL_FILES, opened
 
 NAME = "observations.jsonl"
-BEGUN, POSE, ANGLE, LEFT_OUT = "begun", "pose", "angle", "left_out"
-"""Kinds of lines."""
-KINDS = (BEGUN, POSE, ANGLE, LEFT_OUT)
 
 
 class Record:
     """The lines of a folder's record; a last line that was cut short is cut off.
 
     Raises:
-        DataError: another line is not one of ours.
+        DataError: another line is not one of ours, or damaged.
         InputError: the folder cannot be written.
     """
 
@@ -70,13 +72,13 @@ class Record:
             entry = json.loads(text)
         except ValueError:
             entry = None
-        if not isinstance(entry, dict) or entry.get("kind") not in KINDS:
+        if fault := fault_of(entry, line == 1):
             raise DataError(
-                "found a line that is not an observation.",
+                f"found {fault}.",
                 where=Location(str(self.path), line=line),
-                hint="Give another --out, or remove this line.",
+                hint="Give another --out." if line == 1 else "Give another --out, or remove this line.",
             )
-        return entry
+        return dict(entry)
 
 
 def _unwritable(path: Path, fault: OSError) -> InputError:

@@ -20,7 +20,7 @@ from armcal.bench.servo.keys import QUIT, Wishes
 from armcal.bench.servo.known import KnownBoard, KnownServo
 from armcal.bench.servo.mover import Motion, Mover, ServoDevice, StoppedError
 from armcal.bench.servo.outcome import Outcome, outcome_of
-from armcal.bench.servo.record import BEGUN, Record
+from armcal.bench.servo.record import BEGUN, POSE, Record
 from armcal.bench.servo.setup import Setup
 from armcal.bench.servo.sweep import angles_told, to_base
 from armcal.bench.servo.trial import Move, Verdict, answered, judged, wrapped
@@ -28,7 +28,9 @@ from armcal.bench.servo.warmth import Warmth
 from armcal.errors import InputError, Location
 
 _FIRST_FRAME_S = 3.0
+_SAME = 1e-6
 _LOOK_S = 0.1
+_AS_IT_IS = "its pulses go on as they are, unless the board brings the arm to its base pose"
 
 
 @dataclass(frozen=True)
@@ -65,7 +67,7 @@ def measure(setup: Setup, folder: Path, talk: Conversation, how: str) -> None:
                 Guided(setup, mover, wishes, record, talk.say).run()
             return
         with _eyes(setup, mover) as eyes:
-            look = Automatic(setup, mover, eyes, record, talk.told, _cooling(setup, mover))
+            look = Automatic(setup, mover, eyes, record, talk.told, _cooling(setup, mover, record))
             mover.look = look.look
             look.run()
 
@@ -140,8 +142,9 @@ def _opened(setup: Setup, clock: Clock, talk: Conversation, record: Record | Non
         if free and not talk.may_energise(free):
             raise InputError("the joints may not be energised; nothing was moved.", hint="Say yes, or give --yes.")
         yield mover
-    except StoppedError:
-        mover.guard({})
+    except StoppedError as stop:
+        if not mover.hold():
+            raise StoppedError(f"{stop}, while the board was lost", _AS_IT_IS) from stop
         raise
     finally:
         device.close()
@@ -177,8 +180,8 @@ def _warmth(setup: Setup, mover: Mover) -> Warmth:
     return Warmth(setup.heat, tuple(setup.bench.arm.commanded), setup.base, mover.clock)
 
 
-def _cooling(setup: Setup, mover: Mover) -> Warmth:
-    """The same, where the servos may have to rest.
+def _cooling(setup: Setup, mover: Mover, record: Record) -> Warmth:
+    """From where the record's last line left it, where the servos may have to rest.
 
     Raises:
         InputError: one would not cool where it is to rest.
@@ -189,6 +192,9 @@ def _cooling(setup: Setup, mover: Mover) -> Warmth:
             f"the servo of {joint} would not cool in the base pose, by bench.acquisition.heat; nothing was moved.",
             hint="Give bench.servo.base a pose in which it carries less.",
         )
+    last = next((entry for entry in reversed(record.entries) if "warmth" in entry), None)
+    if last is not None:
+        warmth.go_on(last["warmth"], angles_told(mover), mover.clock.wall() - float(last["at"]))
     return warmth
 
 
@@ -200,6 +206,21 @@ def _begin(setup: Setup, record: Record, device: DeviceIdentity) -> None:
         told = {"device": device.name, "adapter": device.adapter}
         record.append(BEGUN, {"servos": servos, **told, "base": dict(setup.base)})
         return
+    adapter = str(begun[0].get("adapter", ""))
+    if adapter and device.adapter and adapter != device.adapter:
+        raise InputError(
+            f"it was begun with the adapter {adapter!r}, found {device.adapter!r}.",
+            where=Location(str(record.path)),
+            hint="Connect the one that it was begun with, or give a new --out.",
+        )
+    moved = [joint for joint, angle in setup.base.items() if abs(begun[0]["base"].get(joint, angle) - angle) > _SAME]
+    if moved and record.of_kind(POSE):
+        raise InputError(
+            f"it was begun with another base pose: {moved[0]} stood at {_deg(begun[0]['base'][moved[0]])}, not at "
+            f"{_deg(setup.base[moved[0]])}.",
+            where=Location(str(record.path)),
+            hint="Give the base pose that it was begun with, or a new --out.",
+        )
     for joint, stated in servos.items():
         before = begun[0]["servos"].get(joint, {})
         if any(stated[key] != before.get(key) for key in ("board", "channel", "oscillator_hz", "prescale")):
@@ -208,6 +229,10 @@ def _begin(setup: Setup, record: Record, device: DeviceIdentity) -> None:
                 where=Location(str(record.path)),
                 hint="Give a new --out.",
             )
+
+
+def _deg(angle: float) -> str:
+    return f"{math.degrees(angle):.1f} deg"
 
 
 def _as_stated(setup: Setup, joint: str) -> dict[str, Any]:

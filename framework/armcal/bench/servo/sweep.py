@@ -47,8 +47,7 @@ def sweep(setup: Setup, mover: Mover, joint: str) -> list[Point]:
 
 def approach_counts(setup: Setup, mover: Mover, joint: str) -> int:
     """How many counts a joint comes from aside before it is measured; at most what the sweep leaves room for."""
-    at, margin = setup.base[joint], setup.settings.approach
-    return max(abs(mover.counts_at(joint, at + margin) - mover.counts_at(joint, at)) - 1, 1)
+    return max(int(setup.settings.approach * mover.counts_per_rad(joint)) - 1, 1)
 
 
 def left(points: Iterable[Point], entries: Iterable[Mapping[str, Any]]) -> list[Point]:

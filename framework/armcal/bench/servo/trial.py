@@ -22,6 +22,8 @@ _USUAL_M = 0.004
 """How far a move of a few degrees lies from the model's, since arms sag and are not as drawn."""
 _UNCLEAR_M = 0.02
 _EACH_FAULT, _MOST, _UNSURE = 4.0, 100.0, 4.0
+_USUAL_TURN = math.radians(10.0)
+_SURE = 40.0
 _TURN = 2 * math.pi
 
 
@@ -109,6 +111,19 @@ def judged(moves: Sequence[Move], base: Mapping[str, float], nominal: NominalArm
     return [_judged(move, best, near, base, nominal) for move in moves]
 
 
+def exchanged(moves: Sequence[Move], base: Mapping[str, float], nominal: NominalArm) -> dict[str, str]:
+    """Which joints moved instead of which, where that is beyond doubt; see ``judged``."""
+    seen = [move for move in moves if not move.is_little]
+    straight, *others = _wirings(tuple(base))
+    as_meant = _score(straight, seen, base, nominal)
+    if as_meant <= _SURE:
+        return {}
+    best_score, _, best = min((_score(wiring, seen, base, nominal), i, wiring) for i, wiring in enumerate(others))
+    if best_score > as_meant - _SURE:
+        return {}
+    return {move.joint: best.moves[move.joint] for move in seen if best.moves[move.joint] != move.joint}
+
+
 def _wirings(joints: tuple[str, ...]) -> Iterator[_Wiring]:
     """All with up to three joints exchanged and up to two reversed."""
     for count in (0, 2, 3):
@@ -127,7 +142,8 @@ def _score(wiring: _Wiring, seen: Sequence[Move], base: Mapping[str, float], nom
     score = _EACH_FAULT * wiring.faults
     for move in seen:
         turned, off = _explained(move, *axes[wiring.moves[move.joint]])
-        score += min((off / _USUAL_M) ** 2, _MOST)
+        usual = _USUAL_M * max(abs(move.told) / _USUAL_TURN, 1.0)
+        score += min((off / usual) ** 2, _MOST)
         score += _MOST if turned * wiring.signs[move.joint] * move.told < 0 else 0.0
     return score
 

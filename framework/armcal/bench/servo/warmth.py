@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -16,7 +16,7 @@ _COOLED_TO = 0.5
 
 
 class Warmth:
-    """Followed from cold on.
+    """Followed from cold on, or from where another run left it.
 
     Args:
         heat: the servos' model, and the torques that heat them.
@@ -31,6 +31,20 @@ class Warmth:
         (self._model, self._torques), self._joints, self._clock = heat, joints, clock
         self._warmth, self._since = self._model.cold, clock.now()
         self._base = self._pose(base)
+
+    def go_on(self, before: Mapping[str, Sequence[float]], standing: Mapping[str, float], seconds: float) -> None:
+        """From another run's warmth (winding and case, by joint), after which joints stood at angles (rad) for so long.
+
+        Joints that are not among these angles hang free, and cool.
+        """
+        self._warmth = np.array([before.get(joint, (0.0, 0.0)) for joint in self._joints], dtype=float)
+        held = np.array([joint in standing for joint in self._joints])
+        self._warmth = self._model.after(self._warmth, self._torques(self._pose(standing)) * held, max(seconds, 0.0))
+
+    @property
+    def by_joint(self) -> dict[str, list[float]]:
+        """Of winding and case, by joint."""
+        return dict(zip(self._joints, self._warmth.tolist(), strict=True))
 
     def pass_to_now(self, angles: Mapping[str, float]) -> None:
         """The servos have stood at these angles (rad) since the last call."""

@@ -1,0 +1,425 @@
+"""Servo calibrations at their worst: the arm is never unsafe, nothing measured is lost, no wrong table is written."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from contextlib import nullcontext
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from armcal.bench.acquisition.heat import HeatModel
+from armcal.bench.device import DeviceIdentity
+from armcal.bench.faults import DeviceError
+from armcal.bench.servo.mover import Motion, Mover, StoppedError
+from armcal.bench.servo.outputs import improved, write_servo_file
+from armcal.bench.servo.record import NAME, Record
+from armcal.bench.servo.session import Conversation, evaluated, measure
+from armcal.bench.servo.setup import Setup
+from armcal.bench.servo.warmth import Warmth
+from armcal.config.servo_file import BoardSettings, ServoFile, load_servo_file
+from armcal.errors import ArmcalError, DataError, InputError
+
+from tests.bench_fakes import FakeClock
+from tests.framework.test_acquire_faults import faults
+from tests.servo_fakes import CONFIGS, config_in, setup_on
+from tests.servo_runs import SETS, ServoRun
+
+QUICK, MANY = 2, 150
+SECONDS = 50.0
+"""What a calibration takes when nothing goes wrong."""
+KINDS = ("drop", "duplicate", "reorder", "flip", "split", "unplug", "reset", "brown_out", "nack", "stuck")
+KINDS += ("lost", "silent", "frozen", "stall", "asked", "kill")
+UNCHECKED = tuple(kind for kind in KINDS if kind not in ("reorder", "flip", "split"))
+"""What a link without checksums survives."""
+AGREE_US = 4.0
+"""Counts of 4.9 us, and play taken up from energising in another pose."""
+
+
+@pytest.fixture(scope="module")
+def done(tmp_path_factory: pytest.TempPathFactory) -> ServoRun:
+    """One that nothing disturbed."""
+    run = ServoRun(tmp_path_factory.mktemp("undisturbed"))
+    with run.run.simulated() as clock:
+        run.measure()
+        state = clock.ask({"state": True})
+    assert state["offences"] == {} and state["violations"] == 0
+    return run
+
+
+@pytest.fixture(scope="module")
+def undisturbed(done: ServoRun) -> dict[str, np.ndarray]:
+    return done.pulses()
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> ServoRun:
+    return ServoRun(tmp_path)
+
+
+class Troubled:
+    """One calibration through random troubles, gone on with until it is done."""
+
+    def __init__(self, run: ServoRun, seed: int, kinds: tuple[str, ...]) -> None:
+        self.run, self.random = run, np.random.default_rng(seed)
+        self.units = ("frames", "bytes") if "flip" in kinds else ("frames",)
+        self.kinds = [str(k) for k in self.random.choice(kinds, int(self.random.integers(1, 4)), replace=False)]
+        self.said: list[str] = []
+
+    def go(self) -> dict[str, Any]:
+        """Through the troubles and to the end; gives the bench's own account."""
+        with self.run.run.simulated() as clock:
+            for kind in self.kinds:
+                if kind not in ("stall", "asked", "kill"):
+                    for fault in faults(self.random, kind, self.units):
+                        clock.ask({"fault": fault})
+            if "kill" in self.kinds:
+                self.run.measure_until_killed(int(self.random.integers(3, 1200)))
+                clock.ask({"advance": float(self.random.uniform(0, 8))})
+            self._once(self._asked(clock))
+            for _ in range(6):
+                if self.said[-1] == "done":
+                    break
+                clock.ask({"advance": 12.0})
+                self._once(lambda: False)
+            return clock.ask({"state": True})
+
+    def _once(self, asked: Callable[[], bool]) -> None:
+        try:
+            self.run.measure(asked)
+            self.said.append("done")
+        except (StoppedError, DeviceError, ArmcalError) as end:
+            self.said.append(f"{type(end).__name__}: {end}")
+
+    def _asked(self, clock: Any) -> Callable[[], bool]:
+        when, stall, seen = int(self.random.uniform(50, 1200)), int(self.random.uniform(50, 1200)), [0]
+        seconds = float(self.random.uniform(0.5, 12))
+
+        def asked() -> bool:
+            seen[0] += 1
+            if "stall" in self.kinds and seen[0] == stall:
+                clock.ask({"advance": seconds})
+            return "asked" in self.kinds and seen[0] > when
+
+        return asked
+
+
+def judge(run: ServoRun, seed: int, undisturbed: dict[str, np.ndarray], kinds: tuple[str, ...] = KINDS) -> None:
+    troubled = Troubled(run, seed, kinds)
+    state = troubled.go()
+    told = f"seed {seed}, {troubled.kinds}: {troubled.said}"
+    assert state["offences"] == {}, f"{told}: {state['offences']}"
+    assert state["failed"] == [], told
+    assert troubled.said[-1] == "done", told
+    lines = [(e["joint"], e["counts"], e["came"]) for e in run.rows() if "counts" in e]
+    assert len(lines) == len(set(lines)) == 12, told
+    left_out = {(e["joint"], e["why"]) for e in run.entries("left_out")}
+    assert not left_out, f"{told}, {left_out}"
+    for joint, pulses in run.pulses().items():
+        assert np.abs(pulses - undisturbed[joint]).max() < AGREE_US, f"{told}, {joint}: {pulses - undisturbed[joint]}"
+
+
+@pytest.mark.parametrize("seed", range(QUICK))
+def test_random_troubles_never_make_the_arm_unsafe(run: ServoRun, undisturbed: Any, seed: int) -> None:
+    judge(run, seed, undisturbed)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(QUICK, MANY))
+def test_many_random_troubles_never_make_the_arm_unsafe(run: ServoRun, undisturbed: Any, seed: int) -> None:
+    judge(run, seed, undisturbed)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(40))
+def test_a_link_without_checksums_survives_all_but_damage(tmp_path: Path, undisturbed: Any, seed: int) -> None:
+    link = ("bench.link.type=firmata", "bench.simulator.firmware=firmata")
+    judge(ServoRun(tmp_path, (*SETS, *link)), seed, undisturbed, UNCHECKED)
+
+
+def drawn(state: dict[str, Any]) -> dict[str, float]:
+    """The angles that the pulses ask for, by the true tables (deg)."""
+    return {joint: float(np.degrees(s["target_rad"])) for joint, s in state["joints"].items()}
+
+
+class TestRecovery:
+    def test_a_board_that_drove_by_itself_while_the_host_stalled(self, run: ServoRun, undisturbed: Any) -> None:
+        looks = [0]
+        with run.run.simulated() as clock:
+
+            def asked() -> bool:
+                looks[0] += 1
+                if looks[0] in (300, 520):
+                    clock.ask({"advance": 6.0})
+                return False
+
+            run.measure(asked)
+            assert clock.ask({"state": True})["offences"] == {}
+        assert all(np.abs(pulses - undisturbed[joint]).max() < AGREE_US for joint, pulses in run.pulses().items())
+
+    def test_after_a_brown_out_the_board_is_told_the_way_home_again(self, run: ServoRun) -> None:
+        """It had forgotten it: an arm whose host is killed later would be left where it is."""
+        with run.run.simulated() as clock:
+            clock.ask({"fault": {"kind": "brown_out", "at": 12}})
+            killed = run.measure_until_killed(600)
+            before = clock.ask({"state": True})
+            assert killed and before["now"] > 20
+            clock.ask({"advance": 12.0})
+            state = clock.ask({"state": True})
+        assert state["offences"] == {}
+        assert drawn(state)["q3"] == pytest.approx(0.0, abs=2.5) and drawn(state)["q5"] == pytest.approx(0.0, abs=2.5)
+        assert max(abs(drawn(before)[joint]) for joint in ("q3", "q5")) > 5
+
+    @pytest.mark.slow
+    def test_a_way_home_of_an_earlier_run_is_not_gone_while_somebody_thinks(self, run: ServoRun) -> None:
+        with run.run.simulated() as clock:
+            assert run.measure_until_killed(500)
+            clock.ask({"fault": {"kind": "brown_out"}})
+
+            def thinks(joints: tuple[str, ...]) -> bool:
+                clock.ask({"advance": 20.0})
+                return True
+
+            measure(run.setup(), run.out, run.talk(may=thinks), "automatic")
+            assert clock.ask({"state": True})["offences"] == {}
+        assert len(run.entries("pose")) == 12
+
+    def test_another_board_that_is_plugged_in_meanwhile_is_not_moved(self, tmp_path: Path, monkeypatch: Any) -> None:
+        setup, device, _ = setup_on(monkeypatch, config_in(tmp_path, "bench:\n  servo: {joints: [q1]}\n"))
+        device.lost_at = {12}
+        opened = device.open
+
+        def other(clock: Any) -> DeviceIdentity:
+            opened(clock)
+            return DeviceIdentity("fake" if device.opened == 1 else "another", "d1")
+
+        monkeypatch.setattr(device, "open", other)
+        mover = Mover(device, *_of_mover(setup))
+        mover.open()
+        calls = []
+        with pytest.raises(DeviceError, match="found another, expected fake"):
+            for joint, angle in setup.base.items():
+                mover.energise(joint, mover.counts_at(joint, angle))
+            try:
+                mover.go("q1", mover.told["q1"] + 50)
+            except DeviceError as fault:
+                calls.append(device.calls)
+                mover.recover(fault)
+        assert device.calls == calls[0]
+
+    def test_stopped_while_the_board_is_gone_it_does_not_say_that_the_arm_holds(self, run: ServoRun) -> None:
+        with run.run.simulated() as clock:
+            clock.ask({"fault": {"kind": "unplug", "at": 12}})
+            with pytest.raises(StoppedError) as stop:
+                run.measure(lambda: clock.ask({"state": True})["now"] > 15)
+            assert "unless the board" in stop.value.arm and "lost" in str(stop.value)
+
+
+class TestTracker:
+    @pytest.mark.slow
+    def test_one_that_stays_away_leaves_the_arm_in_its_base_pose(self, run: ServoRun) -> None:
+        """Where it may stay: nobody looks after the heat of an arm that was left alone."""
+        with run.run.simulated() as clock:
+            clock.ask({"fault": {"kind": "lost", "at": 15}})
+            with pytest.raises(StoppedError, match="told nothing") as stop:
+                run.measure()
+            state = clock.ask({"state": True})
+            assert "base pose" in stop.value.arm and state["offences"] == {}
+            assert drawn(state)["q3"] == pytest.approx(0.0, abs=2.5)
+            clock.ask({"fault": {"kind": "seen"}})
+            run.measure()
+        assert len(run.entries("pose")) == 12 and not run.entries("left_out")
+
+    @pytest.mark.slow
+    def test_servos_rest_while_it_is_waited_for(self, run: ServoRun) -> None:
+        heat = ("bench.acquisition.heat={q2: {continuous_Nm: 1.5, winding_time_s: 5, case_time_s: 9, budget: 0.9}}",)
+        setup = run.setup(*heat, "bench.acquisition.lost.park_s=60", "bench.servo.joints=[q2]")
+        rests: list[float] = []
+        stand = Mover.stand
+        with run.run.simulated() as clock, pytest.MonkeyPatch.context() as patch:
+            patch.setattr(Mover, "stand", lambda mover, s: (rests.append(s), stand(mover, s))[1])
+            clock.ask({"fault": {"kind": "lost", "at": 15}})
+            with pytest.raises(StoppedError, match="told nothing"):
+                run.measure(setup=setup)
+            assert clock.ask({"state": True})["offences"] == {}
+        assert rests
+
+    def test_warmth_outlasts_the_program(self, run: ServoRun) -> None:
+        heat = HeatModel(np.array([1.0]), np.array([[20.0, 300.0]]), np.array([[0.3, 0.7]]), np.array([0.6]))
+        clock = FakeClock()
+        warm = Warmth((heat, lambda pose: 2.0 * np.abs(pose)), ("q1",), {"q1": 0.0}, clock)
+        warm.go_on({"q1": [0.9, 0.5]}, {"q1": 0.0}, 0.0)
+        assert warm.must_rest
+        warm.go_on({"q1": [0.9, 0.5]}, {"q1": 0.0}, 3600.0)
+        assert not warm.must_rest
+        warm.go_on({"q1": [0.9, 0.5]}, {"q1": 1.0}, 3600.0)
+        assert warm.must_rest  # it held something heavy meanwhile
+        warm.go_on({"q1": [0.9, 0.5]}, {}, 3600.0)
+        assert not warm.must_rest  # it hung free
+        warm.go_on({"q1": [0.9, 0.5]}, {"q1": 0.0}, -1e9)
+        assert warm.must_rest  # by a wall clock that was set back
+
+
+def _of_mover(setup: Setup) -> tuple[Any, ...]:
+    read_by = {joint: (setup.known(joint), setup.file.boards["front"].clock) for joint in setup.base}
+    clock = FakeClock()
+    return clock, read_by, read_by, Motion(0.3, 0.02, setup.settings.pulses), lambda: False
+
+
+def test_guided_nothing_goes_beyond_the_range(tmp_path: Path, monkeypatch: Any) -> None:
+    """Not even where an angle at its end is come to from aside."""
+    config = config_in(tmp_path, "bench:\n  servo: {joints: [q1, q5], ranges: {q1: [-60 deg, 60 deg]}}\n")
+    setup, device, _ = setup_on(monkeypatch, config)
+
+    class Content:
+        def next(self, seconds: float) -> str:
+            return "ok"
+
+    talk = Conversation(lambda: False, lambda j: True, lambda *t: None, lambda t: None, lambda: nullcontext(Content()))
+    measure(setup, tmp_path / "out", talk, "guided")
+    for joint in ("q1", "q5"):
+        servo = setup.file.calibrated(joint)
+        low, high = np.degrees(setup.ranges[joint])
+        angles = [float(np.degrees(servo.table.angle(c * servo.clock.tick))) for j, c, _ in device.log if j == joint]
+        assert low - 0.3 < min(angles) < low + 1 and high - 1 < max(angles) < high + 0.3
+
+
+class TestRecord:
+    def damaged(self, done: ServoRun, folder: Path, line: int, change: Callable[[dict[str, Any]], None]) -> Path:
+        rows = done.rows()
+        change(rows[line])
+        (folder / NAME).write_text("".join(json.dumps(row) + "\n" for row in rows))
+        return folder
+
+    @pytest.mark.parametrize(
+        ("key", "value"),
+        [
+            ("joint", None),
+            ("counts", 307.5),
+            ("counts", 99999),
+            ("came", 0),
+            ("position", [0.1, 0.2]),
+            ("position", [0.1, float("nan"), 0.2]),
+            ("rotation", [[1, 0, 0], [0, 1, 0], [0, 0, 2]]),
+            ("rotation", [[1, 0, 0], [0, 1, 0]]),
+            ("rotation", "what"),
+            ("deviations", [None] * 5),
+            ("told", {"q1": "x"}),
+            ("told", None),
+            ("kind", "begun"),
+            ("kind", ["pose"]),
+            ("at", None),
+            ("warmth", {"q1": [1]}),
+        ],
+    )
+    def test_a_line_that_was_damaged_is_refused_with_its_place(
+        self, done: ServoRun, tmp_path: Path, key: str, value: Any
+    ) -> None:
+        folder = self.damaged(done, tmp_path, 4, lambda row: row.update({key: value}))
+        with pytest.raises(DataError, match=rf"{NAME}:5"):
+            Record(folder)
+
+    def test_so_is_one_of_which_a_part_is_gone(self, done: ServoRun, tmp_path: Path) -> None:
+        for key in ("joint", "counts", "came", "position", "rotation", "deviations", "told", "at"):
+            with pytest.raises(DataError, match=rf"{NAME}:5"):
+                Record(self.damaged(done, tmp_path, 4, lambda row, key=key: row.pop(key)))  # type: ignore[misc]
+
+    def test_so_is_any_bit_that_makes_it_no_line(self, done: ServoRun, tmp_path: Path) -> None:
+        whole = bytearray((done.out / NAME).read_bytes())
+        random = np.random.default_rng(1)
+        for _ in range(200):
+            bad = bytearray(whole)
+            bad[int(random.integers(len(bad)))] ^= 1 << int(random.integers(8))
+            (tmp_path / NAME).write_bytes(bad)
+            try:
+                evaluated_entries = Record(tmp_path).entries
+            except DataError as fault:
+                assert fault.where is not None and fault.where.line
+            else:
+                assert len(evaluated_entries) >= len(done.rows()) - 1
+
+    def test_without_its_beginning_nobody_knows_by_which_tables_it_was_measured(
+        self, done: ServoRun, tmp_path: Path
+    ) -> None:
+        (tmp_path / NAME).write_text("".join(json.dumps(row) + "\n" for row in done.rows()[1:]))
+        with pytest.raises(DataError, match="by which tables"):
+            Record(tmp_path)
+
+    def test_another_base_pose_or_adapter_is_refused_and_other_steps_are_not(self, done: ServoRun) -> None:
+        with done.run.simulated() as clock:
+            with pytest.raises(InputError, match=r"another base pose: q2 stood at -50.0 deg, not at -40.0 deg"):
+                done.measure(setup=done.setup("bench.servo.base={q2: -40 deg}"))
+            rows = done.rows()
+            rows[0]["adapter"] = "LRM-2"
+            (done.out / NAME).write_text("".join(json.dumps(row) + "\n" for row in rows))
+            with pytest.raises(InputError, match="adapter 'LRM-2', found 'LRM-1'"):
+                done.measure()
+            assert clock.ask({"state": True})["events"].get("first_pulse", 0) == 0
+            rows[0]["adapter"] = "LRM-1"
+            (done.out / NAME).write_text("".join(json.dumps(row) + "\n" for row in rows))
+            before = done.pulses()
+            done.measure(setup=done.setup("bench.servo.step_deg=92", "bench.servo.knots_deg=[-100, 0, 100]"))
+        assert done.rows()[: len(rows)] == rows
+        assert all(np.abs(before[joint] - pulses).max() < AGREE_US for joint, pulses in done.pulses().items())
+
+
+class TestTables:
+    @pytest.mark.slow
+    def test_a_joint_that_cannot_lift_its_load_ends_it_before_anything_burns(self, tmp_path: Path) -> None:
+        sets = [s for s in SETS if "joints" not in s and "ranges" not in s and "step" not in s]
+        weak = "bench.simulator.joints.q2={stall_Nm: 1.2, backlash_deg: 0.1}"
+        run = ServoRun(tmp_path, (*sets, "bench.servo.joints=[q2]", "bench.servo.step_deg=12", weak))
+        with run.run.simulated() as clock:
+            with pytest.raises(StoppedError, match="q2 did not come to stand 3 times"):
+                run.measure()
+            state = clock.ask({"state": True})
+        assert state["offences"] == {} and drawn(state)["q2"] == pytest.approx(-50, abs=2.5)
+        assert len(run.entries("left_out")) == 3
+
+    @pytest.mark.slow
+    def test_exchanged_servos_leave_the_tables_as_they_were(self, tmp_path: Path) -> None:
+        sets = [s for s in SETS if "joints" not in s and "ranges" not in s]
+        ranges = "bench.servo.ranges={q4: [-45 deg, 45 deg], q6: [-45 deg, 45 deg]}"
+        run = ServoRun(tmp_path, (*sets, "bench.servo.joints=[q4, q6]", ranges))
+        path = tmp_path / "bench_servos.yaml"
+        truth = yaml.safe_load(path.read_text())
+        truth["servos"]["q4"]["channel"], truth["servos"]["q6"]["channel"] = 5, 3
+        path.write_text(yaml.safe_dump(truth))
+        setup = run.setup()
+        with run.run.simulated():
+            run.measure()
+        outcome = evaluated(setup, run.out)
+        assert "what turned is q6" in outcome.silent["q4"] and "what turned is q4" in outcome.silent["q6"]
+        assert improved(setup.file, outcome).servos == setup.file.servos
+
+    def test_what_was_measured_by_another_oscillator_is_written_by_the_files(self, done: ServoRun) -> None:
+        """An oscillator was found and written; later the same record is evaluated without what told it."""
+        setup, stated = done.setup(), done.setup().file.boards["front"].oscillator_hz
+        fitted = evaluated(setup, done.out)
+        hertz = 1.01 * stated
+        boards = {"front": BoardSettings.si(**{**setup.file.boards["front"].model_dump(), "oscillator_hz": hertz})}
+        later = improved(ServoFile(boards, setup.file.servos), fitted)
+        for joint, servo in fitted.fit.servos.items():
+            ticks = np.array(later.servos[joint].pulses) * hertz
+            assert ticks == pytest.approx(np.array(servo.pulses) * stated, abs=0.03)
+
+    def test_a_read_only_file_is_left_and_a_link_stays_one(self, tmp_path: Path) -> None:
+        real = tmp_path / "real.yaml"
+        real.write_text((CONFIGS / "servos.yaml").read_text())
+        link = tmp_path / "servos.yaml"
+        link.symlink_to(real)
+        file = load_servo_file(link)
+        real.chmod(0o444)
+        before = real.read_bytes()
+        with pytest.raises(InputError, match="read-only"):
+            write_servo_file(link, file)
+        assert real.read_bytes() == before and sorted(p.name for p in tmp_path.iterdir()) == [
+            "real.yaml",
+            "servos.yaml",
+        ]
+        real.chmod(0o644)
+        kept = write_servo_file(link, file)
+        assert link.is_symlink() and kept is not None and kept.read_bytes() == before and real.read_bytes() != before
