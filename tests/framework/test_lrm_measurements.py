@@ -102,6 +102,7 @@ def test_ipopt_and_cvxpy_agree_on_the_real_arm(repository: Path, loaded) -> None
         assert errors[0] == pytest.approx(errors[1], abs=1e-4)
 
 
+@pytest.mark.slow
 def test_the_best_model_judged_by_records_that_did_not_train_it(
     repository: Path, lrm_data: Path, tmp_path: Path
 ) -> None:

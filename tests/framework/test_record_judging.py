@@ -122,6 +122,7 @@ def test_all_at_once_gives_what_one_after_the_other_gives() -> None:
     assert set(AgreementJudge(fitter, groups).anew().doubtful) == {4, 22} == judged({4: 0.4, 22: 0.4}, 30)[1]
 
 
+@pytest.mark.slow
 def test_two_arms_from_their_log_rest_by_rest(tmp_path: Path) -> None:
     """The log of Frida's motors, streamed, gives the records that reading it gives; a clamp that slipped is told."""
     config = DEMO.parents[1] / "frida" / "dual_known_clamp.yaml"

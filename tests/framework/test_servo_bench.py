@@ -116,6 +116,7 @@ def test_the_arm_was_never_unsafe(calibrated, bench):
     assert {event["event"] for event in events} <= {"first_pulse", "drop"}
 
 
+@pytest.mark.slow
 def test_an_unplugged_board_that_comes_back_is_gone_on_with(calibrated, bench, tmp_path):
     now = ask(bench, {"advance": 0.0})["now"]
     for kind, at in (("unplug", now + 20.0), ("replug", now + 23.0)):
