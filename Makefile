@@ -16,7 +16,7 @@ demo: $(READY)
 	$(BIN)/armcal run configs/lrm_arm/demo.yaml --out runs/demo
 
 test: $(READY)
-	$(BIN)/python -m pytest -n 3 -m "not slow" tests
+	$(BIN)/python -m pytest -n 2 -m "not slow" tests
 
 test-all: $(READY)
 	$(BIN)/python -m pytest -n 2 tests

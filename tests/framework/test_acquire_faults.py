@@ -13,7 +13,7 @@ from armcal.bench.serial_port import SerialPort, SerialPortSettings
 
 from tests.bench_runs import BenchRun, positions
 
-QUICK, MANY = 4, 200
+QUICK, MANY = 3, 200
 SECONDS = 28.0
 """What the run takes when nothing goes wrong."""
 SERIAL = ("drop", "duplicate", "reorder", "flip", "split")

@@ -235,6 +235,7 @@ class TestAskedToEnd:
             state = clock.ask({"state": True})
         assert is_parked(state) and state["offences"] == {}
 
+    @pytest.mark.slow
     def test_while_the_question_is_put(self, run: BenchRun) -> None:
         answered = [False]
 
@@ -250,6 +251,7 @@ class TestAskedToEnd:
 
 
 class TestBoard:
+    @pytest.mark.slow
     def test_a_brown_out_gives_joints_the_angles_that_they_had(self, run: BenchRun) -> None:
         """Not those at which the way began."""
         with run.simulated() as clock:
@@ -309,6 +311,7 @@ class TestBoard:
             clock.ask({"fault": {"kind": "replug"}})
             assert run.acquire().ending.how == "done", "a run that was refused is no run"
 
+    @pytest.mark.slow
     def test_what_was_refused_may_be_begun_anew_with_another_configuration(self, run: BenchRun, tmp_path: Path) -> None:
         with run.simulated() as clock:
             clock.ask({"fault": {"kind": "silent"}})
@@ -347,6 +350,7 @@ class TestBoard:
         made._parts.drive.guard_here()
         assert run.device.guards[-1] == [{"q1": 0.4, "q2": 0.2}]
 
+    @pytest.mark.slow
     def test_two_boards_on_one_link(self, tmp_path: Path) -> None:
         for name in ("servos.yaml", "bench_servos.yaml"):
             text = (CONFIG.parent / name).read_text()
@@ -379,6 +383,7 @@ class TestBoard:
 
 
 class TestNobodyFeelsWhereTheArmIs:
+    @pytest.mark.slow
     def test_a_joint_that_does_not_arrive_is_not_measured_as_if_it_had(self, tmp_path: Path) -> None:
         blocked = "bench.simulator.joints={all: {backlash_deg: 0.1}, q3: {travel_deg: [-60, 30]}}"
         run = BenchRun(tmp_path, (*SETS, blocked))

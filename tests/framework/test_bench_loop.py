@@ -25,7 +25,7 @@ from armcal.solve.simulation import SimulationRequest, measured_without_noise
 from tests.bench_runs import free_port, write_plan
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs" / "lrm_arm"
-POSES, FRESH = 60, 24
+POSES, FRESH = 60, 16
 XYZ = ("x", "y", "z")
 
 

@@ -51,6 +51,7 @@ def test_intervals_hold_under_priors_when_the_noise_is_ten_times_what_was_declar
     assert 0.92 < np.mean(np.abs(scores) < 1.97) < 0.98
 
 
+@pytest.mark.slow
 def test_a_second_tracker_on_the_same_tip_does_not_make_the_arm_look_worse(tmp_path: Path) -> None:
     lines = [line.split(",") for line in (CONFIGS / "demo.csv").read_text().splitlines()]
     names = [f"tracker.{n}" if n in ("x_mm", "y_mm", "z_mm") else n for n in lines[0]]

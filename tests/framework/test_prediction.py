@@ -401,7 +401,10 @@ def test_python_gives_what_the_command_gives(recording: Path) -> None:
         assert float(rows[record]["radius95_mm"]) == pytest.approx(1000 * found.radii["tracker"][i], 1e-5)
 
 
-@pytest.mark.parametrize("extra", [(), ("noise.estimate=true",), DRIFTING, (*DRIFTING, "noise.loss=huber")])
+@pytest.mark.parametrize(
+    "extra",
+    [(), ("noise.estimate=true",), DRIFTING, pytest.param((*DRIFTING, "noise.loss=huber"), marks=pytest.mark.slow)],
+)
 def test_what_is_kept_predicts_as_the_fit_itself(extra: tuple[str, ...], tmp_path: Path) -> None:
     """Through the file: drift, estimated components, robust weights."""
     poses = tmp_path / "numbered.csv"

@@ -38,6 +38,7 @@ def test_a_wrong_posture_is_told_kept_marked_and_can_be_taken_back(tmp_path: Pat
     assert json.loads(identified.stdout)["rank"] == ranks[-1]
 
 
+@pytest.mark.slow
 def test_the_rank_is_what_identify_says_while_much_is_open(tmp_path: Path) -> None:
     out = tmp_path / "out"
     rows = [row for row in postures() if row["pose_id"].endswith(("/1", "/2")) and row["position"] != "right"]
@@ -90,6 +91,7 @@ def judged(wrong: dict[int, float], count: int, order: list[int] | None = None) 
     return list(dataset.ids), set(doubtful)
 
 
+@pytest.mark.slow
 def test_right_postures_are_never_in_doubt_whatever_their_order() -> None:
     order = np.random.default_rng(5).permutation(120)[:45].tolist()
     assert judged({}, 45, order)[1] == set()

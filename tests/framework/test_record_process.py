@@ -240,6 +240,7 @@ def test_bad_requests_are_refused_before_anything_is_written(tmp_path: Path, mor
     assert not (tmp_path / "out" / "dataset.csv").exists()
 
 
+@pytest.mark.slow
 def test_a_recording_is_not_begun_over_another(tmp_path: Path) -> None:
     out = tmp_path / "out"
     lines = still_lines(postures()[:1])

@@ -23,6 +23,7 @@ from scipy.stats import chi, chi2
 IPOPT = IpoptEstimator(IpoptEstimator.Settings())
 LOSSES = ("huber", "cauchy", "reject")
 every_loss = pytest.mark.parametrize("loss", LOSSES)
+quick_losses = pytest.mark.parametrize("loss", ["huber", pytest.param("cauchy", marks=pytest.mark.slow), "reject"])
 
 
 def fitted(problem, records, start, loss, estimator=IPOPT, **settings):
@@ -95,7 +96,7 @@ def clean(lrm, q, points, wrong):
     return posed(lrm, q[~wrong], points[~wrong])
 
 
-@every_loss
+@quick_losses
 def test_without_outliers_nothing_much_changes(lrm, loss):
     """At 95 % efficiency an answer scatters by sqrt(1/0.95 - 1) = 0.23 deviations about that of least squares."""
     apart, ratios = [], []
@@ -192,7 +193,7 @@ def test_the_cost_also_falls_from_a_bad_start_at_a_fixed_scale(lrm, monkeypatch)
 # ---------------------------------------------------------------- invariance
 
 
-@every_loss
+@quick_losses
 def test_neither_order_nor_unit_nor_axes_of_the_noise_matter(lrm, loss):
     q, points, _ = measured(80, 11, outliers=0.05)
     problem, records, start = posed(lrm, q, points)
@@ -386,6 +387,7 @@ def test_the_exact_hessian_knows_each_records_noise(lrm):
     np.testing.assert_allclose(exact, np.array(columns), rtol=1e-4, atol=1e-4 * np.abs(exact).max())
 
 
+@pytest.mark.slow
 def test_precise_records_pull_more_than_imprecise_ones(lrm):
     """Half the records are ten times as noisy; saying so gives the smaller spread, and the stated one."""
     off = {"said": [], "unsaid": []}

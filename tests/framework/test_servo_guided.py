@@ -97,6 +97,7 @@ def test_pulses_change_slowly_one_joint_at_a_time_and_each_side_is_come_to_from_
         assert any(a * came < counts * came and b == counts for a, b in pairwise(rows)), target
 
 
+@pytest.mark.slow
 def test_stopped_after_any_angle_and_given_again_it_finds_the_same(tmp_path, monkeypatch):
     config = config_in(tmp_path, SERVO)
     setup, device, _ = setup_on(monkeypatch, config)

@@ -146,6 +146,7 @@ def drawn(state: dict[str, Any]) -> dict[str, float]:
 
 
 class TestRecovery:
+    @pytest.mark.slow
     def test_a_board_that_drove_by_itself_while_the_host_stalled(self, run: ServoRun, undisturbed: Any) -> None:
         looks = [0]
         with run.run.simulated() as clock:
@@ -160,6 +161,7 @@ class TestRecovery:
             assert clock.ask({"state": True})["offences"] == {}
         assert all(np.abs(pulses - undisturbed[joint]).max() < AGREE_US for joint, pulses in run.pulses().items())
 
+    @pytest.mark.slow
     def test_after_a_brown_out_the_board_is_told_the_way_home_again(self, run: ServoRun) -> None:
         """It had forgotten it: an arm whose host is killed later would be left where it is."""
         with run.run.simulated() as clock:
@@ -187,6 +189,7 @@ class TestRecovery:
             assert clock.ask({"state": True})["offences"] == {}
         assert len(run.entries("pose")) == 12
 
+    @pytest.mark.slow
     def test_another_board_that_is_plugged_in_meanwhile_is_not_moved(self, tmp_path: Path, monkeypatch: Any) -> None:
         setup, device, _ = setup_on(monkeypatch, config_in(tmp_path, "bench:\n  servo: {joints: [q1]}\n"))
         device.lost_at = {12}
@@ -210,6 +213,7 @@ class TestRecovery:
                 mover.recover(fault)
         assert device.calls == calls[0]
 
+    @pytest.mark.slow
     def test_stopped_while_the_board_is_gone_it_does_not_say_that_the_arm_holds(self, run: ServoRun) -> None:
         with run.run.simulated() as clock:
             clock.ask({"fault": {"kind": "unplug", "at": 12}})
@@ -247,6 +251,7 @@ class TestTracker:
             assert clock.ask({"state": True})["offences"] == {}
         assert rests
 
+    @pytest.mark.slow
     def test_warmth_outlasts_the_program(self, run: ServoRun) -> None:
         heat = HeatModel(np.array([1.0]), np.array([[20.0, 300.0]]), np.array([[0.3, 0.7]]), np.array([0.6]))
         clock = FakeClock()
@@ -269,6 +274,7 @@ def _of_mover(setup: Setup) -> tuple[Any, ...]:
     return clock, read_by, read_by, Motion(0.3, 0.02, setup.settings.pulses), lambda: False
 
 
+@pytest.mark.slow
 def test_guided_nothing_goes_beyond_the_range(tmp_path: Path, monkeypatch: Any) -> None:
     """Not even where an angle at its end is come to from aside."""
     config = config_in(tmp_path, "bench:\n  servo: {joints: [q1, q5], ranges: {q1: [-60 deg, 60 deg]}}\n")

@@ -254,6 +254,7 @@ def _few(place: Path, spoilt: tuple[int, ...] = ()) -> Path:
     return _write(place, CLOSE)
 
 
+@pytest.mark.slow
 def test_a_nested_choice_is_made_without_the_records_that_judge_it(place: Path, close_choices) -> None:
     clean = close_choices
     assert len(set(clean.nested.chosen)) > 1, "the choices are too clear to test anything"
@@ -356,6 +357,7 @@ def test_a_study_leaves_files_that_agree(place: Path) -> None:
     assert not re.search(r"(src|href)=[\"'](?!#|data:)", page) and "<script" not in page
 
 
+@pytest.mark.slow
 def test_the_study_that_was_run_can_be_run_again_without_the_files_it_extended(place: Path, tmp_path: Path) -> None:
     text = SMALL.replace("none: {}", "none: {extends: option5.yaml, set: {parameters.bounds: none}}")
     path, out, data = _write(place, text), tmp_path / "out", str(tmp_path / "measured.csv")
@@ -394,6 +396,7 @@ def test_names_of_variants_are_shown_as_text(place: Path) -> None:
     assert "<b>" not in page and "&lt;b&gt;" in page
 
 
+@pytest.mark.slow
 def test_the_terminal_says_what_the_page_says(place: Path) -> None:
     done = armcal("study", str(_write(place, SMALL)), "--out", str(place / "out"), "--set", FAST[0])
     told = json.loads((place / "out" / "study.json").read_text())
