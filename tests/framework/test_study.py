@@ -220,6 +220,7 @@ def test_repeats_draw_the_folds_anew_and_average(place: Path, ladder) -> None:
         assert both.variant(name).crossed.count == 200
 
 
+@pytest.mark.slow
 def test_studies_are_the_same_on_any_workers(place: Path) -> None:
     path = _write(place, SMALL)
     one, other = _run(path, "study.nested=true"), _run(path, "study.nested=true", executor=Workers("loky", 2))
