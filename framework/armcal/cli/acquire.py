@@ -98,6 +98,8 @@ def show_outlook(voice: Voice, prepared: Prepared, outlook: Outlook) -> None:
         lines.append(f"hottest, of what each servo bears: {', '.join(hot)}.")
     for text in (*lines, *(f"left out: {why}." for why in left_out)):
         voice.out.print(text, markup=False, soft_wrap=True)
+    for each in prepared.plan.set_aside:
+        voice.warn(f"row {each.row} of the plan, pose {each.record_id}, is set aside and not driven: {each.reason}")
 
 
 def show_outcome(voice: Voice, outcome: Outcome, config: Path, out: Path) -> None:
@@ -134,6 +136,7 @@ def _foretold(prepared: Prepared, outlook: Outlook) -> dict[str, Any]:
         "resting_s": outlook.resting,
         "hottest": dict(zip(names, outlook.hottest.tolist(), strict=True)),
         "left_out": [step.why for step in outlook.steps if isinstance(step, LeaveOut)],
+        "set_aside": {each.record_id: each.reason for each in prepared.plan.set_aside},
     }
 
 

@@ -1,4 +1,4 @@
-"""What a measuring run leaves behind: a dataset and a summary, written anew whenever a pose is done."""
+"""What a measuring run leaves behind when it ends: a dataset and a summary. Until then its journal holds all."""
 
 from __future__ import annotations
 
