@@ -1,134 +1,282 @@
 """The plugin contract: hook specifications and their version. Imports nothing heavy, so registration is instant.
 
 A plugin is a Python module named by an entry point in the group ``armcal``. It registers named components as
-``module:attribute``; a component is imported when a configuration asks for it.
+``module:attribute``; a component is imported when a configuration asks for it. ``docs/hooks.md`` is made from this
+file: ``armcal plugins hooks --markdown``.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any, Protocol
 
 import pluggy
 
 PROJECT = "armcal"
-CONTRACT_VERSION = "1.3"
+CONTRACT_VERSION = "1.4"
 """Version of the plugin contract: the major number changes when an existing plugin would break."""
+WRITTEN_FOR = "ARMCAL_CONTRACT"
+"""What a registration module may call the contract that it was written for: ``ARMCAL_CONTRACT = "1.4"``."""
 
 hookspec = pluggy.HookspecMarker(PROJECT)
 hookimpl = pluggy.HookimplMarker(PROJECT)
 
 
+class ContractDeprecationWarning(DeprecationWarning):
+    """Something of the contract still works, and goes with its next major version."""
+
+
 class Register(Protocol):
     """What registration hooks are handed."""
 
-    def __call__(self, name: str, target: str, summary: str = "") -> None:
+    def __call__(self, name: str, target: str, summary: str = "", deprecated: str = "") -> None:
         """Announce a component.
 
         Args:
             name: what a configuration calls it (``type: NAME``).
             target: ``module:attribute`` of its class.
             summary: one line for ``armcal plugins list``.
+            deprecated: what to use in its place (``use ball_in_socket``); whoever still names it is warned. Since
+                contract 1.4.
         """
+
+
+@dataclass(frozen=True)
+class ComponentKind:
+    """One kind of component.
+
+    Attributes:
+        hook: that registers it.
+        built_as: how armcal builds it.
+        protocol: ``module:class`` of what it must have.
+        beside: ``module:class`` of what it may have.
+    """
+
+    hook: str
+    built_as: str
+    protocol: str
+    beside: tuple[str, ...] = ()
 
 
 @hookspec
 def armcal_register_models(register: Register) -> None:
-    """Arm models: classes built as ``Model(settings)`` that satisfy ``armcal.arm.model.ArmModel``."""
+    """Arm models: the chain of joints, as an expression of its parameters.
+
+    Since contract 1.0.
+    """
 
 
 @hookspec
 def armcal_register_effects(register: Register) -> None:
-    """Joint effects: classes built as ``Effect(settings, joint_names)`` that satisfy ``armcal.arm.effects.JointEffect``."""  # noqa: E501
+    """Joint effects: what stands between the commanded and the real displacement of a joint.
+
+    Since contract 1.0.
+    """
 
 
 @hookspec
 def armcal_register_measurements(register: Register) -> None:
-    """Measurements: built as ``Measurement(settings, arm_names)``; see ``armcal.measure.measurement.Measurement``."""
+    """Measurements: what an instrument or a contact says of the arm in one record, or in two.
+
+    Since contract 1.0.
+    """
 
 
 @hookspec
 def armcal_register_readers(register: Register) -> None:
-    """Dataset readers: built as ``Reader(settings)``; see ``armcal.measure.reader.Reader``."""
+    """Readers: datasets from files.
+
+    Since contract 1.0.
+    """
 
 
 @hookspec
 def armcal_register_estimators(register: Register) -> None:
-    """Batch estimators: built as ``Estimator(settings)``; see ``armcal.solve.estimator.Estimator``."""
+    """Batch estimators: all records at once.
+
+    Since contract 1.0.
+    """
 
 
 @hookspec
 def armcal_register_online_estimators(register: Register) -> None:
-    """Online estimators: built as ``Estimator(settings)``; see ``armcal.solve.online.OnlineEstimator``."""
+    """Online estimators: one record at a time.
+
+    Since contract 1.2.
+    """
 
 
 @hookspec
 def armcal_register_simulators(register: Register) -> None:
-    """Simulators: built as ``Simulator(settings)``; see ``armcal.solve.simulation.Simulator``."""
+    """Simulators: datasets from a stated truth.
+
+    Since contract 1.0.
+    """
 
 
 @hookspec
 def armcal_register_exporters(register: Register) -> None:
-    """Exporters: built as ``Exporter(settings)``; see ``armcal.use.exporter.Exporter``."""
+    """Exporters: a calibrated arm as a file of another program.
+
+    Since contract 1.1.
+    """
 
 
 @hookspec
 def armcal_register_links(register: Register) -> None:
-    """Links to servo boards: built as ``Link(settings)``; see ``armcal.bench.link.Link``."""
+    """Links: what carries bytes to a servo board.
+
+    Since contract 1.3.
+    """
 
 
 @hookspec
 def armcal_register_devices(register: Register) -> None:
-    """What moves joints: built as ``Device(settings, joint_names, link)``; see ``armcal.bench.device.JointDevice``."""
+    """Devices: what moves joints, over a link.
+
+    Since contract 1.3.
+    """
 
 
 @hookspec
 def armcal_register_trackers(register: Register) -> None:
-    """Live trackers: built as ``Tracker(settings)``; see ``armcal.bench.tracker.Tracker``."""
+    """Live trackers: where bodies are, frame by frame.
+
+    Since contract 1.3.
+    """
 
 
 @hookspec
 def armcal_register_joint_streams(register: Register) -> None:
-    """Live joint readings: built as ``Stream(settings)``; see ``armcal.bench.joint_stream.JointStream``."""
+    """Live joint readings of arms that are guided by hand.
+
+    Since contract 1.3.
+    """
 
 
 @hookspec
 def armcal_register_benches(register: Register) -> None:
-    """Simulated benches: built as ``Bench(settings)``; see ``armcal.bench.simulated.SimulatedBench``."""
+    """Simulated benches: what stands in for board, arm and tracker in a rehearsal.
+
+    Since contract 1.3.
+    """
 
 
 @hookspec
 def armcal_run_started(name: str, records: int) -> None:
-    """A calibration run begins; observers may log it. What they return is ignored."""
+    """A calibration run begins.
+
+    Args:
+        name: of the experiment.
+        records: how many records it begins with.
+
+    Since contract 1.0.
+    """
 
 
 @hookspec
 def armcal_record_rejected(row: int, record_id: str, reason: str) -> None:
-    """A record was set aside."""
+    """A record was set aside.
+
+    Args:
+        row: where it stood in its source (from 1; the line of a CSV file).
+        record_id: as written in the source.
+        reason: in words.
+
+    Since contract 1.0.
+    """
 
 
 @hookspec
 def armcal_estimate_changed(estimate: Any) -> None:
-    """An estimator came to a new estimate."""
+    """An estimator came to a new estimate.
+
+    Args:
+        estimate: an ``armcal.solve.estimator.Estimate``.
+
+    Since contract 1.0.
+    """
 
 
 @hookspec
 def armcal_run_ended(name: str, folder: str, converged: bool) -> None:
-    """A calibration run has written its results."""
+    """A calibration run has written its results.
+
+    Args:
+        name: of the experiment.
+        folder: where the results are.
+        converged: whether the solver did.
+
+    Since contract 1.0.
+    """
 
 
-KINDS = {
-    "model": "armcal_register_models",
-    "effect": "armcal_register_effects",
-    "measurement": "armcal_register_measurements",
-    "reader": "armcal_register_readers",
-    "estimator": "armcal_register_estimators",
-    "online": "armcal_register_online_estimators",
-    "simulator": "armcal_register_simulators",
-    "exporter": "armcal_register_exporters",
-    "link": "armcal_register_links",
-    "device": "armcal_register_devices",
-    "tracker": "armcal_register_trackers",
-    "joints": "armcal_register_joint_streams",
-    "bench": "armcal_register_benches",
-}
+_MEASURE = "armcal.measure.measurement"
+COMPONENTS: Mapping[str, ComponentKind] = MappingProxyType(
+    {
+        "model": ComponentKind(
+            "armcal_register_models",
+            "Model(settings)",
+            "armcal.arm.model:ArmModel",
+            ("armcal.arm.assembly:MassiveModel",),
+        ),
+        "effect": ComponentKind(
+            "armcal_register_effects",
+            "Effect(settings, joint_names)",
+            "armcal.arm.effects:JointEffect",
+            ("armcal.arm.effects:ShapeEffect",),
+        ),
+        "measurement": ComponentKind(
+            "armcal_register_measurements",
+            "Measurement(settings, arm_names)",
+            f"{_MEASURE}:Measurement",
+            (
+                f"{_MEASURE}:RecordNoise",
+                f"{_MEASURE}:DimensionedResidual",
+                f"{_MEASURE}:GroupedMeasurement",
+                f"{_MEASURE}:NamesGroups",
+                "armcal.measure.partners:PairedMeasurement",
+            ),
+        ),
+        "reader": ComponentKind("armcal_register_readers", "Reader(settings)", "armcal.measure.reader:Reader"),
+        "estimator": ComponentKind(
+            "armcal_register_estimators",
+            "Estimator(settings)",
+            "armcal.solve.estimator:Estimator",
+            ("armcal.solve.estimator:SpreadableEstimator",),
+        ),
+        "online": ComponentKind(
+            "armcal_register_online_estimators", "Estimator(settings)", "armcal.solve.online:OnlineEstimator"
+        ),
+        "simulator": ComponentKind(
+            "armcal_register_simulators", "Simulator(settings)", "armcal.solve.simulation:Simulator"
+        ),
+        "exporter": ComponentKind("armcal_register_exporters", "Exporter(settings)", "armcal.use.exporter:Exporter"),
+        "link": ComponentKind(
+            "armcal_register_links", "Link(settings)", "armcal.bench.link:Link", ("armcal.bench.link:GuardedLink",)
+        ),
+        "device": ComponentKind(
+            "armcal_register_devices",
+            "Device(settings, joint_names, link)",
+            "armcal.bench.device:JointDevice",
+            ("armcal.bench.device:PulseDevice",),
+        ),
+        "tracker": ComponentKind("armcal_register_trackers", "Tracker(settings)", "armcal.bench.tracker:Tracker"),
+        "joints": ComponentKind(
+            "armcal_register_joint_streams",
+            "Stream(settings)",
+            "armcal.bench.joint_stream:JointStream",
+            ("armcal.bench.recording.rest_stream:RestStream",),
+        ),
+        "bench": ComponentKind("armcal_register_benches", "Bench(settings)", "armcal.bench.simulated:SimulatedBench"),
+    }
+)
+"""The kinds of component."""
+
+KINDS: Mapping[str, str] = MappingProxyType({kind: component.hook for kind, component in COMPONENTS.items()})
 """The kinds of component and the hook that registers each."""
+
+DEPRECATED_METHODS: Mapping[str, Mapping[str, str]] = MappingProxyType({})
+"""By kind: methods that a component no longer needs, and what to write in their place. None at present."""

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import difflib
+import time
+import warnings
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -12,8 +14,10 @@ from typing import Any
 
 import pluggy
 
-from armcal import hooks
 from armcal.errors import PluginError
+from armcal.hook_trace import Answer, HookTrace
+from armcal.hooks import ContractDeprecationWarning
+from armcal.registration import Specifications, registered, said
 
 GROUP = "armcal"
 
@@ -22,7 +26,12 @@ GROUP = "armcal"
 class Component:
     """Something a configuration can name.
 
-    ``target`` is ``module:attribute``; ``plugin`` the entry point that registered it, and ``module`` what that names.
+    Attributes:
+        target: ``module:attribute``.
+        plugin: the entry point that registered it.
+        module: what that entry point names.
+        deprecated: what to use in its place; empty while it is here to stay.
+        deprecated_methods: methods of its kind that are to go, and what to write in their place.
     """
 
     kind: str
@@ -31,32 +40,47 @@ class Component:
     summary: str
     plugin: str
     module: str = ""
+    deprecated: str = ""
+    deprecated_methods: Mapping[str, str] = field(default_factory=dict, repr=False, compare=False)
 
     def load(self) -> Any:
-        """The component's class.
+        """The component's class; a ``ContractDeprecationWarning`` for each of its methods that is to go.
 
         Raises:
             PluginError: its module does not import, or lacks the attribute.
         """
         module, _, attribute = self.target.partition(":")
         try:
-            return getattr(import_module(module), attribute)
+            made = getattr(import_module(module), attribute)
         except (Exception, SystemExit) as fault:  # a plugin may fail in any way; the user is told which and how
             raise PluginError(
-                f"the {self.kind} {self.name!r} of the plugin {self.plugin!r} does not load: {_said(fault)}.",
+                f"the {self.kind} {self.name!r} of the plugin {self.plugin!r} does not load: {said(fault)}.",
                 hint="Repair or update that plugin.",
             ) from fault
+        for method in (name for name in self.deprecated_methods if hasattr(made, name)):
+            _warn(
+                f"the {self.kind} {self.name!r} of the plugin {self.plugin} has {method}(), which is deprecated: "
+                f"{self.deprecated_methods[method]}."
+            )
+        return made
 
 
 @dataclass(frozen=True)
 class PluginInfo:
-    """One entry point: its distribution, and what was wrong with it (empty if nothing)."""
+    """One entry point.
+
+    Attributes:
+        distribution: that it came with, if any, and ``version`` of that.
+        fault: why it is left out; empty if it is not.
+        notices: what it uses of the contract that is to go.
+    """
 
     name: str
     module: str
     distribution: str
     version: str
     fault: str = ""
+    notices: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -66,6 +90,7 @@ class PluginRegistry:
     plugins: tuple[PluginInfo, ...]
     components: tuple[Component, ...]
     manager: pluggy.PluginManager = field(repr=False, compare=False)
+    trace: HookTrace = field(default_factory=lambda: HookTrace(active=False), repr=False, compare=False)
 
     @property
     def faults(self) -> tuple[PluginInfo, ...]:
@@ -84,7 +109,7 @@ class PluginRegistry:
         return index
 
     def find(self, kind: str, name: str) -> Component:
-        """The component of that kind and name.
+        """The component of that kind and name; a ``ContractDeprecationWarning`` if it is to go.
 
         Raises:
             PluginError: there is none (the nearest and the failed plugins are named), or two offer it.
@@ -94,6 +119,8 @@ class PluginRegistry:
             offered = " and ".join(f"{c.plugin} ({c.target})" for c in found)
             raise PluginError(f"the {kind} {name!r} is offered twice, by {offered}.", hint="Uninstall one of them.")
         if found:
+            if found[0].deprecated:
+                _warn(f"{kind} {name!r} of the plugin {found[0].plugin} is deprecated: {found[0].deprecated}.")
             return found[0]
         known = sorted(n for k, n in self._by_name if k == kind)
         near = difflib.get_close_matches(name, known, n=1)
@@ -105,12 +132,16 @@ class PluginRegistry:
 
     def notify(self, event: str, **what: Any) -> list[str]:
         """Tell every observer of an event; gives what went wrong in those that failed, which stops nothing."""
-        faults = []
+        faults, answers, began = [], [], time.perf_counter()
         for observer in getattr(self.manager.hook, event).get_hookimpls():
+            start, raised = time.perf_counter(), ""
             try:
                 observer.function(*[what[name] for name in observer.argnames])
             except Exception as fault:  # an observer must not cost anybody a calibration
-                faults.append(f"plugin {observer.plugin_name}: {event} raised {type(fault).__name__}: {fault}.")
+                raised = type(fault).__name__
+                faults.append(f"plugin {observer.plugin_name}: {event} raised {raised}: {fault}.")
+            answers.append(Answer(observer.plugin_name, time.perf_counter() - start, raised))
+        self.trace.write(event, what, answers, time.perf_counter() - began)
         return faults
 
 
@@ -120,70 +151,40 @@ def _spoken(kind: str) -> str:
     return f"{'an' if name[0] in 'aeiou' else 'a'} {name}"
 
 
-def discover(found: Iterable[EntryPoint] | None = None) -> PluginRegistry:
+def _warn(text: str) -> None:
+    warnings.warn(text, ContractDeprecationWarning, stacklevel=3)
+
+
+def discover(found: Iterable[EntryPoint] | None = None, contract: Specifications | None = None) -> PluginRegistry:
     """Load every registration module.
 
-    A plugin that fails to import, or has a hook that armcal does not know, is listed with its fault and
-    breaks nothing else.
+    A plugin that fails to import, has a hook that armcal does not know, or is written for a contract that this armcal
+    has not, is listed with its fault and breaks nothing else. What a plugin uses that is to go is a
+    ``ContractDeprecationWarning``. Calls are traced as the environment variable ``ARMCAL_TRACE_HOOKS`` asks now.
+
+    Raises:
+        ConfigError: that variable names a file that cannot be written.
     """
-    manager = pluggy.PluginManager(hooks.PROJECT)
-    manager.add_hookspecs(hooks)
+    contract, trace = contract or Specifications(), HookTrace.from_environment()
+    manager = contract.manager()
     plugins, components = [], []
     points = entry_points(group=GROUP) if found is None else found
     for point in sorted({(p.name, p.value): p for p in points}.values(), key=lambda p: (p.name, p.value)):
-        fault, announced = _load(manager, point)
-        distribution = point.dist
+        outcome, distribution = registered(manager, point, contract, trace), point.dist
         plugins.append(
             PluginInfo(
                 point.name,
                 point.value,
                 distribution.name if distribution else "",
                 distribution.version if distribution else "",
-                fault,
+                outcome.fault,
+                outcome.notices,
             )
         )
-        components += announced
-    return PluginRegistry(tuple(plugins), tuple(components), manager)
-
-
-def _load(manager: pluggy.PluginManager, point: EntryPoint) -> tuple[str, list[Component]]:
-    """Register one plugin; gives its fault (or nothing) and its components."""
-    name = f"{point.name} ({point.value})"
-    try:
-        module = point.load()
-        alone = pluggy.PluginManager(hooks.PROJECT)
-        alone.add_hookspecs(hooks)
-        alone.register(module, name)
-        alone.check_pending()
-        _require_marks(module)
-        announced = _announced(alone, point)
-        manager.register(module, name)
-    except (Exception, SystemExit) as fault:  # whatever a third party's module does, the others must work
-        return _said(fault), []
-    return "", announced
-
-
-def _said(fault: BaseException) -> str:
-    """A fault in one line."""
-    return " ".join(f"{type(fault).__name__}: {fault}".split())
-
-
-def _require_marks(module: Any) -> None:
-    """Refuse a hook that would be passed over without a word."""
-    for name, specified in vars(hooks).items():
-        own = getattr(module, name, None) if name.startswith(f"{hooks.PROJECT}_") else None
-        if callable(own) and own is not specified and not hasattr(own, f"{hooks.PROJECT}_impl"):
-            raise ValueError(f"{name} is not marked: put @hookimpl before it")
-
-
-def _announced(alone: pluggy.PluginManager, point: EntryPoint) -> list[Component]:
-    components: list[Component] = []
-    for kind, hook in hooks.KINDS.items():
-
-        def register(name: str, target: str, summary: str = "", kind: str = kind) -> None:
-            if ":" not in target:
-                raise ValueError(f"the target of {name!r} is {target!r}; expected module:attribute")
-            components.append(Component(kind, name, target, summary, point.name, point.value))
-
-        getattr(alone.hook, hook)(register=register)
-    return components
+        for notice in outcome.notices:
+            _warn(f"plugin {point.name} ({point.value}): {notice}")
+        for each in outcome.announced:
+            old = contract.deprecated_methods.get(each.kind, {})
+            said_of_it = (each.kind, each.name, each.target, each.summary, point.name, point.value)
+            components.append(Component(*said_of_it, deprecated=each.deprecated, deprecated_methods=old))
+    return PluginRegistry(tuple(plugins), tuple(components), manager, trace)

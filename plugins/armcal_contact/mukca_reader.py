@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar, Literal, NoReturn
@@ -56,6 +56,11 @@ class MukcaReader:
     """The reader ``mukca``: text labels ``position`` and ``socket``, ids such as ``front/hole_0/12`` (the line)."""
 
     Settings: ClassVar[type[MukcaSettings]] = MukcaSettings
+    EXAMPLE_SOURCE: ClassVar[Mapping[str, Any]] = {
+        "files": {"front/hole_0.csv": "0.1,-0.2\n0.3,0.4\n", "front/hole_1.csv": "0.5,-0.6\n0.7,0.8\n"},
+        "path": "",
+        "channels": {"arm.q1": (0.1, 0.3, 0.5, 0.7), "arm.q2": (-0.2, 0.4, -0.6, 0.8)},
+    }
 
     def __init__(self, settings: MukcaSettings) -> None:
         self._settings = settings

@@ -50,6 +50,12 @@ class TwoArmLogReader:
         "arms": {"arm": {"columns": [1, 2], "order": [2, 1], "gear_ratios": [100, -100]}},
     }
 
+    EXAMPLE_SOURCE: ClassVar[Mapping[str, object]] = {
+        "files": {"motors.log": "-20,10\n-45,30\n60,-60\n"},
+        "path": "motors.log",
+        "channels": {"arm.q1": (0.1, 0.3, -0.6), "arm.q2": (0.2, 0.45, -0.6)},
+    }
+
     def __init__(self, settings: TwoArmLogSettings) -> None:
         self._settings = settings
 

@@ -31,6 +31,10 @@ _BARRIER_START = 1e-8
 _SMALLEST_UNIT = 1e-9
 _LEAST_START = 2e-2
 """Of a semidefinite matrix's ordinary size: its smallest eigenvalue at the start."""
+_MOST_REFUSED = 110
+"""Trial points in a row without an equilibrium, which is two whole line searches down to a step of rounding errors: the
+fit stands where no way leads on, and IPOPT would search again in each iteration."""
+_STUCK = "stuck where springs no longer hold the arm"
 
 
 class IpoptSettings(Settings):
@@ -104,19 +108,21 @@ def _solve_once(task: _Start) -> _Run:
     lower, upper = posed.bounds()
     # CasADi holds callbacks weakly: they must outlive the solve here.
     callbacks = [_Callback(name, objective) for name in ("cost", "gradient", "hessian")]
-    solver = _solver(task.settings, callbacks, len(task.x))
+    watch = _Watch(objective)
+    solver = _solver(task.settings, callbacks, watch, len(task.x))
     answer = solver(x0=task.x, lbx=lower, ubx=upper)
     told = solver.stats()
-    if objective.interrupted or told["return_status"] == "User_Requested_Stop":
+    stopped = told["return_status"] == "User_Requested_Stop"
+    if objective.interrupted or (stopped and not objective.stuck):
         raise KeyboardInterrupt  # CasADi keeps it to itself, and the next start would go on
     # IPOPT stays inside its bounds by a rounding error; the model's domain wants it exactly.
     x = np.clip(np.asarray(answer["x"]).ravel(), lower, upper)
     converged = bool(told["success"]) and bool(np.isfinite(x).all())
     cost = float(answer["f"]) * objective.unit
-    return _Run(x, cost, converged, str(told["return_status"]), int(told["iter_count"]))
+    return _Run(x, cost, converged, _STUCK if stopped else str(told["return_status"]), int(told["iter_count"]))
 
 
-def _solver(settings: IpoptSettings, callbacks: list[_Callback], size: int) -> Any:
+def _solver(settings: IpoptSettings, callbacks: list[_Callback], watch: _Watch, size: int) -> Any:
     cost, gradient, hessian = callbacks
     x, parameters, factor, multipliers = (
         ca.MX.sym("x", size),
@@ -131,6 +137,7 @@ def _solver(settings: IpoptSettings, callbacks: list[_Callback], size: int) -> A
         "show_eval_warnings": False,
         "no_nlp_grad": True,
         "calc_lam_p": False,
+        "iteration_callback": watch,
         "grad_f": ca.Function("grad_f", inputs, [value, gradient(x)], ["x", "p"], ["f", "grad_f_x"]),
         "hess_lag": ca.Function(
             "hess_lag",
@@ -195,7 +202,7 @@ class _Objective:
         self._at: Array | None = None
         self._tried: tuple[Array, float] | None = None
         self._model = NormalEquations(np.nan, np.zeros(0), np.zeros((0, 0)))
-        self.size, self.unit, self.interrupted = len(start), 1.0, False
+        self.size, self.unit, self.interrupted, self._refused = len(start), 1.0, False, 0
         at_start = float(self.cost(start))
         self.unit = at_start if np.isfinite(at_start) and at_start > _SMALLEST_UNIT else 1.0
 
@@ -206,7 +213,13 @@ class _Objective:
         if self._tried is None or not np.array_equal(x, self._tried[0]):
             cost = self._interruptible(lambda: self._posed.cost(x))
             self._tried = x.copy(), cost if np.isfinite(cost) else np.nan
+            self._refused = 0 if np.isfinite(cost) else self._refused + 1
         return np.array(self._tried[1] / self.unit)
+
+    @property
+    def stuck(self) -> bool:
+        """Whether no step, however short, leads on."""
+        return self._refused >= _MOST_REFUSED
 
     def gradient(self, x: Array) -> Array:
         """By scaled increments."""
@@ -264,3 +277,29 @@ class _Callback(ca.Callback):  # type: ignore[misc]
     def eval(self, arguments: list[ca.DM]) -> list[ca.DM]:
         """Evaluate."""
         return [ca.DM(self._function(np.asarray(arguments[0]).ravel()))]
+
+
+class _Watch(ca.Callback):  # type: ignore[misc]
+    """Ends the solve between two iterations once the objective is stuck."""
+
+    def __init__(self, objective: _Objective) -> None:
+        super().__init__()
+        self._objective = objective
+        self.construct("watch", {})
+
+    def get_n_in(self) -> int:
+        """What a solver gives out."""
+        return int(ca.nlpsol_n_out())
+
+    def get_n_out(self) -> int:
+        """One."""
+        return 1
+
+    def get_sparsity_in(self, i: int) -> ca.Sparsity:
+        """As the solver has it: no constraints, no parameters."""
+        rows = {"f": 1, "x": self._objective.size, "lam_x": self._objective.size}
+        return ca.Sparsity.dense(rows.get(ca.nlpsol_out(i), 0), 1)
+
+    def eval(self, arguments: list[ca.DM]) -> list[int]:
+        """Not zero to end."""
+        return [int(self._objective.stuck)]

@@ -110,6 +110,10 @@ class Quantisation:
         """None: the table is known, or it is the servo map's to find."""
         return ()
 
+    def servos(self) -> Mapping[int, tuple[PulseTable, PulseClock]]:
+        """Pulse table and clock by the joint's index; a joint without a table is not stepped."""
+        return dict(self._servos)
+
     def displacement(self, command: JointCommand, values: Mapping[str, Any]) -> Any:
         """From the commanded angle to the one that is set (rad)."""
         servo = self._servos.get(command.index)

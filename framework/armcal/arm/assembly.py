@@ -13,7 +13,7 @@ import casadi as ca
 from armcal.arm.effects import JointCommand, JointEffect, ShapeEffect, Spring
 from armcal.arm.elastic import deflections, elastic_sites, split_deflection
 from armcal.arm.model import ArmModel, Chain, forward
-from armcal.arm.statics import Load, Mass, wrenches
+from armcal.arm.statics import Load, Mass, joint_efforts, wrenches
 from armcal.base.parameters import ParameterBlock, scalar
 from armcal.base.pose_blocks import pose_transform
 from armcal.base.se3 import Expression, Transform
@@ -60,12 +60,14 @@ class ArmInputs:
 class ArmState:
     """An arm in one record: its tool and named frames, and the deflection that its springs answer with.
 
-    In equilibrium ``next_deflection`` equals the deflection that was put in.
+    In equilibrium ``next_deflection`` equals the deflection that was put in. ``efforts`` are what gravity and load do
+    about or along each joint's own axis (joints x 1; N m, N on sliding joints).
     """
 
     base_T_tool: Transform
     frames: Mapping[str, Transform]
     next_deflection: Expression
+    efforts: Expression = None
 
 
 @dataclass(frozen=True)
@@ -179,7 +181,8 @@ class Arm:
         ]
         frames = forward(chain, displacements, rotations)
         acting = wrenches(chain, frames, self._masses(values), inputs.load)
-        return ArmState(frames.base_T_tool, frames.named, deflections(chain, frames, acting, sites))
+        answer = deflections(chain, frames, acting, sites)
+        return ArmState(frames.base_T_tool, frames.named, answer, joint_efforts(chain, frames, acting))
 
     @property
     def conditions(self) -> tuple[str, ...]:

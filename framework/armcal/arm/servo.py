@@ -6,12 +6,14 @@ The board counts ticks of an oscillator, divided by ``prescale + 1``, and takes 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Protocol, runtime_checkable
 
 import casadi as ca
 
+from armcal.arm.effects import JointEffect
 from armcal.base.se3 import Expression
 
 COUNTS = 4096
@@ -95,6 +97,17 @@ class PulseClock:
 def quantised(angle: Expression, table: PulseTable, clock: PulseClock) -> Expression:
     """The angle (rad) at which a servo stands that was told another."""
     return table.angle(clock.counts(table.pulse(angle)) * clock.tick)
+
+
+@runtime_checkable
+class SteppedEffect(JointEffect, Protocol):
+    """A joint effect by which only some displacements can be set: those of the whole counts of a servo board.
+
+    Its expression has no slope. What chooses commands leaves it out, and chooses among the counts afterwards.
+    """
+
+    def servos(self) -> Mapping[int, tuple[PulseTable, PulseClock]]:
+        """Pulse table and clock by the joint's index (from 0); joints that are not there are not stepped."""
 
 
 def piecewise_linear(x: Expression, at: Sequence[float], values: Sequence[Expression]) -> Expression:

@@ -97,6 +97,12 @@ def effort(joint: Joint, site: Site, wrench: SiteWrench) -> Expression:
     return ca.dot(angular, wrench.moment) + ca.dot(linear, wrench.force)
 
 
+def joint_efforts(chain: Chain, frames: Frames, acting: Sequence[SiteWrench]) -> Expression:
+    """What wrenches do about or along each joint's own axis (joints x 1; N m, N on sliding joints)."""
+    each = zip(chain.joints, frames.sites[1:], acting[1:], strict=True)
+    return ca.vertcat(*[effort(joint, site, wrench) for joint, site, wrench in each])
+
+
 def _frame(chain: Chain, frames: Frames, name: str) -> tuple[se3.Transform, int]:
     if name == TOOL_FRAME:
         return frames.base_T_tool, chain.tool.joint

@@ -5,14 +5,18 @@ from __future__ import annotations
 import json
 import shlex
 import sys
+import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, TypeVar
 
 import click
 from rich.console import Console
 
+from armcal.errors import DataError, Location
+from armcal.hooks import ContractDeprecationWarning
 from armcal.plugins import PluginRegistry
 from armcal.solve.estimator import Progress, no_progress
 from armcal.solve.parallel import parse_executor
@@ -58,6 +62,23 @@ class Voice:
             self.warn(f"plugin {plugin.name} ({plugin.module}) is left out: {plugin.fault}")
 
     @contextmanager
+    def telling_what_is_to_go(self) -> Iterator[None]:
+        """One line for each thing of the plugin contract that is used and deprecated, once."""
+        with warnings.catch_warnings():
+            warnings.simplefilter("always", ContractDeprecationWarning)
+            others, told = warnings.showwarning, set()
+
+            def show(message: Any, category: type[Warning], *where: Any, **more: Any) -> None:
+                if not issubclass(category, ContractDeprecationWarning):
+                    others(message, category, *where, **more)
+                elif str(message) not in told:
+                    told.add(str(message))
+                    self.warn(str(message))
+
+            warnings.showwarning = show
+            yield
+
+    @contextmanager
     def progress(self) -> Iterator[Progress]:
         """A progress line with the time left, on a terminal."""
         if self.quiet or self.json or not sys.stderr.isatty():
@@ -86,7 +107,9 @@ def speaking(command: F) -> F:
     @click.option("-v", "--verbose", is_flag=True, help="Say more on standard error.")
     @click.pass_context
     def wrapped(ctx: click.Context, /, as_json: bool, quiet: bool, verbose: bool, **given: Any) -> Any:
-        return ctx.invoke(command, voice=Voice(as_json, quiet, verbose), **given)
+        voice = Voice(as_json, quiet, verbose)
+        with voice.telling_what_is_to_go():
+            return ctx.invoke(command, voice=voice, **given)
 
     wrapped.__doc__ = command.__doc__
     wrapped.__name__ = command.__name__
@@ -113,6 +136,17 @@ def parallel(command: F) -> F:
         callback=lambda ctx, option, text: parse_executor(text),
         help="Processes for independent fits: N, threading:N, dask:ADDRESS, ray [default: auto].",
     )(command)
+
+
+def spare_inputs(out: Path, *given: Path | None) -> None:
+    """What is to be written must be none of the files that are read.
+
+    Raises:
+        DataError: it is one of them.
+    """
+    for path in given:
+        if path is not None and out.exists() and path.exists() and out.samefile(path):
+            raise DataError("it is one of the inputs.", where=Location(str(out)), hint="Give another --out.")
 
 
 def command_line() -> str:

@@ -67,7 +67,7 @@ def verdict_of(
         judged[np.isfinite(judged)],
         f"{held} held-out records" if held else "cross-validation",
         run.dataset.ids,
-        suggest(run.problem, training, found, joints) if found.names and _reads(run.problem) else (),
+        suggest(run.problem, training, found, joints) if found.names and _can_be_helped(run) else (),
         run.fitted,
         [*worse_than_nominal(judged, errors.nominal_mm), *intervals.findings(), *moved_findings(_moved(run))],
         evidence,
@@ -104,9 +104,14 @@ def _moved(run: FittedRecords) -> tuple[Moved, ...]:
     return moved_groups(run.problem, run.fitted.estimate.values, acting)
 
 
-def _reads(problem: Problem) -> bool:
-    """Whether all measurements read something: in a contact no pose can be chosen that does not touch."""
-    return all(kernel.factor.output_channels for kernel in problem.kernels)
+def _can_be_helped(run: FittedRecords) -> bool:
+    """Whether poses can be told that would help the fit.
+
+    It must have converged, and all measurements must read something: in a contact no pose can be chosen that does not
+    touch.
+    """
+    converged = run.fitted.estimate.verdict.converged
+    return converged and all(kernel.factor.output_channels for kernel in run.problem.kernels)
 
 
 def effect_types(system: System) -> frozenset[str]:

@@ -21,7 +21,7 @@ from armcal.run.groups import GroupError
 from armcal.run.result import RunResult
 from armcal.solve.bootstrap import Bootstrap
 from armcal.solve.profile import Profile
-from armcal.use.calibration import SCHEMA, CalibrationFile, InformationRecord, dump, parameter_records
+from armcal.use.calibration_file import SCHEMA, CalibrationFile, InformationRecord, dump, parameter_records
 
 FILES = ("experiment.yaml", "residuals.csv", "metrics.json", "report.html", "log.txt", "calibration.yaml")
 """In the order in which they are put in place: the calibration last."""

@@ -11,13 +11,14 @@ import numpy as np
 
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
-from armcal.errors import ProblemError
+from armcal.errors import NotConvergedError, ProblemError
 from armcal.measure.id_list import read_ids
 from armcal.plugins import PluginRegistry
 from armcal.run.experiment import Experiment
 from armcal.run.groups import RunGroups, group_errors, labels_of
 from armcal.run.intervals import IntervalResult, interval_result
 from armcal.run.judging import FittedRecords, verdict_of
+from armcal.run.mixup import check_mixups
 from armcal.run.noise import noise_result
 from armcal.run.provenance import provenance
 from armcal.run.reach import check_reach
@@ -25,7 +26,7 @@ from armcal.run.result import ErrorTable, RecordErrors, RunResult
 from armcal.solve.bootstrap import Bootstrap, bootstrap
 from armcal.solve.coverage import fit_and_predict
 from armcal.solve.drift import residuals, with_drift
-from armcal.solve.estimator import Estimate, Progress, no_progress, require_solvable, spread
+from armcal.solve.estimator import Estimate, Progress, gave_up, no_progress, require_solvable, spread
 from armcal.solve.evidence import Evidence
 from armcal.solve.joint_noise import with_joint_noise
 from armcal.solve.nuisance import restricted, settled, started, untrained
@@ -123,6 +124,7 @@ def assemble(experiment: Experiment, watch: Stopwatch) -> Prepared:
         records = with_drift(problem, records, dataset, problem.parameters.nominal())
     with watch.stage("check"):
         check_reach(problem, records, dataset)
+        check_mixups(problem, records, dataset)
         split = _split(experiment, dataset)
         _check_folds(experiment, split)
         problem = restricted(problem, problem.subset(records, split.train))
@@ -146,7 +148,7 @@ def calibrate(
     faults += registry.notify("armcal_estimate_changed", estimate=fitted.estimate)
     resampled, profiled_result = _uncertainty(experiment, ready, fitted, progress, executor, watch)
     with watch.stage("validate"):
-        crossed = _crossed(experiment, ready, progress, executor)
+        crossed = _crossed(experiment, ready, fitted, progress, executor)
         errors, intervals = _errors(ready, fitted, crossed), _intervals(experiment, ready, fitted, crossed)
     verdict, evidence = _judge(experiment, ready, fitted, errors, intervals, watch)
     noise = noise_result(ready.problem, fitted, ready.dataset, ready.split, errors.calibrated_mm)
@@ -265,11 +267,14 @@ def _check_folds(experiment: Experiment, split: Split) -> None:
 
 
 def _crossed(
-    experiment: Experiment, ready: Prepared, progress: Progress, executor: Executor | None
+    experiment: Experiment, ready: Prepared, fitted: WeighedFit, progress: Progress, executor: Executor | None
 ) -> tuple[CrossValidation, tuple[Split, ...]] | None:
-    """Cross-validation over the training records, with what each fold predicted; None where none is asked for."""
+    """Cross-validation over the training records, with what each fold predicted; None where none is asked for.
+
+    Nor of a fit that did not converge: its folds would not either, and each would take as long.
+    """
     asked, problem = experiment.settings.validation, ready.problem
-    if not asked.folds:
+    if not (asked.folds and fitted.estimate.verdict.converged):
         return None
     splits = folds(len(ready.split.train), asked.folds, asked.seed)
     start = problem.parameters.nominal()
@@ -306,6 +311,16 @@ def _prediction(
 
 
 def _errors(
+    ready: Prepared, fitted: WeighedFit, judged: tuple[CrossValidation, tuple[Split, ...]] | None
+) -> RecordErrors:
+    try:
+        return _errors_of(ready, fitted, judged)
+    except NotConvergedError as fault:
+        verdict = fitted.estimate.verdict
+        raise fault if verdict.converged else gave_up(verdict) from fault
+
+
+def _errors_of(
     ready: Prepared, fitted: WeighedFit, judged: tuple[CrossValidation, tuple[Split, ...]] | None
 ) -> RecordErrors:
     problem, records, values = ready.problem, ready.records, fitted.estimate.values

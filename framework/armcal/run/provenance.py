@@ -9,7 +9,7 @@ from typing import Any
 
 from armcal.base.dataset import Dataset
 from armcal.run.experiment import Experiment
-from armcal.use.calibration import identity_of
+from armcal.use.calibration_file import identity_of
 
 
 def provenance(experiment: Experiment, dataset: Dataset) -> dict[str, Any]:

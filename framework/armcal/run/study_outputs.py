@@ -14,7 +14,7 @@ from armcal.config.variants import SECTION
 from armcal.run import folder as folders
 from armcal.run.study import Study
 from armcal.run.study_result import StudyResult, TransferResult
-from armcal.use.calibration import dump
+from armcal.use.calibration_file import dump
 
 FILES = ("experiment.yaml", "study.csv", "study.json", "study.html")
 

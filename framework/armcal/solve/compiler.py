@@ -17,7 +17,7 @@ import stat
 import subprocess
 import tempfile
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
@@ -55,7 +55,7 @@ def library_key(text: str) -> str:
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:40]
 
 
-def load_cached(key: str) -> ctypes.CDLL | None:
+def load_cached(key: str, entry_points: Sequence[str] = ENTRY_POINTS) -> ctypes.CDLL | None:
     """A compiled library from the cache, or None. Files that others could have written are not loaded."""
     path = cache_directory() / f"{key}.so"
     try:
@@ -67,17 +67,17 @@ def load_cached(key: str) -> ctypes.CDLL | None:
         library = ctypes.CDLL(str(path))
     except OSError:
         return None
-    return library if all(hasattr(library, name) for name in ENTRY_POINTS) else None
+    return library if all(hasattr(library, name) for name in entry_points) else None
 
 
-def compile_now(key: str, source: Callable[[], str]) -> ctypes.CDLL | None:
+def compile_now(key: str, source: Callable[[], str], entry_points: Sequence[str] = ENTRY_POINTS) -> ctypes.CDLL | None:
     """Compile, cache and load; None when that fails."""
     command = _prepare(key, source)
     if command is None:
         return None
     with suppress(OSError, subprocess.SubprocessError):
         subprocess.run(command, check=True, capture_output=True, timeout=_COMPILE_LIMIT_S)
-    return load_cached(key)
+    return load_cached(key, entry_points)
 
 
 def compile_in_background(key: str, source: Callable[[], str]) -> None:

@@ -12,7 +12,7 @@ from scipy.special import stdtrit
 
 from armcal.base.domains import Array
 from armcal.base.parameters import Parameters
-from armcal.errors import ProblemError
+from armcal.errors import NotConvergedError, ProblemError
 from armcal.solve.identifiability import POOR_CONDITION, Identifiability
 from armcal.solve.parallel import Executor
 from armcal.solve.problem import FactorRecords, Problem, triangular
@@ -30,6 +30,12 @@ FEW_HELD = 2
 SMALLEST_SPREAD = 1e-12
 AT_BOUND = 1e-6
 """In ordinary sizes of the parameter: closer than this, a parameter lies on its bound."""
+
+CHECK_THE_DATA = (
+    "Check the axes, units and frame of the measurements, the order and signs of the joints, and the start values; "
+    "or allow more iterations."
+)
+"""What to do about a fit that leads nowhere."""
 
 Progress = Callable[[str, float], None]
 """Told what is being done, and which fraction of it is."""
@@ -50,6 +56,14 @@ class SolverVerdict:
     seconds: float
     starts: int = 1
     agreeing_starts: int = 1
+
+
+def gave_up(verdict: SolverVerdict) -> NotConvergedError:
+    """What to say of a fit that ended where not even its residuals can be taken."""
+    return NotConvergedError(
+        f"{verdict.name} did not converge ({verdict.status}): the fit was driven to where springs do not hold the arm.",
+        hint=f"{CHECK_THE_DATA} If all is right, bound the compliances.",
+    )
 
 
 @dataclass(frozen=True)

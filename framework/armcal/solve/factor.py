@@ -194,7 +194,7 @@ def build_factor(
     symbols, values = _value_expressions(parameters)
     group, of_group = _group_expressions(measurement)
     records = _Records(available)
-    load = _tilted(_load(records, environment), scoped(values, f"{STATICS}."))
+    load = tilted(_load(records, environment), scoped(values, f"{STATICS}."))
     states, deflections = {}, []
     for arm_name in measurement.arms:
         arm = arms[arm_name.removesuffix(OTHER)]
@@ -264,7 +264,8 @@ def gravity_tilt() -> tuple[ParameterBlock, ...]:
     return tuple(scalar(f"{STATICS}.gravity_{axis}", "rad", 0.0, 0.02) for axis in ("rx", "ry"))
 
 
-def _tilted(load: Load, tilt: Mapping[str, Expression]) -> Load:
+def tilted(load: Load, tilt: Mapping[str, Expression]) -> Load:
+    """A load under the real gravity; ``tilt`` has the values of ``gravity_tilt`` by local name, or nothing."""
     if not tilt:
         return load
     about_x, about_y = (se3.rotation_about(axis, tilt[f"gravity_r{axis}"]).rotation for axis in "xy")

@@ -30,10 +30,12 @@ AS_IT_STANDS = 1e300
 """Any state is at rest: take the one given, to which repeated passes might not lead."""
 MOST_DEFLECTION = 1.0
 """rad, or m: a spring that gives more does not hold the arm, and more than one equilibrium may be near."""
+LONGEST_STEP = 0.3
+"""rad, or m: of Newton's method."""
 MOST_PASSES = 100
 WORTH_COMPILING_RECORDS = 5000
 """From this many records on, waiting for the compiler costs less than the virtual machine does."""
-_BLOCK = 64
+_BLOCK, _FEW = 64, 8
 _AGREEMENT = 1e-12
 
 
@@ -57,8 +59,8 @@ class VirtualMachine:
     name = "virtual machine"
 
     def __init__(self, factor: Factor) -> None:
-        self._pass = _Mapped(factor.pass_function())
-        self._linearise = _Mapped(factor.linearise_function())
+        self._pass = Mapped(factor.pass_function())
+        self._linearise = Mapped(factor.linearise_function())
         self._has_state = factor.state.numel() > 0
 
     def residuals(self, values: Array, record: Array, state: Array, residual: Array, rest: float = REST_RAD) -> int:
@@ -89,19 +91,20 @@ class VirtualMachine:
         return int(moving.sum())
 
 
-class _Mapped:
+class Mapped:
     """A CasADi function over many records, without a conversion for each number."""
 
-    def __init__(self, function: ca.Function) -> None:
-        self._function = function.map(f"{function.name()}_block", "serial", _BLOCK, [0], [])
+    def __init__(self, function: ca.Function, block: int = _BLOCK) -> None:
+        self._block, self._function = block, function.map(f"{function.name()}_block", "serial", block, [0], [])
         self._out_sizes = [function.numel_out(i) for i in range(function.n_out())]
         self._in_sizes = [function.numel_in(i) for i in range(1, function.n_in())]
 
     def __call__(self, values: Array, inputs: Sequence[Array], outputs: Sequence[Array]) -> None:
+        """Fill the outputs (entries x N each) for inputs (entries x N each) and ``values``, the same for all."""
         count = inputs[0].shape[1]
         buffer, evaluate = direct_access(self._function)
-        given = [np.zeros((_BLOCK, size)) for size in self._in_sizes]
-        taken = [np.zeros((_BLOCK, size)) for size in self._out_sizes]
+        given = [np.zeros((self._block, size)) for size in self._in_sizes]
+        taken = [np.zeros((self._block, size)) for size in self._out_sizes]
         shared = np.ascontiguousarray(values)
         for position, array in enumerate([shared, *given]):
             if array.size:
@@ -109,8 +112,8 @@ class _Mapped:
         for position, array in enumerate(taken):
             if array.size:
                 buffer.set_res(position, array.data)
-        for start in range(0, count, _BLOCK):
-            stop = min(start + _BLOCK, count)
+        for start in range(0, count, self._block):
+            stop = min(start + self._block, count)
             for block, source in zip(given, inputs, strict=True):
                 block[: stop - start] = source[:, start:stop].T
             evaluate()
@@ -166,12 +169,12 @@ class Kernel:
     identity: str = f"casadi {ca.CasadiMeta.version()}"
 
     @cached_property
-    def newton(self) -> ca.Function:
+    def _newton(self) -> Mapped:
         """Newton steps on the equilibrium, for records whose passes do not settle."""
-        return self.factor.newton_function()
+        return Mapped(self.factor.newton_function(), _FEW)
 
     @cached_property
-    def _by_channels(self) -> dict[tuple[str, ...], _Mapped]:
+    def _by_channels(self) -> dict[tuple[str, ...], Mapped]:
         """Slopes by channels, once they were asked for."""
         return {}
 
@@ -192,7 +195,7 @@ class Kernel:
         if slopes.size:
             chosen = tuple(channels)
             if chosen not in self._by_channels:
-                self._by_channels[chosen] = _Mapped(self.factor.channel_slope_function(chosen))
+                self._by_channels[chosen] = Mapped(self.factor.channel_slope_function(chosen))
             self._by_channels[chosen](values, (record, state), (slopes,))
 
     def residuals(self, values: Array, record: Array, state: Array, residual: Array) -> None:
@@ -203,8 +206,7 @@ class Kernel:
         """
         before = state.copy()
         if self.backend.residuals(values, record, state, residual, REST_RAD) or _out_of_hand(state):
-            state[:] = before
-            self._settle_by_newton(values, record, state)
+            self._settle_by_newton(values, record, state, before)
             self.backend.residuals(values, record, state, residual, AS_IT_STANDS)
 
     def linearise(self, values: Array, record: Array, state: Array, residual: Array, jacobian: Array) -> None:
@@ -215,27 +217,41 @@ class Kernel:
         """
         before = state.copy()
         if self.backend.linearise(values, record, state, residual, jacobian, NEAR_REST_RAD) or _out_of_hand(state):
-            state[:] = before
-            self._settle_by_newton(values, record, state)
+            self._settle_by_newton(values, record, state, before)
             self.backend.linearise(values, record, state, residual, jacobian, AS_IT_STANDS)
 
-    def _settle_by_newton(self, values: Array, record: Array, state: Array) -> None:
-        """Bring every record to an equilibrium in place, where repeated passes lead away from it."""
-        for column in range(record.shape[1]):
-            at = np.nan_to_num(state[:, column], nan=0.0, posinf=0.0, neginf=0.0)
-            at = np.zeros_like(at) if _out_of_hand(at) else at
-            for _ in range(MOST_PASSES):
-                moved, step = (np.asarray(m).ravel() for m in self.newton(values, record[:, column], at))
-                length = float(np.abs(step).max(initial=0.0))
-                at = moved if length < 0.3 else at + step * (0.3 / length)
-                if not np.isfinite(length) or length < REST_RAD:
-                    break
-            if not length < NEAR_REST_RAD or _out_of_hand(at):
-                raise NotConvergedError(
-                    "the elastic equilibrium of a record did not settle.",
-                    hint="Bound the compliances, or check masses and units: springs this soft do not hold the arm.",
-                )
-            state[:, column] = at
+    def _settle_by_newton(self, values: Array, record: Array, state: Array, before: Array) -> None:
+        """Bring every record to an equilibrium in place, where repeated passes lead away from it.
+
+        ``state`` is where the passes ended. Records that they brought to rest stay there; the others start anew from
+        ``before``, or from no deflection if that is too much. If one has no equilibrium, all are left at ``before``.
+        """
+        at_rest = np.abs(state).max(axis=0, initial=0.0) <= MOST_DEFLECTION
+        state[:, ~at_rest] = 0.0
+        at_rest &= np.abs(self._newton_step(values, record, state)).max(axis=0, initial=0.0) < NEAR_REST_RAD
+        held = np.abs(before).max(axis=0, initial=0.0) <= MOST_DEFLECTION
+        state[:, ~at_rest] = np.where(held, before, 0.0)[:, ~at_rest]
+        lengths = np.full(state.shape[1], np.inf)
+        moving = np.arange(state.shape[1])
+        for _ in range(MOST_PASSES):
+            step = self._newton_step(values, record[:, moving], state[:, moving])
+            length = np.abs(step).max(axis=0, initial=0.0)
+            state[:, moving] += step * np.minimum(1.0, LONGEST_STEP / np.maximum(length, LONGEST_STEP))
+            lengths[moving] = length
+            moving = moving[np.isfinite(length) & (length >= REST_RAD)]
+            if not len(moving):
+                break
+        if not (np.all(lengths < NEAR_REST_RAD) and np.abs(state).max(initial=0.0) <= MOST_DEFLECTION):
+            state[:] = before
+            raise NotConvergedError(
+                "the elastic equilibrium of a record did not settle.",
+                hint="Bound the compliances, or check masses and units: springs this soft do not hold the arm.",
+            )
+
+    def _newton_step(self, values: Array, record: Array, state: Array) -> Array:
+        step = np.empty_like(state)
+        self._newton(values, (record, state), (np.empty_like(state), step))
+        return step
 
     def predict(self, values: Array, record: Array, state: Array, shown: Array) -> None:
         """Outputs and tool poses in equilibrium (n_o + 12 an arm x records).
@@ -250,14 +266,14 @@ class Kernel:
         self._in_equilibrium(self.factor.told_function(), values, record, state, said)
 
     def _in_equilibrium(self, function: ca.Function, values: Array, record: Array, state: Array, shown: Array) -> None:
-        mapped, following = _Mapped(function), np.empty_like(state)
+        mapped, following, before = Mapped(function), np.empty_like(state), state.copy()
         for _ in range(MOST_PASSES):
             mapped(values, (record, state), (following, shown))
             moved = np.abs(following - state).max(initial=0.0)
             state[:] = following
             if moved <= REST_RAD and not _out_of_hand(state):
                 return
-        self._settle_by_newton(values, record, state)
+        self._settle_by_newton(values, record, state, before)
         mapped(values, (record, state), (following, shown))
 
 
@@ -285,9 +301,9 @@ def build_kernel(factor: Factor, records: int, choice: EvaluatorChoice = "auto")
     library = compiler.load_cached(key)
     if library is None:
         if choice == "auto" and records < WORTH_COMPILING_RECORDS:
-            _quietly(lambda: compiler.compile_in_background(key, source))
+            quietly(lambda: compiler.compile_in_background(key, source))
             return Kernel(factor, machine)
-        library = _quietly(lambda: compiler.compile_now(key, source))
+        library = quietly(lambda: compiler.compile_now(key, source))
     if library is None:
         return Kernel(factor, machine)
     compiled = Compiled(library)
@@ -311,8 +327,8 @@ def kernel_source(factor: Factor, single_pass: ca.Function, linearise: ca.Functi
     return defines + c_source.support_source() + one.source + two.source + c_source.driver_source()
 
 
-def _quietly(build: Callable[[], ctypes.CDLL | None]) -> ctypes.CDLL | None:
-    """An expression without a C form is no fault: the virtual machine serves."""
+def quietly(build: Callable[[], ctypes.CDLL | None]) -> ctypes.CDLL | None:
+    """What was built, or None: an expression without a C form is no fault, the virtual machine serves."""
     try:
         return build()
     except c_source.UnsupportedExpressionError:

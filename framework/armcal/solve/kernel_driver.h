@@ -28,13 +28,6 @@ static int settle(const double *c, const V *record, V *state, V *residual, doubl
   return 1;
 }
 
-static void gather(V *to, const double *from, long stride, int count) {
-  for (int k = 0; k < count; ++k) to[k] = load(from + k * stride);
-}
-static void scatter(double *to, const V *from, long stride, int count) {
-  for (int k = 0; k < count; ++k) store(to + k * stride, from[k]);
-}
-
 /* Residuals in equilibrium. Gives the number of vectors of records that did not settle. */
 long armcal_residuals(long n, long stride, const double *values, const double *record, double *state,
                       double *residual, long residual_stride, double tolerance, int most) {

@@ -86,3 +86,11 @@ BOTH void v_sincos(V x, V *sine, V *cosine) {
   *sine = (V)((I)choose(swap, c, s) ^ flip_sine);
   *cosine = (V)((I)choose(swap, s, c) ^ flip_cosine);
 }
+
+/* Channel by channel: entry k of a vector of records is at [k * stride]. */
+BOTH void gather(V *to, const double *from, long stride, int count) {
+  for (int k = 0; k < count; ++k) to[k] = load(from + k * stride);
+}
+BOTH void scatter(double *to, const V *from, long stride, int count) {
+  for (int k = 0; k < count; ++k) store(to + k * stride, from[k]);
+}

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.special import bdtr, chdtri, ndtri
 
 from armcal.base.domains import Array
-from armcal.solve.estimator import Estimate
+from armcal.solve.estimator import CHECK_THE_DATA, Estimate
 from armcal.solve.evidence import Evidence
 from armcal.solve.evidence_findings import MOST_TOLD, determined_told, misses_told, neighbours_told, structures_told
 from armcal.solve.identifiability import POOR_CONDITION, bound_together, correlated_pairs
@@ -136,7 +136,7 @@ def _convergence(estimate: Estimate) -> Finding:
     told = estimate.verdict
     if not told.converged:
         text = f"{told.name} did not converge ({told.status}): these values are no calibration."
-        return Finding("bad", text, "the solver's own", "Check the data and the start values; allow more iterations.")
+        return Finding("bad", text, "the solver's own", CHECK_THE_DATA)
     text = f"{told.name} converged in {told.iterations} iterations"
     if told.starts > 1:
         text += f"; {told.agreeing_starts} of {told.starts} starts came to the same answer"

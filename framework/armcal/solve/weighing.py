@@ -11,7 +11,18 @@ from pydantic import Field
 
 from armcal.base.domains import Array
 from armcal.base.settings import Settings
-from armcal.solve.estimator import Estimate, Estimator, Progress, Solution, estimate, no_progress, spread
+from armcal.errors import NotConvergedError
+from armcal.solve.estimator import (
+    Estimate,
+    Estimator,
+    Influence,
+    Progress,
+    Solution,
+    estimate,
+    gave_up,
+    no_progress,
+    spread,
+)
 from armcal.solve.parallel import Executor
 from armcal.solve.problem import FactorRecords, Problem
 from armcal.solve.redundancy import studentised_distances
@@ -123,7 +134,7 @@ class Weighing:
             acting = influence(problem, whitened, robust, loss, self._trusted(problem, whitened, robust))
         elif loss == "reject":
             whitened = problem.weighted(whitened, robust.weights)
-        found = estimate(problem, whitened, robust.solution, acting)
+        found = _estimate(problem, whitened, robust.solution, acting)
         return WeighedFit(
             robust.solution,
             found,
@@ -205,7 +216,17 @@ def fit(
     if isinstance(estimator, Weighing):
         return estimator.fit(problem, records, start, progress)
     solution = estimator.solve(problem, records, start, progress)
-    return WeighedFit(solution, estimate(problem, records, solution), tuple(records), ones(records))
+    return WeighedFit(solution, _estimate(problem, records, solution), tuple(records), ones(records))
+
+
+def _estimate(
+    problem: Problem, records: Sequence[FactorRecords], solution: Solution, acting: Influence | None = None
+) -> Estimate:
+    """The estimate at a solution; where a solver gave up on the edge of what springs hold, there may be none."""
+    try:
+        return estimate(problem, records, solution, acting)
+    except NotConvergedError as fault:
+        raise fault if solution.verdict.converged else gave_up(solution.verdict) from fault
 
 
 def _suspects(problem: Problem, robust: RobustFit, records: tuple[FactorRecords, ...]) -> tuple[Suspect, ...]:

@@ -2,23 +2,17 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
-from pydantic import Field
 
 from armcal.base.config_text import plain
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.base.parameters import Parameters
-from armcal.base.settings import Settings
 from armcal.config.system import System, build_system
 from armcal.config.validate import validate
 from armcal.config.yaml_source import load_config
@@ -28,67 +22,13 @@ from armcal.measure.measurement import Measurement
 from armcal.measure.partners import PairedMeasurement
 from armcal.plugins import PluginRegistry, discover
 from armcal.solve.coverage import Recording
-from armcal.solve.estimator import Estimate
 from armcal.solve.problem import Problem
 from armcal.solve.variance import Component
-from armcal.use.intervals import PlusMinus, PredictionRecord, Uncertainty
-
-SCHEMA = 1
-UNMOVED_SD = 1e-4
-"""In standard deviations: a step that ignores the bounds and is shorter than this is the solver's own tolerance."""
-_LINE_END = re.compile("[\n\r\x85\u2028\u2029]")
-
-
-class ParameterRecord(Settings):
-    """One canonical entry as it is kept; ``sd``, ``lower`` and ``upper`` are null where they are not known.
-
-    ``determined`` is by the records alone; what they do not determine may be held by a prior, and is no finding.
-    ``unconstrained`` is where the records would have it if no bound held any parameter, where that differs: who goes on
-    from the calibration needs it, for a bound is no evidence.
-    """
-
-    name: str
-    unit: str
-    nominal: float
-    value: float
-    free: bool
-    sd: float | None = None
-    lower: float | None = None
-    upper: float | None = None
-    determined: bool | None = None
-    held_by_prior: bool = False
-    at_bound: bool = False
-    unconstrained: float | None = None
-
-
-class InformationRecord(Settings):
-    """Square-root information of the increments of the free parameters about their values."""
-
-    increments: tuple[str, ...]
-    square_root: tuple[tuple[float, ...], ...]
-
-
-class CalibrationFile(Settings):
-    """The schema of calibration.yaml."""
-
-    armcal_calibration: int
-    created: str
-    experiment: str
-    converged: bool
-    software: dict[str, str]
-    identity: dict[str, str]
-    environment_columns: tuple[str, ...] = ()
-    noise: dict[str, Any]
-    quality_mm: dict[str, Any]
-    verdict: dict[str, Any]
-    arms: dict[str, Any]
-    measurements: dict[str, Any]
-    statics: dict[str, Any]
-    groups: dict[str, tuple[str, ...]] = Field(default_factory=dict)
-    parameters: tuple[ParameterRecord, ...]
-    prediction: PredictionRecord | None = None
-    information: InformationRecord
-    recalibrated: dict[str, Any] | None = None
+from armcal.use.calibration_file import SCHEMA, CalibrationFile, identity_of
+from armcal.use.compensation.compensator import Compensator
+from armcal.use.compensation.request import Commands, Options
+from armcal.use.intervals import PlusMinus, Uncertainty
+from armcal.use.tool_expression import ToolExpression, arm_expression
 
 
 @dataclass(frozen=True)
@@ -165,13 +105,7 @@ class Calibration:
             DataError: the arm is elastic and neither records nor calibration say what hangs on the tool.
             NotConvergedError: a record has no equilibrium.
         """
-        elastic = any(arm.deflection_size for arm in self.system.arms.values())
-        if elastic and self.system.statics.payload is None and not commands.has("payload"):
-            raise DataError(
-                "the arm is elastic and its payload is not stated.",
-                where=Location(commands.source or None),
-                hint="Add a column payload_g; the calibration was made with one.",
-            )
+        self.require_payload(commands.has("payload"), commands.source)
         fixed = self.parameters.with_free(())
         problem = Problem.build(
             self.system.arms,
@@ -189,6 +123,20 @@ class Calibration:
             for row, channel in enumerate(kernel.factor.output_channels)
         }
         return channels, _poses(shown[0][len(problem.kernels[0].factor.output_channels) :])
+
+    def require_payload(self, told: bool, source: str | None = None) -> None:
+        """An elastic arm needs to know what hangs on its tool, if not from the calibration then from the records.
+
+        Raises:
+            DataError: neither says.
+        """
+        elastic = any(arm.deflection_size for arm in self.system.arms.values())
+        if elastic and self.system.statics.payload is None and not told:
+            raise DataError(
+                "the arm is elastic and its payload is not stated.",
+                where=Location(source or None),
+                hint="Add a column payload_g; the calibration was made with one.",
+            )
 
     @property
     def uncertainty(self) -> Uncertainty:
@@ -241,6 +189,56 @@ class Calibration:
             )
         return self.uncertainty.plus_minus(commands, recording)
 
+    def expression(self, arm: str | None = None, conditions: Sequence[str] = ()) -> ToolExpression:
+        """One arm (the first if no name is given) as expressions of commands, load and elastic state.
+
+        Raises:
+            ValueError: no such arm.
+        """
+        system, name = self.system, self._named(arm)
+        return arm_expression(system.arms[name], self.parameters, system.environment, conditions)
+
+    def compensator(
+        self, arm: str | None = None, options: Options | None = None, conditions: Sequence[str] = (), **parts: Any
+    ) -> Compensator:
+        """What finds commands for one arm (the first if no name is given); build it once and ask it often.
+
+        ``conditions`` of the surroundings are those that targets will tell; ``parts`` are further ones of
+        ``Compensator``.
+
+        Raises:
+            ValueError: no such arm, or limits of a joint that it does not have.
+        """
+        return Compensator(self.expression(arm, conditions), self.parameters, options, **parts)
+
+    def compensate(
+        self,
+        positions: Array,
+        rotations: Array | None = None,
+        start: Array | None = None,
+        arm: str | None = None,
+        options: Options | None = None,
+        **told: Any,
+    ) -> Commands:
+        """What to command so that the tool is at positions (N x 3; m; base frame), turned as base_R_tool (N x 3 x 3).
+
+        ``start`` (n or N x n; rad or m) is where the arm comes from, ``told`` the rest of ``Compensator.targets``:
+        payload, gravity, approach. Who asks often keeps a ``compensator``.
+
+        Raises:
+            ValueError: no such arm, limits of a joint that it does not have, or arrays of other shapes.
+            DataError: the arm is elastic and nothing says what hangs on the tool.
+        """
+        self.require_payload(told.get("payload") is not None)
+        compensator = self.compensator(arm, options)
+        return compensator.solve(compensator.targets(positions, rotations, **told), start)
+
+    def _named(self, arm: str | None) -> str:
+        name = arm or next(iter(self.system.arms))
+        if name not in self.system.arms:
+            raise ValueError(f"no arm is called {name!r}; the arms are {', '.join(self.system.arms)}")
+        return name
+
     def forward(self, joint_angles: Array, arm: str | None = None) -> Array:
         """base_T_tool (N x 4 x 4) at commanded joint angles (N x n; rad, or m on sliding joints).
 
@@ -248,86 +246,37 @@ class Calibration:
             ValueError: no such arm, or the number of joints differs.
             NotConvergedError: a record has no equilibrium.
         """
-        name = arm or next(iter(self.system.arms))
-        if name not in self.system.arms:
-            raise ValueError(f"no arm is called {name!r}; the arms are {', '.join(self.system.arms)}")
+        name = self._named(arm)
         joints = tuple(self.system.arms[name].commanded)
         angles = np.atleast_2d(np.asarray(joint_angles, dtype=float))
         if angles.shape[1] != len(joints):
             raise ValueError(f"found {angles.shape[1]} joint angles a row, the arm {name} has {len(joints)} joints")
         channels = {f"{name}.{joint}": angles[:, i] for i, joint in enumerate(joints)}
         commands = Dataset(tuple(str(i) for i in range(len(angles))), channels)
-        alone = replace(self.system, measurements={"pose": ArmsAlone([name])})
+        alone = replace(self.system, arms={name: self.system.arms[name]}, measurements={})
         poses = replace(self, system=alone).predict(commands)[1]
         return np.asarray(poses[0])
 
 
-def identity_of(description: Mapping[str, Any]) -> str:
-    """A hash of an arm's whole description."""
-    return hashlib.sha256(json.dumps(plain(description), sort_keys=True).encode()).hexdigest()
+def arm_named(calibration: Calibration, arm: str | None) -> str:
+    """The arm of this name, or the only one if there is no name.
 
-
-def parameter_records(estimate: Estimate) -> tuple[ParameterRecord, ...]:
-    """Every canonical entry of an estimate."""
-    parameters, nominal = estimate.parameters, estimate.parameters.nominal()
-    units = [block.entry_unit for block in parameters.blocks for _ in block.entry_names]
-    place = {name: i for i, name in enumerate(estimate.names)}
-    records = []
-    for position, name in enumerate(parameters.entry_names):
-        i = place.get(name)
-        known = {} if i is None else _uncertainty(estimate, i)
-        records.append(
-            ParameterRecord(
-                name=name,
-                unit=units[position],
-                nominal=float(nominal[position]),
-                value=float(estimate.values[position]),
-                free=i is not None,
-                at_bound=name in estimate.at_bound,
-                **known,
-            )
-        )
-    return tuple(records)
-
-
-def dump(content: Mapping[str, Any]) -> str:
-    """YAML text, keys in order, numbers to their last digit."""
-    return yaml.dump(plain(dict(content)), Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=110)
-
-
-class _Dumper(getattr(yaml, "CSafeDumper", yaml.SafeDumper)):  # type: ignore[misc]
-    """Puts text of several lines in double quotes, the only style that keeps every kind of line end."""
-
-
-def _quoted(dumper: yaml.SafeDumper, text: str) -> yaml.ScalarNode:
-    style = '"' if _LINE_END.search(text) else None
-    return dumper.represent_scalar("tag:yaml.org,2002:str", text, style=style)
-
-
-_Dumper.add_representer(str, _quoted)
-
-
-def _uncertainty(estimate: Estimate, index: int) -> dict[str, Any]:
-    interval, free = estimate.intervals[index], float(estimate.unconstrained[index])
-    moved = abs(free - estimate.values[estimate.free_entries[index]])
-    return {
-        "unconstrained": free if moved > UNMOVED_SD * estimate.deviations[index] else None,
-        "sd": _finite(estimate.deviations[index]),
-        "lower": _finite(interval.lower),
-        "upper": _finite(interval.upper),
-        "determined": estimate.told_by_data[index],
-        "held_by_prior": estimate.determined[index] and not estimate.told_by_data[index],
-    }
+    Raises:
+        ConfigError: no such arm, or several and no name.
+    """
+    arms = calibration.system.arms
+    if arm is None and len(arms) > 1:
+        raise ConfigError(f"the calibration has {len(arms)} arms, {', '.join(arms)}.", hint="Choose: --arm NAME.")
+    name = next(iter(arms)) if arm is None else arm
+    if name not in arms:
+        raise ConfigError(f"no arm is called {name!r}.", hint=f"The arms are {', '.join(arms)}.")
+    return name
 
 
 def _component(kept: Mapping[str, Any]) -> Component:
     """One estimated variance; not a number where null is kept."""
     known: dict[str, Any] = {key: float("nan") if value is None else value for key, value in kept.items()}
     return Component(**known)
-
-
-def _finite(number: float) -> float | None:
-    return float(number) if np.isfinite(number) else None
 
 
 def _values(parameters: Parameters, record: CalibrationFile, path: str | Path) -> Array:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Protocol
+from dataclasses import dataclass, field, replace
+from typing import Any, Protocol
 
 import casadi as ca
 import numpy as np
@@ -14,35 +16,104 @@ from armcal.arm.assembly import Arm, ArmState
 from armcal.arm.model import forward
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
-from armcal.base.parameters import ParameterBlock
+from armcal.base.parameters import ParameterBlock, Parameters
 from armcal.base.se3 import Expression
-from armcal.errors import ConfigError, NotConvergedError
+from armcal.errors import NotConvergedError
 from armcal.measure.measurement import Channel
-from armcal.use.calibration import Calibration
+from armcal.solve.factor import STATICS, Environment
+from armcal.use.calibration import Calibration, arm_named
+from armcal.use.calibration_file import ParameterRecord
+from armcal.use.tool_expression import ToolExpression, arm_expression
 
 POSES = 1000
 """So many random poses, within the joints' limits, are compared."""
 _LONGEST_M = 1.0
 _FARTHEST = {"angle": math.pi, "length": _LONGEST_M}
 _WIDEST = {"angle": 4 * math.pi, "length": 100.0}
+_NOTHING = Environment((0.0, 0.0, 0.0))
+
+
+@dataclass(frozen=True)
+class Origin:
+    """Where the numbers of an export come from.
+
+    Attributes:
+        experiment: the calibration's name.
+        created: when it was made (ISO 8601).
+        software: versions by name.
+        identity: hashes of what it was made from, by name (``arm``, ``data``).
+    """
+
+    experiment: str = ""
+    created: str = ""
+    software: Mapping[str, str] = field(default_factory=dict)
+    identity: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class ExportRequest:
-    """What is to be written: an arm, its instance name, and its calibrated parameters by full name."""
+    """What is to be written: an arm, its instance name, and its calibrated parameters by full name.
+
+    Since contract 1.4 also:
+
+    Attributes:
+        name: the arm's instance name.
+        arm: the arm.
+        values: its own calibrated parameters by full name (SI).
+        tilt: how the real gravity is turned from the stated one, by full name (``statics.gravity_rx``; rad).
+        environment: what acts where nothing is said.
+        payload_stated: whether the calibration says what hangs on the tool.
+        entries: what the calibration says of each number: unit, nominal value, value, standard deviation.
+        description: the arm as a configuration in SI units: ``model``, ``effects``, ``links``.
+        origin: where the numbers come from.
+        out: the name of the file that is written, for formats whose files name one another.
+    """
 
     name: str
     arm: Arm
     values: Mapping[str, Array]
+    tilt: Mapping[str, Array] = field(default_factory=dict)
+    environment: Environment = _NOTHING
+    payload_stated: bool = True
+    entries: tuple[ParameterRecord, ...] = ()
+    description: Mapping[str, Any] = field(default_factory=dict)
+    origin: Origin = field(default_factory=Origin)
+    out: str = ""
+
+    def expression(self, conditions: Sequence[str] = ()) -> ToolExpression:
+        """The arm as expressions of commands, load and elastic state; ``conditions`` are told, not taken as known."""
+        blocks = [replace(b, nominal=tuple(map(float, self.values[b.name]))) for b in self.arm.parameters()]
+        tilt = [ParameterBlock(name, "rad", tuple(map(float, value))) for name, value in self.tilt.items()]
+        return arm_expression(self.arm, Parameters((*blocks, *tilt)), self.environment, conditions)
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of the arm's description and of its calibrated values, by which an export is known again."""
+        numbers = {name: [float(x) for x in value] for name, value in {**self.values, **self.tilt}.items()}
+        told = {"arm": self.origin.identity.get("arm", ""), "name": self.name, "values": numbers}
+        return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()
 
 
 @dataclass(frozen=True)
 class Exported:
-    """A file's content, how many of the arm's numbers changed in it, and what of the arm it cannot hold."""
+    """A file's content, how many of the arm's numbers changed in it, and what of the arm it cannot hold.
+
+    Attributes:
+        content: of the file that was asked for.
+        changed: how many numbers are not the nominal ones.
+        left_out: what the format cannot hold.
+        companions: further files by name, which are written beside it. Since contract 1.4.
+        remarks: what whoever uses the files should know, a sentence each. Since contract 1.4.
+        reach: how far what is left out moves the tool, at most over random poses (m), where the exporter measured it;
+            None for all effects together, which armcal measures. Since contract 1.4.
+    """
 
     content: bytes
     changed: int
     left_out: tuple[str, ...] = ()
+    companions: Mapping[str, bytes] = field(default_factory=dict)
+    remarks: tuple[str, ...] = ()
+    reach: float | None = None
 
 
 class Exporter(Protocol):
@@ -52,25 +123,38 @@ class Exporter(Protocol):
         """The arm in the format, read again and compared before it is handed out.
 
         Raises:
-            InputError: the format cannot hold this arm.
+            InputError: the format cannot hold this arm, or what it needs is not installed.
         """
 
 
-def request_of(calibration: Calibration, arm: str | None) -> ExportRequest:
-    """What a calibration says of one arm; of its only one if no name is given.
+def changed_numbers(request: ExportRequest) -> int:
+    """How many of the arm's calibrated numbers are not the nominal ones."""
+    nominal = {block.name: block.nominal for block in request.arm.parameters()}
+    return sum(float(a) != b for n, value in request.values.items() for a, b in zip(value, nominal[n], strict=True))
+
+
+def request_of(calibration: Calibration, arm: str | None, out: str = "") -> ExportRequest:
+    """What a calibration says of one arm, of its only one if no name is given; ``out`` names the file to be written.
 
     Raises:
         ConfigError: no such arm, or several and no name.
     """
-    arms = calibration.system.arms
-    if arm is None and len(arms) > 1:
-        raise ConfigError(f"the calibration has {len(arms)} arms, {', '.join(arms)}.", hint="Choose: --arm NAME.")
-    name = next(iter(arms)) if arm is None else arm
-    if name not in arms:
-        raise ConfigError(f"no arm is called {name!r}.", hint=f"The arms are {', '.join(arms)}.")
+    arms, name = calibration.system.arms, arm_named(calibration, arm)
     values = {block.name: np.array(block.nominal) for block in calibration.parameters.blocks}
     own = {block.name for block in arms[name].parameters()}
-    return ExportRequest(name, arms[name], {key: value for key, value in values.items() if key in own})
+    record = calibration.record
+    return ExportRequest(
+        name,
+        arms[name],
+        {key: value for key, value in values.items() if key in own},
+        tilt={key: value for key, value in values.items() if key.startswith(f"{STATICS}.")},
+        environment=calibration.system.environment,
+        payload_stated=calibration.system.statics.payload is not None,
+        description=record.arms[name],
+        entries=tuple(e for e in record.parameters if e.name.partition("[")[0] in own),
+        origin=Origin(record.experiment, record.created, record.software, record.identity),
+        out=out,
+    )
 
 
 def random_commands(arm: Arm, count: int = POSES, seed: int = 1) -> Array:

@@ -7,7 +7,7 @@ times larger than the records that tell of it. Those are kept instead, and the d
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Literal
 
@@ -82,12 +82,14 @@ class PlusMinus:
         deviations: standard deviation of each channel (N each; m or rad), not stretched.
         half_widths: of 90 % intervals, stretched as cross-validation found (N each).
         radii: of each position measurement by name: of a ball about the prediction that holds 95 % (N each; m).
+        covariances: of each position measurement by name, stretched as half widths are (N x 3 x 3 each; m^2).
     """
 
     shift: dict[str, Array]
     deviations: dict[str, Array]
     half_widths: dict[str, Array]
     radii: dict[str, Array]
+    covariances: dict[str, Array] = field(default_factory=dict)
 
 
 def stretch_records(stretches: Mapping[Recording, Stretch]) -> dict[Literal["same", "new"], StretchRecord]:
@@ -268,15 +270,17 @@ def _joined(
         if len(channels) != kernel.factor.residual.numel():
             continue
         rows, radius = np.full((3, len(channels), count), np.nan), np.full(count, np.nan)
+        covariance = np.full((count, len(channels), len(channels)), np.nan)
         for part in parts:
             own, spread = stretches.get(part.recording), part.spreads[place]
-            half = spread.half_widths(STATED) * (own.coordinates[level_name(STATED)] if own else 1.0)
-            rows[:, :, part.places] = part.shifts[place], spread.deviations, half
+            stretch = own.coordinates[level_name(STATED)] if own else 1.0
+            rows[:, :, part.places] = part.shifts[place], spread.deviations, stretch * spread.half_widths(STATED)
+            covariance[part.places] = stretch**2 * spread.covariance
             radius[part.places] = spread.radius() * (own.radius if own and own.radius is not None else 1.0)
         for i, channel in enumerate(channels):
             found.shift[channel], found.deviations[channel], found.half_widths[channel] = rows[:, i]
         if is_position(kernel):
-            found.radii[name] = radius
+            found.radii[name], found.covariances[name] = radius, covariance
     return found
 
 

@@ -29,7 +29,7 @@ from armcal.bench.clock import Clock
 from armcal.bench.device import DeviceIdentity, JointDevice
 from armcal.bench.faults import DeviceRefusedError
 from armcal.errors import InputError, Location
-from armcal.use.calibration import identity_of
+from armcal.use.calibration_file import identity_of
 
 _FIRST_FRAME_S = 3.0
 

@@ -24,7 +24,8 @@ from armcal.run.outputs import calibration_content
 from armcal.run.pipeline import Stopwatch, calibrate
 from armcal.solve.estimator import Progress, no_progress
 from armcal.solve.simulation import SimulationRequest
-from armcal.use.calibration import Calibration, dump
+from armcal.use.calibration import Calibration
+from armcal.use.calibration_file import dump
 
 CALIBRATION = "calibration.yaml"
 BENCH = "bench.csv"

@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
 import select
 import socket
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from stat import S_ISSOCK
 from typing import Any
 
 from armcal.errors import ArmcalError, InputError, Location
 from armcal.online.running.outputs import as_line
+from armcal.online.running.unix_socket import listening, short_address
 
 SOCKET = "control.sock"
 COMMANDS = ("status", "pause", "resume", "rollback", "finish", "what_if")
@@ -24,8 +22,6 @@ _LONGEST = 64 * 1024
 _CLIENTS = 8
 _PATIENCE_S = 10.0
 """A client that neither asks nor reads for so long is let go of."""
-_PATH_BYTES = 100
-"""A longer path does not fit a Unix socket's address."""
 
 Answer = Callable[[Mapping[str, Any]], Mapping[str, Any]]
 """The reply to a request; an ArmcalError becomes an error reply."""
@@ -51,7 +47,7 @@ class ControlServer:
         self._path = folder / SOCKET
         self._answer = answer
         self._clients: list[_Client] = []
-        self._listener = _listening(self._path)
+        self._listener = listening(self._path, "a recalibration is running here.", "Give another --out.", _CLIENTS)
 
     def serve(self) -> None:
         """Answer what was asked by now; returns at once."""
@@ -150,7 +146,7 @@ def ask(folder: Path, request: Mapping[str, Any], timeout_s: float = 30.0) -> di
     """
     where = Location(str(folder / SOCKET))
     try:
-        with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection, _address(folder / SOCKET) as address:
+        with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection, short_address(folder / SOCKET) as address:
             connection.settimeout(timeout_s)
             connection.connect(address)
             connection.sendall(json.dumps(request).encode() + b"\n")
@@ -167,60 +163,3 @@ def ask(folder: Path, request: Mapping[str, Any], timeout_s: float = 30.0) -> di
 
 def _refusal(sentence: str) -> dict[str, Any]:
     return {"ok": False, "error": sentence}
-
-
-@contextmanager
-def _address(path: Path) -> Iterator[str]:
-    """A socket's address, which is short: by the folder's descriptor where the path is long."""
-    if len(os.fsencode(path)) <= _PATH_BYTES:
-        yield str(path)
-        return
-    folder = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        yield f"/proc/self/fd/{folder}/{path.name}"
-    finally:
-        os.close(folder)
-
-
-def _listening(path: Path) -> socket.socket:
-    where = Location(str(path))
-    listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-    try:
-        with _address(path) as address:
-            _clear(path, address)
-            mask = os.umask(0o177)
-            try:
-                listener.bind(address)
-            finally:
-                os.umask(mask)
-        listener.listen(_CLIENTS)
-        listener.setblocking(False)
-    except OSError as fault:
-        listener.close()
-        hint = "Give --out a folder on a disk of this machine that is writable."
-        raise InputError(f"the socket cannot be made ({fault}).", where=where, hint=hint) from fault
-    except BaseException:
-        listener.close()
-        raise
-    return listener
-
-
-def _clear(path: Path, address: str) -> None:
-    """Take away a socket that nobody serves any more."""
-    where = Location(str(path))
-    try:
-        kind = path.lstat().st_mode
-    except FileNotFoundError:
-        return
-    if not S_ISSOCK(kind):
-        raise InputError("it is not a socket.", where=where, hint="Remove it, or give another --out.")
-    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
-        probe.settimeout(1.0)
-        try:
-            probe.connect(address)
-        except (ConnectionRefusedError, FileNotFoundError):
-            path.unlink(missing_ok=True)
-            return
-        except OSError:
-            pass
-    raise InputError("a recalibration is running here.", where=where, hint="End it first, or give another --out.")

@@ -39,7 +39,7 @@ class Udp:
         self._clock = clock
         self._row = 0
         self._senders: OrderedDict[int, Any] = OrderedDict()
-        self._socket = _bound(host, port)
+        self._socket = bound(host, port)
         self._open = True
 
     @property
@@ -93,18 +93,23 @@ class Udp:
         self._socket.close()
 
 
-def _bound(host: str, port: int) -> socket.socket:
+def bound(host: str, port: int) -> socket.socket:
+    """A socket that does not block.
+
+    Raises:
+        InputError: the port cannot be had.
+    """
     where = Location(f"udp:{host}:{port}")
     try:
         kind, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM, flags=socket.AI_PASSIVE)[0]
-        bound = socket.socket(kind, socket.SOCK_DGRAM)
+        found = socket.socket(kind, socket.SOCK_DGRAM)
         try:
-            bound.bind(address)
+            found.bind(address)
         except OSError:
-            bound.close()
+            found.close()
             raise
     except (OSError, UnicodeError) as fault:
         hint = "Give a free port, and an address of this machine."
         raise InputError(f"the socket cannot be had ({fault}).", where=where, hint=hint) from fault
-    bound.setblocking(False)
-    return bound
+    found.setblocking(False)
+    return found

@@ -13,7 +13,8 @@ from armcal.base.domains import Array, Interval
 from armcal.online.tracking.belief import Belief
 from armcal.online.tracking.chart import Chart
 from armcal.online.tracking.projection import most_likely
-from armcal.use.calibration import UNMOVED_SD, Calibration, InformationRecord, dump
+from armcal.use.calibration import Calibration
+from armcal.use.calibration_file import UNMOVED_SD, InformationRecord, dump
 from armcal.use.intervals import covariance_rows
 
 _QUANTILE = float(ndtri(0.975))

@@ -1,0 +1,122 @@
+"""``armcal compensate``."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, get_args
+
+import click
+import numpy as np
+
+from armcal.base.domains import Array
+from armcal.base.units import parse_quantity
+from armcal.cli.common import Voice, spare_inputs, speaking
+from armcal.errors import InputError, Location
+from armcal.plugins import discover
+from armcal.run.command_file import write_commands
+from armcal.run.compensate import Assessed, Bench, assess, summary
+from armcal.run.target_file import TargetFile, check_units
+from armcal.use.calibration import Calibration
+from armcal.use.compensation.compensator import Compensator
+from armcal.use.compensation.request import Redundancy
+
+_SHOWN = 5
+
+
+@click.command()
+@click.argument("calibration", type=click.Path(path_type=Path))
+@click.option("--targets", required=True, type=click.Path(path_type=Path), help="A CSV of positions or poses.")
+@click.option("--out", required=True, type=click.Path(path_type=Path), help="The CSV to write.")
+@click.option("--arm", metavar="NAME", help="Which arm, where there are several.")
+@click.option("--within", type=click.Path(path_type=Path), help="A configuration whose plan has limits and clearance.")
+@click.option("--path", "kind", flag_value="path", help="The targets are a path: one after another, without jumps.")
+@click.option("--start", multiple=True, metavar="JOINT=ANGLE", help="Where the arm comes from: --start 'q1=10 deg'.")
+@click.option(
+    "--redundancy",
+    type=click.Choice(get_args(Redundancy)),
+    default="nearest",
+    show_default=True,
+    help="Which of many commands.",
+)
+@click.option("--angles", type=click.Choice(["deg", "rad"]), default="deg", show_default=True, help="Unit of commands.")
+@speaking
+def compensate(voice: Voice, calibration: Path, targets: Path, out: Path, angles: str, **asked: Any) -> None:
+    """Find what to command so that the arm in CALIBRATION, as it really is, arrives at targets."""
+    spare_inputs(out, calibration, targets, asked["within"])
+    registry = discover()
+    voice.plugin_faults(registry)
+    loaded = Calibration.load(calibration, registry)
+    bench = Bench.of(loaded, asked["arm"], asked["within"], asked["redundancy"], registry)
+    file = bench.read(targets, registry)
+    for text in file.dataset.warnings:
+        voice.warn(text)
+    compensator = bench.compensator(file.targets)
+    check_units(targets, file.targets, compensator.reach)
+    _warn_of_free_joints(voice, compensator)
+    start = _start(asked["start"], compensator)
+    if asked["kind"] == "path":
+        commands = compensator.follow(file.targets, start)
+    else:
+        commands = compensator.solve(file.targets, start)
+    assessed = assess(loaded, compensator, bench.nominal(), file.targets, commands)
+    write_commands(out, compensator, file.targets, file.dataset, assessed, angles)
+    _tell(voice, file, assessed, out)
+
+
+def _warn_of_free_joints(voice: Voice, compensator: Compensator) -> None:
+    limits = zip(compensator.joints, compensator.limits, strict=True)
+    free = [joint for joint, ends in limits if not np.isfinite(ends).all()]
+    if free:
+        voice.warn(f"no limits are known of {', '.join(free)}: commands may lie beyond them. Give --within CONFIG.")
+
+
+def _start(stated: Sequence[str], compensator: Compensator) -> Array | None:
+    """Commands (n; rad or m); joints that are not named stand at zero."""
+    if not stated:
+        return None
+    kinds = compensator.expression.arm.commanded
+    at = dict.fromkeys(compensator.joints, 0.0)
+    for text in stated:
+        joint, found, quantity = (part.strip() for part in text.partition("="))
+        hint = "For example --start 'q1=10 deg'."
+        if not found or joint not in at:
+            known = ", ".join(compensator.joints)
+            raise InputError(
+                f"found {text!r}, expected JOINT=ANGLE with a joint of {known}.", where=Location("--start"), hint=hint
+            )
+        try:
+            at[joint] = parse_quantity(quantity, kinds[joint])
+        except ValueError as fault:
+            raise InputError(f"{joint}: {fault}", where=Location("--start"), hint=hint) from fault
+    return np.array(list(at.values()))
+
+
+def _tell(voice: Voice, file: TargetFile, assessed: Assessed, out: Path) -> None:
+    found, commands = summary(assessed), assessed.commands
+    missed = [
+        {"id": name, "reason": reason, "nearest_mm": 1000 * float(distance) if np.isfinite(distance) else None}
+        for name, reason, distance in zip(file.dataset.ids, commands.reasons, commands.distances, strict=True)
+        if reason
+    ]
+    set_aside = [{"row": each.row, "reason": each.reason} for each in file.dataset.set_aside]
+    voice.result({**found, "missed": missed, "set_aside": set_aside, "out": str(out)})
+    for each in missed[:_SHOWN]:
+        away = each["nearest_mm"]
+        voice.warn(f"{each['id']}: {each['reason']}" + ("" if away is None else f"; the nearest is {away:.3f} mm away"))
+    if len(missed) > _SHOWN:
+        voice.warn(f"{len(missed) - _SHOWN} more targets cannot be had; the file says why")
+    for cell in set_aside[:_SHOWN]:
+        voice.warn(f"row {cell['row']} is set aside: {cell['reason']}")
+    voice.out.print(f"{found['had']} of {found['targets']} targets are had: {out}", markup=False, soft_wrap=True)
+    if found["had"]:
+        voice.out.print(f"error {_accuracy(found)}", markup=False, soft_wrap=True)
+
+
+def _accuracy(found: Any) -> str:
+    told = f"{found['error_mm']:.3g} mm by the calibration's model (at most {found['largest_error_mm']:.3g} mm)"
+    if found["nominal_error_mm"] is not None:
+        told += f"; nominal commands: {found['nominal_error_mm']:.3g} mm"
+    if found["radius_95_mm"] is not None:
+        told += f"; measured places lie within {found['radius_95_mm']:.3g} mm (95 %, median)"
+    return told

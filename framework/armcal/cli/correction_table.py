@@ -1,0 +1,56 @@
+"""``armcal correction-table``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+import numpy as np
+
+from armcal.cli.common import Voice, spare_inputs, speaking
+from armcal.plugins import discover
+from armcal.run.compensate import Bench
+from armcal.run.correction_table import correction_table as made_table
+from armcal.run.correction_table import read_table_settings, write_table
+from armcal.use.calibration import Calibration
+
+
+@click.command("correction-table")
+@click.argument("calibration", type=click.Path(path_type=Path))
+@click.option("--grid", required=True, type=click.Path(path_type=Path), help="A YAML file that describes the grid.")
+@click.option("--out", required=True, type=click.Path(path_type=Path), help="The CSV to write.")
+@click.option("--arm", metavar="NAME", help="Which arm, where there are several.")
+@click.option("--within", type=click.Path(path_type=Path), help="A configuration whose plan has limits and clearance.")
+@speaking
+def correction_table(
+    voice: Voice, calibration: Path, grid: Path, out: Path, arm: str | None, within: Path | None
+) -> None:
+    """Make a table of what to tell a controller that takes the arm in CALIBRATION for the nominal one."""
+    spare_inputs(out, calibration, grid, within)
+    registry = discover()
+    voice.plugin_faults(registry)
+    settings = read_table_settings(grid)
+    loaded = Calibration.load(calibration, registry)
+    loaded.require_payload(settings.payload is not None)
+    bench = Bench.of(loaded, arm, within, "nearest", registry)
+    table = made_table(bench.compensator(), bench.nominal(), settings)
+    write_table(out, table)
+    with_table, without = (1000 * column[np.isfinite(column)] for column in table.tried.T)
+    found = {
+        "nodes": table.had.size,
+        "had": int(table.had.sum()),
+        "tried": len(table.tried),
+        "largest_shift_mm": 1000 * float(np.nanmax(np.linalg.norm(table.shifts, axis=-1))),
+        "error_mm": float(with_table.mean()) if with_table.size else None,
+        "error_95_mm": float(np.percentile(with_table, 95)) if with_table.size else None,
+        "nominal_error_mm": float(without.mean()) if without.size else None,
+    }
+    voice.result({**found, "out": str(out)})
+    voice.out.print(f"{found['had']} of {found['nodes']} nodes are had: {out}", markup=False, soft_wrap=True)
+    if not with_table.size:
+        voice.warn("no cell has all its corners: nothing between the nodes could be tried")
+        return
+    told = f"between nodes {found['error_mm']:.3g} mm (95 %: {found['error_95_mm']:.3g} mm)"
+    if found["nominal_error_mm"] is not None:
+        told += f", without the table {found['nominal_error_mm']:.3g} mm"
+    voice.out.print(told, markup=False, soft_wrap=True)

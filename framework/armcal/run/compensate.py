@@ -1,0 +1,173 @@
+"""From a file of targets to commands, with what they lead to, how sure that is, and what nominal commands would do."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from armcal.arm.loading import LOAD_CHANNELS
+from armcal.base.dataset import Dataset
+from armcal.base.domains import Array
+from armcal.errors import ArmcalError, ConfigError
+from armcal.plugins import PluginRegistry
+from armcal.run.target_file import TargetFile, read_targets
+from armcal.run.workspace import Workspace, workspace_of
+from armcal.use.calibration import Calibration, arm_named
+from armcal.use.compensation.compensator import Compensator
+from armcal.use.compensation.request import Commands, Options, Redundancy, Targets
+from armcal.use.tool_expression import APPROACH, arm_expression
+
+_WORTH_COMPILING = 5000
+"""From this many targets on, waiting for the compiler costs less than doing without it."""
+
+
+@dataclass(frozen=True)
+class Assessed:
+    """Commands, and what is known about them.
+
+    Attributes:
+        commands: found.
+        nominal_distances: how far from its target the real arm is with the nominal arm's command (N; m); nan where the
+            nominal arm has none.
+        nominal_T_tool: where the nominal arm would be at the commands (N x 4 x 4): what a controller must be told that
+            takes the nominal arm for the real one.
+        radii: of the ball about the expected place that holds a measurement of it with 95 % (N; m); None if unknown.
+    """
+
+    commands: Commands
+    nominal_distances: Array
+    nominal_T_tool: Array
+    radii: Array | None
+
+
+@dataclass(frozen=True)
+class Bench:
+    """An arm of a calibration, where it may go and how its commands are chosen.
+
+    Attributes:
+        calibration: as loaded.
+        arm: its instance name.
+        options: of compensation.
+        space: where it may go.
+    """
+
+    calibration: Calibration
+    arm: str
+    options: Options
+    space: Workspace
+
+    @classmethod
+    def of(
+        cls,
+        calibration: Calibration,
+        arm: str | None,
+        within: Path | None,
+        redundancy: Redundancy,
+        registry: PluginRegistry,
+    ) -> Bench:
+        """One arm (the only one if no name is given), with the limits and the clearance of a configuration's plan.
+
+        Raises:
+            ConfigError: no such arm, or several and no name; or the configuration plans for another arm.
+        """
+        name = arm_named(calibration, arm)
+        joints = tuple(calibration.system.arms[name].commanded)
+        space = workspace_of(within, joints, registry) if within else Workspace()
+        return cls(calibration, name, Options(limits=space.limits, redundancy=redundancy), space)
+
+    def read(self, path: Path, registry: PluginRegistry) -> TargetFile:
+        """Targets from a CSV.
+
+        Raises:
+            DataError: it cannot be read, or the arm is elastic and nothing says what hangs on the tool.
+        """
+        file = read_targets(path, self.calibration.expression(self.arm), registry)
+        self.calibration.require_payload(file.dataset.has("payload"), str(path))
+        return file
+
+    def compensator(self, targets: Targets | None = None) -> Compensator:
+        """What finds commands, for targets that tell of such surroundings.
+
+        Raises:
+            ConfigError: the limits leave a joint no room.
+        """
+        told = () if targets is None else tuple(targets.conditions)
+        choice = "compiled" if targets is not None and len(targets) >= _WORTH_COMPILING else "auto"
+        try:
+            return self.calibration.compensator(self.arm, self.options, told, allowed=self.space.allowed, choice=choice)
+        except ValueError as fault:
+            raise ConfigError(f"{fault}.", hint="Correct the limits in the plan.") from fault
+
+    def nominal(self) -> Compensator:
+        """The arm as it was thought to be: nominal parameters, rigid, without effects."""
+        stated = np.array([entry.nominal for entry in self.calibration.record.parameters])
+        plain = replace(self.calibration.system.arms[self.arm], effects={}, masses=())
+        nominal = self.calibration.parameters.with_nominal(stated)
+        expression = arm_expression(plain, nominal, self.calibration.system.environment)
+        return Compensator(expression, nominal, Options(limits=self.options.limits))
+
+
+def assess(
+    calibration: Calibration, compensator: Compensator, nominal: Compensator, targets: Targets, commands: Commands
+) -> Assessed:
+    """What is known about commands that were found.
+
+    Raises:
+        NotConvergedError: a command has no elastic equilibrium.
+    """
+    thought = nominal.solve(replace(targets, conditions={}), commands.joint_angles)
+    reached = compensator.stand(thought.joint_angles, targets, commands.approach)
+    away = np.linalg.norm(reached.base_T_tool[:, :3, 3] - targets.positions, axis=1)
+    return Assessed(
+        commands=commands,
+        nominal_distances=np.where(thought.found & reached.settled, away, np.nan),
+        nominal_T_tool=nominal.forward(commands.joint_angles),
+        radii=_radii(calibration, compensator, targets, commands),
+    )
+
+
+def commanded(compensator: Compensator, targets: Targets, commands: Commands) -> Dataset:
+    """Commands as records, with what acts on the arm in each."""
+    name, joints = compensator.expression.name, compensator.joints
+    channels: dict[str, Array] = {f"{name}.{joint}": commands.joint_angles[:, i] for i, joint in enumerate(joints)}
+    channels |= {f"{name}.{APPROACH}{joint}": commands.approach[:, i] for i, joint in enumerate(joints)}
+    channels |= dict(zip(LOAD_CHANNELS, targets.acting, strict=True))
+    channels |= targets.conditions
+    return Dataset(tuple(str(i) for i in range(1, len(commands) + 1)), channels)
+
+
+def _radii(calibration: Calibration, compensator: Compensator, targets: Targets, commands: Commands) -> Array | None:
+    """95 % radii of the first position that is measured of this arm alone."""
+    if len(calibration.system.arms) > 1 or not calibration.readable or calibration.record.prediction is None:
+        return None
+    settled = np.flatnonzero(commands.found)
+    radii = np.full(len(commands), np.nan)
+    if not settled.size:
+        return radii
+    try:
+        found = calibration.plus_minus(commanded(compensator, targets, commands).subset(settled))
+    except ArmcalError:  # what it tells beyond the commands themselves is not kept
+        return None
+    if not found.radii:
+        return None
+    radii[settled] = next(iter(found.radii.values()))
+    return radii
+
+
+def summary(assessed: Assessed) -> Mapping[str, float | int | None]:
+    """In mm, over the targets that are had."""
+    had = assessed.commands.found
+    away = 1000 * assessed.commands.distances[had]
+    nominal = 1000 * assessed.nominal_distances[had & np.isfinite(assessed.nominal_distances)]
+    radii = None if assessed.radii is None else 1000 * assessed.radii[had]
+    return {
+        "targets": len(had),
+        "had": int(had.sum()),
+        "error_mm": float(away.mean()) if away.size else None,
+        "largest_error_mm": float(away.max()) if away.size else None,
+        "nominal_error_mm": float(nominal.mean()) if nominal.size else None,
+        "radius_95_mm": float(np.median(radii)) if radii is not None and radii.size else None,
+    }

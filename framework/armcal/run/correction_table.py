@@ -1,0 +1,173 @@
+"""A table of corrections for a controller that only knows the nominal arm: what to tell it instead of a target.
+
+At each node of a grid the exact commands are found, and the pose that the nominal arm takes with them is what the
+controller must be told. Between nodes corrections are interpolated linearly along each axis; how well that does is
+tried at random points between them, through the controller's own inverse kinematics.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+from pydantic import Field, model_validator
+from scipy.interpolate import RegularGridInterpolator
+from scipy.spatial.transform import Rotation
+
+from armcal.base.dataset import Dataset
+from armcal.base.domains import Array
+from armcal.base.settings import Angle3, Length3, Mass, Settings
+from armcal.config.validate import validate
+from armcal.config.yaml_source import load_config
+from armcal.errors import ConfigError, Location, ProblemError
+from armcal.measure.csv_writer import write_csv
+from armcal.measure.reader import WantedChannel
+from armcal.use.compensation.compensator import Compensator
+from armcal.use.compensation.grid import over_grid
+from armcal.use.compensation.request import FARTHEST_M, Mask, Targets
+from armcal.use.compensation.turning import turn_between
+
+_MOST_NODES = 200_000
+
+
+class TableSettings(Settings):
+    """A grid in the base frame, between two corners, with ``nodes`` along each axis; the tool's rotation; the load."""
+
+    low: Length3
+    high: Length3
+    nodes: tuple[Annotated[int, Field(ge=2)], Annotated[int, Field(ge=2)], Annotated[int, Field(ge=2)]]
+    rpy: Angle3
+    payload: Mass | None = None
+    tried: Annotated[int, Field(ge=1, le=100_000)] = 1000
+    seed: Annotated[int, Field(ge=0)] = 0
+
+    @model_validator(mode="after")
+    def _ordered(self) -> TableSettings:
+        if any(low >= high for low, high in zip(self.low, self.high, strict=True)):
+            raise ValueError("low does not lie below high on every axis: give the smaller coordinates as low")
+        if np.abs([self.low, self.high]).max() > FARTHEST_M:
+            raise ValueError(f"found a corner beyond {FARTHEST_M:g} m: check the numbers and the unit in the keys")
+        if np.prod(self.nodes) > _MOST_NODES:
+            raise ValueError(
+                f"found {np.prod(self.nodes)} nodes, expected {_MOST_NODES} at most: make the grid coarser"
+            )
+        return self
+
+
+class TableFileSettings(Settings):
+    """The file: ``table: {low_mm: ..., high_mm: ..., nodes: ..., rpy_deg: ...}``."""
+
+    table: TableSettings
+
+
+@dataclass(frozen=True)
+class CorrectionTable:
+    """Corrections at the nodes of a grid.
+
+    Attributes:
+        axes: the nodes' coordinates along x, y and z (m).
+        had: whether a node's pose can be had (grid).
+        shifts: what to add to a position (grid x 3; m); nan where the pose cannot be had.
+        turns: by what to turn a rotation, a rotation vector in the base frame (grid x 3; rad).
+        tried: errors at random points between nodes that can be had: with the table, and without it (N x 2; m).
+    """
+
+    axes: tuple[Array, Array, Array]
+    had: Mask
+    shifts: Array
+    turns: Array
+    tried: Array
+
+
+def read_table_settings(path: Path) -> TableSettings:
+    """Read and check the settings of a table.
+
+    Raises:
+        ConfigError: with file, line and field.
+    """
+    return validate(TableFileSettings, load_config(path)).table
+
+
+def correction_table(compensator: Compensator, nominal: Compensator, settings: TableSettings) -> CorrectionTable:
+    """The table for an arm and what its controller takes it for.
+
+    Raises:
+        ConfigError: the arm has too few joints to keep a rotation.
+        ProblemError: no node can be had.
+    """
+    if len(compensator.joints) < 6:
+        raise ConfigError(
+            f"the arm has {len(compensator.joints)} joints, expected 6 or more to keep the rotation of a table.",
+            where=Location(field="table"),
+            hint="Correct targets one by one: the columns tell_nominal of --targets.",
+        )
+    axes = [np.linspace(*ends) for ends in zip(settings.low, settings.high, settings.nodes, strict=True)]
+    nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    commands = over_grid(compensator, _targets(compensator, nodes, settings), settings.nodes)
+    if not commands.found.any():
+        raise ProblemError("no node of the grid can be had.", hint="Move the grid, or change the rotation.")
+    told = nominal.forward(commands.joint_angles)
+    shape = settings.nodes
+    nothing = np.where(commands.found, 1.0, np.nan)[:, None]
+    asked = np.repeat(_rotation(settings)[None], len(nodes), axis=0)
+    table = CorrectionTable(
+        axes=(axes[0], axes[1], axes[2]),
+        had=commands.found.reshape(shape),
+        shifts=((told[:, :3, 3] - nodes) * nothing).reshape(*shape, 3),
+        turns=(turn_between(asked, told[:, :3, :3]) * nothing).reshape(*shape, 3),
+        tried=np.zeros((0, 2)),
+    )
+    starts = commands.joint_angles.reshape(*shape, -1)
+    return _tried(compensator, nominal, settings, table, starts)
+
+
+def write_table(path: Path, table: CorrectionTable) -> None:
+    """One row a node: ``x_mm, y_mm, z_mm``, what to add, ``dx_mm`` ..., and by what to turn, ``turn_x_rad`` ...
+
+    Raises:
+        DataError: the file cannot be written.
+    """
+    nodes = np.stack(np.meshgrid(*table.axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    columns = {axis: nodes[:, i] for i, axis in enumerate("xyz")}
+    columns |= {f"d{axis}": table.shifts.reshape(-1, 3)[:, i] for i, axis in enumerate("xyz")}
+    columns |= {f"turn_{axis}": table.turns.reshape(-1, 3)[:, i] for i, axis in enumerate("xyz")}
+    kinds = {name: "angle" if name.startswith("turn") else "length" for name in columns}
+    wanted = [WantedChannel(name, (name,), kind, True) for name, kind in kinds.items()]
+    ids = tuple(str(i) for i in range(1, len(nodes) + 1))
+    write_csv(path, Dataset(ids, columns), wanted, {"angle": "rad"})
+
+
+def _tried(
+    compensator: Compensator, nominal: Compensator, settings: TableSettings, table: CorrectionTable, starts: Array
+) -> CorrectionTable:
+    """The table, tried at random points of cells whose corners can all be had."""
+    random = np.random.default_rng(settings.seed)
+    points = random.uniform(settings.low, settings.high, (settings.tried, 3))
+    shift, turn, near = (_between(table.axes, grid)(points) for grid in (table.shifts, table.turns, starts))
+    whole = np.isfinite(shift).all(axis=1)
+    points, shift, turn, near = points[whole], shift[whole], turn[whole], near[whole]
+    rotation = Rotation.from_matrix(_rotation(settings))
+    errors = []
+    for told, turned in ((points + shift, (Rotation.from_rotvec(turn) * rotation).as_matrix()), (points, None)):
+        asked = np.repeat(_rotation(settings)[None], len(points), axis=0) if turned is None else turned
+        thought = nominal.solve(nominal.targets(told, asked), near)
+        targets = _targets(compensator, points, settings)
+        stands = compensator.stand(thought.joint_angles, targets, np.zeros_like(thought.joint_angles))
+        away = np.linalg.norm(stands.base_T_tool[:, :3, 3] - points, axis=1)
+        errors.append(np.where(thought.found & stands.settled, away, np.nan))
+    return CorrectionTable(table.axes, table.had, table.shifts, table.turns, np.stack(errors, axis=1))
+
+
+def _between(axes: tuple[Array, Array, Array], grid: Array) -> RegularGridInterpolator:
+    return RegularGridInterpolator(axes, grid, method="linear", bounds_error=False)
+
+
+def _targets(compensator: Compensator, positions: Array, settings: TableSettings) -> Targets:
+    rotations = np.repeat(_rotation(settings)[None], len(positions), axis=0)
+    return compensator.targets(positions, rotations, payload=settings.payload)
+
+
+def _rotation(settings: TableSettings) -> Array:
+    return np.asarray(Rotation.from_euler("xyz", settings.rpy).as_matrix())

@@ -1,0 +1,33 @@
+"""Are axes or joints exchanged or reversed in the data? Then no parameters can mend it, and a fit may lead nowhere."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from armcal.base.dataset import Dataset
+from armcal.errors import DataError, Location
+from armcal.solve.mixups import find_mixup
+from armcal.solve.problem import FactorRecords, Problem
+
+_MEND = {
+    True: "the order or the directions of the joints in the model",
+    False: "how the tracker's frame lies",
+}
+
+
+def check_mixups(problem: Problem, records: Sequence[FactorRecords], dataset: Dataset) -> None:
+    """Positions that do not fit the model, but do once one mix-up is undone.
+
+    Raises:
+        DataError: they are such; it names what looks mixed up.
+    """
+    found = find_mixup(problem, records, dataset)
+    if found is None:
+        return
+    raise DataError(
+        f"{found.measurement}: as they stand, the data are typically {found.as_given_mm:.3g} mm off the model, however "
+        f"its free parameters adapt; with {', or with '.join(found.told)}, they are {found.left_mm:.3g} mm off.",
+        where=Location(dataset.source),
+        hint=f"Mend these columns in the file or by data.columns, or {_MEND[found.of_joints]}. If the data are right, "
+        "the model's nominal values are far off: give better ones.",
+    )

@@ -1,0 +1,175 @@
+"""Targets as a CSV: where the tool shall be, with what load."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from armcal.arm.loading import LOAD_CHANNELS
+from armcal.base.config_text import ConfigText
+from armcal.base.dataset import Dataset
+from armcal.base.domains import Array
+from armcal.base.quaternions import rotation_matrix
+from armcal.base.units import DIMENSIONLESS
+from armcal.errors import DataError, Location
+from armcal.measure.environment import noticed
+from armcal.measure.reader import ENVIRONMENT, ReadRequest, WantedChannel
+from armcal.plugins import PluginRegistry
+from armcal.use.compensation.reach import Reach
+from armcal.use.compensation.request import FARTHEST_M, Targets
+from armcal.use.tool_expression import APPROACH, ToolExpression
+
+QUATERNION = ("qw", "qx", "qy", "qz")
+RPY = ("roll", "pitch", "yaw")
+_NORM = 1e-3
+_FARTHER, _NEARER = 10.0, 100.0
+
+
+@dataclass(frozen=True)
+class TargetFile:
+    """Targets, and the file's content: ids, columns that nothing asked for, rows set aside."""
+
+    targets: Targets
+    dataset: Dataset
+
+
+def read_targets(path: Path, expression: ToolExpression, registry: PluginRegistry) -> TargetFile:
+    """Targets of one arm.
+
+    Columns ``x_mm, y_mm, z_mm``, or ``target_x_mm`` and so on, which alone counts where a joint is called ``x``; for a
+    rotation too ``qw, qx, qy, qz`` or ``roll_deg, pitch_deg, yaw_deg`` (about the base frame's x, then y, then z).
+    Load, gravity, surroundings and approach are told as in measured data.
+
+    Raises:
+        DataError: the file cannot be read, or a rotation is told in part, or twice, or is none.
+    """
+    wanted = _wanted(expression)
+    reader_class = registry.find("reader", "csv").load()
+    reader = reader_class(reader_class.Settings(path=ConfigText(str(path))))
+    dataset = noticed(reader.read(ReadRequest({}, {}, wanted)))
+    if not len(dataset):
+        raise DataError("it has no targets.", where=Location(str(path)), hint="Give a row for each target.")
+    count = len(dataset)
+    acting = np.repeat(expression.defaults[:, None], count, axis=1)
+    for i, channel in enumerate(expression.channels):
+        name = f"{expression.name}.{channel}" if channel.startswith(APPROACH) else channel
+        if channel not in expression.joints and dataset.has(name):
+            acting[i] = dataset.column(name)
+    _check_payload(path, dataset)
+    joints = len(expression.joints)
+    positions = _positions(path, dataset)
+    loads = slice(2 * joints, 2 * joints + len(LOAD_CHANNELS))
+    surroundings = {name: dataset.column(name) for name in expression.arm.conditions if dataset.has(name)}
+    return TargetFile(
+        Targets(positions, _rotations(path, dataset), acting[loads], acting[joints : 2 * joints], surroundings), dataset
+    )
+
+
+def rpy_matrices(rpy: Array) -> Array:
+    """Rz(yaw) Ry(pitch) Rx(roll) (N x 3 x 3) from roll, pitch, yaw (N x 3; rad)."""
+    (a, b, c), (sa, sb, sc) = np.cos(rpy.T), np.sin(rpy.T)
+    rows = [
+        [c * b, c * sb * sa - sc * a, c * sb * a + sc * sa],
+        [sc * b, sc * sb * sa + c * a, sc * sb * a - c * sa],
+        [-sb, b * sa, b * a],
+    ]
+    return np.array(rows).transpose(2, 0, 1)
+
+
+def check_units(path: Path, targets: Targets, reach: Reach) -> None:
+    """Positions ten times farther out than the arm reaches, or a hundredth of that: a unit is wrong.
+
+    Raises:
+        DataError: they are so.
+    """
+    away = float(np.median(np.linalg.norm(targets.positions, axis=1)))
+    if np.isfinite(reach.farthest) and not reach.farthest / _NEARER < away < _FARTHER * reach.farthest:
+        raise DataError(
+            f"targets are typically {away:.4g} m from the base frame, the arm reaches {reach.farthest:.4g} m.",
+            where=Location(str(path)),
+            hint="Check the unit in the column names: x_mm or x_m.",
+        )
+
+
+def _wanted(expression: ToolExpression) -> tuple[WantedChannel, ...]:
+    told: list[tuple[str, str, bool]] = [(axis, "length", True) for axis in "xyz"]
+    told += [(name, DIMENSIONLESS, False) for name in QUATERNION] + [(name, "angle", False) for name in RPY]
+    told += [(name, dimension, False) for name, dimension in ENVIRONMENT if name not in ("time", "sequence")]
+    wanted = [WantedChannel(name, _names(name, expression), dimension, needed) for name, dimension, needed in told]
+    for index, joint in enumerate(expression.joints, start=1):
+        names = (f"approach{index}", f"approach_{joint}")
+        wanted.append(WantedChannel(f"{expression.name}.{APPROACH}{joint}", names, DIMENSIONLESS, False))
+    return tuple(wanted)
+
+
+def _positions(path: Path, dataset: Dataset) -> Array:
+    positions = np.stack([dataset.column(axis) for axis in "xyz"], axis=1)
+    row, axis = np.unravel_index(np.abs(positions).argmax(), positions.shape)
+    if abs(positions[row, axis]) > FARTHEST_M:
+        raise DataError(
+            f"found {positions[row, axis]:g} m, expected a place that an arm could have.",
+            where=Location(str(path), line=_line(dataset, int(row)), field="xyz"[axis]),
+            hint="Check the number and the unit in the column's name.",
+        )
+    return positions
+
+
+def _check_payload(path: Path, dataset: Dataset) -> None:
+    if not dataset.has("payload"):
+        return
+    below = np.flatnonzero(dataset.column("payload") < 0)
+    if below.size:
+        raise DataError(
+            f"found a payload of {1000 * dataset.column('payload')[below[0]]:g} g, which is below zero.",
+            where=Location(str(path), line=_line(dataset, int(below[0])), field="payload"),
+            hint="Give the mass that hangs on the tool.",
+        )
+
+
+def _line(dataset: Dataset, row: int) -> int:
+    return dataset.rows[row] if dataset.rows else row + 1
+
+
+def _names(name: str, expression: ToolExpression) -> tuple[str, ...]:
+    """What a column may be called; the short name is the joint's where one has it."""
+    loads = name in {channel for channel, _ in ENVIRONMENT}
+    return (name,) if loads else (f"target_{name}", *((name,) if name not in expression.joints else ()))
+
+
+def _rotations(path: Path, dataset: Dataset) -> Array | None:
+    told = {kind: [name for name in names if dataset.has(name)] for kind, names in _KINDS.items()}
+    given = [kind for kind, found in told.items() if found]
+    if not given:
+        return None
+    if len(given) == 2:
+        raise DataError(
+            f"it tells the rotation twice, by {', '.join(told[given[0]])} and by {', '.join(told[given[1]])}.",
+            where=Location(str(path)),
+            hint="Leave one of them out.",
+        )
+    kind = given[0]
+    missing = [name for name in _KINDS[kind] if name not in told[kind]]
+    if missing:
+        raise DataError(
+            f"it tells {', '.join(told[kind])} and not {', '.join(missing)}: that is no rotation.",
+            where=Location(str(path)),
+            hint="Give all columns, or none where only positions count.",
+        )
+    stacked = dataset.stacked(_KINDS[kind])
+    if kind == "angles":
+        return rpy_matrices(stacked.T)
+    norms = np.linalg.norm(stacked, axis=0)
+    bad = np.flatnonzero(np.abs(norms - 1) > _NORM)
+    if bad.size:
+        raise DataError(
+            f"its quaternion has the norm {norms[bad[0]]:.4g}, expected 1.",
+            where=Location(str(path), line=_line(dataset, int(bad[0])), field=", ".join(QUATERNION)),
+            hint="Give unit quaternions, the real part first.",
+        )
+    return np.stack([rotation_matrix(q) for q in (stacked / norms).T])
+
+
+_KINDS: Mapping[str, tuple[str, ...]] = {"quaternion": QUATERNION, "angles": RPY}

@@ -1,0 +1,132 @@
+"""Commands that a servo board can set: the best of the whole counts about the exact commands.
+
+The tool's error is nearly linear over a few counts, so the joints are split in two halves, all combinations of each
+half are laid out, and the pairs of them that cancel best are tried on the arm itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armcal.arm.servo import PulseClock, PulseTable
+from armcal.base.domains import Array
+
+Counts = NDArray[np.int64]
+_MOST_PAIRS = 20_000
+_WIDEST = 2
+"""Counts to either side of the exact one."""
+TRIED = 4
+"""Combinations that are tried on the arm."""
+
+
+@dataclass(frozen=True)
+class Settable:
+    """What can be set near some commands.
+
+    Attributes:
+        counts: n x o x N; zeros on joints without a pulse table.
+        angles: what they make (n x o x N; rad).
+    """
+
+    counts: Counts
+    angles: Array
+
+
+class ServoCounts:
+    """From commands to counts and back, for joints of which some have a servo."""
+
+    def __init__(self, joints: Sequence[str], servos: Mapping[str, tuple[PulseTable, PulseClock]]) -> None:
+        self._servos = [servos.get(joint) for joint in joints]
+        self._stepped = [i for i, servo in enumerate(self._servos) if servo is not None]
+        wide = _WIDEST
+        while wide > 1 and (2 * wide + 1) ** len(self._stepped) > _MOST_PAIRS:
+            wide -= 1
+        self._offsets = np.arange(-wide, wide + 1)
+
+    def counts(self, commands: Array) -> Counts:
+        """The whole counts nearest to commands (n x N; rad)."""
+        found = np.zeros(commands.shape, dtype=np.int64)
+        for i, servo in enumerate(self._servos):
+            if servo is not None:
+                table, clock = servo
+                found[i] = np.floor(_piecewise(commands[i], table.angles, table.pulses) / clock.tick + 0.5)
+        return found
+
+    def angles(self, counts: Counts, commands: Array) -> Array:
+        """What counts make (n x N; rad); joints without a pulse table stand at their commands."""
+        made = commands.copy()
+        for i, servo in enumerate(self._servos):
+            if servo is not None:
+                table, clock = servo
+                order = slice(None) if table.pulses[0] < table.pulses[-1] else slice(None, None, -1)
+                made[i] = _piecewise(counts[i] * clock.tick, table.pulses[order], table.angles[order])
+        return made
+
+    def near(self, commands: Array, limits: Array, held: tuple[int, ...] = ()) -> Settable:
+        """Counts to either side of commands (n x N).
+
+        None beyond the limits (n x 2), where the nearest stands in, and none beside the nearest of ``held`` joints.
+        """
+        middle = self.counts(commands)
+        moved = np.where(middle[:, None, :] == 0, 0, self._offsets[None, :, None])
+        moved[list(held)] = 0
+        counts = middle[:, None, :] + moved
+        exact = np.repeat(commands[:, None, :], len(self._offsets), axis=1)
+        shape = (len(commands), -1)
+        angles = self.angles(counts.reshape(shape), exact.reshape(shape)).reshape(counts.shape)
+        slack = 1e-9
+        beyond = (angles < limits[:, :1, None] - slack) | (angles > limits[:, 1:, None] + slack)
+        inside = np.where(beyond, np.inf, np.abs(angles - exact)).argmin(axis=1, keepdims=True)
+        counts = np.where(beyond, np.take_along_axis(counts, inside, axis=1), counts)
+        angles = np.where(beyond, np.take_along_axis(angles, inside, axis=1), angles)
+        return Settable(counts, angles)
+
+    def best(self, near: Settable, commands: Array, slopes: Array, left: Array) -> tuple[Counts, Array]:
+        """The combinations with the least error to first order.
+
+        Args:
+            near: what can be set about the commands.
+            commands: the exact ones (n x N).
+            slopes: of the tool, its weighted rows (N x m x n).
+            left: what the exact commands leave (m x N).
+
+        Returns:
+            counts and angles (n x N x TRIED), the best first.
+        """
+        moved = (near.angles - commands[:, None, :]).transpose(2, 0, 1)
+        half = (len(self._stepped) + 1) // 2
+        parts = self._stepped[:half], self._stepped[half:]
+        first, second = (_sums(slopes, moved, part) for part in parts)
+        aim = left.T[:, None, :] - first[0]
+        cost = np.einsum("nai,nai->na", aim, aim)[:, :, None] - 2 * aim @ second[0].transpose(0, 2, 1)
+        cost += np.einsum("nbi,nbi->nb", second[0], second[0])[:, None, :]
+        flat = cost.reshape(len(cost), -1)
+        few = np.argpartition(flat, min(TRIED, flat.shape[1] - 1), axis=1)[:, :TRIED]
+        chosen = np.concatenate([first[1][few // cost.shape[2]], second[1][few % cost.shape[2]]], axis=2)
+        place = np.full((len(commands), *few.shape), len(self._offsets) // 2)
+        place[self._stepped] = chosen.transpose(2, 0, 1)
+        joint, target = np.arange(len(commands))[:, None, None], np.arange(len(cost))[None, :, None]
+        return near.counts[joint, place, target], near.angles[joint, place, target]
+
+
+def _sums(slopes: Array, moved: Array, joints: Sequence[int]) -> tuple[Array, NDArray[np.intp]]:
+    """What all combinations of some joints' offsets do (N x combinations x m), and the combinations."""
+    wide = moved.shape[2]
+    places = np.indices((wide,) * len(joints)).reshape(len(joints), wide ** len(joints)).T
+    total = np.zeros((len(moved), len(places), slopes.shape[1]))
+    for column, joint in enumerate(joints):
+        effect = moved[:, joint, :, None] * slopes[:, None, :, joint]
+        total += effect[:, places[:, column]]
+    return total, places
+
+
+def _piecewise(x: Array, at: Sequence[float], values: Sequence[float]) -> Array:
+    """Linear between points, and beyond the ends as before them."""
+    knots, known = np.asarray(at), np.asarray(values)
+    cell = np.clip(np.searchsorted(knots, x) - 1, 0, len(knots) - 2)
+    slope = (known[cell + 1] - known[cell]) / (knots[cell + 1] - knots[cell])
+    return np.asarray(known[cell] + slope * (x - knots[cell]))

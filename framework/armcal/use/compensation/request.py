@@ -1,0 +1,129 @@
+"""What compensation is asked, and what it answers; arrays, a row or column a target."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armcal.base.domains import Array
+
+Redundancy = Literal["nearest", "stiffest", "least_sag", "coolest"]
+Mask = NDArray[np.bool_]
+FARTHEST_M = 1e6
+"""A target beyond this is a slip of a unit, and its square may be no number."""
+_ORTHOGONAL = 1e-6
+
+
+@dataclass(frozen=True)
+class Targets:
+    """Where the tool shall be.
+
+    Attributes:
+        positions: of the tool's origin in the base frame (N x 3; m).
+        rotations: base_R_tool (N x 3 x 3); None where only positions count.
+        acting: what acts on the arm (LOAD_CHANNELS x N; SI, base frame).
+        approach: from where each joint comes (n x N; -1, 0, 1; 0: not known).
+        conditions: of the surroundings, by name (N each).
+
+    Raises:
+        ValueError: arrays of other shapes, numbers that are none, or matrices that are no rotations.
+    """
+
+    positions: Array
+    rotations: Array | None
+    acting: Array
+    approach: Array
+    conditions: Mapping[str, Array] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        count = len(self.positions)
+        _check("positions", self.positions, (count, 3))
+        if np.abs(self.positions).max(initial=0.0) > FARTHEST_M:
+            raise ValueError(f"found positions beyond {FARTHEST_M:g} m")
+        _check("approach", self.approach, (len(self.approach), count))
+        _check("what acts on the arm", self.acting, (len(self.acting), count))
+        if self.rotations is None:
+            return
+        _check("rotations", self.rotations, (count, 3, 3))
+        square = self.rotations.transpose(0, 2, 1) @ self.rotations
+        off = np.abs(square - np.eye(3)).max(axis=(1, 2)) > _ORTHOGONAL
+        bad = np.flatnonzero(off | (np.linalg.det(self.rotations) < 0))
+        if bad.size:
+            raise ValueError(f"the matrix of target {bad[0] + 1} is no rotation")
+
+    def __len__(self) -> int:
+        return len(self.positions)
+
+    def subset(self, rows: NDArray[np.intp]) -> Targets:
+        """Some of them."""
+        turned = None if self.rotations is None else self.rotations[rows]
+        told = {name: values[rows] for name, values in self.conditions.items()}
+        return Targets(self.positions[rows], turned, self.acting[:, rows], self.approach[:, rows], told)
+
+
+@dataclass(frozen=True)
+class Commands:
+    """What to command, and where that leads.
+
+    Attributes:
+        joints: the commanded joints (n).
+        joint_angles: what to command (N x n; rad, or m on sliding joints); of a target that cannot be had, the
+            nearest that was found.
+        counts: what a servo board is told (N x n; 0 of joints without a pulse table); None for an arm without one.
+        base_T_tool: where the calibrated arm then is (N x 4 x 4), quantisation and elasticity included.
+        distances: from there to the target (N; m).
+        turns: from there to the target's rotation (N; rad); zeros where only positions count.
+        found: whether the target is had, up to what the counts leave (N).
+        reasons: why not; empty for those that are had (N).
+        bounds: no command brings the arm nearer than this (N; m); zero where nothing is known.
+        moves: along a path, of each joint from the target before (N x n; rad or m); None for single targets.
+        approach: from where each joint comes (N x n; -1, 0, 1), as far as that was told or follows from the path.
+    """
+
+    joints: tuple[str, ...]
+    joint_angles: Array
+    counts: NDArray[np.int64] | None
+    base_T_tool: Array
+    distances: Array
+    turns: Array
+    found: Mask
+    reasons: tuple[str, ...]
+    bounds: Array
+    approach: Array
+    moves: Array | None = None
+
+    def __len__(self) -> int:
+        return len(self.joint_angles)
+
+
+@dataclass(frozen=True)
+class Options:
+    """How commands are chosen.
+
+    Attributes:
+        limits: lowest and highest command by joint (rad or m), instead of the model's.
+        redundancy: which of many commands: nearest to the start, stiffest against a force at the tool, with the least
+            sag, or the coolest (least torque).
+        held: joints that stay where the arm comes from.
+        reach_m: targets of this size count as had (m).
+        reach_rad: and of this size of turn (rad).
+        seed: of the random starts.
+    """
+
+    limits: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    redundancy: Redundancy = "nearest"
+    held: tuple[str, ...] = ()
+    reach_m: float = 1e-9
+    reach_rad: float = 1e-8
+    seed: int = 0
+
+
+def _check(what: str, found: Array, shape: tuple[int, ...]) -> None:
+    if found.shape != shape:
+        raise ValueError(f"found {what} of the shape {found.shape}, expected {shape}")
+    if not np.isfinite(found).all():
+        raise ValueError(f"found {what} that are not finite numbers")

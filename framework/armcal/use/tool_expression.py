@@ -1,0 +1,147 @@
+"""A calibrated arm as expressions: where its tool is, for what it is told and what acts on it.
+
+All parameters are numbers at their calibrated values; what remains are the commands, the approach, the load and the
+elastic state. From these come compensation, maps of what the arm can do, and code for other computers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import casadi as ca
+import numpy as np
+
+from armcal.arm.assembly import Arm, ArmInputs, scoped
+from armcal.arm.loading import LOAD_CHANNELS
+from armcal.arm.servo import PulseClock, PulseTable, SteppedEffect
+from armcal.arm.statics import Load
+from armcal.base import se3
+from armcal.base.domains import Array
+from armcal.base.parameters import Parameters
+from armcal.base.se3 import Expression, Transform
+from armcal.solve.factor import STATICS, Environment, tilted
+
+APPROACH = "approach."
+_VECTORS = ("gravity", "payload", "force", "torque")
+
+
+@dataclass(frozen=True)
+class ToolExpression:
+    """One arm whose parameters are numbers.
+
+    Attributes:
+        name: the arm's instance name.
+        arm: without effects that only let some displacements be set.
+        joints: the commanded ones (n).
+        channels: of ``record``, in this order: the joints, ``approach.JOINT`` of each, LOAD_CHANNELS, conditions.
+        defaults: of each channel where nothing is said; commands and approaches are zero.
+        record: symbols, one a channel (commands in rad or m, approaches -1 to 1, loads in SI, in the base frame).
+        state: symbols, the deflection (n_d; rad or m).
+        next_state: what the springs answer with; equal to ``state`` in equilibrium.
+        base_T_tool: at ``state``.
+        efforts: about or along the axes of all joints of the chain, at ``state`` (N m, N on sliding joints).
+        servos: by commanded joint, which displacements can be set.
+    """
+
+    name: str
+    arm: Arm
+    joints: tuple[str, ...]
+    channels: tuple[str, ...]
+    defaults: Array
+    record: Expression
+    state: Expression
+    next_state: Expression
+    base_T_tool: Transform
+    efforts: Expression
+    servos: Mapping[str, tuple[PulseTable, PulseClock]]
+
+    @property
+    def commands(self) -> Expression:
+        """The part of ``record`` that is commanded (n)."""
+        return self.record[: len(self.joints)]
+
+    @property
+    def acting(self) -> Expression:
+        """The part of ``record`` that acts on the arm, in the order of LOAD_CHANNELS."""
+        start = self.channels.index(LOAD_CHANNELS[0])
+        return self.record[start : start + len(LOAD_CHANNELS)]
+
+    def uses(self, channels: Sequence[str]) -> bool:
+        """Whether the tool or the elastic state depends on any of these channels."""
+        chosen = ca.vertcat(*[self.record[self.channels.index(channel)] for channel in channels])
+        return bool(ca.depends_on(ca.vertcat(ca.vec(self.base_T_tool.matrix()), self.next_state), chosen))
+
+    def slope(self) -> Expression:
+        """d next_state / d state (n_d x n_d)."""
+        return ca.densify(ca.jacobian(self.next_state, self.state))
+
+    def to_equilibrium(self, *right: Expression) -> list[Expression]:
+        """(I - slope)^-1 of each right hand side (n_d rows)."""
+        if not self.state.numel():
+            return list(right)
+        matrix = ca.SX.eye(self.state.numel()) - self.slope()
+        solved = se3.solve_near_identity(matrix, ca.densify(ca.horzcat(*right)))
+        widths = np.cumsum([0, *(each.size2() for each in right)])
+        return [solved[:, int(a) : int(b)] for a, b in pairwise(widths)]
+
+
+def arm_expression(
+    arm: Arm, parameters: Parameters, environment: Environment, conditions: Sequence[str] = ()
+) -> ToolExpression:
+    """The expressions of an arm at the nominal values of ``parameters``, under what acts where nothing is said.
+
+    ``conditions`` are those of the surroundings that will be told (``temperature``); others are taken as the effects
+    take what is not told.
+    """
+    smooth, servos = _without_steps(arm)
+    joints = tuple(arm.commanded)
+    channels = (*joints, *(APPROACH + joint for joint in joints), *LOAD_CHANNELS, *conditions)
+    record = ca.SX.sym("record", len(channels))
+    said = dict(zip(channels, ca.vertsplit(record), strict=True))
+    values = {block.name: ca.SX(list(block.nominal)) for block in parameters.blocks if not block.nuisance}
+    deflection = ca.SX.sym("deflection", smooth.deflection_size)
+    inputs = ArmInputs(
+        ca.vertcat(*smooth.joint_commands([said[joint] for joint in joints])),
+        ca.vertcat(*smooth.joint_approaches([said[APPROACH + joint] for joint in joints])),
+        tilted(_load(said), scoped(values, f"{STATICS}.")),
+        deflection,
+        {name: said[name] for name in conditions},
+    )
+    found = smooth.state(values, inputs)
+    return ToolExpression(
+        name=arm.name,
+        arm=smooth,
+        joints=joints,
+        channels=channels,
+        defaults=_defaults(channels, environment),
+        record=record,
+        state=deflection,
+        next_state=ca.densify(found.next_deflection),
+        base_T_tool=found.base_T_tool,
+        efforts=ca.densify(found.efforts),
+        servos=servos,
+    )
+
+
+def _load(said: Mapping[str, Expression]) -> Load:
+    vectors = {name: ca.vertcat(*[said[f"{name}_{axis}"] for axis in "xyz"]) for name in _VECTORS}
+    return Load(vectors["gravity"], said["payload"], vectors["payload"], vectors["force"], vectors["torque"])
+
+
+def _without_steps(arm: Arm) -> tuple[Arm, dict[str, tuple[PulseTable, PulseClock]]]:
+    stepped = {name: effect for name, effect in arm.effects.items() if isinstance(effect, SteppedEffect)}
+    servos = {arm.joint_names[i]: found for effect in stepped.values() for i, found in effect.servos().items()}
+    kept = {name: effect for name, effect in arm.effects.items() if name not in stepped}
+    return replace(arm, effects=kept), servos
+
+
+def _defaults(channels: Sequence[str], environment: Environment) -> Array:
+    stated = (environment.gravity, environment.payload_com, environment.force, environment.torque)
+    said = {
+        f"{name}_{axis}": value
+        for name, vector in zip(_VECTORS, stated, strict=True)
+        for axis, value in zip("xyz", vector, strict=True)
+    }
+    return np.array([{**said, "payload": environment.payload_mass}.get(channel, 0.0) for channel in channels])
