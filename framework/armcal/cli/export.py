@@ -2,100 +2,126 @@
 
 from __future__ import annotations
 
-import os
-import tempfile
 from pathlib import Path
 
 import click
 
-from armcal.base.settings import Settings
 from armcal.cli.common import Voice, speaking
-from armcal.errors import InputError, Location
+from armcal.config.options import settings_from
+from armcal.errors import InputError, Location, PluginError
 from armcal.plugins import PluginRegistry, discover
 from armcal.use.calibration import Calibration
 from armcal.use.exporter import POSES, Exported, Exporter, ExportRequest, effects_reach, request_of
+from armcal.use.file_set import require_new, write_new, write_over
 
 
 @click.command()
 @click.argument("calibration", type=click.Path(path_type=Path))
-@click.option("--format", "kind", required=True, metavar="NAME", help="The format to write: urdf.")
+@click.option("--format", "kind", required=True, metavar="NAME", help="The format: c, json, mujoco, ros2, urdf, yaml.")
 @click.option("--out", required=True, type=click.Path(path_type=Path), help="The file to write.")
 @click.option("--arm", metavar="NAME", help="Which arm, where there are several.")
-@click.option("--force", is_flag=True, help="Overwrite a file that is there.")
+@click.option("--option", "options", multiple=True, metavar="KEY=VALUE", help="A setting of the format: prefix=lrm.")
+@click.option("--force", is_flag=True, help="Overwrite files that are there.")
 @speaking
-def export(voice: Voice, calibration: Path, kind: str, out: Path, arm: str | None, force: bool) -> None:
-    """Write the arm in CALIBRATION in the format of another program, with its calibrated geometry."""
+def export(
+    voice: Voice, calibration: Path, kind: str, out: Path, arm: str | None, options: tuple[str, ...], force: bool
+) -> None:
+    """Write the arm in CALIBRATION in the format of another program.
+
+    Some formats write further files beside --out. What a format cannot hold is told.
+    """
     registry = discover()
     voice.plugin_faults(registry)
-    exporter = _exporter(registry, kind)
+    exporter = _exporter(registry, kind, options)
     _check_place(out, calibration, force)
     loaded = Calibration.load(calibration, registry)
-    request = request_of(loaded, arm)
+    request = request_of(loaded, arm, out.name)
     found = exporter.export(request)
-    reach = effects_reach(loaded, request) if found.left_out else 0.0
-    _write(out, found.content, force)
-    _tell(voice, request, found, reach, out, kind)
+    reach = _reach(loaded, request, found)
+    files = _files(out, found, calibration)
+    new = {file: content for file, content in files.items() if not _holds(file, content)}
+    (write_over if force else write_new)(new)
+    _tell(voice, request, found, reach, list(files), kind)
 
 
-def _exporter(registry: PluginRegistry, kind: str) -> Exporter:
-    made = registry.find("exporter", kind).load()
-    settings: type[Settings] = made.Settings
-    exporter: Exporter = made(settings())
+def _exporter(registry: PluginRegistry, kind: str, options: tuple[str, ...]) -> Exporter:
+    try:
+        made = registry.find("exporter", kind).load()
+    except PluginError as fault:
+        known = ", ".join(sorted(c.name for c in registry.components if c.kind == "exporter"))
+        if kind not in known.split(", ") and known not in fault.hint:
+            raise PluginError(fault.message, hint=f"{fault.hint} The formats are {known}.") from fault
+        raise
+    exporter: Exporter = made(settings_from(made.Settings, options, "--option"))
     return exporter
+
+
+def _reach(loaded: Calibration, request: ExportRequest, found: Exported) -> float | None:
+    """How far what is left out moves the tool (m); None where the arm does not settle."""
+    if not found.left_out:
+        return 0.0
+    return effects_reach(loaded, request) if found.reach is None else found.reach
 
 
 def _check_place(out: Path, calibration: Path, force: bool) -> None:
     where = Location(str(out))
-    if out.is_dir():
-        raise InputError("it is a directory, expected a file.", where=where, hint="Name the file in it.")
-    if out.exists() and calibration.exists() and out.samefile(calibration):
-        raise InputError("it is the calibration itself.", where=where, hint="Give another --out.")
-    if out.exists() and not force:
-        raise InputError("it is there already.", where=where, hint="Give another --out, or --force to overwrite it.")
-
-
-def _write(out: Path, content: bytes, force: bool) -> None:
-    """The whole file or none of it; without ``force`` never over one that appeared in the meantime."""
-    where = Location(str(out))
     try:
-        descriptor, staged = tempfile.mkstemp(prefix=f".{out.name}.", dir=out.parent)
-        try:
-            with os.fdopen(descriptor, "wb") as file:
-                file.write(content)
-                file.flush()
-                os.fsync(file.fileno())
-            Path(staged).chmod(0o666 & ~_umask())
-            if force or not out.exists():
-                os.replace(staged, out)
-            else:
-                raise InputError("it is there already.", where=where, hint="Give another --out, or --force.")
-        finally:
-            Path(staged).unlink(missing_ok=True)
+        if out.is_dir() or not out.name:
+            raise InputError("it is a directory, expected a file.", where=where, hint="Name the file in it.")
+        _not_the_calibration(out, calibration)
+        if not force:
+            require_new([out])
     except OSError as fault:
         hint = "Give --out a place that can be written."
         raise InputError(f"it cannot be written ({fault.strerror}).", where=where, hint=hint) from fault
 
 
-def _umask() -> int:
-    """What new files' rights are reduced by; it can only be read by setting it."""
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
+def _not_the_calibration(out: Path, calibration: Path) -> None:
+    if out.exists() and calibration.exists() and out.samefile(calibration):
+        raise InputError("it is the calibration itself.", where=Location(str(out)), hint="Give another --out.")
 
 
-def _tell(voice: Voice, request: ExportRequest, found: Exported, reach: float | None, out: Path, kind: str) -> None:
+def _files(out: Path, found: Exported, calibration: Path) -> dict[Path, bytes]:
+    """Every file to be written, by its path."""
+    files = {out: found.content}
+    for name, content in found.companions.items():
+        beside = out.with_name(name)
+        if beside.is_dir():
+            hint = "Move it, or give --out another name."
+            raise InputError("it is a directory, expected a file.", where=Location(str(beside)), hint=hint)
+        _not_the_calibration(beside, calibration)
+        files[beside] = content
+    return files
+
+
+def _holds(file: Path, content: bytes) -> bool:
+    """Whether a file has this content already, as a schema has that several exports share."""
+    try:
+        return file.read_bytes() == content
+    except OSError:
+        return False
+
+
+def _tell(
+    voice: Voice, request: ExportRequest, found: Exported, reach: float | None, files: list[Path], kind: str
+) -> None:
     apart = None if reach is None else reach * 1000
     voice.result(
         {
-            "out": str(out),
+            "out": str(files[0]),
+            "files": [str(file) for file in files],
             "format": kind,
             "arm": request.name,
             "changed": found.changed,
             "left_out": list(found.left_out),
             "left_out_mm": apart,
+            "remarks": list(found.remarks),
         }
     )
-    voice.out.print(f"{request.name}: {found.changed} numbers changed: {out}", markup=False, soft_wrap=True)
+    listed = ", ".join(str(file) for file in files)
+    voice.out.print(f"{request.name}: {found.changed} numbers changed: {listed}", markup=False, soft_wrap=True)
+    for remark in found.remarks:
+        voice.warn(f"{remark}.")
     if found.left_out:
         words = "the calibrated arm does not settle in all poses" if apart is None else f"up to {apart:.3f} mm"
         voice.warn(

@@ -1,0 +1,218 @@
+"""A calibrated arm as a description, and the rigid arm rebuilt from a description alone."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import casadi as ca
+import numpy as np
+from armcal.arm.assembly import scoped
+from armcal.arm.model import Chain, forward
+from armcal.arm.statics import MOUNT_FRAME, TOOL_FRAME, Load, frame_names
+from armcal.base.domains import Array
+from armcal.solve.factor import STATICS, tilted
+from armcal.use.exporter import ExportRequest
+from armcal.use.rigid_chain import RigidJoint, rigid_chain
+
+from armcal_export.description import (
+    SCHEMA,
+    ArmDescription,
+    Calibration,
+    Effect,
+    Follows,
+    Joint,
+    MassEntry,
+    Parameter,
+    Pose,
+    Servo,
+    SpringEntry,
+    Statics,
+)
+from armcal_export.springs import spring_numbers
+
+_UNKNOWN_KEYS = ("type",)
+
+
+def chain_of(request: ExportRequest) -> Chain:
+    """The arm's chain at its calibrated values; all its expressions are constants."""
+    return request.arm.chain({name: ca.SX(list(map(float, value))) for name, value in request.values.items()})
+
+
+def describe(request: ExportRequest) -> ArmDescription:
+    """What the files say.
+
+    Raises:
+        ProblemError: the tool hangs on a joint before the last.
+    """
+    chain, origin = chain_of(request), request.origin
+    rigid = rigid_chain(chain)
+    return ArmDescription(
+        armcal_arm=SCHEMA,
+        arm=request.name,
+        calibration=Calibration(
+            experiment=origin.experiment,
+            created=origin.created,
+            software=dict(origin.software),
+            identity=dict(origin.identity),
+            digest=request.digest,
+        ),
+        joints=[_joint(joint) for joint in rigid.joints],
+        base_T_mount=_pose(rigid.base_T_mount),
+        base_T_tool=_pose(rigid.base_T_tool),
+        effects=_effects(request),
+        springs=_springs(request, chain),
+        masses=_masses(request, chain),
+        statics=_statics(request),
+        servos=_servos(request),
+        parameters=_parameters(request),
+    )
+
+
+def rebuilt_tools(told: ArmDescription, commands: Array) -> Array:
+    """base_T_tool (N x 4 x 4) of the rigid arm that a description tells of, at commands (commanded joints x N).
+
+    The product of exponentials of the joints' screws [Murray1994], from the description alone.
+    """
+    given = dict(zip([joint.name for joint in told.joints if joint.follows is None], commands, strict=True))
+    tools = np.tile(np.eye(4), (commands.shape[1], 1, 1))
+    for joint in told.joints:
+        follows = joint.follows
+        q = given[joint.name] if follows is None else follows.multiplier * given[follows.joint] + follows.offset
+        at = _matrix(joint.base_T_joint)
+        tools = tools @ at @ _motion(joint, q) @ np.linalg.inv(at)
+    return np.asarray(tools @ _matrix(told.base_T_tool))
+
+
+def _motion(joint: Joint, q: Array) -> Array:
+    """Of a joint in its own frame (N x 4 x 4); Rodrigues' formula [Murray1994]."""
+    moved = joint.scale * q
+    turns, slides = (moved, joint.pitch * moved) if joint.kind == "revolute" else (joint.pitch * moved, moved)
+    axis = np.array(joint.axis)
+    cross = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
+    result = np.tile(np.eye(4), (len(moved), 1, 1))
+    result[:, :3, :3] += np.sin(turns)[:, None, None] * cross + (1 - np.cos(turns))[:, None, None] * (cross @ cross)
+    result[:, :3, 3] = slides[:, None] * axis
+    return result
+
+
+def _matrix(pose: Pose) -> Array:
+    result = np.eye(4)
+    result[:3, :3], result[:3, 3] = pose.rotation, pose.position_m
+    return result
+
+
+def _pose(matrix: Array) -> Pose:
+    return Pose(position_m=matrix[:3, 3].tolist(), rotation=matrix[:3, :3].tolist())
+
+
+def _joint(joint: RigidJoint) -> Joint:
+    lower, upper = joint.limits or (None, None)
+    follows = joint.mimic and Follows(
+        joint=joint.mimic.master, multiplier=joint.mimic.multiplier, offset=joint.mimic.offset
+    )
+    return Joint(
+        name=joint.name,
+        kind="prismatic" if joint.slides else "revolute",
+        base_T_joint=_pose(joint.base_T_joint),
+        axis=joint.axis.tolist(),
+        scale=joint.scale,
+        pitch=joint.pitch,
+        lower=lower,
+        upper=upper,
+        endless=joint.endless,
+        follows=follows,
+    )
+
+
+def _effects(request: ExportRequest) -> list[Effect]:
+    described: Mapping[str, Mapping[str, object]] = request.description.get("effects", {})
+    return [
+        Effect(
+            name=name,
+            type=str(described.get(name, {}).get("type", "")),
+            settings={key: value for key, value in described.get(name, {}).items() if key not in _UNKNOWN_KEYS},
+        )
+        for name in request.arm.effects
+    ]
+
+
+def _springs(request: ExportRequest, chain: Chain) -> list[SpringEntry]:
+    return [
+        SpringEntry(
+            effect=spring.effect,
+            site=spring.site,
+            axes=spring.axes.T.tolist(),
+            along=spring.along,
+            compliance=spring.compliance.tolist(),
+            linear=spring.linear,
+        )
+        for spring in spring_numbers(request, chain)
+    ]
+
+
+def _masses(request: ExportRequest, chain: Chain) -> list[MassEntry]:
+    frames = forward(chain, [joint.offset for joint in chain.joints], {})
+    moved_by, found = frame_names(chain), []
+    for mass in request.arm.masses:
+        local = scoped(request.values, f"{request.name}.links.{mass.name}.")
+        com = ca.SX([float(local[f"com_{axis}"][0]) for axis in "xyz"])
+        if mass.frame == TOOL_FRAME:
+            place = frames.base_T_tool.apply(com)
+        elif mass.frame == MOUNT_FRAME:
+            place = frames.sites[0].origin + ca.mtimes(frames.sites[0].rotation, com)
+        else:
+            place = frames.named[mass.frame].apply(com)
+        last = moved_by[mass.frame]
+        found.append(
+            MassEntry(
+                name=mass.name,
+                mass_kg=float(local["mass"][0]),
+                com_m=_numbers(place),
+                moved_by=last,
+                loads_up_to=last if mass.loads_up_to is None else mass.loads_up_to,
+            )
+        )
+    return found
+
+
+def _statics(request: ExportRequest) -> Statics:
+    e = request.environment
+    nothing = ca.SX.zeros(3)
+    tilt = {name.removeprefix(f"{STATICS}."): ca.SX(float(value[0])) for name, value in request.tilt.items()}
+    gravity = tilted(Load(ca.SX(list(e.gravity)), ca.SX(0), nothing, nothing, nothing), tilt).gravity
+    return Statics(
+        gravity_m_s2=_numbers(gravity),
+        payload_kg=e.payload_mass if request.payload_stated else None,
+        payload_com_m=list(e.payload_com),
+        force_N=list(e.force),
+        torque_Nm=list(e.torque),
+    )
+
+
+def _servos(request: ExportRequest) -> list[Servo]:
+    return [
+        Servo(joint=name, angles_rad=list(table.angles), pulses_s=list(table.pulses), tick_s=clock.tick)
+        for name, (table, clock) in request.expression().servos.items()
+    ]
+
+
+def _parameters(request: ExportRequest) -> list[Parameter]:
+    blocks = {block.name: block for block in request.arm.parameters()}
+    if not request.entries:
+        entries = [
+            (name, blocks[key].entry_unit, nominal, float(value))
+            for key, numbers in request.values.items()
+            for name, nominal, value in zip(blocks[key].entry_names, blocks[key].nominal, numbers, strict=True)
+        ]
+        told = {"free": False, "sd": None, "determined": None}
+        return [Parameter(name=n, unit=u, nominal=before, value=now, **told) for n, u, before, now in entries]
+    return [
+        Parameter(
+            name=e.name, unit=e.unit, nominal=e.nominal, value=e.value, free=e.free, sd=e.sd, determined=e.determined
+        )
+        for e in request.entries
+    ]
+
+
+def _numbers(expression: ca.SX) -> list[float]:
+    return [float(each) for each in np.asarray(ca.evalf(ca.densify(expression)).full()).ravel()]

@@ -1,0 +1,122 @@
+"""The exporters ``yaml`` and ``json``: a description of the arm, read again and rebuilt before it is written."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from importlib import resources
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+import yaml
+from armcal.base.settings import Settings
+from armcal.errors import ProblemError
+from armcal.use.exporter import Exported, ExportRequest, changed_numbers, random_commands, rigid_tools
+from pydantic import ValidationError
+
+from armcal_export.describe import describe, rebuilt_tools
+from armcal_export.description import SCHEMA_FILE, ArmDescription
+
+TOLERANCE = 1e-12
+"""m, and entries of rotation matrices, for each metre and radian that a pose is made of."""
+_HEAD = "# A calibrated robot arm; {file} says what each field means. Units are SI, angles in rad.\n"
+_REPORT = "Nothing was written. Please report this with the calibration."
+
+
+class DescriptionSettings(Settings):
+    """What is written beside the description.
+
+    Attributes:
+        beside: ``schema`` writes the JSON schema into the same folder, ``nothing`` leaves it out.
+    """
+
+    beside: Literal["schema", "nothing"] = "schema"
+
+
+class YamlExporter:
+    """As YAML."""
+
+    Settings: ClassVar[type[DescriptionSettings]] = DescriptionSettings
+    EXAMPLE: ClassVar[Mapping[str, Any]] = {}
+
+    def __init__(self, settings: DescriptionSettings) -> None:
+        self._settings = settings
+
+    def export(self, request: ExportRequest) -> Exported:
+        """The description and its schema.
+
+        Raises:
+            ProblemError: the tool hangs on a joint before the last, or what reads back is another arm.
+        """
+        told = describe(request)
+        return _checked(request, told, _yaml(told), self._settings)
+
+
+class JsonExporter(YamlExporter):
+    """As JSON."""
+
+    def export(self, request: ExportRequest) -> Exported:
+        """The description and its schema.
+
+        Raises:
+            ProblemError: the tool hangs on a joint before the last, or what reads back is another arm.
+        """
+        told = describe(request)
+        text = json.dumps(told.model_dump(mode="json"), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+        return _checked(request, told, text.encode("utf-8"), self._settings)
+
+
+def read_description(content: bytes) -> ArmDescription:
+    """A description from YAML or JSON.
+
+    Raises:
+        ValueError: it is neither, or not as the schema says.
+    """
+    text = content.decode("utf-8")
+    try:
+        return ArmDescription.model_validate_json(json.dumps(json.loads(text)))
+    except json.JSONDecodeError:
+        pass
+    try:
+        return ArmDescription.model_validate_json(json.dumps(yaml.safe_load(text), allow_nan=False))
+    except yaml.YAMLError as fault:
+        raise ValueError(f"it is neither YAML nor JSON ({fault})") from fault
+
+
+def schema() -> bytes:
+    """The JSON schema."""
+    return resources.files("armcal_export").joinpath(SCHEMA_FILE).read_bytes()
+
+
+def _yaml(told: ArmDescription) -> bytes:
+    text = yaml.dump(
+        told.model_dump(mode="json"), Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=110,
+        default_flow_style=None,
+    )  # fmt: skip
+    return (_HEAD.format(file=SCHEMA_FILE) + text).encode("utf-8")
+
+
+class _Dumper(yaml.SafeDumper):
+    """Rows of numbers on one line, and text of several lines in double quotes, which keep every kind of line end."""
+
+
+def _quoted(dumper: yaml.SafeDumper, text: str) -> yaml.ScalarNode:
+    return dumper.represent_scalar("tag:yaml.org,2002:str", text, style=None if text.isprintable() else '"')
+
+
+_Dumper.add_representer(str, _quoted)
+
+
+def _checked(request: ExportRequest, told: ArmDescription, content: bytes, settings: DescriptionSettings) -> Exported:
+    try:
+        again = read_description(content)
+    except (ValueError, ValidationError) as fault:
+        raise ProblemError(f"the description does not read back: {str(fault)[:300]}.", hint=_REPORT) from fault
+    commands = random_commands(request.arm)
+    tools = rebuilt_tools(again, commands), rigid_tools(request.arm, request.values, commands)
+    apart = float(np.abs(tools[0] - tools[1]).max())
+    allowed = TOLERANCE * max(1.0, float(np.abs(tools[1]).max()), float(np.abs(commands).max(initial=0.0)))
+    if again != told or not apart <= allowed:
+        raise ProblemError(f"what reads back is {apart:.3g} m or 1 off the calibrated arm.", hint=_REPORT)
+    beside = {SCHEMA_FILE: schema()} if settings.beside == "schema" else {}
+    return Exported(content, changed_numbers(request), companions=beside)

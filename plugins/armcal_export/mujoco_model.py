@@ -1,0 +1,180 @@
+"""The exporter ``mujoco``: an MJCF model, loaded by MuJoCo, brought to rest and compared before it is written."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any, ClassVar
+
+import casadi as ca
+import numpy as np
+from armcal.arm.assembly import scoped
+from armcal.arm.effects import JointCommand, ShapeEffect
+from armcal.base.domains import Array
+from armcal.base.settings import Settings
+from armcal.errors import InputError, NotConvergedError, ProblemError
+from armcal.use.exporter import POSES, Exported, ExportRequest, changed_numbers, random_commands, rigid_tools
+from armcal.use.rigid_chain import RigidChain, require_plain_axes, rigid_chain
+from pydantic import Field
+
+from armcal_export.describe import chain_of, describe
+from armcal_export.description import ArmDescription
+from armcal_export.mjcf import Drive, Hinge, mjcf
+from armcal_export.mujoco_rest import LoadedModel
+from armcal_export.reference import Equilibrium
+from armcal_export.springs import SpringNumbers, spring_numbers
+
+TOLERANCE = 1e-9
+"""m, and entries of rotation matrices, of the rigid arm."""
+_COMMANDS = (-0.31, 0.42)
+_NO_SPRING = 1e-12
+"""rad/(N m) or m/N: what gives less than this is no spring."""
+_REPORT = "Nothing was written. Please report this with the calibration."
+
+
+class MujocoSettings(Settings):
+    """The drives: what the calibration cannot know.
+
+    Attributes:
+        gain: of each position actuator (N m/rad, or N/m).
+        damping: of each position actuator (N m s/rad, or N s/m).
+        armature: inertia of each rotor, seen at the joint (kg m^2, or kg).
+    """
+
+    gain: Annotated[float, Field(gt=0)] = 1000.0
+    damping: Annotated[float, Field(ge=0)] = 20.0
+    armature: Annotated[float, Field(gt=0)] = 0.01
+
+
+@dataclass(frozen=True)
+class _Sorted:
+    """The springs that MJCF holds, by site, and what it does not hold."""
+
+    hinges: Mapping[int, Sequence[Hinge]]
+    left_out: tuple[str, ...]
+
+
+class MujocoExporter:
+    """Linear springs as passive hinges in series with the drives."""
+
+    Settings: ClassVar[type[MujocoSettings]] = MujocoSettings
+    EXAMPLE: ClassVar[Mapping[str, Any]] = {"gain": 500.0}
+
+    def __init__(self, settings: MujocoSettings) -> None:
+        self._settings = settings
+
+    def export(self, request: ExportRequest) -> Exported:
+        """The model.
+
+        Raises:
+            InputError: MuJoCo is not installed, or the arm has joints that MJCF has not.
+            ProblemError: MuJoCo's arm is another one.
+        """
+        chain = chain_of(request)
+        rigid, told = rigid_chain(chain), describe(request)
+        require_plain_axes(rigid, "mujoco")
+        found = _sorted(request, spring_numbers(request, chain), told)
+        drive = Drive(self._settings.gain, self._settings.damping, self._settings.armature)
+        content = mjcf(told, rigid, found.hinges, drive)
+        loaded = _loaded(content, rigid)
+        commands = random_commands(request.arm, POSES)
+        _compare(loaded, rigid_tools(request.arm, request.values, commands), commands)
+        reach = _reach(request, loaded, commands)
+        left_out = found.left_out or (("turns of second order in its springs",) if reach > TOLERANCE else ())
+        return Exported(content, changed_numbers(request), left_out, reach=reach)
+
+
+def _loaded(content: bytes, rigid: RigidChain) -> LoadedModel:
+    try:
+        return LoadedModel(content, rigid)
+    except ModuleNotFoundError as fault:
+        raise InputError(
+            "the format mujoco needs MuJoCo, which is not installed.", hint="Install it: pip install armcal[mujoco]."
+        ) from fault
+    except ValueError as fault:
+        raise ProblemError(f"MuJoCo does not take the model: {str(fault)[:300]}.", hint=_REPORT) from fault
+
+
+def _sorted(request: ExportRequest, springs: Sequence[SpringNumbers], told: ArmDescription) -> _Sorted:
+    """Linear springs as hinges along principal axes; the rest by name."""
+    turning: dict[int, Array] = defaultdict(lambda: np.zeros((3, 3)))
+    sliding: dict[int, float] = defaultdict(float)
+    axes: dict[int, Array] = {}
+    for spring in springs:
+        if not spring.linear:
+            continue
+        if spring.along:
+            sliding[spring.site] += float(spring.compliance[0, 0])
+            axes[spring.site] = spring.axes[:, 0]
+        else:
+            turning[spring.site] += spring.axes @ spring.compliance @ spring.axes.T
+    hinges: dict[int, list[Hinge]] = defaultdict(list)
+    for site, compliance in sliding.items():
+        hinges[site] += _kept([(axes[site], compliance)], slides=True)
+    for site, matrix in turning.items():
+        sizes, directions = np.linalg.eigh(0.5 * (matrix + matrix.T))
+        hinges[site] += _kept([(_snapped(directions[:, i]), sizes[i]) for i in range(3)], slides=False)
+    return _Sorted(hinges, _left_out(request, springs, told))
+
+
+def _kept(found: Sequence[tuple[Array, float]], slides: bool) -> list[Hinge]:
+    return [
+        Hinge((float(a[0]), float(a[1]), float(a[2])), slides, float(size)) for a, size in found if size > _NO_SPRING
+    ]
+
+
+def _snapped(axis: Array) -> Array:
+    """Without the rounding of eigenvectors that are coordinate axes."""
+    near = np.round(axis)
+    return near if np.allclose(axis, near, rtol=0, atol=1e-12) else axis
+
+
+def _left_out(request: ExportRequest, springs: Sequence[SpringNumbers], told: ArmDescription) -> tuple[str, ...]:
+    """What no passive hinge and no mass does."""
+    bent = {spring.effect for spring in springs if not spring.linear}
+    effects = [name for name in request.arm.effects if name in bent or _displaces(request, name)]
+    masses = [mass.name for mass in told.masses if mass.loads_up_to != mass.moved_by and mass.mass_kg > 0]
+    counted = [f"what {', '.join(masses)} load beyond the joints that carry them"] if masses else []
+    acting = np.any(request.environment.force) or np.any(request.environment.torque)
+    wrench = ["the force and torque on the tool"] if acting else []
+    return (*effects, *counted, *wrench)
+
+
+def _displaces(request: ExportRequest, name: str) -> bool:
+    """Whether an effect moves a joint, or changes the arm's shape, without any load."""
+    effect = request.arm.effects[name]
+    if isinstance(effect, ShapeEffect):
+        return True
+    values = {full: ca.SX(list(map(float, value))) for full, value in request.values.items()}
+    local = scoped(values, f"{request.name}.{name}.")
+    told = [
+        JointCommand(i, ca.SX(command), ca.SX(1.0))
+        for i in range(len(request.arm.joint_names))
+        for command in _COMMANDS
+    ]
+    return any(float(ca.evalf(ca.SX(effect.displacement(command, local)))) != 0.0 for command in told)
+
+
+def _compare(loaded: LoadedModel, expected: Array, commands: Array) -> None:
+    found = np.array([loaded.rigid_tool(command) for command in commands.T])
+    apart = float(np.abs(found - expected).max())
+    if not apart <= TOLERANCE:
+        raise ProblemError(
+            f"MuJoCo's arm is {apart:.3g} m or 1 off the calibrated one, expected {TOLERANCE:g} at most.", hint=_REPORT
+        )
+
+
+def _reach(request: ExportRequest, loaded: LoadedModel, commands: Array) -> float:
+    """How far MuJoCo's tool at rest is from the calibrated arm's, at most over poses that settle in both (m)."""
+    expression = request.expression()
+    equilibrium, largest = Equilibrium(expression), 0.0
+    for command in commands.T:
+        record = expression.defaults.copy()
+        record[: len(command)] = command
+        try:
+            pose, _ = equilibrium.at(record)
+            largest = max(largest, float(np.linalg.norm(loaded.tool_at_rest(command)[:3, 3] - pose[:, 3])))
+        except NotConvergedError:
+            continue
+    return largest

@@ -1,0 +1,13 @@
+"""Registration; imports nothing heavy."""
+
+from armcal.hooks import Register, hookimpl
+
+
+@hookimpl
+def armcal_register_exporters(register: Register) -> None:
+    """Announce the exporters."""
+    register("c", "armcal_export.c_code:CExporter", "C99: kinematics in equilibrium, Jacobian, efforts, compensation")
+    register("yaml", "armcal_export.description_file:YamlExporter", "the arm as numbers that explain themselves")
+    register("json", "armcal_export.description_file:JsonExporter", "the same as yaml, with its schema")
+    register("ros2", "armcal_export.ros2:Ros2Exporter", "parameters of a ROS 2 node")
+    register("mujoco", "armcal_export.mujoco_model:MujocoExporter", "an MJCF model with springs; needs armcal[mujoco]")

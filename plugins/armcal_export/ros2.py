@@ -1,0 +1,252 @@
+"""The exporter ``ros2``: a calibrated arm as parameters of a ROS 2 node."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import numpy as np
+from armcal.arm.servo import SteppedEffect
+from armcal.base.domains import Array
+from armcal.base.settings import Settings
+from armcal.errors import ConfigError, ProblemError
+from armcal.use.exporter import Exported, ExportRequest, changed_numbers, random_commands, rigid_tools
+from armcal.use.rigid_chain import NEGLIGIBLE, RigidChain, rigid_chain, rpy_of
+from pydantic import field_validator
+
+from armcal_export.c_template import in_comment
+from armcal_export.describe import chain_of, describe
+from armcal_export.description import ArmDescription
+from armcal_export.ros2_text import Value, read_ros2, ros2_text
+
+TOLERANCE = 1e-12
+_REPORT = "Nothing was written. Please report this with the calibration."
+
+
+class Ros2Settings(Settings):
+    """Whose parameters they are.
+
+    Attributes:
+        node: the node's full name; ``/**`` is any.
+        namespace: before every parameter's name; none unless given.
+    """
+
+    node: str = "/**"
+    namespace: str = ""
+
+    @field_validator("node")
+    @classmethod
+    def _a_node(cls, value: str) -> str:
+        if not re.fullmatch(r"/?[A-Za-z_*][A-Za-z0-9_*/]*|/\*\*", value):
+            raise ValueError(f"{value!r} is no name of a node; write node=/arm_driver, or leave it out for any node")
+        return value
+
+    @field_validator("namespace")
+    @classmethod
+    def _a_namespace(cls, value: str) -> str:
+        if value and not re.fullmatch(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*", value, re.ASCII):
+            raise ValueError(f"{value!r} is no namespace; write namespace=arm or namespace=robot.arm")
+        return value
+
+
+class Ros2Exporter:
+    """Flat parameters of one type each: kinematics joint by joint, and every effect's numbers."""
+
+    Settings: ClassVar[type[Ros2Settings]] = Ros2Settings
+    EXAMPLE: ClassVar[Mapping[str, Any]] = {"node": "/arm_driver"}
+
+    def __init__(self, settings: Ros2Settings) -> None:
+        self._settings = settings
+
+    def export(self, request: ExportRequest) -> Exported:
+        """The parameters, read again by ROS 2's rules and compared.
+
+        Raises:
+            ConfigError: two joints or parameters come to the same name.
+            ProblemError: a joint is none that an axis describes, or what reads back differs.
+        """
+        told, rigid = describe(request), rigid_chain(chain_of(request))
+        before = f"{self._settings.namespace}." if self._settings.namespace else ""
+        parameters = {before + name: value for name, value in _parameters(request, told, rigid).items()}
+        comment = in_comment(f"The arm {request.name} as calibrated: {request.origin.experiment}.")
+        text = ros2_text(self._settings.node, parameters, comment)
+        _compare(request, read_ros2(text), {self._settings.node: parameters}, before)
+        return Exported(text.encode("utf-8"), changed_numbers(request), _left_out(request, told))
+
+
+def _parameters(request: ExportRequest, told: ArmDescription, rigid: RigidChain) -> dict[str, Value]:
+    """By dotted name: what is known, then the chain, then the numbers of effects and masses."""
+    found: dict[str, Value] = {
+        "arm": request.name,
+        "digest": told.calibration.digest,
+        "calibrated": told.calibration.created or "unknown",
+        "joint_names": [joint.name for joint in told.joints],
+        "commanded_joint_names": [joint.name for joint in told.joints if joint.follows is None],
+    }
+    here = np.eye(4)
+    for number, (joint, placed) in enumerate(zip(told.joints, rigid.joints, strict=True), start=1):
+        name = _word(joint.name)
+        entries = {"type": joint.kind, **_placed(np.linalg.inv(here) @ placed.base_T_joint), "axis": joint.axis}
+        if joint.lower is not None and joint.upper is not None:
+            entries |= {"lower": joint.lower, "upper": joint.upper}
+        if joint.follows is not None:
+            mimic = joint.follows
+            entries |= {"mimic.joint": mimic.joint, "mimic.multiplier": mimic.multiplier, "mimic.offset": mimic.offset}
+        if abs(joint.pitch) > NEGLIGIBLE or abs(joint.scale - 1) > NEGLIGIBLE:
+            entries |= {"pitch": joint.pitch, "scale": joint.scale}
+        compliance = _own_compliance(told, number, joint.axis)
+        if compliance:
+            entries["compliance"] = compliance
+        _add(found, f"joints.{name}", entries)
+        here = placed.base_T_joint
+    _add(found, "tool", _placed(np.linalg.inv(here) @ rigid.base_T_tool))
+    _add(found, "gravity", {"base": told.statics.gravity_m_s2})
+    return found | _of_servos(told) | _of_masses(told) | _of_settings(told) | _of_effects(request)
+
+
+def _add(found: dict[str, Value], where: str, entries: Mapping[str, Any]) -> None:
+    for name, value in entries.items():
+        full = f"{where}.{name}"
+        if full in found:
+            raise ConfigError(f"two joints or parameters would be called {full!r}.", hint="Rename one of them.")
+        found[full] = value
+
+
+def _placed(matrix: Array) -> dict[str, list[float]]:
+    return {"xyz": [float(x) for x in matrix[:3, 3]], "rpy": [float(each) for each in rpy_of(matrix[:3, :3])]}
+
+
+def _own_compliance(told: ArmDescription, number: int, axis: list[float]) -> float:
+    """What the linear springs of a joint give about its own axis (rad/(N m)), or along it (m/N)."""
+    total = 0.0
+    for spring in told.springs:
+        if spring.site == number and spring.linear:
+            lever = np.array(spring.axes) @ np.array(axis)
+            total += float(lever @ np.array(spring.compliance) @ lever)
+    return total
+
+
+def _of_servos(told: ArmDescription) -> dict[str, Value]:
+    """``joints.q2.servo.angles`` (rad), ``.pulses`` (s), ``.tick`` (s)."""
+    found: dict[str, Value] = {}
+    for servo in told.servos:
+        table = {"angles": servo.angles_rad, "pulses": servo.pulses_s, "tick": servo.tick_s}
+        _add(found, f"joints.{_word(servo.joint)}.servo", table)
+    return found
+
+
+def _of_settings(told: ArmDescription) -> dict[str, Value]:
+    """``effects.servo.type``, ``effects.servo.settings.gains``: what ROS 2 has a type for."""
+    found: dict[str, Value] = {}
+    for effect in told.effects:
+        where = f"effects.{_word(effect.name)}"
+        _add(found, where, {"type": effect.type or "unknown"})
+        flat = {_word(name): value for name, value in effect.settings.items() if _is_flat(value)}
+        _add(found, f"{where}.settings", flat)
+    return found
+
+
+def _is_flat(value: Any) -> bool:
+    entries = value if isinstance(value, list) else [value]
+    return len({type(each) for each in entries}) == 1 and isinstance(entries[0], (bool, int, float, str))
+
+
+def _of_masses(told: ArmDescription) -> dict[str, Value]:
+    """``links.hand.mass``, its centre in the base frame at zero commands, and the joint that moves it."""
+    found: dict[str, Value] = {}
+    for mass in told.masses:
+        moved_by = told.joints[mass.moved_by - 1].name if mass.moved_by else "mount"
+        _add(found, f"links.{_word(mass.name)}", {"mass": mass.mass_kg, "base_com": mass.com_m, "moved_by": moved_by})
+    return found
+
+
+def _of_effects(request: ExportRequest) -> dict[str, Value]:
+    """Every number of the effects: ``effects.servo.gain1``, ``effects.flex.C0_xx``."""
+    found: dict[str, Value] = {}
+    blocks = {block.name: block for block in request.arm.parameters()}
+    for effect in request.arm.effects:
+        before = f"{request.name}.{effect}."
+        for full in [name for name in request.values if name.startswith(before)]:
+            local = full.removeprefix(before)
+            for suffix, number in zip(blocks[full].domain.entries, request.values[full], strict=True):
+                name = _word(f"{local}_{suffix}" if suffix else local)
+                _add(found, f"effects.{_word(effect)}", {name: float(number)})
+    return found
+
+
+def _word(name: str) -> str:
+    return re.sub(r"[^A-Za-z0-9_]", "_", name)
+
+
+def _left_out(request: ExportRequest, told: ArmDescription) -> tuple[str, ...]:
+    """Settings that ROS 2 has no type for; pulse tables are told joint by joint."""
+    return tuple(
+        f"{setting} of {effect.name}"
+        for effect in told.effects
+        if not isinstance(request.arm.effects[effect.name], SteppedEffect)
+        for setting, value in effect.settings.items()
+        if value not in (None, [], {}) and not _is_flat(value)
+    )
+
+
+def _compare(
+    request: ExportRequest,
+    again: Mapping[str, Mapping[str, Value]],
+    told: Mapping[str, Mapping[str, Value]],
+    before: str,
+) -> None:
+    """All parameters to the last bit, and the tool of the chain that they make."""
+    if again != told:
+        raise ProblemError("the parameters do not read back as they were written.", hint=_REPORT)
+    (parameters,) = again.values()
+    commands = random_commands(request.arm)
+    found = rebuilt_tools({name.removeprefix(before): value for name, value in parameters.items()}, commands)
+    expected = rigid_tools(request.arm, request.values, commands)
+    apart = float(np.abs(found - expected).max())
+    allowed = TOLERANCE * max(1.0, float(np.abs(expected).max()), float(np.abs(commands).max(initial=0.0)))
+    if not apart <= allowed:
+        raise ProblemError(f"what reads back is {apart:.3g} m or 1 off the calibrated arm.", hint=_REPORT)
+
+
+def rebuilt_tools(parameters: Mapping[str, Any], commands: Array) -> Array:
+    """base_T_tool (N x 4 x 4) of the rigid arm that the parameters tell of, at commands (commanded joints x N)."""
+    given = dict(zip(parameters["commanded_joint_names"], commands, strict=True))
+    tools = np.tile(np.eye(4), (commands.shape[1], 1, 1))
+    for name in parameters["joint_names"]:
+        at = f"joints.{_word(name)}"
+        if name in given:
+            q = given[name]
+        else:
+            q = parameters[f"{at}.mimic.multiplier"] * given[parameters[f"{at}.mimic.joint"]]
+            q = q + parameters[f"{at}.mimic.offset"]
+        moved = parameters.get(f"{at}.scale", 1.0) * q
+        beside = parameters.get(f"{at}.pitch", 0.0) * moved
+        turns, slides = (moved, beside) if parameters[f"{at}.type"] == "revolute" else (beside, moved)
+        tools = tools @ _pose(parameters, at) @ _motion(np.array(parameters[f"{at}.axis"]), turns, slides)
+    return np.asarray(tools @ _pose(parameters, "tool"))
+
+
+def _pose(parameters: Mapping[str, Any], at: str) -> Array:
+    """Rz(yaw) Ry(pitch) Rx(roll) after the shift, as URDF has it. [URDF]"""
+    roll, pitch, yaw = parameters[f"{at}.rpy"]
+    result = np.eye(4)
+    result[:3, :3] = _turn(np.array([0.0, 0.0, 1.0]), np.array([yaw]))[0]
+    result[:3, :3] = result[:3, :3] @ _turn(np.array([0.0, 1.0, 0.0]), np.array([pitch]))[0]
+    result[:3, :3] = result[:3, :3] @ _turn(np.array([1.0, 0.0, 0.0]), np.array([roll]))[0]
+    result[:3, 3] = parameters[f"{at}.xyz"]
+    return result
+
+
+def _motion(axis: Array, turns: Array, slides: Array) -> Array:
+    result = np.tile(np.eye(4), (len(turns), 1, 1))
+    result[:, :3, :3] = _turn(axis, turns)
+    result[:, :3, 3] = slides[:, None] * axis
+    return result
+
+
+def _turn(axis: Array, angles: Array) -> Array:
+    """N x 3 x 3; Rodrigues' formula [Murray1994]."""
+    cross = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
+    square = cross @ cross
+    return np.asarray(np.eye(3) + np.sin(angles)[:, None, None] * cross + (1 - np.cos(angles))[:, None, None] * square)
