@@ -1,0 +1,54 @@
+"""Waits for many descriptors in one thread, and calls whoever is concerned."""
+
+from __future__ import annotations
+
+import selectors
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+Call = Callable[[], None]
+_NOTHING: Call = lambda: None  # noqa: E731
+
+
+@dataclass
+class _Watched:
+    read: Call
+    write: Call
+
+
+class Poller:
+    """A selector whose entries may be of no interest for a while.
+
+    ``poll`` takes regular files too, which are always ready, as standard input may be one.
+    """
+
+    def __init__(self) -> None:
+        self._selector = selectors.PollSelector()
+
+    def watch(self, place: Any, read: Call | None = None, write: Call | None = None) -> None:
+        """Call these when a descriptor can be read or written; with neither it is let be.
+
+        The two are the same whenever a place is watched. One that nobody asks about is not registered at all: a peer
+        that hung up would be reported for ever.
+        """
+        events = (selectors.EVENT_READ if read else 0) | (selectors.EVENT_WRITE if write else 0)
+        watched = _Watched(read or _NOTHING, write or _NOTHING)
+        registered = place in self._selector.get_map()
+        if not events:
+            if registered:
+                self._selector.unregister(place)
+        elif not registered:
+            self._selector.register(place, events, watched)
+        elif self._selector.get_key(place).events != events:
+            self._selector.modify(place, events, watched)
+
+    def step(self, longest_s: float) -> None:
+        """Wait at most so long, and call those concerned."""
+        for key, events in self._selector.select(longest_s):
+            if self._selector.get_map().get(key.fd) is not key:
+                continue  # an earlier call let go of it, or changed it
+            if events & selectors.EVENT_READ:
+                key.data.read()
+            if events & selectors.EVENT_WRITE and self._selector.get_map().get(key.fd) is key:
+                key.data.write()

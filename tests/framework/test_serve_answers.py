@@ -1,0 +1,313 @@
+"""What requests are answered: against the calibration's own predictions, scipy's rotations, and any input at all."""
+
+from __future__ import annotations
+
+import json
+import random
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from armcal.arm.servo import PulseClock, PulseTable
+from armcal.base.dataset import Dataset
+from armcal.errors import ConfigError, DataError
+from armcal.serve.answering import Answerer
+from armcal.serve.calibration_watch import CalibrationWatch
+from armcal.serve.loaded import Order, loaded
+from armcal.serve.protocol import Acting, CompensateAnswer, ForwardAnswer, Refusal
+from armcal.serve.rows import command_rows
+from armcal.serve.served_arm import ServedArm
+from armcal.use.calibration import Calibration
+from armcal.use.calibration_file import CalibrationFile
+from armcal.use.compensation.request import Commands
+from pydantic import TypeAdapter
+from scipy.spatial.transform import Rotation
+from serving import ROOT, calibrated, foreign, sha256, variant
+
+Q_DEG = [10.0, -20.0, 30.0, 40.0, -50.0, 60.0]
+NAMES = [f"q{i}" for i in range(1, 7)]
+HERE = {"position_mm": [1, 2, 3]}
+LOAD = {"payload_g": 150, "gravity_m_s2": [0.5, -0.3, -1.5]}
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return calibrated(tmp_path_factory.mktemp("serve"))
+
+
+@pytest.fixture(scope="module")
+def calibration(path: Path) -> Calibration:
+    return Calibration.load(path)
+
+
+def made(text: str, arm: str = "", shown: str = "c.yaml") -> Answerer:
+    return loaded(Order(shown, 1, sha256(text), arm, evaluator="interpreted"), text.encode())
+
+
+@pytest.fixture(scope="module")
+def answerer(path: Path) -> Answerer:
+    return made(path.read_text())
+
+
+def ask(answerer: Answerer, **request: Any) -> dict[str, Any]:
+    return dict(json.loads(answerer.answer(json.dumps(request).encode(), 0.0)))
+
+
+def told(answerer: Answerer, **request: Any) -> dict[str, Any]:
+    answer = ask(answerer, **request)
+    assert answer["ok"], answer
+    return answer
+
+
+def position(answer: dict[str, Any], row: int = 0) -> np.ndarray:
+    return np.array(answer["tools"][row]["position_mm"])
+
+
+def test_forward_is_the_calibrations_prediction(answerer: Answerer, calibration: Calibration) -> None:
+    postures = np.random.default_rng(1).uniform(-90, 90, (5, 6))
+    answer = told(answerer, do="forward", joint_angles_deg=postures.tolist())
+    TypeAdapter(ForwardAnswer).validate_python(answer)
+    expected = calibration.forward(np.deg2rad(postures))
+    for row, pose in enumerate(expected):
+        assert position(answer, row) == pytest.approx(pose[:3, 3] * 1000, abs=1e-6)
+        w, *xyz = answer["tools"][row]["quaternion_wxyz"]
+        assert Rotation.from_quat([*xyz, w]).as_matrix() == pytest.approx(pose[:3, :3], abs=1e-9)
+
+
+def test_what_acts_is_what_a_record_would_say(answerer: Answerer, calibration: Calibration) -> None:
+    channels = {f"arm.{name}": np.deg2rad([q]) for name, q in zip(NAMES, Q_DEG, strict=True)}
+    channels |= {
+        "payload": np.array([0.15]),
+        **{f"gravity_{a}": np.array([g]) for a, g in zip("xyz", (0.5, -0.3, -1.5), strict=True)},
+    }
+    poses = calibration.predict(Dataset(("1",), channels))[1]
+    answer = told(answerer, do="forward", joint_angles_deg=Q_DEG, **LOAD)
+    assert position(answer) == pytest.approx(poses[0][0][:3, 3] * 1000, abs=1e-6)
+    assert np.linalg.norm(position(answer) - position(told(answerer, do="forward", joint_angles_deg=Q_DEG))) > 0.1
+
+
+@pytest.mark.parametrize(
+    "said",
+    [
+        {"joint_angles_deg": [Q_DEG]},
+        {"joint_angles_rad": np.deg2rad(Q_DEG).tolist()},
+        {"joint_angles_mrad": (1000 * np.deg2rad(Q_DEG)).tolist()},
+        {"joint_angles_deg": dict(zip(reversed(NAMES), reversed(Q_DEG), strict=True))},
+        {"joint_angles_deg": [dict(zip(NAMES, Q_DEG, strict=True))]},
+        {"joints": {f"{name}_deg": q for name, q in zip(NAMES, Q_DEG, strict=True)}},
+        {"joints": [{f"{name}_rad": float(np.deg2rad(q)) for name, q in zip(NAMES, Q_DEG, strict=True)}]},
+        {"joint_angles_deg": Q_DEG, "arm": "arm", "payload_kg": 0, "armcal_serve": 1},
+        {"joint_angles_deg": Q_DEG, "approach": {"q1": 1}},
+        {"joint_angles_deg": Q_DEG, "approach": [0, 0, 0, 0, 0, 0]},
+    ],
+)
+def test_ways_to_say_the_same(answerer: Answerer, said: dict[str, Any]) -> None:
+    reference = position(told(answerer, do="forward", joint_angles_deg=Q_DEG))
+    assert position(told(answerer, do="forward", **said)) == pytest.approx(reference, abs=1e-9)
+
+
+def test_commands_bring_the_calibrated_arm_there(answerer: Answerer, calibration: Calibration) -> None:
+    tool = told(answerer, do="forward", joint_angles_deg=Q_DEG, **LOAD)["tools"][0]
+    w, *xyz = tool["quaternion_wxyz"]
+    roll_pitch_yaw = Rotation.from_quat([*xyz, w]).as_euler("xyz", degrees=True)  # about fixed axes
+    start = (np.array(Q_DEG) + 3).tolist()
+    found = []
+    for rotation in ({"quaternion_wxyz": tool["quaternion_wxyz"]}, {"rpy_deg": roll_pitch_yaw.tolist()}):
+        target = {"position_mm": tool["position_mm"], **rotation}
+        answer = told(answerer, do="compensate", targets=target, start_deg=start, units="deg", **LOAD)
+        TypeAdapter(CompensateAnswer).validate_python(answer)
+        (command,) = answer["commands"]
+        assert command["found"] and command["error_mm"] < 1e-5 and command["why_not"] == ""
+        found.append(command["joint_angles_deg"])
+    assert found[0] == pytest.approx(Q_DEG, abs=1e-5)
+    assert found[1] == pytest.approx(Q_DEG, abs=1e-5)
+    alone = told(answerer, do="compensate", targets=target | LOAD, start_deg=start)
+    assert np.rad2deg(alone["commands"][0]["joint_angles_rad"]) == pytest.approx(found[1], abs=1e-6)
+
+
+def test_a_path_is_followed_and_what_is_out_of_reach_is_told(answerer: Answerer, calibration: Calibration) -> None:
+    near = position(told(answerer, do="forward", joint_angles_deg=Q_DEG))
+    targets = [{"position_mm": (near + np.array([0, 0, 2 * i])).tolist()} for i in range(4)]
+    answer = told(answerer, do="compensate", targets=targets, start_deg=Q_DEG, path=True)
+    commands = np.array([command["joint_angles_rad"] for command in answer["commands"]])
+    assert np.abs(np.diff(commands, axis=0)).max() < 0.1
+    poses = calibration.forward(commands)
+    assert poses[:, :3, 3] * 1000 == pytest.approx(np.array([t["position_mm"] for t in targets]), abs=1e-4)
+    far = told(answerer, do="compensate", targets=[{"position_m": [9, 0, 0]}])["commands"][0]
+    assert not far["found"] and far["why_not"] and far["error_mm"] > 8000
+
+
+@pytest.mark.parametrize(
+    ("request_", "where", "says"),
+    [
+        ({"do": "forwards"}, "do", "Did you mean forward?"),
+        ({}, "do", "found nothing"),
+        ({"do": "forward"}, "joint_angles_deg", "neither"),
+        ({"do": "forward", "joint_angles_deg": Q_DEG, "joints": {"q1_deg": 1}}, "joint_angles_deg", "both"),
+        ({"do": "forward", "joint_angles_deg": Q_DEG[:5]}, "joint_angles.0", "expected 6: q1, q2"),
+        ({"do": "forward", "joint_angles": Q_DEG}, "joint_angles", "unit missing"),
+        ({"do": "forward", "joint_angels_deg": Q_DEG}, "joint_angels_deg", "did you mean joint_angles_deg?"),
+        ({"do": "forward", "joint_angles_deg": {"q1": 1}}, "joint_angles.0", "found no q2"),
+        ({"do": "forward", "joint_angles_deg": {"q11": 1}}, "joint_angles.0", "Did you mean q1?"),
+        ({"do": "forward", "joints": {"q1": 1}}, "joints.0", "without a unit"),
+        ({"do": "forward", "joints": {"q1_mm": 1}}, "joints.0", "expected a unit of angle"),
+        ({"do": "forward", "joints": {"q1_deg": 1, "q1_rad": 1}}, "joints.0", "twice"),
+        ({"do": "forward", "joint_angles_deg": []}, "joint_angles", "1 to 1000"),
+        ({"do": "forward", "joint_angles_deg": [Q_DEG] * 1001}, "joint_angles", "1 to 1000"),
+        ({"do": "forward", "joint_angles_deg": [1, 2, 3, 4, 5, True]}, "joint_angles", "number"),
+        ({"do": "forward", "joint_angles_deg": Q_DEG, "payload_g": -1}, "payload_g", "greater than or equal"),
+        ({"do": "forward", "joint_angles_deg": Q_DEG, "arm": "left"}, "arm", "no such arm"),
+        ({"do": "forward", "joint_angles_deg": Q_DEG, "approach": [2] * 6}, "approach.0", "less than or equal"),
+        ({"do": "forward", "joint_angles_deg": Q_DEG, "armcal_serve": 2}, "armcal_serve", "version 2, expected 1"),
+        ({"do": "compensate", "targets": [{"position_mm": [1, 2]}]}, "targets.0.position_mm", "at least 3"),
+        ({"do": "compensate", "targets": [{"rpy_deg": [1, 2, 3]}]}, "targets.0", "position_mm"),
+        ({"do": "compensate", "targets": {"position_mm": [1, 2, 3], "paylod_g": 1}}, "targets", "payload_g?"),
+        ({"do": "compensate", "targets": HERE | {"quaternion_wxyz": [1, 1, 0, 0]}}, "targets.0", "length"),
+        ({"do": "compensate", "targets": [HERE, HERE | {"rpy_deg": [0, 0, 0]}]}, "targets.0", "all of one kind"),
+        ({"do": "compensate", "targets": HERE, "units": "counts"}, "units", "no pulse tables"),
+        ({"do": "compensate", "targets": HERE, "start_deg": [1]}, "start", "expected 6"),
+    ],
+)  # fmt: skip
+def test_what_is_wrong_is_named_with_its_field(
+    answerer: Answerer, request_: dict[str, Any], where: str, says: str
+) -> None:
+    answer = ask(answerer, id="x", **request_)
+    TypeAdapter(Refusal).validate_python(answer)
+    assert not answer["ok"] and answer["id"] == "x"
+    assert says in f"{answer['error']} {answer['hint']}"
+    assert answer["where"].startswith(where) or where in answer["error"], answer
+    assert "Traceback" not in answer["error"]
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        b"", b"{", b"null", b"7", b'"do"', b"[]", b"\xff\xfe", b"\x00", b'{"do": NaN}', b'{"id": Infinity}',
+        b"[" * 100_000,
+        b'{"a":' * 50_000, b'{"do": "forward", "joint_angles_rad": [1e999, 0, 0, 0, 0, 0]}', b"9" * 10_000,
+        b'{"id": "\\ud800", "do": "forward"}', b'{"do": "forward", "joint_angles_rad": [-1e308, 1e308, 0, 0, 0, 0]}',
+        b'{"do": "compensate", "targets": {"position_m": [1e300, -1e300, 1e200]}}', b'{"do": "\\u0073tatus"}',
+        b'{"id": {"a": 1}, "do": "status"}', b'{"id": true}', json.dumps({"id": "x" * 1000}).encode(),
+    ],
+)  # fmt: skip
+def test_any_line_has_an_answer(answerer: Answerer, line: bytes) -> None:
+    answer = json.loads(answerer.answer(line, 0.0))
+    assert answer["calibration"]["sequence"] == 1
+    if not answer["ok"]:
+        assert answer["error"] and "Traceback" not in answer["error"]
+    assert told(answerer, do="forward", joint_angles_deg=Q_DEG)
+
+
+def test_thousands_of_damaged_requests(answerer: Answerer) -> None:
+    chance = random.Random(5)
+    whole = [
+        {"id": 7, "do": "forward", "joint_angles_deg": [Q_DEG], **LOAD},
+        {"id": 8, "do": "forward", "joints": {f"{n}_deg": 1.5 for n in NAMES}, "approach": {"q1": 1}},
+        {"id": 9, "do": "compensate", "targets": [HERE | {"rpy_deg": [1, 2, 3]}], "start_deg": Q_DEG},
+    ]  # fmt: skip
+    odd = [b"null", b"[]", b"{}", b'"', b"1e400", b"-", b",", b"\xc3", b"true", b"[[", b"}}", b'"q9_deg":1', b"\x00"]
+    for _ in range(3000):
+        line = bytearray(json.dumps(chance.choice(whole)).encode())
+        for _ in range(chance.randint(1, 4)):
+            at = chance.randrange(len(line) + 1)
+            line[at : at + chance.choice((0, 0, 1, 3, 12))] = chance.choice(odd)
+        answer = json.loads(answerer.answer(bytes(line), 0.0))
+        assert answer["ok"] in (True, False) and "failed (" not in answer.get("error", "")
+
+
+def fake_arm(**dimensions: str) -> ServedArm:
+    table = PulseTable((-1.0, 1.0), (0.001, 0.002))
+    servos = {"q1": (table, PulseClock(25e6, 121))}
+    return ServedArm("a", dimensions, SimpleNamespace(expression=SimpleNamespace(servos=servos)), False)
+
+
+def commands(counts: Any = None) -> Commands:
+    one = np.zeros(1)
+    return Commands(
+        joints=("q1", "s"),
+        joint_angles=np.array([[0.5, 0.02]]),
+        counts=counts,
+        base_T_tool=np.eye(4)[None],
+        distances=one + 1e-3,
+        turns=one + np.pi / 180,
+        found=one > -1,
+        reasons=("",),
+        bounds=one,
+        approach=np.array([[-1.0, 0.0]]),
+    )
+
+
+def test_counts_pulses_and_sliding_joints() -> None:
+    arm = fake_arm(q1="angle", s="length")
+    counted = commands(counts=np.array([[307, 0]]))
+    (row,) = command_rows(arm, counted, "counts", lambda pose: {"position_mm": [], "quaternion_wxyz": []})
+    assert (
+        row["counts"] == [307, None]
+        and row["approach"] == [-1, 0]
+        and row["error_mm"] == 1.0
+        and row["error_deg"] == pytest.approx(1.0)
+    )
+    (row,) = command_rows(arm, counted, "pulse_us", lambda pose: {"position_mm": [], "quaternion_wxyz": []})
+    assert row["pulse_us"] == [pytest.approx(307 * 122 / 25), None]
+    (row,) = command_rows(arm, commands(), "deg", lambda pose: {"position_mm": [], "quaternion_wxyz": []})
+    assert row["joints"] == {"q1_deg": pytest.approx(28.64788975654116), "s_mm": 20.0}
+    assert arm.named([{"s_mm": 5, "q1_deg": 180}], "joints") == pytest.approx(np.array([[np.pi, 0.005]]))
+    with pytest.raises(DataError, match="sliding"):
+        arm.angles([[1.0, 2.0]], "joint_angles")
+
+
+def test_an_elastic_arm_whose_payload_nobody_states_asks_for_it(answerer: Answerer) -> None:
+    arm = replace(answerer.arms["arm"], needs_payload=True)
+    with pytest.raises(DataError, match="what hangs on it"):
+        arm.acting(Acting(), 2)
+    assert arm.acting(Acting.si(payload=0.1), 2).shape == (13, 2)
+    assert arm.acting(Acting(), 1, [Acting.si(payload=0.1)])[3, 0] == 0.1
+
+
+def test_only_a_whole_calibration_of_the_same_arm_is_made_ready(path: Path, answerer: Answerer) -> None:
+    text = path.read_text()
+    arm = answerer.tag["arm"]
+    moved = made(variant(text, 1), arm)
+    here, there = (position(told(a, do="forward", joint_angles_deg=Q_DEG)) for a in (answerer, moved))
+    assert there - here == pytest.approx([0, 0, 10], abs=1e-6)
+    assert moved.tag["sha256"] == sha256(variant(text, 1))
+    for wrong, why in (
+        (foreign(text), "another arm"),
+        (text.replace("converged: true", "converged: false"), "did not converge"),
+        ("armcal_calibration: 1\n", r"c\.yaml"),
+        ("\x00\n", r"c\.yaml"),
+        (text[: len(text) // 2].rpartition("\n")[0] + "\n", r"c\.yaml"),
+    ):
+        with pytest.raises(ConfigError, match=why) as caught:
+            made(wrong, arm)
+        assert "armcal-serve-" not in str(caught.value)
+
+
+def test_commands_stay_within_what_a_configuration_allows(path: Path) -> None:
+    text, folder = path.read_text(), ROOT / "configs" / "lrm_arm"
+    config = shutil.copytree(folder, path.with_name("configs")) / "plan.yaml"
+    plan = config.read_text().replace("q1: [-100 deg, 100 deg]", "q1: [-5 deg, 5 deg]")
+    config.write_text(plan)
+    narrow = loaded(Order("c.yaml", 1, sha256(text), within=str(config), evaluator="interpreted"), text.encode())
+    for q1, found in ((3.0, True), (30.0, False)):
+        target = told(narrow, do="forward", joint_angles_deg=[q1, -20, 30, 40, -50, 20])["tools"][0]
+        (command,) = told(narrow, do="compensate", targets=target, units="deg")["commands"]
+        assert command["found"] is found and abs(command["joint_angles_deg"][0]) <= 5 + 1e-9
+    with pytest.raises(ConfigError, match="no plan"):
+        loaded(Order("c.yaml", 1, sha256(text), within=str(folder / "demo.yaml")), text.encode())
+
+
+def test_no_beginning_of_a_calibration_is_taken_for_one(path: Path) -> None:
+    """However a writer is interrupted: the watch looks for the last key, and all that is needed stands before it."""
+    assert [*CalibrationFile.model_fields][-1] == "recalibrated"
+    lines = path.read_text().splitlines(keepends=True)
+    assert lines[-1].startswith("recalibrated:")
+    watch = CalibrationWatch(path.with_name("part.yaml"))
+    for end in random.Random(3).sample(range(len(lines)), 60):
+        watch.path.write_text("".join(lines[:end]))
+        with pytest.raises(ConfigError, match=r"whole|empty"):
+            watch.first()

@@ -1,0 +1,123 @@
+"""Calibrations to be served, variants of them, and a server as a process."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+from armcal.cli.main import cli
+from armcal.serve.client import Client
+from armcal.use.calibration_file import dump, identity_of
+from click.testing import CliRunner
+
+ROOT = Path(__file__).resolve().parents[1]
+DEMO = ROOT / "configs" / "lrm_arm" / "demo.yaml"
+QUICK = ["--set", "validation.folds=0", "--set", "evaluator=interpreted"]
+LONG_S = 120.0
+
+
+def calibrated(folder: Path) -> Path:
+    """The calibration of the shipped demonstration."""
+    result = CliRunner().invoke(cli, ["run", str(DEMO), "--out", str(folder), "-q", *QUICK])
+    assert result.exit_code == 0, result.output
+    return folder / "calibration.yaml"
+
+
+def variant(text: str, number: int) -> str:
+    """Another calibration of the same arm: its base stands some mm higher, and it was made at another time."""
+    changed, found = re.subn(
+        r"(name: arm\.mdh\.base_z\n(?:  .*\n)*?  value: )(\S+)",
+        lambda m: f"{m[1]}{float(m[2]) + 0.01 * number!r}",
+        text,
+    )
+    assert found == 1
+    return changed.replace("experiment: ", f"experiment: variant {number} of ", 1)
+
+
+def foreign(text: str) -> str:
+    """A calibration that is whole, and of another arm."""
+    content = yaml.safe_load(text)
+    content["statics"]["body"] = "moon"
+    content["identity"]["arm"] = identity_of({key: content[key] for key in ("arms", "measurements", "statics")})
+    return dump(content)
+
+
+def sha256(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def put(path: Path, text: str) -> None:
+    """As recalibrations publish: written aside, then renamed."""
+    beside = path.with_name(".next")
+    beside.write_text(text)
+    os.replace(beside, path)
+
+
+@dataclass
+class Running:
+    """A server as a process."""
+
+    process: subprocess.Popen[str]
+    socket: Path
+    said: Path
+
+    def ask(self, **request: Any) -> dict[str, Any]:
+        with Client(self.socket, LONG_S) as client:
+            return client.ask(request)
+
+    def status(self) -> dict[str, Any]:
+        return self.ask(do="status")
+
+    def until(self, holds: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
+        """The first status of which something holds."""
+        ends = time.monotonic() + LONG_S
+        while time.monotonic() < ends:
+            status = self.status()
+            if holds(status):
+                return status
+            time.sleep(0.05)
+        raise AssertionError(f"never: {status}")
+
+
+def command(path: Path, *arguments: str) -> list[str]:
+    return [sys.executable, "-m", "armcal.cli", "serve", str(path), "--evaluator", "interpreted", *arguments]
+
+
+@contextmanager
+def serving(path: Path, *arguments: str) -> Iterator[Running]:
+    """A server that is ready; it has to end well when it is told to."""
+    socket, said = path.parent / "serve.sock", path.parent / "said.jsonl"
+    with said.open("w") as told:
+        process = subprocess.Popen(
+            command(path, "--socket", str(socket), "--json", *arguments),
+            stderr=told,
+            stdin=subprocess.DEVNULL,
+            text=True,
+        )
+    running = Running(process, socket, said)
+    try:
+        ends = time.monotonic() + LONG_S
+        while '"ready"' not in said.read_text():
+            assert process.poll() is None and time.monotonic() < ends, said.read_text()
+            time.sleep(0.05)
+        yield running
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(LONG_S) == 0
+        assert not socket.exists()
+        events = [json.loads(line) for line in said.read_text().splitlines()]  # and no traceback
+        assert all("event" in event for event in events)
+    finally:
+        process.kill()
+        process.wait()
