@@ -12,12 +12,19 @@ from armcal import __version__
 from armcal.errors import EXIT_FAULT, ArmcalError
 
 COMMANDS = {
+    "new": ("armcal.cli.new:new", "Begin a robot's files, or a plugin of your own."),
     "run": ("armcal.cli.run:run", "Calibrate: load, check, fit, validate, report."),
     "check": ("armcal.cli.check:check", "Everything that can be known before solving."),
     "identify": ("armcal.cli.identify:identify", "Which parameters the poses determine; a minimal set of them."),
     "study": ("armcal.cli.study:study", "Compare model variants by cross-validated error, or by load transfer."),
     "predict": ("armcal.cli.predict:predict", "Where a calibrated arm goes for commanded joint angles."),
+    "compensate": ("armcal.cli.compensate:compensate", "What to command so that the real arm arrives at targets."),
+    "correction-table": (
+        "armcal.cli.correction_table:correction_table",
+        "What to tell a controller that only knows the nominal arm.",
+    ),
     "export": ("armcal.cli.export:export", "Write a calibrated arm in another program's format, such as URDF."),
+    "capability": ("armcal.cli.capability:capability", "What an arm can do where, and which design does it best."),
     "plan": ("armcal.cli.plan:plan", "Which poses to measure: the best few, and how good any could be."),
     "convert": ("armcal.cli.convert:convert", "The geometry of an arm in another form: mdh, poe, urdf."),
     "servo": ("armcal.cli.servo:servo", "Which pulse makes which angle: servo tables, by tracker or by eye."),
@@ -30,9 +37,11 @@ COMMANDS = {
     "control": ("armcal.cli.control:control", "Ask a running recalibration, or tell it what to do."),
     "replay": ("armcal.cli.replay:replay_command", "Make every state of a recalibration again from its journal."),
     "what-if": ("armcal.cli.what_if:what_if", "How much one more record would tell, by pose."),
+    "serve": ("armcal.cli.serve:serve", "Answer forward, compensate and status requests of other programs."),
     "watch": ("armcal.cli.watch:watch", "Show a recalibration live, in the browser or the terminal."),
     "mission": ("armcal.cli.mission:mission", "Simulate a mission, recalibrate over it, judge it by its truth."),
     "plugins": ("armcal.cli.plugins:plugins", "List plugins, or check one."),
+    "doctor": ("armcal.cli.doctor:doctor", "What is installed, what works, and what is missing."),
 }
 
 
@@ -50,7 +59,7 @@ class LazyGroup(click.Group):
         module, _, attribute = COMMANDS[cmd_name][0].partition(":")
         try:
             command: click.Command = getattr(import_module(module), attribute)
-        except ModuleNotFoundError as fault:
+        except ImportError as fault:
             raise _missing(fault) from fault
         return command
 
@@ -61,7 +70,7 @@ class LazyGroup(click.Group):
         except ArmcalError as fault:
             _report(fault)
             ctx.exit(fault.exit_code)
-        except ModuleNotFoundError as fault:  # of a library that is imported where it is needed
+        except ImportError as fault:  # of a library that is imported where it is needed
             _report(_missing(fault))
             ctx.exit(EXIT_FAULT)
 
@@ -89,16 +98,18 @@ def main() -> None:
         sys.exit(EXIT_FAULT)
 
 
-def _missing(fault: ModuleNotFoundError) -> ArmcalError:
-    """The refusal where a library is not there.
+def _missing(fault: ImportError) -> ArmcalError:
+    """The refusal where a library is not there, or is broken.
 
     Raises:
-        ModuleNotFoundError: it is a module of armcal: a fault of ours, not of the installation.
+        ImportError: it is a module of armcal: a fault of ours, not of the installation.
     """
-    if (fault.name or "armcal").partition(".")[0] == "armcal":
+    absent = isinstance(fault, ModuleNotFoundError)
+    if (fault.name or ("armcal" if absent else "")).partition(".")[0] == "armcal":
         raise fault
+    found = f"the library {fault.name} is missing." if absent else f"a library cannot be loaded ({fault})."
     return ArmcalError(
-        f"the library {fault.name} is missing.", hint="Install armcal anew with all it needs: pip install armcal."
+        found, hint="Install armcal anew with all it needs: pip install armcal. `armcal doctor` names what is broken."
     )
 
 

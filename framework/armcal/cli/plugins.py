@@ -4,18 +4,23 @@ from __future__ import annotations
 
 import json
 import sys
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from armcal.errors import EXIT_BAD_INPUT, PluginError
 from armcal.hooks import CONTRACT_VERSION
-from armcal.plugins import PluginInfo, PluginRegistry, discover
+from armcal.plugins import Component, PluginInfo, PluginRegistry, discover
+
+if TYPE_CHECKING:
+    from armcal.testing.results import CheckResult
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})
 def plugins() -> None:
-    """List plugins, or check one."""
+    """List plugins, check them, or show the hooks that they may have."""
 
 
 @plugins.command("list")
@@ -39,9 +44,12 @@ def _show(plugin: PluginInfo, registry: PluginRegistry, quiet: bool, verbose: bo
     click.echo(f"{plugin.name}  ({plugin.distribution} {plugin.version}, {plugin.module})")
     if plugin.fault:
         click.echo(f"  does not load: {plugin.fault}")
+    for notice in plugin.notices:
+        click.echo(f"  to be changed: {notice}")
     for component in registry.announced_by(plugin):
         place = f"  [{component.target}]" if verbose else ""
-        click.echo(f"  {component.kind:<12} {component.name:<18} {component.summary}{place}")
+        gone = f"  (deprecated: {component.deprecated})" if component.deprecated else ""
+        click.echo(f"  {component.kind:<12} {component.name:<18} {component.summary}{gone}{place}")
 
 
 def _content(registry: PluginRegistry) -> dict[str, Any]:
@@ -54,42 +62,110 @@ def _content(registry: PluginRegistry) -> dict[str, Any]:
                 "distribution": plugin.distribution,
                 "version": plugin.version,
                 "fault": plugin.fault or None,
-                "components": [
-                    {"kind": c.kind, "name": c.name, "target": c.target, "summary": c.summary}
-                    for c in registry.announced_by(plugin)
-                ],
+                "notices": list(plugin.notices),
+                "components": [_told(component) for component in registry.announced_by(plugin)],
             }
             for plugin in registry.plugins
         ],
     }
 
 
-@plugins.command("check")
-@click.argument("name")
-@click.option("--json", "as_json", is_flag=True, help="Print the result as JSON on standard output.")
-@click.option("-q", "--quiet", is_flag=True, help="Say nothing but errors.")
-@click.option("-v", "--verbose", is_flag=True, help="Name every check.")
-def check_plugin(name: str, as_json: bool, quiet: bool, verbose: bool) -> None:
-    """Check the plugin NAME: its import, its hooks, and the contract of each component."""
-    from armcal.testing.contract import check_plugin as checks_of
+def _told(component: Component) -> dict[str, Any]:
+    names = ("kind", "name", "target", "summary")
+    return {**{name: getattr(component, name) for name in names}, "deprecated": component.deprecated or None}
 
-    registry = discover()
-    chosen = [plugin for plugin in registry.plugins if plugin.name == name]
-    if not chosen:
-        known = ", ".join(p.name for p in registry.plugins)
-        raise PluginError(f"no plugin is called {name!r}.", hint=f"Installed: {known}.")
-    results = [result for plugin in chosen for result in checks_of(plugin, registry)]
-    broken = "; ".join(plugin.fault for plugin in chosen if plugin.fault)
-    failed = [result for result in results if result.fault]
-    if as_json:
-        rows = [{"component": r.component, "check": r.check, "fault": r.fault or None} for r in results]
-        click.echo(json.dumps({"plugin": name, "fault": broken or None, "checks": rows}, indent=2))
-    elif not quiet:
-        for result in results:
+
+@dataclass(frozen=True)
+class _Report:
+    """What the checks found on the plugins of one name."""
+
+    name: str
+    plugins: tuple[PluginInfo, ...]
+    results: tuple[CheckResult, ...]
+
+    @property
+    def broken(self) -> str:
+        """Why it does not load; empty if it does."""
+        return "; ".join(plugin.fault for plugin in self.plugins if plugin.fault)
+
+    @property
+    def failed(self) -> tuple[CheckResult, ...]:
+        """Checks that found a fault."""
+        return tuple(result for result in self.results if result.fault)
+
+    @property
+    def left(self) -> tuple[CheckResult, ...]:
+        """Checks that did not run."""
+        return tuple(result for result in self.results if result.not_run)
+
+    @property
+    def ran(self) -> int:
+        """How many checks ran."""
+        return len(self.results) - len(self.left)
+
+    def content(self) -> dict[str, Any]:
+        """For JSON."""
+        rows = [
+            {"component": r.component, "check": r.check, "fault": r.fault or None, "not_run": r.not_run or None}
+            for r in self.results
+        ]
+        counts = {"ran": self.ran, "failed": len(self.failed), "not_run": len(self.left)}
+        return {"plugin": self.name, "fault": self.broken or None, **counts, "checks": rows}
+
+    def show(self, verbose: bool) -> None:
+        """For people."""
+        for result in self.results:
             if verbose or result.fault:
                 mark, fault = ("FAIL", f": {result.fault}") if result.fault else ("ok  ", "")
-                click.echo(f"{mark} {result.component}: {result.check}{fault}")
-        click.echo(f"{name}: {len(results) - len(failed)} of {len(results)} checks passed.")
+                click.echo(f"{'--  ' if result.not_run else mark} {result.component}: {result.check}{fault}")
+        for plugin in self.plugins:
+            for notice in plugin.notices:
+                click.echo(f"to be changed: {notice}")
+        left = f", {len(self.left)} not run" if self.left else ""
+        why = f"{left} (-v says why)" if left and not verbose else left
+        click.echo(f"{self.name}: {self.ran - len(self.failed)} of {self.ran} checks passed{why}.")
+
+
+@plugins.command("check")
+@click.argument("name", required=False)
+@click.option("--json", "as_json", is_flag=True, help="Print the result as JSON on standard output.")
+@click.option("-q", "--quiet", is_flag=True, help="Say nothing but errors.")
+@click.option("-v", "--verbose", is_flag=True, help="Name every check, and why one did not run.")
+def check_plugin(name: str | None, as_json: bool, quiet: bool, verbose: bool) -> None:
+    """Check the plugin NAME, or all: imports, hooks, and the contract of each component."""
+    reports = _reports(discover(), name)
+    if as_json:
+        content = [report.content() for report in reports]
+        click.echo(json.dumps({"plugins": content} if name is None else content[0], indent=2))
+    elif not quiet:
+        for report in reports:
+            report.show(verbose)
+    failed = [report for report in reports if report.failed]
+    for report in failed:
+        click.echo(f"armcal: {report.name}: {report.broken or 'it breaks the plugin contract'}", err=True)
     if failed:
-        click.echo(f"armcal: {name}: {broken or 'it breaks the plugin contract'}", err=True)
         sys.exit(EXIT_BAD_INPUT)
+
+
+def _reports(registry: PluginRegistry, name: str | None) -> Sequence[_Report]:
+    from armcal.testing.contract import check_plugin as checks_of
+
+    names = list(dict.fromkeys(plugin.name for plugin in registry.plugins if name in (None, plugin.name)))
+    if not names:
+        known = ", ".join(p.name for p in registry.plugins)
+        raise PluginError(f"no plugin is called {name!r}.", hint=f"Installed: {known}.")
+    reports = []
+    for each in names:
+        chosen = tuple(plugin for plugin in registry.plugins if plugin.name == each)
+        results = [result for plugin in chosen for result in checks_of(plugin, registry)]
+        reports.append(_Report(each, chosen, tuple(results)))
+    return reports
+
+
+@plugins.command("hooks")
+@click.option("--markdown", is_flag=True, help="As the page docs/hooks.md.")
+def show_hooks(markdown: bool) -> None:
+    """Show every hook and kind of component: what armcal hands over, and what a component must have."""
+    from armcal.cli.hook_reference import as_markdown, as_text, reference
+
+    click.echo(as_markdown(reference()) if markdown else as_text(reference()), nl=False)

@@ -15,6 +15,7 @@ from armcal.report import render
 from armcal.run import outputs
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import Stopwatch, calibrate
+from armcal.solve.estimator import CHECK_THE_DATA
 from armcal.solve.parallel import Executor
 
 
@@ -59,7 +60,7 @@ def run(
     if not converged:
         click.echo(
             f"armcal: {result.estimate.verdict.name} did not converge ({result.estimate.verdict.status}). "
-            "Nothing was exported as calibrated. Check the data and the start values, or allow more iterations.",
+            f"Nothing was exported as calibrated. {CHECK_THE_DATA}",
             err=True,
         )
         sys.exit(EXIT_NOT_CONVERGED)

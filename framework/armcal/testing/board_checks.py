@@ -2,34 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Mapping
 from typing import Any
 
-from armcal.bench.clock import Clock, RealClock
+from armcal.bench.clock import RealClock
 from armcal.bench.device import JointDevice
-from armcal.bench.faults import DeviceError, DeviceLostError
-from armcal.bench.link import GuardedLink, LinkIdentity
-from armcal.testing.results import ContractError, Recorder, expect
+from armcal.bench.faults import DeviceError
+from armcal.bench.link import GuardedLink
+from armcal.errors import InputError
+from armcal.testing.memory_link import MemoryLink, NoLink
+from armcal.testing.results import ContractError, NotRun, Recorder, expect
 from armcal.testing.settings_checks import Subject
 
 JOINTS = ("q1", "q2")
 """The joints that a device's ``EXAMPLE`` must know."""
-
-
-class _NoLink:
-    """A link with nobody at the other end."""
-
-    def open(self, clock: Clock) -> LinkIdentity:
-        raise DeviceLostError("nobody is there.")
-
-    def write(self, address: int, data: bytes) -> None:
-        raise DeviceLostError("nobody is there.")
-
-    def read(self, address: int, register: int, count: int) -> bytes:
-        raise DeviceLostError("nobody is there.")
-
-    def close(self) -> None:
-        pass
+_NEAR_RAD = 0.02
+"""So near to an angle must a board's pulses come."""
+_SAME_RAD = 1e-9
 
 
 def check_link(record: Recorder, subject: Subject) -> None:
@@ -49,7 +39,7 @@ def check_link(record: Recorder, subject: Subject) -> None:
 
 def check_device(record: Recorder, subject: Subject) -> None:
     """That it moves the joints that it is given, and passes on what its link says."""
-    device: Any = record.check("it builds", lambda: subject.made(subject.settings, JOINTS, _NoLink()))
+    device: Any = record.check("it builds", lambda: subject.made(subject.settings, JOINTS, NoLink()))
     if device is None:
         return
     for name in [name for name in vars(JointDevice) if not name.startswith("_") and name != "joint_names"]:
@@ -61,6 +51,95 @@ def check_device(record: Recorder, subject: Subject) -> None:
     for call in (device.state, device.keep_alive, lambda: device.energise(JOINTS[0], 0.0)):
         record.check("so is every call before it is opened", lambda c=call: _lost(c))  # type: ignore[misc]
     record.check("angles that pulses can set stand where they are told", lambda: _stands(device))
+    for angle in (math.nan, 1e3):
+        record.check(f"an angle of {angle:g} rad is refused", lambda a=angle: _refused(device, a))  # type: ignore[misc]
+    _check_on_a_bus(record, subject)
+
+
+def _check_on_a_bus(record: Recorder, subject: Subject) -> None:
+    """What it does with a board that keeps what is written to it."""
+    link = MemoryLink()
+    device = record.check("it opens on a bus of registers", lambda: _opened(subject, link))
+    record.check("it sets the angles that it says", lambda: _sets(_needed(device)))
+    record.check("its state is read from the board, not remembered", lambda: _reads(_needed(device), link))
+    record.check("a joint that is let go has no angle", lambda: _lets_go(_needed(device)))
+    link.is_lost = True
+    for call in ("state", "command", "energise", "keep_alive", "release"):
+        record.check(
+            f"{call}() passes on that the link was lost",
+            lambda c=call: _lost(_calls(_needed(device))[c]),  # type: ignore[misc]
+        )
+
+
+def _opened(subject: Subject, link: MemoryLink) -> Any:
+    device = subject.made(subject.settings, JOINTS, link)
+    try:
+        device.open(RealClock())
+    except (DeviceError, InputError) as refusal:
+        raise NotRun(f"its board is no bus of registers: {refusal}") from refusal
+    return device
+
+
+def _needed(device: Any) -> Any:
+    if device is None:
+        raise NotRun("it did not open")
+    return device
+
+
+def _calls(device: Any) -> dict[str, Callable[[], Any]]:
+    first = JOINTS[0]
+    return {
+        "state": device.state,
+        "command": lambda: device.command({JOINTS[1]: -0.2}),
+        "energise": lambda: device.energise(first, 0.1),
+        "keep_alive": device.keep_alive,
+        "release": lambda: device.release(first),
+    }
+
+
+def _sets(device: Any) -> None:
+    for joint, angle in zip(JOINTS, (0.2, -0.3), strict=True):
+        device.energise(joint, angle)
+    _at(device, dict(zip(JOINTS, (0.2, -0.3), strict=True)), "energise()")
+    asked = dict(zip(JOINTS, (-0.4, 0.5), strict=True))
+    device.command(asked)
+    _at(device, asked, "command()")
+
+
+def _at(device: Any, asked: Mapping[str, float], after: str) -> None:
+    found, told = device.state().angles, device.standing(asked)
+    for joint, angle in asked.items():
+        expect(joint in found, f"found no angle of {joint} after {after}, expected {angle:g} rad")
+        for what, value in (("state()", found[joint]), ("standing()", told[joint])):
+            off = abs(value - angle)
+            expect(off <= _NEAR_RAD, f"found {value:.4f} rad of {joint} in {what} after {after}, expected {angle:g}")
+        off = abs(found[joint] - told[joint])
+        expect(off <= _SAME_RAD, f"found {joint} at {found[joint]:.6f} rad after {after}, expected {told[joint]:.6f}")
+
+
+def _reads(device: Any, link: MemoryLink) -> None:
+    before, there = link.snapshot(), device.state().angles
+    device.command(dict.fromkeys(JOINTS, 0.15))
+    expect(link.snapshot() != before, "found nothing written to the board by command()")
+    link.restore(before)
+    found = device.state().angles
+    same = all(abs(found[joint] - there[joint]) <= _SAME_RAD for joint in JOINTS)
+    expect(same, f"found {found} after the board was put back, expected {there}: read its pulses, do not remember them")
+
+
+def _lets_go(device: Any) -> None:
+    device.release(JOINTS[0])
+    found = device.state().angles
+    expect(JOINTS[0] not in found, f"found {JOINTS[0]} with an angle after release(), expected it to hang free")
+    expect(JOINTS[1] in found, f"found {JOINTS[1]} without an angle after release() of {JOINTS[0]}")
+
+
+def _refused(device: Any, angle: float) -> None:
+    try:
+        found = device.standing({JOINTS[0]: angle})
+    except InputError:
+        return
+    raise ContractError(f"found {found}, expected armcal.bench.faults.DeviceRefusedError")
 
 
 def _callable(made: Any, name: str) -> None:

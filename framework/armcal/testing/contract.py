@@ -6,6 +6,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
+from typing import Any
 
 from armcal.plugins import Component, PluginInfo, PluginRegistry
 from armcal.testing.bench_checks import check_bench
@@ -14,18 +15,19 @@ from armcal.testing.effect_checks import check_effect
 from armcal.testing.estimator_checks import check_estimator
 from armcal.testing.exporter_checks import check_exporter
 from armcal.testing.joint_stream_checks import check_joint_stream
+from armcal.testing.manners import watched
 from armcal.testing.measurement_checks import check_measurement
 from armcal.testing.model_checks import check_model
 from armcal.testing.online_checks import check_online
+from armcal.testing.reader_checks import check_reader
 from armcal.testing.results import CheckResult, ContractError, Recorder, expect
 from armcal.testing.settings_checks import Subject, check_settings
-from armcal.testing.source_checks import check_reader, check_simulator
+from armcal.testing.simulator_checks import check_simulator
 from armcal.testing.tracker_checks import check_tracker
 
 __all__ = ["CheckResult", "check_component", "check_plugin"]
 
-HEAVY = ("numpy", "scipy", "casadi", "cvxpy", "matplotlib", "pydantic")
-"""What a registration module must not import: ``armcal --help`` and ``plugins list`` run every one of them."""
+_MARK = "imported:"
 _LONGEST_IMPORT_S = 60
 
 _CHECKS: Mapping[str, Callable[[Recorder, Subject], None]] = MappingProxyType(
@@ -49,9 +51,7 @@ _CHECKS: Mapping[str, Callable[[Recorder, Subject], None]] = MappingProxyType(
 
 def check_component(component: Component) -> list[CheckResult]:
     """Every check of the component's kind; what the component raises becomes a fault, never an exception."""
-    record = Recorder(f"{component.kind} {component.name}")
-    record.guard(lambda: _check(record, component))
-    return record.results
+    return check_made(component.kind, component.name, component.load)
 
 
 def check_plugin(plugin: PluginInfo, registry: PluginRegistry) -> list[CheckResult]:
@@ -68,24 +68,39 @@ def check_plugin(plugin: PluginInfo, registry: PluginRegistry) -> list[CheckResu
     return record.results + [result for component in own for result in check_component(component)]
 
 
-def _check(record: Recorder, component: Component) -> None:
-    made = record.check("it imports", component.load)
-    subject = None if made is None else check_settings(record, component.kind, made)
-    if subject is not None:
-        _CHECKS[component.kind](record, subject)
+def check_made(kind: str, name: str, load: Callable[[], Any]) -> list[CheckResult]:
+    """Every check of a kind on what ``load`` gives: a component's class."""
+    record = Recorder(f"{kind} {name}")
+    record.guard(lambda: _check(record, kind, load))
+    return record.results
+
+
+def _check(record: Recorder, kind: str, load: Callable[[], Any]) -> None:
+    with watched(record) as begin:
+        made = record.check("it imports", load)
+        begin(made)
+        subject = None if made is None else check_settings(record, kind, made)
+        if subject is not None:
+            record.guard(lambda: _CHECKS[kind](record, subject))
 
 
 def _light(target: str) -> None:
-    """Import the registration module in a fresh interpreter and see what came with it."""
+    """Import the registration module in a fresh interpreter and see what came with it, and what it said."""
     module = target.partition(":")[0]
-    code = f"import sys, {module}; print(*[name for name in {HEAVY!r} if name in sys.modules])"
-    path = f"import sys; sys.path[:] = {sys.path!r}; "
+    code = (
+        f"import sys; sys.path[:] = {sys.path!r}; import armcal.hooks; before = set(sys.modules); import {module}; "
+        f"print({_MARK!r}, *sorted({{name.partition('.')[0] for name in set(sys.modules) - before}}))"
+    )
     ran = subprocess.run(
-        [sys.executable, "-c", path + code], capture_output=True, text=True, timeout=_LONGEST_IMPORT_S, check=False
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=_LONGEST_IMPORT_S, check=False
     )
     if ran.returncode:
         raise ContractError(f"{module} does not import by itself: {ran.stderr.strip().splitlines()[-1:]}")
-    found = ran.stdout.split()
+    said, _, imported = ran.stdout.rpartition(_MARK)
+    shown = " ".join(said.split())[:60]
+    expect(not shown, f"found {shown!r} printed when {module} is imported, expected nothing")
+    own = {module.partition(".")[0], "armcal"}
+    found = [name for name in imported.split() if name not in own and name not in sys.stdlib_module_names]
     expect(
         not found,
         f"found {', '.join(found)} imported by {module}, expected only armcal.hooks: "

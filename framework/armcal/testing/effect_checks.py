@@ -7,21 +7,27 @@ from collections.abc import Mapping, Sequence
 import casadi as ca
 import numpy as np
 
-from armcal.arm.effects import JointCommand, JointEffect, Spring
+from armcal.arm.effects import JointCommand, JointEffect, ShapeEffect, Spring
+from armcal.arm.model import Attachment, Chain, Joint
+from armcal.base import se3
+from armcal.base.domains import Array
 from armcal.base.parameters import ParameterBlock
 from armcal.base.se3 import Expression
 from armcal.testing.expressions import (
     check_parameters,
     entry_names,
+    expect_all_used,
     expect_derivatives,
     expect_no_choice,
     expect_only,
+    expect_repeated,
     near_nominal,
     stacked,
     symbols,
 )
 from armcal.testing.results import Recorder, expect
 from armcal.testing.settings_checks import Subject
+from armcal.testing.unit_checks import expect_gain, scalars
 
 JOINTS = ("q1", "q2", "q3")
 
@@ -42,6 +48,11 @@ def check_effect(record: Recorder, subject: Subject) -> None:
         record.check("displacements depend on what is given", lambda: expect_only(moved, [recorded, given]))
         record.check("displacements do not branch on a parameter", lambda: expect_no_choice(moved, recorded, given))
         record.check("displacements are finite", lambda: _finite_displacement(blocks, given, recorded, moved))
+        record.check(
+            "lengths and angles move a joint by as much", lambda: _displacement_gains(blocks, given, recorded, moved)
+        )
+    record.check("it is the same each time", lambda: _repeated(subject, effect, blocks))
+    record.check("every parameter has an influence", lambda: expect_all_used(_all_of(effect, values), values))
     springs = record.check("its springs have a site and unit directions", lambda: _springs(effect, values))
     if not springs:
         return
@@ -55,6 +66,7 @@ def check_effect(record: Recorder, subject: Subject) -> None:
         lambda: expect_no_choice(laws, ca.SX(0, 1), stacked([loads, given])),
     )
     record.check("laws are finite and smooth, at zero load too", lambda: _smooth(blocks, given, loads, laws))
+    record.check("deflections are in rad, of loads in N m", lambda: _law_gains(blocks, given, loads, laws))
 
 
 def _displacement(effect: JointEffect, values: Mapping[str, Expression]) -> tuple[Expression, Expression]:
@@ -79,6 +91,60 @@ def _finite_displacement(
                 bool(np.isfinite(found).all()),
                 f"found {found.ravel()} for the command {command} from approach {approach:+.0f}",
             )
+
+
+def _displacement_gains(
+    blocks: Sequence[ParameterBlock], given: Expression, recorded: Expression, moved: Expression
+) -> None:
+    """What a parameter in m or rad adds to a joint, at commands and approaches of either sign."""
+    slope = ca.Function("slope", [given, recorded], [ca.densify(ca.jacobian(moved, given))])
+    entries = near_nominal(blocks, np.random.default_rng(3))
+    points = [[command, side] * len(JOINTS) for command in (0.4, -1.2, 2.0) for side in (-1.0, 1.0)]
+    found = np.abs([np.asarray(slope(entries, at)) for at in points]).max(axis=(0, 1), initial=0.0)
+    for place, block in scalars(blocks, "m", "rad"):
+        expect_gain(float(found[place]), "a joint's displacement", block.name, block.unit)
+
+
+def _all_of(effect: JointEffect, values: Mapping[str, Expression]) -> Expression:
+    """Everything that an effect says, on an arm of its joints."""
+    loads = ca.SX.sym("loads", 3 * len(JOINTS) + 3)
+    laws = [spring.law(loads[: spring.size]) for spring in effect.springs(values)]
+    shapes: list[Expression] = []
+    if isinstance(effect, ShapeEffect):
+        links = [se3.translation_along("x", ca.SX.sym(f"l{i}")) for i in range(len(JOINTS) + 1)]
+        joints = tuple(Joint(name, link) for name, link in zip(JOINTS, links, strict=False))
+        chain = Chain(se3.identity(), joints, Attachment(len(JOINTS), links[-1]))
+        shaped = effect.shaped(chain, {name: ca.SX.sym(name) for name in effect.conditions}, values)
+        shapes = [shaped.tool.joint_T_frame.matrix(), *(j.parent_T_joint.matrix() for j in shaped.joints)]
+    return stacked([_displacement(effect, values)[1], *laws, *shapes])
+
+
+def _repeated(subject: Subject, effect: JointEffect, blocks: tuple[ParameterBlock, ...]) -> None:
+    def picture(made: JointEffect) -> Array:
+        expect(tuple(made.parameters()) == blocks, "found other parameters another time")
+        values = symbols(blocks)
+        entries = near_nominal(blocks, np.random.default_rng(4))
+        recorded, moved = _displacement(made, values)
+        springs = made.springs(values)
+        laws = [spring.law(ca.SX(np.linspace(0.3, 1.1, spring.size))) for spring in springs]
+        function = ca.Function("all", [stacked(list(values.values())), recorded], [stacked([moved, *laws])])
+        return np.asarray(function(entries, [0.4, 1.0] * len(JOINTS)))
+
+    expect_repeated(lambda: picture(effect), lambda: picture(subject.made(subject.settings, JOINTS)))
+
+
+def _law_gains(blocks: Sequence[ParameterBlock], given: Expression, loads: Expression, laws: Expression) -> None:
+    """What a parameter in rad adds to a deflection; one in rad/(N m), for each N m."""
+    slope = ca.Function("slope", [given, loads], [ca.densify(ca.jacobian(laws, given))])
+    random = np.random.default_rng(3)
+    entries, found = near_nominal(blocks, random), []
+    for _ in range(3):
+        load = random.uniform(0.5, 2, loads.numel()) * random.choice([-1, 1], loads.numel())
+        found.append(np.abs(np.asarray(slope(entries, load))) / np.array([[1.0], [np.abs(load).max()]])[:, :, None])
+    per = np.array(found).max(axis=(0, 2), initial=0.0)
+    for row, unit in enumerate(("rad", "rad_per_Nm")):
+        for place, block in scalars(blocks, unit):
+            expect_gain(float(per[row, place]), "a deflection", block.name, "rad")
 
 
 def _springs(effect: JointEffect, values: Mapping[str, Expression]) -> tuple[Spring, ...]:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import PurePath
 from typing import Any
 
 import numpy as np
 
 from armcal.errors import InputError
 from armcal.testing.planar import ARM, planar_arms
-from armcal.testing.results import ContractError, Recorder, expect
+from armcal.testing.results import ContractError, NotRun, Recorder, expect
 from armcal.testing.settings_checks import Subject
 from armcal.use.exporter import Exported, ExportRequest
 
@@ -18,21 +19,43 @@ def check_exporter(record: Recorder, subject: Subject) -> None:
     exporter: Any = record.check("it builds", lambda: subject.made(subject.settings))
     if exporter is None:
         return
-    record.check(
-        "a planar arm is written, the same each time, or refused by an armcal error", lambda: _writes(exporter)
-    )
+    written = record.check("an arm is written, or refused by an armcal error", lambda: _written(exporter, _request()))
+    record.check("it writes the same each time", lambda: _same(subject, exporter, written))
+    record.check("it changes nothing that it is given", lambda: _untouched(exporter))
 
 
-def _writes(exporter: Any) -> None:
+def _request() -> ExportRequest:
     arm = planar_arms([ARM])[ARM]
-    request = ExportRequest(ARM, arm, {block.name: np.array(block.nominal) for block in arm.parameters()})
+    return ExportRequest(ARM, arm, {block.name: np.array(block.nominal) for block in arm.parameters()})
+
+
+def _written(exporter: Any, request: ExportRequest) -> Exported | str:
+    """What it writes, or why it refuses."""
     try:
-        found = [exporter.export(request) for _ in range(2)]
-    except InputError:
-        return
+        found = exporter.export(request)
+    except InputError as refusal:
+        return str(refusal)
     except Exception as fault:
         raise ContractError(f"found {type(fault).__name__} ({fault}), expected armcal.errors.InputError") from fault
-    for each in found:
-        expect(isinstance(each, Exported), f"found {type(each).__name__}, expected armcal.use.exporter.Exported")
-        expect(isinstance(each.content, bytes), f"found content of type {type(each.content).__name__}, expected bytes")
-    expect(found[0] == found[1], "found other content the second time")
+    expect(isinstance(found, Exported), f"found {type(found).__name__}, expected armcal.use.exporter.Exported")
+    for name, content in {"content": found.content, **found.companions}.items():
+        expect(isinstance(content, bytes), f"found {name} of type {type(content).__name__}, expected bytes")
+    for name in found.companions:
+        plain = name == PurePath(name).name and name not in ("", ".", "..") and "\\" not in name
+        expect(plain, f"found the companion {name!r}, expected the plain name of a file")
+    result: Exported = found
+    return result
+
+
+def _same(subject: Subject, exporter: Any, first: Exported | str | None) -> None:
+    if first is None:
+        raise NotRun("it does not write the planar arm")
+    for other in (exporter, subject.made(subject.settings)):
+        expect(_written(other, _request()) == first, "found other content, or another refusal, the second time")
+
+
+def _untouched(exporter: Any) -> None:
+    request = _request()
+    _written(exporter, request)
+    kept = all(np.array_equal(value, _request().values[name]) for name, value in request.values.items())
+    expect(kept and set(request.values) == set(_request().values), "it changed the values that it was given")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import casadi as ca
@@ -15,6 +15,7 @@ from armcal.base.parameters import ParameterBlock, Parameters
 from armcal.base.se3 import Expression
 from armcal.base.units import UNITS, si_unit
 from armcal.testing.results import ContractError, Recorder, expect
+from armcal.testing.unit_checks import expect_plausible
 
 JACOBIAN_TOLERANCE = 1e-6
 _STEP = 1e-5
@@ -24,6 +25,7 @@ _CHOICES = {
     for name in (
         *("OP_LT", "OP_LE", "OP_EQ", "OP_NE", "OP_NOT", "OP_AND", "OP_OR", "OP_IF_ELSE_ZERO"),
         *("OP_SIGN", "OP_FABS", "OP_FMIN", "OP_FMAX", "OP_FLOOR", "OP_CEIL", "OP_FMOD", "OP_COPYSIGN"),
+        *("OP_REMAINDER", "OP_MMIN", "OP_MMAX"),
     )
 }
 
@@ -38,6 +40,7 @@ def check_parameters(
     well_valued = record.check("their nominal values are finite and in their domains", lambda: _valued(blocks))
     well_sized = record.check("their scales are positive and move them", lambda: _movable(blocks))
     record.check("their units are SI", lambda: _in_si(blocks))
+    record.check("their values and scales are plausible in their units", lambda: expect_plausible(blocks))
     return None if well_valued is None or well_sized is None else blocks
 
 
@@ -172,3 +175,23 @@ def expect_derivatives(function: ca.Function, at: Array, what: str, inputs: Sequ
             worst <= allowed,
             f"the derivative of {what} by {name} is off by {worst:.1e}, expected {allowed:.1e}",
         )
+
+
+def expect_all_used(expression: Expression, values: Mapping[str, Expression]) -> None:
+    """Raise ContractError if a parameter has no influence on any of what is given."""
+    idle = [name for name, symbol in values.items() if not ca.depends_on(ca.SX(expression), symbol)]
+    expect(
+        not idle,
+        f"found that {', '.join(idle)} changes nothing, expected every parameter to have an influence: "
+        "is a nominal value used in its place?",
+    )
+
+
+def expect_repeated(picture: Callable[[], Array], again: Callable[[], Array]) -> None:
+    """Raise ContractError unless a component, asked again, and a second one like it give the same numbers."""
+    first, second, other = picture(), picture(), again()
+    expect(np.array_equal(first, second, equal_nan=True), "found other numbers when it was asked a second time")
+    expect(
+        np.array_equal(first, other, equal_nan=True),
+        "found other numbers from a second component of equal settings: it keeps something between calls",
+    )

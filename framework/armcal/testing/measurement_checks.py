@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 
 import casadi as ca
 import numpy as np
@@ -17,18 +18,23 @@ from armcal.measure.partners import OTHER
 from armcal.solve.factor import Factor, build_factor
 from armcal.testing.expressions import (
     check_parameters,
+    expect_all_used,
     expect_derivatives,
     expect_only,
+    expect_repeated,
     near_nominal,
     stacked,
 )
-from armcal.testing.planar import ARM, GRAVITY, planar_arms
+from armcal.testing.planar import ARM, GRAVITY, planar_arms, skewed_arms
 from armcal.testing.results import PLUGIN_FAULTS, ContractError, NotRun, Recorder, expect
 from armcal.testing.settings_checks import Subject
+from armcal.testing.unit_checks import dimension_of, expect_gain, expect_small_noise, scalars
 
 ARM_NAMES = ((ARM,), ("left", "right"))
 """The arms that a measurement is built for: one, or if it refuses that, two."""
 _RATIO = "1"
+_UNITS: Mapping[str, str] = MappingProxyType({"length": "m", "angle": "rad"})
+_POINTS = 6
 _INSTRUMENT = "instrument"
 _GROUP = "front/hole"
 
@@ -56,6 +62,13 @@ def check_measurement(record: Recorder, subject: Subject) -> None:
     record.check(
         "its Jacobian is finite and agrees with differences", lambda: _jacobian(factor, measurement, arms, blocks)
     )
+    record.check("it is the same each time", lambda: _repeated(subject, factor, measurement, arms, blocks))
+    skewed = skewed_arms(tuple(arms))
+    general = record.check("it makes a residual of any arm", lambda: _factor(measurement, skewed, blocks, channels))
+    if general is None:
+        return
+    record.check("every parameter has an influence", lambda: _all_used(general, measurement, arms, blocks))
+    record.check("its residual is in m and rad", lambda: _gains(general, measurement, arms, blocks, channels))
     if isinstance(measurement, GroupedMeasurement):
         record.check("all groups have the same parameters", lambda: _groups(measurement))
         record.check("what a record says of its group fits it", lambda: _told(factor, measurement, arms, blocks))
@@ -118,6 +131,11 @@ def _noise(factor: Factor) -> None:
         all(np.isfinite(noise) and noise > 0 for noise in factor.noise),
         f"found the noise {factor.noise}, expected standard deviations above zero",
     )
+    dims = len(factor.dimensions)
+    expect(dims == count, f"found {dims} dimensions for {count} residuals, expected length or angle of each")
+    strange = sorted(set(factor.dimensions) - {"length", "angle"})
+    expect(not strange, f"found the dimensions {', '.join(strange)} of residuals, expected length or angle")
+    expect_small_noise(factor.noise, factor.dimensions)
     stated = len(factor.noise_channels)
     expect(stated in (0, count), f"found noise channels for {stated} of {count} residuals, expected all or none")
 
@@ -161,10 +179,10 @@ def _told(factor: Factor, measurement: Measurement, arms: Mapping[str, Arm], blo
 
 
 def _point(
-    factor: Factor, measurement: Measurement, arms: Mapping[str, Arm], blocks: Sequence[ParameterBlock]
+    factor: Factor, measurement: Measurement, arms: Mapping[str, Arm], blocks: Sequence[ParameterBlock], seed: int = 1
 ) -> tuple[Array, Array]:
     """Values, and a record with random joint angles whose measured channels say what would be read."""
-    random = np.random.default_rng(1)
+    random = np.random.default_rng(seed)
     values = near_nominal((*_parameters(arms, blocks).blocks, *_group_blocks(measurement)), random)
     record = random.uniform(-1, 1, factor.record.numel())
     shown = np.asarray(_function(factor, factor.outputs)(np.concatenate([values, record]))).ravel()
@@ -203,3 +221,72 @@ def _jacobian(
     of_group = [name for block in _group_blocks(measurement) for name in block.entry_names]
     names = (*_parameters(arms, blocks).entry_names, *of_group, *factor.channels)
     expect_derivatives(_function(factor, factor.residual), at, "the residual", names)
+
+
+def _repeated(
+    subject: Subject,
+    factor: Factor,
+    measurement: Measurement,
+    arms: Mapping[str, Arm],
+    blocks: Sequence[ParameterBlock],
+) -> None:
+    def picture(made: Measurement) -> Array:
+        same = tuple(made.parameters()) == tuple(blocks)
+        expect(same, "found other parameters another time, expected them from its settings alone")
+        own = _factor(made, arms, blocks, tuple(made.channels()))
+        shown = stacked([own.residual, own.outputs, own.told])
+        at = np.concatenate(_point(factor, measurement, arms, blocks))
+        return np.concatenate([np.asarray(_function(own, shown)(at)).ravel(), own.noise])
+
+    expect_repeated(lambda: picture(measurement), lambda: picture(subject.made(subject.settings, tuple(arms))))
+
+
+def _own_entries(
+    factor: Factor, measurement: Measurement, arms: Mapping[str, Arm], blocks: Sequence[ParameterBlock]
+) -> tuple[tuple[ParameterBlock, ...], tuple[ParameterBlock, ...]]:
+    """The arms' blocks, and the measurement's own with those of a group; together all entries in their order."""
+    own = prefixed(f"{_INSTRUMENT}.", blocks)
+    every = _parameters(arms, blocks).blocks
+    return every[: len(every) - len(own)], (*every[len(every) - len(own) :], *_group_blocks(measurement))
+
+
+def _all_used(
+    factor: Factor, measurement: Measurement, arms: Mapping[str, Arm], blocks: Sequence[ParameterBlock]
+) -> None:
+    others, own = _own_entries(factor, measurement, arms, blocks)
+    place, values = sum(block.size for block in others), {}
+    for block in own:
+        values[block.name.removeprefix(f"{_INSTRUMENT}.")] = factor.values[place : place + block.size]
+        place += block.size
+    expect_all_used(stacked([factor.residual, factor.outputs]), values)
+
+
+def _gains(
+    factor: Factor,
+    measurement: Measurement,
+    arms: Mapping[str, Arm],
+    blocks: Sequence[ParameterBlock],
+    channels: Sequence[Channel],
+) -> None:
+    """What a length or an angle, of a parameter or as it is read, changes in a residual of the same dimension."""
+    function, slopes = _function(factor, factor.residual), []
+    for seed in range(_POINTS):
+        at = np.concatenate(_point(factor, measurement, arms, blocks, seed))
+        at[factor.values.numel() :] += 0.01
+        slopes.append(np.abs(np.asarray(function.jacobian()(at, function(at)))))
+    slope = np.max(slopes, axis=0)
+    rows = {dimension: np.array([d == dimension for d in factor.dimensions]) for dimension in _UNITS}
+    others, own = _own_entries(factor, measurement, arms, blocks)
+    of_arms = [place for place, _ in scalars(others, "m", "rad")]
+    both = scalars((*others, *own), "m", "rad")[len(of_arms) :]
+    gains = [(dimension_of(b), b.name, slope[:, place]) for place, b in both]
+    for unit, dimension in (("m", "length"), ("rad", "angle")):
+        places = [place for place, _ in scalars(others, unit)]
+        gains.append((dimension, "the arm's parameters", slope[:, places].max(axis=1)))
+    for channel in channels:
+        name = f"{_INSTRUMENT}.{channel.name}"
+        if name in factor.channels and channel.dimension in _UNITS:
+            column = factor.values.numel() + factor.channels.index(name)
+            gains.append((channel.dimension, f"the channel {channel.name}", slope[:, column]))
+    for dimension, name, column in gains:
+        expect_gain(float(column[rows[dimension]].max(initial=0.0)), "the residual", name, _UNITS[dimension])

@@ -19,9 +19,11 @@ from armcal.solve.problem import Problem
 from armcal.testing.expressions import (
     check_parameters,
     entry_names,
+    expect_all_used,
     expect_derivatives,
     expect_no_choice,
     expect_only,
+    expect_repeated,
     near_nominal,
     stacked,
     symbols,
@@ -29,6 +31,7 @@ from armcal.testing.expressions import (
 from armcal.testing.planar import ARM, TRACKER, Springs, Tip, all_parameters, commands, dataset
 from armcal.testing.results import Recorder, expect
 from armcal.testing.settings_checks import Subject
+from armcal.testing.unit_checks import dimension_of, expect_gain, scalars, size_of
 
 POSES = 20
 ROTATION_TOLERANCE = 1e-9
@@ -70,11 +73,14 @@ def check_model(record: Recorder, subject: Subject) -> None:
         "the chain does not branch on a parameter",
         lambda: expect_no_choice(parts, ca.SX(0, 1), stacked(list(values.values()))),
     )
+    record.check("every parameter has an influence", lambda: expect_all_used(parts, values))
     known = record.check("its kinematics can be evaluated", lambda: _kinematics(blocks, values, chain))
     if known is None:
         return
+    record.check("it is the same each time", lambda: _repeated(subject, model, blocks))
     record.check(f"{POSES} random poses are rigid motions", lambda: _rigid(known))
     record.check("derivatives agree with differences", lambda: _derivatives(known))
+    record.check("lengths move it by lengths, and angles by angles", lambda: _gains(known))
     record.check("springs on it settle under gravity", lambda: _settles(model, chain))
 
 
@@ -153,6 +159,29 @@ def _rigid(known: _Kinematics) -> None:
 def _derivatives(known: _Kinematics) -> None:
     names = (*entry_names(known.blocks), *(joint.name for joint in known.chain.joints))
     expect_derivatives(known.poses, known.point(np.random.default_rng(2)), "the poses", names)
+
+
+def _repeated(subject: Subject, model: ArmModel, blocks: tuple[ParameterBlock, ...]) -> None:
+    def picture(made: ArmModel) -> Array:
+        expect(tuple(made.parameters()) == blocks, "found other parameters another time")
+        values = symbols(blocks)
+        known = _kinematics(blocks, values, made.chain(values))
+        return np.asarray(known.poses(known.point(np.random.default_rng(4))))
+
+    expect_repeated(lambda: picture(model), lambda: picture(subject.made(subject.settings)))
+
+
+def _gains(known: _Kinematics) -> None:
+    """How far the tool moves (m) with a parameter in m, and how far it turns (rad) with one in rad."""
+    random, jacobian = np.random.default_rng(5), known.poses.jacobian()
+    points = [known.point(random) for _ in range(3)]
+    slopes = [np.asarray(jacobian(at, known.poses(at)))[:12].reshape(4, 3, -1) for at in points]
+    for place, block in scalars(known.blocks, "m", "rad"):
+        turned = [size_of(slope[:3, :, place]) / np.sqrt(2) for slope in slopes]
+        moved = [size_of(slope[3, :, place]) for slope in slopes]
+        angular = dimension_of(block) == "angle"
+        what = "the tool's orientation" if angular else "the tool's position"
+        expect_gain(max(turned if angular else moved), what, block.name, block.unit)
 
 
 def _settles(model: ArmModel, chain: Chain) -> None:

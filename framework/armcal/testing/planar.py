@@ -15,6 +15,7 @@ from armcal.base import se3
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.base.parameters import ParameterBlock, Parameters, scalar
+from armcal.base.pose_blocks import quaternion_expression
 from armcal.base.se3 import Expression
 from armcal.measure.contact import Contact
 from armcal.measure.measurement import Channel
@@ -25,6 +26,7 @@ GRAVITY = Environment((0.0, 0.0, -9.81))
 NOISE_M = 1e-3
 _Y_AXIS = (0.0, 1.0, 0.0)
 _TIP = "xyz"
+QUATERNION = ("qw", "qx", "qy", "qz")
 
 
 class PlanarArm:
@@ -54,6 +56,16 @@ class PlanarArm:
         )
         base = se3.translation_along("y", values["side"])
         return Chain(base, joints, Attachment(2, fore), {"elbow": Attachment(1, upper)})
+
+
+class SkewedArm(PlanarArm):
+    """The same, but that q1 turns about z: every point of the tool moves in a way of its own."""
+
+    def chain(self, values: Mapping[str, Expression]) -> Chain:
+        """As the planar arm's, with another first axis."""
+        chain = super().chain(values)
+        first, second = chain.joints
+        return replace(chain, joints=(replace(first, angular=(0.0, 0.0, 1.0)), second))
 
 
 @dataclass(frozen=True)
@@ -149,9 +161,29 @@ class Tip:
         return (NOISE_M,) * 3
 
 
+@dataclass(frozen=True)
+class Body(Tip):
+    """The tool's position and orientation, without parameters of its own."""
+
+    def channels(self) -> tuple[Channel, ...]:
+        """Three coordinates and a unit quaternion."""
+        return (*super().channels(), *(Channel(name, "dimensionless") for name in QUATERNION))
+
+    def outputs(self, arms: Mapping[str, ArmState], values: Mapping[str, Expression]) -> dict[str, Expression]:
+        """In the base frame (m, 1)."""
+        turned = quaternion_expression(arms[self.arm].base_T_tool.rotation)
+        named = {name: turned[i] for i, name in enumerate(QUATERNION)}
+        return {**super().outputs(arms, values), **named}
+
+
 def planar_arms(names: Sequence[str]) -> dict[str, Arm]:
     """A planar arm under each of these names, without springs."""
     return {name: Arm(name, "planar", PlanarArm(), {}, ()) for name in names}
+
+
+def skewed_arms(names: Sequence[str]) -> dict[str, Arm]:
+    """A skewed arm under each of these names, with the parameters of a planar one."""
+    return {name: Arm(name, "planar", SkewedArm(), {}, ()) for name in names}
 
 
 def all_parameters(arms: Mapping[str, Arm]) -> Parameters:

@@ -17,12 +17,13 @@ PLUGIN_FAULTS = (Exception, SystemExit)
 class CheckResult:
     """What one check found: nothing, if ``fault`` is empty.
 
-    A check that could not run says why at the end of ``check``: ``(not run: ...)``.
+    A check that could not run says why in ``not_run``, and at the end of ``check``: ``(not run: ...)``.
     """
 
     component: str
     check: str
     fault: str = ""
+    not_run: str = ""
 
 
 class ContractError(Exception):
@@ -45,7 +46,7 @@ class Recorder:
         try:
             value = run()
         except NotRun as reason:
-            self._add(f"{name} (not run: {reason})")
+            self.results.append(CheckResult(self.component, f"{name} (not run: {reason})", not_run=str(reason)))
         except PLUGIN_FAULTS as fault:
             self._add(name, said(fault))
         else:

@@ -4,15 +4,27 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from types import MappingProxyType
+from typing import Any, get_args
 
 from pydantic import ValidationError
 
 from armcal.base.settings import Settings
+from armcal.base.units import split_suffix
 from armcal.testing.results import NotRun, Recorder, expect
 
 MISSING_FILE = "/no/such/folder/measurements"
 _UNKNOWN_KEY = "no_component_has_this_key"
+_QUANTITIES: Mapping[str, str] = MappingProxyType(
+    {
+        **dict.fromkeys(("length", "distance", "height", "width", "depth", "radius", "diameter", "noise"), "length"),
+        **dict.fromkeys(("angle", "angles", "rotation_vector"), "angle"),
+        **dict.fromkeys(("mass", "payload"), "mass"),
+        **{word: word for word in ("compliance", "force", "torque", "temperature", "acceleration")},
+        **dict.fromkeys(("duration", "timeout"), "time"),
+    }
+)
+"""Words in the names of settings that are quantities, and their dimension."""
 
 
 @dataclass(frozen=True)
@@ -30,6 +42,7 @@ def check_settings(record: Recorder, kind: str, made: Any) -> Subject | None:
     if found is None:
         return None
     record.check("every setting is typed or documented", lambda: _described(found))
+    record.check("every quantity has its unit", lambda: _with_units(found))
     example = record.check("its EXAMPLE is a mapping", lambda: _example(kind, made, found))
     if example is None:
         return None
@@ -58,6 +71,28 @@ def _described(found: type[Settings]) -> None:
         if info.annotation in (None, Any, object) and not info.description
     ]
     expect(not bare, f"found {', '.join(bare)} without a type, expected a type or Field(description=...)")
+
+
+def _with_units(found: type[Settings]) -> None:
+    """No plain number has a quantity's name; one that is none says so in ``Field(description=...)``."""
+    quantities = found.quantities()
+    for name, info in found.model_fields.items():
+        if name in quantities or info.description or not _holds_floats(info.annotation, info.metadata):
+            continue
+        suffix = split_suffix(name)
+        word = next((word for word in name.split("_") if word in _QUANTITIES), None)
+        dimension = suffix[1].dimension if suffix else _QUANTITIES[word] if word else ""
+        expect(
+            not dimension,
+            f"found {name}, a number without a unit; expected a type with one ({dimension}), such as Length or Angle "
+            "of armcal.base.settings, under a name without one, or Field(description=...) if it has none",
+        )
+
+
+def _holds_floats(*parts: Any) -> bool:
+    """Whether a type is a float, or holds some; a name that maps to floats counts too."""
+    inner = [each for part in parts for each in (part if isinstance(part, list) else (part,))]
+    return any(each is float or (get_args(each) and _holds_floats(*get_args(each))) for each in inner)
 
 
 def _example(kind: str, made: Any, found: type[Settings]) -> Mapping[str, Any]:

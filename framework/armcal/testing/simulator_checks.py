@@ -1,4 +1,4 @@
-"""Checks on readers and simulators."""
+"""Checks on simulators."""
 
 from __future__ import annotations
 
@@ -6,49 +6,21 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from pydantic import ValidationError
 
 from armcal.arm.assembly import Arm
 from armcal.base.dataset import Dataset
 from armcal.errors import InputError
 from armcal.measure.measurement import Measurement
-from armcal.measure.reader import Reader, ReadRequest, wanted_channels
+from armcal.measure.reader import wanted_channels
 from armcal.solve.simulation import SimulationRequest, Simulator
 from armcal.testing.planar import ARM, GRAVITY, TRACKER, WALLS, Tip, Walls, all_parameters, planar_arms
-from armcal.testing.results import ContractError, NotRun, Recorder, expect
-from armcal.testing.settings_checks import MISSING_FILE, Subject
-
-
-def check_reader(record: Recorder, subject: Subject) -> None:
-    """That it can be asked, and refuses a missing file as a user's fault."""
-    reader: Any = record.check("it builds", lambda: subject.made(subject.settings))
-    if reader is None:
-        return
-    record.check("it reads", lambda: _has(reader, "read"))
-    record.check("a missing file is refused by an armcal error", lambda: _misses(subject))
+from armcal.testing.results import NotRun, Recorder, expect
+from armcal.testing.settings_checks import Subject
 
 
 def _has(component: Any, method: str) -> None:
     found = getattr(component, method, None)
     expect(callable(found), f"found {method} = {found!r}, expected a method")
-
-
-def _misses(subject: Subject) -> None:
-    if "path" not in type(subject.settings).model_fields:
-        raise NotRun("its settings have no path")
-    arms, measurements = planar_arms([ARM]), {TRACKER: Tip()}
-    request = ReadRequest(arms, measurements, wanted_channels(arms, measurements, measured=True))
-    try:
-        settings = subject.made.Settings.model_validate({**subject.example, "path": MISSING_FILE})
-        reader: Reader = subject.made(settings)
-        reader.read(request)
-    except (InputError, ValidationError):
-        return
-    except Exception as fault:
-        raise ContractError(
-            f"found {type(fault).__name__} ({fault}), expected armcal.errors.DataError with the file's name"
-        ) from fault
-    raise ContractError("found a dataset read from a file that is not there")
 
 
 def check_simulator(record: Recorder, subject: Subject) -> None:

@@ -1,0 +1,92 @@
+"""What the command line does, in a few calls: load an experiment, run it, use what it found."""
+
+from __future__ import annotations
+
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from armcal.errors import NotConvergedError
+from armcal.report import render
+from armcal.run import experiment, outputs
+from armcal.run.pipeline import calibrate
+from armcal.run.result import RunResult
+from armcal.solve.estimator import CHECK_THE_DATA, Estimate
+from armcal.solve.parallel import Executor
+from armcal.solve.verdict import Verdict
+from armcal.use.calibration import Calibration
+from armcal.use.calibration_file import dump
+
+
+@dataclass(frozen=True)
+class Run:
+    """A finished calibration run.
+
+    Attributes:
+        experiment: what was run.
+        result: everything that it knows.
+    """
+
+    experiment: experiment.Experiment
+    result: RunResult
+
+    @property
+    def converged(self) -> bool:
+        """Whether the solver came to an end."""
+        return self.result.estimate.verdict.converged
+
+    @property
+    def estimate(self) -> Estimate:
+        """Values, covariance, residuals, and what the data could not determine."""
+        return self.result.estimate
+
+    @property
+    def verdict(self) -> Verdict:
+        """What to conclude: one finding a test that was made."""
+        return self.result.verdict
+
+    @property
+    def metrics(self) -> dict[str, Any]:
+        """The numbers of metrics.json; errors in mm, by model and records: ``metrics["error_mm"]["calibrated"]``."""
+        return outputs.metrics(self.result)
+
+    @property
+    def calibration(self) -> Calibration:
+        """The calibrated arm, as calibration.yaml would give it.
+
+        Raises:
+            NotConvergedError: the solver did not converge, so nothing is calibrated.
+        """
+        if not self.converged:
+            raise NotConvergedError(
+                f"{self.estimate.verdict.name} did not converge ({self.estimate.verdict.status}).",
+                hint=CHECK_THE_DATA,
+            )
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "calibration.yaml"
+            path.write_text(dump(outputs.calibration_content(self.result, self.experiment)), encoding="utf-8")
+            return Calibration.load(path, self.experiment.registry)
+
+    def write(self, folder: str | Path) -> Path:
+        """Write what ``armcal run`` writes: calibration.yaml, report.html, metrics.json and the rest.
+
+        Raises:
+            InputError: the folder holds other things, or cannot be written.
+        """
+        outputs.check_folder(Path(folder))
+        outputs.write(self.result, self.experiment, Path(folder), render)
+        return Path(folder)
+
+
+@dataclass(frozen=True)
+class Experiment(experiment.Experiment):
+    """A configuration made of real components, ready to run."""
+
+    def run(self, executor: Executor | None = None) -> Run:
+        """Load the data, check, fit, validate; starts and folds by ``executor``.
+
+        Raises:
+            InputError: configuration or data are refused before solving.
+        """
+        return Run(self, calibrate(self, executor=executor))

@@ -1,0 +1,314 @@
+"""The reference of hooks and kinds of component, made from their specifications: signatures and docstrings.
+
+``docs/hooks.md`` is what ``as_markdown`` gives; a test compares the two.
+"""
+
+from __future__ import annotations
+
+import inspect
+import re
+import textwrap
+import typing
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from importlib import import_module
+from types import MappingProxyType
+from typing import Any
+
+from armcal import hooks
+
+_SINCE = re.compile(r"Since contract ([0-9]+\.[0-9]+)\.")
+_SECTION = re.compile(r"^(Args|Attributes|Raises|Returns):$")
+_ENTRY = re.compile(r"^(\w+): (.*)$")
+
+WORDS: Mapping[str, str] = MappingProxyType(
+    {
+        "address": "of a device on the bus, 7 bits.",
+        "after_s": "how long the host must have been silent (s).",
+        "angle": "of a joint, as commanded (rad).",
+        "angles": "by joint name, as commanded (rad).",
+        "arms": "each arm that takes part, by instance name, as it stands in the record.",
+        "chain": "the arm that its model describes.",
+        "channels": "what to listen for, each an arm's joint: `arm.q1`.",
+        "conditions": "recorded numbers by name, those that the record has.",
+        "count": "how many bytes.",
+        "counts_per_s": "how fast each channel may go, by address and channel.",
+        "data": "all bytes of the transaction.",
+        "group": "its key: its labels joined by a slash.",
+        "groups": "the keys of all groups that the records have.",
+        "joint": "a joint's name.",
+        "measured": "what the record says, by the local names of the channels (SI).",
+        "observations": "records, the newest last, each ready to be looked at from anywhere.",
+        "progress": "to be told what is being done, and which fraction of it is.",
+        "pulse": "its length (s).",
+        "records": "those of each measurement, with their weights.",
+        "register": "the number of the first register.",
+        "targets": "ON and OFF counts, by address and channel.",
+        "values": "the parameters, as CasADi expressions under their local names, a block's entries in a column.",
+        "waypoints": "where to go, in order: angles by joint (rad), of a link counts by address and channel.",
+    }
+)
+"""Arguments of several methods that their docstrings do not explain again."""
+
+
+@dataclass(frozen=True)
+class Argument:
+    """An argument, and what it is; empty if nobody says."""
+
+    name: str
+    explained: str
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A hook or a method: how it is called, what it does, what it raises, since which contract (hooks alone)."""
+
+    name: str
+    call: str
+    text: str
+    arguments: tuple[Argument, ...]
+    raises: tuple[tuple[str, str], ...] = ()
+    since: str = ""
+
+
+@dataclass(frozen=True)
+class ProtocolEntry:
+    """What a component has, or may have beside: ``module.class``, its docstring, its methods."""
+
+    name: str
+    text: str
+    methods: tuple[Entry, ...]
+
+
+@dataclass(frozen=True)
+class KindEntry:
+    """A kind of component."""
+
+    kind: str
+    hook: Entry
+    built_as: str
+    protocol: ProtocolEntry
+    beside: tuple[ProtocolEntry, ...]
+
+
+@dataclass(frozen=True)
+class Reference:
+    """All of a contract."""
+
+    version: str
+    register: Entry
+    kinds: tuple[KindEntry, ...]
+    observers: tuple[Entry, ...]
+
+
+def reference(specifications: Any = hooks) -> Reference:
+    """Of a module of specifications, such as ``armcal.hooks``."""
+    kinds = tuple(
+        KindEntry(
+            kind,
+            _entry(getattr(specifications, component.hook)),
+            component.built_as,
+            _protocol(component.protocol),
+            tuple(map(_protocol, component.beside)),
+        )
+        for kind, component in specifications.COMPONENTS.items()
+    )
+    registering = {component.hook for component in specifications.COMPONENTS.values()}
+    marked = [f for f in vars(specifications).values() if hasattr(f, f"{hooks.PROJECT}_spec")]
+    observers = tuple(_entry(hook) for hook in marked if hook.__name__ not in registering)
+    register = _entry(specifications.Register.__call__, "register")
+    return Reference(specifications.CONTRACT_VERSION, register, kinds, observers)
+
+
+def missing(found: Reference) -> list[str]:
+    """What a reader would not find explained: hooks and methods without a docstring, arguments without a word."""
+    gaps = []
+    for hook in (*(kind.hook for kind in found.kinds), *found.observers):
+        gaps += [f"{hook.name}: since which contract"] if not hook.since else []
+    entries = [("", hook) for hook in (found.register, *(k.hook for k in found.kinds), *found.observers)]
+    for protocol in _protocols(found):
+        gaps += [f"{protocol.name}: a docstring"] if not protocol.text else []
+        entries += [(f"{protocol.name}.", method) for method in protocol.methods]
+    for before, entry in entries:
+        gaps += [f"{before}{entry.name}: a docstring"] if not entry.text else []
+        gaps += [f"{before}{entry.name}: the argument {a.name}" for a in entry.arguments if not a.explained]
+    return gaps
+
+
+def idle_words(found: Reference) -> list[str]:
+    """Words of the table above that explain no argument."""
+    used = {
+        argument.name
+        for protocol in _protocols(found)
+        for method in protocol.methods
+        for argument in method.arguments
+        if argument.explained == WORDS.get(argument.name)
+    }
+    return [word for word in WORDS if word not in used]
+
+
+def _protocols(found: Reference) -> list[ProtocolEntry]:
+    return [protocol for kind in found.kinds for protocol in (kind.protocol, *kind.beside)]
+
+
+def _protocol(target: str) -> ProtocolEntry:
+    module, _, name = target.partition(":")
+    made = getattr(import_module(module), name)
+    text = inspect.cleandoc(made.__doc__ or "")
+    methods = [
+        _entry(getattr(member, "fget", member), name, text, isinstance(member, property))
+        for name, member in vars(made).items()
+        if not name.startswith("_") and (callable(member) or isinstance(member, property))
+    ]
+    return ProtocolEntry(f"{module}.{name}", text, tuple(methods))
+
+
+def _entry(function: Callable[..., Any], name: str = "", around: str = "", is_property: bool = False) -> Entry:
+    """A function as the reference shows it; ``around`` is the docstring of its class."""
+    name = name or function.__name__
+    text, sections = _sections(inspect.cleandoc(function.__doc__ or ""))
+    since = _SINCE.search(text)
+    signature = inspect.signature(function)
+    given = [p for p in signature.parameters.values() if p.name != "self"]
+    arguments = tuple(
+        Argument(p.name, _explained(p, function, sections.get("Args", {}), f"{around}\n{text}")) for p in given
+    )
+    call = name if is_property else f"{name}({', '.join(map(_shown, given))})"
+    if signature.return_annotation not in (inspect.Signature.empty, "None"):
+        call += f" -> {signature.return_annotation}"
+    told = _SINCE.sub("", text).strip()
+    return Entry(name, call, told, arguments, tuple(sections.get("Raises", {}).items()), since[1] if since else "")
+
+
+def _shown(parameter: inspect.Parameter) -> str:
+    empty = parameter.default is inspect.Parameter.empty
+    if empty:
+        return f"{parameter.name}: {parameter.annotation}"
+    default = getattr(parameter.default, "__name__", repr(parameter.default))
+    return f"{parameter.name}: {parameter.annotation} = {default}"
+
+
+def _explained(parameter: inspect.Parameter, function: Callable[..., Any], told: Mapping[str, str], text: str) -> str:
+    """From its own docstring, the class's, the words above, or the docstring of its type."""
+    if parameter.name in told:
+        return told[parameter.name]
+    if f"``{parameter.name}``" in text:
+        return "see above."
+    if parameter.name in WORDS:
+        return WORDS[parameter.name]
+    hint = _hints(function).get(parameter.name)
+    if isinstance(hint, type) and hint.__module__.partition(".")[0] == "armcal" and hint.__doc__:
+        first = inspect.cleandoc(hint.__doc__).split("\n\n")[0]
+        return f"`{hint.__module__}.{hint.__name__}`. {' '.join(first.split())}"
+    return ""
+
+
+def _hints(function: Callable[..., Any]) -> dict[str, Any]:
+    try:
+        return typing.get_type_hints(function)
+    except (NameError, TypeError):  # of a type that is only imported for type checkers
+        return {}
+
+
+def _sections(text: str) -> tuple[str, dict[str, dict[str, str]]]:
+    """A docstring without its sections, and the entries of each (``Args``, ``Raises``)."""
+    kept, sections, inside, last = list[str](), dict[str, dict[str, str]](), "", ""
+    for line in text.splitlines():
+        heading = _SECTION.match(line)
+        if heading:
+            inside = heading[1]
+            sections[inside] = {}
+        elif inside and line.startswith("    "):
+            entry = _ENTRY.match(line[4:])
+            if entry:
+                last = entry[1]
+                sections[inside][last] = entry[2]
+            elif last:
+                sections[inside][last] += f" {line.strip()}"
+        elif line or not inside:
+            inside = ""
+            kept.append(line)
+    return "\n".join(kept).strip(), sections
+
+
+def as_markdown(found: Reference) -> str:
+    """The page ``docs/hooks.md``."""
+    lines = [
+        "# Hooks and kinds of component",
+        "",
+        "This page is made from armcal's own specifications: `armcal plugins hooks --markdown > docs/hooks.md`. Do not",
+        f"edit it. It shows contract {found.version}. How to write a plugin is in [plugins](plugins.md).",
+        "",
+        "A registration module marks each hook with `@hookimpl` and may leave out any hook, and any argument of one.",
+        "",
+        "| Kind | Hook | Since | Built as | Must have |",
+        "| --- | --- | --- | --- | --- |",
+    ]
+    for kind in found.kinds:
+        row = (f"[{kind.kind}](#{kind.kind})", f"`{kind.hook.name}`", kind.hook.since)
+        lines.append(f"| {' | '.join((*row, f'`{kind.built_as}`', f'`{kind.protocol.name}`'))} |")
+    lines += [
+        "",
+        "`settings` are the component's own checked `Settings`, `joint_names` the commanded joints of its arm from",
+    ]
+    lines += ["the base, `arm_names` all arms' instance names, `link` the link of the bench.", ""]
+    lines += ["## Announcing a component", "", *_markdown(found.register)]
+    lines += ["## Observers", "", "They are told what happens; what they return is ignored.", ""]
+    for hook in found.observers:
+        lines += [f"### `{hook.name}`", "", *_markdown(hook), f"Since contract {hook.since}.", ""]
+    for kind in found.kinds:
+        lines += [f"## {kind.kind}", "", _marked(kind.hook.text), ""]
+        lines += [f"Announced in `{kind.hook.call}`, built as `{kind.built_as}`. Since contract {kind.hook.since}.", ""]
+        for protocol in (kind.protocol, *kind.beside):
+            may = "Must have" if protocol is kind.protocol else "May have"
+            lines += [f"### {may}: `{protocol.name}`", "", *_paragraphs(protocol.text)]
+            for method in protocol.methods:
+                lines += _markdown(method)
+    return "\n".join(lines).rstrip() + "\n"
+
+
+def _markdown(entry: Entry) -> list[str]:
+    lines = ["```py", *_wrapped(entry.call), "```", "", *_paragraphs(entry.text)]
+    listed = [f"- `{a.name}`: {_marked(a.explained)}" for a in entry.arguments]
+    listed += [f"- raises `{error}`: {_marked(why)}" for error, why in entry.raises]
+    return [*lines, *listed, ""] if listed else lines
+
+
+def _wrapped(call: str) -> list[str]:
+    """A signature, an argument a line where it is long."""
+    if len(call) <= 110:
+        return [call]
+    head, _, rest = call.partition("(")
+    inner, _, after = rest.rpartition(")")
+    parts = re.split(r", (?=\w+: )", inner)
+    return [f"{head}(", *(f"    {part}," for part in parts), f"){after}"]
+
+
+def _paragraphs(text: str) -> list[str]:
+    """A docstring's paragraphs; its attributes as a list."""
+    plain, sections = _sections(text)
+    lines = [line for part in plain.split("\n\n") for line in (_marked(" ".join(part.split())), "")]
+    attributes = [f"- `{name}`: {_marked(said)}" for name, said in sections.get("Attributes", {}).items()]
+    return [*lines, *attributes, ""] if attributes else lines
+
+
+def _marked(text: str) -> str:
+    return text.replace("``", "`")
+
+
+def as_text(found: Reference) -> str:
+    """For a terminal."""
+    lines = [f"Contract {found.version}", ""]
+    for kind in found.kinds:
+        lines += [f"{kind.kind}: {kind.hook.name}, since {kind.hook.since}", *_indented(kind.hook.text, 2)]
+        lines += [f"  built as {kind.built_as}; {kind.protocol.name}:"]
+        lines += [f"    {method.call}" for method in kind.protocol.methods]
+        lines += [f"  may have {protocol.name}" for protocol in kind.beside] + [""]
+    lines += ["observers:"]
+    for hook in found.observers:
+        lines += [f"  {hook.call}, since {hook.since}", *_indented(hook.text, 4)]
+    return "\n".join(lines) + "\n"
+
+
+def _indented(text: str, depth: int) -> Sequence[str]:
+    return textwrap.wrap(" ".join(text.split()), 110, initial_indent=" " * depth, subsequent_indent=" " * depth)

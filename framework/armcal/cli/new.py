@@ -1,0 +1,57 @@
+"""``armcal new``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from armcal.cli.common import Voice, speaking
+from armcal.plugins import discover
+from armcal.scaffold.naming import plugin_name
+from armcal.scaffold.plugin_files import KINDS, write_plugin
+
+
+@click.group(context_settings={"help_option_names": ["-h", "--help"]})
+def new() -> None:
+    """Begin a plugin of your own, or the files of a robot."""
+
+
+@new.command("plugin")
+@click.argument("name")
+@click.option("--kind", required=True, type=click.Choice(KINDS), help="What it adds to armcal.")
+@click.option("--out", type=click.Path(path_type=Path), help="The folder to make [default: armcal-NAME].")
+@speaking
+def new_plugin(voice: Voice, name: str, kind: str, out: Path | None) -> None:
+    """Write a package that adds a component called NAME: it works, has tests, and is yours to change."""
+    registry = discover()
+    voice.plugin_faults(registry)
+    chosen = plugin_name(name, registry)
+    folder = out or Path(f"armcal-{chosen.replace('_', '-')}")
+    files = write_plugin(chosen, kind, folder)
+    voice.result({"plugin": chosen, "kind": kind, "out": str(folder), "files": list(files)})
+    for file in files:
+        voice.detail(str(folder / file))
+    after = ("pip install -e '.[test]'", f"armcal plugins check {chosen} -v", "pytest")
+    told = (f"the {kind} {chosen}: {len(files)} files in {folder}", "next, in that folder:", *(f"  {c}" for c in after))
+    for text in told:
+        voice.out.print(text, markup=False, soft_wrap=True)
+
+
+@new.command("robot")
+@click.argument("name")
+@click.option("--dh", type=click.Path(path_type=Path), help="A CSV of Denavit-Hartenberg rows, units in its header.")
+@click.option("--convention", type=click.Choice(("standard", "modified")), help="Of the rows in --dh.")
+@click.option("--urdf", type=click.Path(path_type=Path), help="A URDF.")
+@click.option("--tip", metavar="LINK", help="The URDF's link at the arm's end, where there are several.")
+@click.option("--out", type=click.Path(path_type=Path), help="The folder to make [default: NAME].")
+@speaking
+def new_robot(voice: Voice, name: str, out: Path | None, **source: Any) -> None:
+    """Write all that the robot NAME needs to be calibrated, and try it on simulated records.
+
+    Without --dh and --urdf it asks for the rows.
+    """
+    from armcal.cli.new_robot import Source, begin  # all of the solver, which a plugin's files do without
+
+    begin(voice, name, Source(**source), out or Path(name))

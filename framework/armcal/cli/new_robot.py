@@ -1,0 +1,101 @@
+"""What ``armcal new robot`` does."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import click
+
+from armcal.cli.common import Voice, command_line
+from armcal.cli.robot_questions import ask_rows
+from armcal.errors import EXIT_FAULT, EXIT_NOT_CONVERGED, ConfigError
+from armcal.plugins import PluginRegistry, discover
+from armcal.scaffold.dh_table import read_rows
+from armcal.scaffold.naming import robot_name
+from armcal.scaffold.robot import Convention, Robot, robot_of_rows
+from armcal.scaffold.robot_files import RobotFolder, write_robot
+from armcal.scaffold.trial import Trial, try_out
+from armcal.scaffold.urdf_source import robot_of_urdf
+
+CONVENTIONS: dict[str, Convention] = {"standard": "standard", "modified": "craig"}
+
+
+@dataclass(frozen=True)
+class Source:
+    """What a robot is made from, as given on the command line; it is asked for if nothing is given."""
+
+    dh: Path | None
+    convention: str | None
+    urdf: Path | None
+    tip: str | None
+
+
+def begin(voice: Voice, name: str, source: Source, folder: Path) -> None:
+    """Write a robot's folder, calibrate its simulated records, and say how that went."""
+    registry = discover()
+    voice.plugin_faults(registry)
+    robot = _robot(robot_name(name), source, registry)
+    made = write_robot(robot, folder, registry)
+    with voice.progress() as progress:
+        trial = try_out(made, registry, command_line(), progress)
+    _show(voice, robot, made, trial)
+    if trial.fault:
+        click.echo(f"armcal: {made.folder}: the calibration of simulated records failed: {trial.fault}.", err=True)
+        sys.exit(EXIT_FAULT if trial.result.estimate.verdict.converged else EXIT_NOT_CONVERGED)
+
+
+def _robot(name: str, source: Source, registry: PluginRegistry) -> Robot:
+    if source.dh and source.urdf:
+        raise ConfigError("found both --dh and --urdf, expected one of them.", hint="Leave one out.")
+    if source.tip and not source.urdf:
+        raise ConfigError("found --tip without --urdf.", hint="Give --urdf FILE, or leave it out.")
+    if source.convention and not source.dh:
+        raise ConfigError("found --convention without --dh.", hint="Give --dh FILE, or leave it out.")
+    if source.urdf:
+        return robot_of_urdf(name, source.urdf, source.tip, registry)
+    if not source.dh:
+        return robot_of_rows(name, *ask_rows(CONVENTIONS))
+    if source.convention is None:
+        raise ConfigError(
+            "found --dh without --convention: two go by the same name.",
+            hint="Give --convention standard, Rot_z(theta) Trans_z(d) Trans_x(a) Rot_x(alpha), or modified, "
+            "Rot_x(alpha) Trans_x(a) Rot_z(theta) Trans_z(d).",
+        )
+    return robot_of_rows(name, CONVENTIONS[source.convention], read_rows(source.dh))
+
+
+def _show(voice: Voice, robot: Robot, made: RobotFolder, trial: Trial) -> None:
+    content = {
+        "robot": robot.name,
+        "out": str(made.folder),
+        "free": list(made.choice.kept),
+        "redundant": list(made.choice.redundant),
+        "holdout_nominal_mm": trial.nominal_mm,
+        "holdout_calibrated_mm": trial.calibrated_mm,
+        "noise_alone_mm": trial.noise_mm,
+        "verdict": trial.result.verdict.headline,
+        "works": not trial.fault,
+    }
+    voice.result(content)
+    for text in trial.result.warnings:
+        voice.warn(text)
+    _say(voice, f"{robot.name}: {len(robot.joints)} joints, {len(made.choice.kept)} free parameters, in {made.folder}")
+    assumed = [joint.name for joint in robot.joints if joint.assumed]
+    if assumed:
+        _say(voice, f"limits were assumed for {', '.join(assumed)}: correct them in plan.yaml before the arm moves")
+    _say(
+        voice,
+        f"held-out tips of simulated records: nominal {trial.nominal_mm:.3f} mm, calibrated "
+        f"{trial.calibrated_mm:.3f} mm (the noise alone: {trial.noise_mm:.3f} mm)",
+    )
+    findings = [f for f in trial.result.verdict.findings if f.grade in ("bad", "warning")]
+    for finding in findings:
+        _say(voice, f"{finding.grade}: {finding.text}")
+    _say(voice, trial.result.verdict.headline)
+    _say(voice, f"report: {trial.results / 'report.html'}; next: {made.folder / 'README.md'}")
+
+
+def _say(voice: Voice, text: str) -> None:
+    voice.out.print(text, markup=False, soft_wrap=True)

@@ -1,0 +1,91 @@
+"""Questions for ``armcal new robot``: the rows of an arm, each number with its unit."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import click
+
+from armcal.base.units import from_unit, parse_quantity
+from armcal.errors import ConfigError
+from armcal.measure.cells import is_number
+from armcal.scaffold.robot import (
+    ASSUMED_TRAVEL,
+    ASSUMED_TURN,
+    FEWEST_JOINTS,
+    MOST,
+    MOST_JOINTS,
+    Convention,
+    Mass,
+    Range,
+    RobotJoint,
+    Row,
+)
+
+
+def ask_rows(conventions: Mapping[str, Convention]) -> tuple[Convention, tuple[Row, ...]]:
+    """The convention and the rows, from the terminal or standard input.
+
+    Raises:
+        ConfigError: the answers end early.
+    """
+    try:
+        chosen = click.prompt("Denavit-Hartenberg rows", type=click.Choice(tuple(conventions)), default="standard")
+        count = click.prompt("joints", type=click.IntRange(FEWEST_JOINTS, MOST_JOINTS))
+        return conventions[chosen], tuple(_row(number) for number in range(1, count + 1))
+    except click.Abort as fault:
+        raise ConfigError(
+            "the answers ended before the last question.",
+            hint="Answer all of them, or give --dh FILE or --urdf FILE.",
+        ) from fault
+
+
+def _row(number: int) -> Row:
+    name = f"q{number}"
+    click.echo(f"joint {number}, {name}:", err=True)
+    turns = click.prompt("  it is", type=click.Choice(("revolute", "prismatic")), default="revolute") == "revolute"
+    alpha, a = _ask("  alpha", "deg", "angle"), _ask("  a", "mm", "length")
+    theta, d = _ask("  theta", "deg", "angle"), _ask("  d", "mm", "length")
+    limits = _limits(turns)
+    mass = _ask("  mass of its link, 0 if not known", "g", "mass", lowest=0.0)
+    com = [_ask(f"  its centre, {axis} in the row's frame", "mm", "length") for axis in "xyz"] if mass else []
+    known = Mass(mass, (com[0], com[1], com[2])) if mass else None
+    return Row(RobotJoint(name, turns, limits), alpha, a, theta, d, known)
+
+
+def _limits(turns: bool) -> Range:
+    unit, dimension = ("deg", "angle") if turns else ("mm", "length")
+    low, high = ASSUMED_TURN if turns else ASSUMED_TRAVEL
+    scale = from_unit(1.0, unit)
+    lower = _ask("  lower limit", unit, dimension, default=round(low / scale))
+    upper = _ask("  upper limit", unit, dimension, default=round(high / scale), above=lower)
+    return lower, upper
+
+
+def _ask(
+    words: str, unit: str, dimension: str, default: float = 0, lowest: float = -math.inf, above: float | None = None
+) -> float:
+    """A number, in SI; asked in ``unit``, and taken in another one that is written behind it."""
+
+    def read(text: Any) -> float:
+        found = _quantity(str(text), unit, dimension)
+        if found < lowest or (above is not None and found <= above):
+            raise click.BadParameter(f"found {text}, expected more.")
+        return found
+
+    return float(click.prompt(f"{words}, {unit}", default=str(default), value_proc=read))
+
+
+def _quantity(text: str, unit: str, dimension: str) -> float:
+    if is_number(text):
+        value = from_unit(float(text), unit)
+    else:
+        try:
+            value = parse_quantity(text, dimension)
+        except ValueError as fault:
+            raise click.BadParameter(str(fault)) from fault
+    if not abs(value) <= MOST[dimension]:
+        raise click.BadParameter(f"found {text}, expected an arm's {dimension}.")
+    return value

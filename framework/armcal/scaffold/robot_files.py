@@ -1,0 +1,139 @@
+"""The files of a new robot: its arm, what to calibrate, a plan, a made-up truth and records of it."""
+
+from __future__ import annotations
+
+import fnmatch
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from armcal.base.dataset import Dataset
+from armcal.base.units import display_unit, to_unit
+from armcal.errors import InputError
+from armcal.measure.csv_writer import write_csv
+from armcal.plugins import PluginRegistry
+from armcal.run.experiment import Experiment
+from armcal.scaffold import truth
+from armcal.scaffold.folder import staged, write_texts
+from armcal.scaffold.free_choice import FreeChoice, choose_free
+from armcal.scaffold.rendering import number, rendered
+from armcal.scaffold.robot import Robot, RobotJoint
+from armcal.solve.simulation import SimulationRequest, measured_without_noise
+
+SIMULATED, RECORDS = "simulated.yaml", "simulated.csv"
+NOISE_MM, NOISE_SEED = 0.1, 4
+GRAVITY_M_S2 = 9.81
+_SMALLEST_REACH_M = 0.01
+_POSES_A_JOINT, _FEWEST_POSES, _MOST_POSES = 25, 60, 200
+
+
+@dataclass(frozen=True)
+class RobotFolder:
+    """What was written: where, the parameters chosen, and the noise that the made-up records have (mm)."""
+
+    folder: Path
+    choice: FreeChoice
+    noise_mm: float = NOISE_MM
+
+
+def write_robot(robot: Robot, folder: Path, registry: PluginRegistry) -> RobotFolder:
+    """Write a new robot's folder, with simulated records of it.
+
+    Raises:
+        InputError: the folder cannot be written, or what it would hold is refused.
+    """
+    with staged(folder) as place:
+        try:
+            chosen = _fill(place, robot, registry)
+        except InputError as fault:
+            raise _of_robot(fault, robot, place, folder) from fault
+    return RobotFolder(folder, chosen)
+
+
+def _fill(place: Path, robot: Robot, registry: PluginRegistry) -> FreeChoice:
+    """First with nothing free, to see what there is; then with everything; then with what the records determine."""
+    nothing = FreeChoice((), (), ())
+    if robot.urdf:
+        (place / robot.urdf_file).write_bytes(robot.urdf)
+    _write(place, robot, nothing, {})
+    experiment = Experiment.load(place / SIMULATED, registry=registry)
+    parameters = experiment.parameters
+    true = truth.made_up(parameters, _weight(experiment) * _reach(experiment, robot))
+    _write(place, robot, nothing, truth.as_text(parameters, true))
+    _simulate(place, registry)
+    freed = f"parameters.free={json.dumps(truth.candidates(parameters))}"
+    chosen = choose_free(Experiment.load(place / SIMULATED, [freed], registry=registry), robot)
+    _write(place, robot, chosen, truth.as_text(parameters, true))
+    return chosen
+
+
+def _of_robot(fault: InputError, robot: Robot, place: Path, folder: Path) -> InputError:
+    """A refusal of files that nobody sees, since they are not kept."""
+    told = str(fault).replace(str(place.resolve()), str(folder)).replace(str(place), str(folder))
+    return InputError(f"the files of {robot.name} would be refused: {told}", hint="Correct what they are made from.")
+
+
+def _write(place: Path, robot: Robot, choice: FreeChoice, true: Mapping[str, str]) -> None:
+    priors = {glob: sd for glob, sd in robot.priors.items() if fnmatch.filter(choice.kept, glob)}
+    context: dict[str, Any] = {
+        "robot": robot,
+        "name": robot.name,
+        "choice": choice,
+        "priors": priors,
+        "truth": true,
+        "noise_mm": number(NOISE_MM),
+        "count": min(max(_POSES_A_JOINT * len(robot.joints), _FEWEST_POSES), _MOST_POSES),
+        "truth_seed": truth.SEED,
+        "seed": NOISE_SEED,
+        "shown": _shown,
+        "levels": _levels,
+        "turning": [joint for joint in robot.joints if joint.turns],
+        "sliding": [joint for joint in robot.joints if not joint.turns],
+        "assumed": [joint.name for joint in robot.joints if joint.assumed],
+    }
+    write_texts(place, rendered("robot", context))
+
+
+def _shown(value: float, dimension: str) -> str:
+    """A number in the unit that people read."""
+    return number(to_unit(value, display_unit(dimension).name))
+
+
+def _levels(joint: RobotJoint) -> list[str]:
+    """Low, middle and high, in deg or mm."""
+    low, high = joint.limits
+    return [_shown(value, "angle" if joint.turns else "length") for value in (low, 0.5 * (low + high), high)]
+
+
+def _weight(experiment: Experiment) -> float:
+    """Of all masses that are known (N)."""
+    masses = [b for b in experiment.parameters.blocks if b.name.startswith("arm.links.") and b.name.endswith(".mass")]
+    return GRAVITY_M_S2 * sum(block.nominal[0] for block in masses)
+
+
+def _reach(experiment: Experiment, robot: Robot) -> float:
+    random = np.random.default_rng(truth.SEED)
+    commands = {f"arm.{j.name}": random.uniform(*j.limits, _FEWEST_POSES) for j in robot.joints}
+    poses = Dataset(tuple(str(i) for i in range(_FEWEST_POSES)), commands)
+    system = experiment.system
+    request = SimulationRequest(system.arms, system.measurements, experiment.parameters, system.environment)
+    exact = measured_without_noise(request, poses)
+    found = truth.reach(np.array([exact[f"tracker.{axis}"] for axis in "xyz"]))
+    if not found > _SMALLEST_REACH_M:
+        raise InputError(
+            f"in all poses the tip stays within {1000 * found:.3g} mm.",
+            hint="Check the lengths a and d and their units.",
+        )
+    return found
+
+
+def _simulate(place: Path, registry: PluginRegistry) -> None:
+    experiment = Experiment.load(place / SIMULATED, registry=registry)
+    system = experiment.system
+    request = SimulationRequest(system.arms, system.measurements, experiment.parameters, system.environment)
+    dataset = experiment.simulator().simulate(request)
+    write_csv(place / RECORDS, dataset, experiment.request(measured=True).wanted)

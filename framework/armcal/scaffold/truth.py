@@ -1,0 +1,69 @@
+"""A truth to try a new robot with: errors of the size that drawings and assemblies have, from a fixed seed."""
+
+from __future__ import annotations
+
+import fnmatch
+from collections.abc import Mapping
+
+import numpy as np
+
+from armcal.base.domains import Array
+from armcal.base.parameters import ParameterBlock, Parameters
+from armcal.base.units import to_unit
+from armcal.scaffold.rendering import number
+
+SEED = 1
+LENGTH_SD_M, ANGLE_SD_RAD = 0.001, 0.003
+SAG_RAD = 0.002
+"""What a joint gives under half the moment that the arm's whole weight has at its full reach."""
+_MOST_SD = 2.0
+_SPRING = (0.5, 1.5)
+_SHOWN = {"m": "mm", "rad": "deg", "rad_per_Nm": "rad_per_Nm"}
+_WRITTEN = {"rad_per_Nm": "rad/Nm"}
+
+
+def candidates(parameters: Parameters) -> tuple[str, ...]:
+    """The numbers that a first calibration may look for: geometry, springs and the target; no masses, no gravity."""
+    return tuple(
+        block.name
+        for block in parameters.blocks
+        if block.unit in _SHOWN
+        and block.size == 1
+        and not fnmatch.fnmatch(block.name, "arm.links.*")
+        and not block.name.startswith("statics.")
+    )
+
+
+def made_up(parameters: Parameters, load_Nm: float) -> dict[str, float]:
+    """True values (SI) of every candidate.
+
+    Args:
+        parameters: of the robot, with their nominal values.
+        load_Nm: the moment of its whole weight at its full reach; 0 if its masses are not known.
+    """
+    random = np.random.default_rng(SEED)
+    return {name: _true(parameters[name], load_Nm, random) for name in candidates(parameters)}
+
+
+def as_text(parameters: Parameters, values: Mapping[str, float]) -> dict[str, str]:
+    """Values with their units, as people write them."""
+    found = {}
+    for name, value in values.items():
+        unit = _SHOWN[parameters[name].unit]
+        found[name] = f"{number(float(f'{to_unit(value, unit):.6g}'))} {_WRITTEN.get(unit, unit)}"
+    return found
+
+
+def _true(block: ParameterBlock, load_Nm: float, random: np.random.Generator) -> float:
+    nominal = float(block.nominal[0])
+    if block.unit == "rad_per_Nm":
+        drawn = float(random.uniform(*_SPRING))
+        return nominal + (drawn * SAG_RAD / (0.5 * load_Nm) if load_Nm > 0 else 0.0)
+    deviation = LENGTH_SD_M if block.unit == "m" else ANGLE_SD_RAD
+    return nominal + deviation * float(np.clip(random.normal(), -_MOST_SD, _MOST_SD))
+
+
+def reach(tips: Array) -> float:
+    """How far a tip comes from the middle of where it goes (3 x N, m)."""
+    middle = tips.mean(axis=1, keepdims=True)
+    return float(np.linalg.norm(tips - middle, axis=0).max())

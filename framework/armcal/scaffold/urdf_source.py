@@ -1,0 +1,90 @@
+"""A new robot from a URDF: the file as it is, its joints and their limits."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from armcal.arm.assembly import MassiveModel
+from armcal.arm.model import Joint
+from armcal.errors import ConfigError, DataError, Location
+from armcal.plugins import PluginRegistry
+from armcal.scaffold.joint_names import check_joint_names
+from armcal.scaffold.robot import ASSUMED_TRAVEL, ASSUMED_TURN, FEWEST_JOINTS, MOST_JOINTS, Robot, RobotJoint
+from armcal.use.convert_check import nominal_values
+from armcal.use.rigid_chain import numeric_chain
+
+_MOST_TRAVEL_RAD = 3.2
+"""A turning joint need not be measured over more than one turn."""
+
+
+def robot_of_urdf(name: str, path: Path, tip: str | None, registry: PluginRegistry) -> Robot:
+    """A robot from a URDF; ``tip`` names its last link where the file leaves a choice.
+
+    Raises:
+        ConfigError: the file is refused, or has no chain to calibrate.
+        PluginError: no plugin reads URDFs.
+    """
+    where = Location(str(path))
+    if not path.is_file():
+        raise DataError("there is no such file.", where=where, hint="Check the path.")
+    model = _model(path, tip, registry)
+    chain = numeric_chain(model, nominal_values(model))
+    joints = tuple(_joint(joint, where) for joint in chain.joints if joint.mimic is None)
+    if not FEWEST_JOINTS <= len(joints) <= MOST_JOINTS:
+        raise DataError(
+            f"found {len(joints)} moving joints between root and tip, expected {FEWEST_JOINTS} to {MOST_JOINTS}.",
+            where=where,
+            hint="Name the link at the arm's end: --tip LINK.",
+        )
+    check_joint_names([joint.name for joint in joints], [where] * len(joints))
+    return Robot(
+        name=name,
+        joints=joints,
+        has_masses=isinstance(model, MassiveModel) and bool(model.masses()),
+        preferred=_preferred(joints),
+        priors=_priors(joints),
+        urdf=path.read_bytes(),
+        urdf_file=f"{name}.urdf",
+        tip=model.settings.tip,
+    )
+
+
+def _model(path: Path, tip: str | None, registry: PluginRegistry) -> Any:
+    made = registry.find("model", "urdf").load()
+    try:
+        return made(made.Settings.model_validate({"path": str(path), **({"tip": tip} if tip else {})}))
+    except ValidationError as fault:
+        told = "; ".join(str(error["msg"]).removeprefix("Value error, ") for error in fault.errors(include_url=False))
+        hint = "Correct the URDF, or choose --tip LINK."
+        raise ConfigError(f"{told}.", where=Location(str(path)), hint=hint) from fault
+
+
+def _joint(joint: Joint, where: Location) -> RobotJoint:
+    turns = joint.is_revolute
+    if joint.limits is None:
+        return RobotJoint(joint.name, turns, ASSUMED_TURN if turns else ASSUMED_TRAVEL, assumed=True)
+    low, high = joint.limits
+    if not low < high:
+        found = f"joint {joint.name!r} has the limits {low:g} and {high:g}, and cannot move."
+        raise DataError(found, where=where, hint="Correct them, or make it a fixed joint.")
+    if turns and not joint.endless:
+        low, high = max(low, -_MOST_TRAVEL_RAD), min(high, _MOST_TRAVEL_RAD)
+    return RobotJoint(joint.name, turns, (low, high))
+
+
+def _preferred(joints: tuple[RobotJoint, ...]) -> tuple[tuple[str, ...], ...]:
+    """The first origin and the target, which say how arm and tracker stand; then joints that move, then the others."""
+    moving = tuple(f"arm.urdf.{joint.name}_*" for joint in joints)
+    return (moving[:1], ("tracker.target_*",), moving, ("arm.urdf.*",), ("arm.spring.*",))
+
+
+def _priors(joints: tuple[RobotJoint, ...]) -> dict[str, str]:
+    """Of the joints beyond the first, whose origin says where the arm stands before the tracker as well."""
+    found = {}
+    for joint in joints[1:]:
+        found[f"arm.urdf.{joint.name}_[xyz]"] = "10 mm"
+        found[f"arm.urdf.{joint.name}_[rpy][oia]*"] = "2 deg"
+    return found

@@ -1,0 +1,263 @@
+"""Faults planted in components and plugins, one at a time: the contract's checks find each, and nothing in its twin."""
+
+from __future__ import annotations
+
+import sys
+from importlib.metadata import EntryPoint
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+from armcal.plugins import Component, PluginRegistry, discover
+from armcal.testing import KNOWN_CHECKS, assert_contract
+from armcal.testing.contract import CheckResult, check_component, check_plugin
+
+PLANTED = Path(__file__).parents[1] / "data" / "planted_faults"
+EXPRESSIONS, SOLVING, BENCH = "planted_expressions", "planted_solving", "planted_bench"
+
+SOUND = [
+    ("model", EXPRESSIONS, "Arm"),
+    ("effect", EXPRESSIONS, "Springy"),
+    ("measurement", EXPRESSIONS, "Gauge"),
+    ("measurement", EXPRESSIONS, "Ledge"),
+    ("reader", SOLVING, "Table"),
+    ("estimator", SOLVING, "Newton"),
+    ("online", SOLVING, "Filter"),
+    ("exporter", SOLVING, "Printer"),
+    ("exporter", SOLVING, "RefusesAnArm"),
+    ("simulator", SOLVING, "Maker"),
+    ("device", BENCH, "Board"),
+    ("link", BENCH, "Bus"),
+    ("tracker", BENCH, "Udp"),
+    ("joints", BENCH, "Lines"),
+]
+
+FAULTS = [
+    ("model", EXPRESSIONS, "BlockInDegrees", "units are SI"),
+    ("model", EXPRESSIONS, "MillimetresCalledMetres", "plausible in their units"),
+    ("model", EXPRESSIONS, "MillimetresInExpression", "lengths move it by lengths"),
+    ("model", EXPRESSIONS, "DegreesCalledRadians", "lengths move it by lengths"),
+    ("model", EXPRESSIONS, "DottedName", "parameters are named"),
+    ("model", EXPRESSIONS, "TwinName", "parameters are named"),
+    ("model", EXPRESSIONS, "OutsideItsDomain", "nominal values"),
+    ("model", EXPRESSIONS, "IdleParameter", "has an influence"),
+    ("model", EXPRESSIONS, "Floored", "does not branch"),
+    ("model", EXPRESSIONS, "NumericBranch", "one joint for each name"),
+    ("model", EXPRESSIONS, "OutsideNumpy", "has an influence"),
+    ("model", EXPRESSIONS, "CallbackWithoutDerivative", "derivatives agree"),
+    ("model", EXPRESSIONS, "RemembersSymbols", "the same each time"),
+    ("model", EXPRESSIONS, "DriftsEachCall", "the same each time"),
+    ("model", EXPRESSIONS, "CountsInItsModule", "keeps nothing in its modules"),
+    ("model", EXPRESSIONS, "CountsInItsClass", "keeps nothing in its modules"),
+    ("model", EXPRESSIONS, "LongAxis", "one joint for each name"),
+    ("model", EXPRESSIONS, "Stretching", "rigid motions"),
+    ("model", EXPRESSIONS, "OneJointShort", "one joint for each name"),
+    ("model", EXPRESSIONS, "Talkative", "prints nothing"),
+    ("model", EXPRESSIONS, "Reseeding", "leaves the process alone"),
+    ("model", EXPRESSIONS, "Silencing", "leaves the process alone"),
+    ("model", EXPRESSIONS, "BareLength", "every quantity has its unit"),
+    ("model", EXPRESSIONS, "UnitInItsName", "every quantity has its unit"),
+    ("model", EXPRESSIONS, "AcceptsAnyKey", "unknown key"),
+    ("effect", EXPRESSIONS, "LagInDegrees", "move a joint by as much"),
+    ("effect", EXPRESSIONS, "DeflectionInDegrees", "deflections are in rad"),
+    ("effect", EXPRESSIONS, "LongDirection", "unit directions"),
+    ("effect", EXPRESSIONS, "BranchingLaw", "branch neither"),
+    ("effect", EXPRESSIONS, "TwoNumbersAJoint", "a displacement for every joint"),
+    ("effect", EXPRESSIONS, "LearnsFromCommands", "the same each time"),
+    ("measurement", EXPRESSIONS, "ResidualInMillimetres", "residual is in m and rad"),
+    ("measurement", EXPRESSIONS, "ReadsMillimetres", "residual is in m and rad"),
+    ("measurement", EXPRESSIONS, "NoiseInMillimetres", "noise is positive"),
+    ("measurement", EXPRESSIONS, "OneNoiseTooFew", "noise is positive"),
+    ("measurement", EXPRESSIONS, "NegativeNoise", "noise is positive"),
+    ("measurement", EXPRESSIONS, "FlatResidual", "makes a residual"),
+    ("measurement", EXPRESSIONS, "MissesAnOutput", "outputs are channels"),
+    ("measurement", EXPRESSIONS, "AddsInsteadOfSubtracting", "residual is zero"),
+    ("measurement", EXPRESSIONS, "SteppedResidual", "agrees with differences"),
+    ("measurement", EXPRESSIONS, "ShiftsEachCall", "the same each time"),
+    ("measurement", EXPRESSIONS, "LedgeInMillimetres", "residual is in m and rad"),
+    ("measurement", EXPRESSIONS, "TellsTheOppositeHeight", "says of its group fits"),
+    ("measurement", EXPRESSIONS, "GroupsThatDiffer", "groups have the same parameters"),
+    ("reader", SOLVING, "TableThatCrashes", "missing file"),
+    ("reader", SOLVING, "TableInDegrees", "known file in SI"),
+    ("reader", SOLVING, "TableThatDropsRows", "wrong or empty is told"),
+    ("reader", SOLVING, "TableThatLosesTheLastRow", "known file in SI"),
+    ("reader", SOLVING, "TableThatFillsIn", "wrong or empty is told"),
+    ("reader", SOLVING, "TableThatRemembers", "keeps nothing in its modules"),
+    ("estimator", SOLVING, "IgnoresBounds", "keeps to the bounds"),
+    ("estimator", SOLVING, "AlwaysConverged", "cut short"),
+    ("estimator", SOLVING, "RaisesWhenStopped", "cut short"),
+    ("estimator", SOLVING, "IgnoresWeights", "weighs records"),
+    ("estimator", SOLVING, "IgnoresPriors", "weighs priors"),
+    ("estimator", SOLVING, "TrustsTheFirstHalf", "order of records"),
+    ("estimator", SOLVING, "StartsFromTheLastAnswer", "the same twice"),
+    ("estimator", SOLVING, "MovesItsStart", "a value for every entry"),
+    ("online", SOLVING, "ForgetsTheGainTwice", "prior and records say together"),
+    ("online", SOLVING, "MakesVariancesPositive", "variance below zero"),
+    ("online", SOLVING, "RemembersTheLastBelief", "from one update to the next"),
+    ("exporter", SOLVING, "StampsItsContent", "the same each time"),
+    ("exporter", SOLVING, "RaisesAtAnArm", "written, or refused"),
+    ("exporter", SOLVING, "ChangesWhatItWrites", "changes nothing"),
+    ("exporter", SOLVING, "GivesText", "written, or refused"),
+    ("simulator", SOLVING, "NeverTwiceTheSame", "the same each time"),
+    ("simulator", SOLVING, "SharesItsRandomNumbers", "the same each time"),
+    ("simulator", SOLVING, "GlobalRandomNumbers", "leaves the process alone"),
+    ("device", BENCH, "SetsTheMirroredAngle", "sets the angles that it says"),
+    ("device", BENCH, "SetsDegrees", "stand where they are told"),
+    ("device", BENCH, "RemembersItsAngles", "read from the board"),
+    ("device", BENCH, "SwallowsALostLink", "passes on that the link was lost"),
+    ("device", BENCH, "SaysItLivesAlone", "passes on that the link was lost"),
+    ("device", BENCH, "TakesAnyAngle", "is refused"),
+    ("device", BENCH, "KeepsPulsesOnRelease", "let go has no angle"),
+    ("link", BENCH, "ReadsZeros", "reading before it is opened"),
+    ("link", BENCH, "RaisesOsError", "writing before it is opened"),
+    ("tracker", BENCH, "RaisesOnDamage", "damaged bytes"),
+    ("tracker", BENCH, "RaisesOnDeepNesting", "damaged bytes"),
+    ("tracker", BENCH, "CountsNothing", "damaged bytes"),
+    ("tracker", BENCH, "Blocks", "without waiting"),
+    ("tracker", BENCH, "SleepsInFrames", "without waiting"),
+    ("joints", BENCH, "RaisesOnDamagedLine", "damaged bytes"),
+    ("joints", BENCH, "RaisesWhereNoFileIs", "opens, or refuses"),
+]
+
+
+@pytest.fixture(autouse=True)
+def planted(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(PLANTED))
+    monkeypatch.setattr("armcal.testing.live_checks._PATIENCE_S", 0.3)
+
+
+def checked(kind: str, module: str, name: str) -> list[CheckResult]:
+    return check_component(Component(kind, name, f"{module}:{name}", "", "planted"))
+
+
+@pytest.mark.parametrize(("kind", "module", "name"), SOUND, ids=[name for _, _, name in SOUND])
+def test_the_sound_twin_passes_all_that_is_known_of_its_kind(kind: str, module: str, name: str) -> None:
+    results = checked(kind, module, name)
+    assert [result for result in results if result.fault] == []
+    ran = sum(not result.not_run for result in results)
+    # What reads nothing cannot be asked whether its residual is zero where its outputs are measured.
+    assert ran >= KNOWN_CHECKS[kind], [result for result in results if result.not_run]
+
+
+@pytest.mark.parametrize(("kind", "module", "name", "check"), FAULTS, ids=[name for _, _, name, _ in FAULTS])
+def test_a_planted_fault_is_found(kind: str, module: str, name: str, check: str) -> None:
+    failed = [result for result in checked(kind, module, name) if result.fault]
+    assert any(check in result.check for result in failed), failed
+    assert all(result.fault and "\n" not in result.fault for result in failed)
+
+
+def test_every_planted_component_is_asked_after() -> None:
+    asked = {(module, name) for _, module, name, *_ in (*SOUND, *FAULTS)}
+    for name in (EXPRESSIONS, SOLVING, BENCH):
+        module: ModuleType = __import__(name)
+        own = {n for n, v in vars(module).items() if isinstance(v, type) and v.__module__ == name}
+        left = {n for n in own if (name, n) not in asked and not n.startswith("_") and not n.endswith("Settings")}
+        assert left - {"WithBlock", "ReadsItsOwnFormat"} == set()
+
+
+# Faults of whole plugins
+
+PLUGIN = """
+from armcal.hooks import hookimpl
+{more}
+
+@hookimpl
+def armcal_register_models(register):
+    register("arm", "planted_expressions:Arm")
+"""
+
+
+def registry_of(monkeypatch: pytest.MonkeyPatch, site: Path, **texts: str) -> PluginRegistry:
+    monkeypatch.syspath_prepend(str(site))
+    for name, text in texts.items():
+        (site / f"planted_{name}.py").write_text(text, encoding="utf-8")
+        monkeypatch.delitem(sys.modules, f"planted_{name}", raising=False)
+    return discover([EntryPoint(name, f"planted_{name}", "armcal") for name in texts])
+
+
+def failed_checks(registry: PluginRegistry) -> list[CheckResult]:
+    return [result for plugin in registry.plugins for result in check_plugin(plugin, registry) if result.fault]
+
+
+def test_the_sound_plugin_passes(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    assert failed_checks(registry_of(monkeypatch, tmp_path, sound=PLUGIN.format(more=""))) == []
+
+
+PLUGIN_FAULTS = {
+    "heavy": ("import numpy", "imports nothing heavy", "numpy"),
+    "armcals_own": ("import armcal.base.settings", "imports nothing heavy", "pydantic"),
+    "talking": ("print('here I am')", "imports nothing heavy", "'here I am' printed"),
+    "missing": ("import no_such_module_of_anybody", "it loads", "ModuleNotFoundError"),
+    "misspelt": ("@hookimpl\ndef armcal_register_modells(register): pass", "it loads", "unknown hook"),
+    "unmarked": ("def armcal_register_effects(register): pass", "it loads", "is not marked"),
+}
+
+
+@pytest.mark.parametrize("name", PLUGIN_FAULTS)
+def test_a_fault_of_a_registration_is_found(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, name: str) -> None:
+    more, check, said = PLUGIN_FAULTS[name]
+    failed = failed_checks(registry_of(monkeypatch, tmp_path, **{name: PLUGIN.format(more=more)}))
+    assert [result for result in failed if check in result.check and said in result.fault], failed
+
+
+def test_two_plugins_of_one_component_are_found(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    text = PLUGIN.format(more="")
+    failed = failed_checks(registry_of(monkeypatch, tmp_path, one=text, two=text))
+    assert len(failed) == 2
+    assert all(
+        "is offered once" in each.check and "by one" in each.fault and "and two" in each.fault for each in failed
+    )
+
+
+# The one call for a plugin's own tests
+
+
+def test_one_call_checks_a_class_or_its_name() -> None:
+    by_name = assert_contract(f"{EXPRESSIONS}:Arm", "model")
+    by_class = assert_contract(__import__(EXPRESSIONS).Arm, "model", at_least=20)
+    assert [r.check for r in by_name] == [r.check for r in by_class]
+
+
+def test_one_call_lists_every_fault() -> None:
+    with pytest.raises(AssertionError, match="breaks the plugin contract") as fault:
+        assert_contract(f"{EXPRESSIONS}:MillimetresCalledMetres", "model")
+    assert "plausible in their units" in str(fault.value)
+    assert "is it in mm?" in str(fault.value)
+
+
+def test_one_call_wants_enough_checks_to_have_run() -> None:
+    count = len(assert_contract(f"{SOLVING}:Printer", "exporter"))
+    with pytest.raises(AssertionError, match=f"{count} checks ran, expected at least {count + 1}"):
+        assert_contract(f"{SOLVING}:Printer", "exporter", at_least=count + 1)
+
+
+def test_a_component_of_which_too_little_can_be_checked_is_no_pass() -> None:
+    """A reader whose format is no table and that shows no example passes every check that runs, and is refused."""
+    results = assert_contract(f"{BENCH}:ReadsItsOwnFormat", "reader", at_least=1)
+    assert sum(bool(result.not_run) for result in results) == 3
+    with pytest.raises(AssertionError, match="has no EXAMPLE_SOURCE"):
+        assert_contract(f"{BENCH}:ReadsItsOwnFormat", "reader")
+
+
+def test_what_does_not_import_is_a_fault_of_the_component() -> None:
+    with pytest.raises(AssertionError, match="it imports: ModuleNotFoundError"):
+        assert_contract("no_such_module_of_anybody:Model", "model")
+    with pytest.raises(AssertionError, match="expected module:attribute"):
+        assert_contract("no_such_module_of_anybody", "model")
+
+
+def test_an_unknown_kind_is_refused() -> None:
+    with pytest.raises(ValueError, match="'motor', expected one of model, effect"):
+        assert_contract(f"{EXPRESSIONS}:Arm", "motor")
+
+
+@pytest.mark.slow
+def test_the_known_numbers_are_what_runs_on_our_own_plugins() -> None:
+    """So that no check is left out by mistake: the least that runs on any component of a kind."""
+    counts: dict[str, list[int]] = {}
+    for component in discover().components:
+        if component.module.startswith("armcal_"):
+            results = check_component(component)
+            assert [result for result in results if result.fault] == [], component
+            counts.setdefault(component.kind, []).append(sum(not result.not_run for result in results))
+    assert {kind: min(found) for kind, found in counts.items()} == dict(KNOWN_CHECKS)

@@ -1,0 +1,118 @@
+"""The reference of hooks: made from the specifications, complete, and the page in docs/ is what is made now."""
+
+from __future__ import annotations
+
+import inspect
+import re
+import subprocess
+import sys
+from importlib import import_module
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from armcal import hooks
+from armcal.cli.hook_reference import as_markdown, as_text, idle_words, missing, reference
+
+ROOT = Path(__file__).parents[2]
+PAGE = ROOT / "docs" / "hooks.md"
+
+
+def test_the_page_is_what_is_made_now() -> None:
+    made = as_markdown(reference())
+    assert PAGE.read_text(encoding="utf-8") == made, "run: armcal plugins hooks --markdown > docs/hooks.md"
+
+
+def test_the_command_prints_the_page_and_a_list_for_the_terminal() -> None:
+    def said(*arguments: str) -> str:
+        command = [sys.executable, "-m", "armcal.cli", "plugins", "hooks", *arguments]
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout
+
+    assert said("--markdown") == as_markdown(reference())
+    told = said()
+    assert told == as_text(reference())
+    assert all(hook in told for hook in hooks.KINDS.values())
+
+
+def test_every_hook_method_and_argument_is_explained() -> None:
+    assert missing(reference()) == []
+
+
+def test_no_word_is_explained_that_no_method_uses() -> None:
+    assert idle_words(reference()) == []
+
+
+def test_every_specification_is_in_the_reference() -> None:
+    """The marks on the module's functions are counted here, not by what the reference itself walks over."""
+    marked = set(re.findall(r"@hookspec\ndef (\w+)", inspect.getsource(hooks)))
+    found = reference()
+    shown = {kind.hook.name for kind in found.kinds} | {observer.name for observer in found.observers}
+    assert shown == marked
+    assert {kind.kind for kind in found.kinds} == set(hooks.KINDS)
+    page = PAGE.read_text(encoding="utf-8")
+    for name in marked:
+        assert page.count(name) >= 2, name
+
+
+@pytest.mark.parametrize("kind", hooks.COMPONENTS)
+def test_every_public_method_of_a_protocol_is_on_the_page(kind: str) -> None:
+    found = next(each for each in reference().kinds if each.kind == kind)
+    for entry in (found.protocol, *found.beside):
+        module, _, name = entry.name.rpartition(".")
+        members = {m for m in vars(getattr(import_module(module), name)) if not m.startswith("_")}
+        assert {method.name for method in entry.methods} == members
+        assert getattr(getattr(import_module(module), name), "_is_protocol", False), f"{entry.name} is no protocol"
+
+
+def test_no_hook_is_newer_than_the_contract() -> None:
+    def version(text: str) -> tuple[int, ...]:
+        return tuple(map(int, text.split(".")))
+
+    found = reference()
+    for hook in (*(kind.hook for kind in found.kinds), *found.observers):
+        assert version(hook.since) <= version(hooks.CONTRACT_VERSION), hook.name
+
+
+def changed(**functions: Any) -> SimpleNamespace:
+    """The specifications with hooks added or exchanged."""
+    for function in functions.values():
+        hooks.hookspec(function)
+    return SimpleNamespace(**{**vars(hooks), **functions})
+
+
+def test_a_hook_without_a_word_is_found() -> None:
+    def armcal_arm_parked(arm: str, seconds: float) -> None:
+        pass
+
+    found = missing(reference(changed(armcal_arm_parked=armcal_arm_parked)))
+    assert "armcal_arm_parked: a docstring" in found
+    assert "armcal_arm_parked: the argument arm" in found
+    assert "armcal_arm_parked: since which contract" in found
+
+
+def test_an_argument_that_is_not_explained_is_found() -> None:
+    def armcal_run_ended(name: str, folder: str, reason: str) -> None:
+        """A run has ended.
+
+        Args:
+            name: of the experiment.
+            folder: where the results are,
+                all of them.
+
+        Since contract 1.0.
+        """
+
+    specifications = changed(armcal_run_ended=armcal_run_ended)
+    assert missing(reference(specifications)) == ["armcal_run_ended: the argument reason"]
+    assert "- `folder`: where the results are, all of them.\n" in as_markdown(reference(specifications))
+    assert as_markdown(reference(specifications)) != PAGE.read_text(encoding="utf-8")
+
+
+def test_the_page_has_no_line_of_markup_left_over() -> None:
+    text = PAGE.read_text(encoding="utf-8")
+    assert "``" not in text.replace("```", "")
+    assert "Args:" not in text
+    assert "Since contract" in text
+    for link in re.findall(r"\]\(#(\w+)\)", text):
+        assert f"\n## {link}\n" in text

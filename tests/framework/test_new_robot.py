@@ -1,0 +1,351 @@
+"""``armcal new robot``: from rows, a URDF or answers to a calibration that works; bad input is refused by place."""
+
+from __future__ import annotations
+
+import json
+import math
+import shlex
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from armcal.cli.main import cli
+from armcal.errors import InputError
+from armcal.plugins import discover
+from armcal.run.experiment import Experiment
+from armcal.run.pipeline import Stopwatch, prepare
+from armcal.scaffold.dh_table import read_rows
+from armcal.scaffold.rendering import number, word
+from armcal.scaffold.robot import Row, robot_of_rows
+from armcal.scaffold.robot_files import write_robot
+from armcal.use.calibration import Calibration
+from click.testing import CliRunner, Result
+from scaffolds import ROOT, commands_of, files_of, page
+
+HEADER = "alpha_deg,a_mm,theta_deg,d_mm"
+NOISE_MM = 0.1596  # mean length of three coordinates of 0.1 mm
+REGISTRY = discover()
+PAGE = page("new_robot.md")
+
+
+def new_robot(*arguments: str, answers: str | None = None) -> Result:
+    return CliRunner().invoke(cli, ["new", "robot", *arguments], input=answers, prog_name="armcal")
+
+
+@pytest.fixture
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def table(folder: Path, text: str | bytes, name: str = "rows.csv") -> str:
+    (folder / name).write_bytes(text if isinstance(text, bytes) else text.encode())
+    return name
+
+
+# The page, word for word
+
+
+def test_the_page_takes_five_joints_from_a_table_to_a_calibrated_urdf(here: Path) -> None:
+    for name, content in files_of(PAGE).items():
+        table(here, content, name)
+    (here / "configs").symlink_to(ROOT / "configs")
+    for command in commands_of(PAGE, "console"):
+        ran = CliRunner().invoke(cli, shlex.split(command)[1:], prog_name="armcal")
+        assert ran.exit_code == 0, f"{command}\n{ran.output}"
+    arm5 = here / "arm5"
+    files = {"arm.yaml", "calibrate.yaml", "plan.yaml", "simulated.yaml", "truth.yaml", "simulated.csv", "README.md"}
+    assert files <= {path.name for path in arm5.iterdir()}
+    content = json.loads((arm5 / "runs" / "simulated" / "metrics.json").read_text(encoding="utf-8"))
+    errors = content["error_mm"]
+    assert errors["nominal"]["holdout"]["mean"] > 2
+    assert errors["calibrated"]["holdout"]["mean"] == pytest.approx(NOISE_MM, rel=0.2)
+    assert f"calibrated {errors['calibrated']['holdout']['mean']:.3f} mm (the noise alone: 0.160 mm)" in PAGE
+    assert f"nominal {errors['nominal']['holdout']['mean']:.3f} mm" in PAGE
+    assert not [f for f in content["verdict"]["findings"] if f["grade"] in ("bad", "warning")]
+    assert (arm5 / "arm5-calibrated.urdf").read_text(encoding="utf-8").count("<joint") >= 5
+    assert (here / "arm7" / "arm7-calibrated.urdf").exists()
+
+
+def test_the_calibration_is_nearer_to_the_truth_everywhere_than_the_drawing(here: Path) -> None:
+    """The made-up arm without noise, at poses of its own, against what was found: below the noise of one reading."""
+    rows = table(here, files_of(PAGE)["arm5.csv"])
+    assert new_robot("arm5", "--dh", rows, "--convention", "standard").exit_code == 0
+    experiment = Experiment.load(here / "arm5" / "simulated.yaml", ["simulation.noise=0 mm", "simulation.seed=99"])
+    from armcal.solve.simulation import SimulationRequest
+
+    system = experiment.system
+    request = SimulationRequest(system.arms, system.measurements, experiment.parameters, system.environment)
+    exact = experiment.simulator().simulate(request)
+    found = Calibration.load(here / "arm5" / "runs" / "simulated" / "calibration.yaml").predict(exact)[0]
+    off = np.array([found[f"tracker.{axis}"] - exact.column(f"tracker.{axis}") for axis in "xyz"])
+    assert float(np.linalg.norm(off, axis=0).mean()) < 1e-4
+
+
+# What is written
+
+
+def test_nothing_that_is_free_is_redundant_or_unknown(here: Path) -> None:
+    rows = read_rows(here / table(here, files_of(PAGE)["arm5.csv"]))
+    made = write_robot(robot_of_rows("arm5", "standard", rows), here / "arm5", REGISTRY)
+    experiment = Experiment.load(here / "arm5" / "simulated.yaml", registry=REGISTRY)
+    ready = prepare(experiment, Stopwatch())
+    assert not [text for text in ready.warnings if "determine" in text]
+    assert {block.name for block in ready.problem.parameters.free} == set(made.choice.kept)
+    # Six of the base, four a joint less two of the last, three of the target and its gauge; springs 2 to 4 are loaded.
+    assert {"arm.mdh.base_x", "arm.mdh.base_rz", "tracker.target_z", "arm.mdh.after2_ry"} <= set(made.choice.kept)
+    assert {"arm.mdh.theta1", "arm.mdh.d1", "arm.spring.k1"} <= set(made.choice.redundant)
+    assert {"arm.spring.k2", "arm.spring.k3"} <= set(made.choice.kept)
+
+
+def test_the_rows_are_those_of_the_table(here: Path) -> None:
+    rows = read_rows(here / table(here, files_of(PAGE)["arm5.csv"]))
+    write_robot(robot_of_rows("arm5", "standard", rows), here / "arm5", REGISTRY)
+    told = yaml.safe_load((here / "arm5" / "arm.yaml").read_text(encoding="utf-8"))["arms"]["arm"]
+    lines = [line.split(",") for line in files_of(PAGE)["arm5.csv"].splitlines()[1:]]
+    assert told["model"]["joints"] == [line[0] for line in lines]
+    for row, line in zip(told["model"]["rows"], lines, strict=True):
+        assert [row[key] for key in HEADER.split(",")] == pytest.approx([float(cell) for cell in line[1:5]])
+    assert told["links"]["link3"] == {"mass_g": 250, "com_mm": [-80, 0, 0], "frame": "row3"}
+    plan = yaml.safe_load((here / "arm5" / "plan.yaml").read_text(encoding="utf-8"))["plan"]
+    assert plan["limits_deg"]["shoulder"] == [-60, 100]
+    assert plan["levels_deg"]["shoulder"] == [-60, 20, 100]
+
+
+def test_units_names_and_kinds_of_a_table(here: Path) -> None:
+    text = (
+        "type,joint,alpha_rad,a_m,theta_deg,d_cm,lower_deg,upper_deg,lower_mm,upper_mm,mass_kg\n"
+        ",1,0,0.25,0,30,-130,130,,,2\n"
+        "\n"
+        "revolute,2,3.141592653589793,0.2,0,0,,,,,1.5\n"
+        "prismatic,quill,0,0,0,0,,,0,150,\n"
+    )
+    rows = read_rows(here / table(here, b"\xef\xbb\xbf" + text.encode()))
+    assert [row.joint.name for row in rows] == ["q1", "q2", "quill"]
+    assert [row.joint.turns for row in rows] == [True, True, False]
+    assert (rows[0].a, rows[0].d, rows[1].alpha) == pytest.approx((0.25, 0.3, math.pi))
+    assert rows[0].joint.limits == pytest.approx((-math.radians(130), math.radians(130)))
+    assert [row.joint.assumed for row in rows] == [False, True, False]
+    assert rows[2].joint.limits == pytest.approx((0, 0.15))
+    assert [row.mass.mass if row.mass else None for row in rows] == [2, 1.5, None]
+
+
+@pytest.mark.parametrize(
+    ("convention", "marked"), [("standard", [True, False, False]), ("craig", [False, False, True])]
+)
+def test_a_tilt_is_put_between_parallel_axes_only(convention: str, marked: list[bool]) -> None:
+    """alpha lies after the joint, in Craig's convention before it: 0, then a right angle, then pi."""
+    alphas = (0.0, math.pi / 2, math.pi)
+    joints = [row_of(name).joint for name in ("q1", "q2", "q3")]
+    rows = tuple(Row(joint, alpha, 0.1, 0, 0) for joint, alpha in zip(joints, alphas, strict=True))
+    found = robot_of_rows("r", convention, rows)  # type: ignore[arg-type]
+    assert [row.tilts for row in found.rows] == marked
+
+
+def row_of(name: str) -> Row:
+    from armcal.scaffold.robot import ASSUMED_TURN, RobotJoint
+
+    return Row(RobotJoint(name, True, ASSUMED_TURN), 0, 0, 0, 0)
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(90.00000000000001, "90"), (1e-7, "0.0000001"), (-0.0, "0"), (1e9, "1000000000"), (0.1 + 0.2, "0.3")],
+)
+def test_numbers_are_written_as_people_do(value: float, text: str) -> None:
+    assert number(value) == text
+    assert yaml.safe_load(number(value)) == pytest.approx(value, abs=1e-15, rel=1e-11)
+
+
+@pytest.mark.parametrize("name", ["waist", "y", "no", "on", "J-1", "null", "a_b"])
+def test_names_stay_text_in_yaml(name: str) -> None:
+    assert yaml.safe_load(f"[{word(name)}]") == [name]
+
+
+# Other sources
+
+
+@pytest.mark.parametrize("convention", ["standard", "modified"])
+def test_a_scara_slides_in_either_convention(convention: str, here: Path) -> None:
+    rows = [
+        f"name,type,{HEADER},lower_deg,upper_deg,lower_mm,upper_mm",
+        "y,,0,250,0,300,-130,130,,".replace("y", "no"),  # a YAML word for false
+        "q2,,180,200,0,0,-140,140,,",
+        "q3,prismatic,0,0,0,0,,,0,150",
+        "q4,,0,50,0,40,-180,180,,",
+    ]
+    ran = new_robot("scara", "--dh", table(here, "\n".join(rows)), "--convention", convention, "--json")
+    assert ran.exit_code == 0, ran.output
+    content = json.loads(ran.stdout)
+    assert content["works"]
+    assert content["holdout_calibrated_mm"] < 1.3 * NOISE_MM < 1 < content["holdout_nominal_mm"]
+    read = (here / "scara" / "simulated.csv").read_text(encoding="utf-8").splitlines()[0]
+    assert "no_deg" in read and "q3_mm" in read
+    text = (here / "scara" / "README.md").read_text(encoding="utf-8")
+    assert "masses" not in text and "assumed" not in text
+
+
+def test_a_urdf_gives_limits_and_masses(here: Path) -> None:
+    source = ROOT / "configs" / "mukca" / "gen3lite.urdf"
+    ran = new_robot("lite", "--urdf", str(source), "--json")
+    assert ran.exit_code == 0, ran.output
+    content = json.loads(ran.stdout)
+    assert content["works"] and any(name.startswith("arm.spring.k") for name in content["free"])
+    assert (here / "lite" / "lite.urdf").read_bytes() == source.read_bytes()
+    plan = yaml.safe_load((here / "lite" / "plan.yaml").read_text(encoding="utf-8"))["plan"]
+    experiment = Experiment.load(here / "lite" / "simulated.yaml", registry=REGISTRY)
+    for joint in experiment.system.arms["arm"].nominal_chain.joints:
+        if joint.limits:
+            low, high = (math.degrees(limit) for limit in joint.limits)
+            assert low - 1e-6 <= plan["limits_deg"][joint.name][0] < plan["limits_deg"][joint.name][1] <= high + 1e-6
+    assert experiment.simulator() is not None
+
+
+ANSWERS = """standard
+2
+revolute
+90
+0
+0
+100
+-120
+120
+500
+0
+0
+20
+revolute
+0
+0.2 m
+not a number
+0
+0
+-90
+-100
+90
+0
+"""
+
+
+def test_answers_make_a_robot(here: Path) -> None:
+    ran = new_robot("asked", answers=ANSWERS)
+    assert ran.exit_code == 0, ran.output
+    told = yaml.safe_load((here / "asked" / "arm.yaml").read_text(encoding="utf-8"))["arms"]["arm"]
+    assert told["model"]["rows"][1]["a_mm"] == 200
+    assert told["links"] == {"link1": {"mass_g": 500, "com_mm": [0, 0, 20], "frame": "row1"}}
+    plan = yaml.safe_load((here / "asked" / "plan.yaml").read_text(encoding="utf-8"))["plan"]
+    assert plan["limits_deg"] == {"q1": [-120, 120], "q2": [-90, 90]}
+
+
+@pytest.mark.parametrize("lines", [0, 1, 5, 20])
+def test_answers_that_end_early_are_refused(lines: int, here: Path) -> None:
+    ran = new_robot("asked", answers="".join(ANSWERS.splitlines(keepends=True)[:lines]))
+    assert ran.exit_code == 2
+    assert "the answers ended before the last question" in ran.output
+    assert list(here.iterdir()) == []
+
+
+# What is refused
+
+TABLES = {
+    "a column without its unit": ("alpha,a_mm,theta_deg,d_mm\n0,1,2,3\n", ":1, alpha: found 'alpha' with no unit"),
+    "another unit": ("alpha_mm,a_mm,theta_deg,d_mm\n", ":1, alpha_mm: found 'alpha_mm' with a unit of length"),
+    "a missing column": ("alpha_deg,a_mm,theta_deg\n", ":1: found no column for d"),
+    "a misspelt column": (f"{HEADER},masss_g\n", "Did you mean mass_g?"),
+    "a column twice": (f"{HEADER},a_m\n", ":1, a_m: found a twice"),
+    "another delimiter": (HEADER.replace(",", ";") + "\n", ":1: found ';' between the columns"),
+    "NaN": (f"{HEADER}\n0,1,2,3\n0,1,nan,3\n", ":3, theta_deg: found 'nan', expected a number"),
+    "infinity": (f"{HEADER}\n0,1,2,3\n0,inf,0,3\n", ":3, a_mm: found 'inf', expected a number"),
+    "too much": (f"{HEADER}\n0,1,2,3\n1e300,1,0,3\n", ":3, alpha_deg: found 1e300 deg, expected an arm's angle"),
+    "an empty cell": (f"{HEADER}\n0,1,,3\n", ":2, theta_deg: found nothing"),
+    "a text": (f"{HEADER}\n0,1,2 deg,3\n", ":2, theta_deg: found '2 deg'"),
+    "a decimal comma": (f'{HEADER}\n0,"1,5",2,3\n', ":2, a_mm: found '1,5', a decimal comma"),
+    "one row": (f"{HEADER}\n0,1,2,3\n", ":2: found 1 joint, expected 2 to 20"),
+    "no row": (f"{HEADER}\n", "found 0 joints"),
+    "a short line": (f"{HEADER}\n0,1,2,3\n0,1,2\n", ":3: found 3 cells, expected 4"),
+    "a long line": (f"{HEADER}\n0,1,2,3,4\n", ":2: found 5 cells, expected 4"),
+    "an open quote": (f'{HEADER}\n0,1,"2,3\n', "not CSV"),
+    "no UTF-8": (f"{HEADER}\n0,1,2,".encode() + b"\xff\n", ":2: found the byte 0xff"),
+    "NUL": (f"{HEADER}\n0,1,2,\0\n", ":2: found a NUL byte"),
+    "nothing": ("", "it is empty"),
+    "limits the wrong way": (f"{HEADER},lower_deg,upper_deg\n0,1,2,3,9,-9\n", ":2, lower_deg: found no lower limit"),
+    "half of the limits": (f"{HEADER},lower_deg,upper_deg\n0,1,2,3,9,\n", ":2, lower_deg: found no lower limit"),
+    "limits of the other kind": (
+        f"{HEADER},type,lower_deg,upper_deg\n0,1,2,3,prismatic,0,9\n",
+        ":2, lower_deg: found a limit of angle, and the joint slides",
+    ),
+    "an unknown type": (f"{HEADER},type\n0,1,2,3,ball\n", ":2, type: found 'ball'"),
+    "a mass below zero": (f"{HEADER},mass_g\n0,1,2,3,-1\n", ":2, mass_g: found a mass below zero"),
+    "a name twice": (f"{HEADER},name\n0,1,2,3,a\n0,1,2,3,a\n", ":3: found the joint name 'a', a second time"),
+    "a name that is taken": (f"{HEADER},name\n0,1,2,3,a\n0,1,2,3,x\n", ":3: found the joint name 'x'"),
+    "a name like a unit": (f"{HEADER},name\n0,1,2,3,a_mm\n0,1,2,3,b\n", ":2: found the joint name 'a_mm'"),
+    "a name that is none": (f"{HEADER},name\n0,1,2,3,a b\n0,1,2,3,b\n", ":2: found the joint name 'a b'"),
+}
+
+
+@pytest.mark.parametrize("fault", TABLES)
+def test_a_faulty_table_is_refused_with_its_place(fault: str, here: Path) -> None:
+    text, told = TABLES[fault]
+    with pytest.raises(InputError) as refused:
+        read_rows(here / table(here, text))
+    assert told in str(refused.value)
+    assert "rows.csv" in str(refused.value)
+    assert refused.value.hint
+
+
+URDF = '<robot name="r"><link name="a"/><link name="b"/>{}</robot>'
+JOINT = '<joint name="j" type="{}"><parent link="a"/><child link="b"/>{}</joint>'
+URDFS = {
+    "no chain": (URDF.format(JOINT.format("fixed", "")), "moves"),
+    "no joint": ('<robot name="r"><link name="a"/></robot>', "moves"),
+    "one joint": (URDF.format(JOINT.format("continuous", "")), "found 1 moving joints"),
+    "no XML": ("<robot", "not well-formed XML"),
+    "no text": (b"\xff\xfe\xfa", "bytes"),
+}
+
+
+@pytest.mark.parametrize("fault", URDFS)
+def test_a_faulty_urdf_is_refused(fault: str, here: Path) -> None:
+    text, told = URDFS[fault]
+    ran = new_robot("r", "--urdf", table(here, text, "r.urdf"))
+    assert ran.exit_code == 2, ran.output
+    assert told in ran.output and "r.urdf" in ran.output
+    assert [path.name for path in here.iterdir()] == ["r.urdf"]
+
+
+COMMANDS = {
+    "no convention": (["--dh", "rows.csv"], "two go by the same name"),
+    "two sources": (["--dh", "rows.csv", "--urdf", "r.urdf"], "found both --dh and --urdf"),
+    "a tip of rows": (["--tip", "hand"], "found --tip without --urdf"),
+    "a convention of nothing": (["--convention", "standard"], "found --convention without --dh"),
+    "no file": (["--dh", "none.csv", "--convention", "standard"], "none.csv: there is no such file"),
+    "a folder": (["--dh", ".", "--convention", "standard"], "no regular file"),
+    "no URDF": (["--urdf", "none.urdf"], "none.urdf: there is no such file"),
+    "a folder that is there": (
+        ["--dh", "rows.csv", "--convention", "standard", "--out", "taken"],
+        "taken: it is there",
+    ),
+    "an arm of no size": (["--dh", "flat.csv", "--convention", "standard"], "the tip stays within 0 mm"),
+}
+
+
+@pytest.mark.parametrize("fault", COMMANDS)
+def test_a_faulty_command_is_refused_and_leaves_nothing(fault: str, here: Path) -> None:
+    arguments, told = COMMANDS[fault]
+    table(here, f"{HEADER}\n90,0,0,100\n0,200,0,0\n")
+    table(here, f"{HEADER}\n0,0,0,0\n0,0,0,0\n", "flat.csv")
+    (here / "taken").mkdir()
+    before = sorted(path.name for path in here.rglob("*"))
+    ran = new_robot("r", *arguments)
+    assert ran.exit_code == 2, ran.output
+    assert told in ran.output
+    assert "Traceback" not in ran.output and ".r." not in ran.output
+    assert sorted(path.name for path in here.rglob("*")) == before
+
+
+@pytest.mark.parametrize("name", ["", "1r", "a b", "../r", "a/b", "r" * 31])
+def test_a_name_that_is_none_is_refused(name: str, here: Path) -> None:
+    ran = new_robot("--dh", table(here, f"{HEADER}\n"), "--convention", "standard", "--", name)
+    assert ran.exit_code == 2
+    assert "found the name" in ran.output
