@@ -4,12 +4,12 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: demo test test-all bench lint types docs-commands clean
+.PHONY: demo test test-all bench lint types docs docs-commands dist clean
 
 # The editable install is made anew when dependencies or entry points change.
 $(READY): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[test,dev]"
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[test,dev,docs]"
 	touch $(READY)
 
 demo: $(READY)
@@ -27,8 +27,8 @@ bench: $(READY)
 	$(BIN)/python -m benchmarks
 
 lint: $(READY)
-	$(BIN)/ruff check framework plugins tests benchmarks
-	$(BIN)/ruff format --check framework plugins tests benchmarks
+	$(BIN)/ruff check framework plugins tests benchmarks docs/tools
+	$(BIN)/ruff format --check framework plugins tests benchmarks docs/tools
 
 types: $(READY)
 	$(BIN)/mypy
@@ -37,5 +37,15 @@ types: $(READY)
 docs-commands: $(READY)
 	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python -m tests.docs_commands README.md docs
 
+# The pages as a site that works without a network, in site/; its figures are made anew from real runs.
+docs: $(READY)
+	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python docs/tools/figures.py
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet
+
+# Wheel and source distribution in dist/, the same bytes whenever and wherever they are built from the same tree.
+dist: $(READY)
+	rm -rf dist
+	SOURCE_DATE_EPOCH=$${SOURCE_DATE_EPOCH:-1577836800} $(BIN)/python -m hatchling build -d dist
+
 clean:
-	rm -rf $(VENV) runs dist .pytest_cache .mypy_cache .ruff_cache
+	rm -rf $(VENV) runs dist site .pytest_cache .mypy_cache .ruff_cache

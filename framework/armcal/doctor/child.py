@@ -1,0 +1,71 @@
+"""A check in a process of its own: a library that crashes, hangs or ends the process costs that check alone."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+from collections.abc import Mapping
+from importlib import import_module
+from typing import Any
+
+LONGEST_S = 120.0
+"""A check takes a few seconds on a slow machine."""
+_MARK = "\x1earmcal-doctor "
+_START = "import sys; from armcal.doctor.child import answer; answer(sys.argv[1], sys.argv[2:])"
+
+
+def ask(probe: str, *arguments: str, longest_s: float = LONGEST_S) -> Mapping[str, Any]:
+    """What a function of ``armcal.doctor.probes`` gives, done in a fresh interpreter.
+
+    Gives ``{"fault": one line}`` where it raises, crashes or does not end.
+    """
+    # -P: a file of the working directory called like a library is not taken for it, as it is not by the command.
+    command = [sys.executable, "-P", "-c", _START, probe, *arguments]
+    try:
+        done = subprocess.run(
+            command,
+            capture_output=True,
+            text=True,
+            errors="replace",
+            timeout=longest_s,
+            check=False,
+            stdin=subprocess.DEVNULL,
+        )
+    except subprocess.TimeoutExpired:
+        return {"fault": f"it did not end within {longest_s:.0f} s"}
+    except OSError as fault:
+        return {"fault": f"no process could be started ({one_line(fault)})"}
+    for line in reversed(done.stdout.split("\n")):
+        if line.startswith(_MARK):
+            told: dict[str, Any] = json.loads(line.removeprefix(_MARK))
+            return told
+    return {"fault": _ending(done.returncode, done.stderr)}
+
+
+def answer(probe: str, arguments: list[str]) -> None:
+    """The child's side: do it, and write what it gave as the last line."""
+    try:
+        told = getattr(import_module("armcal.doctor.probes"), probe)(*arguments)
+    except BaseException as fault:  # a broken library may raise anything, or try to leave
+        told = {"fault": one_line(fault)}
+    sys.stdout.write(f"\n{_MARK}{json.dumps(told)}\n")
+    sys.stdout.flush()
+
+
+def one_line(fault: BaseException) -> str:
+    """An exception in one line, cut to what a terminal shows well."""
+    text = " ".join(f"{type(fault).__name__}: {fault}".split())
+    return text if len(text) <= 200 else text[:197] + "..."
+
+
+def _ending(code: int, errors: str) -> str:
+    last = next((line.strip() for line in reversed(errors.splitlines()) if line.strip()), "")
+    if code < 0:
+        try:
+            name = signal.Signals(-code).name
+        except ValueError:
+            name = f"signal {-code}"
+        return f"the process crashed ({name})"
+    return f"the process ended with {code} and no answer" + (f" ({last[:160]})" if last else "")

@@ -1,0 +1,172 @@
+"""The checks that load libraries, each called in a process of its own by ``armcal.doctor.child``.
+
+Each gives facts for JSON, and raises where what it tries does not work.
+"""
+
+from __future__ import annotations
+
+import math
+import tempfile
+import time
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from armcal.doctor.kernel_probe import kernel
+
+if TYPE_CHECKING:
+    from armcal.plugins import Component
+
+__all__ = ["calibration", "components", "convex", "imported", "ipopt", "kalman", "kernel"]
+
+TRUE_LENGTHS_M = (0.310, 0.243)
+_NOMINAL_LENGTHS_M = (0.300, 0.250)
+_NOISE_M = 1e-4
+_NEAR_M = 5e-4
+_POSES = 16
+_CONFIG = """
+name: what armcal doctor calibrates
+arms:
+  arm:
+    model:
+      type: mdh
+      convention: standard
+      rows: [{{a_m: {0}}}, {{a_m: {1}}}]
+measurements: {{tracker: {{type: tip_position, noise_mm: 0.1}}}}
+statics: {{gravity_m_s2: [0, 0, -9.81]}}
+data: {{type: csv, path: poses.csv}}
+parameters: {{free: ["arm.mdh.a[12]"]}}
+"""
+
+
+def imported(module: str) -> dict[str, Any]:
+    """Import one library; the seconds it takes."""
+    began = time.perf_counter()
+    import_module(module)
+    return {"import_s": round(time.perf_counter() - began, 3)}
+
+
+def components() -> dict[str, Any]:
+    """Every plugin, with what its registration lacks; and every component imported, with what that lacks."""
+    from armcal.plugins import discover
+
+    registry = discover()
+    told = []
+    for plugin in registry.plugins:
+        own = registry.announced_by(plugin)
+        broken = [{"kind": c.kind, "name": c.name, "fault": fault} for c in own if (fault := _fault_of(c))]
+        origin = f"{plugin.distribution} {plugin.version}".strip()
+        facts = {"name": plugin.name, "module": plugin.module, "distribution": origin, "fault": plugin.fault or None}
+        told.append({**facts, "components": len(own), "broken": broken})
+    return {"plugins": told}
+
+
+def _fault_of(component: Component) -> str:
+    """Why a component does not load; empty if it does."""
+    from armcal.errors import PluginError
+
+    try:
+        component.load()
+    except PluginError as fault:
+        cause = fault.__cause__ or fault
+        return " ".join(f"{type(cause).__name__}: {cause}".split())[:200]
+    return ""
+
+
+def ipopt() -> dict[str, Any]:
+    """Minimise (x - 1)^2 + (y - x^2)^2, which is zero at (1, 1), with x at most 2."""
+    import casadi as ca
+
+    x, y = ca.SX.sym("x"), ca.SX.sym("y")
+    options: Any = {"print_time": False, "ipopt": {"print_level": 0, "sb": "yes"}}
+    solver = ca.nlpsol("doctor", "ipopt", {"x": ca.vertcat(x, y), "f": (x - 1) ** 2 + (y - x**2) ** 2}, options)
+    found = [float(v) for v in solver(x0=[0.0, 0.0], lbx=[-2, -2], ubx=[2, 2])["x"].full().ravel()]
+    if not solver.stats()["success"] or max(abs(v - 1.0) for v in found) > 1e-6:
+        raise ArithmeticError(f"IPOPT found {found} ({solver.stats()['return_status']}), expected [1, 1]")
+    return {"version": str(ca.CasadiMeta.version())}
+
+
+def convex() -> dict[str, Any]:
+    """A cone problem by the solver that armcal asks for, and a linear one by each other that cvxpy sees.
+
+    Gives each solver's fault, empty where it solves.
+    """
+    import cvxpy as cp
+
+    def least_sum(name: str) -> str:
+        x = cp.Variable(2)
+        problem = cp.Problem(cp.Minimize(cp.sum(x)), [x >= [1.0, 2.0]])
+        problem.solve(solver=name)
+        right = problem.value is not None and abs(float(problem.value) - 3.0) < 1e-3
+        return "" if right else f"it found {problem.value}, expected 3"
+
+    told: dict[str, str] = {}
+    for name in dict.fromkeys(["CLARABEL", *sorted(cp.installed_solvers())]):
+        try:
+            told[name] = _nearest_semidefinite() if name == "CLARABEL" else least_sum(name)
+        except Exception as fault:  # each solver has its own way of failing
+            told[name] = " ".join(f"{type(fault).__name__}: {fault}".split())[:160]
+    return {"solvers": told}
+
+
+def _nearest_semidefinite() -> str:
+    """The positive semidefinite matrix nearest to diag(1, -1) is diag(1, 0)."""
+    import cvxpy as cp
+    import numpy as np
+
+    x = cp.Variable((2, 2), PSD=True)
+    cp.Problem(cp.Minimize(cp.sum_squares(x - np.diag([1.0, -1.0])))).solve(solver=cp.CLARABEL)
+    off = float(np.abs(np.asarray(x.value) - np.diag([1.0, 0.0])).max())
+    return "" if off < 1e-4 else f"it is off by {off:.2g}"
+
+
+def kalman() -> dict[str, Any]:
+    """One update of one state: prior 0 with variance 1, measured 1 with variance 1; half is believed."""
+    import numpy as np
+    from filterpy.kalman import ExtendedKalmanFilter
+
+    filtered = ExtendedKalmanFilter(dim_x=1, dim_z=1)
+    filtered.update(np.ones((1, 1)), lambda x: np.ones((1, 1)), lambda x: x)
+    found = float(filtered.x[0, 0])
+    if not abs(found - 0.5) < 1e-12:
+        raise ArithmeticError(f"filterpy found {found}, expected 0.5")
+    return {}
+
+
+def calibration() -> dict[str, Any]:
+    """Calibrate a made-up arm of two links as ``armcal run`` does, and compare with what made it up.
+
+    The measured positions come from the cosine rule written here, not from armcal's kinematics.
+    """
+    from armcal.plugins import discover
+    from armcal.report import render
+    from armcal.run import outputs
+    from armcal.run.experiment import Experiment
+    from armcal.run.pipeline import calibrate
+    from armcal.use.calibration import Calibration
+
+    with tempfile.TemporaryDirectory(prefix="armcal-doctor-") as text:
+        place = Path(text)
+        (place / "arm.yaml").write_text(_CONFIG.format(*_NOMINAL_LENGTHS_M), encoding="utf-8")
+        (place / "poses.csv").write_text(_made_up(), encoding="utf-8")
+        experiment = Experiment.load(place / "arm.yaml", (), None, discover())
+        result = calibrate(experiment, "armcal doctor")
+        outputs.write(result, experiment, place / "run", render)
+        record = Calibration.load(place / "run" / "calibration.yaml").record
+        found = [p.value for p in record.parameters if p.free]
+    off = max(abs(a - b) for a, b in zip(found, TRUE_LENGTHS_M, strict=True))
+    if not result.estimate.verdict.converged or not off < _NEAR_M:
+        raise ArithmeticError(f"the lengths found are off by {off * 1000:.3g} mm")
+    return {"off_mm": round(off * 1000, 4)}
+
+
+def _made_up() -> str:
+    """Poses of a planar arm of two links, with a scatter that comes out the same each time."""
+    lines = ["pose_id,q1_rad,q2_rad,x_m,y_m,z_m"]
+    one, two = TRUE_LENGTHS_M
+    for n in range(_POSES):
+        q1, q2 = 2.0 * math.sin(1.7 * n), 1.5 * math.cos(2.3 * n)
+        x = one * math.cos(q1) + two * math.cos(q1 + q2) + _NOISE_M * math.sin(12.9 * n)
+        y = one * math.sin(q1) + two * math.sin(q1 + q2) + _NOISE_M * math.sin(78.2 * n + 1)
+        lines.append(f"{n},{q1:.9f},{q2:.9f},{x:.9f},{y:.9f},{_NOISE_M * math.sin(37.7 * n + 2):.9f}")
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,121 @@
+"""Plugins, solvers, the compiler, and the main job: whether an arm can be calibrated here."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from importlib.metadata import entry_points
+from typing import Any
+
+from armcal.doctor.finding import Finding
+from armcal.doctor.libraries import Ask
+from armcal.doctor.requirements import DISTRIBUTION
+
+_CORE = "Install armcal anew: pip install --force-reinstall armcal (or pip install -e . in a checkout)."
+
+
+def plugins(ask: Ask) -> Iterator[Finding]:
+    """Each plugin: whether its registration loads, then whether its components do."""
+    told = ask("components")
+    if "fault" in told:
+        text = f"cannot be tried together: {told['fault']}"
+        yield Finding("plugins", "all plugins", "warning", text, "What stands above and below says more.", told)
+        yield from _one_by_one(ask)
+        return
+    if not told["plugins"]:
+        yield Finding("plugins", "plugins", "fault", "found none, not even armcal's own", _CORE)
+    for plugin in told["plugins"]:
+        yield _plugin(plugin)
+
+
+def _plugin(facts: Mapping[str, Any]) -> Finding:
+    name, count, broken = facts["name"], facts["components"], facts["broken"]
+    origin = f"({facts['distribution']})"
+    if facts["fault"]:
+        text = f"{origin} is left out: {facts['fault']}"
+        return Finding("plugins", name, "warning", text, "Repair, update or uninstall it.", facts)
+    if broken:
+        lost = ", ".join(f"{b['kind']} {b['name']}" for b in broken)
+        text = f"{origin} {len(broken)} of {count} do not load: {lost} ({broken[0]['fault']})"
+        return Finding("plugins", name, "warning", text, f"armcal plugins check {name} says more.", facts)
+    return Finding("plugins", name, "ok", f"{origin} {count} component{'' if count == 1 else 's'}", detail=facts)
+
+
+def _one_by_one(ask: Ask) -> Iterator[Finding]:
+    """Registrations that fail on their own: one of them may end the whole process."""
+    for point in sorted(entry_points(group=DISTRIBUTION), key=lambda p: p.name):
+        told = ask("imported", point.module)
+        if "fault" in told:
+            yield Finding("plugins", point.name, "warning", f"does not load: {told['fault']}", "Uninstall it.", told)
+
+
+def solvers(ask: Ask) -> Iterator[Finding]:
+    """A tiny problem for each."""
+    told = ask("ipopt")
+    if "fault" in told:
+        text = f"does not solve ({told['fault']}): the estimator ipopt, which is the usual one, does not work"
+        hint = "Install casadi anew: pip install --force-reinstall casadi."
+        yield Finding("solvers", "IPOPT (in casadi)", "warning", text, hint, told)
+    else:
+        yield Finding("solvers", "IPOPT (in casadi)", "ok", "solves", detail=told)
+    yield from _convex(ask)
+    told = ask("kalman")
+    if "fault" in told:
+        text = f"does not work ({told['fault']}): armcal recalibrate cannot use ekf or ukf"
+        yield Finding(
+            "solvers",
+            "Kalman filters (filterpy)",
+            "warning",
+            text,
+            "Install it anew: pip install --force-reinstall filterpy.",
+            told,
+        )
+    else:
+        yield Finding("solvers", "Kalman filters (filterpy)", "ok", "work")
+
+
+def _convex(ask: Ask) -> Iterator[Finding]:
+    """The solver that armcal asks for, then the others of cvxpy."""
+    told = ask("convex")
+    faults = dict(told.get("solvers", {}))
+    fault = told.get("fault") or faults.pop("CLARABEL", "")
+    if fault:
+        text = f"does not solve ({fault}): no estimator cvxpy, no certified bound of a plan, no cones"
+        hint = "Install them anew: pip install --force-reinstall cvxpy clarabel."
+        yield Finding("solvers", "CLARABEL (in cvxpy)", "warning", text, hint, {"fault": fault})
+    else:
+        yield Finding("solvers", "CLARABEL (in cvxpy)", "ok", "solves")
+    for name, own in faults.items():
+        text = f"{f'does not solve ({own})' if own else 'solves'}; armcal does not ask for it"
+        yield Finding("solvers", f"{name} (in cvxpy)", "note" if own else "ok", text, detail={"fault": own or None})
+
+
+def compiler(ask: Ask) -> Finding:
+    """The optional C compiler."""
+    from armcal.doctor.machine import compiler_path
+
+    path = compiler_path()
+    slower = "every fit runs on the virtual machine, with the same numbers: large data take 40 times as long"
+    if path is None:
+        hint = "If fits are slow: install gcc or clang."
+        return Finding("compiler", "C compiler", "note", f"none found, and none is needed; {slower}", hint)
+    told = ask("kernel")
+    facts = {"path": path, **told}
+    if "fault" in told:
+        text = f"{path} does not serve ({told['fault']}); {slower}"
+        hint = "Name another with ARMCAL_CC, or turn it off with ARMCAL_CC=none."
+        return Finding("compiler", "C compiler", "warning", text, hint, facts)
+    text = (
+        f"{path} makes a kernel with the same numbers in {told['compile_s']:.1f} s, "
+        f"{told['times_faster']:.0f} times as fast as without it (optional)"
+    )
+    return Finding("compiler", "C compiler", "ok", text, detail=facts)
+
+
+def main_job(ask: Ask) -> Finding:
+    """Calibrate a small made-up arm, report and all."""
+    told = ask("calibration")
+    if "fault" in told:
+        text = f"a made-up arm cannot be calibrated: {told['fault']}"
+        return Finding("main job", "calibrate", "fault", text, "Mend what is marked above first.", told)
+    text = f"a made-up arm of two links came out right to {told['off_mm']:.3f} mm, with report and calibration file"
+    return Finding("main job", "calibrate", "ok", text, detail=told)
