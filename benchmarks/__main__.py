@@ -12,7 +12,21 @@ from pathlib import Path
 
 from rich.console import Console
 
-from benchmarks import batch, fit_elastic, fit_rigid, large, links, online, plan, startup, tracker
+from benchmarks import (
+    batch,
+    capability,
+    compensate,
+    export_c,
+    fit_elastic,
+    fit_rigid,
+    large,
+    links,
+    online,
+    plan,
+    serve,
+    startup,
+    tracker,
+)
 from benchmarks.report import Row, print_table, write_json
 
 
@@ -29,8 +43,12 @@ def main() -> None:
         "batch": batch.run,
         "large": partial(large.run, long=chosen.long),
         "plan": plan.run,
+        "capability": capability.run,
         "online": online.run,
         "links": links.run,
+        "export_c": export_c.run,
+        "serve": serve.run,
+        "compensate": compensate.run,
         "startup": startup.run,
         "tracker": tracker.run,
     }

@@ -39,7 +39,7 @@ class Loop:
 
 def find_loop() -> Loop | str:
     """The fastest way that this machine has, or why there is none and how to get it."""
-    library = _compiled()
+    library = compiled(SOURCE)
     if isinstance(library, ctypes.CDLL):
         return Loop("pinocchio, C++ loop", sys.maxsize, _through(library))
     if find_spec("pinocchio") is None:
@@ -47,7 +47,8 @@ def find_loop() -> Loop | str:
     return Loop("pinocchio, from Python", PYTHON_POSES, _from_python, f"not the C++ loop: {library}")
 
 
-def _compiled() -> ctypes.CDLL | str:
+def compiled(source: Path) -> ctypes.CDLL | str:
+    """A C++ source that needs pinocchio's headers, compiled and loaded; or why it is not."""
     compiler = shutil.which("g++") or shutil.which("clang++")
     if compiler is None:
         return "no C++ compiler: apt-get install g++"
@@ -61,8 +62,8 @@ def _compiled() -> ctypes.CDLL | str:
     eigen = _first([pinocchio / "eigen3", *bundled, Path("/usr/include/eigen3")], "Eigen")
     if eigen is None:
         return "no headers of Eigen: apt-get install libeigen3-dev"
-    command = [compiler, *FLAGS, f"-I{pinocchio}", f"-I{eigen}", str(SOURCE)]
-    key = hashlib.sha256((" ".join(command) + SOURCE.read_text(encoding="utf-8")).encode()).hexdigest()[:20]
+    command = [compiler, *FLAGS, f"-I{pinocchio}", f"-I{eigen}", str(source)]
+    key = hashlib.sha256((" ".join(command) + source.read_text(encoding="utf-8")).encode()).hexdigest()[:20]
     target = cache_directory() / "benchmarks" / f"{key}.so"
     if not target.exists():
         target.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
