@@ -1,43 +1,221 @@
-"""Run what the documentation shows: lines that begin with ``$`` in ``console`` blocks, and ``python run`` blocks."""
+"""Run what the documentation shows, each page in a directory of its own that holds a copy of ``configs``.
+
+What a fence says decides what happens to its block:
+
+- ``console``: each line that begins with ``$`` is run. Where a line after it begins with ``armcal: ``, the command must
+  be refused with that message (``...`` stands for anything). ``sh``: the whole block is run as one script.
+- ``python``: executed, all of a page's in one namespace, in order.
+- any of these or ``yaml``, ``toml``, ``json``, ``csv`` with ``title="NAME"``: written to that file there, and not run.
+- ``yaml``, ``json`` and ``toml`` without a title: fragments, which must at least parse (JSON may be one object a line).
+- ``py``: a piece of Python that cannot stand alone, such as a signature. ``text``: whatever else must not run.
+
+No other kind is allowed, so that nothing slips by.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import io
+import json
+import os
+import re
+import shutil
 import subprocess
 import sys
+import tempfile
+import time
+import tomllib
+import traceback
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, field
+from multiprocessing import get_context
 from pathlib import Path
+from typing import Any
+
+import yaml
+
+ROOT = Path(__file__).resolve().parents[1]
+RUN = ("console", "sh", "python")
+FRAGMENTS = ("yaml", "json", "toml")
+KINDS = (*RUN, *FRAGMENTS, "csv", "py", "text")
+DONE_BY_TESTS = {
+    "new_robot.md": "tests/framework/test_new_robot.py",
+    "write_a_plugin.md": "tests/framework/test_new_plugin.py",
+}
+"""Pages that a test does word for word, so that doing them here again would only take time."""
+AT_ONCE = 2
+LONGEST_S = 300
+_FENCE = re.compile(r"^(?P<indent> *)```(?P<kind>[^\s`]*)(?P<rest>[^`]*)$")
+_TITLE = re.compile(r'title="([^"]+)"')
 
 
-def runnable(text: str) -> list[list[str]]:
-    """The commands of one document, in order, as argument lists."""
-    found: list[list[str]] = []
-    kind, block = "", []
-    for line in text.splitlines():
-        if line.startswith("```"):
-            if kind == "python run":
-                found.append([sys.executable, "-c", "\n".join(block)])
-            kind, block = ("" if kind else line[3:].strip() or "text"), []
-        elif kind == "console" and line.startswith("$ "):
-            found.append(["bash", "-ec", line[2:]])
-        else:
-            block.append(line)
+@dataclass(frozen=True)
+class Block:
+    """A fenced block: its kind, the file it stands for (or none), its first line's number and its text."""
+
+    kind: str
+    title: str
+    line: int
+    text: str
+
+
+@dataclass
+class Outcome:
+    """What came of one page: a line for each thing done, and what went wrong."""
+
+    page: str
+    lines: list[str] = field(default_factory=list)
+    faults: list[str] = field(default_factory=list)
+    done: int = 0
+
+
+def blocks(text: str) -> Iterator[Block]:
+    """The fenced blocks of a page, in order."""
+    opened: tuple[str, str, int, int] | None = None
+    held: list[str] = []
+    for number, line in enumerate(text.splitlines(), 1):
+        match = _FENCE.match(line)
+        if match and opened is None:
+            title = _TITLE.search(match["rest"])
+            opened, held = (match["kind"], title[1] if title else "", number, len(match["indent"])), []
+        elif opened and line.strip() == "```":
+            yield Block(opened[0], opened[1], opened[2], "\n".join(held) + "\n")
+            opened = None
+        elif opened:
+            held.append(line[opened[3] :])
+    if opened:
+        raise ValueError(f"the fence of line {opened[2]} is never closed")
+
+
+def faults_of(block: Block) -> str:
+    """What is wrong with a block before anything runs; empty if nothing."""
+    if block.kind not in KINDS:
+        return f"the fence says {block.kind!r}, expected one of {', '.join(KINDS)}"
+    if block.kind in FRAGMENTS:
+        try:
+            {"yaml": yaml.safe_load, "json": _json, "toml": tomllib.loads}[block.kind](block.text)
+        except (yaml.YAMLError, ValueError) as fault:
+            return f"it is not {block.kind}: {fault}"
+    return ""
+
+
+def _json(text: str) -> None:
+    """One document, or one a line."""
+    try:
+        json.loads(text)
+    except ValueError:
+        for line in text.splitlines():
+            json.loads(line)
+
+
+@dataclass(frozen=True)
+class Command:
+    """What bash is given, and the message that must come of it; empty where the command must end well."""
+
+    text: str
+    refusal: str = ""
+
+
+def commands(block: Block) -> list[Command]:
+    """What a block has run."""
+    if block.title or block.kind not in ("console", "sh"):
+        return []
+    if block.kind == "sh":
+        return [Command(block.text)]
+    found: list[Command] = []
+    for line in map(str.strip, block.text.splitlines()):
+        if line.startswith("$ "):
+            found.append(Command(line[2:]))
+        elif found and (line.startswith("armcal: ") or (found[-1].refusal and line)):
+            found[-1] = Command(found[-1].text, f"{found[-1].refusal} {line}".strip())
     return found
 
 
+def page_outcome(page: Path) -> Outcome:
+    """Run one page, in this process's own working directory from now on."""
+    told = Outcome(os.path.relpath(page, ROOT))
+    with tempfile.TemporaryDirectory(prefix="armcal-docs-") as place:
+        shutil.copytree(ROOT / "configs", Path(place) / "configs")
+        os.chdir(place)
+        namespace: dict[str, Any] = {"__name__": "__main__"}
+        for block in blocks(page.read_text(encoding="utf-8")):
+            fault = faults_of(block)
+            if fault:
+                told.faults.append(f"{told.page}:{block.line}: {fault}")
+            elif block.title:
+                Path(block.title).parent.mkdir(parents=True, exist_ok=True)
+                Path(block.title).write_text(block.text, encoding="utf-8")
+            elif block.kind == "python":
+                _note(told, block, "python", lambda b=block: _execute(b, told.page, namespace))
+            for command in commands(block) if not fault else ():
+                _note(told, block, command.text, lambda c=command: _bash(c))
+        os.chdir(ROOT)
+    return told
+
+
+def _note(told: Outcome, block: Block, what: str, act: Any) -> None:
+    """Do one thing, and write down what came of it."""
+    began = time.perf_counter()
+    said = act()
+    shown = f"{told.page}:{block.line}: {what.strip().splitlines()[0]}"
+    told.lines.append(f"{'FAIL' if said else 'ok  '} {time.perf_counter() - began:5.1f} s  {shown}")
+    told.done += 1
+    if said:
+        told.faults.append(f"{shown}\n{said}")
+
+
+def _bash(command: Command) -> str:
+    """Run it; what it said, if it did not end as the page has it."""
+    try:
+        done = subprocess.run(
+            ["bash", "-ec", command.text], capture_output=True, text=True, timeout=LONGEST_S, check=False
+        )
+    except subprocess.TimeoutExpired:
+        return f"it did not end within {LONGEST_S} s"
+    said = f"exit {done.returncode}\n{done.stdout}{done.stderr}"
+    if not command.refusal:
+        return said if done.returncode else ""
+    told = " ".join(done.stderr.split())
+    pattern = ".*".join(re.escape(" ".join(part.split())) for part in command.refusal.split("..."))
+    return "" if done.returncode and re.search(pattern, told) else f"expected: {command.refusal}\n{said}"
+
+
+def _execute(block: Block, page: str, namespace: dict[str, Any]) -> str:
+    """Execute a Python block at its line of the page; the traceback, if it failed."""
+    said = io.StringIO()
+    try:
+        code = compile("\n" * block.line + block.text, page, "exec")
+        with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
+            exec(code, namespace)
+    except BaseException:
+        return said.getvalue() + traceback.format_exc()
+    return ""
+
+
+def pages_of(places: list[str]) -> list[Path]:
+    """The pages in files and folders."""
+    found: list[Path] = []
+    for place in map(Path, places):
+        found += sorted(place.rglob("*.md")) if place.is_dir() else [place]
+    return [page.resolve() for page in found]
+
+
 def main(places: list[str]) -> int:
-    """Run them all; the number of failures."""
-    files = [f for place in map(Path, places) for f in (sorted(place.rglob("*.md")) if place.is_dir() else [place])]
-    failed = count = 0
-    for file in files:
-        for command in runnable(file.read_text(encoding="utf-8")):
-            count += 1
-            done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
-            print(f"{'ok  ' if done.returncode == 0 else 'FAIL'} {file}: {command[2].splitlines()[0]}")
-            if done.returncode:
-                failed += 1
-                print(done.stdout, done.stderr, sep="\n")
-    print(f"{count - failed} passed, {failed} failed")
-    return failed or not count
+    """Run them all, two pages at once; the number of failures."""
+    for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ.setdefault(variable, "1")
+    began, done, faults = time.perf_counter(), 0, []
+    with ProcessPoolExecutor(AT_ONCE, mp_context=get_context("spawn"), max_tasks_per_child=1) as pool:
+        for outcome in pool.map(page_outcome, [page for page in pages_of(places) if page.name not in DONE_BY_TESTS]):
+            for line in outcome.lines:
+                print(line, flush=True)
+            done += outcome.done
+            faults += outcome.faults
+    print(*(f"\nFAIL {fault}" for fault in faults), sep="\n")
+    print(f"{done} done, {len(faults)} failed, in {time.perf_counter() - began:.0f} s")
+    return len(faults) or not done
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(min(main(sys.argv[1:]), 100))
