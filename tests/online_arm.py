@@ -26,7 +26,8 @@ from armcal.online.tracking.start import Footing, footing
 from armcal.plugins import discover
 from armcal.solve.online import OnlineEstimator, Update
 from armcal.solve.problem import Problem
-from armcal.use.calibration import Calibration, CalibrationFile, identity_of
+from armcal.use.calibration import Calibration
+from armcal.use.calibration_file import CalibrationFile, identity_of
 
 CONFIG = Path(__file__).resolve().parents[1] / "configs" / "lrm_arm" / "arm.yaml"
 NOISE_M = 0.0003

@@ -64,7 +64,7 @@ class Case:
 
     @cached_property
     def experiment(self):
-        return Experiment.load(self.path, [*self.settings, "simulation.joint_noise=0"])
+        return Experiment.load(self.path, [*self.settings, "simulation.joint_noise_rad=0"])
 
     @property
     def truth_file(self):

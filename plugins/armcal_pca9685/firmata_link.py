@@ -23,6 +23,8 @@ from armcal_pca9685.firmata_messages import FirmataDecoder, Message
 _TRIES = 4
 _REPLY_S = 0.1
 _PROTOCOL = 2
+_LENGTHS = 4
+"""Answers have no number of their own: their lengths tell so many reads in a row apart."""
 
 
 class FirmataSettings(SerialPortSettings):
@@ -43,6 +45,7 @@ class FirmataLink:
         self._where = Location(settings.meant)
         self._port = SerialPort(settings)
         self._decoder = FirmataDecoder()
+        self._reads = 0
 
     def open(self, clock: Clock) -> LinkIdentity:
         """See ``armcal.bench.link.Link``. Many boards start anew when their port is opened; it waits for them."""
@@ -62,14 +65,16 @@ class FirmataLink:
         self._port.write(firmata.i2c_write(address, data))
 
     def read(self, address: int, register: int, count: int) -> bytes:
-        """See ``Link``."""
+        """See ``Link``. It asks for up to three bytes more than it gives: no late answer is taken for this one."""
         complaint = ""
         for _ in range(_TRIES):
-            self._heard(0.0)  # an answer that came too late would be taken for this one
-            self._port.write(firmata.i2c_read(address, register, count))
-            data, complaint = self._answer(address, register, count)
+            self._heard(0.0)
+            self._reads += 1
+            length = count + self._reads % _LENGTHS
+            self._port.write(firmata.i2c_read(address, register, length))
+            data, complaint = self._answer(address, register, length)
             if data is not None and not complaint:
-                return data
+                return data[:count]
         if complaint:
             raise DeviceError(
                 f"the device at 0x{address:02x} does not answer; the board says {complaint!r}.",
@@ -83,16 +88,19 @@ class FirmataLink:
         """See ``Link``."""
         self._port.close()
 
-    def _answer(self, address: int, register: int, count: int) -> tuple[bytes | None, str]:
-        """What was read, if it comes, and what the board complained of: then what was read is not to be used."""
+    def _answer(self, address: int, register: int, length: int) -> tuple[bytes | None, str]:
+        """What was read, if it comes, and what the board complained of: then what was read is not to be used.
+
+        An answer of another length is a late one, to a read before.
+        """
         complaint, until = "", time.monotonic() + _REPLY_S
         while (left := until - time.monotonic()) > 0:
             for message in self._heard(left):
                 if message.kind == firmata.STRING:
                     complaint = firmata.text_of(message.data)
                 reply = firmata.i2c_reply(message.data) if message.kind == firmata.I2C_REPLY else None
-                if reply is not None and reply[:2] == (address, register):
-                    return (reply.data if len(reply.data) == count else None), complaint
+                if reply is not None and reply[:2] == (address, register) and len(reply.data) == length:
+                    return reply.data, complaint
         return None, complaint
 
     def _heard(self, longest_s: float) -> list[Message]:

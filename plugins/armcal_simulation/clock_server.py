@@ -32,7 +32,7 @@ class ClockServer:
         answer: gives the answer to a request; ``ValueError`` refuses it.
 
     Raises:
-        InputError: another bench is listening there, or the path is too long for a socket.
+        InputError: another bench is listening there.
     """
 
     def __init__(self, path: Path, answer: Answer) -> None:
@@ -41,18 +41,26 @@ class ClockServer:
         self._watched: Port | None = None
         _remove_dead(path)
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        self._poll = select.epoll()
+        self._bound = False
+
+    def listen(self) -> None:
+        """Be there for clients, who take the socket for the sign that the bench is ready.
+
+        Raises:
+            InputError: the path is too long for a socket, or cannot be written.
+        """
         try:
-            self._listener.bind(str(path))
+            self._listener.bind(str(self._path))
         except OSError as fault:
-            self._listener.close()
             raise InputError(
                 f"the clock's socket cannot be made ({fault}).",
-                where=Location(str(path)),
+                where=Location(str(self._path)),
                 hint="Give a folder with a short path (a socket's has at most 107 characters) that can be written.",
             ) from fault
+        self._bound = True
         self._listener.listen()
         self._listener.setblocking(False)
-        self._poll = select.epoll()
         self._poll.register(self._listener.fileno(), select.EPOLLIN)
 
     def serve(self, port: Callable[[], Port | None], readable: Callable[[], None], ended: Callable[[], bool]) -> None:
@@ -73,7 +81,8 @@ class ClockServer:
             self._drop(number)
         self._poll.close()
         self._listener.close()
-        self._path.unlink(missing_ok=True)
+        if self._bound:
+            self._path.unlink(missing_ok=True)
 
     def _awaited(self) -> list[tuple[int, int]]:
         """What happens next. A client that works with the bench asks again at once: it is not worth falling asleep."""

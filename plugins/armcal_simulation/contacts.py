@@ -41,7 +41,7 @@ class ContactsSettings(Settings):
     within: Angle = 1.0
     travel: Length = 0.1
     around: dict[str, dict[str, Angle]] = Field(default_factory=dict)
-    joint_noise: Annotated[float, Field(ge=0)] | None = None
+    joint_noise: Annotated[Angle, Field(ge=0)] | None = None
     seed: Annotated[int, Field(ge=0)] = 0
 
 

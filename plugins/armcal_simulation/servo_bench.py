@@ -50,6 +50,7 @@ class ServoBench:
             try:
                 with Signals() as signals:
                     world.start(request.folder / BOARD)
+                    server.listen()  # after the board: who finds the clock finds the board as well
                     server.serve(world.port, world.attend_line, lambda: world.stopped or signals.finish)
             finally:
                 server.close()

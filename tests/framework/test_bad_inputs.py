@@ -203,6 +203,7 @@ def test_a_path_in_a_file_may_not_leave_its_directory(tmp_path: Path) -> None:
     assert check(config=str(inside / "mine.yaml"), data=outside).exit_code == 0
 
 
+@pytest.mark.slow
 def test_two_hundred_damaged_configurations_never_end_in_a_traceback(tmp_path: Path) -> None:
     """Lines taken out, doubled, swapped and cut: a result or a refusal that names the file."""
     lines = (CONFIGS / "arm.yaml").read_text().splitlines()

@@ -140,6 +140,7 @@ def _white(random: np.random.Generator, count: int) -> np.ndarray:
 @pytest.mark.parametrize(
     "method, blocks, low, high", [("blocks", 1, 0.8, 1.25), ("blocks", "auto", 0.6, 1.4), ("parametric", 1, 0.8, 1.25)]
 )
+@pytest.mark.slow
 def test_where_the_model_is_true_the_bootstrap_agrees_with_the_curvature(
     lrm, method: str, blocks: object, low: float, high: float
 ) -> None:

@@ -149,6 +149,7 @@ def test_ranks_with_priors_left_out(name):
     assert case.traded <= {name for each in found["undetermined"] for name in terms(each)}
 
 
+@pytest.mark.slow
 def test_twists_and_offsets_leave_one_combination_and_it_is_named():
     found = identified("twists_and_offsets", "parameters.priors={}")
     assert (found["rank"], len(found["free"])) == (48, 49)
@@ -239,6 +240,7 @@ def coverage(names, seeds):
     return float(np.mean(inside)), len(inside)
 
 
+@pytest.mark.slow
 def test_intervals_hold_the_truth():
     share, count = coverage(QUICK, range(8))
     assert count > 250 and 0.90 < share < 0.99
@@ -329,6 +331,7 @@ def test_where_the_last_axes_are_one_line_thirteen_are_determined_and_the_rest_i
 
 
 @pytest.mark.parametrize("seeds", [8, pytest.param(100, marks=SLOW)])
+@pytest.mark.slow
 def test_a_wrong_clamp_in_the_problem_costs_joints_1_to_6_nothing(seeds):
     errors = two_arms.clamp_table().clamp_study(range(seeds))
     size = {way: two_arms.clamp_table().root_mean_square(found.errors) for way, found in errors.items()}

@@ -108,6 +108,7 @@ def _reopen(held: dict[Path, bytes], witness: Witness) -> str:
     return "torn after reopening" if verify(FOLDER, files).cut else ""
 
 
+@pytest.mark.slow
 def test_power_losses_lose_nothing_acknowledged() -> None:
     faults = {seed: fault for seed in range(500) if (fault := lives(seed))}
     assert faults == {}

@@ -626,6 +626,7 @@ def test_a_cached_library_is_private_and_used_again(repository, built):
 
 
 @pytest.mark.parametrize("content", ["nothing", "text", "a foreign library"])
+@pytest.mark.slow
 def test_a_damaged_or_foreign_library_in_the_cache_is_replaced(repository, built, reference_cost, content):
     mode = stat.S_IMODE(built.stat().st_mode)
     if content == "a foreign library":
@@ -674,6 +675,7 @@ def test_a_cache_named_by_a_relative_path_works(repository, tmp_path, reference_
 
 
 @needs_compiler
+@pytest.mark.slow
 def test_two_processes_that_compile_at_once_both_get_a_library(repository, tmp_path, reference_cost):
     processes = [start(repository, tmp_path / "cache") for _ in range(2)]
     for process in processes:

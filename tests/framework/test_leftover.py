@@ -137,6 +137,7 @@ def false_findings(lrm, seeds, **how):
     return wrong
 
 
+@pytest.mark.slow
 def test_data_of_the_model_itself_show_no_structure(lrm):
     """At 5 % family-wise three in ten happen once in eighty such tests."""
     assert false_findings(lrm, range(10), count=100) <= 2
@@ -215,6 +216,7 @@ def rows_of(rng, blocks=40, each=6, free=5):
     return slopes, np.repeat(np.arange(blocks), each)
 
 
+@pytest.mark.slow
 def test_p_values_are_uniform_without_structure_and_family_wise_ones_keep_their_level():
     rng = np.random.default_rng(2)
     slopes, block = rows_of(rng)

@@ -161,6 +161,7 @@ def test_no_figure_rests_on_a_record_that_it_judges(plain: Path) -> None:
         assert np.isfinite(clean.errors_mm[(variant, (0.0, 66.3))]).all()
 
 
+@pytest.mark.slow
 def test_payloads_are_told_apart_to_a_tenth_of_a_gram_and_the_others_left_out(plain: Path) -> None:
     data = _measured(plain, {0: 20, 66.3: 20, 120: 10})
     everything = _run(plain / "study.yaml", data=data)

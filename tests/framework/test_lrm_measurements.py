@@ -122,6 +122,7 @@ def test_the_best_model_judged_by_records_that_did_not_train_it(
         assert np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])[0] > -1e-12
 
 
+@pytest.mark.slow
 def test_the_best_model_trained_on_the_published_poses_alone(repository: Path, lrm_data: Path, tmp_path: Path) -> None:
     ids = f"validation.train_ids={lrm_data / 'published_50.csv'}"
     held = run(repository, lrm_data, "best", tmp_path / "out", ids, "validation.folds=0")["error_mm"]["calibrated"][

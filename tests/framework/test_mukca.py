@@ -287,6 +287,7 @@ def test_every_row_of_the_published_table(run, name, trained):
 
 
 @pytest.mark.parametrize(("name", "trained"), [pytest.param(*k, marks=[] if k in FIRST else SLOW) for k in BEST])
+@pytest.mark.slow
 def test_joint_effects_do_better_on_positions_that_did_not_train_them(run, name, trained):
     told, _ = run(CONFIGS / f"{name}_best.yaml", DATA / ROBOTS[name].folder, trained)
     held = told["error_mm"]["calibrated"]["holdout"]

@@ -19,7 +19,8 @@ from armcal.run.experiment import Experiment
 from armcal.run.outputs import calibration_content
 from armcal.run.pipeline import calibrate
 from armcal.solve.online import Gaussian
-from armcal.use.calibration import Calibration, dump
+from armcal.use.calibration import Calibration
+from armcal.use.calibration_file import dump
 
 ROOT = Path(__file__).resolve().parents[2]
 pytestmark = pytest.mark.shared

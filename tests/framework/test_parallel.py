@@ -203,6 +203,7 @@ def _blas(task: None) -> str | None:
     return os.environ.get("OPENBLAS_NUM_THREADS")
 
 
+@pytest.mark.slow
 def test_a_dask_cluster_of_two_processes_gives_the_same_bits(lrm) -> None:
     distributed = pytest.importorskip("distributed", reason='needs: pip install "dask[distributed]"')
     local = distributed.LocalCluster(

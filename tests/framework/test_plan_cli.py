@@ -59,6 +59,7 @@ def scaled_rows(path: Path) -> np.ndarray:
     return triangle * experiment.parameters.scales()
 
 
+@pytest.mark.slow
 def test_a_plan_is_a_csv_of_recorded_poses_and_trains_a_run(tmp_path: Path) -> None:
     out = tmp_path / "plan.csv"
     told = planned(out, "--poses", "30")
@@ -74,6 +75,7 @@ def test_a_plan_is_a_csv_of_recorded_poses_and_trains_a_run(tmp_path: Path) -> N
     assert json.loads(run.stdout)["records"]["train"] == 30
 
 
+@pytest.mark.slow
 def test_predicted_deviations_are_those_that_a_run_finds(tmp_path: Path) -> None:
     """The declared noise is the true one here, so the calibrated deviations agree up to the residuals' own scale."""
     out = tmp_path / "plan.csv"

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import importlib.util
+import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -20,7 +22,10 @@ from armcal.testing.contract import CheckResult, check_component
 ROOT = Path(__file__).parents[2]
 DATA = ROOT / "tests" / "data"
 SCARA = DATA / "scara_plugin"
-OURS = ("contact", "cvxpy", "dualarm", "ipopt", "joints", "mdh", "poe", "simulation", "tracker", "urdf")
+OURS = (
+    *("contact", "cvxpy", "dualarm", "ipopt", "joints", "kalman"),
+    *("mdh", "pca9685", "poe", "simulation", "tracker", "urdf"),
+)
 HEAVY = ("numpy", "casadi", "matplotlib", "pydantic", "scipy", "cvxpy")
 Ran = subprocess.CompletedProcess[str]
 
@@ -57,15 +62,42 @@ def test_our_plugins_load() -> None:
     assert set(OURS) <= {p.name for p in registry.plugins}
 
 
-@pytest.mark.parametrize("plugin", OURS)
-def test_our_plugins_keep_the_contract(plugin: str) -> None:
-    ran = armcal("plugins", "check", plugin, "-v")
-    assert ran.returncode == 0, ran.stdout + ran.stderr
-    passed, _, total = ran.stdout.splitlines()[-1].removeprefix(f"{plugin}: ").split()[:3]
-    assert passed == total
-    assert int(total) > 10
-    left = [line for line in ran.stdout.splitlines() if "not run" in line]
-    assert all("it reads nothing" in line or plugin == "tracker" for line in left)
+def test_our_plugins_keep_the_contract() -> None:
+    ran = armcal("plugins", "check", "--json")
+    reports = {report["plugin"]: report for report in json.loads(ran.stdout)["plugins"]}
+    assert set(OURS) <= set(reports)
+    for plugin in reports:
+        report = reports[plugin]
+        assert [check for check in report["checks"] if check["fault"]] == []
+        assert (report["fault"], report["failed"]) == (None, 0)
+        assert report["ran"] + report["not_run"] == len(report["checks"])
+        assert report["ran"] > 10
+        assert {check["not_run"] for check in report["checks"]} <= {None, "it reads nothing"}
+
+
+def test_a_check_tells_how_many_ran_and_why_one_did_not() -> None:
+    ran, told = armcal("plugins", "check", "contact"), armcal("plugins", "check", "contact", "-v")
+    assert (ran.returncode, told.returncode) == (0, 0), ran.stdout + ran.stderr
+    assert re.fullmatch(r"contact: ([0-9]+) of \1 checks passed, 3 not run \(-v says why\)\.\n", ran.stdout)
+    lines = told.stdout.splitlines()
+    left = [line for line in lines[:-1] if not line.startswith("ok ")]
+    assert len(left) == 3
+    assert all(line.startswith("-- ") and line.endswith("(not run: it reads nothing)") for line in left)
+    assert lines[-1] == f"contact: {len(lines) - 4} of {len(lines) - 4} checks passed, 3 not run."
+
+
+def test_checking_all_names_the_one_that_is_broken(tmp_path: Path) -> None:
+    write_plugin(tmp_path, "import", BROKEN["import"][0])
+    code = "from importlib.metadata import EntryPoint as E; import armcal.cli.plugins as p; d = p.discover; "
+    code += (
+        "p.discover = lambda: d([E('import', 'broken_import', 'armcal'), E('mdh', 'armcal_mdh.plugin', 'armcal')]); "
+    )
+    ran = python("-c", f"{code}p.plugins(['check'])", path=tmp_path)
+    assert ran.returncode == 2
+    assert ran.stderr.count("\n") == 1
+    assert ran.stderr.startswith("armcal: import: ModuleNotFoundError")
+    assert "import: 0 of 1 checks passed." in ran.stdout
+    assert re.search(r"mdh: ([0-9]+) of \1 checks passed\.", ran.stdout)
 
 
 # The checks find faults

@@ -78,6 +78,7 @@ def test_the_stream_is_json_lines_and_the_calibration_can_be_used(whole: Path, t
     assert armcal("predict", whole / "calibration.yaml", "--poses", POSES, "--out", out).exit_code == 0
 
 
+@pytest.mark.slow
 def test_kills_of_the_whole_command_change_no_bit(
     calibration: Path, config: Path, poses: Path, whole: Path, tmp_path: Path
 ) -> None:

@@ -15,6 +15,7 @@ from armcal.run.experiment import Experiment
 from recordings import DEMO, command, postures, recorded, still_lines
 
 
+@pytest.mark.slow
 def test_a_wrong_posture_is_told_kept_marked_and_can_be_taken_back(tmp_path: Path) -> None:
     rows = postures()[:26]
     rows[20] = {**rows[20], "j4_deg": str(float(rows[20]["j4_deg"]) + 0.4)}
@@ -49,6 +50,7 @@ def test_the_rank_is_what_identify_says_while_much_is_open(tmp_path: Path) -> No
     assert last["rank"] < last["free"] and last["vary"] and last["missing"] == []
 
 
+@pytest.mark.slow
 def test_a_run_of_the_recording_gives_the_calibration_of_the_shipped_one(tmp_path: Path) -> None:
     trained = [row for row in postures() if row["position"] in ("front", "left")]
     rows = [row for row in trained if int(row["pose_id"].rpartition("/")[2]) <= 9]

@@ -76,6 +76,7 @@ def test_captures_undone_named_killed_and_resumed(tmp_path: Path, arm: GuidedArm
             assert abs(float(row[joint]) - angle) < 0.005
 
 
+@pytest.mark.slow
 def test_kills_at_any_moment_lose_nothing_acknowledged_and_repeat_nothing(
     tmp_path: Path, arm: GuidedArm, started: list[Recording]
 ) -> None:

@@ -97,6 +97,7 @@ def clean(lrm, q, points, wrong):
 
 
 @quick_losses
+@pytest.mark.slow
 def test_without_outliers_nothing_much_changes(lrm, loss):
     """At 95 % efficiency an answer scatters by sqrt(1/0.95 - 1) = 0.23 deviations about that of least squares."""
     apart, ratios = [], []
@@ -194,6 +195,7 @@ def test_the_cost_also_falls_from_a_bad_start_at_a_fixed_scale(lrm, monkeypatch)
 
 
 @quick_losses
+@pytest.mark.slow
 def test_neither_order_nor_unit_nor_axes_of_the_noise_matter(lrm, loss):
     q, points, _ = measured(80, 11, outliers=0.05)
     problem, records, start = posed(lrm, q, points)

@@ -77,6 +77,7 @@ def calibrated(bench):
     return first.returncode, said, kept, done, out
 
 
+@pytest.mark.slow
 def test_interrupted_it_holds_and_keeps_what_it_measured(calibrated):
     code, said, kept, done, out = calibrated
     assert code == 4 and "The arm holds" in said

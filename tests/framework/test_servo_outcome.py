@@ -106,6 +106,7 @@ def whole(truth, nominal):
     return evaluated(record_of(truth), nominal)
 
 
+@pytest.mark.slow
 def test_tables_come_back_though_nobody_knew_springs_or_axes(whole):
     assert worst_us(whole) < 3.0
     for servo in whole.fit.servos.values():

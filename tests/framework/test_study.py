@@ -193,6 +193,7 @@ def test_errors_are_those_of_a_run_with_the_same_folds(place: Path, ladder) -> N
     assert nothing.crossed == nothing.train == nothing.nominal
 
 
+@pytest.mark.slow
 def test_each_rung_is_compared_with_the_one_before_or_with_one_reference(place: Path, ladder) -> None:
     against = _run(_write(place, SMALL), "study.reference=springs")
     assert [v.change and v.change.against for v in ladder.variants] == [None, "none", "angles", "springs"]
@@ -208,6 +209,7 @@ def test_each_rung_is_compared_with_the_one_before_or_with_one_reference(place: 
     assert ladder.best == ladder.variants[int(np.argmin(means))].name
 
 
+@pytest.mark.slow
 def test_repeats_draw_the_folds_anew_and_average(place: Path, ladder) -> None:
     path = _write(place, SMALL)
     both = _run(path, "study.repeats=2")
@@ -265,6 +267,7 @@ def test_a_nested_choice_is_made_without_the_records_that_judge_it(place: Path, 
         assert np.all(spoilt.nested.errors_mm[outer.holdout] > 40)
 
 
+@pytest.mark.slow
 def test_a_nested_choice_is_that_of_a_plain_loop(place: Path, close_choices) -> None:
     result, study = close_choices, Study.load(_few(place), COMPILED)
     experiments = study.experiments
@@ -313,6 +316,7 @@ def test_variants_must_be_judged_on_the_same_records(place: Path) -> None:
         _run(path)
 
 
+@pytest.mark.slow
 def test_a_variant_whose_fits_fail_is_never_chosen(place: Path) -> None:
     path = _write(place, SMALL.replace("lengths: {extends: springs,", "lengths: {extends: springs, set: {LIMIT},"))
     path.write_text(path.read_text().replace("LIMIT", "estimator.max_iterations: 1"))
@@ -336,6 +340,7 @@ def test_a_study_judges_by_every_record_whatever_a_run_would_hold_out(place: Pat
     assert all(np.array_equal(a.errors_mm, b.errors_mm) for a, b in zip(held.variants, ladder.variants, strict=True))
 
 
+@pytest.mark.slow
 def test_a_study_leaves_files_that_agree(place: Path) -> None:
     path, out = _write(place, SMALL), place / "out"
     done = armcal("study", str(path), "--out", str(out), "--set", FAST[0], "--set", "study.nested=true", "--json")
@@ -378,6 +383,7 @@ def test_the_study_that_was_run_can_be_run_again_without_the_files_it_extended(p
         )
 
 
+@pytest.mark.slow
 def test_an_earlier_study_is_kept_and_a_run_is_not_written_into_one(place: Path) -> None:
     path, out = _write(place, SMALL), place / "out"
     for _ in range(2):
@@ -409,6 +415,7 @@ def test_the_terminal_says_what_the_page_says(place: Path) -> None:
     assert (quiet.exit_code, quiet.stdout) == (0, "")
 
 
+@pytest.mark.slow
 def test_the_five_options_give_the_published_figures(shared_data: Path, tmp_path: Path) -> None:
     data = str(shared_data / "lrm_arm" / "poses.csv")
     done = armcal("study", str(CONFIGS / "study_options.yaml"), "--data", data, "--out", str(tmp_path / "o"), "--json")
@@ -421,6 +428,7 @@ def test_the_five_options_give_the_published_figures(shared_data: Path, tmp_path
     assert told["lowest"] == told["simplest_within_one_standard_error"] == "option1"
 
 
+@pytest.mark.slow
 def test_what_a_drift_adds_is_told_apart_from_the_arm(place: Path) -> None:
     """Judged with the drift that training neighbours tell of, and without."""
     drifting = "drift: {extends: angles, set: {parameters.drift: {arm.mdh.theta1: {sd: 1 deg, over: 10}}}}"

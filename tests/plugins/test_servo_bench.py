@@ -514,6 +514,27 @@ class TestServer:
         assert client.ask(advance=0.5)["now"] == 0.5
         client.close()
 
+    def test_the_board_is_there_before_the_clock(
+        self, experiment: Experiment, tmp_path: Path, ear: socket.socket, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """However long it takes to plug the board in: who waits for the clock finds both."""
+        start, early = BenchWorld.start, []
+
+        def slowly(world: BenchWorld, path: Path) -> None:
+            early.append((tmp_path / "clock").exists())
+            start(world, path)
+
+        monkeypatch.setattr(BenchWorld, "start", slowly)
+        bench = ServoBench(bench_settings(ear))
+        thread = threading.Thread(target=bench.serve, args=(BenchRequest(experiment, tmp_path),))
+        thread.start()
+        client = Client(tmp_path / "clock")
+        assert early == [False] and (tmp_path / "board").exists()
+        client.ask(stop=True)
+        client.close()
+        thread.join(30)
+        assert not thread.is_alive()
+
     def test_bytes_to_the_board_are_done_before_time_passes(self, path: Path) -> None:
         """Without an answer to wait for: each write must be there when the advance after it begins."""
         client = Client(path)

@@ -19,7 +19,7 @@ from armcal.measure.limits import warn_beyond_limits
 from armcal.measure.reader import wanted_channels
 from armcal.plugins import discover
 from armcal.run.experiment import Experiment
-from armcal.use.calibration import dump
+from armcal.use.calibration_file import dump
 from armcal_urdf.encoding import MAX_BYTES, decode, encode
 from armcal_urdf.model import UrdfModel, UrdfSettings
 from pydantic import ValidationError
