@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 from armcal.arm.servo import quantised
 from armcal.solve.compiler import find_compiler
-from armcal.use.compensation.compensator import Compensator
+from armcal.use.compensation.compensator import SEEDS, Compensator
+from armcal.use.compensation.equilibrium import Equilibrium
 from armcal.use.compensation.finder import Found
 from armcal.use.compensation.request import Commands, Options, Targets
+from armcal.use.compensation.seeds import Seeds
 from armcal.use.compensation.sides import with_sides
 from scipy.optimize import least_squares, minimize
 from scipy.spatial.transform import Rotation
@@ -212,7 +214,8 @@ def test_limits_that_are_none_are_refused(limits, said: str) -> None:
 def test_starts_lie_within_limits_however_they_lie(limits) -> None:
     """A whole turn is open in each of these, so that all is reached as without limits."""
     found = with_options("rigid", Options(limits={"q1": limits}))
-    starts = found._seeds.commands[0]
+    seeds = Seeds(found.expression, Equilibrium(found.expression, "interpreted"), found.limits, SEEDS, 0)
+    starts = seeds.commands[0]
     assert limits[0] <= starts.min() < starts.max() <= limits[1]
     assert np.ptp(starts) > 6
     free = compensator("rigid")

@@ -6,7 +6,8 @@ Arrays are stored channel by channel, (entries x records).
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cached_property, partial
 from itertools import accumulate
 from typing import Any
@@ -26,6 +27,29 @@ _FEW = 16
 """Records that are evaluated one by one in the virtual machine."""
 
 
+@dataclass(frozen=True)
+class Loop:
+    """More C that is compiled together with a function, which it knows as ``evaluate``.
+
+    Attributes:
+        entry: the C function to be called.
+        inputs: names of the sizes of inputs, by the inputs' places.
+        outputs: names of the sizes of outputs, by their places.
+        text: the source.
+    """
+
+    entry: str
+    inputs: Mapping[str, int]
+    outputs: Mapping[str, int]
+    text: str
+
+    def source(self, function: ca.Function) -> str:
+        """For one function."""
+        sizes = {name: function.numel_in(place) for name, place in self.inputs.items()}
+        sizes |= {name: function.numel_out(place) for name, place in self.outputs.items()}
+        return "".join(f"#define {name} {size}\n" for name, size in sizes.items()) + self.text
+
+
 class BatchFunction:
     """A function of column vectors, to be called for many records.
 
@@ -34,7 +58,13 @@ class BatchFunction:
         compiled: whether C serves it.
     """
 
-    def __init__(self, function: ca.Function, sample: Sequence[Array], choice: EvaluatorChoice = "auto") -> None:
+    def __init__(
+        self,
+        function: ca.Function,
+        sample: Sequence[Array],
+        choice: EvaluatorChoice = "auto",
+        loop: Loop | None = None,
+    ) -> None:
         """Build it; ``sample`` are inputs (entries x 8 each) on which C must agree with the virtual machine.
 
         ``auto`` takes what was compiled before, and else lets the compiler work for the next time once so many records
@@ -49,13 +79,17 @@ class BatchFunction:
         self._asked = 0
         self._compile_later: Callable[[], None] | None = None
         if choice != "interpreted" and compiler.find_compiler() is not None:
-            library, self._compile_later = _library(function, choice)
+            library, self._compile_later = _library(function, choice, loop)
             self._library = _agreeing(self, library, sample)
 
     @property
     def compiled(self) -> bool:
         """Whether C serves it."""
         return self._library is not None
+
+    def entry(self, name: str) -> Any:
+        """A C function of its library, where it is compiled."""
+        return getattr(self._library, name)
 
     def __call__(self, *inputs: Array) -> list[Array]:
         """The outputs (entries x N each) for inputs (entries x N each)."""
@@ -108,19 +142,23 @@ class BatchFunction:
         return Mapped(self._shared, 1)
 
 
-def _library(function: ca.Function, choice: EvaluatorChoice) -> tuple[ctypes.CDLL | None, Callable[[], None]]:
+def _library(
+    function: ca.Function, choice: EvaluatorChoice, loop: Loop | None
+) -> tuple[ctypes.CDLL | None, Callable[[], None]]:
     """The library if there is one by now, and what has it compiled for the next time."""
-    text = function.serialize() + c_source.support_source() + c_source.generator_source() + _driver(function)
+    driver = _driver(function) + (loop.source(function) if loop else "")
+    entries = (_ENTRY, _VECTOR, *([loop.entry] if loop else []))
+    text = function.serialize() + c_source.support_source() + c_source.generator_source() + driver
     key = compiler.library_key(f"{_ENTRY} {c_source.LANES} lanes {text}")
 
     def source() -> str:
         written = c_source.write_function(function, "evaluate", 0)
         defines = f"#define LANES {c_source.LANES}\n#define HOISTED {written.hoisted}\n"
-        return defines + c_source.support_source() + written.source + _driver(function)
+        return defines + c_source.support_source() + written.source + driver
 
-    library = compiler.load_cached(key, (_ENTRY, _VECTOR))
+    library = compiler.load_cached(key, entries)
     if library is None and choice == "compiled":
-        library = quietly(partial(compiler.compile_now, key, source, (_ENTRY, _VECTOR)))
+        library = quietly(partial(compiler.compile_now, key, source, entries))
     return library, partial(compiler.compile_in_background, key, source)
 
 

@@ -14,17 +14,15 @@ from armcal.base.parameters import Parameters
 from armcal.solve.kernel import EvaluatorChoice
 from armcal.use.compensation.counts import Counts, ServoCounts
 from armcal.use.compensation.equilibrium import Equilibrium, Standing
-from armcal.use.compensation.finder import Allowed, Finder, Found, Rows
+from armcal.use.compensation.finder import Allowed, Found, Rows
 from armcal.use.compensation.limits import check_held, held_joints, joint_limits
 from armcal.use.compensation.path import PathFinder
 from armcal.use.compensation.reach import Reach, reach_of
 from armcal.use.compensation.reasons import why_not
-from armcal.use.compensation.redundancy import Descent
 from armcal.use.compensation.request import Commands, Mask, Options, Targets
-from armcal.use.compensation.rounding import Rounding
 from armcal.use.compensation.seeds import Seeds
 from armcal.use.compensation.sides import with_sides
-from armcal.use.compensation.solver import Solver
+from armcal.use.compensation.target_kind import TargetKind
 from armcal.use.compensation.turning import turn_between
 from armcal.use.tool_expression import APPROACH, ToolExpression
 
@@ -62,16 +60,25 @@ class Compensator:
             ValueError: limits of a joint that is not there, or in falling order.
         """
         self.expression, self.options = expression, options or Options()
-        self._allowed, self._choice = allowed, choice
+        self._allowed = allowed
         self._held = held_joints(expression, self.options.held)
         self.limits = joint_limits(expression, self.options.limits)
         self.reach: Reach = reach_of(expression.arm, parameters, self.limits)
         self._equilibrium = Equilibrium(expression, choice)
-        self._seeds = Seeds(expression, self._equilibrium, self.limits, SEEDS, self.options.seed)
         self._counts = ServoCounts(expression.joints, expression.servos) if expression.servos else None
-        self._made_descents: dict[bool, Descent] = {}
-        self._made_solvers: dict[bool, Solver] = {}
-        self._made_roundings: dict[bool, Rounding] = {}
+        self._positions = TargetKind(
+            expression=expression,
+            options=self.options,
+            limits=self.limits,
+            held=self._held,
+            seeds=Seeds(expression, self._equilibrium, self.limits, SEEDS, self.options.seed),
+            equilibrium=self._equilibrium,
+            counts=self._counts,
+            allowed=allowed,
+            choice=choice,
+            turns=False,
+        )
+        self._poses = replace(self._positions, turns=True)
 
     @property
     def joints(self) -> tuple[str, ...]:
@@ -146,8 +153,8 @@ class Compensator:
         check_held(self.joints, self._held, self.limits, start)
         if not len(targets):
             return replace(self.solve(targets, start), moves=np.zeros((0, len(self.joints))))
-        record, turns = self._record(targets), targets.rotations is not None
-        finder = PathFinder(self._finder(turns), len(self.joints), self._tells_approach)
+        record = self._record(targets)
+        finder = PathFinder(self._kind(targets).finder, len(self.joints), self._tells_approach)
         at = None if start is None else self._commanded(start, 1)[:, 0]
         path = finder(record, _goal(targets), at)
         record[len(self.joints) : 2 * len(self.joints)] = path.approach
@@ -160,15 +167,13 @@ class Compensator:
             ValueError: joints are to be held, and nothing can say where.
         """
         check_held(self.joints, self._held, self.limits, None)
-        finder = PathFinder(self._finder(target.rotations is not None), len(self.joints), self._tells_approach)
+        finder = PathFinder(self._kind(target).finder, len(self.joints), self._tells_approach)
         return finder.beginnings(self._record(target), _goal(target))
 
     def onward(self, targets: Targets, at: Array) -> Commands:
         """Commands for targets straight on from others (N x n): no other posture is looked for."""
         record = self._record(targets)
-        found = self._finder(targets.rotations is not None).straight(
-            record, _goal(targets), self._commanded(at, len(targets))
-        )
+        found = self._kind(targets).finder.straight(record, _goal(targets), self._commanded(at, len(targets)))
         return self._commands(record, targets, found)
 
     def forward(
@@ -231,26 +236,25 @@ class Compensator:
 
     def _found(self, record: Array, targets: Targets, start: Array | None) -> Found:
         """Exact commands, as redundancy asks."""
-        goal, finder = _goal(targets), self._finder(targets.rotations is not None)
+        goal, kind = _goal(targets), self._kind(targets)
         choice = len(self.joints) - len(self._held) > (3 if targets.rotations is None else 6)
         if self.options.redundancy == "nearest":
-            return finder(record, goal) if start is None else finder.onward(record, goal, start)
-        descent = self._descents(targets.rotations is not None)
+            return kind.finder(record, goal) if start is None else kind.finder.onward(record, goal, start)
 
         def score(commands: Array, states: Array, rows: Rows) -> Array:
-            return descent.score(record[:, rows], commands, states)
+            return kind.descent.score(record[:, rows], commands, states)
 
-        found = finder(record, goal, start, score)
+        found = kind.finder(record, goal, start, score)
         if choice:
-            descent.improve(record, goal, found, self._allowed)
+            kind.descent.improve(record, goal, found, self._allowed)
         return found
 
     def _commands(self, record: Array, targets: Targets, found: Found) -> Commands:
         """What is commanded: exact, or the best counts; and where that leads."""
         joints, counts = len(self.joints), None
         record[:joints] = found.commands
-        if self._counts is not None:
-            rounding = self._rounding(targets.rotations is not None)
+        rounding = self._kind(targets).rounding
+        if rounding is not None:
             counts, record[:joints] = rounding(record, found, targets, self._allowed)
             if self._allowed is not None:
                 barred = found.there & ~self._allowed(record[:joints])
@@ -269,7 +273,7 @@ class Compensator:
         commands = record[: len(self.joints)]
 
         def position_can_be_had(rows: Rows) -> Mask:
-            return self._finder(False)(record[:, rows], targets.positions[rows].T, commands[:, rows]).there
+            return self._positions.finder(record[:, rows], targets.positions[rows].T, commands[:, rows]).there
 
         reasons = why_not(self.joints, self.limits, commands, targets, found, had, bounds, position_can_be_had)
         return Commands(
@@ -298,30 +302,8 @@ class Compensator:
             record[self.expression.channels.index(name)] = values
         return record
 
-    def _finder(self, turns: bool) -> Finder:
-        return Finder(self._solver(turns), self._seeds, self._allowed, self._held)
-
-    def _solver(self, turns: bool) -> Solver:
-        if turns not in self._made_solvers:
-            tolerance = (self.options.reach_m, self.options.reach_rad)
-            length = self._seeds.spread / 2
-            made = Solver(self.expression, self.limits, turns, length, tolerance, self._choice)
-            self._made_solvers[turns] = made
-        return self._made_solvers[turns]
-
-    def _rounding(self, turns: bool) -> Rounding:
-        if turns not in self._made_roundings and self._counts is not None:
-            parts = (self.expression, self._counts, self._equilibrium, self._solver(turns))
-            self._made_roundings[turns] = Rounding(*parts, self._held, self._choice)
-        return self._made_roundings[turns]
-
-    def _descents(self, turns: bool) -> Descent:
-        if turns not in self._made_descents:
-            solver = self._solver(turns)
-            self._made_descents[turns] = Descent(
-                self.expression, self.options.redundancy, solver, self._held, self._choice
-            )
-        return self._made_descents[turns]
+    def _kind(self, targets: Targets) -> TargetKind:
+        return self._positions if targets.rotations is None else self._poses
 
     @cached_property
     def _tells_approach(self) -> bool:

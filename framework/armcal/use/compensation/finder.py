@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armcal.base.domains import Array
+from armcal.use.compensation.goal import NEAREST, WISHED, Attempt, Goal, chosen_of
 from armcal.use.compensation.request import Mask
 from armcal.use.compensation.seeds import Seeds
-from armcal.use.compensation.solver import NEAREST, WISHED, Attempt, Goal, Solver, chosen_of
+from armcal.use.compensation.solver import Solver
 
 Rows = NDArray[np.intp]
 Allowed = Callable[[Array], Mask]

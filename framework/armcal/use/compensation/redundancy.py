@@ -16,8 +16,9 @@ from armcal.base.se3 import Expression
 from armcal.solve.batch_function import BatchFunction
 from armcal.solve.kernel import EvaluatorChoice
 from armcal.use.compensation.finder import Allowed, Found
+from armcal.use.compensation.goal import Goal
 from armcal.use.compensation.request import Redundancy
-from armcal.use.compensation.solver import Goal, Solver
+from armcal.use.compensation.solver import Solver
 from armcal.use.compensation.step import sample_inputs, slopes, tool_error
 from armcal.use.tool_expression import ToolExpression
 

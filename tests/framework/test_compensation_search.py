@@ -1,0 +1,115 @@
+"""Searches in C go the way of those in arrays: the same commands, and the same ends."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from armcal.solve.batch_function import BatchFunction
+from armcal.solve.compiler import find_compiler
+from armcal.use.compensation.array_search import ArraySearch
+from armcal.use.compensation.compiled_search import CompiledSearch, loop_source
+from armcal.use.compensation.goal import NEAREST, QUICK, WISHED, Goal, Manner, Near
+from armcal.use.compensation.step import sample_inputs, slopes, step_function
+from small_arms import compensator, drawn
+
+pytestmark = pytest.mark.skipif(find_compiler() is None, reason="there is no C compiler")
+
+LENGTH = 0.1
+NEAR = Near(metres=1e-10, radians=1e-9, rest=1e-11)
+
+
+class Pair:
+    """Both searches of one arm and kind of target."""
+
+    def __init__(self, name: str, turns: bool) -> None:
+        self.found, self.turns = compensator(name), turns
+        expression = self.found.expression
+        function = step_function(expression, slopes(expression), turns, LENGTH)
+        record, state = sample_inputs(expression)
+        sizes = [function.numel_in(i) for i in range(1, function.n_in() - 1)]
+        sample = [record, *(np.full((size, 8), 0.2) for size in sizes), state]
+        steps = BatchFunction(function, sample, "compiled", loop_source())
+        assert steps.compiled
+        limits = self.found.limits
+        self.compiled, self.arrays = CompiledSearch(steps, limits, LENGTH), ArraySearch(steps, limits, LENGTH)
+
+    def goal(self, count: int, stretch: float = 1.0) -> Goal:
+        """Targets of random commands (farther out where they are stretched), from other random commands."""
+        joints = len(self.found.joints)
+        there, here = drawn(self.found, count, seed=1), drawn(self.found, count, seed=2)
+        tools = self.found.forward(there)
+        target = stretch * tools[:, :3, 3].T
+        if self.turns:
+            target = np.concatenate([target, tools[:, :3, :3].transpose(2, 1, 0).reshape(9, count)])
+        record = np.repeat(self.found.expression.defaults[:, None], count, axis=1)
+        record[:joints] = here.T
+        return Goal(record, np.zeros((self.found.expression.state.numel(), count)), target)
+
+    def alike(self, goal: Goal, manner: Manner) -> float:
+        """The share of targets that are had; everything else must agree."""
+        one, two = self.compiled(goal, manner, NEAR), self.arrays(goal, manner, NEAR)
+        # Rounding grows where a search wanders: a few may end elsewhere.
+        same = np.abs(one.commands - two.commands).max(axis=0) < 1e-7
+        assert same.mean() > 0.97
+        assert (one.there == two.there)[same].all()
+        for mine, others in ((one.states, two.states), (one.distances, two.distances), (one.turns, two.turns)):
+            assert mine[..., same] == pytest.approx(others[..., same], abs=1e-7)
+        assert one.there.mean() == pytest.approx(two.there.mean(), abs=0.02)
+        return float(one.there.mean())
+
+
+@pytest.mark.parametrize("count", [1, 7, 8, 9, 203])
+def test_all_targets_are_answered_at_their_places(count: int) -> None:
+    """However they fill the lanes."""
+    pair = Pair("three", False)
+    pair.alike(pair.goal(count), QUICK)
+
+
+def test_no_targets_have_no_answers() -> None:
+    pair = Pair("three", False)
+    assert pair.compiled(pair.goal(0), QUICK, NEAR).commands.shape == (3, 0)
+
+
+@pytest.mark.parametrize(("name", "turns"), [("three", False), ("rigid", False), ("lift", True), ("lrm", True)])
+def test_targets_in_reach(name: str, turns: bool) -> None:
+    pair = Pair(name, turns)
+    assert pair.alike(pair.goal(400), QUICK) > 0.3
+
+
+def test_targets_out_of_reach_end_at_the_nearest() -> None:
+    pair = Pair("three", False)
+    assert pair.alike(pair.goal(200, stretch=5.0), NEAREST) == 0
+
+
+def test_wishes_and_joints_that_are_held() -> None:
+    pair = Pair("lrm", False)
+    goal = pair.goal(200)
+    wished = replace(goal, towards=drawn(pair.found, 200, seed=3).T)
+    assert pair.alike(wished, WISHED) > 0.3
+    held = replace(goal, held=(1, 4))
+    assert pair.alike(held, QUICK) > 0.05
+    answer = pair.compiled(held, QUICK, NEAR)
+    assert (answer.commands[[1, 4]] == goal.record[[1, 4]]).all()
+
+
+def test_numbers_that_are_none_end_a_search_and_touch_no_other() -> None:
+    pair = Pair("three", False)
+    goal = pair.goal(20)
+    sound = pair.compiled(goal, QUICK, NEAR)
+    target = goal.target.copy()
+    target[:, 5] = np.nan
+    target[0, 11] = np.inf
+    answer = pair.compiled(replace(goal, target=target), QUICK, NEAR)
+    others = np.delete(np.arange(20), [5, 11])
+    assert not answer.there[[5, 11]].any()
+    assert (answer.commands[:, others] == sound.commands[:, others]).all()
+    assert (answer.there == sound.there)[others].all()
+
+
+def test_arrays_are_read_however_they_are_stored() -> None:
+    pair = Pair("three", False)
+    goal = pair.goal(30)
+    turned = replace(goal, record=np.asfortranarray(goal.record), target=np.asfortranarray(goal.target))
+    assert (pair.compiled(turned, QUICK, NEAR).commands == pair.compiled(goal, QUICK, NEAR).commands).all()
