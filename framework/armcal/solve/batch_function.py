@@ -23,8 +23,8 @@ _ENTRY, _VECTOR = "armcal_evaluate", "armcal_evaluate_vector"
 _AGREEMENT = 1e-9
 _WORTH_COMPILING = 100_000
 """Records that the virtual machine takes longer for than the compiler takes to make a library."""
-_FEW = 16
-"""Records that are evaluated one by one in the virtual machine."""
+_BLOCK = 16
+"""Records that the virtual machine evaluates together; what is left of them one by one."""
 
 
 @dataclass(frozen=True)
@@ -97,7 +97,11 @@ class BatchFunction:
         if self._library is None:
             self._count(count)
             outputs = [np.empty((size, count)) for size in self._sizes_out]
-            (self._mapped if count > _FEW else self._single)(np.zeros(0), inputs, outputs)
+            whole = count - count % _BLOCK
+            if whole:
+                self._mapped(np.zeros(0), [each[:, :whole] for each in inputs], [each[:, :whole] for each in outputs])
+            if whole < count:
+                self._single(np.zeros(0), [each[:, whole:] for each in inputs], [each[:, whole:] for each in outputs])
             return outputs
         whole = count - count % c_source.LANES
         if not whole and count:
@@ -135,7 +139,7 @@ class BatchFunction:
 
     @cached_property
     def _mapped(self) -> Mapped:
-        return Mapped(self._shared)
+        return Mapped(self._shared, _BLOCK)
 
     @cached_property
     def _single(self) -> Mapped:
