@@ -364,8 +364,9 @@ def improved(found: Compensator, cost, position: np.ndarray, starts: np.ndarray)
 
 
 def test_the_nearest_commands_cannot_be_bettered() -> None:
-    """From where they are, limits included; and they are seldom far from the nearest of all."""
+    """From where they are, limits included, nor from elsewhere."""
     found = with_options("five", Options(limits=NARROW))
+    elsewhere = drawn(found, 8, seed=6)
     start = np.array([0.9, -0.8, 1.0, -1.0, 0.6])
     targets = of(found, drawn(found, 5, seed=11))
     commands = found.solve(targets, start)
@@ -377,7 +378,8 @@ def test_the_nearest_commands_cannot_be_bettered() -> None:
             return float(((q - start) ** 2).sum())
 
         mine = cost(commands.joint_angles[i])
-        assert mine <= 1.001 * improved(found, cost, targets.positions[i], commands.joint_angles[i : i + 1])
+        starts = np.concatenate([commands.joint_angles[i : i + 1], elsewhere])
+        assert mine <= 1.001 * improved(found, cost, targets.positions[i], starts)
 
 
 @pytest.mark.parametrize("redundancy", ["stiffest", "least_sag", "coolest"])

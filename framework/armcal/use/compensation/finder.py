@@ -27,6 +27,9 @@ _AT_ONCE = 4096
 PARTS = ("commands", "states", "distances", "turns", "there", "forbidden")
 _BESIDE = 0.6
 """Commands that moved no joint farther (rad or m) are taken for the nearest without a look at other postures."""
+_POSTURES, _MOVED = 24, 0.2
+"""Starts from which the nearest of all commands is sought; what their distance from where the arm is counts beside
+that of their tool from the target."""
 _NEAREST_STARTS = 4
 
 
@@ -62,7 +65,7 @@ class Found:
         self.commands[:, at], self.states[:, at] = attempt.commands[:, chosen], attempt.states[:, chosen]
         self.distances[at], self.turns[at] = attempt.distances[chosen], attempt.turns[chosen]
 
-    def subset(self, chosen: Mask) -> Found:
+    def subset(self, chosen: Mask | Rows) -> Found:
         """Some of them."""
         return Found(*(getattr(self, name)[..., chosen] for name in PARTS))
 
@@ -133,15 +136,31 @@ class Finder:
         far = np.flatnonzero(~found.there | (np.abs(found.commands - at).max(axis=0) > _BESIDE))
         if not far.size:
             return found
-
-        def score(commands: Array, states: Array, rows: Rows) -> Array:
-            return _apart(commands, at[:, far[rows]])
-
-        other = self(record[:, far], target[:, far], at[:, far], score)
-        self.towards(record[:, far], target[:, far], at[:, far], other)
+        other = self._of_many(record[:, far], target[:, far], at[:, far])
         nearer = _apart(other.commands, at[:, far]) < _apart(found.commands[:, far], at[:, far])
         better = ~found.there[far] | (other.there & nearer)
         found.replace(far[better], other.subset(better))
+        return found
+
+    def _of_many(self, record: Array, target: Array, at: Array) -> Found:
+        """From many starts, each brought as near to commands (n x N) as its target allows: the nearest of them."""
+        found = Found.nothing(len(self._solver.limits), self.states, record.shape[1])
+        wide = min(_POSTURES, self._seeds.commands.shape[1])
+        for todo in _chunks(np.arange(record.shape[1]), wide):
+            rows, first = np.repeat(todo, wide), np.arange(len(todo)) * wide
+            attempts = Found.nothing(len(self._solver.limits), self.states, len(rows))
+            picks = self._picked_for(target[:, todo], at[:, todo], wide).ravel()[:, None]
+            records, targets, wished = (chosen_of(each, rows) for each in (record, target, at))
+            self._round(records, targets, np.arange(len(rows)), picks, attempts, None, wished)
+            self.towards(records, targets, wished, attempts)
+            apart = np.where(attempts.there, _apart(attempts.commands, wished), np.inf)
+            found.replace(todo, attempts.subset(apart.reshape(-1, wide).argmin(axis=1) + first))
+        lost = np.flatnonzero(~found.there)
+        if lost.size:
+            parts = (record[:, lost], target[:, lost], at[:, lost])
+            more = self(*parts)
+            self.towards(*parts, more)
+            found.replace(lost, more)
         return found
 
     def _beside(self, record: Array, target: Array, at: Array) -> Found:
@@ -184,6 +203,13 @@ class Finder:
         near = np.argpartition(apart, last, axis=1)[:, : used + wide]
         order = np.argsort(np.take_along_axis(apart, near, axis=1), axis=1)
         return np.asarray(np.take_along_axis(near, order, axis=1)[:, used:])
+
+    def _picked_for(self, target: Array, at: Array, wide: int) -> NDArray[np.intp]:
+        """Seeds near to targets, and near to commands too (N x wide)."""
+        apart = self._seeds.apart(target, self._solver.length)
+        moved = _apart(self._seeds.commands[:, None, :], at[:, :, None])
+        cost = apart + _MOVED * self._solver.length**2 * moved
+        return np.asarray(np.argpartition(cost, wide - 1, axis=1)[:, :wide])
 
     def _round(
         self,
