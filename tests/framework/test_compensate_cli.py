@@ -168,7 +168,7 @@ def test_joints_without_limits_are_named(desk: Desk) -> None:
 def test_a_pose_file_may_hold_the_targets(desk: Desk) -> None:
     """As ``armcal simulate`` writes it: its commands, in any unit, give way to those that are found."""
     rows = [[1, 2, 3, *place] for place in desk.places_mm]
-    told(desk.ask(desk.file("q1_deg,q2_rad,q3_deg,x_mm,y_mm,z_mm", rows)))
+    assert "not used" not in told(desk.ask(desk.file("q1_deg,q2_rad,q3_deg,x_mm,y_mm,z_mm", rows)))
     assert not {"q1_rad", "q2_rad"} & set(desk.answers()[0])
     tools = predicted(calibration("three"), desk.commands())
     assert np.abs(1000 * tools[:, :3, 3] - desk.places_mm).max() < 2e-6
@@ -248,6 +248,8 @@ def test_one_arm_of_two(tmp_path: Path) -> None:
     ("header", "row", "said"),
     [
         ("x_mm,y_mm", [1, 2], "found no column for z"),
+        ("x_mm,y_mm", [1, 2], "Give columns x_mm, y_mm, z_mm, for a rotation"),
+        ("x_mm;y_mm;z_mm", ["1,5;2;3"], "with commas between them and decimal points"),
         ("x,y,z", [1, 2, 3], "x has no unit"),
         ("x_mm,y_mm,z_deg", [1, 2, 3], "z_deg"),
         ("x_mm,y_mm,z_mm", ["nan", 2, 3], "found no usable record"),
@@ -275,6 +277,13 @@ def test_files_of_targets_that_are_none(desk: Desk, header: str, row, said: str)
 def test_a_misspelt_column_is_noticed(desk: Desk) -> None:
     text = told(desk.ask(desk.file("x_mm,y_mm,z_mm,paylod_g", [[*place, 100] for place in desk.places_mm])))
     assert "the column paylod_g is kept but not used: was payload meant?" in text
+
+
+def test_columns_that_mean_nothing_are_named(desk: Desk) -> None:
+    """A rotation in a form that is not known, a quantity nobody asked for; not words, which need no unit."""
+    rows = [[*place, 20, 30, "left"] for place in desk.places_mm]
+    text = told(desk.ask(desk.file("x_mm,y_mm,z_mm,rx_deg,speed_mm,note", rows)))
+    assert "columns that mean nothing to this arm are not used: rx_deg, speed_mm." in text
 
 
 @pytest.mark.parametrize(

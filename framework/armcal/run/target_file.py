@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +13,7 @@ from armcal.base.config_text import ConfigText
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.base.quaternions import rotation_matrix
-from armcal.base.units import DIMENSIONLESS
+from armcal.base.units import DIMENSIONLESS, split_suffix
 from armcal.errors import DataError, Location
 from armcal.measure.environment import noticed
 from armcal.measure.reader import ENVIRONMENT, ReadRequest, WantedChannel
@@ -26,6 +26,10 @@ QUATERNION = ("qw", "qx", "qy", "qz")
 RPY = ("roll", "pitch", "yaw")
 _NORM = 1e-3
 _FARTHER, _NEARER = 10.0, 100.0
+_AS_DOCUMENTED = (
+    "Give columns x_mm, y_mm, z_mm, for a rotation roll_deg, pitch_deg, yaw_deg or qw, qx, qy, qz as well, with commas "
+    "between them and decimal points."
+)
 
 
 @dataclass(frozen=True)
@@ -46,10 +50,7 @@ def read_targets(path: Path, expression: ToolExpression, registry: PluginRegistr
     Raises:
         DataError: the file cannot be read, or a rotation is told in part, or twice, or is none.
     """
-    wanted = _wanted(expression)
-    reader_class = registry.find("reader", "csv").load()
-    reader = reader_class(reader_class.Settings(path=ConfigText(str(path))))
-    dataset = noticed(reader.read(ReadRequest({}, {}, wanted)))
+    dataset = _read(path, expression, registry)
     if not len(dataset):
         raise DataError("it has no targets.", where=Location(str(path)), hint="Give a row for each target.")
     count = len(dataset)
@@ -92,6 +93,26 @@ def check_units(path: Path, targets: Targets, reach: Reach) -> None:
             where=Location(str(path)),
             hint="Check the unit in the column names: x_mm or x_m.",
         )
+
+
+def _read(path: Path, expression: ToolExpression, registry: PluginRegistry) -> Dataset:
+    """The columns that mean something to this arm; a warning names those with a unit that do not."""
+    wanted = _wanted(expression)
+    reader_class = registry.find("reader", "csv").load()
+    reader = reader_class(reader_class.Settings(path=ConfigText(str(path))))
+    try:
+        dataset = noticed(reader.read(ReadRequest({}, {}, wanted)))
+    except DataError as fault:
+        # Measured data have a section in a configuration that describes them; targets have none.
+        hint = _AS_DOCUMENTED if "data section" in fault.hint else fault.hint
+        raise DataError(fault.message, where=fault.where, hint=hint) from fault
+    units = {name: split_suffix(name) for name in dataset.extra if not any(name in w for w in dataset.warnings)}
+    # Commands that stand in the file already give way to those that are found.
+    idle = [name for name, split in units.items() if split is not None and split[0] not in expression.joints]
+    if not idle:
+        return dataset
+    found = f"columns that mean nothing to this arm are not used: {', '.join(idle)}."
+    return replace(dataset, warnings=(*dataset.warnings, found))
 
 
 def _wanted(expression: ToolExpression) -> tuple[WantedChannel, ...]:
