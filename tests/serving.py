@@ -18,7 +18,9 @@ from typing import Any
 
 import yaml
 from armcal.cli.main import cli
+from armcal.serve.answering import Answerer
 from armcal.serve.client import Client
+from armcal.serve.loaded import Order, loaded
 from armcal.use.calibration_file import dump, identity_of
 from click.testing import CliRunner
 
@@ -56,6 +58,23 @@ def foreign(text: str) -> str:
 
 def sha256(text: str) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
+
+
+def made(text: str, arm: str = "", shown: str = "c.yaml") -> Answerer:
+    """What answers by a calibration's text, in this process."""
+    return loaded(Order(shown, 1, sha256(text), arm, evaluator="interpreted"), text.encode())
+
+
+def ask(answerer: Answerer, **request: Any) -> dict[str, Any]:
+    """The answer to a request."""
+    return dict(json.loads(answerer.answer(json.dumps(request).encode(), 0.0)))
+
+
+def told(answerer: Answerer, **request: Any) -> dict[str, Any]:
+    """The answer to a request that is not refused."""
+    answer = ask(answerer, **request)
+    assert answer["ok"], answer
+    return answer
 
 
 def put(path: Path, text: str) -> None:

@@ -374,6 +374,7 @@ ORDER = [
     "armcal.serve.reading",
     "armcal.serve.served_arm",
     "armcal.serve.rows",
+    "armcal.serve.shares",
     "armcal.serve.answering",
     "armcal.serve.loaded",
     "armcal.serve.frames",

@@ -26,7 +26,7 @@ from armcal.use.calibration_file import CalibrationFile
 from armcal.use.compensation.request import Commands
 from pydantic import TypeAdapter
 from scipy.spatial.transform import Rotation
-from serving import ROOT, calibrated, foreign, sha256, variant
+from serving import ROOT, ask, calibrated, foreign, made, sha256, told, variant
 
 Q_DEG = [10.0, -20.0, 30.0, 40.0, -50.0, 60.0]
 NAMES = [f"q{i}" for i in range(1, 7)]
@@ -44,23 +44,9 @@ def calibration(path: Path) -> Calibration:
     return Calibration.load(path)
 
 
-def made(text: str, arm: str = "", shown: str = "c.yaml") -> Answerer:
-    return loaded(Order(shown, 1, sha256(text), arm, evaluator="interpreted"), text.encode())
-
-
 @pytest.fixture(scope="module")
 def answerer(path: Path) -> Answerer:
     return made(path.read_text())
-
-
-def ask(answerer: Answerer, **request: Any) -> dict[str, Any]:
-    return dict(json.loads(answerer.answer(json.dumps(request).encode(), 0.0)))
-
-
-def told(answerer: Answerer, **request: Any) -> dict[str, Any]:
-    answer = ask(answerer, **request)
-    assert answer["ok"], answer
-    return answer
 
 
 def position(answer: dict[str, Any], row: int = 0) -> np.ndarray:

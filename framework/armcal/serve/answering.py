@@ -6,6 +6,7 @@ import difflib
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from armcal.errors import ArmcalError, DataError, Location
 from armcal.serve.protocol import (
     VERSION,
     CalibrationTag,
+    Command,
     CompensateAnswer,
     CompensateRequest,
     ForwardAnswer,
@@ -29,7 +31,8 @@ from armcal.serve.protocol import (
 )
 from armcal.serve.reading import parsed, request_of
 from armcal.serve.rows import command_rows
-from armcal.serve.served_arm import ServedArm
+from armcal.serve.served_arm import TEMPERATURE, TEMPERATURE_KEY, ServedArm
+from armcal.serve.shares import Share, shares
 from armcal.use.compensation.request import Targets
 
 Clock = Callable[[], float]
@@ -79,7 +82,11 @@ class Answerer:
         arm = self._arm(request.arm)
         rows = self._postures(arm, request)
         acting, approach = arm.acting(request, len(rows)), arm.approach(request, len(rows))
-        poses = arm.compensator.forward(rows, acting, approach.T)
+        if request.temperature is None:
+            poses = arm.compensator.forward(rows, acting, approach.T)
+        else:
+            told = {TEMPERATURE: request.temperature}
+            poses = arm.at_temperature(TEMPERATURE_KEY).forward(rows, acting, approach.T, told)
         return {
             "armcal_serve": VERSION,
             "id": request.id,
@@ -103,19 +110,13 @@ class Answerer:
         if request.units in ("counts", "pulse_us") and not arm.compensator.expression.servos:
             hint = "Ask for rad or deg, or give the arm's joints pulse tables and calibrate again."
             raise DataError("the arm has no pulse tables.", where=Location(field="units"), hint=hint)
-        start = _start(arm, request)
-        find = arm.compensator.follow if request.path else arm.compensator.solve
-        try:
-            commands = find(_targets(arm, request), start)
-        except ValueError as fault:
-            raise DataError(f"{fault}.", where=Location(field="targets"), hint="Correct the request.") from fault
         return {
             "armcal_serve": VERSION,
             "id": request.id,
             "ok": True,
             "arm": arm.name,
             "joint_names": [*arm.joints],
-            "commands": command_rows(arm, commands, request.units, _tool),
+            "commands": _commands(arm, request),
         }
 
     def _arm(self, name: str | None) -> ServedArm:
@@ -128,6 +129,30 @@ class Answerer:
         found = "the calibration has several arms" if name is None else "the calibration has no such arm"
         hint = f"Did you mean {near[0]}?" if near else f"Say which: {known}."
         raise DataError(f"{found}.", where=Location(field="arm"), hint=hint)
+
+
+def _commands(arm: ServedArm, request: CompensateRequest) -> list[Command]:
+    """One for each target, in their order."""
+    start, rows = _start(arm, request), list[tuple[int, Command]]()
+    for share in _shares(arm, request):
+        find = share.compensator.follow if request.path else share.compensator.solve
+        try:
+            commands = find(share.targets, start)
+        except ValueError as fault:
+            raise _refused(fault) from fault
+        rows += zip(share.places, command_rows(arm, commands, request.units, _tool), strict=True)
+    return [command for _, command in sorted(rows, key=itemgetter(0))]
+
+
+def _shares(arm: ServedArm, request: CompensateRequest) -> list[Share]:
+    try:
+        return shares(arm, request, _targets(arm, request))
+    except ValueError as fault:
+        raise _refused(fault) from fault
+
+
+def _refused(fault: ValueError) -> DataError:
+    return DataError(f"{fault}.", where=Location(field="targets"), hint="Correct the request.")
 
 
 def _targets(arm: ServedArm, request: CompensateRequest) -> Targets:

@@ -7,7 +7,7 @@ import json
 import tempfile
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ from typing import Any
 from armcal.errors import ArmcalError, ConfigError, InputError, Location
 from armcal.serve.answering import Answerer
 from armcal.serve.protocol import CalibrationTag
-from armcal.serve.served_arm import ServedArm
+from armcal.serve.served_arm import TEMPERATURE, TEMPERATURE_KEY, ServedArm
 from armcal.solve.kernel import EvaluatorChoice
 from armcal.use.calibration import Calibration
 from armcal.use.compensation.request import Options, Redundancy
@@ -23,6 +23,7 @@ from armcal.use.compensation.request import Options, Redundancy
 _TRIES = 20
 _LONGEST_S = 1.0
 """Requests of each kind before the first real one: what is made when it is first needed is made then."""
+_ORDINARY_C = 20.0
 
 
 @dataclass(frozen=True)
@@ -108,12 +109,15 @@ def _arm(calibration: Calibration, name: str, order: Order) -> ServedArm:
     options = Options(limits=limits, redundancy=order.redundancy)
     try:
         # A request never waits for a compiler, so the compiler is waited for here.
-        compensator = calibration.compensator(name, options, allowed=allowed, choice=order.evaluator)
+        parts: dict[str, Any] = {"allowed": allowed, "choice": order.evaluator}
+        compensator, heated = calibration.compensator(name, options, **parts), None
+        if TEMPERATURE in arm.conditions:
+            heated = calibration.compensator(name, options, (TEMPERATURE,), **parts)
     except ValueError as fault:
         hint = "Correct the limits in the plan."
         raise ConfigError(f"{fault}.", where=Location(order.within or order.shown), hint=hint) from fault
     needs_payload = bool(arm.deflection_size) and statics.payload is None
-    return ServedArm(name, dict(arm.commanded), compensator, needs_payload)
+    return ServedArm(name, dict(arm.commanded), compensator, needs_payload, heated)
 
 
 def _space(within: str, joints: tuple[str, ...]) -> tuple[Mapping[str, tuple[float, float]], Any]:
@@ -132,19 +136,26 @@ def _tried(answerer: Answerer) -> None:
         InputError: an arm cannot even be predicted.
     """
     for arm in answerer.arms.values():
-        began = time.monotonic()
-        for i in range(_TRIES):
-            posture = {"joints": arm.written([0.05 * (k + 1) + 0.01 * i for k in range(len(arm.joints))], "rad")}
-            told = _asked(answerer, arm, {"do": "forward", **posture})
-            if not told["ok"]:
-                raise InputError(f"the arm {arm.name} cannot be predicted: {told['error']}", hint=told["hint"])
-            tool = told["tools"][0]
-            for target in (tool, {"position_mm": tool["position_mm"]}):
-                for path in (False, True):
-                    _asked(answerer, arm, {"do": "compensate", "targets": target, "path": path})
-            _asked(answerer, arm, {"do": "compensate", "targets": tool, "start_joints": posture["joints"]})
-            if time.monotonic() - began > _LONGEST_S:
-                break
+        _tried_with(answerer, arm, {})
+        if arm.heated is not None:
+            with suppress(InputError):  # what is ordinary elsewhere may be too hot for this arm
+                _tried_with(answerer, arm, {TEMPERATURE_KEY: _ORDINARY_C})
+
+
+def _tried_with(answerer: Answerer, arm: ServedArm, said: Mapping[str, float]) -> None:
+    began = time.monotonic()
+    for i in range(_TRIES):
+        posture = {"joints": arm.written([0.05 * (k + 1) + 0.01 * i for k in range(len(arm.joints))], "rad")}
+        told = _asked(answerer, arm, {"do": "forward", **posture, **said})
+        if not told["ok"]:
+            raise InputError(f"the arm {arm.name} cannot be predicted: {told['error']}", hint=told["hint"])
+        tool = told["tools"][0]
+        for target in (tool, {"position_mm": tool["position_mm"]}):
+            for path in (False, True):
+                _asked(answerer, arm, {"do": "compensate", "targets": target, "path": path, **said})
+        _asked(answerer, arm, {"do": "compensate", "targets": tool, "start_joints": posture["joints"], **said})
+        if time.monotonic() - began > _LONGEST_S:
+            break
 
 
 def _asked(answerer: Answerer, arm: ServedArm, request: Mapping[str, Any]) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from pydantic import Field, field_validator
 from typing_extensions import TypedDict  # pydantic checks no other before Python 3.12
 
 from armcal.base.quantities import Kind
-from armcal.base.settings import Acceleration3, Angle, Angle3, Force3, Length3, Mass, Settings, Torque3
+from armcal.base.settings import Acceleration3, Angle, Angle3, Force3, Length3, Mass, Settings, Temperature, Torque3
 from armcal.errors import ArmcalError
 from armcal.online.running.outputs import as_line
 
@@ -22,6 +22,7 @@ MAX_LINE_BYTES = 256 * 1024
 MAX_ROWS = 1000
 """So many targets or postures may stand in one request."""
 _MAX_ID = 200
+_ABSOLUTE_ZERO_C = -273.15
 
 Approach = Annotated[int, Field(ge=-1, le=1)]
 Joints = tuple[Angle, ...] | dict[str, Angle]
@@ -60,6 +61,7 @@ class Acting(_Quick):
         payload_com: its centre of mass, in the tool's frame (m).
         gravity: in the base frame (m/s^2).
         force, torque: on the tool, in the base frame (N, N m).
+        temperature: of the arm (C), where it changes with that.
         approach: from where joints come, by name or in the arm's order: -1, 0 (not known), 1.
     """
 
@@ -68,6 +70,7 @@ class Acting(_Quick):
     gravity: Acceleration3 | None = None
     force: Force3 | None = None
     torque: Torque3 | None = None
+    temperature: Annotated[Temperature, Field(ge=_ABSOLUTE_ZERO_C)] | None = None
     approach: tuple[Approach, ...] | dict[str, Approach] | None = None
 
 

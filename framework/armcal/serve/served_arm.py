@@ -18,6 +18,8 @@ from armcal.serve.protocol import Acting
 if TYPE_CHECKING:
     from armcal.use.compensation.compensator import Compensator
 
+TEMPERATURE = "temperature"
+TEMPERATURE_KEY = "temperature_C"
 _VECTORS = ("gravity", "payload_com", "force", "torque")
 _CHANNEL = {"payload_com": "payload"}
 """The channels of the payload's centre are called ``payload_x`` and so on, those of the others as the field."""
@@ -32,12 +34,14 @@ class ServedArm:
         dimensions: ``angle`` or ``length`` by commanded joint, in order.
         compensator: of the calibration as it was loaded.
         needs_payload: whether it gives under load and nothing says what hangs on it.
+        heated: the compensator of requests that tell the temperature; None where the arm does not change with it.
     """
 
     name: str
     dimensions: Mapping[str, str]
     compensator: Compensator
     needs_payload: bool
+    heated: Compensator | None = None
 
     @property
     def joints(self) -> tuple[str, ...]:
@@ -48,6 +52,12 @@ class ServedArm:
     def turns_only(self) -> bool:
         """Whether no commanded joint slides."""
         return set(self.dimensions.values()) <= {"angle"}
+
+    @property
+    def shown(self) -> Mapping[str, list[str]]:
+        """What a client can know of it: its joints, and the keys of the surroundings that it changes with."""
+        joints = [*self.joints]
+        return {"joints": joints} if self.heated is None else {"joints": joints, "conditions": [TEMPERATURE_KEY]}
 
     def angles(self, given: Sequence[Sequence[float] | Mapping[str, float]], field: str) -> Array:
         """Postures (N x n; rad) from angles in order or by name.
@@ -116,6 +126,17 @@ class ServedArm:
                 "Give payload_g, 0 where nothing hangs on it.",
             )
         return found
+
+    def at_temperature(self, field: str) -> Compensator:
+        """What answers where a field of the request tells the temperature.
+
+        Raises:
+            DataError: the arm does not change with it.
+        """
+        if self.heated is None:
+            hint = "Leave it out, or calibrate the arm with an effect that depends on it, such as thermal_length."
+            _refuse(f"the arm {self.name} does not change with the temperature.", field, hint)
+        return self.heated
 
     def _in_order(self, row: Sequence[float] | Mapping[str, float], field: str) -> list[float]:
         if isinstance(row, Mapping):

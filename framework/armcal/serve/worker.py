@@ -71,7 +71,7 @@ def _prepared(order: dict[str, Any], data: bytes, link: socket.socket) -> Answer
         told = {"fault": {"message": text, "file": order["shown"], "exit_code": EXIT_FAULT}}
         link.sendall(Message(ABOUT_ITSELF, json.dumps(told).encode()).packed())
         return None
-    arms = {name: {"joints": [*arm.joints]} for name, arm in answerer.arms.items()}
+    arms = {name: arm.shown for name, arm in answerer.arms.items()}
     link.sendall(Message(ABOUT_ITSELF, json.dumps({"ready": answerer.tag, "arms": arms}).encode()).packed())
     return answerer
 
