@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -33,6 +34,7 @@ class Pair:
         steps = BatchFunction(function, sample, "compiled", loop_source())
         assert steps.compiled
         limits = self.found.limits
+        self.steps = steps
         self.compiled, self.arrays = CompiledSearch(steps, limits, LENGTH), ArraySearch(steps, limits, LENGTH)
 
     def goal(self, count: int, stretch: float = 1.0) -> Goal:
@@ -101,9 +103,11 @@ def test_numbers_that_are_none_end_a_search_and_touch_no_other() -> None:
     target = goal.target.copy()
     target[:, 5] = np.nan
     target[0, 11] = np.inf
-    answer = pair.compiled(replace(goal, target=target), QUICK, NEAR)
-    others = np.delete(np.arange(20), [5, 11])
-    assert not answer.there[[5, 11]].any()
+    record, state = goal.record.copy(), goal.state.copy()
+    record[1, 13], state[0, 14], state[1, 15] = np.nan, np.nan, np.inf
+    answer = pair.compiled(replace(goal, record=record, target=target, state=state), QUICK, NEAR)
+    others = np.delete(np.arange(20), [5, 11, 13, 14, 15])
+    assert not answer.there[[5, 11, 13]].any()
     assert (answer.commands[:, others] == sound.commands[:, others]).all()
     assert (answer.there == sound.there)[others].all()
 
@@ -113,3 +117,71 @@ def test_arrays_are_read_however_they_are_stored() -> None:
     goal = pair.goal(30)
     turned = replace(goal, record=np.asfortranarray(goal.record), target=np.asfortranarray(goal.target))
     assert (pair.compiled(turned, QUICK, NEAR).commands == pair.compiled(goal, QUICK, NEAR).commands).all()
+
+
+def test_other_shapes_are_refused() -> None:
+    """C would read beyond them."""
+    pair = Pair("three", False)
+    goal = pair.goal(4)
+    for name, wrong in (("record", goal.record[:-1]), ("target", goal.target[:, :3]), ("state", goal.state[:, :1])):
+        with pytest.raises(ValueError, match=f"found {name} of the shape"):
+            pair.compiled(replace(goal, **{name: wrong}), QUICK, NEAR)
+    with pytest.raises(ValueError, match=r"found towards of the shape \(3, 1\), expected \(3, 4\)"):
+        pair.compiled(replace(goal, towards=np.zeros((3, 1))), QUICK, NEAR)
+
+
+def test_neighbours_do_not_matter() -> None:
+    """Alone, in another order, or beside joints that were turned a thousand times: the same to the last bit."""
+    pair = Pair("three", False)
+    limits = np.tile([-np.inf, np.inf], (3, 1))
+    goal = pair.goal(61)
+    goal = replace(goal, towards=drawn(pair.found, 61, seed=3).T)
+    wild = goal.record.copy()
+    wild[:3, ::8] = 1e6
+    order = np.random.default_rng(0).permutation(61)
+    for search in (CompiledSearch(pair.steps, limits, LENGTH), ArraySearch(pair.steps, limits, LENGTH)):
+        answer = search(goal, WISHED, NEAR)
+        turned = search(goal.subset(order), WISHED, NEAR)
+        beside = search(replace(goal, record=wild), WISHED, NEAR)
+        for name in ("commands", "states", "distances", "there"):
+            whole = getattr(answer, name)
+            assert (getattr(turned, name) == whole[..., order]).all()
+            assert (np.delete(getattr(beside, name) == whole, np.arange(0, 61, 8), axis=-1)).all()
+            for i in range(0, 61, 10):
+                alone = search(goal.subset(np.array([i])), WISHED, NEAR)
+                assert (getattr(alone, name)[..., 0] == whole[..., i]).all()
+
+
+def test_several_threads_may_search_at_once() -> None:
+    """Nothing in the library is shared between calls, and Python lets threads run meanwhile."""
+    pair = Pair("three", False)
+    goals = [pair.goal(203, stretch) for stretch in (1.0, 0.9, 1.1, 3.0)] * 4
+    with ThreadPoolExecutor(4) as threads:
+        together = list(threads.map(lambda goal: pair.compiled(goal, QUICK, NEAR).commands, goals))
+    for goal, found in zip(goals, together, strict=True):
+        assert (found == pair.compiled(goal, QUICK, NEAR).commands).all()
+
+
+@pytest.mark.parametrize("kind", ["compiled", "arrays"])
+def test_what_counts_as_there_is_what_is_given(kind: str) -> None:
+    """Not an earlier step that moved less but was not at rest, or was turned too far: a few of 1000 have such steps."""
+    pair, near = Pair("lrm", True), Near(metres=1e-9, radians=1e-8, rest=1e-11)
+    goal = pair.goal(1000)
+    found = getattr(pair, kind)(replace(goal, towards=drawn(pair.found, 1000, seed=3).T), WISHED, near)
+    record, free = goal.record.copy(), np.ones((6, 1000))
+    record[:6] = found.commands
+    answers = pair.steps(record, goal.target, 0 * free, free, free[:1], found.states)
+    _, left, _, error, _ = (each[:, found.there] for each in answers)
+    assert np.linalg.norm(error[:3], axis=0).max() <= near.metres
+    assert np.linalg.norm(error[3:], axis=0).max() <= near.radians
+    assert np.abs(left).max() <= near.rest
+
+
+@pytest.mark.parametrize("held", [(), (1,), (0, 1, 2)])
+def test_without_limits_and_with_nothing_that_may_move(held: tuple[int, ...]) -> None:
+    pair = Pair("lift", False)
+    limits = np.array([[-np.inf, np.inf], [-np.inf, 0.3], [-0.2, np.inf]])
+    pair.compiled, pair.arrays = (kind(pair.steps, limits, LENGTH) for kind in (CompiledSearch, ArraySearch))
+    goal = replace(pair.goal(100), held=held)
+    assert (pair.alike(goal, QUICK) > 0.3) == (not held)
+    pair.alike(replace(goal, towards=drawn(pair.found, 100, seed=3).T), WISHED)

@@ -46,13 +46,6 @@ LANEWISE2(if_else_zero)
    any joint angle in radians; larger or non-finite angles go to the C library. */
 BOTH void v_sincos(V x, V *sine, V *cosine) {
   const double shift = 0x1.8p52;
-  V size = choose(x < 0, -x, x);
-  int small = 1;
-  for (int i = 0; i < LANES; ++i) small &= size[i] < 1e5;
-  if (!small) {
-    for (int i = 0; i < LANES; ++i) { (*sine)[i] = sin(x[i]); (*cosine)[i] = cos(x[i]); }
-    return;
-  }
   V shifted = x * 0x1.45f306dc9c883p-1 + shift;
   I quadrant = (I)shifted;
   V turns = shifted - shift;
@@ -85,6 +78,9 @@ BOTH void v_sincos(V x, V *sine, V *cosine) {
   I flip_cosine = ((quadrant + 1) & 2) << 62;
   *sine = (V)((I)choose(swap, c, s) ^ flip_sine);
   *cosine = (V)((I)choose(swap, s, c) ^ flip_cosine);
+  /* Lane by lane, so that no record's numbers depend on its neighbours. */
+  for (int i = 0; i < LANES; ++i)
+    if (!(fabs(x[i]) < 1e5)) { (*sine)[i] = sin(x[i]); (*cosine)[i] = cos(x[i]); }
 }
 
 /* Channel by channel: entry k of a vector of records is at [k * stride]. */

@@ -39,12 +39,12 @@ class ArraySearch:
                 break
             step, left, moved, error, pull = self._steps(*search.inputs())
             away, turn = _size(error[:3]), _size(error[3:])
-            search.judge(away, turn, step, self._length)
             there = (away <= near.metres) & (turn <= near.radians)
             there &= np.abs(left).max(axis=0, initial=0.0) <= near.rest
             if search.towards is not None:
                 wishes = np.abs(step).max(axis=0) <= WISHED_ENOUGH
                 there &= wishes & ~search.pulled_back(pull, WISHED_ENOUGH).any(axis=0)
+            search.judge(away, turn, step, self._length, there)
             search.move(step, left, moved, pull)
             search.close(there)
         return search.answer()
@@ -111,14 +111,18 @@ class _Search:
             wish *= np.minimum(1.0, LONGEST / np.maximum(np.abs(wish).max(axis=0), LONGEST))
         return goal.record, goal.target, wish, self._free, self._damping[None], goal.state
 
-    def judge(self, away: Array, turn: Array, step: Array, length: float) -> None:
-        """Keep the best, and see whether it still becomes better; with a wish, how far that moves the arm counts."""
+    def judge(self, away: Array, turn: Array, step: Array, length: float, there: Mask) -> None:
+        """Keep what is there, else the best, and see whether it still becomes better.
+
+        With a wish, how far that moves the arm counts. What is there need not be the best: an earlier step may have
+        been better by this measure, and turned too far or not at rest.
+        """
         cost = away**2 + (length * turn) ** 2
         self._damping = self._manner.damping * np.minimum(np.nan_to_num(cost, nan=1.0), 1.0) + LEAST_DAMPING
         if self.towards is not None:
             cost = cost + length**2 * np.abs(step).max(axis=0) ** 2
         cost = np.where(np.isfinite(cost), cost, np.inf)
-        better = cost < self._best
+        better = there | (cost < self._best)
         self._kept.take(better, self._goal.record[: self._joints], self._goal.state, away, turn)
         self._best = np.minimum(self._best, cost)
         halved = self._best < 0.25 * self._milestone
@@ -138,13 +142,14 @@ class _Search:
         here = goal.record[: self._joints]
         size = np.abs(step).max(axis=0)
         scale = np.minimum(1.0, LONGEST / np.maximum(size, LONGEST))
-        wanted = here + np.where(np.isfinite(size), scale * step, 0.0)
+        finite = np.isfinite(size)
+        wanted = here + np.where(finite, scale * step, 0.0)
         new = np.clip(wanted, low, high)
         self._free = np.where(new != wanted, 0.0, np.where(self.pulled_back(pull, 0.0), 1.0, self._free))
         self._free[list(goal.held)] = 0.0
         along = np.where((new == wanted).all(axis=0), scale, 0.0)
         ahead = goal.state + left + along * moved
-        goal.state[:] = np.where(np.abs(ahead) < WILD, ahead, 0.0)
+        goal.state[:] = np.where(finite & (np.abs(ahead) < WILD), ahead, 0.0)
         goal.record[: self._joints] = new
 
     def close(self, there: Mask) -> None:

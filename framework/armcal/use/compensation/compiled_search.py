@@ -56,16 +56,25 @@ class CompiledSearch:
         self._search = steps.entry(_ENTRY)
         self._search.argtypes = [ctypes.POINTER(_Search)]
         self._search.restype = None
+        self._sizes = [steps.function.numel_in(place) for place in (0, 1, 5, 2)]
         self._low, self._high = (np.ascontiguousarray(limits[:, i]) for i in (0, 1))
         self._length = length
 
     def __call__(self, goal: Goal, manner: Manner, near: Near) -> Attempt:
-        """Search until it is near, or no longer comes nearer."""
+        """Search until it is near, or no longer comes nearer.
+
+        Raises:
+            ValueError: an array of another shape: C would read beyond it.
+        """
         count, joints = goal.record.shape[1], len(self._low)
         held = np.zeros(joints)
         held[list(goal.held)] = 1.0
-        given = [goal.record, goal.target, goal.state, goal.towards, self._low, self._high, held]
+        given = (goal.record, goal.target, goal.state, goal.towards)
+        for name, array, size in zip(_ARRAYS, given, self._sizes, strict=False):
+            if array is not None and array.shape != (size, count):
+                raise ValueError(f"found {name} of the shape {array.shape}, expected {(size, count)}")
         arrays = [None if each is None else np.ascontiguousarray(each, dtype=float) for each in given]
+        arrays += [self._low, self._high, held]
         commands, states = np.empty((joints, count)), np.empty((len(goal.state), count))
         distances, turns, there = np.empty((3, count))
         numbers = (manner.damping, manner.patience, manner.steps, near.metres, near.radians, near.rest)

@@ -66,12 +66,13 @@ static double largest(const V *vector, int count, int i) {
   return most;
 }
 
-/* Keep the best, and see whether it still becomes better; with a wish, how far that moves the arm counts. */
-static void judge(const Search *s, Lanes *now, int i, double away, double turn, double size) {
+/* Keep what is there, else the best, and see whether it still becomes better; with a wish, how far that moves the arm
+   counts. */
+static void judge(const Search *s, Lanes *now, int i, double away, double turn, double size, int there) {
   double cost = away * away + s->length * turn * (s->length * turn);
   now->damping[0][i] = s->damping * (cost < 1 ? cost : 1) + s->least_damping;
   if (s->towards) cost += s->length * s->length * size * size;
-  if (cost < now->best[i]) {
+  if (there || cost < now->best[i]) {
     for (int k = 0; k < N_JOINTS; ++k) now->kept[k][i] = now->record[k][i];
     for (int k = 0; k < N_STATE; ++k) now->kept[N_JOINTS + k][i] = now->state[k][i];
     now->best[i] = cost, now->away[i] = away, now->turn[i] = turn;
@@ -125,8 +126,8 @@ static void finish(const Search *s, const Lanes *now, int i, int there) {
 static int advance(const Search *s, Lanes *now, int i) {
   double away = norm_of(now->error, 0, 3, i), turn = norm_of(now->error, 3, N_ERROR, i);
   double size = largest(now->step, N_JOINTS, i);
-  judge(s, now, i, away, turn, size);
   int there = is_there(s, now, i, away, turn, size);
+  judge(s, now, i, away, turn, size, there);
   now->turns_taken[i] += 1;
   if (there || now->waited[i] >= s->patience || now->turns_taken[i] >= s->steps) {
     finish(s, now, i, there);
