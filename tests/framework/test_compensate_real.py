@@ -57,13 +57,14 @@ def test_joint_angles_follow_from_measured_tips(repository: Path, shared_data: P
     assert {free for free, found in inside.items() if not found.size} == SINGULAR
     everything = np.concatenate(list(inside.values()))
     assert len(everything) > 3000
-    # Intervals of angles follow from those of the tip: they are as good. From 50 poses both are too narrow by a bit.
+    # Intervals of angles follow from those of the tip: they are as good, and from 50 poses rather too wide.
     names = [f"tracker.{axis}" for axis in "xyz"]
     predicted, _ = calibration.predict(commands)
     missed = measured.stacked(names) - np.stack([predicted[name] for name in names])
     tips = np.abs(missed) <= np.stack([about.half_widths[name] for name in names])
     assert everything.mean() == pytest.approx(tips.mean(), abs=0.05)
-    assert np.mean(np.linalg.norm(missed, axis=0) <= about.radii["tracker"]) > 0.93
+    assert tips.mean() > 0.9
+    assert np.mean(np.linalg.norm(missed, axis=0) <= about.radii["tracker"]) > 0.95
 
 
 def _inside(calibration: Calibration, held: tuple[str, ...], measured: Dataset, covariance: np.ndarray) -> np.ndarray:

@@ -30,24 +30,18 @@ from armcal.solve.coverage import (
 )
 from armcal.solve.drift import with_drift
 from armcal.solve.prediction import LEVELS, Spread
-from armcal.solve.problem import Problem
 from armcal.solve.simulation import SimulationRequest, measured_without_noise, with_channels
 from armcal.solve.validation import folds
 from armcal.solve.weighing import fit
 from armcal.use.calibration import Calibration
 from click.testing import CliRunner, Result
+from drifting import DEMO, DRIFTING, FREE, dense_drift, dense_slopes, drifting_problem, problem_of
 
 ROOT = Path(__file__).resolve().parents[2]
 CONFIGS = ROOT / "configs" / "lrm_arm"
-DEMO = str(CONFIGS / "demo.yaml")
 POSES = CONFIGS / "demo.csv"
 MEASURED = ROOT.parent / "shared" / "data" / "lrm_arm" / "poses.csv"
-DRIFTING = (
-    "parameters.drift={arm.mdh.base_x: {sd: 2 mm, over: 8}, arm.mdh.theta1: {sd: 0.3 deg, over: 12}}",
-    "data.columns={sequence: pose_id}",
-)
 ONLY_BASE = "parameters.drift={arm.mdh.base_x: {sd: 2 mm, over: 8}}"
-FREE = 'parameters.free=["arm.mdh.base_[xyz]", arm.mdh.theta1, arm.spring.k1]'
 
 
 def setting(*texts: str) -> list[str]:
@@ -60,47 +54,9 @@ def armcal(*arguments: str) -> Result:
     return CliRunner().invoke(cli, list(arguments))
 
 
-def problem_of(loaded: Experiment, dataset):
-    system = loaded.system
-    parts = (system.arms, system.measurements, loaded.parameters, system.environment, dataset, "interpreted")
-    return Problem.build(*parts)
-
-
 @pytest.fixture(scope="module")
 def drifting():
-    """A small drifting problem: which records train, which are new, all with one drift."""
-    loaded = Experiment.load(DEMO, [FREE, 'parameters.priors={"arm.spring.k1": 0.02 rad/Nm}', *DRIFTING])
-    dataset = loaded.read().subset(np.arange(60))
-    problem = problem_of(loaded, dataset)
-    records = with_drift(problem, problem.records(dataset), dataset, loaded.parameters.nominal())
-    train, held = np.setdiff1d(np.arange(60), np.arange(3, 60, 4)), np.arange(3, 60, 4)
-    fitted = fit(problem, problem.subset(records, train), loaded.estimator, loaded.parameters.nominal())
-    return loaded, dataset, problem, records, train, held, fitted
-
-
-def _dense_slopes(problem, values, records, step=1e-7):
-    """Residuals (numbers of all records in a column) by free entries, by differences."""
-    columns = []
-    for entry in problem.parameters.free_entries:
-        ends = []
-        for sign in (1, -1):
-            moved = values.copy()
-            moved[entry] += sign * step
-            ends.append(problem.residuals(moved, records)[0].T.ravel())
-        columns.append((ends[0] - ends[1]) / (2 * step))
-    return np.array(columns).T
-
-
-def _dense_drift(loaded, places, nominal_slopes):
-    """Residuals by knots of both processes times their Cholesky factors, in plain numpy."""
-    parts = []
-    for name, sd, over in (("arm.mdh.base_x", 2e-3, 8.0), ("arm.mdh.theta1", np.deg2rad(0.3), 12.0)):
-        knots = over * np.arange(np.floor(places.min() / over), np.ceil(places.max() / over) + 2)
-        hats = np.maximum(0, 1 - np.abs(places[:, None] - knots) / over)
-        root = sd * np.linalg.cholesky(np.exp(-np.abs(knots[:, None] - knots) / over))
-        free = [b.name for b in loaded.parameters.free]
-        parts.append(nominal_slopes[:, [free.index(name)]] * np.repeat(hats @ root, 3, axis=0))
-    return np.hstack(parts)
+    return drifting_problem()
 
 
 def test_covariances_are_those_of_dense_gaussian_conditioning(drifting) -> None:
@@ -109,8 +65,8 @@ def test_covariances_are_those_of_dense_gaussian_conditioning(drifting) -> None:
     found = fitted.estimate
     by = predictor(problem, fitted)
     plain = [replace(each, correlation=None) for each in records]
-    slopes = _dense_slopes(problem, found.values, plain)
-    drift = _dense_drift(loaded, dataset.column("sequence"), _dense_slopes(problem, loaded.parameters.nominal(), plain))
+    slopes = dense_slopes(problem, found.values, plain)
+    drift = dense_drift(loaded, dataset.column("sequence"), dense_slopes(problem, loaded.parameters.nominal(), plain))
     rows = {name: (3 * chosen[:, None] + np.arange(3)).ravel() for name, chosen in (("t", train), ("h", held))}
     noise, s = 5e-4, found.noise_scale
     j, a = slopes[rows["t"]] / noise, drift[rows["t"]] / noise
@@ -132,8 +88,8 @@ def test_without_priors_it_is_the_joint_posterior(drifting) -> None:
     problem = replace(problem, parameters=loose)
     fitted = fit(problem, problem.subset(records, train), loaded.estimator, loose.nominal())
     plain = [replace(each, correlation=None) for each in records]
-    slopes = _dense_slopes(problem, fitted.estimate.values, plain)
-    drift = _dense_drift(loaded, dataset.column("sequence"), _dense_slopes(problem, loose.nominal(), plain))
+    slopes = dense_slopes(problem, fitted.estimate.values, plain)
+    drift = dense_drift(loaded, dataset.column("sequence"), dense_slopes(problem, loose.nominal(), plain))
     rows_t, rows_h = ((3 * chosen[:, None] + np.arange(3)).ravel() for chosen in (train, held))
     joint = np.hstack([slopes, drift])
     scale = np.concatenate([loose.scales(), np.ones(drift.shape[1])])
@@ -151,7 +107,7 @@ def test_nothing_told_of_the_drift_counts_all_of_it(drifting) -> None:
     by, found = predictor(problem, fitted), fitted.estimate
     new = problem.subset(records, held)
     plain = [replace(each, correlation=None) for each in new]
-    slopes = _dense_slopes(problem, found.values, plain)
+    slopes = dense_slopes(problem, found.values, plain)
     free = [b.name for b in loaded.parameters.free]
     variance = np.zeros(len(free))
     variance[free.index("arm.mdh.base_x")] = 4e-6

@@ -19,13 +19,14 @@ from armcal.solve.coverage import (
     coverage,
     predictor,
     score,
+    scored,
     stretch,
     told,
     whitened_like,
 )
 from armcal.solve.estimator import Estimator
 from armcal.solve.noise_findings import Finding
-from armcal.solve.prediction import LEVELS, STATED, Spread, is_position
+from armcal.solve.prediction import LEVELS, STATED, Predictor, Spread, is_position
 from armcal.solve.problem import FactorRecords, Problem
 from armcal.solve.validation import CrossValidation, Indices, Split
 from armcal.solve.weighing import WeighedFit
@@ -105,7 +106,7 @@ def interval_result(
     if problem.blueprint.groups:
         return IntervalResult()  # a contact reads nothing that could be predicted
     by, alike = predictor(problem, fitted), whitened_like(problem, fitted, records, estimator)
-    scores, shares, stretches = _crossed(crossed, split, records[0].count)
+    scores, shares, stretches = _crossed(by, fitted, crossed, split, records[0].count)
     holdout: dict[Recording, Coverage] = {}
     if len(split.holdout):
         for name, own in score(by, problem.subset(alike, split.holdout)).items():
@@ -129,14 +130,20 @@ def interval_result(
 
 
 def _crossed(
-    crossed: tuple[CrossValidation, Sequence[Split]] | None, split: Split, count: int
+    by: Predictor, fitted: WeighedFit, crossed: tuple[CrossValidation, Sequence[Split]] | None, split: Split, count: int
 ) -> tuple[dict[Recording, Scores], dict[Recording, Coverage], dict[Recording, Stretch]]:
-    """Scores in dataset order, the shares they hold by stretches of other folds, and the stretches from all of them."""
+    """Scores in dataset order, the shares they hold by stretches of other folds, and the stretches from all of them.
+
+    Residuals of the folds are put in units of what the whole fit would have predicted for the record: a fold with fewer
+    records claims less, and by its own claims would let the whole fit claim too much.
+    """
     if crossed is None:
         return {}, {}, {}
     judged, splits = crossed
     fits = [fit if isinstance(fit, PredictedFit) else None for fit in judged.fits]
-    found = collected(splits, [fit.scores if fit else {} for fit in fits], len(split.train))
+    misses = collected(splits, [fit.misses if fit else {} for fit in fits], len(split.train))
+    ways = {"same": by.left_out_of_recording, "new": by.left_out_of_new_recording}
+    found = {name: scored(by.problem, own, ways[name](fitted.records)) for name, own in misses.items()}
     shares: dict[Recording, Coverage] = {}
     for name, own in found.items():
         others: list[Stretch | None] = [None] * len(split.train)

@@ -30,6 +30,8 @@ from armcal.solve.weighing import WeighedFit, Weighing, fit
 
 Recording = Literal["same", "new"]
 """Whether what is predicted lies within the recording of the fit, whose drift is told, or in another one."""
+Misses = tuple[Array, ...]
+"""Raw residuals, one (n_r x N) a factor."""
 FEWEST = 40
 """Judged records for a stretch to be found."""
 LEVEL = 0.05
@@ -75,13 +77,13 @@ class Stretch:
 
 @dataclass(frozen=True)
 class PredictedFit(JudgedFit):
-    """A fit that also told how far off it would be.
+    """A fit that also tells how its predictions missed.
 
     Attributes:
-        scores: of the records that judge, by recording (``new`` only where something drifts).
+        misses: raw residuals of the records that judge, by recording (``new`` only where something drifts).
     """
 
-    scores: Mapping[Recording, Scores]
+    misses: Mapping[Recording, Misses]
 
 
 @dataclass(frozen=True)
@@ -139,12 +141,31 @@ def predictor(problem: Problem, fitted: WeighedFit) -> Predictor:
     return Predictor(problem, found.values, found.covariance, found.noise_scale, found.degrees_of_freedom, drift)
 
 
+def missed(by: Predictor, held: Sequence[FactorRecords]) -> dict[Recording, Misses]:
+    """Residuals of records that a fit did not see."""
+    found: dict[Recording, Misses] = {"same": by.residuals(held)}
+    if by.drifts:
+        found["new"] = by.problem.residuals(by.values, held)
+    return found
+
+
 def score(by: Predictor, held: Sequence[FactorRecords]) -> dict[Recording, Scores]:
     """Residuals of records that a fit did not see, in units of what it predicts for them."""
-    found: dict[Recording, Scores] = {"same": _scores(by.problem, by.residuals(held), by.in_recording(held))}
-    if by.drifts:
-        found["new"] = _scores(by.problem, by.problem.residuals(by.values, held), by.in_new_recording(held))
-    return found
+    ways = {"same": by.in_recording, "new": by.in_new_recording}
+    return {name: scored(by.problem, found, ways[name](held)) for name, found in missed(by, held).items()}
+
+
+def scored(problem: Problem, found: Misses, spreads: Sequence[Spread]) -> Scores:
+    """Residuals in units of what is predicted for them; nan where there are none."""
+    errors = [residual / spread.deviations for residual, spread in zip(found, spreads, strict=True)]
+    reaches = [
+        np.linalg.norm(residual, axis=0) / spread.radius()
+        for kernel, residual, spread in zip(problem.kernels, found, spreads, strict=True)
+        if is_position(kernel)
+    ]
+    count = found[0].shape[1]
+    freedom = np.full(count, max(spreads[0].freedom, 1))
+    return Scores(np.vstack(errors), np.array(reaches).reshape(-1, count), freedom)
 
 
 def whitened_like(
@@ -157,7 +178,7 @@ def whitened_like(
 
 
 def fit_and_predict(task: FitTask) -> JudgedFit:
-    """Fit, judge and score; see ``fit_and_judge``."""
+    """Fit, judge and tell how it missed; see ``fit_and_judge``."""
     if task.problem.blueprint.groups:
         return fit_and_judge(task)  # a socket that is found anew from the records that judge it has no interval
     began = time.perf_counter()
@@ -167,10 +188,10 @@ def fit_and_predict(task: FitTask) -> JudgedFit:
         judged = judged_fit(task, fitted.solution, train, held, began)
         if not judged.converged:
             return judged
-        scores = score(predictor(task.problem, fitted), whitened_like(task.problem, fitted, held, task.estimator))
+        misses = missed(predictor(task.problem, fitted), whitened_like(task.problem, fitted, held, task.estimator))
     except NotConvergedError:
         return failed_fit(task, began)
-    return PredictedFit(judged.errors, judged.at_rest, True, time.perf_counter() - began, scores)
+    return PredictedFit(judged.errors, judged.at_rest, True, time.perf_counter() - began, misses)
 
 
 def besides(scores: Scores, places: Indices) -> Scores:
@@ -181,18 +202,15 @@ def besides(scores: Scores, places: Indices) -> Scores:
 
 
 def collected(
-    splits: Sequence[Split], found: Sequence[Mapping[Recording, Scores]], count: int
-) -> dict[Recording, Scores]:
-    """The scores of all folds in the order of the records; nan where a fold has none."""
-    result: dict[Recording, Scores] = {}
-    for split, scores in zip(splits, found, strict=True):
-        for name, own in scores.items():
-            if name not in result:
-                errors, reaches = (np.full((len(rows), count), np.nan) for rows in (own.errors, own.reaches))
-                result[name] = Scores(errors, reaches, np.ones(count))
-            whole = result[name]
-            whole.errors[:, split.holdout], whole.reaches[:, split.holdout] = own.errors, own.reaches
-            whole.freedom[split.holdout] = own.freedom
+    splits: Sequence[Split], found: Sequence[Mapping[Recording, Misses]], count: int
+) -> dict[Recording, Misses]:
+    """The residuals of all folds in the order of the records; nan where a fold has none."""
+    result: dict[Recording, Misses] = {}
+    for split, misses in zip(splits, found, strict=True):
+        for name, own in misses.items():
+            whole = result.setdefault(name, tuple(np.full((len(each), count), np.nan) for each in own))
+            for mine, each in zip(whole, own, strict=True):
+                mine[:, split.holdout] = each
     return result
 
 
@@ -239,18 +257,6 @@ def told(found: Coverage, of: str, recording: Recording = "same") -> Finding:
     if share > STATED:
         return Finding("note", f"{text}: wider than need be.", test)
     return Finding("warning", f"{text}: too narrow.", test, "Take the shares found for what a +- is worth.")
-
-
-def _scores(problem: Problem, found: Sequence[Array], spreads: Sequence[Spread]) -> Scores:
-    errors = [residual / spread.deviations for residual, spread in zip(found, spreads, strict=True)]
-    reaches = [
-        np.linalg.norm(residual, axis=0) / spread.radius()
-        for kernel, residual, spread in zip(problem.kernels, found, spreads, strict=True)
-        if is_position(kernel)
-    ]
-    count = found[0].shape[1]
-    freedom = np.full(count, max(spreads[0].freedom, 1))
-    return Scores(np.vstack(errors), np.array(reaches).reshape(-1, count), freedom)
 
 
 def _ranked(scores: Array, level: float) -> float:

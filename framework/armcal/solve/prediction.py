@@ -29,6 +29,9 @@ STATED = 0.9
 """The level of a plus-minus."""
 RADIUS_LEVEL = 0.95
 _POSITION = ["x", "y", "z"]
+_LEAST_LEFT = 1e-3
+"""Of the information on a direction that a record alone tells: without it next to nothing would be known."""
+_Parts = tuple[Array, Array, Array]
 
 
 @dataclass(frozen=True)
@@ -131,19 +134,44 @@ class Predictor:
 
     def in_new_recording(self, records: Sequence[FactorRecords]) -> tuple[Spread, ...]:
         """Scatter about predictions without drift, where nothing is known of it; one a factor."""
-        slopes = self._slopes(records)
-        variance = self.noise_scale**2 * self._drift_variances()
-        spreads = [np.einsum("rvn,v,svn->nrs", slope, variance, slope, optimize=True) for slope in slopes]
-        return self._spreads(records, slopes, spreads)
+        return tuple(Spread(noise + values + drift, self.freedom) for noise, values, drift in self._unknown(records))
 
     def in_recording(self, records: Sequence[FactorRecords]) -> tuple[Spread, ...]:
         """Scatter about predictions with the drift that the recording of the fit tells; one a factor.
 
         The records must share the innovations of their drift with those of the fit.
         """
+        return tuple(Spread(noise + values + drift, self.freedom) for noise, values, drift in self._told(records))
+
+    def left_out_of_recording(self, fitted: Sequence[FactorRecords]) -> tuple[Spread, ...]:
+        """As ``in_recording`` of the fit's own records, each as if the fit had done without it."""
+        parts = zip(fitted, self._told(fitted), strict=True)
+        return tuple(
+            Spread(_without_itself(noise, values + drift, each), self.freedom) for each, (noise, values, drift) in parts
+        )
+
+    def left_out_of_new_recording(self, fitted: Sequence[FactorRecords]) -> tuple[Spread, ...]:
+        """As ``in_new_recording`` of the fit's own records, each as if the fit had done without it.
+
+        As if each record told of the values alone, though neighbours share their drift: a little too narrow.
+        """
+        parts = zip(fitted, self._unknown(fitted), strict=True)
+        return tuple(
+            Spread(_without_itself(noise + drift, values, each), self.freedom) for each, (noise, values, drift) in parts
+        )
+
+    def _unknown(self, records: Sequence[FactorRecords]) -> list[_Parts]:
+        """What scatter comes from, in a recording whose drift is not known."""
+        slopes = self._slopes(records)
+        variance = self.noise_scale**2 * self._drift_variances()
+        drift = [np.einsum("rvn,v,svn->nrs", slope, variance, slope, optimize=True) for slope in slopes]
+        return self._parts(records, slopes, drift)
+
+    def _told(self, records: Sequence[FactorRecords]) -> list[_Parts]:
+        """What scatter comes from, in the recording whose drift was told."""
         here, there = records[0].correlation, self.drift
         if here is None or there is None:
-            return self.in_new_recording(records)
+            return self._unknown(records)
         told = cho_solve((there.correlation.root, True), there.slopes)
         slopes, spreads = [], []
         for raw, slope in zip(here.raw, self._slopes(records), strict=True):
@@ -152,17 +180,15 @@ class Predictor:
             left = there.correlation.absorbed(by_innovation.reshape(-1, here.size).T)
             parts = left.reshape(here.size, *by_innovation.shape[:2])
             spreads.append(self.noise_scale**2 * np.einsum("zrn,zsn->nrs", parts, parts, optimize=True))
-        return self._spreads(records, slopes, spreads)
+        return self._parts(records, slopes, spreads)
 
-    def _spreads(
-        self, records: Sequence[FactorRecords], slopes: Sequence[Array], drift: Sequence[Array]
-    ) -> tuple[Spread, ...]:
+    def _parts(self, records: Sequence[FactorRecords], slopes: Sequence[Array], drift: Sequence[Array]) -> list[_Parts]:
+        """Covariances by noise, by values and by drift (N x n_r x n_r each), one of each a factor."""
         found = []
         for kernel, each, slope, moved in zip(self.problem.kernels, records, slopes, drift, strict=True):
-            noise = self.noise_scale**2 * _noise(kernel, each)
             values = np.einsum("rvn,vw,swn->nrs", slope, self.covariance, slope, optimize=True)
-            found.append(Spread(noise + values + moved, self.freedom))
-        return tuple(found)
+            found.append((self.noise_scale**2 * _noise(kernel, each), values, moved))
+        return found
 
     def _slopes(self, records: Sequence[FactorRecords]) -> list[Array]:
         """Residuals by free canonical entries, raw, one (n_r x n_v x N) a factor."""
@@ -183,6 +209,20 @@ def is_position(kernel: Kernel) -> bool:
     """Whether a factor's residual is measured minus predicted position."""
     channels = [channel.rpartition(".")[2] for channel in kernel.factor.output_channels]
     return channels == _POSITION and kernel.factor.residual.numel() == len(_POSITION)
+
+
+def _without_itself(noise: Array, known: Array, each: FactorRecords) -> Array:
+    """Covariance of each record's residual (N x n_r x n_r) had the fit not had the record.
+
+    ``known`` is that of what the fit predicts, which the record helped to know: of information it added its weight
+    times the inverse of its noise, and that is taken away again.
+    """
+    root = np.linalg.cholesky(noise)
+    inverse = np.linalg.inv(root)
+    sizes, axes = np.linalg.eigh(inverse @ known @ inverse.transpose(0, 2, 1))
+    left = np.maximum(1.0 - each.weight[: each.count, None] * sizes, _LEAST_LEFT)
+    turned = root @ axes
+    return np.asarray(noise + np.einsum("nrk,nk,nsk->nrs", turned, sizes / left, turned))
 
 
 def _whole(blocks: Iterator[Array], width: int) -> Array:
