@@ -254,3 +254,20 @@ def test_moving_the_base_moves_the_targets_and_not_the_commands() -> None:
     second = two.solve(two.targets(there[:, :3, 3]), commands[0])
     assert first.found.all()
     assert apart(first.joint_angles, second.joint_angles) < 1e-6
+
+
+def test_a_condition_that_the_arm_does_not_change_with_is_refused() -> None:
+    with pytest.raises(ValueError, match="the arm arm does not change with humidity; it changes with temperature"):
+        calibration("warm").compensate(np.array([[0.2, 0.1, 0.2]]), payload=0.0, conditions={"humidity": 0.4})
+    with pytest.raises(ValueError, match="does not change with temperature; it changes with nothing"):
+        calibration("three").expression(conditions=("temperature",))
+
+
+def test_the_shortest_call_takes_conditions_too() -> None:
+    position = np.array([[0.2, 0.1, 0.2]])
+    given = calibration("warm")
+    cold = given.compensate(position, payload=0.0)
+    warm = given.compensate(position, payload=0.0, conditions={"temperature": 80.0})
+    for commands, told in ((cold, {}), (warm, {"temperature": 80.0})):
+        assert apart(predicted(given, commands.joint_angles, **told)[:, :3, 3], position) < 1e-8
+    assert apart(warm.joint_angles, cold.joint_angles) > 1e-4

@@ -223,14 +223,14 @@ class Calibration:
         """What to command so that the tool is at positions (N x 3; m; base frame), turned as base_R_tool (N x 3 x 3).
 
         ``start`` (n or N x n; rad or m) is where the arm comes from, ``told`` the rest of ``Compensator.targets``:
-        payload, gravity, approach. Who asks often keeps a ``compensator``.
+        payload, gravity, approach, conditions of the surroundings. Who asks often keeps a ``compensator``.
 
         Raises:
             ValueError: no such arm, limits of a joint that it does not have, or arrays of other shapes.
             DataError: the arm is elastic and nothing says what hangs on the tool.
         """
         self.require_payload(told.get("payload") is not None)
-        compensator = self.compensator(arm, options)
+        compensator = self.compensator(arm, options, tuple(told.get("conditions") or ()))
         return compensator.solve(compensator.targets(positions, rotations, **told), start)
 
     def _named(self, arm: str | None) -> str:

@@ -94,7 +94,14 @@ def arm_expression(
 
     ``conditions`` are those of the surroundings that will be told (``temperature``); others are taken as the effects
     take what is not told.
+
+    Raises:
+        ValueError: the arm does not change with a condition.
     """
+    idle = [name for name in conditions if name not in arm.conditions]
+    if idle:
+        known = ", ".join(arm.conditions) or "nothing of the surroundings"
+        raise ValueError(f"the arm {arm.name} does not change with {', '.join(idle)}; it changes with {known}")
     smooth, servos = _without_steps(arm)
     joints = tuple(arm.commanded)
     channels = (*joints, *(APPROACH + joint for joint in joints), *LOAD_CHANNELS, *conditions)
