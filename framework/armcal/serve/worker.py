@@ -18,7 +18,7 @@ from armcal.serve.frames import ABOUT_ITSELF, Message, Unpacker
 if TYPE_CHECKING:
     from armcal.serve.answering import Answerer
 
-_NICENESS = 10
+_NICENESS = 19
 """Requests come first."""
 _CHUNK = 256 * 1024
 
