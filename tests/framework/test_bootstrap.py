@@ -173,6 +173,7 @@ def _fitted(lrm, *overrides):
     return experiment, problem, records, estimate(problem, records, experiment.estimator.solve(problem, records, start))
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_refits_anywhere(lrm) -> None:
     experiment, problem, records, found = _fitted(lrm)
     for method in ("blocks", "parametric"):

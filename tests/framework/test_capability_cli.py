@@ -91,6 +91,7 @@ def test_a_second_study_keeps_the_first_and_gives_the_same(tmp_path: Path) -> No
     assert (out / "earlier" / "1" / "map.csv").read_text() == (out / "map.csv").read_text()
 
 
+@pytest.mark.slow
 def test_a_calibration_is_surveyed_with_its_accuracy(calibration: Path, tmp_path: Path) -> None:
     rules = CONFIGS / "capability.yaml"
     done = armcal("capability", calibration, "--settings", rules, "--out", tmp_path / "o", "--json", *QUICK)

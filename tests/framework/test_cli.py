@@ -195,7 +195,9 @@ def test_errors_are_json_too_where_json_was_asked_for() -> None:
     assert "nowhere.yaml" in json.loads(done.stdout)["error"]["message"]
 
 
-@pytest.mark.parametrize("moment", [0.3, 0.7, 0.9, 1.1, 1.3])
+@pytest.mark.parametrize(
+    "moment", [0.3, *(pytest.param(moment, marks=pytest.mark.slow) for moment in (0.7, 0.9, 1.3)), 1.1]
+)
 def test_a_killed_run_leaves_the_earlier_calibration_whole(demo: Path, tmp_path: Path, moment: float) -> None:
     folder = tmp_path / "run"
     assert armcal("run", DEMO, "--out", str(folder), "-q", *FAST).exit_code == 0

@@ -335,6 +335,7 @@ def scores(lrm, seeds, drifts, count=80):
     return np.array(held), np.array(ratios), np.mean(noise)
 
 
+@pytest.mark.slow
 def test_intervals_that_know_of_a_drift_hold_the_truth_and_others_do_not(lrm):
     seeds = range(100, 108)
     held, ratios, _ = scores(lrm, seeds, PLANTED)

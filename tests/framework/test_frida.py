@@ -254,6 +254,7 @@ def test_intervals_hold_the_truth_in_many_recordings(name):
     assert 0.93 < share < 0.97, f"{share:.4f} of {count}"
 
 
+@pytest.mark.slow
 def test_the_closing_error_of_both_arms_twists_is_that_of_the_encoders():
     """On postures that did not train, against what the truth itself leaves open."""
     case = Case.load("dual_twists_tools_held")

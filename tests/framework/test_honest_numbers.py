@@ -28,6 +28,7 @@ def armcal(*arguments: str) -> Result:
     return CliRunner().invoke(cli, list(arguments))
 
 
+@pytest.mark.slow
 def test_intervals_hold_under_priors_when_the_noise_is_ten_times_what_was_declared() -> None:
     """Truths drawn from the priors; pooled over 60 experiments of 6 parameters."""
     priors = 'parameters.priors={"arm.mdh.theta?": 0.4 deg}'

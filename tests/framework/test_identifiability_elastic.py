@@ -71,6 +71,7 @@ def test_planted_elastic_combinations_are_found_exactly(lrm: Any, name: str) -> 
     assert np.linalg.norm(slopes @ direction) < 1e-8 * values[0] * np.linalg.norm(direction)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "names",
     [

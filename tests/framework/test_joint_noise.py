@@ -226,6 +226,7 @@ def inside_and_errors(seeds):
     return float(np.mean(held)), np.array(errors).reshape(seeds, -1)
 
 
+@pytest.mark.slow
 def test_a_hundred_seeds_lie_in_their_intervals_as_often_as_they_say():
     share, errors = inside_and_errors(100)
     assert 0.92 <= share <= 0.98

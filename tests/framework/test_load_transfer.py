@@ -114,6 +114,7 @@ def test_a_cell_at_another_load_is_a_run_at_one_judged_on_the_other(plain: Path)
         assert cell.errors.p95 == pytest.approx(held.p95, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_records_that_were_measured_give_what_their_simulation_gave(place: Path, tmp_path: Path) -> None:
     simulated = _run(place / "study.yaml")
     out = place / "out"

@@ -79,7 +79,9 @@ def compliances(out):
     return {p["name"]: (p["value"], p["sd"]) for p in springs}
 
 
-@pytest.mark.parametrize("loss", ["huber", "cauchy", "reject"])
+@pytest.mark.parametrize(
+    "loss", [*(pytest.param(loss, marks=pytest.mark.slow) for loss in ("huber", "cauchy")), "reject"]
+)
 def test_every_output_tells_of_the_wrong_records(spoilt, robust_run, plain_run, loss):
     _, wrong = spoilt
     out, told, shown = robust_run(loss)

@@ -296,6 +296,7 @@ def test_the_unit_of_length_does_not_matter() -> None:
     assert np.sqrt(np.diag(other.belief.gaussian.covariance)) / ratio == pytest.approx(sd, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_where_the_instrument_stands_does_not_matter() -> None:
     """The same arm measured in a frame that is shifted and turned about the upright."""
     moved = begun(settings(), placement=("position_mm=[700, -250, 120]", "rpy_deg=[0, 0, 130]"))

@@ -131,6 +131,7 @@ def test_a_step_of_joint_3_is_named_and_followed(halves: Halves, step_deg: float
     assert [e["joint"] for e in course.decisions()[2:] if "joint" in e] == []
 
 
+@pytest.mark.slow
 def test_without_gate_and_process_noise_the_filter_ends_where_a_batch_over_all_does(
     poses: Path, tmp_path: Path
 ) -> None:
@@ -157,6 +158,7 @@ def test_without_gate_and_process_noise_the_filter_ends_where_a_batch_over_all_d
     assert max(off) < 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", MODELS)
 def test_from_nominal_values_on_shuffled_records_it_ends_within_two_percent_of_the_batch(
     model: str, poses: Path, tmp_path: Path
@@ -182,6 +184,7 @@ def test_from_nominal_values_on_shuffled_records_it_ends_within_two_percent_of_t
     assert ends <= 1.02 * aim
 
 
+@pytest.mark.slow
 def test_the_window_starts_from_nominal_values_as_well(poses: Path, tmp_path: Path) -> None:
     """Option 1, of whose records the last 20 are held."""
     first = calibrated("option1", poses, tmp_path)

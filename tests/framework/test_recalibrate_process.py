@@ -90,6 +90,7 @@ def killed(tmp_path: Path, kills: int, rows: int) -> None:
     assert replayed(folder).calibration_text() == (folder / "calibration.yaml").read_text()
 
 
+@pytest.mark.slow
 def test_fifty_kills_lose_nothing_and_repeat_nothing(tmp_path: Path) -> None:
     killed(tmp_path, 50, 600)
 

@@ -115,6 +115,7 @@ def test_wrong_postures_are_found_whatever_their_size(off_deg: float) -> None:
     assert judged({22: off_deg, 26: -off_deg}, 28)[1] == {22, 26}
 
 
+@pytest.mark.slow
 def test_all_at_once_gives_what_one_after_the_other_gives() -> None:
     experiment = Experiment.load(DEMO)
     dataset = experiment.read().subset(range(30))

@@ -152,6 +152,7 @@ def test_the_calibration_as_it_was_at_any_entry(whole: Path, tmp_path: Path) -> 
     assert armcal("predict", out, "--poses", DEMO.with_suffix(".csv"), "--out", tmp_path / "p.csv").exit_code == 0
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
 def test_another_evaluator_agrees_within_the_bound_and_decides_alike(whole: Path) -> None:
     found = told(whole, "--evaluator", "compiled")
@@ -163,6 +164,7 @@ def test_another_evaluator_agrees_within_the_bound_and_decides_alike(whole: Path
     assert done.exit_code == 0 and "another than the journal's" in done.output and "noted in full" in done.output
 
 
+@pytest.mark.slow
 def test_other_settings_are_told_beside_what_was_done(whole: Path, tmp_path: Path) -> None:
     until = read_until(whole / "journal", sequence_of(whole, records()[79].record_id))[1][-1].sequence
     same = told(whole, "--set", "gate.probability=0.999", "--until", until)

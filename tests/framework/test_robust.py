@@ -140,7 +140,7 @@ def test_hardly_any_experiment_without_outliers_has_a_record_set_aside(lrm):
     assert count <= 8  # 1.5 expected; the median scale makes it somewhat more
 
 
-@pytest.mark.parametrize("loss", ["huber", "cauchy"])
+@pytest.mark.parametrize("loss", [pytest.param("huber", marks=pytest.mark.slow), "cauchy"])
 def test_the_answer_minimises_the_robust_cost(lrm, loss):
     """Against scipy on the loss itself, at the scale that was found."""
     q, points, _ = measured(60, 7, outliers=0.05)
@@ -258,6 +258,7 @@ def test_distances_of_good_records_are_chi_distributed(lrm):
         assert np.mean(squared < chi2.ppf(level, 3)) == pytest.approx(level, abs=0.05)
 
 
+@pytest.mark.slow
 def test_a_record_alone_in_telling_a_parameter_is_never_set_aside(lrm):
     """Its residual is zero whatever it says; taking it away would leave the parameter undetermined."""
     q = oracle.random_poses(30, 3)

@@ -114,6 +114,7 @@ def test_tables_come_back_though_nobody_knew_springs_or_axes(whole):
         assert not servo.outliers
 
 
+@pytest.mark.slow
 def test_the_springs_that_matter_are_found_with_them(whole, truth):
     for name in ("arm.spring.k2", "arm.spring.k4"):
         value, sd = whole.compliances[name]

@@ -334,6 +334,7 @@ def test_a_variant_whose_fits_fail_is_never_chosen(place: Path) -> None:
         _run(_write(place, alone), "estimator.max_iterations=1", "study.seed=1", "statics.payload_g=500")
 
 
+@pytest.mark.slow
 def test_a_study_judges_by_every_record_whatever_a_run_would_hold_out(place: Path, ladder) -> None:
     path = _write(place, SMALL + "validation: {holdout: 0.5, folds: 9, seed: 5}\n")
     held = _run(path)

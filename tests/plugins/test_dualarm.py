@@ -242,6 +242,7 @@ def ran(case, folder, *settings):
     return json.loads(result.stdout), {p["name"]: p for p in kept if p["free"]}
 
 
+@pytest.mark.slow
 def test_closed_chains_and_tracked_points_in_one_file_give_what_neither_gives_alone(mixed, tmp_path):
     still = ("arms.left.joint_noise_rad=0", "arms.right.joint_noise_rad=0")
     mixed_csv(mixed, 12)

@@ -221,6 +221,7 @@ def test_temperature_goes_by_day_and_night_and_acts() -> None:
         assert np.abs(tips(made)[i] - tips_at(alone, moved)[0]).max() < 1e-10
 
 
+@pytest.mark.slow
 def test_creep_goes_along_a_line_or_walks_at_random() -> None:
     assert parsed_creep("0.05 deg in 30 d") == ("0.05 deg", 30 * DAY_S, False)
     assert parsed_creep("walk 2 mm in 12 h") == ("2 mm", 12 * 3600.0, True)

@@ -194,7 +194,7 @@ def agree(lrm, seed, count, *overrides):
     return smallest
 
 
-@pytest.mark.parametrize(("seed", "count"), [(1, 60), (21, 100)])
+@pytest.mark.parametrize(("seed", "count"), [(1, 60), pytest.param(21, 100, marks=pytest.mark.slow)])
 def test_cone_and_root_agree_where_matrices_end_on_the_boundary(lrm, seed, count):
     smallest = agree(lrm, seed, count)
     assert np.sum(smallest < 1e-9) >= 4, "few matrices on the boundary: not the case meant"
@@ -284,7 +284,7 @@ def training_sets(lrm, seeds, solver):
     return smallest
 
 
-@pytest.mark.parametrize("solver", [CONE, ROOT], ids=["cone", "root"])
+@pytest.mark.parametrize("solver", [CONE, pytest.param(ROOT, marks=pytest.mark.slow)], ids=["cone", "root"])
 def test_no_fit_has_a_negative_eigenvalue(lrm, solver):
     assert min(training_sets(lrm, range(3), solver)) >= LEAST_EIGENVALUE
 

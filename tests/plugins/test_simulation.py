@@ -59,7 +59,10 @@ def test_without_noise_the_truth_comes_back(solver: str) -> None:
 
 @pytest.mark.parametrize(
     ("seeds", "pooled", "single"),
-    [(50, (0.925, 0.975), (0.80, 1.0)), pytest.param(SEEDS, (0.94, 0.96), (0.90, 0.99), marks=pytest.mark.slow)],
+    [
+        pytest.param(50, (0.925, 0.975), (0.80, 1.0), marks=pytest.mark.slow),
+        pytest.param(SEEDS, (0.94, 0.96), (0.90, 0.99), marks=pytest.mark.slow),
+    ],
 )
 def test_intervals_hold_the_truth_as_often_as_they_say(
     seeds: int, pooled: tuple[float, float], single: tuple[float, float]

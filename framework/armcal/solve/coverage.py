@@ -40,7 +40,7 @@ _MEANT = {"same": "", "new": " without what is told of the drift, as in a new re
 
 @dataclass(frozen=True)
 class Scores:
-    """Residuals of judged records in units of what was predicted; nan where there was no fit to judge.
+    """Residuals of judged records in units of what was predicted; nan where there was no fit to judge, or no residual.
 
     Attributes:
         errors: residual numbers over their standard deviations, all factors stacked (n_r x N).
@@ -58,8 +58,8 @@ class Scores:
 
     @property
     def judged(self) -> Array:
-        """Whether each record was judged (N)."""
-        return np.asarray(np.isfinite(self.errors).all(axis=0))
+        """Whether each record was judged (N), by any of its measurements."""
+        return np.asarray(np.isfinite(self.errors).any(axis=0))
 
 
 @dataclass(frozen=True)
@@ -142,11 +142,14 @@ def predictor(problem: Problem, fitted: WeighedFit) -> Predictor:
 
 
 def missed(by: Predictor, held: Sequence[FactorRecords]) -> dict[Recording, Misses]:
-    """Residuals of records that a fit did not see."""
+    """Residuals of records that a fit did not see; nan where a measurement was not made."""
     found: dict[Recording, Misses] = {"same": by.residuals(held)}
     if by.drifts:
         found["new"] = by.problem.residuals(by.values, held)
-    return found
+    return {
+        name: tuple(np.where(each.measured, own, np.nan) for each, own in zip(held, misses, strict=True))
+        for name, misses in found.items()
+    }
 
 
 def score(by: Predictor, held: Sequence[FactorRecords]) -> dict[Recording, Scores]:
@@ -223,7 +226,8 @@ def stretch(scores: Scores) -> Stretch | None:
     if judged.sum() < FEWEST:
         return None
     rank = [_ranked(scores.of_level(level)[:, judged].ravel(), level) for level in LEVELS]
-    radius = _ranked(scores.reaches[:, judged].ravel(), RADIUS_LEVEL) if len(scores.reaches) else None
+    reaches = scores.reaches[:, judged].ravel()
+    radius = _ranked(reaches, RADIUS_LEVEL) if np.isfinite(reaches).any() else None
     return Stretch(tuple(rank), radius)
 
 
@@ -238,7 +242,7 @@ def coverage(scores: Scores, stretches: Sequence[Stretch | None] | None = None) 
     known = bool(own) and all(own[i] is not None for i in judged)
     shares, radius = _shares(scores, own, judged) if known else (None, None)
     held = _held(scores, own if known else none, STATED)[:, judged]
-    return Coverage(len(judged), held.size, raw, raw_radius, shares, radius, _worth(held))
+    return Coverage(len(judged), int(np.isfinite(held).sum()), raw, raw_radius, shares, radius, _worth(held))
 
 
 def told(found: Coverage, of: str, recording: Recording = "same") -> Finding:
@@ -260,26 +264,30 @@ def told(found: Coverage, of: str, recording: Recording = "same") -> Finding:
 
 
 def _ranked(scores: Array, level: float) -> float:
-    """The ceil((n + 1) p)-th smallest, or the largest."""
-    ordered = np.sort(scores)
+    """The ceil((n + 1) p)-th smallest of those that there are, or the largest."""
+    ordered = np.sort(scores[np.isfinite(scores)])
     return float(ordered[min(int(np.ceil((len(ordered) + 1) * level)), len(ordered)) - 1])
 
 
 def _held(scores: Scores, stretches: Sequence[Stretch | None], level: float) -> Array:
-    """Whether each number lies within its interval (n_r x N)."""
+    """Whether each number lies within its interval (n_r x N): one, zero, or nan where there is none."""
     place = LEVELS.index(level)
     factors = np.array([np.nan if s is None else s.coordinates[place] for s in stretches])
-    return np.asarray(scores.of_level(level) <= factors)
+    return _within(scores.of_level(level), factors)
 
 
 def _shares(
     scores: Scores, stretches: Sequence[Stretch | None], judged: Indices
 ) -> tuple[tuple[float, ...], float | None]:
-    shares = tuple(float(np.mean(_held(scores, stretches, level)[:, judged])) for level in LEVELS)
-    if not len(scores.reaches):
+    shares = tuple(float(np.nanmean(_held(scores, stretches, level)[:, judged])) for level in LEVELS)
+    if not np.isfinite(scores.reaches[:, judged]).any():
         return shares, None
     radii = np.array([np.nan if s is None or s.radius is None else s.radius for s in stretches])
-    return shares, float(np.mean((scores.reaches <= radii)[:, judged]))
+    return shares, float(np.nanmean(_within(scores.reaches, radii)[:, judged]))
+
+
+def _within(scores: Array, limits: Array) -> Array:
+    return np.where(np.isfinite(scores), scores <= limits, np.nan)
 
 
 def _worth(held: Array) -> float:
@@ -288,10 +296,10 @@ def _worth(held: Array) -> float:
     The standard error of a record's share over circular blocks of neighbours [Politis1992] against that of
     independent numbers; no more than there are, and where all or none were held no more than the records.
     """
-    share, by_record = float(np.mean(held)), held.mean(axis=0)
+    share, by_record = float(np.nanmean(held)), np.nanmean(held, axis=0)
     if share in (0.0, 1.0):
         return float(held.shape[1])
     error = standard_error_of_mean(by_record, automatic_block_length(by_record))
     if not np.isfinite(error) or error == 0:
         return float(held.shape[1])
-    return float(np.clip(share * (1 - share) / error**2, 1.0, held.size))
+    return float(np.clip(share * (1 - share) / error**2, 1.0, np.isfinite(held).sum()))
