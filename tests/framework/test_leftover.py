@@ -149,6 +149,7 @@ def test_the_family_wise_level_holds(lrm):
     assert false_findings(lrm, range(100, 300), count=100) <= 16
 
 
+@pytest.mark.slow
 def test_errors_that_resemble_their_neighbours_do_not_pass_for_dependence_on_the_pose(lrm):
     """Long-lived errors: neighbours are found to correlate, with time, and poses are not blamed more often than 5 %."""
     blamed = 0

@@ -173,6 +173,7 @@ def test_payloads_are_told_apart_to_a_tenth_of_a_gram_and_the_others_left_out(pl
     assert np.isnan(two.errors_mm[("elastic", (0.0,))][40:]).all()
 
 
+@pytest.mark.slow
 def test_any_workers_give_the_same(place: Path) -> None:
     one, other = (_run(place / "study.yaml", executor=e) for e in (Sequential(), Workers("loky", 2)))
     assert one.cells == other.cells

@@ -113,6 +113,7 @@ def test_every_output_tells_of_the_wrong_records(spoilt, robust_run, plain_run, 
     Calibration.load(out / "calibration.yaml")
 
 
+@pytest.mark.slow
 def test_robust_compliances_are_the_simulated_truths(repository, robust_run):
     truth = dict(
         re.findall(r"^(arm\.spring\.k\d): (\S+) rad/Nm$", (repository / "configs/lrm_arm/truth.yaml").read_text(), re.M)

@@ -98,6 +98,7 @@ def test_outliers_hardly_matter(seeds: int) -> None:
     assert caught > 0.95
 
 
+@pytest.mark.slow
 def test_without_a_gate_outliers_matter() -> None:
     """The figures above would mean little if they did not."""
     ungated = begun(settings(gating="off"))

@@ -309,7 +309,13 @@ def experiment(tmp_path: Path) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("name", BROKEN)
+QUICKLY_BROKEN = ("import", "exits")
+"""The others break in the same place."""
+
+
+@pytest.mark.parametrize(
+    "name", [n if n in QUICKLY_BROKEN else pytest.param(n, marks=pytest.mark.slow) for n in BROKEN]
+)
 def test_a_broken_plugin_warns_once_and_breaks_nothing(name: str, tmp_path: Path, experiment: Path) -> None:
     text, fault = BROKEN[name]
     write_plugin(tmp_path, name, text)

@@ -183,6 +183,7 @@ def test_without_overrides_the_masses_load_the_joints_that_move_them(lrm):
     assert np.abs(expected - oracle.tip(oracle.published(), q)).max() > 1e-5
 
 
+@pytest.mark.slow
 def test_the_tip_moves_with_every_parameter_as_the_independently_iterated_oracles(lrm):
     """All 77 parameters, masses and centres too: central differences of the oracle against the Jacobian."""
     experiment, q = lrm.experiment(), oracle.random_poses(8, 8)

@@ -306,6 +306,7 @@ def test_the_order_of_the_records_does_not_matter(lrm):
     same_answer(problem, records, one, other)
 
 
+@pytest.mark.slow
 def test_what_a_parameter_calls_an_ordinary_size_does_not_matter(lrm):
     problem, records = springs_measured(lrm, 12, 50)
     parameters, random = problem.parameters, np.random.default_rng(2)
