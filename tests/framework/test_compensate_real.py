@@ -63,6 +63,7 @@ def test_joint_angles_follow_from_measured_tips(repository: Path, shared_data: P
     missed = measured.stacked(names) - np.stack([predicted[name] for name in names])
     tips = np.abs(missed) <= np.stack([about.half_widths[name] for name in names])
     assert everything.mean() == pytest.approx(tips.mean(), abs=0.05)
+    assert all(found.mean() > 0.9 for found in inside.values() if found.size)
     assert tips.mean() > 0.9
     assert np.mean(np.linalg.norm(missed, axis=0) <= about.radii["tracker"]) > 0.95
 
