@@ -16,7 +16,7 @@ import numpy as np
 from armcal.base.domains import Array
 from armcal.solve.compiler import cache_directory
 
-SOURCE = Path(__file__).with_name("pinocchio_loop.cpp")
+SOURCE, ARM = (Path(__file__).with_name(name) for name in ("pinocchio_loop.cpp", "pinocchio_arm.hpp"))
 FLAGS = [
     *("-std=c++17", "-O2", "-march=native", "-DNDEBUG", "-fPIC", "-shared", "-w"),
     *("-DBOOST_MPL_LIMIT_LIST_SIZE=30", "-DBOOST_MPL_CFG_NO_PREPROCESSED_HEADERS"),
@@ -63,7 +63,8 @@ def compiled(source: Path) -> ctypes.CDLL | str:
     if eigen is None:
         return "no headers of Eigen: apt-get install libeigen3-dev"
     command = [compiler, *FLAGS, f"-I{pinocchio}", f"-I{eigen}", str(source)]
-    key = hashlib.sha256((" ".join(command) + source.read_text(encoding="utf-8")).encode()).hexdigest()[:20]
+    text = "".join(path.read_text(encoding="utf-8") for path in (source, ARM))
+    key = hashlib.sha256((" ".join(command) + text).encode()).hexdigest()[:20]
     target = cache_directory() / "benchmarks" / f"{key}.so"
     if not target.exists():
         target.parent.mkdir(parents=True, exist_ok=True, mode=0o700)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from armcal.base.config_text import plain
@@ -43,6 +45,29 @@ def following_arm(folder: Path) -> Path:
     return folder / "a.yaml"
 
 
+def made_record(
+    description: Mapping[str, Any], entries: Sequence[Mapping[str, Any]], increments: Sequence[str], **more: Any
+) -> CalibrationFile:
+    """A calibration's file without a run: unit noise, unit information on the increments."""
+    return CalibrationFile.model_validate(
+        {
+            "armcal_calibration": 1,
+            "created": "2031-01-01T00:00:00+00:00",
+            "experiment": "made up",
+            "converged": True,
+            "software": {},
+            "identity": {"arm": identity_of(description)},
+            "noise": {"scale": 1.0, "degrees_of_freedom": 1000},
+            "quality_mm": {},
+            "verdict": {},
+            **description,
+            "parameters": entries,
+            "information": {"increments": increments, "square_root": np.eye(len(increments)).tolist()},
+            **more,
+        }
+    )
+
+
 @cache
 def made_calibration(config: Path, overrides: tuple[str, ...] = (), seed: int = 1) -> Calibration:
     """Every parameter of the arms moved at random; springs of 0.03 rad/(N m) or so, play and lag of a few mrad."""
@@ -67,25 +92,7 @@ def made_calibration(config: Path, overrides: tuple[str, ...] = (), seed: int = 
     ]
     known = parameters.with_free(free)
     description = {key: plain(system.description[key]) for key in ("arms", "measurements", "statics")}
-    record = CalibrationFile.model_validate(
-        {
-            "armcal_calibration": 1,
-            "created": "2031-01-01T00:00:00+00:00",
-            "experiment": "made up",
-            "converged": True,
-            "software": {},
-            "identity": {"arm": identity_of(description)},
-            "noise": {"scale": 1.0, "degrees_of_freedom": 1000},
-            "quality_mm": {},
-            "verdict": {},
-            **description,
-            "parameters": entries,
-            "information": {
-                "increments": known.coordinate_names,
-                "square_root": np.eye(len(known.coordinate_names)).tolist(),
-            },
-        }
-    )
+    record = made_record(description, entries, known.coordinate_names)
     return Calibration(system, parameters.with_nominal(np.array(values)), record)
 
 

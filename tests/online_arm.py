@@ -27,7 +27,7 @@ from armcal.plugins import discover
 from armcal.solve.online import OnlineEstimator, Update
 from armcal.solve.problem import Problem
 from armcal.use.calibration import Calibration
-from armcal.use.calibration_file import CalibrationFile, identity_of
+from made_calibrations import made_record
 
 CONFIG = Path(__file__).resolve().parents[1] / "configs" / "lrm_arm" / "arm.yaml"
 NOISE_M = 0.0003
@@ -91,26 +91,8 @@ def calibration(
         for name, unit, value in zip(parameters.entry_names, units, values.tolist(), strict=True)
     ]
     description = {key: plain(source.data[key]) for key in ("arms", "measurements", "statics")}
-    record = CalibrationFile.model_validate(
-        {
-            "armcal_calibration": 1,
-            "created": "2031-01-01T00:00:00+00:00",
-            "experiment": "simulated arm",
-            "converged": True,
-            "software": {},
-            "identity": {"arm": identity_of(description)},
-            "noise": {"scale": 1.0, "degrees_of_freedom": 1000},
-            "quality_mm": {},
-            "verdict": {},
-            **description,
-            "parameters": entries,
-            "prediction": {
-                "entries": names,
-                "covariance": [row[: i + 1].tolist() for i, row in enumerate(covariance)],
-            },
-            "information": {"increments": parameters.coordinate_names, "square_root": np.eye(len(names)).tolist()},
-        }
-    )
+    told = {"entries": names, "covariance": [row[: i + 1].tolist() for i, row in enumerate(covariance)]}
+    record = made_record(description, entries, parameters.coordinate_names, prediction=told)
     return Calibration(system, system.parameters({}).with_nominal(values), record)
 
 

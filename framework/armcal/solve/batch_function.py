@@ -68,8 +68,8 @@ class BatchFunction:
         """Build it; ``sample`` are inputs (entries x 8 each) on which C must agree with the virtual machine.
 
         ``auto`` takes what was compiled before, and else lets the compiler work for the next time once so many records
-        were asked for that it would have paid; ``compiled`` waits
-        for it; ``interpreted`` does without.
+        were asked for that it would have paid; ``compiled`` waits for it; ``interpreted`` does without. A ``loop`` is
+        compiled with the function.
         """
         self.function = function
         self._sizes_out = [function.numel_out(i) for i in range(function.n_out())]

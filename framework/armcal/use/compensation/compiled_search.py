@@ -70,7 +70,7 @@ class CompiledSearch:
         held = np.zeros(joints)
         held[list(goal.held)] = 1.0
         given = (goal.record, goal.target, goal.state, goal.towards)
-        for name, array, size in zip(_ARRAYS, given, self._sizes, strict=False):
+        for name, array, size in zip(_ARRAYS[: len(given)], given, self._sizes, strict=True):
             if array is not None and array.shape != (size, count):
                 raise ValueError(f"found {name} of the shape {array.shape}, expected {(size, count)}")
         arrays = [None if each is None else np.ascontiguousarray(each, dtype=float) for each in given]
