@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import casadi as ca
 import numpy as np
-from armcal.arm.assembly import Arm
+from armcal.arm.assembly import PLACEMENT, Arm
 from armcal.arm.model import forward
 from armcal.base.domains import Array
+from armcal.base.quaternions import rotation_matrix
 from armcal.base.settings import Settings
 from armcal.errors import ConfigError, ProblemError
 from armcal.use.exporter import Exported, ExportRequest, random_commands
+from armcal.use.rigid_chain import numeric_chain, rigid_chain, rpy_of
 
 from armcal_urdf.edit import Placed, with_origins
 from armcal_urdf.encoding import encode
@@ -21,6 +24,8 @@ from armcal_urdf.numbers import Three
 
 TOLERANCE_M = 1e-9
 TOLERANCE_RAD = 1e-9
+MOST_SHIFT_MM, MOST_TURN_DEG = 5.0, 3.0
+"""Beyond these a first joint is not made wrong: it holds where the arm stands."""
 
 
 class UrdfExportSettings(Settings):
@@ -63,7 +68,8 @@ class UrdfExporter:
             for each in placed
             for before, now in zip((*each.joint.xyz, *each.joint.rpy), (*each.xyz, *each.rpy), strict=True)
         )
-        return Exported(encode(text, old.encoding or "utf-8"), changed, _left_out(request))
+        remarks = _placed(request) or _base_moved(model, values)
+        return Exported(encode(text, old.encoding or "utf-8"), changed, _left_out(request), remarks=remarks)
 
 
 def _three(joint: str, names: tuple[str, ...], values: Mapping[str, float]) -> Three:
@@ -76,11 +82,23 @@ def _read_again(old: UrdfSettings, text: str) -> UrdfModel:
     return UrdfModel(UrdfSettings.model_validate(told))
 
 
+def _nominal(model: UrdfModel) -> dict[str, float]:
+    return {block.name: float(block.nominal[0]) for block in model.parameters()}
+
+
+def _first(model: UrdfModel, values: Mapping[str, float]) -> Array:
+    """base_T_joint of the first joint that moves (4 x 4)."""
+    return (
+        rigid_chain(numeric_chain(model, {name: np.array(value) for name, value in values.items()}))
+        .joints[0]
+        .base_T_joint
+    )
+
+
 def _compare(request: ExportRequest, model: UrdfModel, written: UrdfModel, values: Mapping[str, float]) -> None:
     """All frames in random poses within the limits, as calibrated and as written."""
     arm, commands = request.arm, random_commands(request.arm)
-    nominal = {block.name: block.nominal[0] for block in written.parameters()}
-    calibrated, again = _frames(arm, model, values, commands), _frames(arm, written, nominal, commands)
+    calibrated, again = _frames(arm, model, values, commands), _frames(arm, written, _nominal(written), commands)
     shift = float(np.linalg.norm(calibrated[..., :3, 3] - again[..., :3, 3], axis=-1).max())
     apart = np.linalg.norm(calibrated[..., :3, :3] - again[..., :3, :3], axis=(-2, -1)).max()
     turn = float(apart) / np.sqrt(2)
@@ -108,5 +126,33 @@ def _left_out(request: ExportRequest) -> tuple[str, ...]:
     arm, nominal = request.arm, {block.name: block.nominal for block in request.arm.parameters()}
     moved = [name for name, value in request.values.items() if tuple(value) != nominal[name]]
     masses = sorted({name.split(".")[2] for name in moved if name.startswith(f"{request.name}.links.")})
-    found = [*arm.effects, *(f"the mass of {link}" for link in masses)]
-    return (*found, "the placement of its base") if arm.placement else tuple(found)
+    return (*arm.effects, *(f"the mass of {link}" for link in masses))
+
+
+def _placed(request: ExportRequest) -> tuple[str, ...]:
+    """Where the arm stands, of which a URDF says nothing: its base is the arm's own."""
+    if not request.arm.placement:
+        return ()
+    scope = f"{request.name}.{PLACEMENT}_"
+    x, y, z = (1000 * float(request.values[scope + axis][0]) for axis in XYZ)
+    roll, pitch, yaw = np.degrees(rpy_of(rotation_matrix(request.values[f"{scope}rotation"])))
+    return (
+        f"the URDF begins at the arm's own base; in the measurement frame that base stands at x {x:.3f}, y {y:.3f}, "
+        f"z {z:.3f} mm, roll {roll:.4f}, pitch {pitch:.4f}, yaw {yaw:.4f} deg",
+    )
+
+
+def _base_moved(model: UrdfModel, values: Mapping[str, float]) -> tuple[str, ...]:
+    """Whether the first joint that moves stands elsewhere than in the file, by more than an arm is made wrong."""
+    before, now = (_first(model, {**_nominal(model), **told}) for told in ({}, values))
+    shift = 1000 * float(np.linalg.norm(now[:3, 3] - before[:3, 3]))
+    cosine = (float(np.trace(before[:3, :3].T @ now[:3, :3])) - 1) / 2
+    turn = math.degrees(math.acos(min(1.0, max(-1.0, cosine))))
+    if shift <= MOST_SHIFT_MM and turn <= MOST_TURN_DEG:
+        return ()
+    first = model.urdf_chain.moving[0].name
+    return (
+        f"the first joint, {first}, moved by {shift:.3g} mm and turned by {turn:.3g} deg against its URDF: "
+        "if where the arm stands before the instrument is in it, give the arm a placement, free that instead of "
+        f"{first}'s origin, and calibrate again",
+    )

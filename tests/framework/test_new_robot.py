@@ -202,6 +202,34 @@ def test_a_urdf_gives_limits_and_masses(here: Path) -> None:
     assert experiment.simulator() is not None
 
 
+def test_the_trackers_frame_stays_out_of_a_urdfs_joints(here: Path) -> None:
+    """Measured by a tracker 0.8 m away and turned by 80 deg: the first joint is exported as it was."""
+    source = ROOT / "configs" / "ball" / "arm7.urdf"
+    assert new_robot("arm7", "--urdf", str(source), "--tip", "ball_link").exit_code == 0
+    truth = (here / "arm7" / "truth.yaml").read_text(encoding="utf-8").splitlines()
+    half = math.radians(80) / 2
+    stands = {
+        "x": "820 mm",
+        "y": "-310 mm",
+        "z": "505 mm",
+        "rotation[w]": math.cos(half),
+        "rotation[z]": math.sin(half),
+    }
+    kept = [line for line in truth if "placement" not in line]
+    kept += [f"'arm.placement_{name}': {value}" for name, value in stands.items()]
+    (here / "arm7" / "truth.yaml").write_text("\n".join(kept), encoding="utf-8")
+    for command in (
+        "simulate arm7/simulated.yaml --out arm7/simulated.csv",
+        "run arm7/simulated.yaml --out arm7/runs/away",
+        "export arm7/runs/away/calibration.yaml --format urdf --out arm7/out.urdf",
+    ):
+        ran = CliRunner().invoke(cli, command.split(), prog_name="armcal")
+        assert ran.exit_code == 0, ran.output
+    assert "in the measurement frame that base stands at x 8" in ran.stderr and "yaw 7" in ran.stderr
+    first, now = ((path.read_text().partition('name="j2"')[0]) for path in (source, here / "arm7" / "out.urdf"))
+    assert now == first
+
+
 ANSWERS = """standard
 2
 revolute

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -275,3 +276,53 @@ def test_formats_that_nobody_offers_are_refused(folder, tmp_path):
     ran = armcal("export", folder / "run" / "calibration.yaml", "--format", "urdff", "--out", tmp_path / "x")
     assert ran.exit_code == 2
     assert "Did you mean 'urdf'?" in ran.stderr
+
+
+# Where the arm stands
+
+
+def with_base(folder, free, truth, placement=""):
+    """The arm with its base elsewhere in the tracker's frame: simulated, calibrated, exported."""
+    config = CONFIG.replace("    effects: {spring: {type: torsional_spring, joints: [q2]}}\n", placement)
+    config = config.replace("free: [arm.urdf.q2_x, arm.urdf.q3_y, arm.spring.k2]", f"free: [{free}]")
+    (folder / "a.yaml").write_text(config)
+    (folder / "arm.urdf").write_bytes(ARM)
+    (folder / "truth.yaml").write_text(truth)
+    for arguments in (
+        ("simulate", folder / "a.yaml", "--out", folder / "m.csv"),
+        ("run", folder / "a.yaml", "--out", folder / "run"),
+        ("export", folder / "run" / "calibration.yaml", "--format", "urdf", "--force", "--out", folder / "out.urdf"),
+    ):
+        ran = armcal(*arguments)
+        assert ran.exit_code == 0, ran.output
+    return ran.stderr, (folder / "out.urdf").read_bytes()
+
+
+def test_a_base_that_holds_the_trackers_frame_is_warned_of_with_its_amount(tmp_path):
+    free = "arm.urdf.q1_x, arm.urdf.q1_yaw, arm.urdf.q2_x"
+    told, _ = with_base(tmp_path, free, "arm.urdf.q1_x: 840 mm\narm.urdf.q1_yaw: 89 deg\narm.urdf.q2_x: 2 mm\n")
+    assert "the first joint, q1, moved by 840 mm and turned by 89 deg against its URDF" in told
+    assert "give the arm a placement" in told
+    quiet, _ = with_base(tmp_path, free, "arm.urdf.q1_x: 2 mm\narm.urdf.q1_yaw: 1 deg\narm.urdf.q2_x: 2 mm\n")
+    assert "moved by" not in quiet
+
+
+def test_a_placement_stays_out_of_the_urdf_and_is_said(tmp_path):
+    placement = "    placement: {position_mm: [0, 0, 0], rpy_deg: [0, 0, 0]}\n"
+    free = "'arm.placement_*', arm.urdf.q2_x"
+    yaw = np.radians(60) / 2
+    truth = "arm.placement_x: 840 mm\narm.placement_z: -90 mm\narm.urdf.q2_x: 2 mm\n"
+    truth += f"'arm.placement_rotation[w]': {np.cos(yaw)}\n'arm.placement_rotation[z]': {np.sin(yaw)}\n"
+    told, content = with_base(tmp_path, free, truth, placement)
+    assert re.search(r"in the measurement frame that base stands at x (839.99|840.00)\d, y", told)
+    assert "yaw 60.0" in told and "up to 0.000" not in told and "left out" not in told
+    assert content.count(b"<origin") == ARM.count(b"<origin") + 1
+    assert b'<origin xyz="0 0 0.3"/>' in content
+
+
+def test_what_is_left_out_is_said_in_significant_digits():
+    from armcal.cli.export import _up_to
+
+    assert _up_to(38.4794) == "up to 38.5 mm"
+    assert _up_to(0.000123) == "up to 0.000123 mm"
+    assert _up_to(1e-13) == "which does not move the tool"

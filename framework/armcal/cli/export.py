@@ -14,6 +14,8 @@ from armcal.use.calibration import Calibration
 from armcal.use.exporter import POSES, Exported, Exporter, ExportRequest, effects_reach, request_of
 from armcal.use.file_set import require_new, write_new, write_over
 
+_NOTHING_MM = 1e-6
+
 
 @click.command()
 @click.argument("calibration", type=click.Path(path_type=Path))
@@ -123,7 +125,12 @@ def _tell(
     for remark in found.remarks:
         voice.warn(f"{remark}.")
     if found.left_out:
-        words = "the calibrated arm does not settle in all poses" if apart is None else f"up to {apart:.3f} mm"
+        words = "the calibrated arm does not settle in all poses" if apart is None else _up_to(apart)
         voice.warn(
             f"left out, a {kind} file cannot hold it: {', '.join(found.left_out)} ({words}, in {POSES} random poses)."
         )
+
+
+def _up_to(apart_mm: float) -> str:
+    """In significant digits: a thousandth of a micrometre is rounding, and said as none."""
+    return f"up to {apart_mm:.3g} mm" if apart_mm >= _NOTHING_MM else "which does not move the tool"

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from armcal.base.domains import Array
+from armcal.base.domains import Array, Rotation
 from armcal.base.parameters import ParameterBlock, Parameters
 from armcal.base.units import to_unit
 from armcal.scaffold.rendering import number
@@ -23,26 +23,27 @@ _WRITTEN = {"rad_per_Nm": "rad/Nm"}
 
 
 def candidates(parameters: Parameters) -> tuple[str, ...]:
-    """The numbers that a first calibration may look for: geometry, springs and the target; no masses, no gravity."""
+    """What a first calibration may look for: placement, geometry, springs, the target; no masses, no gravity."""
     return tuple(
         block.name
         for block in parameters.blocks
         if block.unit in _SHOWN
-        and block.size == 1
+        and (block.size == 1 or isinstance(block.domain, Rotation))
         and not fnmatch.fnmatch(block.name, "arm.links.*")
         and not block.name.startswith("statics.")
     )
 
 
 def made_up(parameters: Parameters, load_Nm: float) -> dict[str, float]:
-    """True values (SI) of every candidate.
+    """True values (SI) of every candidate that is one number; a rotation stays as it was stated.
 
     Args:
         parameters: of the robot, with their nominal values.
         load_Nm: the moment of its whole weight at its full reach; 0 if its masses are not known.
     """
     random = np.random.default_rng(SEED)
-    return {name: _true(parameters[name], load_Nm, random) for name in candidates(parameters)}
+    names = [name for name in candidates(parameters) if parameters[name].size == 1]
+    return {name: _true(parameters[name], load_Nm, random) for name in names}
 
 
 def as_text(parameters: Parameters, values: Mapping[str, float]) -> dict[str, str]:

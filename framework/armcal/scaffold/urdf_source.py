@@ -7,7 +7,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from armcal.arm.assembly import MassiveModel
+from armcal.arm.assembly import PLACEMENT, MassiveModel
 from armcal.arm.model import Joint
 from armcal.errors import ConfigError, DataError, Location
 from armcal.plugins import PluginRegistry
@@ -76,15 +76,18 @@ def _joint(joint: Joint, where: Location) -> RobotJoint:
 
 
 def _preferred(joints: tuple[RobotJoint, ...]) -> tuple[tuple[str, ...], ...]:
-    """The first origin and the target, which say how arm and tracker stand; then joints that move, then the others."""
+    """The placement and the target, which say how arm and tracker stand; then joints that move, then the others.
+
+    Without a placement of its own the tracker's frame would end up in the first joint, and with it in every export.
+    """
     moving = tuple(f"arm.urdf.{joint.name}_*" for joint in joints)
-    return (moving[:1], ("tracker.target_*",), moving, ("arm.urdf.*",), ("arm.spring.*",))
+    return ((f"arm.{PLACEMENT}_*",), ("tracker.target_*",), moving, ("arm.urdf.*",), ("arm.spring.*",))
 
 
 def _priors(joints: tuple[RobotJoint, ...]) -> dict[str, str]:
-    """Of the joints beyond the first, whose origin says where the arm stands before the tracker as well."""
+    """How far each joint's origin may be off the URDF; where the arm stands before the tracker has none."""
     found = {}
-    for joint in joints[1:]:
+    for joint in joints:
         found[f"arm.urdf.{joint.name}_[xyz]"] = "10 mm"
         found[f"arm.urdf.{joint.name}_[rpy][oia]*"] = "2 deg"
     return found
