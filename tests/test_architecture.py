@@ -130,6 +130,7 @@ ORDER = [
     "armcal.config.servo_file",
     "armcal.config.system",
     "armcal.config.selection",
+    "armcal.use.measured_point",
     "armcal.use.tool_expression",
     "armcal.use.compensation.request",
     "armcal.use.compensation.turning",

@@ -92,7 +92,7 @@ def places(rows: list[dict[str, str]], name: str = "tool") -> np.ndarray:
 
 def test_the_commands_lead_where_the_targets_are(desk: Desk) -> None:
     text = told(desk.ask(desk.file()))
-    assert "5 of 5 targets are had" in text
+    assert "5 of 5 targets are reached" in text
     assert "nominal commands:" in text
     assert {row["reached"] for row in desk.answers()} == {"yes"}
     tools = predicted(calibration("three"), desk.commands())
@@ -177,8 +177,8 @@ def test_a_pose_file_may_hold_the_targets(desk: Desk) -> None:
 def test_what_is_missed_is_told_in_words(desk: Desk) -> None:
     text = told(desk.ask(desk.file(rows=[[3000, 0, 0]] * 1 + [[3000 + i, 0, 0] for i in range(1, 8)])))
     assert text.count("out of reach: no command comes nearer than") == 5
-    assert "3 more targets cannot be had; the file says why" in text
-    assert "0 of 8 targets are had" in text
+    assert "3 more targets cannot be reached; the file says why" in text
+    assert "0 of 8 targets are reached" in text
     assert "error" not in text.splitlines()[-1]
 
 

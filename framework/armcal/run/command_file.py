@@ -66,7 +66,7 @@ def _extra(compensator: Compensator, assessed: Assessed) -> Iterator[tuple[str, 
                 yield f"{joint}_counts", tuple(str(count) for count in commands.counts[:, i])
                 yield f"{joint}_pulse_us", _texts(1e6 * tick * commands.counts[:, i])
     yield "reached", tuple(_ENGLISH[bool(had)] for had in commands.found)
-    yield from _pose("tool", commands.base_T_tool)
+    yield from _pose("tool", assessed.tools)
     yield "error_mm", _texts(1000 * commands.distances)
     yield "error_deg", _texts(np.asarray(np.degrees(commands.turns)))
     if assessed.radii is not None:

@@ -6,19 +6,23 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import casadi as ca
 import numpy as np
 
 from armcal.arm.loading import LOAD_CHANNELS
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
+from armcal.base.parameters import Parameters
 from armcal.errors import ArmcalError, ConfigError
 from armcal.plugins import PluginRegistry
 from armcal.run.target_file import TargetFile, read_targets
 from armcal.run.workspace import Workspace, workspace_of
+from armcal.solve.kernel import EvaluatorChoice
 from armcal.use.calibration import Calibration, arm_named
 from armcal.use.compensation.compensator import Compensator
 from armcal.use.compensation.request import Commands, Options, Redundancy, Targets
-from armcal.use.tool_expression import APPROACH, arm_expression
+from armcal.use.measured_point import MeasuredPoint, measured_point
+from armcal.use.tool_expression import APPROACH, ToolExpression, arm_expression
 
 _WORTH_COMPILING = 5000
 """From this many targets on, waiting for the compiler costs less than doing without it."""
@@ -32,13 +36,15 @@ class Assessed:
         commands: found.
         nominal_distances: how far from its target the real arm is with the nominal arm's command (N; m); nan where the
             nominal arm has none.
-        nominal_T_tool: where the nominal arm would be at the commands (N x 4 x 4): what a controller must be told that
-            takes the nominal arm for the real one.
+        tools: where the tool's frame is at the commands (N x 4 x 4), whichever point of it was brought to the targets.
+        nominal_T_tool: where the nominal arm's would be (N x 4 x 4): what a controller must be told that takes the
+            nominal arm for the real one.
         radii: of the ball about the expected place that holds a measurement of it with 95 % (N; m); None if unknown.
     """
 
     commands: Commands
     nominal_distances: Array
+    tools: Array
     nominal_T_tool: Array
     radii: Array | None
 
@@ -52,12 +58,16 @@ class Bench:
         arm: its instance name.
         options: of compensation.
         space: where it may go.
+        target: what its instrument reads, if it reads a point of the tool.
+        to_target: whether that point is brought to targets, and not the tool's origin.
     """
 
     calibration: Calibration
     arm: str
     options: Options
     space: Workspace
+    target: MeasuredPoint | None
+    to_target: bool = False
 
     @classmethod
     def of(
@@ -67,16 +77,25 @@ class Bench:
         within: Path | None,
         redundancy: Redundancy,
         registry: PluginRegistry,
+        to_target: bool = False,
     ) -> Bench:
         """One arm (the only one if no name is given), with the limits and the clearance of a configuration's plan.
 
         Raises:
-            ConfigError: no such arm, or several and no name; or the configuration plans for another arm.
+            ConfigError: no such arm, or several and no name; the configuration plans for another arm; or no measurement
+                reads the target that shall be brought.
         """
         name = arm_named(calibration, arm)
         joints = tuple(calibration.system.arms[name].commanded)
         space = workspace_of(within, joints, registry) if within else Workspace()
-        return cls(calibration, name, Options(limits=space.limits, redundancy=redundancy), space)
+        target = measured_point(calibration.system, name, calibration.parameters)
+        if to_target and target is None:
+            raise ConfigError(
+                f"no measurement reads the place of a target on the tool of {name!r} in the base frame.",
+                hint="Leave --point target out: then the tool frame's origin arrives.",
+            )
+        options = Options(limits=space.limits, redundancy=redundancy)
+        return cls(calibration, name, options, space, target, to_target)
 
     def read(self, path: Path, registry: PluginRegistry) -> TargetFile:
         """Targets from a CSV.
@@ -95,9 +114,11 @@ class Bench:
             ConfigError: the limits leave a joint no room.
         """
         told = () if targets is None else tuple(targets.conditions)
-        choice = "compiled" if targets is not None and len(targets) >= _WORTH_COMPILING else "auto"
+        choice: EvaluatorChoice = "compiled" if targets is not None and len(targets) >= _WORTH_COMPILING else "auto"
         try:
-            return self.calibration.compensator(self.arm, self.options, told, allowed=self.space.allowed, choice=choice)
+            parameters = self.calibration.parameters
+            expression = self._pointed(self.calibration.expression(self.arm, told), parameters)
+            return Compensator(expression, parameters, self.options, self.space.allowed, choice)
         except ValueError as fault:
             raise ConfigError(f"{fault}.", hint="Correct the limits in the plan.") from fault
 
@@ -107,7 +128,12 @@ class Bench:
         plain = replace(self.calibration.system.arms[self.arm], effects={}, masses=())
         nominal = self.calibration.parameters.with_nominal(stated)
         expression = arm_expression(plain, nominal, self.calibration.system.environment)
-        return Compensator(expression, nominal, Options(limits=self.options.limits))
+        return Compensator(self._pointed(expression, nominal), nominal, Options(limits=self.options.limits))
+
+    def _pointed(self, expression: ToolExpression, parameters: Parameters) -> ToolExpression:
+        """With the measured target where the tool's frame is, if that is to arrive."""
+        point = measured_point(self.calibration.system, self.arm, parameters) if self.to_target else None
+        return expression if point is None else expression.at(point.transform)
 
 
 def assess(
@@ -124,9 +150,16 @@ def assess(
     return Assessed(
         commands=commands,
         nominal_distances=np.where(thought.found & reached.settled, away, np.nan),
-        nominal_T_tool=nominal.forward(commands.joint_angles),
+        tools=_of_tool(compensator, commands.base_T_tool),
+        nominal_T_tool=_of_tool(nominal, nominal.forward(commands.joint_angles)),
         radii=_radii(calibration, compensator, targets, commands),
     )
+
+
+def _of_tool(compensator: Compensator, poses: Array) -> Array:
+    """base_T_tool (N x 4 x 4) for the poses of the point that the compensator brings to targets."""
+    tool_T_point = np.asarray(ca.evalf(ca.densify(compensator.expression.tool_T_point.matrix())).full())
+    return np.asarray(poses @ np.linalg.inv(tool_T_point))
 
 
 def commanded(compensator: Compensator, targets: Targets, commands: Commands) -> Dataset:

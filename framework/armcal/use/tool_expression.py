@@ -7,7 +7,7 @@ elastic state. From these come compensation, maps of what the arm can do, and co
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import casadi as ca
@@ -43,6 +43,7 @@ class ToolExpression:
         base_T_tool: at ``state``.
         efforts: about or along the axes of all joints of the chain, at ``state`` (N m, N on sliding joints).
         servos: by commanded joint, which displacements can be set.
+        tool_T_point: the point of the tool that ``base_T_tool`` is of (constant); the tool itself unless ``at`` chose.
     """
 
     name: str
@@ -56,6 +57,11 @@ class ToolExpression:
     base_T_tool: Transform
     efforts: Expression
     servos: Mapping[str, tuple[PulseTable, PulseClock]]
+    tool_T_point: Transform = field(default_factory=se3.identity)
+
+    def at(self, tool_T_point: Transform) -> ToolExpression:
+        """The same arm, with another point of its tool (constant) where the tool's frame is."""
+        return replace(self, base_T_tool=self.base_T_tool @ tool_T_point, tool_T_point=tool_T_point)
 
     @property
     def commands(self) -> Expression:

@@ -63,7 +63,7 @@ class Compensator:
         self._allowed = allowed
         self._held = held_joints(expression, self.options.held)
         self.limits = joint_limits(expression, self.options.limits)
-        self.reach: Reach = reach_of(expression.arm, parameters, self.limits)
+        self.reach: Reach = reach_of(expression.arm, parameters, self.limits, expression.tool_T_point)
         self._equilibrium = Equilibrium(expression, choice)
         self._counts = ServoCounts(expression.joints, expression.servos) if expression.servos else None
         self._positions = TargetKind(

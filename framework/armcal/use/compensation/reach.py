@@ -11,6 +11,7 @@ from armcal.arm.assembly import Arm
 from armcal.arm.model import Chain
 from armcal.base.domains import Array
 from armcal.base.parameters import Parameters
+from armcal.base.se3 import Transform, identity
 
 
 @dataclass(frozen=True)
@@ -38,8 +39,11 @@ class Reach:
         return np.asarray(np.maximum(np.maximum(away - self.farthest, self.nearest - away), 0.0))
 
 
-def reach_of(arm: Arm, parameters: Parameters, limits: Array) -> Reach:
-    """What an arm reaches at most, with the values of ``parameters``; limits (n x 2) of the commanded joints."""
+def reach_of(arm: Arm, parameters: Parameters, limits: Array, tool_T_point: Transform | None = None) -> Reach:
+    """What an arm reaches at most, with the values of ``parameters``; limits (n x 2) of the commanded joints.
+
+    It is reached with the tool's origin, or with another point of the tool.
+    """
     values = {block.name: ca.SX(list(block.nominal)) for block in parameters.blocks if not block.nuisance}
     chain = arm.chain(values)
     centre = _numbers(chain.base_T_mount.translation).ravel()
@@ -47,7 +51,8 @@ def reach_of(arm: Arm, parameters: Parameters, limits: Array) -> Reach:
     if any(joint.twist is not None for joint in chain.joints) or arm.conditions or (slides and arm.effects):
         return Reach(centre, np.inf, 0.0)
     links = [float(np.linalg.norm(_numbers(joint.parent_T_joint.translation))) for joint in chain.joints]
-    links.append(float(np.linalg.norm(_numbers(chain.tool.joint_T_frame.translation))))
+    end = chain.tool.joint_T_frame @ (tool_T_point or identity())
+    links.append(float(np.linalg.norm(_numbers(end.translation))))
     travel = _travel(arm, chain, limits)
     total = sum(links) + travel
     nearest = 0.0 if travel else max(0.0, 2 * max(links) - total)

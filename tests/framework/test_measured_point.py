@@ -1,0 +1,115 @@
+"""Which point of the tool arrives at targets: its frame's origin, or the ball, reflector or body that was measured."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from armcal.cli.main import cli
+from armcal.use.measured_point import measured_point
+from click.testing import CliRunner, Result
+from made_calibrations import written
+from small_arms import calibration, compensator, drawn
+
+OFF_MM = "measurements.tracker.target_mm=[12, -9, 20]"
+BODY = (
+    "measurements.tracker.type=tip_pose",
+    "measurements.tracker.orientation_noise=0.1 deg",
+    OFF_MM,
+    "measurements.tracker.target_rotation=[0.8, 0.0, 0.6, 0.0]",
+)
+
+
+@pytest.fixture(autouse=True)
+def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("armcal.solve.compiler.find_compiler", lambda: None)
+
+
+def armcal(*arguments: object) -> Result:
+    return CliRunner().invoke(cli, [str(each) for each in arguments])
+
+
+def rows(path: Path, names: str) -> np.ndarray:
+    with path.open(encoding="utf-8", newline="") as stream:
+        return np.array([[float(row[name]) for name in names.split()] for row in csv.DictReader(stream)])
+
+
+def measured(folder: Path, name: str, overrides: tuple[str, ...]) -> Path:
+    """A calibration, and a file of what its instrument reads in five poses: places that can be reached."""
+    commands = np.degrees(drawn(compensator(name), 5))
+    joints = compensator(name).joints
+    lines = [",".join(f"{joint}_deg" for joint in joints), *(",".join(map(str, row)) for row in commands)]
+    (folder / "poses.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    found = written(calibration(name, *overrides), folder / "calibration.yaml")
+    assert armcal("predict", found, "--poses", folder / "poses.csv", "--out", folder / "shown.csv").exit_code == 0
+    return found
+
+
+def missed(folder: Path, found: Path, *more: str, columns: str = "x_mm y_mm z_mm") -> tuple[np.ndarray, Result]:
+    """What the instrument would read where the commands lead, beside what it read (N x columns)."""
+    ran = armcal("compensate", found, "--targets", folder / "shown.csv", "--out", folder / "commands.csv", *more)
+    assert ran.exit_code == 0, ran.output
+    again = armcal("predict", found, "--poses", folder / "commands.csv", "--out", folder / "again.csv")
+    assert again.exit_code == 0, again.output
+    return rows(folder / "again.csv", columns) - rows(folder / "shown.csv", columns), ran
+
+
+def test_the_measured_target_arrives_where_it_was_measured(tmp_path: Path) -> None:
+    found = measured(tmp_path, "three", (OFF_MM,))
+    away, ran = missed(tmp_path, found, "--point", "target")
+    assert np.abs(away).max() < 1e-5
+    assert "5 of 5 targets are reached, by the measured target" in ran.output
+    assert "warning: these commands" not in ran.output
+    tool, target = (
+        rows(tmp_path / "commands.csv", "tool_x_mm tool_y_mm tool_z_mm"),
+        rows(tmp_path / "shown.csv", "x_mm y_mm z_mm"),
+    )
+    known = measured_point(calibration("three", OFF_MM).system, "arm", calibration("three", OFF_MM).parameters)
+    assert known is not None and known.measurement == "tracker"
+    assert np.linalg.norm(tool - target, axis=1) == pytest.approx(np.full(5, 1000 * known.distance), abs=1e-4)
+
+
+def test_where_nobody_says_which_point_arrives_the_miss_is_named(tmp_path: Path) -> None:
+    found = measured(tmp_path, "three", (OFF_MM,))
+    away, ran = missed(tmp_path, found, "--json")
+    known = measured_point(calibration("three", OFF_MM).system, "arm", calibration("three", OFF_MM).parameters)
+    assert known is not None
+    with (tmp_path / "commands.csv").open(encoding="utf-8", newline="") as stream:
+        reached = [row["reached"] == "yes" for row in csv.DictReader(stream)]
+    assert any(reached)
+    assert np.linalg.norm(away[reached], axis=1) == pytest.approx(1000 * known.distance, abs=1e-4)
+    assert f"misses them by {1000 * known.distance:.3g} mm. To bring that one there, give --point target" in ran.stderr
+    content = json.loads(ran.stdout)
+    assert content["point"] == "tool" and np.linalg.norm(content["target_mm"]) == pytest.approx(1000 * known.distance)
+    _, quiet = missed(tmp_path, found, "--point", "tool")
+    assert "--point target" not in quiet.output
+
+
+def test_a_measured_body_arrives_with_its_rotation(tmp_path: Path) -> None:
+    found = measured(tmp_path, "three", BODY)
+    away, _ = missed(tmp_path, found, "--point", "target", columns="x_mm y_mm z_mm qw qx qy qz")
+    assert np.abs(away).max() < 1e-5
+
+
+def test_a_target_beyond_the_tool_is_not_called_out_of_reach(tmp_path: Path) -> None:
+    """The arm's tool reaches 0.41 m from its base, a rod of 0.3 m on it reaches farther."""
+    rod = ("measurements.tracker.target_mm=[300, 0, 0]",)
+    found = written(calibration("three", *rod), tmp_path / "calibration.yaml")
+    (tmp_path / "poses.csv").write_text("q1_deg,q2_deg,q3_deg\n20,5,5\n", encoding="utf-8")
+    assert armcal("predict", found, "--poses", tmp_path / "poses.csv", "--out", tmp_path / "shown.csv").exit_code == 0
+    away, _ = missed(tmp_path, found, "--point", "target")
+    assert np.abs(away).max() < 1e-5
+    _, ran = missed(tmp_path, found, "--point", "tool")
+    assert "0 of 1 targets are reached" in ran.output
+
+
+def test_a_contact_reads_no_point_of_the_tool(tmp_path: Path) -> None:
+    found = written(calibration("seven"), tmp_path / "calibration.yaml")
+    (tmp_path / "t.csv").write_text("x_mm,y_mm,z_mm\n300,0,300\n", encoding="utf-8")
+    ran = armcal("compensate", found, "--targets", tmp_path / "t.csv", "--out", tmp_path / "o.csv", "--point", "target")
+    assert ran.exit_code == 2
+    assert "no measurement reads the place of a target on the tool of 'arm'" in ran.output
+    assert not (tmp_path / "o.csv").exists()
