@@ -179,6 +179,7 @@ ORDER = [
     "armcal.run.plan",
     "armcal.run.groups",
     "armcal.run.noise",
+    "armcal.run.gravity",
     "armcal.run.intervals",
     "armcal.run.result",
     "armcal.run.judging",

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import shlex
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
 from armcal.cli.main import cli
+from armcal.cli.robot_questions import direction
 from armcal.errors import InputError
 from armcal.plugins import discover
 from armcal.run.experiment import Experiment
@@ -272,6 +276,70 @@ def test_answers_that_end_early_are_refused(lines: int, here: Path) -> None:
     assert ran.exit_code == 2
     assert "the answers ended before the last question" in ran.output
     assert list(here.iterdir()) == []
+
+
+# Which way is up
+
+
+def test_a_frame_that_is_tilted_is_stated_or_the_assumption_is_a_finding(here: Path) -> None:
+    """The tracker's y axis points up: stated, the spring is found; not stated, the run says what it assumed."""
+    rows = table(here, f"{HEADER},mass_g,com_x_mm\n90,0,0,120,400,0\n0,200,0,0,900,-100\n0,160,0,0,500,-80\n")
+    assert new_robot("arm", "--dh", rows, "--convention", "standard", "--up", "y").exit_code == 0
+    arm = here / "arm" / "arm.yaml"
+    assert yaml.safe_load(arm.read_text(encoding="utf-8"))["statics"]["gravity_m_s2"] == [0, -9.81, 0]
+
+    def run(**more: str) -> list[str]:
+        path = here / "arm" / "simulated.yaml"
+        settings = [f"--set={key.replace('__', '.')}={value}" for key, value in more.items()]
+        ran = CliRunner().invoke(cli, ["run", str(path), "--out", str(here / "run"), "--json", *settings])
+        assert ran.exit_code in (0, 3), ran.output
+        findings = json.loads(ran.stdout)["verdict"]["findings"]
+        return [finding["text"] for finding in findings if finding["grade"] == "warning"]
+
+    assert not [text for text in run() if "gravity" in text]
+    arm.write_text(arm.read_text(encoding="utf-8").replace("  gravity_m_s2", "  # gravity_m_s2"), encoding="utf-8")
+    fixed = {"parameters__free": '["arm.mdh.base_*", "arm.mdh.theta2", "tracker.target_*"]'}
+    told = [text for text in run(**fixed) if "gravity" in text]
+    assert told and "assumed to be (0, 0, -9.80665) m/s^2" in told[0]
+    asked = CliRunner().invoke(cli, ["check", str(here / "arm" / "simulated.yaml")])
+    assert "Nobody stated which way gravity points" in asked.output
+
+
+def test_an_arm_without_springs_needs_no_statics(here: Path) -> None:
+    rows = table(here, f"{HEADER}\n90,0,0,120\n0,200,0,0\n0,160,0,0\n")
+    ran = new_robot("arm", "--dh", rows, "--convention", "standard")
+    assert ran.exit_code == 0 and "gravity" not in ran.output
+    assert "statics" not in yaml.safe_load((here / "arm" / "arm.yaml").read_text(encoding="utf-8"))
+    found = here / "arm" / "runs" / "simulated" / "calibration.yaml"
+    poses = here / "arm" / "simulated.csv"
+    ran = CliRunner().invoke(cli, ["predict", str(found), "--poses", str(poses), "--out", str(here / "p.csv")])
+    assert ran.exit_code == 0, ran.output
+
+
+@pytest.mark.parametrize(
+    ("up", "expected"),
+    [("z", (0, 0, 1)), ("-x", (-1, 0, 0)), ("0.3, 0,0.4", (0.6, 0, 0.8)), ("+y", None), ("0,0,0", None)],
+)
+def test_up_is_an_axis_or_three_numbers(up: str, expected: tuple[float, ...] | None) -> None:
+    if expected is None:
+        with pytest.raises(InputError, match="expected x, y, z"):
+            direction(up)
+    else:
+        assert direction(up) == pytest.approx(expected)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs a pseudo-terminal")
+def test_somebody_at_a_terminal_is_asked_which_way_is_up(here: Path) -> None:
+    import pty
+
+    rows = table(here, f"{HEADER},mass_g\n90,0,0,120,400\n0,200,0,0,900\n")
+    master, slave = pty.openpty()
+    os.write(master, b"sideways\n-y\n")
+    command = [sys.executable, "-m", "armcal.cli", "new", "robot", "arm", "--dh", rows, "--convention", "standard"]
+    ran = subprocess.run(command, stdin=slave, capture_output=True, text=True, timeout=120, cwd=here)
+    os.close(master), os.close(slave)
+    assert "up in the tracker's base frame" in ran.stdout and "found 'sideways' for up" in ran.stdout
+    assert "gravity_m_s2: [0, 9.81, 0]" in (here / "arm" / "arm.yaml").read_text(encoding="utf-8")
 
 
 # What is refused

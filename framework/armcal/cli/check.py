@@ -15,6 +15,7 @@ from armcal.cli.common import Voice, overrides, speaking
 from armcal.errors import ProblemError
 from armcal.plugins import discover
 from armcal.run.experiment import Experiment
+from armcal.run.gravity import gravity_findings
 from armcal.run.pipeline import Prepared, Stopwatch, assemble
 from armcal.solve.estimator import require_solvable
 from armcal.solve.identifiability import Identifiability
@@ -39,6 +40,8 @@ def check(voice: Voice, config: Path, data: Path | None, overrides: tuple[str, .
         ready = replace(ready, warnings=(*ready.warnings, *require_solvable(ready.problem, ready.training, start)))
     except ProblemError as fault:
         refused = fault
+    gravity = [f"{finding.text} {finding.action}" for finding in gravity_findings(experiment.system, ready.dataset)]
+    ready = replace(ready, warnings=(*ready.warnings, *gravity))
     for text in ready.warnings:
         voice.warn(text)
     content = _content(experiment, ready, known)

@@ -45,6 +45,7 @@ def new_plugin(voice: Voice, name: str, kind: str, out: Path | None) -> None:
 @click.option("--convention", type=click.Choice(("standard", "modified")), help="Of the rows in --dh.")
 @click.option("--urdf", type=click.Path(path_type=Path), help="A URDF.")
 @click.option("--tip", metavar="LINK", help="The URDF's link at the arm's end, where there are several.")
+@click.option("--up", metavar="AXIS|X,Y,Z", help="Which way is up in the tracker's frame: z, -y, or three numbers.")
 @click.option("--out", type=click.Path(path_type=Path), help="The folder to make [default: NAME].")
 @speaking
 def new_robot(voice: Voice, name: str, out: Path | None, **source: Any) -> None:

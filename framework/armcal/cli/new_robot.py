@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import click
 
 from armcal.cli.common import Voice, command_line
-from armcal.cli.robot_questions import ask_rows
+from armcal.cli.robot_questions import ask_rows, ask_up, direction
 from armcal.errors import EXIT_FAULT, EXIT_NOT_CONVERGED, ConfigError
 from armcal.plugins import PluginRegistry, discover
 from armcal.scaffold.dh_table import read_rows
@@ -30,13 +30,14 @@ class Source:
     convention: str | None
     urdf: Path | None
     tip: str | None
+    up: str | None
 
 
 def begin(voice: Voice, name: str, source: Source, folder: Path) -> None:
     """Write a robot's folder, calibrate its simulated records, and say how that went."""
     registry = discover()
     voice.plugin_faults(registry)
-    robot = _robot(robot_name(name), source, registry)
+    robot = _upright(_robot(robot_name(name), source, registry), source.up)
     made = write_robot(robot, folder, registry)
     with voice.progress() as progress:
         trial = try_out(made, registry, command_line(), progress)
@@ -64,6 +65,13 @@ def _robot(name: str, source: Source, registry: PluginRegistry) -> Robot:
             "Rot_x(alpha) Trans_x(a) Rot_z(theta) Trans_z(d).",
         )
     return robot_of_rows(name, CONVENTIONS[source.convention], read_rows(source.dh))
+
+
+def _upright(robot: Robot, up: str | None) -> Robot:
+    """With which way is up in the tracker's frame, asked where gravity bends the arm and somebody is there to ask."""
+    if up is None and robot.has_masses and sys.stdin.isatty():
+        up = ask_up()
+    return replace(robot, up=direction(up)) if up else robot
 
 
 def _show(voice: Voice, robot: Robot, made: RobotFolder, trial: Trial) -> None:

@@ -24,6 +24,8 @@ from armcal.scaffold.robot import (
     Row,
 )
 
+_UNKNOWN = "unknown"
+
 
 def ask_rows(conventions: Mapping[str, Convention]) -> tuple[Convention, tuple[Row, ...]]:
     """The convention and the rows, from the terminal or standard input.
@@ -40,6 +42,42 @@ def ask_rows(conventions: Mapping[str, Convention]) -> tuple[Convention, tuple[R
             "the answers ended before the last question.",
             hint="Answer all of them, or give --dh FILE or --urdf FILE.",
         ) from fault
+
+
+def ask_up() -> str:
+    """Which way is up, as ``direction`` takes it; empty if nobody knows."""
+    words = "up in the tracker's base frame (x, y, z, -x, -y, -z, three numbers, or unknown)"
+    answer = click.prompt(words, default=_UNKNOWN, value_proc=lambda text: text if text == _UNKNOWN else _known(text))
+    return "" if answer == _UNKNOWN else str(answer)
+
+
+def _known(text: str) -> str:
+    try:
+        direction(text)
+    except ConfigError as fault:
+        raise click.BadParameter(fault.message) from fault
+    return text
+
+
+def direction(text: str) -> tuple[float, float, float]:
+    """A unit vector from ``z``, ``-y`` or ``0.1,0,0.99``.
+
+    Raises:
+        ConfigError: it is neither.
+    """
+    sign, axis = (-1.0, text[1:]) if text.startswith("-") else (1.0, text)
+    if axis in ("x", "y", "z"):
+        return sign * (axis == "x"), sign * (axis == "y"), sign * (axis == "z")
+    parts = [part.strip() for part in text.split(",")]
+    numbers = [float(part) for part in parts if is_number(part)]
+    length = math.hypot(*numbers)
+    if len(numbers) != len("xyz") or len(parts) != len("xyz") or not 0 < length < math.inf:
+        raise ConfigError(
+            f"found {text!r} for up, expected x, y, z, -x, -y, -z or three numbers such as 0.02,0,0.9998.",
+            hint="Give the direction in the tracker's base frame that points away from the ground.",
+        )
+    x, y, z = (number / length for number in numbers)
+    return x, y, z
 
 
 def _row(number: int) -> Row:

@@ -56,10 +56,11 @@ class ArmSettings(Settings):
 class StaticsSettings(Settings):
     """Gravity and load in the arm's base frame, where a record does not say otherwise.
 
+    Without ``gravity`` it is assumed to pull along -z as on the earth; what bends under it then warns of that.
     ``payload`` is what hangs on the tool beyond the links (0 g has to be said); ``body`` lets gravity be checked.
     """
 
-    gravity: Acceleration3
+    gravity: Acceleration3 | None = None
     body: Literal["earth", "moon", "mars"] | None = None
     payload: Mass | None = None
     payload_com: Length3 = (0.0, 0.0, 0.0)
@@ -79,7 +80,11 @@ class SystemSettings(Settings):
 
     arms: dict[str, dict[str, Any]]
     measurements: dict[str, dict[str, Any]]
-    statics: StaticsSettings
+    statics: StaticsSettings = Field(default_factory=StaticsSettings)
+
+
+ASSUMED_GRAVITY = (0.0, 0.0, -9.80665)
+"""m/s^2, on the earth with z up, where nobody states it. [Williams2024]"""
 
 
 @dataclass(frozen=True)
@@ -102,7 +107,7 @@ class System:
     def environment(self) -> Environment:
         """What acts where a record does not say."""
         s = self.statics
-        return Environment(s.gravity, s.payload or 0.0, s.payload_com, s.force, s.torque)
+        return Environment(s.gravity or ASSUMED_GRAVITY, s.payload or 0.0, s.payload_com, s.force, s.torque)
 
     def parameters(self, groups: Groups | None = None) -> Parameters:
         """Every block, fixed but for what is not known of groups of records."""

@@ -93,7 +93,7 @@ class Experiment:
         parameters = select(system.parameters(), known, source)
         estimator = weighed(_estimator(source, registry), settings.noise)
         name = settings.name or source.path.stem
-        found = tuple(_gravity_warnings(settings, np.array(settings.statics.gravity)))
+        found = tuple(_gravity_warnings(settings, np.array(system.environment.gravity)))
         return cls(str(name), source, settings, system, parameters, estimator, registry, found)
 
     def read(self) -> Dataset:

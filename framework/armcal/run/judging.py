@@ -11,6 +11,7 @@ import numpy as np
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.config.system import System
+from armcal.run.gravity import gravity_findings
 from armcal.run.intervals import IntervalResult
 from armcal.run.result import RecordErrors
 from armcal.solve.drift import residuals
@@ -58,7 +59,7 @@ def verdict_of(
     joints = {
         f"{name}.{joint}": dimension for name, arm in system.arms.items() for joint, dimension in arm.commanded.items()
     }
-    training = run.dataset.subset(run.split.train)
+    training, gravity = run.dataset.subset(run.split.train), gravity_findings(system, run.dataset)
     verdict = judge(
         found,
         _whitened(run),
@@ -69,7 +70,7 @@ def verdict_of(
         run.dataset.ids,
         suggest(run.problem, training, found, joints) if found.names and _can_be_helped(run) else (),
         run.fitted,
-        [*worse_than_nominal(judged, errors.nominal_mm), *intervals.findings(), *moved_findings(_moved(run))],
+        [*worse_than_nominal(judged, errors.nominal_mm), *intervals.findings(), *moved_findings(_moved(run)), *gravity],
         evidence,
     )
     return verdict, evidence

@@ -56,7 +56,7 @@ class ExperimentSettings(Settings):
     name: str = ""
     arms: dict[str, Any]
     measurements: dict[str, Any]
-    statics: StaticsSettings
+    statics: StaticsSettings = Field(default_factory=StaticsSettings)
     data: dict[str, Any] | None = None
     simulation: dict[str, Any] | None = None
     parameters: ParameterSettings = Field(default_factory=ParameterSettings)

@@ -67,6 +67,7 @@ class Robot:
         urdf: the file's content.
         urdf_file: its name.
         tip: the link that is the tool.
+        up: which way is up in the tracker's base frame (unit vector); None if nobody said.
     """
 
     name: str
@@ -79,6 +80,7 @@ class Robot:
     urdf: bytes = b""
     urdf_file: str = ""
     tip: str = ""
+    up: tuple[float, float, float] | None = None
 
 
 def with_tilts(convention: Convention, rows: tuple[Row, ...]) -> tuple[Row, ...]:

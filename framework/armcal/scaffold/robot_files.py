@@ -85,6 +85,7 @@ def _write(place: Path, robot: Robot, choice: FreeChoice, true: Mapping[str, str
         "choice": choice,
         "priors": priors,
         "truth": true,
+        "gravity": [number(-GRAVITY_M_S2 * along) for along in robot.up or ()],
         "noise_mm": number(NOISE_MM),
         "count": min(max(_POSES_A_JOINT * len(robot.joints), _FEWEST_POSES), _MOST_POSES),
         "truth_seed": truth.SEED,
