@@ -10,13 +10,14 @@ from typing import Any, Protocol, runtime_checkable
 
 import casadi as ca
 
-from armcal.arm.effects import JointCommand, JointEffect, ShapeEffect, Spring
+from armcal.arm.effects import Condition, JointCommand, JointEffect, ShapeEffect, Spring
 from armcal.arm.elastic import deflections, elastic_sites, split_deflection
 from armcal.arm.model import ArmModel, Chain, forward
 from armcal.arm.statics import Load, Mass, joint_efforts, wrenches
 from armcal.base.parameters import ParameterBlock, scalar
 from armcal.base.pose_blocks import pose_transform
 from armcal.base.se3 import Expression, Transform
+from armcal.errors import DataError
 
 PLACEMENT = "placement"
 """What the blocks of an arm's placement are called."""
@@ -186,15 +187,34 @@ class Arm:
 
     @property
     def conditions(self) -> tuple[str, ...]:
-        """What its effects ask to know of the surroundings."""
-        asking = [effect for effect in self.effects.values() if isinstance(effect, ShapeEffect)]
-        return tuple(dict.fromkeys(name for effect in asking for name in effect.conditions))
+        """Names of the columns that its effects read of the surroundings."""
+        return tuple(dict.fromkeys(condition.name for _, condition in self.declared))
+
+    @property
+    def declared(self) -> tuple[tuple[str, Condition], ...]:
+        """The columns that its effects read of the surroundings, each with the name of the effect."""
+        return tuple(
+            (name, each if isinstance(each, Condition) else Condition(each))
+            for name, effect in self.effects.items()
+            if isinstance(effect, ShapeEffect)
+            for each in effect.conditions
+        )
 
     def _shaped(self, values: Mapping[str, Expression], inputs: ArmInputs) -> Chain:
         chain = self.chain(values)
         for name, effect in self.effects.items():
-            if isinstance(effect, ShapeEffect):
+            if not isinstance(effect, ShapeEffect):
+                continue
+            try:
                 chain = effect.shaped(chain, inputs.conditions, scoped(values, self._scope(name)))
+            except KeyError as fault:
+                missing = fault.args[0]
+                if missing in inputs.conditions or missing not in self.conditions:
+                    raise
+                raise DataError(
+                    f"the effect {self._scope(name)[:-1]} reads {missing}, which is not recorded.",
+                    hint=f"Add a column {missing} with its unit.",
+                ) from fault
         return chain
 
     def _commanded(self, values: Mapping[str, Expression], inputs: ArmInputs, index: int) -> Expression:

@@ -44,6 +44,20 @@ class Spring:
         return max(1, len(self.directions))
 
 
+@dataclass(frozen=True)
+class Condition:
+    """A recorded number of the surroundings that an effect reads.
+
+    Attributes:
+        name: of its column, without the unit suffix (``humidity``).
+        dimension: of its unit, ``dimensionless`` for a pure number; may be left out for a column that any record may
+            carry (``temperature``).
+    """
+
+    name: str
+    dimension: str | None = None
+
+
 class JointEffect(Protocol):
     """What a plugin provides to describe servos, gears and springs; it holds for any arm model.
 
@@ -66,8 +80,12 @@ class ShapeEffect(JointEffect, Protocol):
     """A joint effect that also changes the arm's shape with what is recorded of its surroundings."""
 
     @property
-    def conditions(self) -> Sequence[str]:
-        """The recorded numbers it reads, each a column that any record may carry (``temperature``, in C)."""
+    def conditions(self) -> Sequence[str | Condition]:
+        """The recorded numbers it reads; a bare name is a column that any record may carry (``temperature``, in C).
+
+        Every measured record must have them. A prediction may lack them: ``shaped`` uses a reference value then, or
+        lets the ``KeyError`` of the missing name pass, and the prediction is refused.
+        """
 
     def shaped(self, chain: Chain, conditions: Mapping[str, Expression], values: Mapping[str, Expression]) -> Chain:
         """The chain under these conditions."""

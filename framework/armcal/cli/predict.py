@@ -146,8 +146,15 @@ def _tell_missing(voice: Voice, loaded: Calibration, commands: Dataset, recordin
     """What the calibration knew and these poses do not say."""
     order = ("time", "sequence")
     missing = [name for name in loaded.record.environment_columns if not commands.has(name) and name not in order]
-    if missing:
-        voice.warn(f"the calibration's records had {', '.join(missing)}; these poses take the configured values.")
+    for name in missing:
+        readers = [
+            f"{arm.name}.{effect}"
+            for arm in loaded.system.arms.values()
+            for effect, c in arm.declared
+            if c.name == name
+        ]
+        taken = f"the reference of {' and '.join(readers)}" if readers else "the configured value"
+        voice.warn(f"the calibration's records had {name}; these poses take {taken}.")
     for text in commands.warnings:
         voice.warn(text)
     kept = loaded.record.prediction

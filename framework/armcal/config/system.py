@@ -18,6 +18,7 @@ from armcal.config.yaml_source import ConfigSource
 from armcal.errors import ArmcalError, ConfigError, PluginError
 from armcal.measure.groups import Groups, group_blocks
 from armcal.measure.measurement import Measurement
+from armcal.measure.reader import surroundings
 from armcal.plugins import Component, PluginRegistry
 from armcal.solve.factor import STATICS, Environment, gravity_tilt
 
@@ -132,6 +133,7 @@ def build_system(source: ConfigSource, registry: PluginRegistry) -> System:
     arms, described_arms = {}, {}
     for name in settings.arms:
         arms[name], described_arms[name] = _arm(source, registry, name)
+    _refusable(source, ("arms",), lambda: surroundings(arms))
     measurements, described = {}, {}
     for name in settings.measurements:
         at: Path = ("measurements", name)
@@ -198,6 +200,7 @@ def _arm(source: ConfigSource, registry: PluginRegistry, name: str) -> tuple[Arm
     placement = settings.placement.blocks(PLACEMENT) if settings.placement else ()
     parts = (model, effects, masses, placement, settings.joint_noise)
     arm = _refusable(source, at, lambda: Arm(name, described_model["type"], *parts))
+    _refusable(source, (*at, "effects"), lambda: surroundings({name: arm}))
     known = _refusable(source, at, lambda: frame_names(arm.nominal_chain))
     for link, stated in settings.links.items():
         _check_link(source, (*at, "links", link), stated, known, len(arm.joint_names))

@@ -14,11 +14,9 @@ from armcal.base.units import DIMENSIONLESS, UNITS, units_of
 from armcal.errors import DataError, Location
 from armcal.measure.cells import is_number
 from armcal.measure.checks import refuse_joint_count
-from armcal.measure.reader import WantedChannel
+from armcal.measure.reader import ID_NAMES, WantedChannel
 
 MAX_COLUMNS = 1000
-
-_ID_NAMES = ("pose_id", "id")
 
 
 @dataclass(frozen=True)
@@ -136,7 +134,7 @@ def match_columns(header: Header, wanted: Sequence[WantedChannel]) -> Plan:
     # An id that counts the records in order may serve as a channel as well: columns: {sequence: pose_id}.
     lower = {column.name.lower(): column for column in reversed(header.columns) if column.known_as in claimed}
     lower |= {name.lower(): column for name, column in reversed(unused.items())}
-    record_id = next((lower[name] for name in _ID_NAMES if name in lower), None)
+    record_id = next((lower[name] for name in ID_NAMES if name in lower), None)
     extra = tuple(column for column in unused.values() if column is not record_id)
     vain = next((column for column in extra if column.known_as != column.name), None)
     if vain is not None:
@@ -177,7 +175,7 @@ def refuse_missing(header: Header, w: WantedChannel, unused: Sequence[str]) -> N
     """Raise a DataError: no column is this channel's; ``unused`` names come near it, perhaps."""
     written = _written(w)
     header.refuse(
-        f"found no column for {w.channel}, expected {written}{_nearest(written.split(' or '), unused)}.",
+        f"found no column for {w.what}, expected {written}{_nearest(written.split(' or '), unused)}.",
         f"Add it, or say which column it is: columns: {{{written.split(' or ')[0]}: NAME}} in the data section.",
         written,
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -10,10 +11,25 @@ import numpy as np
 from armcal.base.dataset import Dataset
 from armcal.base.units import split_suffix
 from armcal.errors import DataError, Location
-from armcal.measure.reader import ENVIRONMENT
+from armcal.measure.reader import ENVIRONMENT, WantedChannel
 
 JUMP_RATIO = 50.0
 SHORTEST_JUMP_S = 600.0
+
+
+def require_conditions(dataset: Dataset, wanted: Sequence[WantedChannel]) -> None:
+    """Refuse records without a column that an effect reads, whatever reader they come from.
+
+    Raises:
+        DataError: with effect, column and source.
+    """
+    for channel in wanted:
+        if channel.effects and channel.required and not dataset.has(channel.channel):
+            raise DataError(
+                f"found no {channel.what}.",
+                where=Location(dataset.source or None, field=channel.channel),
+                hint="Use a source that records it, or remove the effect.",
+            )
 
 
 def noticed(dataset: Dataset) -> Dataset:

@@ -99,7 +99,7 @@ def _with_deviations(dataset: Dataset, layout: Layout, channel: str) -> Dataset:
 
 
 def with_absent(dataset: Dataset, wanted: Sequence[WantedChannel]) -> Dataset:
-    """The dataset with every required channel: those that its source cannot have are missing in all records."""
-    absent = [w.channel for w in wanted if w.required and not dataset.has(w.channel)]
+    """The dataset with all that measurements require: what its source cannot have is missing in all records."""
+    absent = [w.channel for w in wanted if w.required and w.parts and not dataset.has(w.channel)]
     none = np.full(len(dataset), np.nan)
     return replace(dataset, channels={**dataset.channels, **dict.fromkeys(absent, none)}) if absent else dataset

@@ -8,7 +8,7 @@ from typing import Protocol
 
 from armcal.arm.assembly import Arm
 from armcal.base.dataset import Dataset
-from armcal.base.units import DIMENSIONLESS
+from armcal.base.units import DIMENSIONLESS, units_of
 from armcal.measure.measurement import Measurement, noise_channels
 
 
@@ -24,6 +24,7 @@ class WantedChannel:
         is_deviation: whether it is the standard deviation of a measured number.
         is_endless: whether it is the angle of a joint that may turn on and on.
         parts: the measurements (instances) that need it; none if the record as a whole does, or nothing does.
+        effects: the joint effects (``arm.thermal``) that read it.
     """
 
     channel: str
@@ -33,6 +34,13 @@ class WantedChannel:
     is_deviation: bool = False
     is_endless: bool = False
     parts: tuple[str, ...] = ()
+    effects: tuple[str, ...] = ()
+
+    @property
+    def what(self) -> str:
+        """Its name, with the effects that read it, for a message."""
+        readers = " and ".join(self.effects)
+        return f"{self.channel}, which the effect {readers} reads" if readers else self.channel
 
 
 @dataclass(frozen=True)
@@ -55,6 +63,9 @@ class Reader(Protocol):
         """
 
 
+ID_NAMES = ("pose_id", "id")
+"""Columns that name a record."""
+
 ENVIRONMENT: tuple[tuple[str, str], ...] = (
     *((f"gravity_{axis}", "acceleration") for axis in "xyz"),
     ("payload", "mass"),
@@ -68,6 +79,32 @@ ENVIRONMENT: tuple[tuple[str, str], ...] = (
 """Columns that any record may carry, and their dimensions."""
 
 
+def surroundings(arms: Mapping[str, Arm]) -> dict[str, str]:
+    """Columns of what surrounds the arms, with their dimensions: of any record, then those that effects declare.
+
+    Raises:
+        ValueError: an effect declares a column whose name, dimension or meaning is not clear.
+    """
+    known = dict(ENVIRONMENT)
+    joints = {joint for arm in arms.values() for joint in arm.commanded}
+    for arm in arms.values():
+        for effect, condition in arm.declared:
+            name, dimension = condition.name, condition.dimension or known.get(condition.name)
+            found = f"the effect {arm.name}.{effect} reads the column {name!r}"
+            if not name.isidentifier() or name in joints or name in ID_NAMES:
+                raise ValueError(f"{found}, expected letters, digits and underscores, and no name of a joint or id")
+            if dimension is None:
+                raise ValueError(
+                    f"{found} without its dimension, expected Condition({name!r}, DIMENSION), or a column that any "
+                    f"record may carry: {', '.join(name for name, _ in ENVIRONMENT)}"
+                )
+            if dimension != DIMENSIONLESS:
+                units_of(dimension)
+            if known.setdefault(name, dimension) != dimension:
+                raise ValueError(f"{found} as {dimension}, and it is known as {known[name]}: use another name")
+    return known
+
+
 def wanted_channels(
     arms: Mapping[str, Arm], measurements: Mapping[str, Measurement], measured: bool
 ) -> tuple[WantedChannel, ...]:
@@ -79,8 +116,14 @@ def wanted_channels(
     for arm in arms.values():
         parts = tuple(name for name, measurement in measurements.items() if arm.name in measurement.arms)
         wanted += _arm_channels(arm, len(arms) == 1, parts)
-    needed = {name for arm in arms.values() for name in arm.conditions} if measured else set()
-    wanted += [WantedChannel(name, (name,), dimension, name in needed) for name, dimension in ENVIRONMENT]
+    read: dict[str, list[str]] = {}
+    for arm in arms.values():
+        for effect, condition in arm.declared:
+            read.setdefault(condition.name, []).append(f"{arm.name}.{effect}")
+    wanted += [
+        WantedChannel(name, (name,), dimension, measured and name in read, effects=tuple(read.get(name, ())))
+        for name, dimension in surroundings(arms).items()
+    ]
     local = [c.name for m in measurements.values() for c in m.channels()]
     for instance, measurement in measurements.items():
         for channel in measurement.channels():

@@ -103,7 +103,8 @@ class Bench:
         Raises:
             DataError: it cannot be read, or the arm is elastic and nothing says what hangs on the tool.
         """
-        file = read_targets(path, self.calibration.expression(self.arm), registry)
+        conditions = self.calibration.system.arms[self.arm].conditions
+        file = read_targets(path, self.calibration.expression(self.arm, conditions), registry)
         self.calibration.require_payload(file.dataset.has("payload"), str(path))
         return file
 

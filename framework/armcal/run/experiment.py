@@ -18,7 +18,7 @@ from armcal.config.system import System, build_component, build_system
 from armcal.config.validate import validate
 from armcal.config.yaml_source import ConfigSource, load_config
 from armcal.errors import ConfigError
-from armcal.measure.environment import noticed
+from armcal.measure.environment import noticed, require_conditions
 from armcal.measure.groups import grouped_instances, groups_of, unmatched
 from armcal.measure.limits import warn_beyond_limits
 from armcal.measure.reader import Reader, ReadRequest, wanted_channels
@@ -111,8 +111,10 @@ class Experiment:
             )
         reader: Reader
         reader, _ = build_component(self.source, self.registry, "reader", ("data",))
-        dataset = reader.read(self.request(measured=True))
+        request = self.request(measured=True)
+        dataset = reader.read(request)
         self._require_payload(dataset)
+        require_conditions(dataset, request.wanted)
         dataset = warn_beyond_limits(noticed(dataset), self.system.arms)
         if not dataset.has("gravity_z"):
             return dataset

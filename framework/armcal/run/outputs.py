@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from armcal.config.yaml_source import ConfigSource
-from armcal.measure.reader import ENVIRONMENT
+from armcal.measure.reader import surroundings
 from armcal.run import folder as folders
 from armcal.run.experiment import Experiment
 from armcal.run.groups import GroupError
@@ -145,7 +145,7 @@ def calibration_content(result: RunResult, experiment: Experiment) -> dict[str, 
             "data": provenance["data_sha256"],
             "source": provenance["data"],
         },
-        environment_columns=tuple(name for name, _ in ENVIRONMENT if result.dataset.has(name)),
+        environment_columns=tuple(filter(result.dataset.has, surroundings(experiment.system.arms))),
         noise=_noise(result),
         quality_mm=result.table.as_dict(),
         verdict={"headline": result.verdict.headline, "findings": [f.text for f in result.verdict.findings]},

@@ -16,7 +16,7 @@ from armcal.base.domains import Array
 from armcal.config.system import build_component
 from armcal.errors import ConfigError, DataError, Location, ProblemError
 from armcal.measure.id_list import read_ids
-from armcal.measure.reader import ENVIRONMENT, Reader
+from armcal.measure.reader import Reader
 from armcal.run.experiment import Experiment
 from armcal.run.plan_settings import PlanSettings
 
@@ -175,8 +175,11 @@ def given_records(experiment: Experiment, path: Path) -> Dataset:
 
 def commands_of(dataset: Dataset, space: JointSpace) -> Dataset:
     """What is commanded and what acts, without what was measured."""
-    acting = [name for name, _ in ENVIRONMENT if name not in _OF_THE_MOMENT]
-    kept = {n: v for n, v in dataset.channels.items() if n in space.channels or n in acting or ".approach." in n}
+    kept = {
+        name: values
+        for name, values in dataset.channels.items()
+        if name in space.channels or ".approach." in name or ("." not in name and name not in _OF_THE_MOMENT)
+    }
     return replace(dataset, channels=kept, extra={})
 
 

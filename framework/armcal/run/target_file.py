@@ -16,7 +16,7 @@ from armcal.base.quaternions import rotation_matrix
 from armcal.base.units import DIMENSIONLESS, split_suffix
 from armcal.errors import DataError, Location
 from armcal.measure.environment import noticed
-from armcal.measure.reader import ENVIRONMENT, ReadRequest, WantedChannel
+from armcal.measure.reader import ReadRequest, WantedChannel, surroundings
 from armcal.plugins import PluginRegistry
 from armcal.use.compensation.reach import Reach
 from armcal.use.compensation.request import FARTHEST_M, Targets
@@ -118,8 +118,9 @@ def _read(path: Path, expression: ToolExpression, registry: PluginRegistry) -> D
 def _wanted(expression: ToolExpression) -> tuple[WantedChannel, ...]:
     told: list[tuple[str, str, bool]] = [(axis, "length", True) for axis in "xyz"]
     told += [(name, DIMENSIONLESS, False) for name in QUATERNION] + [(name, "angle", False) for name in RPY]
-    told += [(name, dimension, False) for name, dimension in ENVIRONMENT if name not in ("time", "sequence")]
+    acting = surroundings({expression.name: expression.arm})
     wanted = [WantedChannel(name, _names(name, expression), dimension, needed) for name, dimension, needed in told]
+    wanted += [WantedChannel(n, (n,), d, False) for n, d in acting.items() if n not in ("time", "sequence")]
     for index, joint in enumerate(expression.joints, start=1):
         names = (f"approach{index}", f"approach_{joint}")
         wanted.append(WantedChannel(f"{expression.name}.{APPROACH}{joint}", names, DIMENSIONLESS, False))
@@ -156,8 +157,7 @@ def _line(dataset: Dataset, row: int) -> int:
 
 def _names(name: str, expression: ToolExpression) -> tuple[str, ...]:
     """What a column may be called; the short name is the joint's where one has it."""
-    loads = name in {channel for channel, _ in ENVIRONMENT}
-    return (name,) if loads else (f"target_{name}", *((name,) if name not in expression.joints else ()))
+    return (f"target_{name}", *((name,) if name not in expression.joints else ()))
 
 
 def _rotations(path: Path, dataset: Dataset) -> Array | None:

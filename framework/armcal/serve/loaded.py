@@ -105,6 +105,13 @@ def _arms(calibration: Calibration, order: Order) -> Mapping[str, ServedArm]:
 def _arm(calibration: Calibration, name: str, order: Order) -> ServedArm:
     arm, statics = calibration.system.arms[name], calibration.system.statics
     joints = tuple(arm.commanded)
+    unserved = [f"{each.name} (effect {name}.{effect})" for effect, each in arm.declared if each.name != TEMPERATURE]
+    if unserved:
+        raise ConfigError(
+            f"the arm {name} changes with {', '.join(unserved)}, which a request cannot state.",
+            where=Location(order.shown),
+            hint="Use armcal predict or armcal compensate, which read it from a column.",
+        )
     limits, allowed = _space(order.within, joints) if order.within else ({}, None)
     options = Options(limits=limits, redundancy=order.redundancy)
     try:

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import casadi as ca
 import numpy as np
 
+from armcal.arm.assembly import Arm
 from armcal.arm.effects import JointCommand, JointEffect, ShapeEffect, Spring
 from armcal.arm.model import Attachment, Chain, Joint
 from armcal.base import se3
 from armcal.base.domains import Array
 from armcal.base.parameters import ParameterBlock
 from armcal.base.se3 import Expression
+from armcal.measure.reader import surroundings
 from armcal.testing.expressions import (
     check_parameters,
     entry_names,
@@ -25,7 +28,8 @@ from armcal.testing.expressions import (
     stacked,
     symbols,
 )
-from armcal.testing.results import Recorder, expect
+from armcal.testing.planar import ARM, planar_arms
+from armcal.testing.results import ContractError, Recorder, expect
 from armcal.testing.settings_checks import Subject
 from armcal.testing.unit_checks import expect_gain, scalars
 
@@ -53,6 +57,9 @@ def check_effect(record: Recorder, subject: Subject) -> None:
         )
     record.check("it is the same each time", lambda: _repeated(subject, effect, blocks))
     record.check("every parameter has an influence", lambda: expect_all_used(_all_of(effect, values), values))
+    if isinstance(effect, ShapeEffect):
+        record.check("the columns it reads are declared, each with its dimension", lambda: _columns(effect))
+        record.check("its shape changes with every column it declares", lambda: _read(effect, values))
     springs = record.check("its springs have a site and unit directions", lambda: _springs(effect, values))
     if not springs:
         return
@@ -111,12 +118,37 @@ def _all_of(effect: JointEffect, values: Mapping[str, Expression]) -> Expression
     laws = [spring.law(loads[: spring.size]) for spring in effect.springs(values)]
     shapes: list[Expression] = []
     if isinstance(effect, ShapeEffect):
-        links = [se3.translation_along("x", ca.SX.sym(f"l{i}")) for i in range(len(JOINTS) + 1)]
-        joints = tuple(Joint(name, link) for name, link in zip(JOINTS, links, strict=False))
-        chain = Chain(se3.identity(), joints, Attachment(len(JOINTS), links[-1]))
-        shaped = effect.shaped(chain, {name: ca.SX.sym(name) for name in effect.conditions}, values)
-        shapes = [shaped.tool.joint_T_frame.matrix(), *(j.parent_T_joint.matrix() for j in shaped.joints)]
+        shapes = [_shape(effect, {name: ca.SX.sym(name) for name in _arm_of(effect).conditions}, values)]
     return stacked([_displacement(effect, values)[1], *laws, *shapes])
+
+
+def _shape(effect: ShapeEffect, conditions: Mapping[str, Expression], values: Mapping[str, Expression]) -> Expression:
+    """What an effect makes of a chain of links of any length."""
+    links = [se3.translation_along("x", ca.SX.sym(f"l{i}")) for i in range(len(JOINTS) + 1)]
+    joints = tuple(Joint(name, link) for name, link in zip(JOINTS, links, strict=False))
+    shaped = effect.shaped(Chain(se3.identity(), joints, Attachment(len(JOINTS), links[-1])), conditions, values)
+    return stacked([shaped.tool.joint_T_frame.matrix(), *(j.parent_T_joint.matrix() for j in shaped.joints)])
+
+
+def _arm_of(effect: JointEffect) -> Arm:
+    return replace(planar_arms((ARM,))[ARM], effects={"effect": effect})
+
+
+def _columns(effect: ShapeEffect) -> None:
+    try:
+        surroundings({ARM: _arm_of(effect)})
+    except ValueError as fault:
+        raise ContractError(str(fault)) from fault
+
+
+def _read(effect: ShapeEffect, values: Mapping[str, Expression]) -> None:
+    """Each column has an influence, and without them the shape is known, or the missing name is a KeyError."""
+    given = {name: ca.SX.sym(name) for name in _arm_of(effect).conditions}
+    expect_all_used(_shape(effect, given, values), given)
+    try:
+        _shape(effect, {}, values)
+    except KeyError as fault:
+        expect(fault.args[0] in given, f"found that it reads {fault.args[0]!r}, expected it among its conditions")
 
 
 def _repeated(subject: Subject, effect: JointEffect, blocks: tuple[ParameterBlock, ...]) -> None:

@@ -1,0 +1,158 @@
+"""Instruments and effects of an outsider: angles only, pixels whose residual is in rad, a column of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any, ClassVar
+
+import casadi as ca
+from armcal.arm.effects import Condition, JointCommand
+from armcal.arm.model import Chain
+from armcal.base.parameters import scalar
+from armcal.base.se3 import Transform
+from armcal.base.settings import Angle, Length3, Settings
+from armcal.measure.contact import named_arm
+from armcal.measure.measurement import Channel
+from pydantic import Field
+
+
+class TheodoliteSettings(Settings):
+    """Its noise (standard deviation of each angle), and roughly where it stands in the arm's base frame."""
+
+    noise: Angle
+    station: Length3
+    arm: str | None = None
+
+
+class Theodolite:
+    """Channels ``bearing`` and ``elevation``; parameters ``station_x``, ..., and ``heading``."""
+
+    Settings: ClassVar[type[TheodoliteSettings]] = TheodoliteSettings
+    EXAMPLE: ClassVar[Mapping[str, Any]] = {"noise_deg": 0.005, "station_mm": [-1500, 500, 400]}
+
+    def __init__(self, settings: TheodoliteSettings, arm_names: Sequence[str]) -> None:
+        self._settings = settings
+        self.arms = (named_arm(settings.arm, arm_names),)
+
+    def parameters(self):
+        """Where it stands (m, base frame), and where its circle begins (rad)."""
+        place = [scalar(f"station_{axis}", "m", x, 0.01) for axis, x in zip("xyz", self._settings.station, strict=True)]
+        return (*place, scalar("heading", "rad", 0.0, 0.05))
+
+    def channels(self):
+        """What it reads."""
+        return (Channel("bearing", "angle"), Channel("elevation", "angle"))
+
+    def outputs(self, arms, values):
+        """What it would read without noise (rad)."""
+        sight = arms[self.arms[0]].base_T_tool.translation - ca.vertcat(*[values[f"station_{axis}"] for axis in "xyz"])
+        bearing = ca.atan2(sight[1], sight[0]) - values["heading"]
+        return {"bearing": bearing, "elevation": ca.atan2(sight[2], ca.norm_2(sight[:2]))}
+
+    def residual(self, arms, measured, values):
+        """Measured minus predicted (2x1, rad)."""
+        off = {name: measured[name] - value for name, value in self.outputs(arms, values).items()}
+        return ca.vertcat(ca.remainder(off["bearing"], 2 * ca.pi), off["elevation"])
+
+    def noise(self):
+        """Of each entry (rad)."""
+        return (self._settings.noise, self._settings.noise)
+
+    def dimensions(self):
+        """Angles alone."""
+        return ("angle", "angle")
+
+
+class PixelCameraSettings(Settings):
+    """Noise and focal length in pixels, and where the camera stands; it looks along the base frame's x axis."""
+
+    noise_of_a_pixel: float = Field(description="standard deviation in pixels, a pure number")
+    focal: float = Field(description="focal length in pixels, a pure number")
+    station: Length3
+    arm: str | None = None
+
+
+class PixelCamera:
+    """Channels ``u`` and ``v`` (pixels); its residual is v, then u, as angles: in another order and other units."""
+
+    Settings: ClassVar[type[PixelCameraSettings]] = PixelCameraSettings
+    EXAMPLE: ClassVar[Mapping[str, Any]] = {"noise_of_a_pixel": 0.2, "focal": 1200.0, "station_mm": [-1500, 100, 200]}
+
+    def __init__(self, settings: PixelCameraSettings, arm_names: Sequence[str]) -> None:
+        self._settings = settings
+        self.arms = (named_arm(settings.arm, arm_names),)
+
+    def parameters(self):
+        """Where it stands (m, base frame)."""
+        return tuple(scalar(f"station_{a}", "m", x, 0.01) for a, x in zip("xyz", self._settings.station, strict=True))
+
+    def channels(self):
+        """Pixels are pure numbers."""
+        return (Channel("u", "dimensionless"), Channel("v", "dimensionless"))
+
+    def outputs(self, arms, values):
+        """Pixels from the middle of the image."""
+        sight = arms[self.arms[0]].base_T_tool.translation - ca.vertcat(*[values[f"station_{axis}"] for axis in "xyz"])
+        focal = self._settings.focal
+        return {"u": focal * sight[1] / sight[0], "v": 3 * focal * sight[2] / sight[0]}
+
+    def residual(self, arms, measured, values):
+        """Predicted minus measured (2x1; rad near the middle of the image), v before u."""
+        focal, read = self._settings.focal, self.outputs(arms, values)
+        return ca.vertcat((read["v"] - measured["v"]) / (3 * focal), (read["u"] - measured["u"]) / focal)
+
+    def noise(self):
+        """Of each entry (rad): a pixel's of u, and of v, where pixels are a third as high, three."""
+        return (self._settings.noise_of_a_pixel / self._settings.focal,) * 2
+
+    def dimensions(self):
+        """Angles alone."""
+        return ("angle", "angle")
+
+
+class SwellingSettings(Settings):
+    """Nothing to set."""
+
+
+class Swelling:
+    """Every length grows with the relative humidity (0 to 1): parameter ``swelling``."""
+
+    Settings: ClassVar[type[SwellingSettings]] = SwellingSettings
+    EXAMPLE: ClassVar[Mapping[str, Any]] = {}
+    conditions: ClassVar[tuple[Condition, ...]] = (Condition("humidity", "dimensionless"),)
+
+    def __init__(self, settings: SwellingSettings, joint_names: Sequence[str]) -> None:
+        self._joints = len(joint_names)
+
+    def parameters(self):
+        """Growth of a length from dry to wet, a share of it."""
+        return (scalar("swelling", "1", 0.0, 0.01),)
+
+    def displacement(self, command: JointCommand, values):
+        """Nothing."""
+        return 0
+
+    def springs(self, values):
+        """None."""
+        return ()
+
+    def shaped(self, chain: Chain, conditions, values) -> Chain:
+        """Every link and the tool longer; it cannot do without the humidity."""
+        factor = 1 + values["swelling"] * conditions[self.conditions[0].name]
+
+        def longer(at: Transform) -> Transform:
+            return Transform(at.rotation, at.translation * factor)
+
+        joints = tuple(replace(joint, parent_T_joint=longer(joint.parent_T_joint)) for joint in chain.joints)
+        return replace(chain, joints=joints, tool=replace(chain.tool, joint_T_frame=longer(chain.tool.joint_T_frame)))
+
+
+class Unread(Swelling):
+    """As the above, of a column whose dimension nobody states."""
+
+    conditions: ClassVar[tuple[str, ...]] = ("dampness",)
+
+    def shaped(self, chain: Chain, conditions, values) -> Chain:
+        """Takes a condition that is not there for zero."""
+        return super().shaped(chain, {"humidity": conditions.get("dampness", 0.0)}, values)
