@@ -80,6 +80,7 @@ ORDER = [
     "armcal.solve.null_space",
     "armcal.solve.identifiability",
     "armcal.solve.projection",
+    "armcal.solve.readings",
     "armcal.solve.structure",
     "armcal.solve.tool_motion",
     "armcal.solve.scale",

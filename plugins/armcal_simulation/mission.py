@@ -115,7 +115,7 @@ class MissionOfDays:
         """What instruments read, and which records are wrong."""
         exact = measured_while_moving(request, standing, truth.values_at(times))
         seen = _seen(exact, tuple(request.measurements), truth.camera_T_base_at(times))
-        noisy = disturbed(request.measurements, seen, self._settings.noise, random["noise"])
+        noisy = disturbed(request, standing, seen, self._settings.noise, random["noise"])
         return with_outliers(noisy, self._settings.outliers, random["outliers"])
 
 

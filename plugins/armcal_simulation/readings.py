@@ -5,39 +5,32 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
+from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
-from armcal.measure.measurement import Measurement
-from scipy.spatial.transform import Rotation
+from armcal.solve.simulation import SimulationRequest, measured_with_noise
 
 _QUATERNION = ("qw", "qx", "qy", "qz")
-_SCIPY = ("qx", "qy", "qz", "qw")
 
 
 def disturbed(
-    measurements: Mapping[str, Measurement],
+    request: SimulationRequest,
+    commands: Dataset,
     exact: Mapping[str, Array],
     stated: float | None,
     random: np.random.Generator,
 ) -> dict[str, Array]:
-    """Readings by channel (N each) with Gaussian noise, as declared, or ``stated`` (m) on all but orientations.
+    """Readings by channel (N each) with Gaussian noise, as declared, or ``stated`` (m) on all that are lengths.
 
-    A quaternion is turned about its body's axes by the declared noise of the rotation vector, the last three entries.
+    Raises:
+        ProblemError: the residual of a measurement depends on something else than its readings.
     """
-    found: dict[str, Array] = {}
-    for name, measurement in measurements.items():
-        noise = measurement.noise()
-        channels = [channel.name for channel in measurement.channels() if f"{name}.{channel.name}" in exact]
-        plain = [channel for channel in channels if channel not in _QUATERNION or len(channels) == len(noise)]
-        for channel, deviation in zip(plain, noise, strict=False):
-            values = exact[f"{name}.{channel}"]
-            found[f"{name}.{channel}"] = values + random.normal(
-                0.0, deviation if stated is None else stated, len(values)
-            )
-        if len(plain) < len(channels):
-            read = Rotation.from_quat(np.array([exact[f"{name}.{channel}"] for channel in _SCIPY]).T)
-            read = read * Rotation.from_rotvec(random.normal(0.0, noise[-3:], (len(read), 3)))
-            found |= {f"{name}.{channel}": values for channel, values in zip(_SCIPY, read.as_quat().T, strict=True)}
-    return {channel: found[channel] for channel in exact}
+    found = measured_with_noise(request, commands, exact, random, stated)
+    for name in request.measurements:
+        parts = [f"{name}.{part}" for part in _QUATERNION]
+        if set(parts) <= found.keys():
+            length = np.linalg.norm([found[part] for part in parts], axis=0)
+            found |= {part: found[part] / length for part in parts}
+    return found
 
 
 def is_orientation(channel: str) -> bool:

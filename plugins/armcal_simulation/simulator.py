@@ -117,7 +117,7 @@ class ElasticArmSimulator:
     ) -> Mapping[str, Array]:
         true = _with_truth(request, self._settings)
         exact = measured_without_noise(true, standing)
-        read = disturbed(request.measurements, exact, self._settings.noise, random)
+        read = disturbed(true, standing, exact, self._settings.noise, random)
         moved = {channel: values for channel, values in read.items() if not is_orientation(channel)}
         return {**read, **with_outliers(moved, self._settings.outliers, random)[0]}
 

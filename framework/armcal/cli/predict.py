@@ -58,6 +58,8 @@ def predict(voice: Voice, calibration: Path, poses: Path, out: Path, recording: 
     else:
         found = loaded.plus_minus(commands, _RECORDINGS[recording])
         channels = {name: values + found.shift.get(name, 0.0) for name, values in channels.items()}
+        if unknown := [name for name in channels if not np.isfinite(found.half_widths.get(name, np.nan)).any()]:
+            voice.warn(f"how far {', '.join(unknown)} may be off is not known: no residual determines it.")
     if out.resolve() == poses.resolve():
         raise DataError("it is the file of poses itself.", where=Location(str(out)), hint="Give another --out.")
     wanted = wanted_channels(system.arms, loaded.readable, measured=False)
@@ -177,7 +179,7 @@ def _columns(found: PlusMinus, shown: Sequence[WantedChannel]) -> dict[str, tupl
 
 
 def _texts(values: Array) -> tuple[str, ...]:
-    return tuple(f"{value:.6g}" for value in values.tolist())
+    return tuple(f"{value:.6g}" if np.isfinite(value) else "" for value in values.tolist())
 
 
 def _typical(found: PlusMinus | None) -> dict[str, Any]:

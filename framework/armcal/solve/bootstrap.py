@@ -9,7 +9,7 @@ the model were true.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Annotated, Literal
 
 import numpy as np
@@ -23,6 +23,8 @@ from armcal.solve.blocks import BlockLength, automatic_block_length, draw_weight
 from armcal.solve.estimator import CONFIDENCE, Estimate, Estimator, Progress, no_progress
 from armcal.solve.parallel import Executor, Sequential
 from armcal.solve.problem import FactorRecords, Problem
+from armcal.solve.projection import predicted_records
+from armcal.solve.readings import disturbed_records, reading_slopes
 
 _FEWEST = 20
 """Refits that have to converge for an interval to be stated."""
@@ -105,7 +107,7 @@ def bootstrap(
     parametric = settings.method == "parametric"
     block = 1 if parametric else _block(problem, records, found, settings.blocks)
     if parametric:
-        _require_measured(problem, records)
+        _require_measured(problem, records, found.values)
     tasks = []
     for _ in range(settings.bootstrap):
         weights = np.ones(count) if parametric else draw_weights(count, block, random)
@@ -149,28 +151,23 @@ def _made_up(
     random: np.random.Generator,
 ) -> tuple[FactorRecords, ...]:
     """The records with measured values of the model, and noise as it was declared and found."""
-    made = []
-    for kernel, each, predicted in zip(problem.kernels, records, problem.predict(values, records), strict=True):
-        factor = kernel.factor
-        white = noise_scale * random.normal(size=(len(factor.output_channels), each.count))
+    predicted = predicted_records(problem, values, records)
+    noise = []
+    for kernel, each in zip(problem.kernels, records, strict=True):
+        white = noise_scale * random.normal(size=(len(kernel.factor.noise), each.count))
         if each.whitening is None:
-            noise = white * np.array(factor.noise)[:, None]
+            noise.append(white * np.array(kernel.factor.noise)[:, None])
         else:
             inverse = np.linalg.inv(np.moveaxis(each.whitening[:, :, : each.count], 2, 0))
-            noise = np.einsum("wrs,sw->rw", inverse, white)
-        record = each.record.copy()
-        for row, channel in enumerate(factor.output_channels):
-            record[factor.channels.index(channel), : each.count] = predicted[row] + noise[row]
-        made.append(replace(each, record=record))
-    return tuple(made)
+            noise.append(np.einsum("wrs,sw->rw", inverse, white))
+    return disturbed_records(problem, values, predicted, noise)
 
 
-def _require_measured(problem: Problem, records: Sequence[FactorRecords]) -> None:
-    for kernel, each in zip(problem.kernels, records, strict=True):
-        factor = kernel.factor
-        measured = set(factor.output_channels) <= set(factor.channels)
-        if not measured or len(factor.output_channels) != len(factor.noise) or each.correlation is not None:
+def _require_measured(problem: Problem, records: Sequence[FactorRecords], values: Array) -> None:
+    slopes = reading_slopes(problem, values, predicted_records(problem, values, records))
+    for kernel, each, slope in zip(problem.kernels, records, slopes, strict=True):
+        if slope is None or each.correlation is not None:
             raise ProblemError(
-                f"{factor.name} has no measured values of its own noise to make up.",
+                f"{kernel.factor.name} has no measured values of its own noise to make up.",
                 hint="Use uncertainty.method: blocks.",
             )

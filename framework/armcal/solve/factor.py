@@ -22,6 +22,7 @@ from armcal.arm.statics import Load
 from armcal.base import se3
 from armcal.base.parameters import ParameterBlock, Parameters, scalar
 from armcal.base.se3 import Expression
+from armcal.errors import ProblemError
 from armcal.measure.measurement import GroupedMeasurement, Measurement, noise_channels, residual_dimensions
 from armcal.measure.partners import OTHER
 
@@ -140,7 +141,8 @@ class Factor:
         """(values, record, state) -> d residual / d record channels, transposed (n_c x n_r), in equilibrium."""
         places = [self.channels.index(channel) if channel in self.channels else None for channel in channels]
         slope = ca.jacobian(self.residual, self.record)
-        if self.state.numel():
+        chosen_ones = [self.record[place] for place in places if place is not None]
+        if self.state.numel() and ca.depends_on(self.next_state, ca.vertcat(ca.SX(0, 1), *chosen_ones)):
             solved = self._solve_left(ca.jacobian(self.residual, self.state))
             slope = slope + ca.mtimes(solved, ca.jacobian(self.next_state, self.record))
         none = ca.SX.zeros(self.residual.numel(), 1)
@@ -209,6 +211,7 @@ def build_factor(
     outputs = ca.vertcat(*predicted.values())
     tools = ca.vertcat(*[ca.vec(states[a].base_T_tool.matrix()[:3, :]) for a in measurement.arms])
     told, told_names = _told(measurement, states, local)
+    _check_rows(name, measurement, residual)
     used = records.used_by(ca.vertcat(residual, next_state, outputs, tools, told))
     return Factor(
         name=name,
@@ -225,6 +228,29 @@ def build_factor(
         told_names=told_names,
         **_of_residual(name, measurement),
     )
+
+
+def _check_rows(name: str, measurement: Measurement, residual: Expression) -> None:
+    """Refuse a measurement whose noise, dimensions or noise columns are not those of its residual's entries.
+
+    Raises:
+        ProblemError: with what differs.
+    """
+    rows, dimensions, own = residual.numel(), residual_dimensions(measurement), noise_channels(measurement)
+    found = {"noise": len(measurement.noise()), "dimensions": len(dimensions), "noise columns": len(own) or rows}
+    odd = [f"{kind} of {count} entries" for kind, count in found.items() if count != rows]
+    odd += [f"dimension {kind!r}" for kind in dimensions if kind not in ("length", "angle")]
+    odd += [
+        f"noise column {channel.name} of dimension {channel.dimension}"
+        for channels, kind in zip(own, dimensions, strict=False)
+        for channel in channels
+        if channel.dimension != kind
+    ]
+    if odd:
+        raise ProblemError(
+            f"the measurement {name} has a residual of {rows} entries ({', '.join(dimensions)}), and {', '.join(odd)}.",
+            hint="Its plugin is wrong: armcal plugins check says how.",
+        )
 
 
 def _of_residual(name: str, measurement: Measurement) -> dict[str, Any]:

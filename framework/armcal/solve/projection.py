@@ -50,9 +50,22 @@ def as_predicted(problem: Problem, values: Array, records: Sequence[FactorRecord
     """
     if not any(_bilinear(kernel.factor) for kernel in problem.kernels):
         return tuple(records)
+    predicted = predicted_records(problem, values, records)
+    return tuple(
+        after if _bilinear(kernel.factor) else before
+        for kernel, before, after in zip(problem.kernels, records, predicted, strict=True)
+    )
+
+
+def predicted_records(problem: Problem, values: Array, records: Sequence[FactorRecords]) -> tuple[FactorRecords, ...]:
+    """Records with what the model predicts in the place of all measured numbers.
+
+    Raises:
+        NotConvergedError: a record has no elastic equilibrium at these values.
+    """
     shown = problem.predict(values, records)
     return tuple(
-        _as_predicted(kernel.factor, each, outputs) if _bilinear(kernel.factor) else each
+        _with_readings(kernel.factor, each, outputs)
         for kernel, each, outputs in zip(problem.kernels, records, shown, strict=True)
     )
 
@@ -107,7 +120,7 @@ def _bilinear(factor: Factor) -> bool:
     return bool(ca.depends_on(by_measured, ca.vertcat(factor.values, factor.state)))
 
 
-def _as_predicted(factor: Factor, each: FactorRecords, outputs: Array) -> FactorRecords:
+def _with_readings(factor: Factor, each: FactorRecords, outputs: Array) -> FactorRecords:
     record = each.record.copy()
     for row in _measured(factor):
         predicted = outputs[factor.output_channels.index(factor.channels[row])]
@@ -126,7 +139,8 @@ def _fitting_joints(kernel: Kernel, slots: Slots, values: Array, each: FactorRec
         residual = _residual(kernel, slots, values, moved)
         if (_whitened(kernel.factor, residual) < _AT_ZERO * 1e-3).all():
             break
-        inverse = np.linalg.pinv(_slopes(kernel, slots, values, moved).transpose(2, 0, 1), rcond=1e-9)
+        joints = [kernel.factor.channels[row] for row in rows]
+        inverse = np.linalg.pinv(channel_slopes(kernel, slots, values, moved, joints).transpose(2, 0, 1), rcond=1e-9)
         step = np.einsum("nqr,rn->qn", inverse, residual)
         longest = np.abs(step).max(axis=0)
         moved.record[list(rows)] -= step * np.minimum(1.0, 0.3 / np.maximum(longest, 1e-300))
@@ -134,9 +148,8 @@ def _fitting_joints(kernel: Kernel, slots: Slots, values: Array, each: FactorRec
     return replace(each, record=np.where(reached, moved.record, each.record))
 
 
-def _slopes(kernel: Kernel, slots: Slots, values: Array, each: FactorRecords) -> Array:
-    """d residual / d joint angles at states in equilibrium (n_r x joints x N)."""
-    channels = [kernel.factor.channels[row] for row in joint_channels(kernel.factor)]
+def channel_slopes(kernel: Kernel, slots: Slots, values: Array, each: FactorRecords, channels: Sequence[str]) -> Array:
+    """d residual / d channels at states in equilibrium (n_r x channels x N, filled up as the records are)."""
     size, width = kernel.factor.residual.numel(), each.record.shape[1]
     slopes = np.empty((size * len(channels), width))
     evaluate = partial(kernel.channel_slopes, channels=channels)

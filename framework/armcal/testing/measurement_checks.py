@@ -16,6 +16,7 @@ from armcal.base.units import units_of
 from armcal.measure.measurement import Channel, GroupedMeasurement, Measurement
 from armcal.measure.partners import OTHER
 from armcal.solve.factor import Factor, build_factor
+from armcal.solve.readings import readings_by_residual
 from armcal.testing.expressions import (
     check_parameters,
     expect_all_used,
@@ -52,7 +53,7 @@ def check_measurement(record: Recorder, subject: Subject) -> None:
     factor = record.check("it makes a residual", lambda: _factor(measurement, arms, blocks, channels))
     if factor is None:
         return
-    record.check("noise is positive, one number a residual", lambda: _noise(factor))
+    record.check("noise is positive", lambda: _noise(factor))
     record.check("residuals depend on what is given", lambda: _closed(factor))
     measured = [f"{_INSTRUMENT}.{channel.name}" for channel in channels]
     record.check("outputs are channels", lambda: _outputs(factor, measured))
@@ -69,6 +70,11 @@ def check_measurement(record: Recorder, subject: Subject) -> None:
         return
     record.check("every parameter has an influence", lambda: _all_used(general, measurement, arms, blocks))
     record.check("its residual is in m and rad", lambda: _gains(general, measurement, arms, blocks, channels))
+    slopes = record.check(
+        "the noise of every reading follows from its residual", lambda: _readings(general, measurement, arms, blocks)
+    )
+    if slopes is not None:
+        record.check("a position's residual is x, y, z, measured minus predicted", lambda: _position(factor, slopes))
     if isinstance(measurement, GroupedMeasurement):
         record.check("all groups have the same parameters", lambda: _groups(measurement))
         record.check("what a record says of its group fits it", lambda: _told(factor, measurement, arms, blocks))
@@ -125,19 +131,11 @@ def _parameters(arms: Mapping[str, Arm], blocks: Sequence[ParameterBlock]) -> Pa
 
 
 def _noise(factor: Factor) -> None:
-    count = factor.residual.numel()
-    expect(len(factor.noise) == count, f"found {len(factor.noise)} noises for {count} residuals")
     expect(
         all(np.isfinite(noise) and noise > 0 for noise in factor.noise),
         f"found the noise {factor.noise}, expected standard deviations above zero",
     )
-    dims = len(factor.dimensions)
-    expect(dims == count, f"found {dims} dimensions for {count} residuals, expected length or angle of each")
-    strange = sorted(set(factor.dimensions) - {"length", "angle"})
-    expect(not strange, f"found the dimensions {', '.join(strange)} of residuals, expected length or angle")
     expect_small_noise(factor.noise, factor.dimensions)
-    stated = len(factor.noise_channels)
-    expect(stated in (0, count), f"found noise channels for {stated} of {count} residuals, expected all or none")
 
 
 def _closed(factor: Factor) -> None:
@@ -259,6 +257,41 @@ def _all_used(
         values[block.name.removeprefix(f"{_INSTRUMENT}.")] = factor.values[place : place + block.size]
         place += block.size
     expect_all_used(stacked([factor.residual, factor.outputs]), values)
+
+
+def _readings(
+    factor: Factor, measurement: Measurement, arms: Mapping[str, Arm], blocks: Sequence[ParameterBlock]
+) -> Array:
+    """Slopes of the residual by the readings (n_r x outputs), from which noise in the readings is worked out."""
+    if not factor.output_channels:
+        raise NotRun("it reads nothing")
+    function = _function(factor, factor.residual)
+    at = np.concatenate(_point(factor, measurement, arms, blocks))
+    slope, start = np.asarray(function.jacobian()(at, function(at))), factor.values.numel()
+    places = [factor.channels.index(name) if name in factor.channels else None for name in factor.output_channels]
+    none = np.zeros(len(slope))
+    by_reading = np.array([none if place is None else slope[:, start + place] for place in places]).T
+    names = [name.rpartition(".")[2] for name in factor.output_channels]
+    idle = [name for name, column in zip(names, by_reading.T, strict=True) if not np.any(column)]
+    expect(not idle, f"found that no residual depends on the reading {', '.join(idle)}, expected its noise in one")
+    expect(
+        readings_by_residual(by_reading[None], np.array(factor.noise)) is not None,
+        f"found {len(slope)} residuals that the readings {', '.join(names)} do not each determine, expected that noise "
+        "of the residual can be worked out as noise of the readings",
+    )
+    return by_reading
+
+
+def _position(factor: Factor, slopes: Array) -> None:
+    names = [name.rpartition(".")[2] for name in factor.output_channels]
+    if not set("xyz") <= set(names):
+        raise NotRun("it reads no position x, y, z")
+    found = slopes[:3, [names.index(axis) for axis in "xyz"]]
+    expect(
+        bool(np.allclose(found, np.eye(3), atol=1e-6)),
+        f"found residuals that change by {np.round(found, 3).tolist()} with x, y and z, expected measured minus "
+        "predicted of x, y and z in this order: a run tells by them how the arm and the instrument are mistaken",
+    )
 
 
 def _gains(

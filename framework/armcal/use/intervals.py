@@ -24,6 +24,7 @@ from armcal.solve.coverage import Recording, Stretch, level_name
 from armcal.solve.drift import with_drift
 from armcal.solve.prediction import LEVELS, STATED, Predictor, Spread, ToldDrift, is_position
 from armcal.solve.problem import FactorRecords, Problem
+from armcal.solve.readings import reading_slopes
 from armcal.solve.validation import Indices
 from armcal.solve.variance import Axes, Component, VarianceComponents, apply_components
 
@@ -79,7 +80,8 @@ class PlusMinus:
 
     Attributes:
         shift: what the drift of the recording adds to each predicted channel (N each; zero in a new recording).
-        deviations: standard deviation of each channel (N each; m or rad), not stretched.
+        deviations: standard deviation of each channel (N each; SI), not stretched; none of a measurement whose residual
+            does not follow from its readings.
         half_widths: of 90 % intervals, stretched as cross-validation found (N each).
         radii: of each position measurement by name: of a ball about the prediction that holds 95 % (N each; m).
         covariances: of each position measurement by name, stretched as half widths are (N x 3 x 3 each; m^2).
@@ -155,7 +157,8 @@ class Uncertainty:
             DataError: in the same recording, and the records do not say their place in it.
             NotConvergedError: a record has no equilibrium.
         """
-        problem, told = self._problem(commands), self.record.recording
+        told, commands = self.record.recording, self._with_predictions(commands)
+        problem = self._problem(commands)
         near = np.zeros(len(commands), dtype=bool)
         if recording == "same" and told is not None:
             near = self._near(told, commands)
@@ -169,16 +172,19 @@ class Uncertainty:
 
     def _apart(self, problem: Problem, commands: Dataset, places: Indices) -> _Part:
         """Where nothing is told of a drift."""
-        spreads = self._predictor(problem, None).in_new_recording(self._whitened(problem, problem.records(commands)))
+        records = problem.records(commands)
+        spreads = self._predictor(problem, None).in_new_recording(self._whitened(problem, records))
         recording: Recording = "same" if self.record.recording is None else "new"
-        return _Part(places, recording, tuple(np.zeros_like(spread.deviations) for spread in spreads), spreads)
+        still = tuple(np.zeros_like(spread.deviations) for spread in spreads)
+        return _Part(places, recording, still, spreads, reading_slopes(problem, self.values, records))
 
     def _within(self, problem: Problem, commands: Dataset, places: Indices, drift: ToldDrift, span: Span) -> _Part:
         """In the recording, which tells of a drift."""
         records = self._drifted(problem, commands, span)
         spreads = self._predictor(problem, drift).in_recording(records)
         moved = [each.correlation.moved(i, drift.innovations) for i, each in enumerate(records) if each.correlation]
-        return _Part(places, "same", tuple(-m[:, : len(places)] for m in moved), spreads)
+        off = tuple(-m[:, : len(places)] for m in moved)
+        return _Part(places, "same", off, spreads, reading_slopes(problem, self.values, records))
 
     def _predictor(self, problem: Problem, drift: ToldDrift | None) -> Predictor:
         return Predictor(problem, self.values, self._covariance, self.noise_scale, self.freedom, drift)
@@ -203,6 +209,17 @@ class Uncertainty:
         both = replace(both, channels={**both.channels, **ends})
         records = with_drift(problem, problem.records(both), both, self.parameters.nominal())
         return problem.subset(records, np.arange(count, dtype=np.intp))
+
+    def _with_predictions(self, commands: Dataset) -> Dataset:
+        """The commands with what instruments read there: residuals may depend on readings in any way."""
+        problem = self._problem(commands)
+        shown = problem.predict(self.values, problem.records(commands))
+        read = {
+            channel: values[row]
+            for kernel, values in zip(problem.kernels, shown, strict=True)
+            for row, channel in enumerate(kernel.factor.output_channels)
+        }
+        return replace(commands, channels={**commands.channels, **read})
 
     def _problem(self, dataset: Dataset) -> Problem:
         system = self.system
@@ -253,12 +270,29 @@ class Uncertainty:
 
 @dataclass(frozen=True)
 class _Part:
-    """Some records: their places, what is known of their drift, shifts by it (n_r x N) and spreads, by factor."""
+    """Some records: their places, what is known of their drift, and by factor what that says of their residuals.
+
+    Shifts (n_r x N) and spreads are of residuals, ``slopes`` (N x outputs x n_r) those of the readings by them.
+    """
 
     places: Indices
     recording: Recording
     shifts: tuple[Array, ...]
     spreads: tuple[Spread, ...]
+    slopes: tuple[Array | None, ...]
+
+    def of_readings(self, place: int) -> tuple[Array, Spread] | None:
+        """Shift (outputs x N) and spread of the readings of one factor; None where they do not follow from residuals.
+
+        A reading that no residual depends on is not known to any extent: not a number.
+        """
+        slope, spread = self.slopes[place], self.spreads[place]
+        if slope is None:
+            return None
+        covariance = slope @ spread.covariance @ slope.transpose(0, 2, 1)
+        idle = ~np.any(slope != 0, axis=2)
+        covariance[idle[:, :, None] | idle[:, None, :]] = np.nan
+        return np.einsum("nor,rn->on", slope, self.shifts[place]), Spread(covariance, spread.freedom)
 
 
 def _joined(
@@ -267,14 +301,15 @@ def _joined(
     found = PlusMinus({}, {}, {}, {})
     for place, kernel in enumerate(problem.kernels):
         channels, name = kernel.factor.output_channels, kernel.factor.name
-        if len(channels) != kernel.factor.residual.numel():
+        known = [part.of_readings(place) for part in parts]
+        if not channels or any(own is None for own in known):
             continue
         rows, radius = np.full((3, len(channels), count), np.nan), np.full(count, np.nan)
         covariance = np.full((count, len(channels), len(channels)), np.nan)
-        for part in parts:
-            own, spread = stretches.get(part.recording), part.spreads[place]
+        for part, (shift, spread) in zip(parts, filter(None, known), strict=True):
+            own = stretches.get(part.recording)
             stretch = own.coordinates[level_name(STATED)] if own else 1.0
-            rows[:, :, part.places] = part.shifts[place], spread.deviations, stretch * spread.half_widths(STATED)
+            rows[:, :, part.places] = shift, spread.deviations, stretch * spread.half_widths(STATED)
             covariance[part.places] = stretch**2 * spread.covariance
             radius[part.places] = spread.radius() * (own.radius if own and own.radius is not None else 1.0)
         for i, channel in enumerate(channels):

@@ -319,6 +319,55 @@ class ReadsMillimetres(Gauge):
         return {axis: 1000 * value for axis, value in super().outputs(arms, values).items()}
 
 
+class IdleReading(Gauge):
+    """It reads a depth that its residual leaves out: nobody knows how noisy that is."""
+
+    def channels(self) -> Any:
+        return (*super().channels(), Channel("depth", "length"))
+
+    def outputs(self, arms: Any, values: Any) -> Any:
+        return {**super().outputs(arms, values), "depth": arms[self.arms[0]].base_T_tool.translation[1]}
+
+    def residual(self, arms: Any, measured: Any, values: Any) -> Any:
+        shown = self.outputs(arms, values)
+        return ca.vertcat(*[measured[axis] - shown[axis] for axis in self.axes])
+
+
+class SumAndDifference(Gauge):
+    """Sound: what it means in readings can be worked out."""
+
+    def residual(self, arms: Any, measured: Any, values: Any) -> Any:
+        off = super().residual(arms, measured, values)
+        return ca.vertcat(off[1] - off[0], off[0] + off[1]) / 2**0.5
+
+
+class OneReadingTwice(Gauge):
+    deviations = (1e-3, 1e-3, 1e-3)
+
+    def residual(self, arms: Any, measured: Any, values: Any) -> Any:
+        off = super().residual(arms, measured, values)
+        return ca.vertcat(off, off[0])
+
+
+class NoiseOfAnotherDimension(Gauge):
+    def noise_channels(self) -> Any:
+        return ((Channel("noise_x", "length"),), (Channel("noise_z", "dimensionless"),))
+
+
+class PositionInAnotherOrder(Gauge):
+    axes = "xyz"
+    deviations = (1e-3, 1e-3, 1e-3)
+
+    def residual(self, arms: Any, measured: Any, values: Any) -> Any:
+        off = super().residual(arms, measured, values)
+        return ca.vertcat(off[1], off[0], off[2])
+
+
+class PositionHalved(PositionInAnotherOrder):
+    def residual(self, arms: Any, measured: Any, values: Any) -> Any:
+        return Gauge.residual(self, arms, measured, values) / 2
+
+
 class NoiseInMillimetres(Gauge):
     deviations = (0.5, 0.5)
 
