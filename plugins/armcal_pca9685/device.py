@@ -42,7 +42,7 @@ class Pca9685Device:
         if missing:
             known = ", ".join(self._file.servos) or "none"
             raise ValueError(f"the servo file {settings.servos} has no servo {', '.join(missing)}; it has {known}")
-        self._servos = {joint: Servo(self._file.calibrated(joint)) for joint in joint_names}
+        self._servos = {j: Servo(self._file.calibrated(j), self._file.servos[j].pulse_range) for j in joint_names}
         self._chips: dict[int, Chip] = {}
         self._counts: dict[str, int] = {}  # of joints with pulses, as last read or written
         self._guard = Guard((), 0.0, 0.0)
@@ -127,14 +127,19 @@ class Pca9685Device:
 
     def set_pulse(self, joint: str, pulse: float) -> float:
         """See ``PulseDevice``."""
-        clock = self._known(joint).clock
-        counts = int(clock.counts(pulse)) if math.isfinite(pulse) else 0
-        if not 1 <= counts < COUNTS:
-            asked, longest = 1e6 * pulse, 1e6 * clock.longest_pulse
-            found = f"found a pulse of {asked:g} us for {joint}, expected up to {longest:.0f} us."
-            raise DeviceRefusedError(found, where=self._where, hint="Ask for a pulse within the period.")
+        servo = self._known(joint)
+        counts = int(servo.clock.counts(pulse)) if math.isfinite(pulse) else 0
+        fewest, most = servo.borne
+        if not max(fewest, 1) <= counts <= min(most, COUNTS - 1):
+            low, high = (1e6 * end for end in servo.pulse_range)
+            raise DeviceRefusedError(
+                f"found a pulse of {1e6 * pulse:g} us for {joint}, expected {low:g} to {high:g} us, which its servo "
+                "bears.",
+                where=Location(str(self._settings.servos), field=f"servos.{joint}.pulse_range"),
+                hint="Ask for a pulse that it bears, or state its range if its data sheet gives a wider one.",
+            )
         self._begin(joint, counts)
-        return counts * clock.tick
+        return counts * servo.clock.tick
 
     def close(self) -> None:
         """See ``JointDevice``."""

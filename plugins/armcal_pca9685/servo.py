@@ -11,6 +11,7 @@ from armcal.arm.servo import PulseClock, PulseTable, quantised
 from armcal.config.servo_file import CalibratedServo
 
 _ANGLE_SLACK = 1e-9
+_COUNT_SLACK = 1e-6
 
 
 @dataclass(frozen=True)
@@ -18,6 +19,7 @@ class Servo:
     """A servo as the servo file has it; tables and clocks are looked up once, for they are asked at every step."""
 
     calibrated: CalibratedServo
+    pulse_range: tuple[float, float]
 
     @cached_property
     def place(self) -> tuple[int, int]:
@@ -41,14 +43,21 @@ class Servo:
         """The same for people, as it is in the table."""
         return f"{math.degrees(self._table.angles[0]):g} to {math.degrees(self._table.angles[-1]):g} deg"
 
+    @cached_property
+    def borne(self) -> tuple[int, int]:
+        """The fewest and the most counts that lie within the pulses that it bears."""
+        low, high = (pulse / self.clock.tick for pulse in self.pulse_range)
+        return math.ceil(low - _COUNT_SLACK), math.floor(high + _COUNT_SLACK)
+
     def has(self, angle: float) -> bool:
         """Whether its table has this angle (rad); no table has one that is not finite."""
         low, high = self.span
         return low <= angle <= high
 
     def counts(self, angle: float) -> int:
-        """Nearest to an angle (rad)."""
-        return int(self.clock.counts(self._table.pulse(angle)))
+        """Nearest to an angle (rad), of those that it bears."""
+        fewest, most = self.borne
+        return min(max(int(self.clock.counts(self._table.pulse(angle))), fewest), most)
 
     def angle(self, counts: int) -> float:
         """The angle (rad) that so many counts ask for."""

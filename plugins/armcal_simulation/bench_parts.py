@@ -106,15 +106,16 @@ def servo_kind(settings: ServoJointSettings) -> ServoKind:
     return ServoKind(build, heat)
 
 
-def bounds(experiment: Experiment) -> Bounds:
-    """What the plan allows."""
+def bounds(experiment: Experiment, file: ServoFile) -> Bounds:
+    """What the plan allows, and what the servos bear."""
     plan = experiment.settings.plan
+    pulses = {joint: servo.pulse_range for joint, servo in file.servos.items()}
     if plan is None:
-        return Bounds({}, None)
+        return Bounds({}, None, pulses)
     check = None
     if plan.clearance is not None:
         check = clearance_check(plan.clearance, experiment.system.arms, experiment.source)
-    return Bounds(plan.limits, check)
+    return Bounds(plan.limits, check, pulses)
 
 
 def matrix_of(pose: PoseSettings) -> Array:

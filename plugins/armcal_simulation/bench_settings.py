@@ -53,7 +53,8 @@ class SafetySettings(Settings):
     """What the arm must not be made to do, judged by the true pulse tables.
 
     The commanded speed over ``window`` may be above ``rate_deg_per_s`` by a twentieth and one count. Joint limits and
-    clearances are the plan's, less what a host cannot know of the true tables. Two joints whose pulses begin within
+    clearances are the plan's, less what a host cannot know of the true tables. Pulses are those that the true servo
+    file's servos bear, less what a host cannot know of the true oscillator. Two joints whose pulses begin within
     ``together`` were not energised one at a time.
     """
 
@@ -61,6 +62,7 @@ class SafetySettings(Settings):
     window: Duration = 0.25
     limits_slack: Angle = 0.035
     clearance_slack: Length = 0.005
+    pulse_slack: Duration = 2e-5
     together: Duration = 0.1
 
 

@@ -61,7 +61,7 @@ class BenchWorld:
         self._world_T_base = bench_parts.matrix_of(settings.world_T_base)
         self._physics = bench_parts.physics(settings, tracked, file, self._track)
         self._kinds = {joint: settings.servo_of(joint) for joint in self._physics.servos}
-        limits = bench_parts.bounds(experiment)
+        limits = bench_parts.bounds(experiment, file)
         self._safety = Safety(settings.safety, limits, self._physics.servos, appended_to(folder / LOG))
         self._physics.on_failure = self._safety.failed
         self._faults = FaultCalendar(self._clock, self._fail)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections import Counter, deque
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -25,10 +25,11 @@ _NO_TIME = -1e9
 
 @dataclass(frozen=True)
 class Bounds:
-    """What the experiment allows: joint limits (rad) and clearances, where it states them."""
+    """What the experiment allows: joint limits (rad) and clearances, where it has them; pulses (s) that servos bear."""
 
     limits: Mapping[str, tuple[float, float]]
     clearance: ClearanceCheck | None
+    pulses: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
 
 class Safety:
@@ -71,6 +72,7 @@ class Safety:
         self._told[joint] = angle
         self._past[joint].append((commit.time, angle))
         self._judge_limits(joint, commit.time, angle)
+        self._judge_pulse(joint, commit.time, commit.after)
         self._moved = True
 
     def failed(self, joint: str, now: float, heat: float) -> None:
@@ -126,6 +128,12 @@ class Safety:
         slack = self._settings.limits_slack
         if angle < low - slack or angle > high + slack:
             self._offend("limits", joint, now, angle, low - slack if angle < low else high + slack)
+
+    def _judge_pulse(self, joint: str, now: float, pulse: float) -> None:
+        low, high = self._bounds.pulses.get(joint, (0.0, np.inf))
+        slack = self._settings.pulse_slack
+        if not low - slack <= pulse <= high + slack:
+            self._offend("pulse", joint, now, pulse, low - slack if pulse < low else high + slack)
 
     def _began(self, joint: str, now: float, angle: float) -> None:
         last, other = self._first_pulse

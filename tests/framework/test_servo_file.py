@@ -27,6 +27,8 @@ servos:
   q1: {board: front, channel: 0, angles_deg: [-100, 0, 100], pulses_us: [620, 1540, 2460]}
   q2: {board: back, channel: 0, angles_deg: [-90, 90], pulses_us: [2400, 600]}
 """
+WIDE = {"pulse_range": (1e-6, 0.0195)}
+"""Of no servo, so that any number can be written."""
 
 
 def load(folder, text=TEXT):
@@ -54,6 +56,19 @@ BAD = {
     "a rate of none": ("rate_hz: 50", "rate_hz: 10", "servos.yaml:2, boards.front.rate_hz", "10"),
     "prescale": ("rate_hz: 50", "rate_hz: 24", "servos.yaml:2, boards.front", "prescale is 256"),
     "too long": ("rate_hz: 50", "rate_hz: 1000", "servos.yaml:5, servos.q1.pulses", "longer"),
+    "a pulse that no servo bears": ("[620, 1540", "[172.7, 1540", "servos.yaml:5, servos.q1.pulses", "172.7 us"),
+    "a pulse beyond the servo's own range": (
+        "pulses_us: [2400, 600]",
+        "pulses_us: [2400, 600], pulse_range_us: [500, 2350]",
+        "servos.yaml:6, servos.q2.pulses",
+        "500 to 2350 us",
+    ),
+    "a range that falls": (
+        "pulses_us: [2400, 600]",
+        "pulses_us: [2400, 600], pulse_range_us: [2500, 500]",
+        "servos.yaml:6, servos.q2",
+        "pulse_range does not rise",
+    ),
     "unknown board": ("board: back", "board: rear", "servos.yaml:6, servos.q2.board", "front, back"),
     "same channel": ("board: back", "board: front", "servos.yaml:6, servos.q2.channel", "'q1'"),
     "channel 16": (
@@ -120,7 +135,9 @@ names = st.one_of(
 @settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_written_and_read_to_the_last_bit(tmp_path, tables, board, identity, oscillator_hz, rate_hz):
     servos = {
-        joint: ServoSettings.si(board=board, channel=i, angles=sorted(angles), pulses=sorted(pulses)[: len(angles)])
+        joint: ServoSettings.si(
+            board=board, channel=i, angles=sorted(angles), pulses=sorted(pulses)[: len(angles)], **WIDE
+        )
         for i, (joint, (angles, pulses)) in enumerate(tables.items())
     }
     made = ServoFile({board: BoardSettings(oscillator_hz=oscillator_hz, rate_hz=rate_hz, id=identity)}, servos)

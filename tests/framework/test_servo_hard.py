@@ -271,7 +271,7 @@ class TestTracker:
 def _of_mover(setup: Setup) -> tuple[Any, ...]:
     read_by = {joint: (setup.known(joint), setup.file.boards["front"].clock) for joint in setup.base}
     clock = FakeClock()
-    return clock, read_by, read_by, Motion(0.3, 0.02, setup.settings.pulses), lambda: False
+    return clock, read_by, read_by, Motion(0.3, 0.02, {joint: setup.pulses_of(joint) for joint in setup.base}), lambda: False
 
 
 @pytest.mark.slow
@@ -427,5 +427,7 @@ class TestTables:
             "servos.yaml",
         ]
         real.chmod(0o644)
-        kept = write_servo_file(link, file)
+        assert write_servo_file(link, file) is None  # nothing to change
+        boards = {"front": BoardSettings.si(**{**file.boards["front"].model_dump(), "oscillator_hz": 25.5e6})}
+        kept = write_servo_file(link, ServoFile(boards, file.servos))
         assert link.is_symlink() and kept is not None and kept.read_bytes() == before and real.read_bytes() != before

@@ -34,6 +34,7 @@ _PLAIN = re.compile(r"[A-Za-z_]\w*")
 
 Angles = Annotated[tuple[float, ...], UnitOf("angle")]
 Pulses = Annotated[tuple[float, ...], UnitOf("time")]
+PulseRange = Annotated[tuple[float, float], UnitOf("time")]
 Oscillator = Annotated[float, Field(ge=20e6, le=30e6)]
 Place = tuple[str | int, ...]
 
@@ -80,16 +81,23 @@ class BoardSettings(Settings):
 
 
 class ServoSettings(Settings):
-    """A servo: its board, its channel (0 to 15), and its pulse lengths at known angles."""
+    """A servo: its board, its channel (0 to 15), and its pulse lengths at known angles.
+
+    ``pulse_range`` is the shortest and the longest pulse that it bears, by its data sheet. No other is written to the
+    file or sent to the board.
+    """
 
     board: str
     channel: Annotated[int, Field(ge=0, le=CHANNELS - 1)]
     angles: Angles
     pulses: Pulses
+    pulse_range: PulseRange = (300e-6, 2800e-6)
 
     @model_validator(mode="after")
     def _usable(self) -> ServoSettings:
         PulseTable(self.angles, self.pulses)
+        if not 0 < self.pulse_range[0] < self.pulse_range[1]:
+            raise ValueError("the pulse_range does not rise from above zero: give [shortest, longest]")
         return self
 
     @property
@@ -170,6 +178,7 @@ class ServoFile:
                 found = f"found channel {servo.channel}, which {first!r} has, expected its own"
                 raise ServoFileError(found, ("servos", joint, "channel"))
             try:
+                _check_borne(servo)
                 _check_longest(servo.table, self.boards[servo.board].clock)
             except ValueError as fault:
                 raise ServoFileError(str(fault), ("servos", joint, "pulses")) from fault
@@ -207,16 +216,29 @@ def load_servo_file(path: str | Path) -> ServoFile:
 def servo_file_text(file: ServoFile) -> str:
     """The file as YAML; reading it gives equal numbers, to the last bit."""
     lines = ["boards:"]
-    for name, board in file.boards.items():
-        clock = f"oscillator_hz: {_number(board.oscillator_hz)}, rate_hz: {_number(board.rate_hz)}"
-        lines.append(f"  {_word(name)}: {{address: 0x{board.address:02x}, {clock}, id: {_quoted(board.id)}}}")
+    lines += [f"  {_word(name)}: {{{_listed(board_fields(board))}}}" for name, board in file.boards.items()]
     lines.append("servos:")
-    for joint, servo in file.servos.items():
-        angles = _in_unit("angles", servo.angles, "deg", math.degrees, "rad")
-        pulses = _in_unit("pulses", servo.pulses, "us", lambda pulse: 1e6 * pulse, "s")
-        place = f"board: {_word(servo.board)}, channel: {servo.channel}"
-        lines.append(f"  {_word(joint)}: {{{place}, {angles}, {pulses}}}")
+    lines += [f"  {_word(joint)}: {{{_listed(servo_fields(servo))}}}" for joint, servo in file.servos.items()]
     return "\n".join(lines) + "\n"
+
+
+def board_fields(board: BoardSettings) -> list[tuple[str, str]]:
+    """Keys and values of a board as they are written."""
+    clock = [("oscillator_hz", _number(board.oscillator_hz)), ("rate_hz", _number(board.rate_hz))]
+    return [("address", f"0x{board.address:02x}"), *clock, ("id", _quoted(board.id))]
+
+
+def servo_fields(servo: ServoSettings) -> list[tuple[str, str]]:
+    """Keys and values of a servo as they are written."""
+    angles = _in_unit("angles", servo.angles, "deg", math.degrees, "rad")
+    pulses = _in_unit("pulses", servo.pulses, "us", lambda pulse: 1e6 * pulse, "s")
+    borne = _in_unit("pulse_range", servo.pulse_range, "us", lambda pulse: 1e6 * pulse, "s")
+    stated = [borne] if "pulse_range" in servo.model_fields_set else []
+    return [("board", _word(servo.board)), ("channel", str(servo.channel)), angles, pulses, *stated]
+
+
+def _listed(fields: list[tuple[str, str]]) -> str:
+    return ", ".join(f"{key}: {text}" for key, text in fields)
 
 
 def digest(servos: Mapping[str, CalibratedServo]) -> str:
@@ -225,18 +247,30 @@ def digest(servos: Mapping[str, CalibratedServo]) -> str:
     return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
 
 
+def _check_borne(servo: ServoSettings) -> None:
+    low, high = servo.pulse_range
+    outside = [pulse for pulse in servo.pulses if not low <= pulse <= high]
+    if outside:
+        raise ValueError(
+            f"found a pulse of {1e6 * outside[0]:.1f} us, expected {1e6 * low:g} to {1e6 * high:g} us, which the servo "
+            "bears (pulse_range)"
+        )
+
+
 def _check_longest(table: PulseTable, clock: PulseClock) -> None:
     longest, limit = max(table.pulses), clock.longest_pulse
     if longest > limit:
         raise ValueError(f"a pulse of {1e6 * longest:g} us is longer than the board's longest, {1e6 * limit:.0f} us")
 
 
-def _in_unit(name: str, values: tuple[float, ...], unit: str, convert: Callable[[float], float], si: str) -> str:
+def _in_unit(
+    name: str, values: tuple[float, ...], unit: str, convert: Callable[[float], float], si: str
+) -> tuple[str, str]:
     """The numbers in a customary unit if every one can be read back from it to the last bit, in SI otherwise."""
     written = [_exact(value, unit, convert(value)) for value in values]
     found = [number for number in written if number is not None]
     key, numbers = (f"{name}_{unit}", found) if len(found) == len(values) else (f"{name}_{si}", list(values))
-    return f"{key}: [{', '.join(map(_number, numbers))}]"
+    return key, f"[{', '.join(map(_number, numbers))}]"
 
 
 def _number(value: float) -> str:

@@ -11,7 +11,6 @@ from armcal.arm.servo import PulseTable
 from armcal.bench.servo.fit import FittedServo
 from armcal.bench.servo.outcome import Outcome
 
-_SENSIBLE_US = (300.0, 2800.0)
 _SENSIBLE_HZ = (23e6, 27e6)
 _FAR_CHANGE = 0.1
 _SAG_WORTH = math.radians(0.1)
@@ -58,10 +57,6 @@ def _of_servo(servo: FittedServo, outcome: Outcome) -> Iterator[str]:
                 f"{joint}: the pulse at {math.degrees(angle):g} deg goes on straight from what was measured, "
                 f"{math.degrees(servo.reach[0]):.0f} to {math.degrees(servo.reach[1]):.0f} deg."
             )
-    if any(not _SENSIBLE_US[0] <= 1e6 * pulse <= _SENSIBLE_US[1] for pulse in servo.pulses):
-        shown = ", ".join(f"{1e6 * pulse:.0f}" for pulse in servo.pulses)
-        low, high = _SENSIBLE_US
-        yield f"{joint}: pulses of {shown} us are outside the {low:.0f} to {high:.0f} us of a servo."
     if before == after and _gain_change(servo) > _FAR_CHANGE:
         yield (
             f"{joint}: its pulses a degree differ from the stated ones by {100 * _gain_change(servo):.0f} %: is it the "

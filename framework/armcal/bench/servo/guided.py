@@ -70,7 +70,7 @@ class Guided:
         found = []
         for joint in self.setup.joints:
             low, high = self._inner(joint)
-            for angle in sorted({float(np.clip(knot, low, high)) for knot in self.setup.settings.knots}):
+            for angle in sorted({float(np.clip(knot, low, high)) for knot in self.setup.knots_of(joint)}):
                 found += [Target(joint, angle, 1), Target(joint, angle, -1)]
         return found
 
@@ -109,9 +109,9 @@ class Guided:
             self.say(f"  {wish!r} is not known: say a step in us (+10, -1), ok, skip, back or quit")
             return pulse
         wanted = pulse + 1e-6 * step
-        low, high = self.setup.settings.pulses
+        low, high = self.setup.pulses_of(joint)
         if not low <= wanted <= high:
-            allowed = f"{1e6 * low:.0f} to {1e6 * high:.0f} us, which bench.servo.pulses allows"
+            allowed = f"{1e6 * low:.0f} to {1e6 * high:.0f} us, which bench.servo.pulses and the servo's range allow"
             self.say(f"  {1e6 * wanted:.0f} us is outside {allowed}")
             return pulse
         return wanted
@@ -126,7 +126,7 @@ class Guided:
 
     def _within(self, joint: str, counts: int) -> int:
         """The nearest counts that are allowed."""
-        low, high = self.setup.settings.pulses
+        low, high = self.setup.pulses_of(joint)
         tick = self.mover.pulse(joint, 1)
         return min(max(counts, math.ceil(low / tick)), math.floor(high / tick))
 

@@ -23,12 +23,14 @@ class KnownServo:
         board: that drives it.
         table: as stated; pulses by the board's stated oscillator.
         trusted_sd: of the table's pulses (s), where the table is believed; None: it is to be found.
+        knots: angles (rad) that the table is to be given at; empty: those of the stated one.
     """
 
     joint: str
     board: str
     table: PulseTable
     trusted_sd: float | None = None
+    knots: tuple[float, ...] = ()
 
     def pulses_at(self, angles: Array) -> Array:
         """The stated table's pulses (s) at angles (rad)."""

@@ -45,13 +45,13 @@ class Motion:
     Attributes:
         rate: the fastest (rad/s, by the stated tables).
         period: between steps (s).
-        pulses: the shortest and the longest pulse (s).
+        pulses: the shortest and the longest pulse (s), by joint.
         silence: of the host, after which a board that can goes back to the base pose (s).
     """
 
     rate: float
     period: float
-    pulses: tuple[float, float]
+    pulses: Mapping[str, tuple[float, float]]
     silence: float = 1.0
 
 
@@ -142,12 +142,12 @@ class Mover:
         Raises:
             InputError: it is not.
         """
-        low, high = self.motion.pulses
+        low, high = self.motion.pulses[joint]
         if not low <= self.pulse(joint, counts) <= high:
             raise InputError(
                 f"{joint}: found a pulse of {1e6 * self.pulse(joint, counts):.0f} us, expected {1e6 * low:.0f} to "
                 f"{1e6 * high:.0f} us.",
-                hint="Narrow bench.servo.ranges, or widen bench.servo.pulses if the servo bears it.",
+                hint="Narrow bench.servo.ranges; or widen bench.servo.pulses or its pulse_range if the servo bears it.",
             )
 
     def stand(self, seconds: float) -> None:

@@ -49,6 +49,25 @@ class Record:
         """The lines of a kind."""
         return [entry for entry in self._entries if entry["kind"] == kind]
 
+    @property
+    def is_measured(self) -> bool:
+        """Whether there is any line beside the first."""
+        return len(self._entries) > 1
+
+    def set_aside(self) -> Path:
+        """Keep the file under another name, which is given, and be empty.
+
+        Raises:
+            InputError: it cannot be renamed.
+        """
+        kept = next_name(self.path)
+        try:
+            REAL_FILES.rename(self.path, kept)
+        except OSError as fault:
+            raise _unwritable(self.path, fault) from fault
+        self._entries = []
+        return kept
+
     def append(self, kind: str, content: Mapping[str, Any]) -> None:
         """One more line, durable when this returns.
 
@@ -79,6 +98,14 @@ class Record:
                 hint="Give another --out." if line == 1 else "Give another --out, or remove this line.",
             )
         return dict(entry)
+
+
+def next_name(path: Path) -> Path:
+    """The first of ``NAME.before-1``, ``NAME.before-2``, ... that is free, for a file that is to be kept."""
+    number = 1
+    while (kept := path.with_name(f"{path.name}.before-{number}")).exists():
+        number += 1
+    return kept
 
 
 def _unwritable(path: Path, fault: OSError) -> InputError:

@@ -5,22 +5,21 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
-from armcal.arm.servo import PulseClock, PulseTable
+from armcal.arm.servo import PulseClock
 from armcal.bench.acquisition.eyes import TrackerEyes
 from armcal.bench.clock import Clock
-from armcal.bench.device import DeviceIdentity
 from armcal.bench.faults import DeviceRefusedError
 from armcal.bench.servo.automatic import Automatic, Told
+from armcal.bench.servo.beginning import begin, check_same, stated_by
 from armcal.bench.servo.guided import Guided
 from armcal.bench.servo.keys import QUIT, Wishes
-from armcal.bench.servo.known import KnownBoard, KnownServo
 from armcal.bench.servo.mover import Motion, Mover, ServoDevice, StoppedError
 from armcal.bench.servo.outcome import Outcome, outcome_of
-from armcal.bench.servo.record import BEGUN, POSE, Record
+from armcal.bench.servo.record import BEGUN, Record
 from armcal.bench.servo.setup import Setup
 from armcal.bench.servo.sweep import angles_told, to_base
 from armcal.bench.servo.trial import Move, Verdict, answered, judged, wrapped
@@ -28,7 +27,6 @@ from armcal.bench.servo.warmth import Warmth
 from armcal.errors import InputError, Location
 
 _FIRST_FRAME_S = 3.0
-_SAME = 1e-6
 _LOOK_S = 0.1
 _AS_IT_IS = "its pulses go on as they are, unless the board brings the arm to its base pose"
 
@@ -63,11 +61,13 @@ def measure(setup: Setup, folder: Path, talk: Conversation, how: str) -> None:
     record = Record(folder)
     with setup.bench.clock() as clock, _opened(setup, clock, talk, record) as mover:
         if how == "guided":
+            begin(setup, record, mover.identity, talk.say)
             with talk.wishes() as wishes:
                 Guided(setup, mover, wishes, record, talk.say).run()
             return
         with _eyes(setup, mover) as eyes:
             look = Automatic(setup, mover, eyes, record, talk.told, _cooling(setup, mover, record))
+            begin(setup, record, mover.identity, talk.say)
             mover.look = look.look
             look.run()
 
@@ -82,7 +82,7 @@ def evaluated(setup: Setup, folder: Path) -> Outcome:
     begun = record.of_kind(BEGUN)
     if not begun:
         raise InputError("it holds nothing measured.", where=Location(str(folder)), hint="Measure first.")
-    servos, boards = _stated(setup, begun[0], setup.joints)
+    servos, boards = stated_by(setup, begun[0], setup.joints)
     return outcome_of(record.entries, servos, boards, setup.nominal, setup.settings)
 
 
@@ -127,17 +127,18 @@ def park(setup: Setup, talk: Conversation, how: str) -> None:
 def _opened(setup: Setup, clock: Clock, talk: Conversation, record: Record | None) -> Iterator[Mover]:
     device = cast(ServoDevice, setup.bench.device())
     settings = setup.settings
-    motion = Motion(math.radians(settings.rate_deg_per_s), settings.period, settings.pulses, settings.silence)
+    pulses = {joint: setup.pulses_of(joint) for joint in setup.base}
+    motion = Motion(math.radians(settings.rate_deg_per_s), settings.period, pulses, settings.silence)
     read_by = {joint: (setup.known(joint), _clock(setup, joint)) for joint in setup.base}
     servos = read_by
-    if record is not None and (begun := record.of_kind(BEGUN)):
-        stated = _stated(setup, begun[0], tuple(setup.base))[0]
+    if record is not None and record.is_measured:
+        stated = stated_by(setup, record.of_kind(BEGUN)[0], tuple(setup.base))[0]
         servos = {each.joint: (each, _clock(setup, each.joint)) for each in stated}
     mover = Mover(device, clock, servos, read_by, motion, talk.asked_to_stop)
     try:
         identity = mover.open()
-        if record is not None:
-            _begin(setup, record, identity)
+        if record is not None and record.is_measured:
+            check_same(setup, record, identity)
         free = tuple(joint for joint in setup.base if joint not in mover.told)
         if free and not talk.may_energise(free):
             raise InputError("the joints may not be energised; nothing was moved.", hint="Say yes, or give --yes.")
@@ -196,71 +197,6 @@ def _cooling(setup: Setup, mover: Mover, record: Record) -> Warmth:
     if last is not None:
         warmth.go_on(last["warmth"], angles_told(mover), mover.clock.wall() - float(last["at"]))
     return warmth
-
-
-def _begin(setup: Setup, record: Record, device: DeviceIdentity) -> None:
-    """The first line of a record: by which tables it is measured. A record of other ones is refused."""
-    servos = {joint: _as_stated(setup, joint) for joint in setup.base}
-    begun = record.of_kind(BEGUN)
-    if not begun:
-        told = {"device": device.name, "adapter": device.adapter}
-        record.append(BEGUN, {"servos": servos, **told, "base": dict(setup.base)})
-        return
-    adapter = str(begun[0].get("adapter", ""))
-    if adapter and device.adapter and adapter != device.adapter:
-        raise InputError(
-            f"it was begun with the adapter {adapter!r}, found {device.adapter!r}.",
-            where=Location(str(record.path)),
-            hint="Connect the one that it was begun with, or give a new --out.",
-        )
-    moved = [joint for joint, angle in setup.base.items() if abs(begun[0]["base"].get(joint, angle) - angle) > _SAME]
-    if moved and record.of_kind(POSE):
-        raise InputError(
-            f"it was begun with another base pose: {moved[0]} stood at {_deg(begun[0]['base'][moved[0]])}, not at "
-            f"{_deg(setup.base[moved[0]])}.",
-            where=Location(str(record.path)),
-            hint="Give the base pose that it was begun with, or a new --out.",
-        )
-    for joint, stated in servos.items():
-        before = begun[0]["servos"].get(joint, {})
-        if any(stated[key] != before.get(key) for key in ("board", "channel", "oscillator_hz", "prescale")):
-            raise InputError(
-                f"it was begun with another board, channel or oscillator of {joint}.",
-                where=Location(str(record.path)),
-                hint="Give a new --out.",
-            )
-
-
-def _deg(angle: float) -> str:
-    return f"{math.degrees(angle):.1f} deg"
-
-
-def _as_stated(setup: Setup, joint: str) -> dict[str, Any]:
-    servo = setup.file.servos[joint]
-    clock = setup.file.boards[servo.board].clock
-    return {
-        "board": str(servo.board),
-        "channel": servo.channel,
-        "oscillator_hz": clock.oscillator_hz,
-        "prescale": clock.prescale,
-        "angles": list(servo.angles),
-        "pulses": list(servo.pulses),
-    }
-
-
-def _stated(setup: Setup, begun: Any, joints: tuple[str, ...]) -> tuple[list[KnownServo], dict[str, KnownBoard]]:
-    """Servos and boards as they were when the record was begun."""
-    servos, boards = [], setup.boards()
-    for joint in joints:
-        stated = begun["servos"].get(joint)
-        if stated is None:
-            servos.append(setup.known(joint))
-            continue
-        table = PulseTable(tuple(stated["angles"]), tuple(stated["pulses"]))
-        servos.append(replace(setup.known(joint), table=table))
-        clock = PulseClock(stated["oscillator_hz"], stated["prescale"])
-        boards[stated["board"]] = KnownBoard(clock, boards[stated["board"]].measured)
-    return servos, boards
 
 
 def _wrapped(setup: Setup, joint: str) -> Verdict | None:

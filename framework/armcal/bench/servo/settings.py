@@ -30,12 +30,13 @@ class ServoCalibrationSettings(Settings):
     Attributes:
         servos: the servo file to improve; the device's own where it is not given.
         joints: those to calibrate; all of the servo file.
-        knots: the angles that the tables are to be given at.
+        knots: the angles that all tables are to be given at; without them each table keeps its own, and its ends reach
+            as far as the joint is measured.
         base: where the other joints stand while one is measured; joints that are not named stand at zero.
         ranges: over which joints are moved; the limits of ``acquisition`` or ``plan`` where none are given here.
         step: between the angles of a sweep, or of a guided calibration.
         approach: how far a joint comes from below or above before it is measured, so that its play is taken up.
-        pulses: no pulse outside this range is ever set.
+        pulses: no pulse outside this range is ever set, nor one outside the servo's own ``pulse_range``.
         rate_deg_per_s: the fastest that a joint is moved, by its stated table.
         period: between two steps of a motion.
         zero: ``kept``: each servo's pulse at zero stays; ``model``: angles are absolute, by the model and the tracker.
@@ -52,7 +53,7 @@ class ServoCalibrationSettings(Settings):
 
     servos: InputPath | None = None
     joints: tuple[str, ...] = ()
-    knots: Angles = (math.radians(-100), 0.0, math.radians(100))
+    knots: Angles = ()
     base: dict[str, Angle] = Field(default_factory=dict)
     ranges: dict[str, tuple[Angle, Angle]] = Field(default_factory=dict)
     step: Angle = math.radians(10)
@@ -73,7 +74,7 @@ class ServoCalibrationSettings(Settings):
 
     @model_validator(mode="after")
     def _usable(self) -> ServoCalibrationSettings:
-        if len(self.knots) < 2 or not all(a < b for a, b in pairwise(self.knots)):
+        if len(self.knots) == 1 or not all(a < b for a, b in pairwise(self.knots)):
             raise ValueError("the knots do not rise from each to the next, or are fewer than two")
         if not 0 < self.pulses[0] < self.pulses[1]:
             raise ValueError("the range of pulses does not rise from above zero: give [shortest, longest]")

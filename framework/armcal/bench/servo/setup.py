@@ -81,16 +81,47 @@ class Setup:
         heat = heat_of(experiment, bench.settings.acquisition, arm)
         check = clearance_of(experiment, arm)
         found = cls(bench, settings, path, file, joints, base, {}, nominal, heat, check)
+        found._check_base_pulses(experiment)
         return replace(found, ranges=found.clear_ranges(experiment, limits))
 
     def known(self, joint: str) -> KnownServo:
         """A servo as the file states it."""
         servo = self.file.servos[joint]
-        return KnownServo(joint, servo.board, servo.table, self.settings.trusted.get(joint))
+        return KnownServo(joint, servo.board, servo.table, self.settings.trusted.get(joint), self.knots_of(joint))
+
+    def knots_of(self, joint: str) -> tuple[float, ...]:
+        """Angles (rad) that a table is to be given at: as configured, else its own; its ends reach over the range.
+
+        So the table of a servo that turns farther than the others is not cut to theirs.
+        """
+        if self.settings.knots:
+            return self.settings.knots
+        stated, (low, high) = self.file.servos[joint].angles, self.ranges[joint]
+        ends = min(stated[0], low), max(stated[-1], high)
+        inner = stated[1:-1] or ((0.0,) if ends[0] < 0 < ends[1] else ())
+        return (ends[0], *inner, ends[1])
+
+    def pulses_of(self, joint: str) -> tuple[float, float]:
+        """The shortest and the longest pulse (s) that may be set: what the servo bears, and what is configured."""
+        borne, allowed = self.file.servos[joint].pulse_range, self.settings.pulses
+        return max(borne[0], allowed[0]), min(borne[1], allowed[1])
 
     def boards(self) -> dict[str, KnownBoard]:
         """The boards as the file states them, with the pulses measured at their pins."""
         return {name: KnownBoard(board.clock, self._measured(name)) for name, board in self.file.boards.items()}
+
+    def _check_base_pulses(self, experiment: Experiment) -> None:
+        """Before anything moves: half of the joints in the base pose would be worse than none."""
+        for joint, angle in self.base.items():
+            (low, high), pulse = self.pulses_of(joint), float(self.file.servos[joint].table.pulse(angle))
+            if not low <= pulse <= high:
+                raise ConfigError(
+                    f"in the base pose {joint}, at {math.degrees(angle):.1f} deg, needs a pulse of {1e6 * pulse:.0f} "
+                    f"us, expected {1e6 * low:.0f} to {1e6 * high:.0f} us.",
+                    where=experiment.source.where((*AT, "base")),
+                    hint="Choose another base pose, or widen bench.servo.pulses or the servo's pulse_range if the "
+                    "servo bears it.",
+                )
 
     def _measured(self, board: str) -> tuple[MeasuredPulse, ...]:
         stated = [each for each in self.settings.measured_pulses if each.board == board]

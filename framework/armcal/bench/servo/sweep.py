@@ -33,7 +33,7 @@ def sweep(setup: Setup, mover: Mover, joint: str) -> list[Point]:
     """Rising pulses first, then falling ones, as many of the range as leave room to come from either side."""
     low, high = setup.ranges[joint]
     margin = setup.settings.approach
-    shortest, longest = setup.settings.pulses
+    shortest, longest = setup.pulses_of(joint)
     steps = max(round((high - low - 2 * margin) / setup.settings.step), 1)
     wanted = [mover.counts_at(joint, angle) for angle in np.linspace(low + margin, high - margin, steps + 1)]
     room = approach_counts(setup, mover, joint)

@@ -30,7 +30,7 @@ class FitTask:
 
     Attributes:
         servos, boards: as known before; boards by name.
-        knots: angles of the tables to be found (rad, rising).
+        knots: angles of the tables to be found (rad, rising); empty: each servo's own.
         observations: of any of the servos.
         zero: ``measured`` angles are absolute; ``kept``: each servo's pulse at zero stays the stated one.
         compliance_sd: how far the arm's compliances may well be from the model's (rad/(N m)).
@@ -51,7 +51,8 @@ class FitTask:
 
     def knots_of(self, servo: KnownServo) -> Array:
         """A trusted table keeps its own."""
-        return np.array(servo.table.angles if servo.trusted_sd is not None else self.knots)
+        own = servo.table.angles if servo.trusted_sd is not None else self.knots or servo.knots
+        return np.array(own or servo.table.angles)
 
 
 class Unknowns:
