@@ -278,7 +278,15 @@ def test_the_unit_of_length_does_not_matter() -> None:
     scaled = replace(
         ground,
         chart=chart,
-        observer=Observer(ground.problem, chart, old.companions, type(old.companions)(), old._noise, {**old._defaults}),
+        observer=Observer(
+            ground.problem,
+            chart,
+            old.companions,
+            type(old.companions)(),
+            old._noise,
+            {"tracker": 1000.0},
+            {**old._defaults},
+        ),
         belief=Belief(
             ground.belief.origin,
             Gaussian(ground.belief.gaussian.mean * ratio, ground.belief.gaussian.covariance * np.outer(ratio, ratio)),

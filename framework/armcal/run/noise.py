@@ -86,6 +86,7 @@ class NoiseResult:
                 "share": each.share,
                 "over": each.over,
                 "channel": each.channel,
+                "freedom": each.freedom,
             }
             for name, each in self.scatter.items()
         }

@@ -7,6 +7,7 @@ small eigenvalues when angles stand beside compliances. [BarShalom2001]
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
@@ -97,10 +98,22 @@ def weighed(covariance: Array, right: Array) -> Array:
     return np.asarray(np.linalg.solve(covariance, right) if fault else found, dtype=np.float64)
 
 
-def log_likelihood(innovation: Array, covariance: Array) -> float:
-    """Of an innovation under its expected covariance."""
-    _, logarithm = np.linalg.slogdet(2 * np.pi * covariance)
-    return -0.5 * (surprise(innovation, covariance) + float(logarithm))
+def log_likelihood(innovation: Array, covariance: Array, freedom: float = math.inf) -> float:
+    """Of an innovation under its expected covariance, which is known with so many degrees of freedom."""
+    logarithm = float(np.linalg.slogdet(covariance)[1])
+    return log_density(surprise(innovation, covariance), logarithm, len(innovation), freedom)
+
+
+def log_density(surprise: float, logarithm: float, count: int, freedom: float = math.inf) -> float:
+    """Of numbers by their squared Mahalanobis distance and their covariance's log determinant.
+
+    Normal, or Student's t where the covariance is known with so many degrees of freedom up to a common factor.
+    """
+    if math.isinf(freedom):
+        return -0.5 * (surprise + logarithm + count * math.log(2 * math.pi))
+    whole = 0.5 * (freedom + count)
+    normal = math.lgamma(whole) - math.lgamma(0.5 * freedom) - 0.5 * count * math.log(freedom * math.pi)
+    return normal - 0.5 * logarithm - whole * math.log1p(surprise / freedom)
 
 
 def absorbed(prior: Gaussian, seen: Linearised, place: Array) -> Gaussian:

@@ -4,24 +4,31 @@ A model that is wrong errs by more than its instrument, and alike in poses that 
 the calibration needs both: the covariance as the noise to expect, and its shared part as no new evidence each time.
 The shared part is a process whose correlation falls by e over a distance, beside an independent part: the first two
 serial correlations tell share and distance [Box2015].
+
+A few residuals do not determine a covariance of many rows: it is taken together with the declared noise, scaled to the
+residuals, as the mean of an inverse Wishart distribution whose weight is the likeliest for these residuals [Chen1979].
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import multigammaln
 
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
-from armcal.solve.estimator import Estimate
+from armcal.solve.estimator import SMALLEST_SPREAD, Estimate
 from armcal.solve.factor_records import correlation_of
 from armcal.solve.problem import FactorRecords, Problem
 
 _FEWEST = 20
 _TOLD_SD = 3.0
 _LONGEST = 50.0
+_WEIGHTS = np.geomspace(1.0, 1e5, 51)
+"""Of the declared noise, in records: those that are tried."""
 
 
 @dataclass(frozen=True)
@@ -33,12 +40,14 @@ class Scatter:
         share: of it that neighbours have in common, 0 to 1.
         over: distance over which the common part falls by e.
         channel: what counts it: ``sequence`` where the records say their place, else ``record``, one by one.
+        freedom: degrees of freedom with which the covariance is known.
     """
 
     covariance: Array
     share: float
     over: float
     channel: str = "record"
+    freedom: float = math.inf
 
 
 def scatter_of(
@@ -55,11 +64,12 @@ def scatter_of(
         records: it was trained on, with their weights.
         dataset: the same ones, in the order of recording or with their ``sequence``.
     """
+    known = max(float(estimate.degrees_of_freedom), 1.0)
     if correlation_of(records) is not None:
         noise = {k.factor.name: np.array(k.factor.noise) * estimate.noise_scale for k in problem.kernels}
-        return {name: Scatter(np.diag(deviations**2), 0.0, 1.0) for name, deviations in noise.items()}
+        return {name: Scatter(np.diag(sd**2), 0.0, 1.0, freedom=known) for name, sd in noise.items()}
     # Parameters that were fitted make residuals too small.
-    freedom = estimate.degrees_of_freedom / max(problem.equations(records), 1)
+    freedom = known / max(problem.equations(records), 1)
     found, residuals = {}, problem.residuals(estimate.values, records)
     for kernel, each, residual in zip(problem.kernels, records, residuals, strict=True):
         weight = np.minimum(each.weight[: each.count], 1.0) * each.measured
@@ -67,13 +77,36 @@ def scatter_of(
         if len(kept) < 2:
             continue
         roots = residual[:, kept] * np.sqrt(weight[kept])
-        covariance = roots @ roots.T / max(float(weight.sum()) * freedom, 1e-9)
+        count = float(weight.sum()) * freedom
+        covariance, weighed = _shrunk(roots @ roots.T, count, np.array(kernel.factor.noise), estimate.noise_scale)
         whitened = _whitened(covariance, residual[:, kept])
         share, over = _shared(whitened, _places(dataset)[kept])
         found[kernel.factor.name] = Scatter(
-            covariance, share, over, "sequence" if dataset.has("sequence") else "record"
+            covariance, share, over, "sequence" if dataset.has("sequence") else "record", min(weighed, known)
         )
     return found
+
+
+def _shrunk(products: Array, count: float, noise: Array, scale: float) -> tuple[Array, float]:
+    """The covariance of residuals (n_r x n_r), and the records that it is worth, those of the declared noise included.
+
+    Args:
+        products: sum of the residuals' outer products (n_r x n_r; m or rad).
+        count: how many records they are worth, less what parameters took of them.
+        noise: standard deviations that are declared (n_r; m or rad).
+        scale: of all residuals against theirs; holds where this measurement's own are too few to say.
+    """
+    rows, own = len(noise), float(np.sum(np.diag(products) / noise**2))
+    variance = own / (rows * count) if rows * count >= 1 else scale**2
+    declared = noise * np.sqrt(max(variance, SMALLEST_SPREAD**2))
+    sizes = np.maximum(np.linalg.eigvalsh(products / np.outer(declared, declared)), 0.0)
+    prior = _WEIGHTS + rows + 1
+    evidence = multigammaln(0.5 * (prior + count), rows) - multigammaln(0.5 * prior, rows)
+    evidence += 0.5 * prior * rows * np.log(_WEIGHTS)
+    evidence -= 0.5 * (prior + count) * np.log(_WEIGHTS[:, None] + sizes).sum(axis=1)
+    weight = float(_WEIGHTS[int(np.argmax(evidence))])
+    covariance = (weight * np.diag(declared**2) + products) / (weight + count)
+    return covariance, min(weight + count, max(rows * count, 1.0))
 
 
 def _places(dataset: Dataset) -> Array:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from scipy.special import bdtrc, chdtrc, chdtri
+from scipy.special import bdtrc, chdtrc, chdtri, fdtrc, fdtri
 
 Level = Literal["nominal", "watch", "suspect", "lost"]
 LEVELS: tuple[Level, ...] = ("nominal", "watch", "suspect", "lost")
@@ -38,9 +39,15 @@ class Health:
         return Health(level, 0, f"{after} records in a row agree with the calibration.")
 
 
-def surprise_limit(dof: int, probability: float) -> float:
-    """What NIS stays below with a probability, where all is as believed."""
-    return float(chdtri(float(dof), 1 - probability))
+def surprise_limit(dof: int, probability: float, freedom: float = math.inf) -> float:
+    """What NIS stays below with a probability, where all is as believed.
+
+    ``freedom``: degrees of freedom with which the noise is known. Where they are few, NIS by ``dof`` has an F
+    distribution, as Hotelling's T-squared [Hotelling1931].
+    """
+    if math.isinf(freedom):
+        return float(chdtri(float(dof), 1 - probability))
+    return dof * float(fdtri(float(dof), freedom, probability))
 
 
 def many_outliers(count: int, records: int, fraction: float) -> float:
@@ -48,10 +55,11 @@ def many_outliers(count: int, records: int, fraction: float) -> float:
     return float(bdtrc(count - 1, records, fraction)) if count > 0 else 1.0
 
 
-def improbability(surprises: Sequence[tuple[float, int]]) -> float:
+def improbability(surprises: Sequence[tuple[float, int]], known: float = math.inf) -> float:
     """How probable surprises (NIS and its degrees of freedom, in order) at least as large in sum are by chance.
 
-    Neighbours that resemble each other count for less than their number: by their first serial correlation.
+    Neighbours that resemble each other count for less than their number: by their first serial correlation. ``known``:
+    degrees of freedom with which the noise is known, which all of them share.
     """
     if len(surprises) < 3:
         return 1.0
@@ -62,4 +70,6 @@ def improbability(surprises: Sequence[tuple[float, int]]) -> float:
     serial = float(centred[1:] @ centred[:-1]) / power if power > 0 else 0.0
     serial = float(np.clip(serial, 0.0, 0.9))
     shared = (1 + serial) / (1 - serial)
-    return float(chdtrc(freedom / shared, total / shared))
+    if math.isinf(known):
+        return float(chdtrc(freedom / shared, total / shared))
+    return float(fdtrc(freedom / shared, known, total / freedom))

@@ -174,11 +174,12 @@ class Follower:
         try:
             first = seen.at(belief.gaussian.mean)
             expected = first.slope @ belief.gaussian.covariance @ first.slope.T + first.noise
-            outside = np.log(share) + log_likelihood(first.innovation, expected + self._outlying(record))
+            freedom = self.freedom(record)
+            outside = np.log(share) + log_likelihood(first.innovation, expected + self._outlying(record), freedom)
             update = self._estimator.update(belief.gaussian, [seen])
         except ArmcalError:
             return 0.0, belief
-        within = np.log(1 - share) + log_likelihood(update.innovation, update.covariance)
+        within = np.log(1 - share) + log_likelihood(update.innovation, update.covariance, freedom)
         if within < outside:
             return float(outside), belief
         return float(within), belief.updated(self._observer.chart, update.posterior)
@@ -188,7 +189,12 @@ class Follower:
         seen = [self._seen(before, each) for each in recent]
         outlying = [self._outlying(each) for each in recent]
         passed = [each.passed for each in recent]
-        return RecordsSince(before, seen, passed, self._fading, outlying, self._outliers.fraction)
+        known = min(map(self.freedom, recent))
+        return RecordsSince(before, seen, passed, self._fading, outlying, self._outliers.fraction, known)
+
+    def freedom(self, record: Recent) -> float:
+        """Degrees of freedom with which the noise of a record is known."""
+        return self._observer.freedom(record.readings)
 
     def _seen(self, belief: Belief, record: Recent) -> Seen:
         return Seen(self._observer, belief.origin, belief.gaussian.mean, record.readings, record.joint_noise)

@@ -54,7 +54,7 @@ class Judge:
 
     def _changed(self, state: State) -> tuple[State, Decision | None]:
         """Whether the last records tell of a change."""
-        odd = [i for i, each in enumerate(state.recent) if _surprising(each)]
+        odd = [i for i, each in enumerate(state.recent) if self._surprising(each)]
         if len(odd) < 2 or not (state.wary or odd[-1] == len(state.recent) - 1):
             return (replace(state, wary=False) if len(odd) < 2 else state), None
         found = self._follower.compare(state.recent, odd[-_MOST_ONSETS:], self._changes)
@@ -86,6 +86,10 @@ class Judge:
                 if known.hypothesis.kind == "joint_replaced" and each.hypothesis.kind == "joint_slipped":
                     near[each.hypothesis.subject] = each
         return list(near.values())
+
+    def _surprising(self, record: Recent) -> bool:
+        limit = surprise_limit(record.dof, 1 - _SURPRISING, self._follower.freedom(record))
+        return record.rejected or record.nis > limit
 
     def _kinds(self, joints: Sequence[Explained]) -> list[Hypothesis]:
         """Of each joint, that it slipped, and that its servo was replaced."""
@@ -181,7 +185,8 @@ class Judge:
         settings = self._settings.levels
         if len(state.surprises) < settings.window:
             return state, None
-        if improbability(state.surprises) >= settings.probability:
+        known = min(map(self._follower.freedom, state.recent), default=math.inf)
+        if improbability(state.surprises, known) >= settings.probability:
             return replace(state, drifted=0, surprises=state.surprises[settings.window // 2 :]), None
         total, freedom = (float(sum(column)) for column in zip(*state.surprises, strict=True))
         ratio, count = total / freedom, len(state.surprises)
@@ -220,7 +225,3 @@ class Judge:
 def _evidence(candidate: Candidate) -> float:
     """The likeliest first."""
     return -candidate.log_evidence
-
-
-def _surprising(record: Recent) -> bool:
-    return record.rejected or record.nis > surprise_limit(record.dof, 1 - _SURPRISING)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -49,6 +49,7 @@ class Observer:
         companions: what moves beside them.
         noisy: drifts that are not followed: each record has its own.
         noise: covariance of each measurement's error (n_r x n_r), where a record does not say its own.
+        freedoms: degrees of freedom with which each of these is known.
         defaults: channels that a record may leave out, and what then holds.
         unfound: parameters of groups that the calibration never found: what is measured there says nothing.
         joint_scale: of the joints' own noise, against what each arm states.
@@ -61,12 +62,14 @@ class Observer:
         companions: Companions,
         noisy: Companions,
         noise: Mapping[str, Array],
+        freedoms: Mapping[str, float],
         defaults: Mapping[str, float],
         unfound: Collection[str] = (),
         joint_scale: float = 1.0,
     ) -> None:
         self.problem, self.chart, self.companions = problem, chart, companions
         self._noise, self._defaults, self._unfound = noise, defaults, frozenset(unfound)
+        self._freedoms = [freedoms[kernel.factor.name] for kernel in problem.kernels]
         self._factors = [OneRecord(kernel) for kernel in problem.kernels]
         self._plain = [slots.entries[0] if slots.is_plain else None for slots in problem.slots]
         rows = [kernel.factor.residual.numel() for kernel in problem.kernels]
@@ -95,6 +98,10 @@ class Observer:
             record = np.array([known[channel] for channel in factor.channels])
             found.append(Reading(place, record, group, self._own_noise(kernel, known)))
         return tuple(found)
+
+    def freedom(self, readings: Sequence[Reading]) -> float:
+        """Degrees of freedom with which the noise of a record is known: those of its least known reading."""
+        return min(self._freedoms[reading.factor] for reading in readings)
 
     def _group(self, instance: str, known: Mapping[str, float], labels: Mapping[str, str]) -> int:
         plan = self.problem.blueprint

@@ -175,7 +175,7 @@ class Recalibrator:
             return (events.ignored(incoming, self.state, fault.message.rstrip(".")),)
         covariance = first.slope @ before.gaussian.covariance @ first.slope.T + first.noise
         nis, dof = surprise(first.innovation, covariance), len(first.innovation)
-        limit = surprise_limit(dof, self._settings.gate.probability)
+        limit = surprise_limit(dof, self._settings.gate.probability, self._ground.observer.freedom(readings))
         rejected = self._settings.gating == "on" and not nis <= limit
         recent = Recent(state.sequence, readings, noise, passed, before, rejected, nis, dof)
         if rejected:

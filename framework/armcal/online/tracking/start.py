@@ -85,9 +85,7 @@ def footing(calibration: Calibration, settings: RecalibrateSettings, shares: boo
     return Footing(
         problem,
         chart,
-        Observer(
-            problem, chart, companions, noisy, white, _defaults(calibration), _unfound(calibration), _scale(calibration)
-        ),
+        _observer(calibration, problem, chart, (companions, noisy), white),
         Belief(parameters.nominal(), Gaussian(mean, start)),
         Fading(variance_rates(parameters, settings.process_noise), companions),
         ReadRequest(
@@ -178,6 +176,24 @@ def _errors(
     if followed:
         return white, Companions((*drifts, *companions)), Companions()
     return white, Companions(tuple(companions)), Companions(drifts)
+
+
+def _observer(
+    calibration: Calibration,
+    problem: Problem,
+    chart: Chart,
+    beside: tuple[Companions, Companions],
+    white: Mapping[str, Array],
+) -> Observer:
+    freedoms = {name: _freedom(calibration, name) for name in white}
+    defaults, unfound = _defaults(calibration), _unfound(calibration)
+    return Observer(problem, chart, *beside, white, freedoms, defaults, unfound, _scale(calibration))
+
+
+def _freedom(calibration: Calibration, name: str) -> float:
+    """Degrees of freedom with which the noise of a measurement is known; all of the fit's if its own are not kept."""
+    kept = (calibration.record.noise.get("scatter") or {}).get(name) or {}
+    return float(kept.get("freedom") or max(calibration.record.noise["degrees_of_freedom"], 1))
 
 
 def _drifts(calibration: Calibration, chart: Chart) -> list[Companion]:

@@ -1,9 +1,9 @@
 """How likely a change makes some records that came one after another, all at once.
 
-The innovations of the records, seen from what was believed before the first, are jointly Gaussian: they share the
-belief's error, and what companions have in common. A change adds what it reopens to that covariance; it is looked at
-from where it leads (Gauss-Newton over what it reopens alone), as a slipped tooth is no small step. Each record may
-also be an outlier, whichever is likelier.
+The innovations of the records, seen from what was believed before the first, are jointly Gaussian (Student's t where
+few records determined the noise): they share the belief's error, and what companions have in common. A change adds
+what it reopens to that covariance; it is looked at from where it leads (Gauss-Newton over what it reopens alone), as a
+slipped tooth is no small step. Each record may also be an outlier, whichever is likelier.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from armcal.base.domains import Array
 from armcal.online.tracking.belief import Belief, Fading
-from armcal.solve.online import Linearised, Observation
+from armcal.solve.online import Linearised, Observation, log_density
 
 _ROUNDS = 3
 _STEPS = 8
@@ -46,6 +46,7 @@ class RecordsSince:
         fading: how beliefs fade.
         outlying: covariance of an outlier's error, a record each.
         share: of outliers.
+        freedom: degrees of freedom with which the records' noise is known.
     """
 
     def __init__(
@@ -56,8 +57,9 @@ class RecordsSince:
         fading: Fading,
         outlying: Sequence[Array],
         share: float,
+        freedom: float,
     ) -> None:
-        self._mean, self._seen = before.gaussian.mean, seen
+        self._mean, self._seen, self._freedom = before.gaussian.mean, seen, freedom
         self._outlying, self._logs = outlying, (np.log(share), np.log(1 - share))
         self._n = len(fading.rates)
         self._kept, self._means, self._priors = [np.ones(len(self._mean))], [self._mean], [before.gaussian.covariance]
@@ -124,7 +126,7 @@ class RecordsSince:
             whole = covariance.copy()
             for i in np.flatnonzero(~chosen).tolist():
                 whole[rows[i], rows[i]] += self._outlying[i]
-            total, surprise = _gaussian(innovation, whole)
+            total, surprise = _density(innovation, whole, self._freedom)
             return total + float(chosen.sum() * self._logs[1] + (~chosen).sum() * self._logs[0]), surprise
 
         chosen, (best, _) = fits.copy(), judged(fits)
@@ -139,7 +141,8 @@ class RecordsSince:
                 break
             best, chosen[i] = top, not chosen[i]
         inside = np.concatenate([np.full(rows[i].stop - rows[i].start, fit) for i, fit in enumerate(chosen.tolist())])
-        surprise = _gaussian(innovation[inside], covariance[np.ix_(inside, inside)])[1] if inside.any() else 0.0
+        fitting = innovation[inside], covariance[np.ix_(inside, inside)]
+        surprise = _density(*fitting, self._freedom)[1] if inside.any() else 0.0
         return Weighed(best, shift, chosen, surprise)
 
     def _stacked(
@@ -175,10 +178,10 @@ def _widened(covariance: Array, count: int, factor: float) -> Array:
     return covariance * scale[:, None] * scale
 
 
-def _gaussian(innovation: Array, covariance: Array) -> tuple[float, float]:
+def _density(innovation: Array, covariance: Array, freedom: float) -> tuple[float, float]:
     """Log density, and squared Mahalanobis distance."""
     root = np.linalg.cholesky(covariance)
     whitened = np.linalg.solve(root, innovation)
     surprise = float(whitened @ whitened)
-    logarithm = float(np.sum(np.log(np.diag(root))))
-    return -0.5 * surprise - logarithm - 0.5 * len(innovation) * float(np.log(2 * np.pi)), surprise
+    logarithm = 2 * float(np.sum(np.log(np.diag(root))))
+    return log_density(surprise, logarithm, len(innovation), freedom), surprise
