@@ -79,7 +79,8 @@ class BatchFunction:
         self._asked = 0
         self._compile_later: Callable[[], None] | None = None
         if choice != "interpreted" and compiler.find_compiler() is not None:
-            library, self._compile_later = _library(function, choice, loop)
+            trial = partial(_trial, self, sample)
+            library, self._compile_later = _library(function, choice, loop, trial)
             self._library = _agreeing(self, library, sample)
 
     @property
@@ -96,13 +97,7 @@ class BatchFunction:
         count = inputs[0].shape[1]
         if self._library is None:
             self._count(count)
-            outputs = [np.empty((size, count)) for size in self._sizes_out]
-            whole = count - count % _BLOCK
-            if whole:
-                self._mapped(np.zeros(0), [each[:, :whole] for each in inputs], [each[:, :whole] for each in outputs])
-            if whole < count:
-                self._single(np.zeros(0), [each[:, whole:] for each in inputs], [each[:, whole:] for each in outputs])
-            return outputs
+            return self.interpreted(inputs, count)
         whole = count - count % c_source.LANES
         if not whole and count:
             return self._rest(inputs, 0)
@@ -111,6 +106,16 @@ class BatchFunction:
         if whole < count:
             for target, source in zip(outputs, self._rest(inputs, whole), strict=True):
                 target[:, whole:] = source
+        return outputs
+
+    def interpreted(self, inputs: Sequence[Array], count: int) -> list[Array]:
+        """The outputs by the virtual machine."""
+        outputs = [np.empty((size, count)) for size in self._sizes_out]
+        whole = count - count % _BLOCK
+        if whole:
+            self._mapped(np.zeros(0), [each[:, :whole] for each in inputs], [each[:, :whole] for each in outputs])
+        if whole < count:
+            self._single(np.zeros(0), [each[:, whole:] for each in inputs], [each[:, whole:] for each in outputs])
         return outputs
 
     def _count(self, records: int) -> None:
@@ -147,7 +152,7 @@ class BatchFunction:
 
 
 def _library(
-    function: ca.Function, choice: EvaluatorChoice, loop: Loop | None
+    function: ca.Function, choice: EvaluatorChoice, loop: Loop | None, trial: Callable[[], compiler.Trial]
 ) -> tuple[ctypes.CDLL | None, Callable[[], None]]:
     """The library if there is one by now, and what has it compiled for the next time."""
     driver = _driver(function) + (loop.source(function) if loop else "")
@@ -162,8 +167,8 @@ def _library(
 
     library = compiler.load_cached(key, entries)
     if library is None and choice == "compiled":
-        library = quietly(partial(compiler.compile_now, key, source, entries))
-    return library, partial(compiler.compile_in_background, key, source)
+        library = quietly(partial(compiler.compile_now, key, source, entries, trial))
+    return library, partial(compiler.compile_in_background, key, source, trial)
 
 
 def _driver(function: ca.Function) -> str:
@@ -193,6 +198,13 @@ def _driver(function: ca.Function) -> str:
 def _addresses(name: str, sizes: Sequence[int]) -> list[str]:
     """Where each array begins in one piece of memory."""
     return [f"{name} + {start} * LANES" for start in accumulate([0, *sizes[:-1]])]
+
+
+def _trial(batch: BatchFunction, sample: Sequence[Array]) -> compiler.Trial:
+    """What a new library has to give for the sample, all inputs in one piece of memory and so all outputs."""
+    given = [np.ascontiguousarray(each[:, : c_source.LANES], dtype=float) for each in sample]
+    expected = np.concatenate(batch.interpreted(given, c_source.LANES))
+    return compiler.Trial(_VECTOR, (np.concatenate(given), np.zeros_like(expected)), {1: expected}, _AGREEMENT)
 
 
 def _agreeing(batch: BatchFunction, library: ctypes.CDLL | None, sample: Sequence[Array]) -> Any:

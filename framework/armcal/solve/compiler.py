@@ -1,31 +1,41 @@
 """Generated C, compiled by whatever compiler is there and cached on disk; never required.
 
 A library's key covers the expression, the generator, the compiler, its flags and the processor, so that a
-stale or foreign one is never loaded. ``ARMCAL_CACHE_DIR`` moves the cache; ``ARMCAL_CC=none`` turns
-compiling off, any other value names the compiler.
+stale or foreign one is never loaded. Its name ends in a digest of its content, so that a torn one is not loaded
+either; see ``library_build`` for what a library passes before it is there. ``ARMCAL_CACHE_DIR`` moves the cache;
+``ARMCAL_CC=none`` turns compiling off, any other value names the compiler.
 """
 
 from __future__ import annotations
 
 import ctypes
 import hashlib
+import json
 import os
 import platform
-import shlex
 import shutil
 import stat
 import subprocess
+import sys
 import tempfile
 import threading
-from collections.abc import Callable, Sequence
+import time
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+
+import numpy as np
+
+from armcal.base.domains import Array
+from armcal.solve import library_build
 
 FLAGS = ("-O1", "-march=native", "-ffp-contract=off", "-fPIC", "-shared", "-w")
 ENTRY_POINTS = ("armcal_residuals", "armcal_linearise")
 KEPT_LIBRARIES = 64
 _COMPILE_LIMIT_S = 120
+_BUILD = ".build-"
 
 
 @cache
@@ -55,24 +65,58 @@ def library_key(text: str) -> str:
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:40]
 
 
+@dataclass(frozen=True)
+class Trial:
+    """A call of a new library, made in a process of its own, and what it has to give.
+
+    Attributes:
+        entry: the C function.
+        arguments: integers (long), floats (double) and arrays, handed over by their address.
+        expected: by the places of arguments, what these arrays have to hold afterwards.
+        tolerance: in units of the largest number of an array, or of 1.
+    """
+
+    entry: str
+    arguments: Sequence[int | float | Array]
+    expected: Mapping[int, Array]
+    tolerance: float
+
+
 def load_cached(key: str, entry_points: Sequence[str] = ENTRY_POINTS) -> ctypes.CDLL | None:
-    """A compiled library from the cache, or None. Files that others could have written are not loaded."""
-    path = cache_directory() / f"{key}.so"
-    try:
-        for place in (path, path.parent):
-            seen = place.stat()
-            if hasattr(os, "getuid") and (seen.st_uid != os.getuid() or seen.st_mode & (stat.S_IWGRP | stat.S_IWOTH)):
-                return None
-        os.utime(path)
-        library = ctypes.CDLL(str(path))
-    except OSError:
-        return None
-    return library if all(hasattr(library, name) for name in entry_points) else None
+    """A compiled library from the cache, or None.
+
+    Files that others could have written are not loaded; one that is not whole is removed.
+    """
+    directory = cache_directory()
+    with suppress(OSError):
+        for path in sorted(directory.glob(library_build.library_name(key, "*"))):
+            if not (_is_ours(path) and _is_ours(directory)):
+                continue
+            if path.name != library_build.library_name(key, library_build.digest_of(path.read_bytes())):
+                path.unlink()
+                continue
+            os.utime(path)
+            library = ctypes.CDLL(str(path))
+            if all(hasattr(library, name) for name in entry_points):
+                return library
+    return None
 
 
-def compile_now(key: str, source: Callable[[], str], entry_points: Sequence[str] = ENTRY_POINTS) -> ctypes.CDLL | None:
-    """Compile, cache and load; None when that fails."""
-    command = _prepare(key, source)
+def _is_ours(path: Path) -> bool:
+    seen = path.stat()
+    return not hasattr(os, "getuid") or (
+        seen.st_uid == os.getuid() and not seen.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
+    )
+
+
+def compile_now(
+    key: str,
+    source: Callable[[], str],
+    entry_points: Sequence[str] = ENTRY_POINTS,
+    trial: Callable[[], Trial] | None = None,
+) -> ctypes.CDLL | None:
+    """Compile, try, cache and load; None when that fails."""
+    command = _prepare(key, source, trial)
     if command is None:
         return None
     with suppress(OSError, subprocess.SubprocessError):
@@ -80,9 +124,9 @@ def compile_now(key: str, source: Callable[[], str], entry_points: Sequence[str]
     return load_cached(key, entry_points)
 
 
-def compile_in_background(key: str, source: Callable[[], str]) -> None:
+def compile_in_background(key: str, source: Callable[[], str], trial: Callable[[], Trial] | None = None) -> None:
     """Start compiling for the next run; this one goes on, and may end first without stopping the compiler."""
-    command = _prepare(key, source)
+    command = _prepare(key, source, trial)
     if command is None:
         return
 
@@ -94,33 +138,43 @@ def compile_in_background(key: str, source: Callable[[], str]) -> None:
     threading.Thread(target=wait, name="armcal-compile", daemon=True).start()
 
 
-def _prepare(key: str, source: Callable[[], str]) -> list[str] | None:
-    """Write the source and give the command that compiles it and renames the result into place."""
+def _prepare(key: str, source: Callable[[], str], trial: Callable[[], Trial] | None) -> list[str] | None:
+    """Write the source and give the command that compiles and tries it, and puts the result in place."""
     compiler = find_compiler()
     if compiler is None:
         return None
     directory = cache_directory()
+    # -I and -S: nothing but Python's own library is found, whatever lies in the working directory.
+    python = [sys.executable, "-I", "-S"]
     try:
         directory.mkdir(parents=True, exist_ok=True, mode=0o700)
         _forget_old(directory)
-        text = source()
-        build = Path(tempfile.mkdtemp(prefix=".build-", dir=directory))
+        text, tried = source(), None if trial is None else _as_json(trial())
+        job = {"compile": [compiler, *FLAGS], "python": python, "place": str(directory), "key": key, "trial": tried}
+        build = Path(tempfile.mkdtemp(prefix=_BUILD, dir=directory))
         (build / "kernel.c").write_text(text, encoding="utf-8")
+        (build / "job.json").write_text(json.dumps(job), encoding="utf-8")
     except OSError:
         return None
-    compile_it = shlex.join([compiler, *FLAGS, "-o", str(build / "kernel.so"), str(build / "kernel.c"), "-lm"])
-    into_place = shlex.join(["mv", "-f", str(build / "kernel.so"), str(directory / f"{key}.so")])
-    remove = shlex.join(["rm", "-rf", str(build)])
-    private = "umask 077"
-    return ["/bin/sh", "-c", f"{private}; {compile_it} && {into_place}; done=$?; {remove}; exit $done"]
+    return [*python, library_build.__file__, "build", str(build)]
+
+
+def _as_json(trial: Trial) -> dict[str, object]:
+    arguments = [each.ravel().tolist() if isinstance(each, np.ndarray) else each for each in trial.arguments]
+    expected = {str(place): numbers.ravel().tolist() for place, numbers in trial.expected.items()}
+    return {"entry": trial.entry, "arguments": arguments, "expected": expected, "tolerance": trial.tolerance}
 
 
 def _forget_old(directory: Path) -> None:
-    """Keep the libraries that were used last."""
+    """Keep the libraries that were used last, and no folder of a build that was killed."""
     libraries = sorted(directory.glob("*.so"), key=lambda path: path.stat().st_mtime, reverse=True)
     for path in libraries[KEPT_LIBRARIES:]:
         with suppress(OSError):
             path.unlink()
+    for build in directory.glob(f"{_BUILD}*"):
+        with suppress(OSError):
+            if time.time() - build.stat().st_mtime > 10 * _COMPILE_LIMIT_S:
+                shutil.rmtree(build)
 
 
 @cache

@@ -17,7 +17,7 @@ import numpy as np
 
 from armcal.base.domains import Array
 from armcal.errors import NotConvergedError
-from armcal.solve import c_source, compiler
+from armcal.solve import c_source, compiler, kernel_trial
 from armcal.solve.factor import Factor
 
 EvaluatorChoice = Literal["auto", "compiled", "interpreted"]
@@ -36,7 +36,6 @@ MOST_PASSES = 100
 WORTH_COMPILING_RECORDS = 5000
 """From this many records on, waiting for the compiler costs less than the virtual machine does."""
 _BLOCK, _FEW = 64, 8
-_AGREEMENT = 1e-12
 
 
 class Backend(Protocol):
@@ -298,16 +297,23 @@ def build_kernel(factor: Factor, records: int, choice: EvaluatorChoice = "auto")
     def source() -> str:
         return kernel_source(factor, *functions)
 
+    def trial() -> compiler.Trial:
+        return kernel_trial.trial(factor, machine.linearise, (NEAR_REST_RAD, MOST_PASSES))
+
     library = compiler.load_cached(key)
     if library is None:
         if choice == "auto" and records < WORTH_COMPILING_RECORDS:
-            quietly(lambda: compiler.compile_in_background(key, source))
+            quietly(lambda: compiler.compile_in_background(key, source, trial))
             return Kernel(factor, machine)
-        library = quietly(lambda: compiler.compile_now(key, source))
+        library = quietly(lambda: compiler.compile_now(key, source, trial=trial))
     if library is None:
         return Kernel(factor, machine)
     compiled = Compiled(library)
-    return Kernel(factor, compiled, key) if _agree(factor, machine, compiled) else Kernel(factor, machine)
+    return (
+        Kernel(factor, compiled, key)
+        if kernel_trial.agree(factor, machine.linearise, compiled.linearise)
+        else Kernel(factor, machine)
+    )
 
 
 def kernel_source(factor: Factor, single_pass: ca.Function, linearise: ca.Function) -> str:
@@ -333,26 +339,6 @@ def quietly(build: Callable[[], ctypes.CDLL | None]) -> ctypes.CDLL | None:
         return build()
     except c_source.UnsupportedExpressionError:
         return None
-
-
-def _agree(factor: Factor, machine: Backend, compiled: Backend) -> bool:
-    """Whether a library gives the virtual machine's numbers, on a made-up block; a miscompiled one is not used."""
-    random = np.random.default_rng(0)
-    count = c_source.LANES
-    record = random.uniform(-1, 1, (factor.record.numel(), count))
-    values = random.uniform(0.01, 0.02, factor.values.numel())
-    results = []
-    for backend in (machine, compiled):
-        state = np.zeros((factor.state.numel(), count))
-        residual = np.zeros((factor.residual.numel(), count))
-        jacobian = np.zeros((factor.residual.numel() * factor.values.numel(), count))
-        backend.linearise(values, record, state, residual, jacobian, NEAR_REST_RAD)
-        results.append((residual, jacobian))
-    for one, two in zip(*results, strict=True):
-        scale = max(1.0, float(np.nanmax(np.abs(one), initial=0.0)))
-        if not np.isfinite(scale) or not np.allclose(one, two, rtol=0, atol=_AGREEMENT * scale, equal_nan=True):
-            return np.array_equal(one, two, equal_nan=True)
-    return True
 
 
 def _stride(array: Array) -> int:
