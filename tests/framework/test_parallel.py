@@ -283,3 +283,48 @@ def test_a_problem_is_its_own_blueprint(lrm) -> None:
     start = experiment.parameters.nominal()
     pair = [np.vstack(p.residuals(start, p.records(dataset))) for p in (problem, again)]
     assert np.array_equal(*pair)
+
+
+HOSTILE = ("armcal", "casadi", "encodings_", "joblib", "json", "multiprocessing", "numpy", "pickle", "scipy", "site")
+FEW = ("--set", "validation.folds=2", "--set", "evaluator=interpreted", "-q")
+
+
+@pytest.fixture
+def hostile(tmp_path: Path) -> Path:
+    """A working directory with files called like libraries, which leave a trace when they are executed."""
+    folder = tmp_path / "downloads"
+    folder.mkdir()
+    for name in HOSTILE:
+        trace = tmp_path / f"executed-{name}"
+        (folder / f"{name}.py").write_text(f"open({str(trace)!r}, 'w').close()\nraise ImportError('hostile')\n")
+    return folder
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ("run", DEMO, "--out", "../out", "--parallel", "2", *FEW),
+        pytest.param(
+            ("run", DEMO, "--out", "../out", "--parallel", "2", "--set", "bootstrap.refits=20", *FEW),
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(
+            ("study", str(CONFIGS / "study_demo.yaml"), "--out", "../out", "--parallel", "2"), marks=pytest.mark.slow
+        ),
+        pytest.param(
+            ("rehearse", str(CONFIGS / "bench.yaml"), "--plan", "../plan.csv", "--out", "../out"),
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(("doctor",), marks=pytest.mark.slow),
+    ],
+    ids=["run", "bootstrap", "study", "rehearse", "doctor"],
+)
+def test_no_process_executes_a_file_of_the_working_directory(hostile: Path, command: tuple[str, ...]) -> None:
+    """A numpy.py among downloaded data was executed by every worker."""
+    start = Path(sys.executable).with_name("armcal")
+    if command[0] == "rehearse":
+        plan = ["plan", str(CONFIGS / "bench.yaml"), "--poses", "3", "--out", str(hostile.parent / "plan.csv"), "-q"]
+        assert CliRunner().invoke(cli, plan).exit_code == 0
+    done = subprocess.run([start, *command], cwd=hostile, capture_output=True, text=True, timeout=500, check=False)
+    assert [path.name for path in hostile.parent.glob("executed-*")] == []
+    assert done.returncode == 0, done.stdout + done.stderr

@@ -6,6 +6,7 @@ last bit wherever they were made, as long as BLAS keeps to one thread there (wor
 
 from __future__ import annotations
 
+import os
 import pickle
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -24,6 +25,7 @@ Told = Callable[[float], None]
 
 WORTH_WORKERS_S = 6.0
 """Starting worker processes takes a second or two: not worth it for less work than this."""
+_SAFE_PATH = "PYTHONSAFEPATH"
 _DASK_TIMEOUT = "10s"
 _OPTION = Location("--parallel")
 _FORMS = "a number of processes, loky:N, threading:N, dask:ADDRESS, ray or ray:ADDRESS"
@@ -133,11 +135,28 @@ class Workers:
         if self.backend == "ray":
             _join_ray(self.address)
         if self.backend != "dask":
-            with joblib.parallel_config(**options):
+            with _safe_path(), joblib.parallel_config(**options):
                 yield
             return
         with _dask_client(self.address) as client, joblib.parallel_config(**options, client=client):
             yield
+
+
+@contextmanager
+def _safe_path() -> Iterator[None]:
+    """Processes started meanwhile do not take a file of the working directory for a library, as the command does not.
+
+    Loky starts them by ``python -m``, which looks there first, and has no argument for it.
+    """
+    before = os.environ.get(_SAFE_PATH)
+    os.environ[_SAFE_PATH] = "1"
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ[_SAFE_PATH]
+        else:
+            os.environ[_SAFE_PATH] = before
 
 
 def _told_of_rest(told: Told, before: float, done: float) -> None:

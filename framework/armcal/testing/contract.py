@@ -92,7 +92,7 @@ def _light(target: str) -> None:
         f"print({_MARK!r}, *sorted({{name.partition('.')[0] for name in set(sys.modules) - before}}))"
     )
     ran = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, timeout=_LONGEST_IMPORT_S, check=False
+        [sys.executable, "-P", "-c", code], capture_output=True, text=True, timeout=_LONGEST_IMPORT_S, check=False
     )
     if ran.returncode:
         raise ContractError(f"{module} does not import by itself: {ran.stderr.strip().splitlines()[-1:]}")

@@ -58,7 +58,8 @@ def simulated_bench(config: Path, overrides: Sequence[str], folder: Path) -> Ite
     """
     _make(folder)
     sets = [word for text in overrides for word in ("--set", text)]
-    command = [sys.executable, "-m", "armcal.cli", "simulated-bench", str(config), "--dir", str(folder), *sets]
+    # -P: a file of the working directory called like a library is not taken for it, as it is not by the command.
+    command = [sys.executable, "-P", "-m", "armcal.cli", "simulated-bench", str(config), "--dir", str(folder), *sets]
     with (folder / "said.txt").open("w+", encoding="utf-8") as said:
         process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=said, stderr=said)
         try:
