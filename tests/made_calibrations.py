@@ -13,7 +13,7 @@ from armcal.config.system import build_system
 from armcal.config.yaml_source import load_config
 from armcal.plugins import discover
 from armcal.use.calibration import Calibration
-from armcal.use.calibration_file import CalibrationFile, dump, identity_of
+from armcal.use.calibration_file import CalibrationFile, identity_of, sealed
 
 _MOVES = {"m": 0.002, "rad": 0.02, "1": 0.02, "kg": 0.005, "rad_per_Nm3": 0.02, "per_K": 2e-5}
 _COMPLIANCE = 0.03
@@ -98,7 +98,7 @@ def made_calibration(config: Path, overrides: tuple[str, ...] = (), seed: int = 
 
 def written(calibration: Calibration, path: Path) -> Path:
     """The calibration as a file."""
-    path.write_text(dump(calibration.record.to_config()), encoding="utf-8")
+    path.write_text(sealed(calibration.record.to_config()), encoding="utf-8")
     return path
 
 

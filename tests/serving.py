@@ -21,7 +21,7 @@ from armcal.cli.main import cli
 from armcal.serve.answering import Answerer
 from armcal.serve.client import Client
 from armcal.serve.loaded import Order, loaded
-from armcal.use.calibration_file import dump, identity_of
+from armcal.use.calibration_file import identity_of, sealed
 from click.testing import CliRunner
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -45,7 +45,7 @@ def variant(text: str, number: int) -> str:
         text,
     )
     assert found == 1
-    return changed.replace("experiment: ", f"experiment: variant {number} of ", 1)
+    return sealed(yaml.safe_load(changed.replace("experiment: ", f"experiment: variant {number} of ", 1)))
 
 
 def foreign(text: str) -> str:
@@ -53,7 +53,7 @@ def foreign(text: str) -> str:
     content = yaml.safe_load(text)
     content["statics"]["body"] = "moon"
     content["identity"]["arm"] = identity_of({key: content[key] for key in ("arms", "measurements", "statics")})
-    return dump(content)
+    return sealed(content)
 
 
 def sha256(text: str) -> str:

@@ -16,7 +16,7 @@ from armcal.solve.estimator import CHECK_THE_DATA, Estimate
 from armcal.solve.parallel import Executor
 from armcal.solve.verdict import Verdict
 from armcal.use.calibration import Calibration
-from armcal.use.calibration_file import dump
+from armcal.use.calibration_file import sealed
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class Run:
             )
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "calibration.yaml"
-            path.write_text(dump(outputs.calibration_content(self.result, self.experiment)), encoding="utf-8")
+            path.write_text(sealed(outputs.calibration_content(self.result, self.experiment)), encoding="utf-8")
             return Calibration.load(path, self.experiment.registry)
 
     def write(self, folder: str | Path) -> Path:
@@ -74,7 +74,6 @@ class Run:
         Raises:
             InputError: the folder holds other things, or cannot be written.
         """
-        outputs.check_folder(Path(folder))
         outputs.write(self.result, self.experiment, Path(folder), render)
         return Path(folder)
 

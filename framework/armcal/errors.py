@@ -33,6 +33,10 @@ class Location:
         return ", ".join(parts)
 
 
+class CalibrationWarning(UserWarning):
+    """A calibration can be used, and its user should know something of it."""
+
+
 class ArmcalError(Exception):
     """The root of armcal's own errors.
 

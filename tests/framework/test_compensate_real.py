@@ -14,7 +14,7 @@ from armcal.run.outputs import calibration_content
 from armcal.run.pipeline import calibrate
 from armcal.solve.prediction import quantile
 from armcal.use.calibration import Calibration
-from armcal.use.calibration_file import dump
+from armcal.use.calibration_file import sealed
 from armcal.use.compensation.request import Options
 from armcal.use.compensation.step import slope_function
 
@@ -43,7 +43,7 @@ def test_joint_angles_follow_from_measured_tips(repository: Path, shared_data: P
     experiment = Experiment.load(repository / "configs/lrm_arm/best.yaml", settings, data / "poses.csv")
     result = calibrate(experiment)
     path = tmp_path / "calibration.yaml"
-    path.write_text(dump(calibration_content(result, experiment)))
+    path.write_text(sealed(calibration_content(result, experiment)))
     calibration = Calibration.load(path)
     ids = set(trained.read_text().split()[1:])
     measured, commands = held_out(experiment, calibration, ids)

@@ -20,7 +20,7 @@ from armcal.run.outputs import calibration_content
 from armcal.run.pipeline import calibrate
 from armcal.solve.online import Gaussian
 from armcal.use.calibration import Calibration
-from armcal.use.calibration_file import dump
+from armcal.use.calibration_file import sealed
 
 ROOT = Path(__file__).resolve().parents[2]
 pytestmark = pytest.mark.shared
@@ -56,7 +56,7 @@ def calibrated(model: str, data: Path, folder: Path, *overrides: str) -> Calibra
         ROOT / "configs" / "lrm_arm" / f"{model}.yaml", ["validation.folds=0", *overrides], data
     )
     path = folder / f"{model}.yaml"
-    path.write_text(dump(calibration_content(calibrate(experiment), experiment)), encoding="utf-8")
+    path.write_text(sealed(calibration_content(calibrate(experiment), experiment)), encoding="utf-8")
     return Calibration.load(path)
 
 

@@ -34,6 +34,7 @@ from armcal.solve.simulation import SimulationRequest, measured_without_noise, w
 from armcal.solve.validation import folds
 from armcal.solve.weighing import fit
 from armcal.use.calibration import Calibration
+from armcal.use.calibration_file import sealed
 from click.testing import CliRunner, Result
 from drifting import DEMO, DRIFTING, FREE, dense_drift, dense_slopes, drifting_problem, problem_of
 
@@ -404,7 +405,7 @@ def test_predictions_know_when_they_cannot_say_how_good_they_are(recording: Path
     older, damaged = {k: v for k, v in kept.items() if k != "prediction"}, json.loads(json.dumps(kept))
     damaged["prediction"]["covariance"] = damaged["prediction"]["covariance"][:-1]
     for name, content in (("older", older), ("damaged", damaged)):
-        (tmp_path / f"{name}.yaml").write_text(yaml.safe_dump(content, sort_keys=False))
+        (tmp_path / f"{name}.yaml").write_text(sealed(content))
     before, rows = predicted(recording, calibration=tmp_path / "older.yaml")
     assert before.exit_code == 0 and "keeps nothing about the errors" in " ".join(before.output.split())
     assert "x_mm" in next(iter(rows.values())) and "plus_minus_x_mm" not in next(iter(rows.values()))

@@ -22,6 +22,7 @@ from armcal.use.calibration import Calibration
 from click.testing import CliRunner
 from serving import LONG_S, Running, calibrated, command, foreign, put, serving, sha256, variant
 
+HALF = "a: [\n"
 POSTURES = np.random.default_rng(0).uniform(-80, 80, (40, 6))
 
 
@@ -190,7 +191,8 @@ def test_nonsense_by_standard_input_is_answered_line_by_line_to_the_end(path: Pa
         (None, "no such file"),
         (b"", "empty"),
         (b"\xff\xfe\n", "no whole calibration"),
-        (b"a: [\nrecalibrated: null\n", "not valid YAML"),
+        (f"{HALF}# sha256 of the lines above: {sha256(HALF)}\n".encode(), "not valid YAML"),
+        (f"{HALF}# sha256 of the lines above: {sha256('other')}\n".encode(), "edited or damaged"),
     ],
 )
 def test_what_is_no_calibration_is_refused_at_the_start(tmp_path: Path, content: bytes | None, says: str) -> None:

@@ -10,7 +10,7 @@ from armcal.errors import ConfigError
 from armcal.serve.calibration_watch import AGAIN_S, QUIET_S, CalibrationWatch
 from serving import put
 
-END = "recalibrated: null\n"
+END = f"# sha256 of the lines above: {'0' * 64}\n"
 FIRST, SECOND, THIRD = (f"number: {i}\n{END}" for i in range(3))
 
 
@@ -93,7 +93,8 @@ def test_a_new_file_that_grows_is_read_when_it_rests(watch: CalibrationWatch, cl
 
 
 @pytest.mark.parametrize(
-    ("text", "why"), [("", "empty"), ("cut", "no end"), ("recalibrate: 3\n", "the key"), ("x" * (2**20 + 1), "larger")]
+    ("text", "why"),
+    [("", "empty"), ("cut", "no end"), ("recalibrated: null\n", "the line that ends"), ("x" * (2**20 + 1), "larger")],
 )
 def test_what_is_not_whole_is_refused_and_the_next_is_taken(
     watch: CalibrationWatch, clock: Clock, text: str, why: str

@@ -23,9 +23,8 @@ from armcal.cli.common import Voice, command_line, overrides, speaking
 from armcal.plugins import discover
 from armcal.report.capability_figures import DRAWN, designs_figure, quantity_figure, reach_figure
 from armcal.report.capability_page import Picture, conclusions, render_capability
-from armcal.run.folder import check_folder, place
+from armcal.run.folder import Reservation, reserved
 from armcal.run.pipeline import Stopwatch
-from armcal.use.file_set import write_over
 
 _DATA = ("map.csv", "map.npz", "areas.csv", "designs.csv", "capability.json", "capability.html")
 _FIGURES = ("reach.png", "designs.png", *(f"{name}.png" for name in BY_NAME))
@@ -43,7 +42,7 @@ OURS = (*_DATA, *_FIGURES)
 def capability(voice: Voice, source: Path, out: Path, settings: Path | None, overrides: tuple[str, ...]) -> None:
     """Map what an arm can do: its reach, sag, stiffness, accuracy and nimbleness, in all and in areas, for designs."""
     watch = Stopwatch()
-    check_folder(out, OURS)
+    kept = click.get_current_context().with_resource(reserved(out, OURS))
     import_module("matplotlib")  # if it is not here, that is said now and not after the survey
     registry = discover()
     voice.plugin_faults(registry)
@@ -65,7 +64,7 @@ def capability(voice: Voice, source: Path, out: Path, settings: Path | None, ove
     facts = {"command": command_line(), "files": ", ".join(sorted({str(file) for file in task.files}))}
     facts |= {"samples": str(task.settings.samples), "seed": str(task.settings.seed)}
     page = render_capability(task.subject.name, sentences, tables, pictures, facts)
-    _write(out, found, designs, told, page, pictures)
+    _write(kept, found, designs, told, page, pictures)
     voice.result({**told, "folder": str(out)})
     for table in tables:
         voice.out.print(_screen(table))
@@ -111,7 +110,7 @@ def _pictures(task: Task, found: Survey, designs: Mapping[str, Survey], told: Ma
 
 
 def _write(
-    folder: Path,
+    kept: Reservation,
     found: Survey,
     designs: Mapping[str, Survey],
     told: Mapping[str, Any],
@@ -119,16 +118,15 @@ def _write(
     pictures: tuple[Picture, ...],
 ) -> None:
     columns = outputs.map_columns(found)
-    texts = {"map.csv": outputs.csv_text(columns)}
+    texts: dict[str, str | bytes] = {f"{picture.name}.png": picture.png for picture in pictures}
+    texts |= {"map.npz": outputs.npz_bytes(columns), "map.csv": outputs.csv_text(columns)}
     if found.areas:
         texts["areas.csv"] = outputs.areas_text(designs or {found.subject.name: found})
     if designs:
         texts["designs.csv"] = outputs.table_text(*outputs.design_rows(_by_design(told)))
     texts["capability.json"] = json.dumps(told, indent=2) + "\n"
     texts["capability.html"] = page
-    place(folder, texts, OURS)
-    binary = {folder / "map.npz": outputs.npz_bytes(columns)}
-    write_over({**binary, **{folder / f"{picture.name}.png": picture.png for picture in pictures}})
+    kept.place(texts)
 
 
 def _screen(table: Table) -> ScreenTable:

@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 import click
 from rich.console import Console
 
-from armcal.errors import DataError, Location
+from armcal.errors import CalibrationWarning, DataError, Location
 from armcal.hooks import ContractDeprecationWarning
 from armcal.plugins import PluginRegistry
 from armcal.solve.estimator import Progress, no_progress
@@ -63,13 +63,15 @@ class Voice:
 
     @contextmanager
     def telling_what_is_to_go(self) -> Iterator[None]:
-        """One line for each thing of the plugin contract that is used and deprecated, once."""
+        """One line, once, for each deprecated part of the plugin contract and each notice about a calibration."""
+        kinds = (ContractDeprecationWarning, CalibrationWarning)
         with warnings.catch_warnings():
-            warnings.simplefilter("always", ContractDeprecationWarning)
+            for kind in kinds:
+                warnings.simplefilter("always", kind)
             others, told = warnings.showwarning, set()
 
             def show(message: Any, category: type[Warning], *where: Any, **more: Any) -> None:
-                if not issubclass(category, ContractDeprecationWarning):
+                if not issubclass(category, kinds):
                     others(message, category, *where, **more)
                 elif str(message) not in told:
                     told.add(str(message))

@@ -24,6 +24,7 @@ COMMANDS = {
         "What to tell a controller that only knows the nominal arm.",
     ),
     "export": ("armcal.cli.export:export", "Write a calibrated arm in another program's format, such as URDF."),
+    "calibration": ("armcal.cli.calibration:calibration", "Accept a calibration that was edited by hand."),
     "capability": ("armcal.cli.capability:capability", "What an arm can do where, and which design does it best."),
     "plan": ("armcal.cli.plan:plan", "Which poses to measure: the best few, and how good any could be."),
     "convert": ("armcal.cli.convert:convert", "The geometry of an arm in another form: mdh, poe, urdf."),

@@ -17,7 +17,7 @@ from armcal.online.mission.mission import BENCH, CALIBRATION, RECALIBRATION, REC
 from armcal.online.mission.settings import MissionPlan
 from armcal.plugins import discover
 from armcal.report.mission_figure import mission_figure
-from armcal.run.folder import check_folder, place
+from armcal.run.folder import reserved
 from armcal.run.pipeline import Stopwatch
 
 TRUTH = ("truth.csv", "truth.json")
@@ -36,11 +36,11 @@ _NAMED = {"right": "named right", "wrong": "named wrong", "seen": "seen but not 
 def mission(voice: Voice, config: Path, out: Path, overrides: tuple[str, ...]) -> None:
     """Simulate the mission of CONFIG, recalibrate over all of it, and judge that against the truth."""
     watch = Stopwatch()
-    check_folder(out, OURS)
+    kept = click.get_current_context().with_resource(reserved(out, OURS))
     registry = discover()
     voice.plugin_faults(registry)
     plan = MissionPlan.load(config, overrides, registry)
-    place(out, {}, OURS)
+    kept.place({})
     with voice.progress() as progress:
         result = run_mission(plan, out, loop_session(registry), registry, progress, watch)
     told = {**figures(plan.experiment.name, result.mission, result.story, result.judgement), "seconds": watch.seconds}

@@ -32,7 +32,7 @@ def run(
     """Calibrate the arm that CONFIG describes: load, check, fit, validate, report."""
     watch = Stopwatch()
     folder = out or Path("runs") / config.stem
-    outputs.check_folder(folder)
+    reserved = click.get_current_context().with_resource(outputs.reserved(folder))
     registry = discover()
     voice.plugin_faults(registry)
     experiment = Experiment.load(config, overrides, data, registry)
@@ -51,7 +51,7 @@ def run(
         voice.detail(f"{stage}: {seconds:.3f} s")
     voice.detail(f"evaluated by: {result.backend}")
     result.seconds["total"] = watch.total()
-    outputs.write(result, experiment, folder, render)
+    reserved.place(outputs.files(result, experiment, render))
     converged = result.estimate.verdict.converged
     for text in registry.notify("armcal_run_ended", name=result.name, folder=str(folder), converged=converged):
         voice.warn(text)

@@ -24,7 +24,7 @@ from armcal.serve.transports.unix import UnixSocket
 from armcal.solve.kernel import EvaluatorChoice
 from armcal.use.compensation.request import Redundancy
 
-_ALWAYS = ("refused", "worker_lost", "missing", "status")
+_ALWAYS = ("refused", "worker_lost", "missing", "status", "notice")
 """Events that are told although all is to be quiet."""
 
 

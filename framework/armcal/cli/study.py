@@ -13,6 +13,7 @@ from armcal.cli.common import Voice, command_line, overrides, parallel, speaking
 from armcal.plugins import discover
 from armcal.report.study_page import conclusions, render_study, render_transfer, transfer_conclusions, transfer_table
 from armcal.run import study_outputs
+from armcal.run.folder import reserved
 from armcal.run.load_transfer import transfer
 from armcal.run.pipeline import Stopwatch
 from armcal.run.study import Study, compare
@@ -34,7 +35,7 @@ def study(
     """Compare the variants that CONFIG lists by cross-validated error, or by load transfer."""
     watch = Stopwatch()
     folder = out or Path("runs") / config.stem
-    study_outputs.check_folder(folder)
+    kept = click.get_current_context().with_resource(reserved(folder, study_outputs.FILES))
     registry = discover()
     voice.plugin_faults(registry)
     asked = Study.load(config, overrides, data, registry)
@@ -50,7 +51,7 @@ def study(
         voice.detail(f"{stage}: {seconds:.3f} s")
     result.seconds["total"] = watch.total()
     page = render_study(result) if isinstance(result, StudyResult) else render_transfer(result)
-    study_outputs.write(result, asked, folder, page)
+    kept.place(study_outputs.files(result, asked, page))
     voice.result({**result.as_dict(), "folder": str(folder)})
     if isinstance(result, StudyResult):
         _show_study(voice, result)

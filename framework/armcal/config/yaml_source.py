@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NoReturn
@@ -77,7 +77,12 @@ def find_key(value: Any, step: Step) -> Step | None:
     return None
 
 
-def load_config(path: str | Path, overrides: Sequence[str] = (), root: Path | None = None) -> ConfigSource:
+def load_config(
+    path: str | Path,
+    overrides: Sequence[str] = (),
+    root: Path | None = None,
+    check: Callable[[str], object] | None = None,
+) -> ConfigSource:
     """Read a YAML config with all that it extends, and apply overrides.
 
     Args:
@@ -85,12 +90,13 @@ def load_config(path: str | Path, overrides: Sequence[str] = (), root: Path | No
         overrides: ``a.b=value`` each, applied in order; a value is YAML, a list is indexed
             (``rows.2.d_mm=3``), null removes a key, and a key that holds a dot is put in double quotes.
         root: what no path in a config may leave; the directory of the config unless given.
+        check: is given the text of the config before anything is made of it, and may raise.
 
     Raises:
         ConfigError: what was found, where, and the mend.
     """
     path = Path(path)
-    reader = Reader(root_of(path, root))
+    reader = Reader(root_of(path, root), check)
     tree = reader.tree(path, ())
     for text in overrides:
         tree = override(tree, text)
@@ -148,12 +154,15 @@ class Reader:
     """Reads a config and what it extends, each file once."""
 
     root: Path
+    check: Callable[[str], object] | None = None
     files: list[Path] = field(default_factory=list)
     done: dict[Path, Node] = field(default_factory=dict)
 
     def tree(self, path: Path, chain: tuple[Path, ...]) -> Node:
         """The merged tree of a file; ``chain`` is who extends it, resolved."""
         text = _read_text(path)
+        if self.check and not chain:
+            self.check(text)
         resolved = path.resolve()
         if resolved in self.done:
             return self.done[resolved]

@@ -6,6 +6,7 @@ import csv
 import io
 import json
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
@@ -14,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from armcal.config.yaml_source import ConfigSource
+from armcal.errors import NotConvergedError
 from armcal.measure.reader import surroundings
 from armcal.run import folder as folders
 from armcal.run.experiment import Experiment
@@ -21,7 +23,9 @@ from armcal.run.groups import GroupError
 from armcal.run.result import RunResult
 from armcal.solve.bootstrap import Bootstrap
 from armcal.solve.profile import Profile
-from armcal.use.calibration_file import SCHEMA, CalibrationFile, InformationRecord, dump, parameter_records
+from armcal.use.calibration import Calibration
+from armcal.use.calibration_file import SCHEMA, CalibrationFile, InformationRecord, dump, parameter_records, sealed
+from armcal.use.physics import check_poses
 
 FILES = ("experiment.yaml", "residuals.csv", "metrics.json", "report.html", "log.txt", "calibration.yaml")
 """In the order in which they are put in place: the calibration last."""
@@ -30,25 +34,32 @@ BOOTSTRAP_FILE = "bootstrap.csv"
 """Only where a bootstrap was asked for."""
 PROFILE_FILE = "profile.json"
 """Only where profiles were asked for."""
-_OURS = (*FILES, BOOTSTRAP_FILE, PROFILE_FILE, f"calibration.yaml{NOT_CONVERGED_SUFFIX}")
+_OURS = (BOOTSTRAP_FILE, PROFILE_FILE, f"calibration.yaml{NOT_CONVERGED_SUFFIX}", *FILES)
 
 
-def check_folder(folder: Path) -> None:
-    """Refuse a place that is not ours to write to.
+def reserved(folder: Path) -> AbstractContextManager[folders.Reservation]:
+    """Keep a folder for one run.
 
     Raises:
-        InputError: a file, or a directory with anything that is not a run's.
+        InputError: a file, a directory with anything that is not a run's, or one that another run writes to.
     """
-    folders.check_folder(folder, _OURS)
+    return folders.reserved(folder, _OURS)
 
 
 def write(result: RunResult, experiment: Experiment, folder: Path, render: Callable[[RunResult], str]) -> None:
     """Write all files; those of an earlier run in the same place move to ``earlier/``.
 
-    A run that did not converge leaves ``calibration.yaml.not-converged``, which nothing loads.
-
     Raises:
-        InputError: the folder cannot be written.
+        InputError: the folder cannot be written, or is not ours to write to.
+    """
+    with reserved(folder) as held:
+        held.place(files(result, experiment, render))
+
+
+def files(result: RunResult, experiment: Experiment, render: Callable[[RunResult], str]) -> dict[str, str]:
+    """The texts of all files by their names.
+
+    A run that did not converge leaves ``calibration.yaml.not-converged``, which nothing loads.
     """
     texts = {
         "experiment.yaml": experiment_text(experiment.source),
@@ -56,7 +67,7 @@ def write(result: RunResult, experiment: Experiment, folder: Path, render: Calla
         "metrics.json": json.dumps(metrics(result), indent=2) + "\n",
         "report.html": render(result),
         "log.txt": log_text(result),
-        "calibration.yaml": dump(calibration_content(result, experiment)),
+        "calibration.yaml": sealed(calibration_content(result, experiment)),
     }
     if result.bootstrap:
         texts = {BOOTSTRAP_FILE: bootstrap_text(result.bootstrap, result), **texts}
@@ -64,7 +75,7 @@ def write(result: RunResult, experiment: Experiment, folder: Path, render: Calla
         texts = {PROFILE_FILE: profile_text(result.profiles), **texts}
     if not result.estimate.verdict.converged:
         texts[f"calibration.yaml{NOT_CONVERGED_SUFFIX}"] = texts.pop("calibration.yaml")
-    folders.place(folder, texts, _OURS)
+    return texts
 
 
 def metrics(result: RunResult) -> dict[str, Any]:
@@ -157,7 +168,18 @@ def calibration_content(result: RunResult, experiment: Experiment) -> dict[str, 
         prediction=result.prediction,
         information=information,
     )
-    return record.to_config()
+    return _checked(record, result, experiment).to_config()
+
+
+def _checked(record: CalibrationFile, result: RunResult, experiment: Experiment) -> CalibrationFile:
+    """With predictions at check poses, if the arm settles there."""
+    system, registry = experiment.system, experiment.registry
+    parameters = system.parameters(record.groups).with_nominal(result.estimate.values)
+    made = Calibration(system, parameters, record)
+    try:
+        return made.checked(check_poses(system, result.dataset, result.split.train), registry).record
+    except NotConvergedError:
+        return made.checked(None, registry).record
 
 
 def _noise(result: RunResult) -> dict[str, Any]:

@@ -5,13 +5,11 @@ from __future__ import annotations
 import csv
 import io
 import json
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from armcal.config.variants import SECTION
-from armcal.run import folder as folders
 from armcal.run.study import Study
 from armcal.run.study_result import StudyResult, TransferResult
 from armcal.use.calibration_file import dump
@@ -19,28 +17,14 @@ from armcal.use.calibration_file import dump
 FILES = ("experiment.yaml", "study.csv", "study.json", "study.html")
 
 
-def check_folder(folder: Path) -> None:
-    """Refuse a place that is not a study's to write to.
-
-    Raises:
-        InputError: a file, or a directory with anything that is not a study's.
-    """
-    folders.check_folder(folder, FILES)
-
-
-def write(result: StudyResult | TransferResult, study: Study, folder: Path, page: str) -> None:
-    """Write all files; those of an earlier study in the same place move to ``earlier/``.
-
-    Raises:
-        InputError: the folder cannot be written.
-    """
-    texts = {
+def files(result: StudyResult | TransferResult, study: Study, page: str) -> dict[str, str]:
+    """The texts of all files by their names."""
+    return {
         "experiment.yaml": dump(self_contained(study)),
         "study.csv": _csv_text(result),
         "study.json": json.dumps(result.as_dict(), indent=2) + "\n",
         "study.html": page,
     }
-    folders.place(folder, texts, FILES)
 
 
 def self_contained(study: Study) -> dict[str, Any]:

@@ -22,8 +22,8 @@ QUIET_S = 5.0
 AGAIN_S = 10.0
 """A file that could not be tried for a reason of its own is tried again after so long."""
 
-_LAST_KEY = re.compile(rb"^recalibrated:", re.MULTILINE)
-"""The last key of the file's schema, written even when there is nothing to say: what comes before it is whole."""
+_LAST_LINE = re.compile(rb"^# sha256 of the lines above: [0-9a-f]{64}\r?\n\Z", re.MULTILINE)
+"""What a calibration ends in."""
 
 State = Literal["taken", "settling", "loading", "refused", "missing"]
 _Stat = tuple[int, int, int, int]
@@ -181,8 +181,8 @@ def _not_whole(snapshot: Snapshot) -> str:
         return f"the file is larger than {MAX_BYTES} bytes: this is no calibration."
     if not snapshot.data.endswith(b"\n"):
         return "the last line of the file has no end: this is no whole calibration."
-    if not _LAST_KEY.search(snapshot.data):
-        return "the key that ends a calibration is not in the file: this is no whole calibration."
+    if not _LAST_LINE.search(snapshot.data):
+        return "the line that ends a calibration is not at the end of the file: this is no whole calibration."
     return ""
 
 

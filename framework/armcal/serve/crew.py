@@ -175,6 +175,8 @@ class Crew:
         tag: CalibrationTag = told["ready"]
         self.tag, self.arms = tag, told["arms"]
         self._watch.taken()
+        for notice in told["notices"]:
+            self._tell("notice", notice, {})
         if not first:
             sentence = f"calibration {tag['sequence']} is answered from, of {tag['created']}"
             self._tell("calibration", sentence, {"calibration": tag})

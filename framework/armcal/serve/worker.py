@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any
 
-from armcal.errors import EXIT_FAULT, ArmcalError
+from armcal.errors import EXIT_FAULT, ArmcalError, CalibrationWarning
 from armcal.serve.frames import ABOUT_ITSELF, Message, Unpacker
 
 if TYPE_CHECKING:
@@ -52,7 +52,7 @@ def _prepared(order: dict[str, Any], data: bytes, link: socket.socket) -> Answer
     """What answers, once the server was told that it is ready; None if it was told why not."""
     try:
         with ThreadPoolExecutor(1) as aside:
-            answerer = aside.submit(_made, order, data).result()
+            answerer, notices = aside.submit(_made, order, data).result()
     except ArmcalError as fault:
         told: dict[str, Any] = {
             "fault": {
@@ -72,14 +72,22 @@ def _prepared(order: dict[str, Any], data: bytes, link: socket.socket) -> Answer
         link.sendall(Message(ABOUT_ITSELF, json.dumps(told).encode()).packed())
         return None
     arms = {name: arm.shown for name, arm in answerer.arms.items()}
-    link.sendall(Message(ABOUT_ITSELF, json.dumps({"ready": answerer.tag, "arms": arms}).encode()).packed())
+    told = {"ready": answerer.tag, "arms": arms, "notices": notices}
+    link.sendall(Message(ABOUT_ITSELF, json.dumps(told).encode()).packed())
     return answerer
 
 
-def _made(order: dict[str, Any], data: bytes) -> Answerer:
-    """In a thread of its own: on Linux a niceness is a thread's, and could not be taken back from a whole process."""
+def _made(order: dict[str, Any], data: bytes) -> tuple[Answerer, list[str]]:
+    """What answers, and what its users should know of the calibration.
+
+    In a thread of its own: on Linux a niceness is a thread's, and could not be taken back from a whole process.
+    """
     if order["gently"] and sys.platform == "linux":
         os.nice(_NICENESS)
     from armcal.serve.loaded import Order, loaded
 
-    return loaded(Order(**{name: value for name, value in order.items() if name != "gently"}), data)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("ignore")
+        warnings.simplefilter("always", CalibrationWarning)
+        answerer = loaded(Order(**{name: value for name, value in order.items() if name != "gently"}), data)
+    return answerer, [str(each.message) for each in caught]

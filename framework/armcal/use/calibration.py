@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,20 +16,23 @@ from armcal.base.domains import Array
 from armcal.base.parameters import Parameters
 from armcal.config.system import System, build_system
 from armcal.config.validate import validate
-from armcal.config.yaml_source import load_config
-from armcal.errors import ConfigError, DataError, Location
-from armcal.measure.contact import ArmsAlone
+from armcal.config.yaml_source import ConfigSource
+from armcal.errors import ArmcalError, CalibrationWarning, ConfigError, DataError, Location
 from armcal.measure.measurement import Measurement
-from armcal.measure.partners import PairedMeasurement
 from armcal.plugins import PluginRegistry, discover
 from armcal.solve.coverage import Recording
-from armcal.solve.problem import Problem
 from armcal.solve.variance import Component
-from armcal.use.calibration_file import SCHEMA, CalibrationFile, identity_of
+from armcal.use.calibration_file import CalibrationFile, identity_of, read_record
 from armcal.use.compensation.compensator import Compensator
 from armcal.use.compensation.request import Commands, Options
 from armcal.use.intervals import PlusMinus, Uncertainty
+from armcal.use.physics import SHARE, check_record, components, differences, movement, predict, readable
 from armcal.use.tool_expression import ToolExpression, arm_expression
+
+_OTHER_PHYSICS = (
+    "Install the versions that it names, or run the calibration again; to use its values with today's physics in "
+    "spite of that: armcal calibration accept FILE."
+)
 
 
 @dataclass(frozen=True)
@@ -47,20 +51,27 @@ class Calibration:
 
     @classmethod
     def load(cls, path: str | Path, registry: PluginRegistry | None = None) -> Calibration:
-        """Read a calibration.
+        """Read a calibration; a ``CalibrationWarning`` for what its user should know of it.
 
         Raises:
-            ConfigError: not a calibration, of another schema, damaged, or its description was changed.
+            ConfigError: not a calibration, of another schema, damaged, changed since it was written, or made with
+                other physics than that of the plugins that are there now.
             PluginError: it needs a plugin that is not there.
         """
-        source = load_config(path)
-        schema = source.data.get("armcal_calibration")
-        if schema != SCHEMA:
-            raise ConfigError(
-                f"found calibration schema {schema!r}, expected {SCHEMA}.",
-                where=Location(str(path)),
-                hint="Give the calibration.yaml of a run, or run the calibration again with this version.",
-            )
+        registry = registry or discover()
+        loaded = cls.built(read_record(path)[0], path, registry)
+        for notice in loaded.notices(path, registry):
+            warnings.warn(f"the calibration {notice}", CalibrationWarning, stacklevel=2)
+        return loaded
+
+    @classmethod
+    def built(cls, source: ConfigSource, path: str | Path, registry: PluginRegistry) -> Calibration:
+        """The calibration in a file that was read, whatever its predictions were when it was written.
+
+        Raises:
+            ConfigError: its parts do not fit one another.
+            PluginError: it needs a plugin that is not there.
+        """
         record = validate(CalibrationFile, source)
         if not record.converged:
             raise ConfigError(
@@ -82,15 +93,58 @@ class Calibration:
                 where=Location(str(path)),
                 hint="Change the experiment's configuration and run it again.",
             )
-        system = build_system(source, registry or discover())
+        system = build_system(source, registry)
         parameters = system.parameters(record.groups)
         return cls(system, parameters.with_nominal(_values(parameters, record, path)), record)
+
+    def checked(self, commands: Dataset | None, registry: PluginRegistry) -> Calibration:
+        """The same with what its components are now and predictions at check poses (no poses: none).
+
+        Raises:
+            NotConvergedError: a pose has no equilibrium.
+        """
+        checks = None
+        if commands is not None:
+            stated = self.plus_minus(commands) if self.record.prediction and self.readable else None
+            checks = check_record(self.system, self.parameters, commands, stated)
+        physics = {"checks": checks, "components": components(self.system, registry)}
+        return replace(self, record=self.record.model_copy(update=physics))
+
+    def notices(self, path: str | Path, registry: PluginRegistry) -> list[str]:
+        """What its user should know: edits by hand, and other versions whose predictions agree; a sentence's rest each.
+
+        Raises:
+            ConfigError: the physics is not that which it was made with: its check poses are predicted elsewhere.
+        """
+        found, record = [], self.record
+        if record.accepted:
+            found.append(f"was {record.accepted}: no records stand behind what it predicts now.")
+        changed = differences(record.components, components(self.system, registry))
+        made_with = f" It was made with {'; '.join(changed)}." if changed else ""
+        if record.checks is None:
+            return [*found, f"keeps no check poses.{made_with}"] if changed else found
+        try:
+            moved = movement(self.system, self.parameters, record.checks)
+        except (ArmcalError, ValueError) as fault:
+            text = f"its check poses cannot be predicted any more ({fault})."
+            raise ConfigError(f"{text}{made_with}", where=Location(str(path)), hint=_OTHER_PHYSICS) from fault
+        if moved.share > SHARE:
+            raise ConfigError(
+                f"the physics is another than when it was written: at its {len(record.checks.records)} check poses "
+                f"tools moved by up to {moved.tool_m * 1000:.3g} mm, {moved.name} by {moved.share:.2g} times its "
+                f"stated accuracy (limit {SHARE:g}).{made_with}",
+                where=Location(str(path)),
+                hint=_OTHER_PHYSICS,
+            )
+        if changed:
+            agree = f"predictions at its {len(record.checks.records)} check poses agree to {moved.tool_m * 1000:.1g} mm"
+            found.append(f"was made with {'; '.join(changed)}; {agree}.")
+        return found
 
     @property
     def readable(self) -> Mapping[str, Measurement]:
         """The measurements whose readings a single pose has: a contact reads nothing."""
-        measurements = self.system.measurements.items()
-        return {name: m for name, m in measurements if m.channels() and not isinstance(m, PairedMeasurement)}
+        return readable(self.system)
 
     def predict(self, commands: Dataset) -> tuple[dict[str, Array], Array]:
         """What instruments would read and where the first measurement's arms' tools are, in elastic equilibrium.
@@ -106,23 +160,7 @@ class Calibration:
             NotConvergedError: a record has no equilibrium.
         """
         self.require_payload(commands.has("payload"), commands.source)
-        fixed = self.parameters.with_free(())
-        problem = Problem.build(
-            self.system.arms,
-            self.readable or {"pose": ArmsAlone(tuple(self.system.arms))},
-            fixed,
-            self.system.environment,
-            commands,
-            "interpreted",
-            groups={},
-        )
-        shown = problem.predict(fixed.nominal(), problem.records(commands))
-        channels = {
-            channel: values[row]
-            for kernel, values in zip(problem.kernels, shown, strict=True)
-            for row, channel in enumerate(kernel.factor.output_channels)
-        }
-        return channels, _poses(shown[0][len(problem.kernels[0].factor.output_channels) :])
+        return predict(self.system, self.parameters, commands)
 
     def require_payload(self, told: bool, source: str | None = None) -> None:
         """An elastic arm needs to know what hangs on its tool, if not from the calibration then from the records.
@@ -160,8 +198,12 @@ class Calibration:
                 hint="The file was edited or damaged; run the calibration again.",
             )
         fitted = self.parameters.with_nominal(np.array([entry.nominal for entry in entries])).with_free(free)
-        components = tuple(_component(each) for each in noise.get("components", ()))
-        measure = (float(noise["scale"]), int(noise["degrees_of_freedom"]))
+        try:
+            components = tuple(_component(each) for each in noise.get("components", ()))
+            measure = (float(noise["scale"]), int(noise["degrees_of_freedom"]))
+        except (KeyError, TypeError, ValueError) as fault:
+            text = f"the noise in the calibration cannot be read ({type(fault).__name__}: {fault})."
+            raise ConfigError(text, hint="The file was edited or damaged; run the calibration again.") from fault
         return Uncertainty(
             replace(self.system, measurements=self.readable),
             fitted,
@@ -289,13 +331,3 @@ def _values(parameters: Parameters, record: CalibrationFile, path: str | Path) -
             hint="It was written by another version of a plugin; run the calibration again.",
         )
     return np.array(list(kept.values()))
-
-
-def _poses(tools: Array) -> Array:
-    """Stacked 3x4 columns (12 an arm x N) as homogeneous matrices (arms x N x 4 x 4)."""
-    count = tools.shape[1]
-    columns = tools.reshape(-1, 4, 3, count)
-    poses = np.zeros((len(columns), count, 4, 4))
-    poses[:, :, :3, :] = columns.transpose(0, 3, 2, 1)
-    poses[:, :, 3, 3] = 1.0
-    return poses

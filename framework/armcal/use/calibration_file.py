@@ -6,7 +6,8 @@ import hashlib
 import json
 import re
 from collections.abc import Mapping
-from typing import Any
+from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 import yaml
@@ -14,12 +15,20 @@ from pydantic import Field
 
 from armcal.base.config_text import plain
 from armcal.base.settings import Settings
+from armcal.config.yaml_source import ConfigSource, load_config
+from armcal.errors import ConfigError, Location
 from armcal.solve.estimator import Estimate
 from armcal.use.intervals import PredictionRecord
+from armcal.use.physics import CheckRecord, ComponentRecord
 
 SCHEMA = 1
 UNMOVED_SD = 1e-4
 """In standard deviations: a step that ignores the bounds and is shorter than this is the solver's own tolerance."""
+_Seal = Literal["whole", "broken", "absent"]
+_LAST_LINE = "# sha256 of the lines above: "
+_CHANGED_HINT = (
+    "Take a whole copy, or run the calibration again; if it was edited on purpose: armcal calibration accept FILE."
+)
 _LINE_END = re.compile("[\n\r\x85\u2028\u2029]")
 
 
@@ -53,7 +62,7 @@ class InformationRecord(Settings):
 
 
 class CalibrationFile(Settings):
-    """The schema of calibration.yaml."""
+    """The schema of calibration.yaml; ``accepted`` says why and when it was last accepted by hand."""
 
     armcal_calibration: int
     created: str
@@ -71,6 +80,9 @@ class CalibrationFile(Settings):
     groups: dict[str, tuple[str, ...]] = Field(default_factory=dict)
     parameters: tuple[ParameterRecord, ...]
     prediction: PredictionRecord | None = None
+    components: tuple[ComponentRecord, ...] = ()
+    checks: CheckRecord | None = None
+    accepted: str | None = None
     information: InformationRecord
     recalibrated: dict[str, Any] | None = None
 
@@ -106,6 +118,55 @@ def parameter_records(estimate: Estimate) -> tuple[ParameterRecord, ...]:
 def dump(content: Mapping[str, Any]) -> str:
     """YAML text, keys in order, numbers to their last digit."""
     return yaml.dump(plain(dict(content)), Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=110)
+
+
+def sealed(content: Mapping[str, Any]) -> str:
+    """The text of a calibration: YAML that ends in a hash of all that is above it."""
+    text = dump(content)
+    return f"{text}{_LAST_LINE}{_hash(text)}\n"
+
+
+def read_record(path: str | Path, changed: bool = False) -> tuple[ConfigSource, bool]:
+    """A calibration's content, and whether it is as armcal wrote it; if it must be, ``changed`` is false.
+
+    Raises:
+        ConfigError: it cannot be read, is not a calibration of this schema, or was changed since it was written.
+    """
+    states: list[_Seal] = []
+
+    def look(text: str) -> None:
+        states.append(_seal(text))
+        if states == ["broken"] and not changed:
+            found = "its content is not what armcal wrote: it was edited or damaged."
+            raise ConfigError(found, where=Location(str(path)), hint=_CHANGED_HINT)
+
+    source = load_config(path, check=look)
+    schema = source.data.get("armcal_calibration")
+    if schema != SCHEMA:
+        raise ConfigError(
+            f"found calibration schema {schema!r}, expected {SCHEMA}.",
+            where=Location(str(path)),
+            hint="Give the calibration.yaml of a run, or run the calibration again with this version.",
+        )
+    if states == ["absent"] and not changed:
+        raise ConfigError(
+            "it does not end in the hash of its content: it was cut, damaged, or written by an earlier version.",
+            where=Location(str(path)),
+            hint=_CHANGED_HINT,
+        )
+    return source, states == ["whole"]
+
+
+def _seal(text: str) -> _Seal:
+    """What a text's last line is; line ends may have become those of another system."""
+    above, found, kept = text.replace("\r\n", "\n").rpartition(_LAST_LINE)
+    if not found:
+        return "absent"
+    return "whole" if kept == f"{_hash(above)}\n" else "broken"
+
+
+def _hash(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 class _Dumper(getattr(yaml, "CSafeDumper", yaml.SafeDumper)):  # type: ignore[misc]

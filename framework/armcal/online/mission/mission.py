@@ -25,7 +25,7 @@ from armcal.run.pipeline import Stopwatch, calibrate
 from armcal.solve.estimator import Progress, no_progress
 from armcal.solve.simulation import SimulationRequest
 from armcal.use.calibration import Calibration
-from armcal.use.calibration_file import dump
+from armcal.use.calibration_file import sealed
 
 CALIBRATION = "calibration.yaml"
 BENCH = "bench.csv"
@@ -100,7 +100,7 @@ def before_launch(plan: MissionPlan, folder: Path, progress: Progress = no_progr
             "the calibration before launch did not converge.", hint=f"Try armcal run {settings.experiment}."
         )
     path = folder / CALIBRATION
-    path.write_text(dump(calibration_content(result, again)), encoding="utf-8")
+    path.write_text(sealed(calibration_content(result, again)), encoding="utf-8")
     return path
 
 

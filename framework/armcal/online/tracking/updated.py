@@ -14,7 +14,7 @@ from armcal.online.tracking.belief import Belief
 from armcal.online.tracking.chart import Chart
 from armcal.online.tracking.projection import most_likely
 from armcal.use.calibration import Calibration
-from armcal.use.calibration_file import UNMOVED_SD, InformationRecord, dump
+from armcal.use.calibration_file import UNMOVED_SD, InformationRecord, sealed
 from armcal.use.intervals import covariance_rows
 
 _QUANTILE = float(ndtri(0.975))
@@ -67,7 +67,7 @@ def calibration_text(calibration: Calibration, chart: Chart, belief: Belief, tol
             "recalibrated": dict(told),
         }
     )
-    return dump(content.to_config())
+    return sealed(content.to_config())
 
 
 def _bounds(chart: Chart) -> dict[int, tuple[float, float]]:

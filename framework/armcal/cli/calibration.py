@@ -1,0 +1,39 @@
+"""``armcal calibration``."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from pathlib import Path
+
+import click
+
+from armcal.cli.common import Voice, speaking
+from armcal.plugins import discover
+from armcal.use.acceptance import accept as accepted
+from armcal.use.calibration_file import sealed
+from armcal.use.file_set import write_over
+
+
+@click.group()
+def calibration() -> None:
+    """What is done to a calibration.yaml itself."""
+
+
+@calibration.command()
+@click.argument("path", metavar="FILE", type=click.Path(path_type=Path))
+@speaking
+def accept(voice: Voice, path: Path) -> None:
+    """Take FILE as it is, after it was edited by hand or is to be used with other versions of its plugins.
+
+    All but its hash is checked again. The acceptance is noted in FILE, and every command that uses it says so.
+    """
+    registry = discover()
+    voice.plugin_faults(registry)
+    found = accepted(path, datetime.now(UTC).date().isoformat(), registry)
+    if found.was_needed:
+        write_over({path: sealed(found.calibration.record.to_config()).encode()})
+    moved = None if found.moved_m is None else found.moved_m * 1000
+    voice.result({"file": str(path), "edited": found.was_edited, "moved_mm": moved})
+    told = "it keeps no check poses" if moved is None else f"tools at its check poses moved by up to {moved:.3f} mm"
+    done = "accepted" if found.was_needed else "nothing to accept, it is as armcal wrote it"
+    voice.out.print(f"{done}: {path} ({told})", markup=False, soft_wrap=True)

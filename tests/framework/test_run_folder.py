@@ -1,0 +1,228 @@
+"""The folder of a run: one set of files or the other, whole, whatever ends the run; one run at a time."""
+
+from __future__ import annotations
+
+import errno
+import multiprocessing
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from armcal.cli.main import cli
+from armcal.errors import InputError
+from armcal.run import folder as folders
+from armcal.run.folder import place, reserved
+from click.testing import CliRunner
+
+ROOT = Path(__file__).resolve().parents[2]
+DEMO = str(ROOT / "configs" / "lrm_arm" / "demo.yaml")
+FAST = ("--set", "validation.folds=0", "--set", "evaluator=interpreted")
+OURS = ("notes.txt", "table.csv", "page.html", "result.yaml")
+CALLS = ("rename", "mkdir", "rmdir", "unlink", "fsync", "open", "chmod", "rmtree", "change_places")
+
+
+def texts(mark: str, names: tuple[str, ...] = OURS) -> dict[str, str]:
+    return {name: f"{name} of {mark}\n" for name in names}
+
+
+def found(folder: Path) -> dict[str, str]:
+    return {p.name: p.read_text() for p in folder.iterdir() if p.is_file() and p.name in OURS}
+
+
+def everything(folder: Path) -> set[str]:
+    """The content of every file under a folder and beside it."""
+    return {path.read_text() for path in folder.parent.rglob("*") if path.is_file()}
+
+
+def counted(monkeypatch: pytest.MonkeyPatch, act: Callable[[str], None]) -> None:
+    """Call ``act`` with a name before each call that changes what is on the disk."""
+
+    def before(name: str, call: Callable[..., object]) -> Callable[..., object]:
+        def watched(*given: object, **more: object) -> object:
+            act(name)
+            return call(*given, **more)
+
+        return watched
+
+    for name in ("rename", "mkdir", "rmdir", "unlink", "touch", "chmod"):
+        monkeypatch.setattr(Path, name, before(name, getattr(Path, name)))
+    monkeypatch.setattr(os, "fsync", before("fsync", os.fsync))
+    monkeypatch.setattr(folders.shutil, "rmtree", before("rmtree", folders.shutil.rmtree))
+    monkeypatch.setattr(folders.tempfile, "mkdtemp", before("mkdtemp", folders.tempfile.mkdtemp))
+    monkeypatch.setattr(folders, "change_places", before("swap", folders.change_places))
+
+
+def steps(tmp_path: Path, in_place: bool) -> int:
+    """How many changes of the disk a second set takes."""
+    folder, count = tmp_path / "counting", []
+    place(folder, texts("a"), OURS)
+    with pytest.MonkeyPatch.context() as patch:
+        if in_place:
+            patch.setattr(folders, "_movable", lambda folder: False)
+        counted(patch, count.append)
+        place(folder, texts("b"), OURS)
+    assert found(folder) == texts("b")
+    return len(count)
+
+
+def killed_at(step: int, folder: Path, in_place: bool, mark: str) -> int:
+    """Write a set in a process that is killed before its ``step``-th change of the disk; its exit code."""
+
+    def run() -> None:
+        left = [step]
+
+        def act(name: str) -> None:
+            left[0] -= 1
+            if left[0] < 0:
+                os.kill(os.getpid(), signal.SIGKILL)
+
+        patch = pytest.MonkeyPatch()
+        if in_place:
+            patch.setattr(folders, "_movable", lambda folder: False)
+        counted(patch, act)
+        place(folder, texts(mark), OURS)
+
+    process = multiprocessing.get_context("fork").Process(target=run)
+    process.start()
+    process.join(60)
+    return int(process.exitcode or 0)
+
+
+def test_a_run_killed_at_any_step_leaves_one_set_or_the_other_whole(tmp_path: Path) -> None:
+    """Each change of the disk in turn is the one before which the process is killed."""
+    total, ends = steps(tmp_path, in_place=False), []
+    assert total > 10
+    for step in range(total):
+        folder = tmp_path / f"step{step}" / "out"
+        place(folder, texts("first"), OURS)
+        place(folder, texts("second"), OURS)
+        assert killed_at(step, folder, False, "third") == -signal.SIGKILL
+        now = found(folder)
+        assert now in (texts("second"), texts("third")), (step, now)
+        ends.append(now == texts("third"))
+        assert {*texts("first").values(), *texts("second").values()} <= everything(folder), step
+        place(folder, texts("fourth"), OURS)
+        assert found(folder) == texts("fourth")
+        kept = [found(path) for path in sorted((folder / "earlier").iterdir())]
+        assert [texts("first"), texts("second")] == kept[:2] and len(kept) == 2 + ends[-1], (step, kept)
+        assert [path.name for path in folder.parent.iterdir()] == ["out"], "what was staged is cleaned up"
+        assert not list(folder.glob(".armcal-*"))
+    assert True in ends and False in ends
+
+
+def test_where_folders_cannot_change_places_a_killed_run_leaves_no_result_with_other_companions(tmp_path: Path) -> None:
+    for step in range(steps(tmp_path, in_place=True)):
+        folder = tmp_path / f"step{step}" / "out"
+        place(folder, texts("first"), OURS)
+        assert killed_at(step, folder, True, "second") == -signal.SIGKILL
+        now = found(folder)
+        if "result.yaml" in now:
+            assert now in (texts("first"), texts("second")), (step, now)
+        assert set(texts("first").values()) <= everything(folder), step
+        place(folder, texts("third"), OURS)
+        assert found(folder) == texts("third") and not list(folder.glob(".armcal-*"))
+        assert [path.name for path in folder.parent.iterdir()] == ["out"]
+
+
+@pytest.mark.parametrize("in_place", [False, True])
+def test_a_full_disk_at_any_step_leaves_the_earlier_set_or_the_new_one(tmp_path: Path, in_place: bool) -> None:
+    refused = 0
+    for step in range(steps(tmp_path, in_place)):
+        folder, left = tmp_path / f"step{step}" / "out", [step]
+        place(folder, texts("first"), OURS)
+
+        def act(name: str, left: list[int] = left) -> None:
+            left[0] -= 1
+            if left[0] == -1 and name not in ("rmdir", "unlink", "rmtree"):
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+        with pytest.MonkeyPatch.context() as patch:
+            if in_place:
+                patch.setattr(folders, "_movable", lambda folder: False)
+            counted(patch, act)
+            try:
+                place(folder, texts("second"), OURS)
+            except InputError as fault:
+                refused += 1
+                assert "No space left" in str(fault) and found(folder) == texts("first"), step
+                assert not list((folder / "earlier").glob("*")), step
+            else:
+                assert found(folder) == texts("second"), step
+        assert set(texts("first").values()) <= everything(folder), step
+        place(folder, texts("third"), OURS)
+        assert found(folder) == texts("third")
+    assert refused > 5
+
+
+def test_a_folder_that_is_the_working_directory_stays_the_same_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "out"
+    folder.mkdir(mode=0o700)
+    monkeypatch.chdir(folder)
+    for mark in ("first", "second"):
+        place(Path(), texts(mark), OURS)
+        assert found(Path.cwd()) == found(folder) == texts(mark)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "latest").symlink_to(folder)
+    place(Path("latest"), texts("third"), OURS)
+    assert (tmp_path / "latest").is_symlink() and found(folder) == texts("third")
+    assert folder.stat().st_mode & 0o777 == 0o700, "its rights are those that it had"
+    assert [found(path) for path in sorted((folder / "earlier").iterdir())] == [texts("first"), texts("second")]
+
+
+def test_a_second_run_into_one_folder_is_refused_while_the_first_lasts(tmp_path: Path) -> None:
+    """Both ended with 0, and the folder had files of both."""
+    folder = tmp_path / "out"
+    with reserved(folder, folders_of_a_run()) as held:
+        second = CliRunner().invoke(cli, ["run", DEMO, "--out", str(folder), "-q", *FAST])
+        assert second.exit_code == 2 and "another run writes to it" in second.output, second.output
+        assert "Wait until it ends, or give another --out." in second.output
+        held.place({"log.txt": "the first\n"})
+        third = CliRunner().invoke(cli, ["run", DEMO, "--out", str(folder), "-q", *FAST])
+        assert third.exit_code == 2 and "another run writes to it" in third.output, "it lasts on after its files"
+    assert [path.name for path in folder.iterdir()] == ["log.txt"]
+    assert CliRunner().invoke(cli, ["run", DEMO, "--out", str(folder), "-q", *FAST]).exit_code == 0
+
+
+def folders_of_a_run() -> tuple[str, ...]:
+    from armcal.run.outputs import FILES
+
+    return FILES
+
+
+def test_what_a_refused_run_reserved_is_not_left_behind(tmp_path: Path) -> None:
+    bad = tmp_path / "bad.yaml"
+    bad.write_text("arms: 3\n")
+    assert CliRunner().invoke(cli, ["run", str(bad), "--out", str(tmp_path / "runs" / "new")]).exit_code == 2
+    assert [path.name for path in tmp_path.iterdir()] == ["bad.yaml"]
+
+
+@pytest.mark.slow
+def test_real_runs_killed_at_random_moments_leave_one_set_or_the_other(tmp_path: Path) -> None:
+    import random
+
+    import yaml
+
+    folder, dice, names = tmp_path / "out", random.Random(24), None
+    command = [sys.executable, "-m", "armcal.cli", "run", DEMO, "--out", str(folder), "-q", *FAST]
+    began = time.monotonic()
+    subprocess.run(command, check=True)
+    lasts = time.monotonic() - began
+    for number in range(40):
+        process = subprocess.Popen(command)
+        time.sleep(dice.uniform(0.6, 1.05) * lasts)
+        process.kill()
+        process.wait()
+        present = {path.name for path in folder.iterdir() if path.is_file() and not path.name.startswith(".armcal-")}
+        names = names or present
+        assert present == names, (number, present)
+        content = yaml.safe_load((folder / "calibration.yaml").read_text())
+        assert content["created"]
+    subprocess.run(command, check=True)
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
