@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from armcal.cli.common import Voice, speaking
+from armcal.cli.common import Voice, accept_lost, load_calibration, speaking
 from armcal.config.options import settings_from
 from armcal.errors import InputError, Location, PluginError
 from armcal.plugins import PluginRegistry, discover
@@ -24,9 +24,17 @@ _NOTHING_MM = 1e-6
 @click.option("--arm", metavar="NAME", help="Which arm, where there are several.")
 @click.option("--option", "options", multiple=True, metavar="KEY=VALUE", help="A setting of the format: prefix=lrm.")
 @click.option("--force", is_flag=True, help="Overwrite files that are there.")
+@accept_lost
 @speaking
 def export(
-    voice: Voice, calibration: Path, kind: str, out: Path, arm: str | None, options: tuple[str, ...], force: bool
+    voice: Voice,
+    calibration: Path,
+    kind: str,
+    out: Path,
+    arm: str | None,
+    options: tuple[str, ...],
+    force: bool,
+    accept_lost: bool,
 ) -> None:
     """Write the arm in CALIBRATION in the format of another program.
 
@@ -36,7 +44,7 @@ def export(
     voice.plugin_faults(registry)
     exporter = _exporter(registry, kind, options)
     _check_place(out, calibration, force)
-    loaded = Calibration.load(calibration, registry)
+    loaded = load_calibration(voice, calibration, registry, accept_lost)
     request = request_of(loaded, arm, out.name)
     found = exporter.export(request)
     reach = _reach(loaded, request, found)

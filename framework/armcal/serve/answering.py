@@ -46,11 +46,13 @@ class Answerer:
         arms: by name.
         tag: says which calibration it is, in every answer.
         clock: monotonic seconds, the same in all processes of this machine.
+        fault: what is answered to everything; None where the calibration may be used.
     """
 
     arms: Mapping[str, ServedArm]
     tag: CalibrationTag
     clock: Clock = time.monotonic
+    fault: ArmcalError | None = None
 
     def answer(self, line: bytes, arrived: float) -> bytes:
         """The answer to a line that arrived then (monotonic seconds)."""
@@ -72,6 +74,8 @@ class Answerer:
 
     def _answered(self, content: Any) -> Mapping[str, Any]:
         request = request_of(content)
+        if self.fault is not None:
+            raise self.fault
         if isinstance(request, ForwardRequest):
             return self._forward(request)
         if isinstance(request, CompensateRequest):

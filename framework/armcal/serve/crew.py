@@ -31,7 +31,7 @@ class Crew:
     Args:
         size: how many answer.
         watch: of the file.
-        how: commands are found: the fields ``redundancy``, ``within`` and ``evaluator`` of an ``Order``.
+        how: commands are found: the fields those fields of an ``Order`` that a command line sets.
         poller: of the server.
         dispatcher: has the requests.
         tell: is told of changes.
@@ -178,7 +178,8 @@ class Crew:
         for notice in told["notices"]:
             self._tell("notice", notice, {})
         if not first:
-            sentence = f"calibration {tag['sequence']} is answered from, of {tag['created']}"
+            level = f", level {tag['level']}" if tag["level"] else ""
+            sentence = f"calibration {tag['sequence']} is answered from, of {tag['created']}{level}"
             self._tell("calibration", sentence, {"calibration": tag})
 
     def _not_made(self, snapshot: Snapshot | None, fault: ArmcalError, passing: bool) -> None:

@@ -17,7 +17,7 @@ from armcal.serve.answering import Answerer
 from armcal.serve.protocol import CalibrationTag
 from armcal.serve.served_arm import TEMPERATURE, TEMPERATURE_KEY, ServedArm
 from armcal.solve.kernel import EvaluatorChoice
-from armcal.use.calibration import Calibration
+from armcal.use.calibration import Calibration, lost_calibration
 from armcal.use.compensation.request import Options, Redundancy
 
 _TRIES = 20
@@ -38,6 +38,8 @@ class Order:
         redundancy: which of many commands.
         within: a configuration whose plan has limits and clearance; empty: none.
         evaluator: ``compiled`` where a compiler is found, or ``interpreted``.
+        accept_lost: whether one whose level is lost answers as any other; else the first is refused, and a later
+            one, which says of those before it that they no longer hold either, answers with that error.
     """
 
     shown: str
@@ -47,6 +49,7 @@ class Order:
     redundancy: Redundancy = "nearest"
     within: str = ""
     evaluator: EvaluatorChoice = "compiled"
+    accept_lost: bool = False
 
 
 def loaded(order: Order, data: bytes) -> Answerer:
@@ -71,12 +74,14 @@ def loaded(order: Order, data: bytes) -> Answerer:
         "sha256": order.sha256,
         "arm": identity,
         "recalibrated": kept if isinstance(kept, int) else None,
+        "level": found.level,
     }
     answerer = Answerer(_arms(calibration, order), tag)
     _tried(answerer)
     gc.collect()
     gc.freeze()
-    return answerer
+    lost = found.level == "lost" and not order.accept_lost
+    return replace(answerer, fault=lost_calibration(found, order.shown)) if lost else answerer
 
 
 def _read(order: Order, data: bytes) -> Calibration:
@@ -84,7 +89,7 @@ def _read(order: Order, data: bytes) -> Calibration:
         path = Path(folder) / "calibration.yaml"
         path.write_bytes(data)
         with _shown_as(str(path), order.shown):
-            return Calibration.load(path)
+            return Calibration.load(path, accept_lost=order.accept_lost or order.sequence > 1)
 
 
 @contextmanager

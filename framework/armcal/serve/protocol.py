@@ -162,6 +162,7 @@ class CalibrationTag(TypedDict):
         sha256: of its file.
         arm: the identity of the arm's description, the same as long as it is the same arm.
         recalibrated: the recalibration's last record in it; null where there was none.
+        level: the recalibration's: nominal, watch, suspect or lost; null where there was none.
     """
 
     sequence: int
@@ -169,6 +170,7 @@ class CalibrationTag(TypedDict):
     sha256: str
     arm: str
     recalibrated: int | None
+    level: str | None
 
 
 class Tool(TypedDict):

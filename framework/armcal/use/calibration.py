@@ -50,16 +50,20 @@ class Calibration:
     record: CalibrationFile
 
     @classmethod
-    def load(cls, path: str | Path, registry: PluginRegistry | None = None) -> Calibration:
+    def load(cls, path: str | Path, registry: PluginRegistry | None = None, accept_lost: bool = False) -> Calibration:
         """Read a calibration; a ``CalibrationWarning`` for what its user should know of it.
 
+        ``accept_lost``: even one whose recalibration found that it no longer holds.
+
         Raises:
-            ConfigError: not a calibration, of another schema, damaged, changed since it was written, or made with
+            ConfigError: not a calibration, of another schema, damaged, changed since it was written, lost, or made with
                 other physics than that of the plugins that are there now.
             PluginError: it needs a plugin that is not there.
         """
         registry = registry or discover()
         loaded = cls.built(read_record(path)[0], path, registry)
+        if loaded.record.level == "lost" and not accept_lost:
+            raise lost_calibration(loaded.record, path)
         for notice in loaded.notices(path, registry):
             warnings.warn(f"the calibration {notice}", CalibrationWarning, stacklevel=2)
         return loaded
@@ -313,6 +317,17 @@ def arm_named(calibration: Calibration, arm: str | None) -> str:
     if name not in arms:
         raise ConfigError(f"no arm is called {name!r}.", hint=f"The arms are {', '.join(arms)}.")
     return name
+
+
+def lost_calibration(record: CalibrationFile, path: str | Path) -> ConfigError:
+    """What is wrong with a calibration whose recalibration ended at the level lost."""
+    told = record.recalibrated or {}
+    return ConfigError(
+        f"its level is lost since record {told.get('sequence')}: {str(told.get('why', '')).rstrip('.')}.",
+        where=Location(str(path)),
+        hint="Calibrate on the bench again. To use it all the same: --accept-lost of predict, compensate, "
+        "correction-table, export and serve.",
+    )
 
 
 def _component(kept: Mapping[str, Any]) -> Component:

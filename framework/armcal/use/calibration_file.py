@@ -86,6 +86,12 @@ class CalibrationFile(Settings):
     information: InformationRecord
     recalibrated: dict[str, Any] | None = None
 
+    @property
+    def level(self) -> str | None:
+        """How far the recalibration that wrote it trusts it; None where a run wrote it."""
+        level = (self.recalibrated or {}).get("level")
+        return None if level is None else str(level)
+
 
 def identity_of(description: Mapping[str, Any]) -> str:
     """A hash of an arm's whole description."""

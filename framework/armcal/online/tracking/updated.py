@@ -64,10 +64,18 @@ def calibration_text(calibration: Calibration, chart: Chart, belief: Belief, tol
             "parameters": tuple(parameters),
             "prediction": prediction,
             "information": InformationRecord(increments=chart.names, square_root=_root(chart, covariance)),
+            "verdict": _verdict(calibration.record.verdict, told),
             "recalibrated": dict(told),
         }
     )
     return sealed(content.to_config())
+
+
+def _verdict(before: Mapping[str, Any], told: Mapping[str, Any]) -> dict[str, Any]:
+    """Of the calibration's own run, under another headline where it no longer holds."""
+    if told["level"] != "lost":
+        return dict(before)
+    return {**before, "headline": f"Lost, do not use: {told['why']}"}
 
 
 def _bounds(chart: Chart) -> dict[int, tuple[float, float]]:
