@@ -5,10 +5,12 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import resource
 import socket
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -330,3 +332,96 @@ def test_messages_survive_any_cutting() -> None:
         cutter = Unpacker()
         found = [m for at in range(0, len(data), step) for m in cutter.feed(data[at : at + step])]
         assert found == sent
+
+
+def test_idle_and_slow_clients_give_way_to_one_that_asks(
+    house: House, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All places are taken: by one that asks now and then, by one that never ends its line, and by idle ones."""
+    now = _clock(monkeypatch)
+    transport = unix(house, tmp_path)
+    crowd = [connected(tmp_path) for _ in range(MOST_CLIENTS)]
+    house.until(lambda: transport.clients == MOST_CLIENTS)
+    busy, slow, *others = crowd
+    send(house, slow, b"x")
+    house.turn(3)
+    now[0] += 2.0
+    for idle in others:
+        send(house, idle, b"once\n")
+        heard(house, idle, 1)
+    for _ in range(5):
+        now[0] += 4.0
+        send(house, slow, b"x")
+        send(house, busy, b"again\n")
+        heard(house, busy, 1)
+    for number in range(3):
+        one_more = connected(tmp_path)
+        send(house, one_more, f"new {number}\n".encode())
+        assert heard(house, one_more, 1)[0]["echo"] == f"new {number}"
+        crowd.append(one_more)
+    assert "this one asked nothing for 22 s: the connection is closed" in heard(house, slow, 1)[0]["error"]
+    house.until(lambda: transport.clients <= MOST_CLIENTS)
+    send(house, busy, b"still\n")
+    assert heard(house, busy, 1)[0]["echo"] == "still"
+    for client in crowd:
+        client.close()
+
+
+def test_a_line_has_a_deadline_and_an_answer_that_is_awaited_has_none(
+    house: House, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = _clock(monkeypatch)
+    transport = unix(house, tmp_path)
+    with connected(tmp_path) as silent, connected(tmp_path) as waiting, connected(tmp_path) as planner:
+        house.answering = False
+        send(house, waiting, b"long\n")
+        send(house, planner, b'{"do": "status"}\n')
+        heard(house, planner, 1)
+        house.until(lambda: transport.clients == 3)
+        for _ in range(8):
+            now[0] += 9.0
+            house.turn()
+        assert "no whole request came within 30 s" in heard(house, silent, 1)[0]["error"]
+        house.until(lambda: transport.clients == 2)
+        house.answering = True
+        assert heard(house, waiting, 1)[0]["echo"] == "long"
+        send(house, planner, b"half a l")
+        house.turn(3)
+        now[0] += 31.0
+        assert "no whole request" in heard(house, planner, 1)[0]["error"]
+
+
+def test_out_of_descriptors_it_neither_spins_nor_stops(house: House, tmp_path: Path) -> None:
+    transport = unix(house, tmp_path)
+    with connected(tmp_path) as first, connected(tmp_path) as second:
+        send(house, first, b"one\n")
+        heard(house, first, 1)
+        house.until(lambda: transport.clients == 2)
+        third = connected(tmp_path)
+        soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+        free = os.dup(0)
+        os.close(free)
+        resource.setrlimit(resource.RLIMIT_NOFILE, (free, hard))
+        try:
+            turns, ends = 0, time.monotonic() + 0.5
+            while time.monotonic() < ends:
+                house.poller.step(0.1)
+                transport.tend()
+                turns += 1
+            send(house, second, b"two\n")
+            assert heard(house, second, 1)[0]["echo"] == "two"
+        finally:
+            resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+        assert turns < 50
+        send(house, third, b"three\n")
+        assert heard(house, third, 1)[0]["echo"] == "three"
+        third.close()
+
+
+def _clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """Time as the transports have it, in a list of one number (s)."""
+    now = [1000.0]
+    for module in ("stream", "unix"):
+        clock = SimpleNamespace(monotonic=lambda: now[0])
+        monkeypatch.setattr(f"armcal.serve.transports.{module}.time", clock)
+    return now

@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any
 
-from armcal.errors import DataError
+from armcal.errors import ArmcalError, DataError
 from armcal.online.sources.line_cutter import LineCutter
 from armcal.serve.conversation import MOST_WAITING, Conversation
 from armcal.serve.dispatcher import Dispatcher
@@ -34,6 +34,7 @@ class StreamClient:
         ended: whether there is nobody to be told anything any more.
         heard_all: whether all of its requests have come.
         moved: when it last took something, or had nothing to take (monotonic seconds).
+        asked: whether it ever sent a whole line.
     """
 
     def __init__(
@@ -41,7 +42,8 @@ class StreamClient:
     ) -> None:
         self.ended = False
         self.heard_all = False
-        self.moved = time.monotonic()
+        self.asked = False
+        self.moved = self._said = time.monotonic()
         self._incoming, self._outgoing = incoming, outgoing
         self._receive, self._take = receive, send
         self._poller, self._dispatcher = poller, dispatcher
@@ -60,6 +62,21 @@ class StreamClient:
     def stuck_s(self) -> float:
         """How long it has left answers unread (s)."""
         return time.monotonic() - self.moved if self._out else 0.0
+
+    @property
+    def idle_s(self) -> float:
+        """How long it has asked nothing, a line that it only began left out; 0 while it is owed something (s)."""
+        return time.monotonic() - max(self._said, self.moved) if self.finished else 0.0
+
+    @property
+    def owes_line(self) -> bool:
+        """Whether it has yet to end its first line, or one that it began."""
+        return not self.heard_all and (not self.asked or self._cutter.begun)
+
+    def dismiss(self, why: ArmcalError) -> None:
+        """Say why, and listen no more."""
+        self._dispatcher.refuse(self.conversation, why)
+        self.listen_no_more()
 
     def listen_no_more(self) -> None:
         """Take no further requests."""
@@ -107,7 +124,12 @@ class StreamClient:
             return
         if data is None:
             return
-        self._lines.extend(self._cutter.feed(data))
+        began = not self._cutter.begun
+        lines = self._cutter.feed(data)
+        if began or lines:
+            self._said = time.monotonic()
+        self.asked = self.asked or bool(lines)
+        self._lines.extend(lines)
         if not data:
             self.heard_all = True
             if self._cutter.begun:
