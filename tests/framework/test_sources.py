@@ -235,7 +235,7 @@ def test_a_file_that_cannot_be_used_is_refused_at_once(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no such file"):
         open_source(str(tmp_path / "gone.csv"), rows())
     for text in ("udp:", "udp:x:y", "udp:99999", "udp:1:2:3"):
-        with pytest.raises(InputError, match="udp:PORT, udp:HOST:PORT, a directory, or a CSV file"):
+        with pytest.raises(InputError, match=r"udp:PORT, udp:HOST:PORT\?from=SENDER, a directory, or a CSV file"):
             open_source(text, rows())
     assert isinstance(open_source(str(tmp_path), rows()), Folder)
 
@@ -375,6 +375,42 @@ def test_datagrams_are_acknowledged_to_their_sender() -> None:
         Udp("127.0.0.1", source.address[1], rows())
     source.close()
     assert source.ended and source.incoming(0.0) is None
+
+
+def test_records_of_other_machines_need_a_named_sender() -> None:
+    for text in ("udp:0.0.0.0:0", "udp:[::]:0"):
+        with pytest.raises(InputError, match="no sender is named: anybody could change the calibration"):
+            open_source(text, rows())
+    for text in ("udp:0.0.0.0:0?from=", "udp:0.0.0.0:0?from=,", "udp:0.0.0.0:0?from=no such.host"):
+        with pytest.raises(InputError, match="it is no address"):
+            open_source(text, rows())
+    with pytest.raises(InputError, match=r"the sender .nobody\.invalid. has no address"):
+        open_source("udp:0.0.0.0:0?from=127.0.0.1,nobody.invalid", rows())
+
+
+@pytest.mark.parametrize(
+    ("named", "ours"), [("127.0.0.1", True), ("192.0.2.1,localhost", True), ("any", True), ("192.0.2.1", False)]
+)
+def test_only_datagrams_of_named_senders_are_records(named: str, ours: bool) -> None:
+    source = open_source(f"udp:0.0.0.0:0?from={named}", rows())
+    assert isinstance(source, Udp)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        sender.settimeout(0.2)
+        found = []
+        for _ in range(3):
+            sender.sendto(json.dumps(WHOLE).encode(), ("127.0.0.1", source.address[1]))
+            found.append(source.incoming(2.0))
+            if found[-1] is not None:
+                source.acknowledge(found[-1], 1)
+        if ours:
+            assert [r is not None and r.fault for r in found] == ["", "", ""]
+            assert json.loads(sender.recv(2000))["acknowledged"] == 1
+        else:
+            assert found[0] is not None and "from 127.0.0.1, which is not named as a sender" in found[0].fault
+            assert found[1:] == [None, None]
+            with pytest.raises(TimeoutError):
+                sender.recv(2000)
+    source.close()
 
 
 def test_memory_stays_flat_over_a_long_line_and_many_records(tmp_path: Path) -> None:

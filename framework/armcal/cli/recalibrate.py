@@ -31,7 +31,7 @@ _NOT_DECIDING = ("output", "journal")
     "source",
     required=True,
     metavar="SOURCE",
-    help="Where records come from: - (standard input), udp:PORT, udp:HOST:PORT, a directory, or a CSV file.",
+    help="Where records come from: - (standard input), udp:PORT, udp:HOST:PORT?from=SENDER, a directory, or a CSV.",
 )
 @click.option("--config", type=click.Path(path_type=Path), help="How to recalibrate.")
 @overrides

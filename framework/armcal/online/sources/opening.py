@@ -15,13 +15,16 @@ from armcal.online.sources.row_parser import RowParser
 from armcal.online.sources.source import AtEnd, Clock, Source
 from armcal.online.sources.udp import LOOPBACK, Udp
 
-KINDS = "- (standard input), udp:PORT, udp:HOST:PORT, a directory, or a CSV file"
+KINDS = "- (standard input), udp:PORT, udp:HOST:PORT?from=SENDER, a directory, or a CSV file"
 
-_UDP = re.compile(r"udp:(?:(?P<host>[^:\[\]]+|\[[0-9a-fA-F:.]+\]):)?(?P<port>[0-9]{1,5})")
+_UDP = re.compile(
+    r"udp:(?:(?P<host>[^:\[\]]+|\[[0-9a-fA-F:.]+\]):)?(?P<port>[0-9]{1,5})"
+    r"(?:\?from=(?P<senders>[^,\s]+(?:,[^,\s]+)*))?"
+)
 
 
 def open_source(text: str, rows: RowParser, at_end: AtEnd = "stop", clock: Clock = time.time) -> Source:
-    """A source by its name: ``-``, ``udp:PORT``, ``udp:HOST:PORT``, a directory, or a CSV file.
+    """A source by its name: ``-``, ``udp:PORT``, ``udp:HOST:PORT?from=SENDER``, a directory, or a CSV file.
 
     Raises:
         InputError: it is none of these, or cannot be opened.
@@ -33,7 +36,8 @@ def open_source(text: str, rows: RowParser, at_end: AtEnd = "stop", clock: Clock
         found = _UDP.fullmatch(text)
         if found is None or int(found["port"]) > 65535:
             raise InputError("it is no address.", where=Location(text), hint=f"Give {KINDS}.")
-        return Udp((found["host"] or LOOPBACK).strip("[]"), int(found["port"]), rows, clock)
+        senders = tuple(found["senders"].split(",")) if found["senders"] else ()
+        return Udp((found["host"] or LOOPBACK).strip("[]"), int(found["port"]), rows, clock, senders)
     path = Path(text)
     if path.is_dir():
         return Folder(path, rows, clock)

@@ -8,7 +8,8 @@ import select
 import socket
 import time
 from collections import OrderedDict
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from ipaddress import IPv4Address, IPv6Address, ip_address
 from typing import Any
 
 from armcal.errors import InputError, Location
@@ -18,6 +19,7 @@ from armcal.online.sources.source import Clock
 
 MAX_DATAGRAM_BYTES = 16 * 1024
 LOOPBACK = "127.0.0.1"
+ANYBODY = "any"
 
 _WAITING = 64
 """So many senders are remembered until their records are acknowledged; there is one unless a disk is full."""
@@ -27,19 +29,33 @@ class Udp:
     """A socket on a port; what it did not take before the record was lost has to be sent again by its sender.
 
     The reply is ``{"acknowledged": sequence, "id": id}``, with a ``fault`` where the record could not be read.
+    ``senders`` are the addresses whose datagrams are records, or ``any``; those of this machine by default. Others get
+    no reply; of the first of them there is a fault.
 
     Raises:
-        InputError: the port cannot be had.
+        InputError: the port cannot be had, or other machines reach it and no sender is named.
     """
 
     keeps_records = False
 
-    def __init__(self, host: str, port: int, rows: RowParser, clock: Clock = time.time) -> None:
+    def __init__(
+        self, host: str, port: int, rows: RowParser, clock: Clock = time.time, senders: Sequence[str] = ()
+    ) -> None:
         self._rows = rows
         self._clock = clock
         self._row = 0
         self._senders: OrderedDict[int, Any] = OrderedDict()
+        self._from = None if tuple(senders) == (ANYBODY,) else _addresses(senders)
+        self._strange = False
         self._socket = bound(host, port)
+        if not senders and not _plain(self.address[0]).is_loopback:
+            self._socket.close()
+            raise InputError(
+                "other machines reach this address, and no sender is named: anybody could change the calibration.",
+                where=Location(f"udp:{host}:{port}"),
+                hint=f"Name who sends the records: udp:{host}:{port}?from=ADDRESS, several with commas between them "
+                f"(?from={ANYBODY} takes those of everybody), or take udp:{port}, which this machine alone reaches.",
+            )
         self._open = True
 
     @property
@@ -64,6 +80,8 @@ class Udp:
             data, _, flags, sender = self._socket.recvmsg(MAX_DATAGRAM_BYTES + 1)
         except OSError:
             return None
+        if not self._is_ours(sender[0]):
+            return self._stranger(sender[0])
         self._row += 1
         self._senders[self._row] = sender
         while len(self._senders) > _WAITING:
@@ -75,6 +93,18 @@ class Udp:
             return self._rows.json_text(data.decode("utf-8-sig"), place)
         except UnicodeDecodeError as fault:
             return faulty(place, f"The datagram holds the byte 0x{data[fault.start]:02x}, which is not UTF-8 text.")
+
+    def _is_ours(self, sender: str) -> bool:
+        return self._from is None or (_plain(sender) in self._from if self._from else _plain(sender).is_loopback)
+
+    def _stranger(self, sender: str) -> Incoming | None:
+        """A fault for the first datagram of a sender that is not named; whoever sends many fills no journal."""
+        if self._strange:
+            return None
+        self._strange = True
+        self._row += 1
+        fault = f"A datagram came from {sender}, which is not named as a sender. Further ones are passed over unseen."
+        return faulty(Place(self._clock(), "", self._row), fault)
 
     def acknowledge(self, incoming: Incoming, sequence: int) -> None:
         """See ``Source``."""
@@ -91,6 +121,29 @@ class Udp:
         """See ``Source``."""
         self._open = False
         self._socket.close()
+
+
+def _plain(address: str) -> IPv4Address | IPv6Address:
+    """An address, without a zone; one of IPv4 as that even where it came by IPv6."""
+    found = ip_address(address.partition("%")[0])
+    return getattr(found, "ipv4_mapped", None) or found
+
+
+def _addresses(senders: Sequence[str]) -> frozenset[IPv4Address | IPv6Address]:
+    """All addresses of named senders.
+
+    Raises:
+        InputError: one has none.
+    """
+    found = set()
+    for name in senders:
+        try:
+            known = socket.getaddrinfo(name.strip("[] "), None, type=socket.SOCK_DGRAM)
+        except (OSError, UnicodeError) as fault:
+            message = f"the sender {name!r} has no address ({fault})."
+            raise InputError(message, where=Location("?from="), hint="Give its IP address.") from fault
+        found |= {_plain(str(each[4][0])) for each in known}
+    return frozenset(found)
 
 
 def bound(host: str, port: int) -> socket.socket:
