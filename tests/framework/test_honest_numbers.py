@@ -5,18 +5,22 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
 import yaml
+from armcal.base.domains import Array
 from armcal.cli.main import cli
 from armcal.errors import NotConvergedError
 from armcal.run.experiment import Experiment
-from armcal.solve.estimator import estimate
+from armcal.solve.estimator import Estimate, estimate
 from armcal.solve.problem import Problem
 from armcal.solve.simulation import SimulationRequest, measured_without_noise, with_channels
 from armcal.solve.validation import cross_validate, folds
+from armcal.solve.weighing import NoiseSettings, WeighedFit, fit, weighed
 from click.testing import CliRunner, Result
+from scipy.special import chdtri, stdtrit
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs" / "lrm_arm"
 DEMO = str(CONFIGS / "demo.yaml")
@@ -26,6 +30,74 @@ FAST = ("--set", "evaluator=interpreted")
 def armcal(*arguments: str) -> Result:
     """One command in this process."""
     return CliRunner().invoke(cli, list(arguments))
+
+
+TIGHT = {
+    "arm.mdh.theta*": "0.1 deg",
+    "arm.mdh.alpha*": "0.1 deg",
+    "arm.mdh.[ad]?": "0.1 mm",
+    "arm.mdh.after?_z": "0.1 mm",
+    "arm.mdh.base_[xyz]": "0.1 mm",
+    "arm.mdh.base_r?": "0.1 deg",
+    "arm.mdh.tool_[yz]": "0.1 mm",
+    "arm.mdh.tool_r?": "0.1 deg",
+}
+"""Priors about as tight as 13 poses: they hold most of the 35 parameters, which the rank calls determined."""
+
+
+def fits_under_priors(
+    poses: int, seeds: int, loss: Literal["none", "huber"] = "none"
+) -> list[tuple[WeighedFit, Array]]:
+    """Fits of every length and angle of the arm, and the truth, drawn from the priors, that made their data."""
+    settings = [f"parameters.priors={json.dumps(TIGHT)}", "parameters.free=[arm.mdh.*]", "evaluator=interpreted"]
+    loaded = Experiment.load(DEMO, settings)
+    system, parameters, solver = loaded.system, loaded.parameters, loaded.estimator
+    estimator = weighed(solver, NoiseSettings(loss=loss))
+    commands = loaded.read().subset(np.arange(0, 200, 200 // poses)[:poses])
+    problem = Problem.build(system.arms, system.measurements, parameters, system.environment, commands, "interpreted")
+    noise, found = problem.kernels[0].factor.noise[0], []
+    for seed in range(seeds):
+        random = np.random.default_rng(seed)
+        truth = parameters.retract(random.normal(0, [block.prior_sd or 0.0 for block in parameters.free]))
+        moved = (system.arms, system.measurements, parameters.with_nominal(truth), system.environment)
+        exact = measured_without_noise(SimulationRequest(*moved), commands)
+        noisy = {name: values + random.normal(0, noise, len(values)) for name, values in exact.items()}
+        records = problem.records(with_channels(commands, noisy))
+        found.append((fit(problem, records, estimator, parameters.nominal()), truth))
+    return found
+
+
+def larger_than_the_noise(found: Estimate) -> bool:
+    """Whether residuals are beyond what chi-square allows at 5 % (two-sided)."""
+    return found.noise_scale**2 * found.degrees_of_freedom > chdtri(found.degrees_of_freedom, 0.025)
+
+
+def test_parameters_that_priors_hold_are_not_counted_as_spent() -> None:
+    """Few poses, many parameters: the scale of data that satisfy the model is one, and nothing is found missing."""
+    fits = fits_under_priors(13, 12)
+    squares = [each.estimate.noise_scale**2 for each, _ in fits]
+    assert 0.75 < np.mean(squares) < 1.25
+    assert sum(larger_than_the_noise(each.estimate) for each, _ in fits) <= 2
+    spent = 39 - np.mean([each.estimate.degrees_of_freedom for each, _ in fits])
+    assert 5 < spent < 20  # of 35 free parameters
+
+
+def test_robust_scales_do_not_count_them_either() -> None:
+    fits = fits_under_priors(13, 2, "huber")
+    assert all(0.6 < each.estimate.noise_scale < 1.6 for each, _ in fits)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("poses", [13, 50])
+def test_scale_findings_and_intervals_under_priors_are_what_they_claim(poses: int) -> None:
+    fits = fits_under_priors(poses, 100)
+    freedom = np.array([each.estimate.degrees_of_freedom for each, _ in fits])
+    scales = np.array([each.estimate.noise_scale for each, _ in fits])
+    assert np.mean(scales**2) == pytest.approx(1, abs=4 * np.sqrt(2 / freedom.mean() / len(fits)))
+    assert sum(larger_than_the_noise(each.estimate) for each, _ in fits) <= 8
+    off = np.array([(each.estimate.values - truth)[list(each.estimate.free_entries)] for each, truth in fits])
+    held = np.abs(off) < np.array([each.estimate.deviations for each, _ in fits]) * stdtrit(freedom, 0.95)[:, None]
+    assert 0.88 < np.mean(held) < 0.92
 
 
 @pytest.mark.slow

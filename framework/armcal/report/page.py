@@ -181,7 +181,7 @@ def _origin(result: RunResult) -> dict[str, Any]:
         Fact("starts", starts),
         Fact("backend", result.backend or NONE),
         Fact("noise scale", f"{significant(result.estimate.noise_scale)} times the declared noise"),
-        Fact("degrees of freedom", count(result.estimate.degrees_of_freedom)),
+        Fact("degrees of freedom", significant(result.estimate.degrees_of_freedom, 4)),
     ]
     said = {fact.name for fact in facts}
     facts += [fact for fact in provenance_facts(result.provenance) if fact.name not in said]

@@ -13,7 +13,7 @@ from scipy.special import stdtrit
 from armcal.base.domains import Array
 from armcal.base.parameters import Parameters
 from armcal.errors import NotConvergedError, ProblemError
-from armcal.solve.identifiability import POOR_CONDITION, Identifiability
+from armcal.solve.identifiability import POOR_CONDITION, Identifiability, InverseInformation
 from armcal.solve.parallel import Executor
 from armcal.solve.problem import FactorRecords, Problem, triangular
 from armcal.solve.projection import factor_at_zero
@@ -126,7 +126,7 @@ class Estimate:
         square_root_information: R (n x n) with R'R the information of data and priors on the coordinates, at the
             values; undetermined directions included, as its null space.
         noise_scale: residuals in units of the declared noise (standard deviation).
-        degrees_of_freedom: residual numbers less determined parameters.
+        degrees_of_freedom: residual numbers less what the fit takes up of them, see ``degrees_of_freedom``.
         identifiability: what the data alone determines.
         determined: per free entry, whether data and priors together determine it.
         told_by_data: per free entry, whether the data alone does; else only a prior holds it, if anything does.
@@ -140,7 +140,7 @@ class Estimate:
     unconstrained: Array
     square_root_information: Array
     noise_scale: float
-    degrees_of_freedom: int
+    degrees_of_freedom: float
     identifiability: Identifiability
     determined: tuple[bool, ...]
     told_by_data: tuple[bool, ...]
@@ -175,7 +175,7 @@ class Estimate:
         would then hold the truth in less than 95 % of cases [Feldman1998].
         """
         lower, upper = _entry_bounds(self.parameters)
-        freedom = max(self.degrees_of_freedom, 1)
+        freedom = max(self.degrees_of_freedom, 1.0)
         quantile = float(stdtrit(freedom, 0.5 + CONFIDENCE / 2))
         value = self.values[list(self.free_entries)]
         rows = zip(value, self.unconstrained, self.deviations, lower, upper, strict=True)
@@ -212,24 +212,21 @@ def estimate(
     """
     parameters = problem.parameters
     scales, prior = parameters.scales(), parameters.prior_information()
+    slope = 1.0 if influence is None else influence.slope
     moved = parameters.coordinates(parameters.local(solution.values))
     chain = parameters.entries_jacobian(solution.values)
     equations = problem.normal_equations(solution.values, _acting(problem, records, influence)).chained(chain)
     triangle = factor_at_zero(problem, solution.values, records)
     known = identify_from(triangle, parameters)
-    freedom = problem.equations(records) - known.rank
+    inverse = InverseInformation.of(np.sqrt(slope) * triangle, parameters)
+    half, freedom = inverse.root, problem.equations(records) - inverse.spent
     influence = influence or _of_least_squares(equations.cost, freedom)
-    stacked = np.vstack([np.sqrt(influence.slope) * triangle * scales, np.diag(scales * np.sqrt(prior))])
-    _, values, directions = np.linalg.svd(stacked, full_matrices=False)
-    seen = values > 1e-9 * max(values[0], 1e-300) if len(values) else np.zeros(0, dtype=bool)
-    inverse = np.where(seen, 1 / np.where(seen, values, 1.0), 0.0)
-    half = scales[:, None] * directions.T * inverse
     by_data = influence.spread * half @ (half.T @ triangle.T)
     by_priors = half @ (half.T * np.sqrt(prior))
     covariance = by_data @ by_data.T + by_priors @ by_priors.T
     gradient = equations.gradient + prior * moved
     step = -(half @ (half.T @ gradient))
-    unseen = np.linalg.norm(directions[~seen], axis=0) if len(values) else np.zeros(0)
+    unseen = np.linalg.norm(inverse.null, axis=0)
     return Estimate(
         parameters=parameters,
         values=solution.values,
@@ -265,9 +262,23 @@ def _square_root(triangle: Array, prior: Array, influence: Influence) -> Array:
     return triangular(np.vstack([by_data, np.diag(np.sqrt(prior))]))
 
 
-def _of_least_squares(cost: float, freedom: int) -> Influence:
-    noise_scale = float(np.sqrt(2 * cost / freedom)) if freedom > 0 else 1.0
+def _of_least_squares(cost: float, freedom: float) -> Influence:
+    """With less than one degree of freedom the declared noise is believed."""
+    noise_scale = float(np.sqrt(2 * cost / freedom)) if freedom >= 1 else 1.0
     return Influence(None, noise_scale, 1.0, noise_scale)
+
+
+def degrees_of_freedom(problem: Problem, values: Array, records: Sequence[FactorRecords], slope: float = 1.0) -> float:
+    """Residual numbers less what a fit takes up of them, the trace of its hat matrix.
+
+    A parameter that its prior holds takes up nothing, so that it is not counted as spent. ``slope`` is that of an
+    influence.
+
+    Raises:
+        NotConvergedError: a record has no elastic equilibrium there.
+    """
+    triangle = np.sqrt(slope) * factor_at_zero(problem, values, records)
+    return problem.equations(records) - InverseInformation.of(triangle, problem.parameters).spent
 
 
 def require_solvable(problem: Problem, records: Sequence[FactorRecords], start: Array) -> tuple[str, ...]:

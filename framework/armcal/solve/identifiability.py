@@ -124,15 +124,38 @@ def analyse(
     return Identifiability(names, values, directions, rank, undetermined, by_qr, told)
 
 
+@dataclass(frozen=True)
+class InverseInformation:
+    """The inverse of the information of data and priors, R'R + P, by coordinates (SI).
+
+    Attributes:
+        root: B (n x k) with B B' the inverse, in the k directions that data and priors determine together.
+        null: orthonormal rows, in ordinary sizes, that neither determines.
+        spent: how many of the data's numbers the fit takes up, tr J B B' J', the trace of its hat matrix: one for a
+            direction that the data alone determines, none for one that its prior alone holds [Hastie2009].
+    """
+
+    root: Array
+    null: Array
+    spent: float
+
+    @classmethod
+    def of(cls, triangle: Array, parameters: Parameters) -> InverseInformation:
+        """From R (m x n) with R'R = J'J of the whitened residuals."""
+        scales = parameters.scales()
+        prior = np.sqrt(parameters.prior_information()) * scales
+        _, values, directions = np.linalg.svd(np.vstack([triangle * scales, np.diag(prior)]), full_matrices=False)
+        rank = _count_above(values)
+        half = directions[:rank].T / values[:rank]
+        spent = rank - float(np.sum((prior[:, None] * half) ** 2))
+        return cls(scales[:, None] * half, directions[rank:], max(spent, 0.0))
+
+
 def expected_covariance(triangle: Array, parameters: Parameters) -> Array:
     """Covariance by coordinates (n x n, SI) that the declared noise and the priors leave; zero where undetermined."""
-    scales = parameters.scales()
-    prior = np.sqrt(parameters.prior_information()) * scales
-    _, values, directions = np.linalg.svd(np.vstack([triangle * scales, np.diag(prior)]), full_matrices=False)
-    rank = _count_above(values)
-    half = scales[:, None] * directions[:rank].T / values[:rank]
-    known = np.linalg.norm(directions[rank:], axis=0) < _NEGLIGIBLE
-    return np.asarray(half @ half.T * np.outer(known, known))
+    inverse = InverseInformation.of(triangle, parameters)
+    known = np.linalg.norm(inverse.null, axis=0) < _NEGLIGIBLE
+    return np.asarray(inverse.root @ inverse.root.T * np.outer(known, known))
 
 
 def correlated_pairs(

@@ -62,7 +62,8 @@ def maximise(terms: Sequence[Term], prior: Array, floored: Array) -> LikelihoodM
         floored: which thetas may not fall to zero (components).
     """
     count = len(floored)
-    freedom = max(1, sum(term.target.size for term in terms) - len(prior))
+    # A parameter with a prior takes nothing away: its part of the target is in the sum of squares.
+    freedom = max(1, sum(term.target.size for term in terms) - int(np.count_nonzero(prior == 0)))
     total = _least_squares(terms, prior) / freedom
     lower = np.where(floored, INSTRUMENT_FLOOR * total, 0.0)
     theta = np.full(count, max(total, 1e-300) / count)

@@ -44,7 +44,7 @@ class Spread:
     """
 
     covariance: Array
-    freedom: int
+    freedom: float
 
     @cached_property
     def deviations(self) -> Array:
@@ -67,7 +67,7 @@ class Spread:
         return np.asarray(np.sqrt(trace * fdtri(dimensions, max(self.freedom, 1), level)))
 
 
-def quantile(level: float, freedom: int | Array) -> Array:
+def quantile(level: float, freedom: float | Array) -> Array:
     """Of Student's t: the half width of a two-sided interval, in standard deviations."""
     return np.asarray(stdtrit(np.maximum(freedom, 1), 0.5 + level / 2))
 
@@ -116,7 +116,7 @@ class Predictor:
     values: Array
     covariance: Array
     noise_scale: float
-    freedom: int
+    freedom: float
     drift: ToldDrift | None = None
 
     @property

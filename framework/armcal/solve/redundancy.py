@@ -14,6 +14,7 @@ import numpy as np
 from scipy.special import fdtri
 
 from armcal.base.domains import Array
+from armcal.solve.identifiability import InverseInformation
 from armcal.solve.loss import median_norm
 from armcal.solve.problem import FactorRecords, Problem
 
@@ -51,15 +52,15 @@ def studentised_distances(
 
     The limit is Fisher's quantile at 1 % over the number of records (Bonferroni).
     """
-    half = inverse_root(problem, values, problem.weighted(records, weights))
+    counted = problem.weighted(records, weights)
+    inverse = InverseInformation.of(problem.triangular_factor(values, counted), problem.parameters)
     residuals = remaining(problem, values, records, weights)
     lengths = [np.zeros(each.count) for each in records]
-    for factor, part, reached in _reached(problem, values, records, half):
+    for factor, part, reached in _reached(problem, values, records, inverse.root):
         hat = np.einsum("avn,bvn->nab", reached, reached)
         spread = np.eye(len(reached)) - (2 * weights[factor][part, None, None] - 1) * hat
         lengths[factor][part] = _lengths(residuals[factor][:, part], spread)
-    freedom = max(1, sum(len(r) * int(np.count_nonzero(w)) for r, w in zip(residuals, weights, strict=True)))
-    freedom = max(1, freedom - problem.increments)
+    freedom = max(1.0, problem.equations(counted) - inverse.spent)
     tests = sum(len(length) for length in lengths)
     sizes = [len(residual) for residual in residuals]
     scales = [
@@ -85,16 +86,6 @@ def remaining(
     innovations = told.innovations(problem.weighted_residuals(values, told_by))
     pairs = zip(found, shared.slopes, strict=True)
     return tuple(residual + slope[:, : residual.shape[1]] @ innovations for residual, slope in pairs)
-
-
-def inverse_root(problem: Problem, values: Array, records: Sequence[FactorRecords]) -> Array:
-    """B (n x k) with B B' the inverse of the information of records and priors, by coordinates."""
-    scales, prior = problem.parameters.scales(), problem.parameters.prior_information()
-    triangle = problem.triangular_factor(values, records)
-    stacked = np.vstack([triangle * scales, np.diag(scales * np.sqrt(prior))])
-    _, sizes, directions = np.linalg.svd(stacked, full_matrices=False)
-    seen = sizes > 1e-9 * max(sizes[0], 1e-300) if len(sizes) else np.zeros(0, dtype=bool)
-    return np.asarray(scales[:, None] * directions[seen].T / sizes[seen])
 
 
 def _reached(

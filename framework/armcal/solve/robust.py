@@ -15,7 +15,7 @@ import numpy as np
 
 from armcal.base.domains import Array
 from armcal.errors import NotConvergedError
-from armcal.solve.estimator import Estimator, Influence, Progress, Solution, no_progress
+from armcal.solve.estimator import Estimator, Influence, Progress, Solution, degrees_of_freedom, no_progress
 from armcal.solve.loss import Loss, LossName, median_norm, tuned
 from armcal.solve.polish import bounded_step
 from armcal.solve.posed import PosedProblem
@@ -75,14 +75,16 @@ def norms(problem: Problem, values: Array, records: Sequence[FactorRecords], wei
     return tuple(np.linalg.norm(r, axis=0) for r in remaining(problem, values, records, weights))
 
 
-def scales_of(problem: Problem, lengths: Weights, records: Sequence[FactorRecords]) -> tuple[float, ...]:
-    """Each factor's median norm over that of Gaussian noise, with what the fitted parameters took away added.
+def scales_of(
+    problem: Problem, lengths: Weights, records: Sequence[FactorRecords], freedom: float
+) -> tuple[float, ...]:
+    """Each factor's median norm over that of Gaussian noise, with what the fit took up (all but ``freedom``) added.
 
-    Half the records may be wrong without it being far off. Without degrees of freedom the declared noise is believed.
+    Half the records may be wrong without it being far off. With less than one degree of freedom the declared noise is
+    believed.
     """
     count = problem.equations(records)
-    freedom = count - problem.increments
-    if freedom <= 0:
+    if freedom < 1:
         return (1.0,) * len(records)
     found: list[float] = []
     for kernel, each, length in zip(problem.kernels, records, lengths, strict=True):
@@ -117,13 +119,15 @@ def reweighted(
     raises the robust cost, since the weighted squares touch the loss from above.
     """
     kinds, weights, scales = losses(problem, name), ones(records), (np.inf,) * len(records)
-    solution, rounds, settling = first, list[Round](), True
+    solution, rounds, settling, freedom = first, list[Round](), True, 0.0
     for number in range(MOST_ROUNDS):
         if not solution.verdict.converged:
             return RobustFit(solution, weights, scales, tuple(rounds))
         lengths = norms(problem, solution.values, records, weights)
+        if not number:
+            freedom = degrees_of_freedom(problem, solution.values, records)
         if settling:
-            found = scales_of(problem, lengths, records)
+            found = scales_of(problem, lengths, records, freedom)
             settling = number < MOST_SCALE_ROUNDS and not np.allclose(found, scales, rtol=SCALE_SETTLED, atol=0)
             scales = found
         following = tuple(loss.weight(u / s) for loss, u, s in zip(kinds, lengths, scales, strict=True))
@@ -204,12 +208,12 @@ def influence(
         slope += float(np.sum(along + (loss.dimension - 1) * across))
         squared += float(np.sum(along**2 + (loss.dimension - 1) * across**2))
         noise += float(np.sum(good * u**2))
-    freedom = max(1, count - problem.increments)
-    trusted_freedom = max(1, problem.equations(problem.weighted(records, trusted)) - problem.increments)
     slope, squared = max(slope / count, 1e-3), squared / count
-    few = 1 + problem.increments / count * max(squared - slope**2, 0.0) / slope**2
+    spent = count - degrees_of_freedom(problem, fit.solution.values, records, slope)
+    trusted_freedom = max(1.0, problem.equations(problem.weighted(records, trusted)) - spent)
+    few = 1 + spent / count * max(squared - slope**2, 0.0) / slope**2
     noise_scale = float(np.sqrt(noise / trusted_freedom))
-    return Influence(fit.weights, few * float(np.sqrt(spread / freedom)), slope, noise_scale)
+    return Influence(fit.weights, few * float(np.sqrt(spread / max(1.0, count - spent))), slope, noise_scale)
 
 
 def _selection(beyond: Weights, most: float) -> tuple[Weights, str]:

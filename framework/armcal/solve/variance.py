@@ -17,7 +17,7 @@ from scipy.special import ndtri
 
 from armcal.base.domains import Array
 from armcal.errors import ProblemError
-from armcal.solve.estimator import CONFIDENCE
+from armcal.solve.estimator import CONFIDENCE, degrees_of_freedom
 from armcal.solve.identifiability import CORRELATED
 from armcal.solve.kernel import Kernel
 from armcal.solve.likelihood import Term, maximise
@@ -101,7 +101,7 @@ def estimate_components(
     joints = np.array([kind == "joint" for kind in kinds])
     largest = float(sizes[joints].max(initial=0.0))
     seen = ~joints | (sizes > SMALLEST_SHARE * largest)
-    _require_freedom(problem, records, int(seen.sum()))
+    _require_freedom(problem, values, records, int(seen.sum()))
     chosen = [i for i in range(len(names)) if seen[i]]
     terms = _terms(problem, values, records, [bases[i] for i in chosen], sizes[chosen])
     prior = problem.parameters.prior_information()
@@ -229,17 +229,17 @@ def _terms(
     return terms
 
 
-def _require_freedom(problem: Problem, records: Sequence[FactorRecords], components: int) -> None:
+def _require_freedom(problem: Problem, values: Array, records: Sequence[FactorRecords], components: int) -> None:
     if records[0].correlation is not None:
         raise ProblemError(
             "variance components cannot be estimated beside drifting parameters.",
             hint="Take the drifts away, or set noise.estimate: false.",
         )
-    count = problem.equations(records)
-    if count - problem.increments <= 2 * components:
+    freedom = degrees_of_freedom(problem, values, records)
+    if freedom <= 2 * components:
         raise ProblemError(
-            f"{count} equations for {problem.increments} parameters leave too little to estimate {components} "
-            "variance components from.",
+            f"{problem.equations(records)} equations leave {freedom:.1f} degrees of freedom, too few to estimate "
+            f"{components} variance components from.",
             hint="Measure more poses, or set noise.estimate: false.",
         )
 

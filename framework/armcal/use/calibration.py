@@ -204,7 +204,7 @@ class Calibration:
         fitted = self.parameters.with_nominal(np.array([entry.nominal for entry in entries])).with_free(free)
         try:
             components = tuple(_component(each) for each in noise.get("components", ()))
-            measure = (float(noise["scale"]), int(noise["degrees_of_freedom"]))
+            measure = (float(noise["scale"]), float(noise["degrees_of_freedom"]))
         except (KeyError, TypeError, ValueError) as fault:
             text = f"the noise in the calibration cannot be read ({type(fault).__name__}: {fault})."
             raise ConfigError(text, hint="The file was edited or damaged; run the calibration again.") from fault

@@ -143,7 +143,7 @@ class Uncertainty:
     values: Array
     record: PredictionRecord
     noise_scale: float
-    freedom: int
+    freedom: float
     components: tuple[Component, ...] = ()
 
     def plus_minus(self, commands: Dataset, recording: Recording = "new") -> PlusMinus:
