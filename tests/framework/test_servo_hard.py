@@ -271,7 +271,13 @@ class TestTracker:
 def _of_mover(setup: Setup) -> tuple[Any, ...]:
     read_by = {joint: (setup.known(joint), setup.file.boards["front"].clock) for joint in setup.base}
     clock = FakeClock()
-    return clock, read_by, read_by, Motion(0.3, 0.02, {joint: setup.pulses_of(joint) for joint in setup.base}), lambda: False
+    return (
+        clock,
+        read_by,
+        read_by,
+        Motion(0.3, 0.02, {joint: setup.pulses_of(joint) for joint in setup.base}),
+        lambda: False,
+    )
 
 
 @pytest.mark.slow

@@ -71,6 +71,10 @@ def predict(
     shown = [channel for channel in wanted if channel.channel in channels]
     extra = _columns(found, shown) if found else {}
     write_csv(out, replace(commands, channels=channels, extra=extra), shown)
+    _report(voice, commands, out, recording, found)
+
+
+def _report(voice: Voice, commands: Dataset, out: Path, recording: str, found: PlusMinus | None) -> None:
     voice.result(
         {
             "poses": len(commands),
@@ -82,10 +86,10 @@ def predict(
     )
     voice.out.print(f"{len(commands)} poses predicted: {out}", markup=False)
     if found is not None and found.radii:
-        told = _typical(found)
+        typical = _typical(found)
         voice.out.print(
-            f"+- {told['half_width_90_mm']:.2f} mm a coordinate (90 %), {told['radius_95_mm']:.2f} mm in all (95 %), "
-            "in the median pose",
+            f"+- {typical['half_width_90_mm']:.2f} mm a coordinate (90 %), {typical['radius_95_mm']:.2f} mm in all "
+            "(95 %), in the median pose",
             markup=False,
         )
 
