@@ -68,13 +68,15 @@ class Run:
             path.write_text(sealed(outputs.calibration_content(self.result, self.experiment)), encoding="utf-8")
             return Calibration.load(path, self.experiment.registry)
 
-    def write(self, folder: str | Path) -> Path:
+    def write(self, folder: str | Path, accept: bool = False) -> Path:
         """Write what ``armcal run`` writes: calibration.yaml, report.html, metrics.json and the rest.
+
+        ``accept`` writes calibration.yaml although the verdict is bad, as ``--accept`` does.
 
         Raises:
             InputError: the folder holds other things, or cannot be written.
         """
-        outputs.write(self.result, self.experiment, Path(folder), render)
+        outputs.write(self.result, self.experiment, Path(folder), render, accept)
         return Path(folder)
 
 

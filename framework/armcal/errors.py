@@ -8,6 +8,8 @@ EXIT_DONE = 0
 EXIT_FAULT = 1
 EXIT_BAD_INPUT = 2
 EXIT_NOT_CONVERGED = 3
+EXIT_DO_NOT_USE = EXIT_NOT_CONVERGED
+"""A calibration whose verdict is bad is as little use as none."""
 EXIT_STOPPED = 4
 """A measuring run held or parked before its end; it can be resumed."""
 

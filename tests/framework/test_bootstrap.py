@@ -241,7 +241,7 @@ def test_what_was_not_measured_cannot_be_made_up(lrm) -> None:
 def test_a_run_leaves_the_bootstrap_beside_the_curvature(tmp_path: Path) -> None:
     out = tmp_path / "run"
     asked = ["--set", FREE, "--set", "uncertainty.bootstrap=25", "--set", "validation.folds=0"]
-    done = CliRunner().invoke(cli, ["run", DEMO, "--out", str(out), *asked, "--json"])
+    done = CliRunner().invoke(cli, ["run", DEMO, "--out", str(out), *asked, "--json", "--accept"])
     assert done.exit_code == 0, done.output
     told = json.loads(done.stdout)["bootstrap"]
     rows = {row["parameter"]: row for row in csv.DictReader((out / "bootstrap.csv").open())}

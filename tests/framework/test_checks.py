@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -127,13 +128,23 @@ def test_a_prismatic_joint_has_no_turn() -> None:
     assert len(check_dataset(records(arm_q2=np.arange(8.0) * 3), sliding)) == 8
 
 
+def test_degrees_beyond_two_turns_are_refused_unless_the_joint_turns_without_end() -> None:
+    """Angles that were converted to degrees twice look like this."""
+    twice = from_unit(np.linspace(-57.3, 57.3, 8) * 57.3, "deg")
+    found = refusal(lambda: checks.refuse_joint_units(records(arm_q1=twice), layout()))
+    assert "more than two turns" in found and "continuous" in found
+    checks.refuse_joint_units(records(arm_q1=twice), replace(layout(), revolute=()))
+
+
 def test_tenths_of_a_degree() -> None:
     whole = from_unit(np.array([0.0, 1000, -900, 450, 5, 7, 11, 13]), "deg")
     found = refusal(lambda: checks.refuse_joint_units(records(arm_q1=whole), layout()))
     assert found.startswith("poses.csv:3, q1_deg: found 1000 deg in a column of whole numbers")
     assert "divide q1_deg by 10" in found
     checks.refuse_joint_units(records(arm_q1=whole * 0.7), layout())  # within 720
-    checks.refuse_joint_units(records(arm_q1=whole + 0.01), layout())  # not whole
+    assert "tenths" not in refusal(
+        lambda: checks.refuse_joint_units(records(arm_q1=whole + 0.01), layout())
+    )  # not whole
 
 
 def test_degrees_that_may_be_radians() -> None:
@@ -229,11 +240,11 @@ def test_repeated_poses_count_once() -> None:
     kept = check_dataset(dataset, layout())
     assert len(kept) == 8
     assert kept.warnings == (
-        "poses.csv: 2 of 8 records repeat a pose (the first: line 8 that of line 4): there are effectively 6 distinct "
-        "poses. Measure more different ones.",
+        "poses.csv: 8 records at 6 poses (the first repeat: line 8 that of line 4). Records of one pose are held out "
+        "together; measure more different ones.",
     )
     from_other_side = with_row(records(), 6, 2, *POSITION, "arm.approach.q1")
-    assert not check_dataset(from_other_side, layout()).warnings
+    assert "8 records at 7 poses" in check_dataset(from_other_side, layout()).warnings[0]
 
 
 @pytest.mark.parametrize(

@@ -26,7 +26,8 @@ COMPLIANCES = [f"arm.spring.k{i}" for i in range(7)]
 def sentences(folder: Path, *settings: str, data: Path = CONFIGS / "demo.csv") -> str:
     """All findings of a run, in one text with their grades."""
     flags = [x for s in (*settings, "validation.folds=0", "evaluator=interpreted") for x in ("--set", s)]
-    result = CliRunner().invoke(cli, ["run", DEMO, "--data", str(data), "--out", str(folder), "--json", *flags])
+    run = ["run", DEMO, "--data", str(data), "--out", str(folder), "--json", "--accept"]
+    result = CliRunner().invoke(cli, [*run, *flags])
     assert result.exit_code == 0, result.output
     findings = json.loads(result.stdout)["verdict"]["findings"]
     assert all(f["test"] for f in findings if f["grade"] == "good"), "a finding without a test"
@@ -86,7 +87,8 @@ def test_data_that_wants_a_negative_compliance_pushes_against_its_bound(tmp_path
 def verdict(folder: Path, *settings: str, data: Path = CONFIGS / "demo.csv") -> dict:
     """The JSON of a run."""
     flags = [x for s in (*settings, "evaluator=interpreted") for x in ("--set", s)]
-    result = CliRunner().invoke(cli, ["run", DEMO, "--data", str(data), "--out", str(folder), "--json", *flags])
+    run = ["run", DEMO, "--data", str(data), "--out", str(folder), "--json", "--accept"]
+    result = CliRunner().invoke(cli, [*run, *flags])
     assert result.exit_code == 0, result.output
     return json.loads(result.stdout)
 

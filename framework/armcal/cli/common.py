@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import click
 from rich.console import Console
@@ -20,9 +20,6 @@ from armcal.hooks import ContractDeprecationWarning
 from armcal.plugins import PluginRegistry
 from armcal.solve.estimator import Progress, no_progress
 from armcal.solve.parallel import parse_executor
-
-if TYPE_CHECKING:
-    from armcal.use.calibration import Calibration
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -136,20 +133,6 @@ def accept_lost(command: F) -> F:
     """The option --accept-lost."""
     text = "Use a calibration whose recalibration found that it no longer holds."
     return click.option("--accept-lost", is_flag=True, help=text)(command)
-
-
-def load_calibration(voice: Voice, path: Path, registry: PluginRegistry, accept_lost: bool) -> Calibration:
-    """A calibration; of a lost one that is accepted there is a warning.
-
-    Raises:
-        InputError: as ``Calibration.load``.
-    """
-    from armcal.use.calibration import Calibration  # not needed by commands that only list or show
-
-    loaded = Calibration.load(path, registry, accept_lost)
-    if loaded.record.level == "lost":
-        voice.warn(f"{path} is lost: {(loaded.record.recalibrated or {}).get('why')}")
-    return loaded
 
 
 def parallel(command: F) -> F:

@@ -11,12 +11,13 @@ import numpy as np
 
 from armcal.base.domains import Array
 from armcal.base.units import parse_quantity
-from armcal.cli.common import Voice, accept_lost, load_calibration, spare_inputs, speaking
+from armcal.cli.common import Voice, accept_lost, spare_inputs, speaking
 from armcal.errors import InputError, Location
 from armcal.plugins import discover
 from armcal.run.command_file import write_commands
 from armcal.run.compensate import Assessed, Bench, assess, summary
 from armcal.run.target_file import TargetFile, check_units
+from armcal.use.calibration import Calibration
 from armcal.use.compensation.compensator import Compensator
 from armcal.use.compensation.request import Redundancy
 from armcal.use.measured_point import MeasuredPoint
@@ -54,7 +55,7 @@ def compensate(voice: Voice, calibration: Path, targets: Path, out: Path, angles
     spare_inputs(out, calibration, targets, asked["within"])
     registry = discover()
     voice.plugin_faults(registry)
-    loaded = load_calibration(voice, calibration, registry, asked["accept_lost"])
+    loaded = Calibration.load(calibration, registry, asked["accept_lost"])
     to_target = asked["point"] == "target"
     bench = Bench.of(loaded, asked["arm"], asked["within"], asked["redundancy"], registry, to_target)
     file = bench.read(targets, registry)

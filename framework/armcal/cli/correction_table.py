@@ -7,11 +7,12 @@ from pathlib import Path
 import click
 import numpy as np
 
-from armcal.cli.common import Voice, accept_lost, load_calibration, spare_inputs, speaking
+from armcal.cli.common import Voice, accept_lost, spare_inputs, speaking
 from armcal.plugins import discover
 from armcal.run.compensate import Bench
 from armcal.run.correction_table import correction_table as made_table
 from armcal.run.correction_table import read_table_settings, write_table
+from armcal.use.calibration import Calibration
 
 
 @click.command("correction-table")
@@ -30,7 +31,7 @@ def correction_table(
     registry = discover()
     voice.plugin_faults(registry)
     settings = read_table_settings(grid)
-    loaded = load_calibration(voice, calibration, registry, accept_lost)
+    loaded = Calibration.load(calibration, registry, accept_lost)
     loaded.require_payload(settings.payload is not None)
     bench = Bench.of(loaded, arm, within, "nearest", registry)
     table = made_table(bench.compensator(), bench.nominal(), settings)

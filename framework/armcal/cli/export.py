@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from armcal.cli.common import Voice, accept_lost, load_calibration, speaking
+from armcal.cli.common import Voice, accept_lost, speaking
 from armcal.config.options import settings_from
 from armcal.errors import InputError, Location, PluginError
 from armcal.plugins import PluginRegistry, discover
@@ -44,7 +44,7 @@ def export(
     voice.plugin_faults(registry)
     exporter = _exporter(registry, kind, options)
     _check_place(out, calibration, force)
-    loaded = load_calibration(voice, calibration, registry, accept_lost)
+    loaded = Calibration.load(calibration, registry, accept_lost)
     request = request_of(loaded, arm, out.name)
     found = exporter.export(request)
     reach = _reach(loaded, request, found)

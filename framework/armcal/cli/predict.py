@@ -16,7 +16,7 @@ from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.base.pose_settings import quaternion_of
 from armcal.base.units import DIMENSIONLESS, split_suffix, to_unit
-from armcal.cli.common import Voice, accept_lost, load_calibration, speaking
+from armcal.cli.common import Voice, accept_lost, speaking
 from armcal.errors import DataError, InputError, Location
 from armcal.measure.csv_writer import column_names, write_csv
 from armcal.measure.environment import noticed
@@ -48,7 +48,7 @@ def predict(
     """Predict the tip of the arm in CALIBRATION for each row of commanded joint angles, and how far it may be off."""
     registry = discover()
     voice.plugin_faults(registry)
-    loaded = load_calibration(voice, calibration, registry, accept_lost)
+    loaded = Calibration.load(calibration, registry, accept_lost)
     system = loaded.system
     commands = read_commands(registry, loaded, poses, columns)
     _tell_missing(voice, loaded, commands, recording)

@@ -9,12 +9,13 @@ import click
 
 from armcal.cli.common import Voice, command_line, overrides, parallel, speaking
 from armcal.cli.tables import show_run
-from armcal.errors import EXIT_NOT_CONVERGED
+from armcal.errors import EXIT_DO_NOT_USE, EXIT_NOT_CONVERGED
 from armcal.plugins import discover
 from armcal.report import render
 from armcal.run import outputs
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import Stopwatch, calibrate
+from armcal.run.result import RunResult
 from armcal.solve.estimator import CHECK_THE_DATA
 from armcal.solve.parallel import Executor
 
@@ -23,11 +24,18 @@ from armcal.solve.parallel import Executor
 @click.argument("config", type=click.Path(path_type=Path))
 @click.option("--data", type=click.Path(path_type=Path), help="A dataset to read instead of the configured one.")
 @click.option("--out", type=click.Path(path_type=Path), help="Where the results go [default: runs/NAME of CONFIG].")
+@click.option("--accept", is_flag=True, help="Write calibration.yaml although its verdict is bad.")
 @overrides
 @parallel
 @speaking
 def run(
-    voice: Voice, config: Path, data: Path | None, out: Path | None, overrides: tuple[str, ...], parallel: Executor
+    voice: Voice,
+    config: Path,
+    data: Path | None,
+    out: Path | None,
+    accept: bool,
+    overrides: tuple[str, ...],
+    parallel: Executor,
 ) -> None:
     """Calibrate the arm that CONFIG describes: load, check, fit, validate, report."""
     watch = Stopwatch()
@@ -38,6 +46,19 @@ def run(
     experiment = Experiment.load(config, overrides, data, registry)
     with voice.progress() as progress:
         result = calibrate(experiment, command_line(), progress, watch, parallel)
+    _show_details(voice, result)
+    result.seconds["total"] = watch.total()
+    reserved.place(outputs.files(result, experiment, render, accept))
+    converged = result.estimate.verdict.converged
+    for text in registry.notify("armcal_run_ended", name=result.name, folder=str(folder), converged=converged):
+        voice.warn(text)
+    voice.result({**outputs.metrics(result), "folder": str(folder)})
+    show_run(voice, result, folder, watch.total())
+    _end(result, folder, accept)
+
+
+def _show_details(voice: Voice, result: RunResult) -> None:
+    """Warnings, and with -v which records took no part and how long each stage took."""
     for text in result.warnings:
         voice.warn(text)
     for aside in result.dataset.set_aside:
@@ -50,17 +71,23 @@ def run(
     for stage, seconds in result.seconds.items():
         voice.detail(f"{stage}: {seconds:.3f} s")
     voice.detail(f"evaluated by: {result.backend}")
-    result.seconds["total"] = watch.total()
-    reserved.place(outputs.files(result, experiment, render))
-    converged = result.estimate.verdict.converged
-    for text in registry.notify("armcal_run_ended", name=result.name, folder=str(folder), converged=converged):
-        voice.warn(text)
-    voice.result({**outputs.metrics(result), "folder": str(folder)})
-    show_run(voice, result, folder, watch.total())
-    if not converged:
+
+
+def _end(result: RunResult, folder: Path, accept: bool) -> None:
+    """Exit with what is to be done, where there is no calibration to be used."""
+    told = result.estimate.verdict
+    if not told.converged:
         click.echo(
-            f"armcal: {result.estimate.verdict.name} did not converge ({result.estimate.verdict.status}). "
+            f"armcal: {told.name} did not converge ({told.status}). "
             f"Nothing was exported as calibrated. {CHECK_THE_DATA}",
             err=True,
         )
         sys.exit(EXIT_NOT_CONVERGED)
+    if result.verdict.bad and not accept:
+        name = outputs.calibration_name(result, accept)
+        click.echo(
+            f"armcal: {result.verdict.bad[0].text} The calibration is {folder / name}, which no command loads. "
+            "Correct the data or the configuration; or, if you know better, run again with --accept.",
+            err=True,
+        )
+        sys.exit(EXIT_DO_NOT_USE)

@@ -18,6 +18,7 @@ from armcal.base.units import split_suffix, to_unit
 from armcal.errors import DataError, Location
 from armcal.measure.layout import Layout, joints_by_arm, layout_of, set_aside, warned
 from armcal.measure.missing import set_aside_not_finite
+from armcal.measure.poses import first_of_pose
 from armcal.measure.reader import WantedChannel
 
 __all__ = [
@@ -149,7 +150,7 @@ def refuse_joint_units(dataset: Dataset, layout: Layout) -> None:
     """Angles of revolute joints that cannot be in the unit they declare.
 
     Raises:
-        DataError: radians beyond one turn, or degrees that look like whole tenths of a degree.
+        DataError: radians beyond one turn, or degrees beyond two.
     """
     for channel in layout.revolute if len(dataset) else ():
         values, unit, column = _known(dataset, channel), layout.units.get(channel, "rad"), layout.column(channel)
@@ -162,15 +163,16 @@ def refuse_joint_units(dataset: Dataset, layout: Layout) -> None:
                 where=where,
                 hint=f"If so, rename the column {column} to end in _deg; if not, write angles within one turn.",
             )
+        if unit != "deg" or to_unit(largest, "deg") <= _MAX_DEGREES:
+            continue
         degrees = to_unit(values, "deg")
-        whole = np.abs(degrees - np.round(degrees)).max() < 1e-9 * max(1.0, float(np.abs(degrees).max()))
-        if unit == "deg" and whole and np.abs(degrees).max() > _MAX_DEGREES:
-            raise DataError(
-                f"found {layout.shown(channel, values[first])} in a column of whole numbers, expected degrees: "
-                "are these tenths of a degree?",
-                where=where,
-                hint=f"If so, divide {column} by 10; if not, bring the angles within two turns.",
-            )
+        whole = np.abs(degrees - np.round(degrees)).max() < 1e-9 * float(np.abs(degrees).max())
+        doubt = "more than two turns."
+        mend = f"If the unit is wrong, convert {column}; if not, declare a joint that turns without end (continuous)."
+        if whole:
+            doubt = "in a column of whole numbers, expected degrees: are these tenths of a degree?"
+            mend = f"If so, divide {column} by 10; if not, bring the angles within two turns."
+        raise DataError(f"found {layout.shown(channel, values[first])} {doubt}", where=where, hint=mend)
 
 
 def warn_small_degrees(dataset: Dataset, layout: Layout) -> Dataset:
@@ -271,16 +273,15 @@ def warn_repeated_poses(dataset: Dataset, layout: Layout) -> Dataset:
     """Warn of poses that were measured more than once: they count for less than as many different ones."""
     if not layout.measured or not layout.joints:
         return dataset
-    ignored = {*layout.measured, *layout.deviations, *_VARIES_AT_REST}
-    alike = _first_alike(dataset, [name for name in dataset.channels if name not in ignored])
+    alike = first_of_pose(dataset, layout.joints)
     repeats = np.flatnonzero(alike != np.arange(len(dataset)))
     if not repeats.size:
         return dataset
     again, before = layout.place(dataset, int(repeats[0])), layout.place(dataset, int(alike[repeats[0]]))
     return warned(
         dataset,
-        f"{repeats.size} of {len(dataset)} records repeat a pose (the first: {again} that of {before}): "
-        f"there are effectively {len(dataset) - repeats.size} distinct poses. Measure more different ones.",
+        f"{len(dataset)} records at {len(dataset) - repeats.size} poses (the first repeat: {again} that of {before}). "
+        "Records of one pose are held out together; measure more different ones.",
     )
 
 

@@ -10,6 +10,7 @@ from armcal.report import svg
 from armcal.report.numbers import count, plural, significant
 from armcal.report.svg import Axis, Box, Figure
 from armcal.run.result import RunResult
+from armcal.solve.validation import FEWEST_FOR_P95
 
 PLAIN_POINTS = 3000
 """More records than this are drawn as bands, not one by one."""
@@ -99,7 +100,9 @@ def in_order(result: RunResult, worst: NDArray[np.intp]) -> Figure | None:
     top = 2 * ninety_five if clipped else max(largest * 1.06, 1e-9)
     thinned = len(errors) > PLAIN_POINTS
     words = _order_words(len(errors), thinned, int(np.sum(finite > top)) if clipped else 0)
-    said = f"{plural(len(errors), 'record')}; 95 % lie below {significant(ninety_five)} mm."
+    few = len(finite) < FEWEST_FOR_P95
+    most = f"all lie below {significant(largest)} mm" if few else f"95 % lie below {significant(ninety_five)} mm"
+    said = f"{plural(len(errors), 'record')}; {most}."
 
     def draw(width: float) -> tuple[float, list[str]]:
         start, parts = svg.legend(52, 12, width - 60, _order_legend(result, thinned))

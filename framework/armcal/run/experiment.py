@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from armcal.base.config_text import ConfigText
 from armcal.base.dataset import Dataset
@@ -21,6 +22,7 @@ from armcal.errors import ConfigError
 from armcal.measure.environment import noticed, require_conditions
 from armcal.measure.groups import grouped_instances, groups_of, unmatched
 from armcal.measure.limits import warn_beyond_limits
+from armcal.measure.poses import pose_numbers
 from armcal.measure.reader import Reader, ReadRequest, wanted_channels
 from armcal.plugins import PluginRegistry, discover
 from armcal.run.settings import ExperimentSettings
@@ -135,6 +137,11 @@ class Experiment:
         chosen = select(self.system.parameters(groups), self.settings.parameters, self.source)
         told = unmatched(self.system.measurements, groups)
         return replace(self, parameters=chosen, warnings=(*self.warnings, *told))
+
+    def poses(self, dataset: Dataset) -> NDArray[np.intp]:
+        """Which records are of one pose, by number (N): all arms near the same joint positions, under the same load."""
+        arms = self.system.arms.items()
+        return pose_numbers(dataset, [f"{name}.{joint}" for name, arm in arms for joint in arm.commanded])
 
     def request(self, *, measured: bool) -> ReadRequest:
         """What a reader should look for; with ``measured`` the measured values are required."""

@@ -17,10 +17,15 @@ from armcal.run.result import RecordErrors
 from armcal.solve.drift import residuals
 from armcal.solve.evidence import Evidence, priors_alone, unseen_poses
 from armcal.solve.evidence_findings import worse_than_nominal
+from armcal.solve.fit_rows import FitRows
+from armcal.solve.gross import MOST_RECORDS, figure_of, scale_deviation, thinned
+from armcal.solve.gross_findings import contradicting, displaced_told, gross_error, limits_told, size_told
 from armcal.solve.leftover import leftover
+from armcal.solve.majority import minority
 from armcal.solve.misses import Judged, misses
 from armcal.solve.motion import Motion, recorded_position
 from armcal.solve.moved import Moved, moved_findings, moved_groups
+from armcal.solve.noise_findings import Finding
 from armcal.solve.problem import FactorRecords, Problem
 from armcal.solve.suggestion import suggest
 from armcal.solve.validation import Split
@@ -70,7 +75,13 @@ def verdict_of(
         run.dataset.ids,
         suggest(run.problem, training, found, joints) if found.names and _can_be_helped(run) else (),
         run.fitted,
-        [*worse_than_nominal(judged, errors.nominal_mm), *intervals.findings(), *moved_findings(_moved(run)), *gravity],
+        [
+            *_gross(run, judged, evidence),
+            *worse_than_nominal(judged, errors.nominal_mm),
+            *intervals.findings(),
+            *moved_findings(_moved(run)),
+            *gravity,
+        ],
         evidence,
     )
     return verdict, evidence
@@ -95,6 +106,27 @@ def gather(run: FittedRecords, judged_mm: Array, system: System, limit: float | 
     acting = problem.weighted(run.fitted.records, run.fitted.weights)
     own = (training, motion.subset(train), position[train])
     return Evidence(leftover(problem, acting, found, *own, modelled=effect_types(system)), missed, alone)
+
+
+def _gross(run: FittedRecords, judged_mm: Array, evidence: Evidence) -> list[Finding]:
+    """What is grossly wrong with a fit that converged, and what its data cannot show."""
+    problem, found, train = run.problem, run.fitted.estimate, run.split.train
+    if not found.verdict.converged:
+        return []
+    looked_at = thinned(train, MOST_RECORDS)
+    figure = figure_of(problem, found, problem.subset(run.records, looked_at))
+    own = thinned(np.arange(len(train)), MOST_RECORDS)
+    acting = problem.subset(problem.weighted(run.fitted.records, run.fitted.weights), own)
+    rows = FitRows.of(problem, acting, found)
+    dataset = run.dataset.subset(looked_at)
+    position = recorded_position(run.dataset)[looked_at]
+    return [
+        *gross_error(judged_mm, figure, found, evidence.leftover),
+        *contradicting(minority(rows, found.noise_scale, position), dataset.ids),
+        *size_told(figure),
+        *displaced_told(figure),
+        *limits_told(figure, scale_deviation(problem, rows, dataset, found.noise_scale)),
+    ]
 
 
 def _moved(run: FittedRecords) -> tuple[Moved, ...]:

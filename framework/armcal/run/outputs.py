@@ -30,11 +30,17 @@ from armcal.use.physics import check_poses
 FILES = ("experiment.yaml", "residuals.csv", "metrics.json", "report.html", "log.txt", "calibration.yaml")
 """In the order in which they are put in place: the calibration last."""
 NOT_CONVERGED_SUFFIX = ".not-converged"
+DO_NOT_USE_SUFFIX = ".do-not-use"
 BOOTSTRAP_FILE = "bootstrap.csv"
 """Only where a bootstrap was asked for."""
 PROFILE_FILE = "profile.json"
 """Only where profiles were asked for."""
-_OURS = (BOOTSTRAP_FILE, PROFILE_FILE, f"calibration.yaml{NOT_CONVERGED_SUFFIX}", *FILES)
+_OURS = (
+    BOOTSTRAP_FILE,
+    PROFILE_FILE,
+    *(f"calibration.yaml{suffix}" for suffix in (NOT_CONVERGED_SUFFIX, DO_NOT_USE_SUFFIX)),
+    *FILES,
+)
 
 
 def reserved(folder: Path) -> AbstractContextManager[folders.Reservation]:
@@ -46,20 +52,36 @@ def reserved(folder: Path) -> AbstractContextManager[folders.Reservation]:
     return folders.reserved(folder, _OURS)
 
 
-def write(result: RunResult, experiment: Experiment, folder: Path, render: Callable[[RunResult], str]) -> None:
+def calibration_name(result: RunResult, accepted: bool) -> str:
+    """What the calibration is called: as no command loads it if it did not converge, or is bad and not accepted."""
+    if not result.estimate.verdict.converged:
+        return f"calibration.yaml{NOT_CONVERGED_SUFFIX}"
+    return f"calibration.yaml{DO_NOT_USE_SUFFIX}" if result.verdict.bad and not accepted else "calibration.yaml"
+
+
+def write(
+    result: RunResult,
+    experiment: Experiment,
+    folder: Path,
+    render: Callable[[RunResult], str],
+    accepted: bool = False,
+) -> None:
     """Write all files; those of an earlier run in the same place move to ``earlier/``.
 
     Raises:
         InputError: the folder cannot be written, or is not ours to write to.
     """
     with reserved(folder) as held:
-        held.place(files(result, experiment, render))
+        held.place(files(result, experiment, render, accepted))
 
 
-def files(result: RunResult, experiment: Experiment, render: Callable[[RunResult], str]) -> dict[str, str]:
+def files(
+    result: RunResult, experiment: Experiment, render: Callable[[RunResult], str], accepted: bool = False
+) -> dict[str, str]:
     """The texts of all files by their names.
 
-    A run that did not converge leaves ``calibration.yaml.not-converged``, which nothing loads.
+    The calibration of a run that did not converge, or whose verdict is bad and was not ``accepted``, gets a name that
+    nothing loads.
     """
     texts = {
         "experiment.yaml": experiment_text(experiment.source),
@@ -67,14 +89,12 @@ def files(result: RunResult, experiment: Experiment, render: Callable[[RunResult
         "metrics.json": json.dumps(metrics(result), indent=2) + "\n",
         "report.html": render(result),
         "log.txt": log_text(result),
-        "calibration.yaml": sealed(calibration_content(result, experiment)),
+        calibration_name(result, accepted): sealed(calibration_content(result, experiment, accepted)),
     }
     if result.bootstrap:
         texts = {BOOTSTRAP_FILE: bootstrap_text(result.bootstrap, result), **texts}
     if result.profiles:
         texts = {PROFILE_FILE: profile_text(result.profiles), **texts}
-    if not result.estimate.verdict.converged:
-        texts[f"calibration.yaml{NOT_CONVERGED_SUFFIX}"] = texts.pop("calibration.yaml")
     return texts
 
 
@@ -110,7 +130,7 @@ def metrics(result: RunResult) -> dict[str, Any]:
             "starts": told.starts,
             "agreeing_starts": told.agreeing_starts,
         },
-        "verdict": asdict(result.verdict),
+        "verdict": {"usable": not result.verdict.bad, **asdict(result.verdict)},
         "structure": result.evidence.as_dict(),
         "prediction_intervals": result.intervals.as_dict(),
         "bootstrap": _bootstrap_metrics(result),
@@ -138,8 +158,8 @@ def _judging(groups: Sequence[GroupError]) -> list[GroupError]:
     return [group for group in groups if not group.trained]
 
 
-def calibration_content(result: RunResult, experiment: Experiment) -> dict[str, Any]:
-    """The content of calibration.yaml."""
+def calibration_content(result: RunResult, experiment: Experiment, accepted: bool = False) -> dict[str, Any]:
+    """The content of calibration.yaml; nothing loads one whose verdict is bad, unless it was ``accepted``."""
     estimate, provenance = result.estimate, result.provenance
     information = InformationRecord(
         increments=estimate.parameters.coordinate_names,
@@ -159,7 +179,12 @@ def calibration_content(result: RunResult, experiment: Experiment) -> dict[str, 
         environment_columns=tuple(filter(result.dataset.has, surroundings(experiment.system.arms))),
         noise=_noise(result),
         quality_mm=result.table.as_dict(),
-        verdict={"headline": result.verdict.headline, "findings": [f.text for f in result.verdict.findings]},
+        verdict={
+            "headline": result.verdict.headline,
+            "usable": not result.verdict.bad,
+            "accepted": accepted,
+            "findings": [f.text for f in result.verdict.findings],
+        },
         arms=dict(experiment.system.description["arms"]),
         measurements=dict(experiment.system.description["measurements"]),
         statics=dict(experiment.system.description["statics"]),

@@ -33,6 +33,7 @@ from armcal.solve.nuisance import restricted, settled, started, untrained
 from armcal.solve.parallel import Executor
 from armcal.solve.problem import FactorRecords, Problem
 from armcal.solve.profile import Profile, profiled, profiles
+from armcal.solve.screening import hopeless
 from armcal.solve.validation import (
     CrossValidation,
     ErrorSummary,
@@ -46,7 +47,7 @@ from armcal.solve.validation import (
     summarise,
 )
 from armcal.solve.verdict import Verdict
-from armcal.solve.weighing import WeighedFit, fit
+from armcal.solve.weighing import WeighedFit, fit, plain_fit
 from armcal.use.intervals import PredictionRecord, covariance_rows, recording_record, stretch_records
 
 _MM = 1000.0
@@ -126,7 +127,7 @@ def assemble(experiment: Experiment, watch: Stopwatch) -> Prepared:
         check_reach(problem, records, dataset)
         check_mixups(problem, records, dataset)
         split = _split(experiment, dataset)
-        _check_folds(experiment, split)
+        _check_folds(experiment, dataset, split)
         problem = restricted(problem, problem.subset(records, split.train))
         profiled(problem, experiment.settings.uncertainty.profile)
     return Prepared(dataset, problem, records, split, (*experiment.warnings, *dataset.warnings))
@@ -204,7 +205,8 @@ def _resampled(
     asked = experiment.settings.uncertainty
     if not (asked.bootstrap and found.verdict.converged and found.names):
         return None
-    return bootstrap(ready.problem, ready.training, experiment.estimator, found, asked, executor, progress)
+    poses = experiment.poses(ready.dataset.subset(ready.split.train))
+    return bootstrap(ready.problem, ready.training, experiment.estimator, found, asked, executor, progress, poses)
 
 
 def _announce(experiment: Experiment, ready: Prepared) -> list[str]:
@@ -215,8 +217,11 @@ def _announce(experiment: Experiment, ready: Prepared) -> list[str]:
 
 
 def _fitted(experiment: Experiment, ready: Prepared, progress: Progress, executor: Executor | None) -> WeighedFit:
-    estimator = spread(experiment.estimator, executor)
-    return fit(ready.problem, ready.training, estimator, ready.problem.parameters.nominal(), progress)
+    estimator, nominal = spread(experiment.estimator, executor), ready.problem.parameters.nominal()
+    given_up = hopeless(ready.problem, ready.training, ready.dataset.subset(ready.split.train), nominal)
+    if given_up is not None:
+        return plain_fit(ready.problem, ready.training, given_up)
+    return fit(ready.problem, ready.training, estimator, nominal, progress)
 
 
 def _judge(
@@ -254,16 +259,22 @@ def _split(experiment: Experiment, dataset: Dataset) -> Split:
         return split_by_label(labels_of(experiment, dataset), validation.train_groups)
     if validation.train_ids is not None:
         return split_by_id(dataset.ids, read_ids(validation.train_ids))
-    return hold_out(len(dataset), validation.holdout, validation.seed)
+    return hold_out(len(dataset), validation.holdout, validation.seed, experiment.poses(dataset))
 
 
-def _check_folds(experiment: Experiment, split: Split) -> None:
+def _check_folds(experiment: Experiment, dataset: Dataset, split: Split) -> None:
     """Refused before the fit rather than after it."""
     validation = experiment.settings.validation
     if not len(split.train):
         raise ProblemError("no record is left to train on.", hint="Hold fewer out, or measure more poses.")
     if validation.folds:
-        folds(len(split.train), validation.folds, validation.seed)
+        _folds(experiment, dataset, split)
+
+
+def _folds(experiment: Experiment, dataset: Dataset, split: Split) -> tuple[Split, ...]:
+    """Of the training records."""
+    asked, training = experiment.settings.validation, dataset.subset(split.train)
+    return folds(len(training), asked.folds, asked.seed, experiment.poses(training))
 
 
 def _crossed(
@@ -276,7 +287,7 @@ def _crossed(
     asked, problem = experiment.settings.validation, ready.problem
     if not (asked.folds and fitted.estimate.verdict.converged):
         return None
-    splits = folds(len(ready.split.train), asked.folds, asked.seed)
+    splits = _folds(experiment, ready.dataset, ready.split)
     start = problem.parameters.nominal()
     parts = (ready.training, splits, experiment.estimator, start, progress, executor, fit_and_predict)
     return cross_validate(problem, *parts), splits

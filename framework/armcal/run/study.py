@@ -28,6 +28,7 @@ from armcal.solve.problem import FactorRecords, Problem
 from armcal.solve.validation import (
     ErrorSummary,
     FitTask,
+    Indices,
     JudgedFit,
     Split,
     fit_and_judge,
@@ -120,8 +121,9 @@ def compare(
         ready = {name: naming(name, partial(_prepared, e)) for name, e in study.experiments.items()}
         _require_same_records(ready)
     dataset = next(iter(ready.values())).dataset
-    drawn = [folds(len(dataset), settings.folds, settings.seed + r) for r in range(settings.repeats)]
-    inner = [_inside(outer, settings) for outer in drawn[0]] if settings.nested else []
+    poses = next(iter(study.experiments.values())).poses(dataset)
+    drawn = [folds(len(dataset), settings.folds, settings.seed + r, poses) for r in range(settings.repeats)]
+    inner = [_inside(outer, settings, poses) for outer in drawn[0]] if settings.nested else []
     splits = [_everything(len(dataset)), *(s for each in drawn for s in each), *(s for each in inner for s in each)]
     with watch.stage("compile"):
         ready = compiled(study.experiments, ready, len(dataset) * len(splits), executor, progress)
@@ -183,10 +185,10 @@ def _everything(count: int) -> Split:
     return Split(every, every)
 
 
-def _inside(outer: Split, settings: ModelStudySettings) -> tuple[Split, ...]:
+def _inside(outer: Split, settings: ModelStudySettings, poses: Indices) -> tuple[Split, ...]:
     """Folds of the training records of a fold."""
     train = outer.train
-    inner = folds(len(train), settings.folds, settings.seed)
+    inner = folds(len(train), settings.folds, settings.seed, poses[train])
     return tuple(Split(train[split.train], train[split.holdout]) for split in inner)
 
 

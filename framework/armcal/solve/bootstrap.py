@@ -97,20 +97,24 @@ def bootstrap(
     settings: BootstrapSettings,
     executor: Executor | None = None,
     progress: Progress = no_progress,
+    poses: NDArray[np.intp] | None = None,
 ) -> Bootstrap:
     """Refit to resamples of the records (in recorded order) of an estimate; the same seed gives the same refits.
+
+    Records of one pose (``poses``, numbers from 0) are drawn together.
 
     Raises:
         ProblemError: a parametric one of measurements that measure nothing, or of drifting parameters.
     """
     count, random = records[0].count, np.random.default_rng(settings.seed)
+    poses = np.arange(count) if poses is None else poses
     parametric = settings.method == "parametric"
     block = 1 if parametric else _block(problem, records, found, settings.blocks)
     if parametric:
         _require_measured(problem, records, found.values)
     tasks = []
     for _ in range(settings.bootstrap):
-        weights = np.ones(count) if parametric else draw_weights(count, block, random)
+        weights = np.ones(count) if parametric else draw_weights(int(poses.max()) + 1, block, random)[poses]
         chosen = np.flatnonzero(weights).astype(np.intp)
         seed = int(random.integers(2**63)) if parametric else None
         part = (tuple(records), chosen, weights[chosen], seed, found.noise_scale)

@@ -77,6 +77,10 @@ class FitRows:
 
     def mean_error(self, residual: Array) -> float:
         """Mean length of the raw residuals that rows stand for (m); root mean square over several factors."""
+        return float(np.mean(self.errors(residual)))
+
+    def errors(self, residual: Array) -> Array:
+        """The length of each record's (N, m)."""
         squares, place, count = [], 0, len(self.by_record)
         for whitening in self.whitening:
             size = len(whitening)
@@ -87,7 +91,7 @@ class FitRows:
             raw[:, counted] = np.einsum("nrs,sn->rn", inverse, own[:, counted])
             squares.append(np.sum(raw**2, axis=0))
             place += size * count
-        return float(np.mean(np.sqrt(np.mean(squares, axis=0))))
+        return np.asarray(np.sqrt(np.mean(squares, axis=0)))
 
 
 def _by_factor(problem: Problem, values: Array, records: Sequence[FactorRecords]) -> list[Array]:

@@ -1,14 +1,15 @@
 """Whether measured positions fit the model far better with axes or joints exchanged or reversed, or in other units.
 
-Each way of reading the data is given the same chance: what is left of its residuals once all free parameters have
-adapted to first order. A right reading leaves little, a wrong one cannot be mended by any parameters.
+Single mix-ups are tried first; where none explains the data, the base elsewhere, then several at once. Each way of
+reading the data is given the same chance: what is left of its residuals once all free parameters have adapted to first
+order. A right reading leaves little, a wrong one cannot be mended by any parameters.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations, permutations, product
+from itertools import permutations, product
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -18,8 +19,11 @@ from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.errors import NotConvergedError
 from armcal.measure.partners import OTHER
+from armcal.solve.column_mixups import Wires, axes_words, several_joints, single_joints
+from armcal.solve.factor_records import subset
 from armcal.solve.linearised import linearised
 from armcal.solve.problem import FactorRecords, Problem
+from armcal.solve.rigid import rigid_fit, spread_of
 
 MUCH_BETTER = 3.0
 """A mix-up leaves so many times less than the data as they stand."""
@@ -35,7 +39,8 @@ _FAR, _HALVINGS = 3.0, 60
 _AXES = "xyz"
 _LENGTHS = (10.0, 0.1)
 """What a length is off by that was read in cm for mm; what is off by more shows in how far the arm reaches."""
-_DEGREES = 180 / np.pi
+_AXIS_LENGTHS = (*_LENGTHS, 1000.0, 0.001)
+_SEVERAL_RECORDS, _MOST_NAMED = 100, 3
 _MM = 1000.0
 
 
@@ -75,6 +80,11 @@ class _Seen:
     records: FactorRecords
     measured: Array
 
+    def thinned(self, most: int) -> _Seen:
+        """At most so many of the records, evenly."""
+        chosen = np.arange(0, self.records.count, max(1, -(-self.records.count // most)))
+        return _Seen(self.kernel, subset([self.records], chosen)[0], self.measured[:, chosen])
+
 
 @dataclass(frozen=True)
 class _Positions:
@@ -84,17 +94,22 @@ class _Positions:
     ways: Array
     sizes: Array
 
-    def left(self, measured: Array) -> float:
-        """Root mean square distance once the free parameters have adapted to first order, not too far (m)."""
-        off = (measured - self.predicted).T.ravel()
-        along = self.ways.T @ off
-        fitted = self.sizes * _within(along, self.sizes, _FAR * np.sqrt(len(self.sizes)))
-        left = float(off @ off - along @ along + (along - fitted) @ (along - fitted))
-        return float(np.sqrt(3 * max(left, 0.0) / max(1, len(off) - len(self.sizes))))
+    def left(self, measured: Array, enough: float = np.inf) -> float:
+        """Root mean square distance once the free parameters have adapted to first order, not too far (m).
 
-    def can_turn(self, turn: Array) -> bool:
-        """Whether the free parameters move all positions as the beginning of a turn (3 x 3) of the base would."""
-        moved = np.cross(Rotation.from_matrix(turn).as_rotvec(), self.predicted.T).ravel()
+        Where more than ``enough`` is left however far they adapt, that is given.
+        """
+        off = (measured - self.predicted).T.ravel()
+        along, unit = self.ways.T @ off, 3 / max(1, len(off) - len(self.sizes))
+        left = float(off @ off - along @ along)
+        if unit * left <= enough**2:
+            fitted = self.sizes * _within(along, self.sizes, _FAR * np.sqrt(len(self.sizes)))
+            left += float((along - fitted) @ (along - fitted))
+        return float(np.sqrt(unit * max(left, 0.0)))
+
+    def can_move(self, turn: Array, shift: Array) -> bool:
+        """Whether the free parameters move all positions as the beginning of a motion of the base would."""
+        moved = (np.cross(Rotation.from_matrix(turn).as_rotvec(), self.predicted.T) + shift).ravel()
         along = self.ways.T @ moved
         return float(moved @ moved - along @ along) <= _TURNED**2 * float(moved @ moved)
 
@@ -150,26 +165,27 @@ def _of(problem: Problem, seen: _Seen, arm: Arm) -> Mixup | None:
     straight = _positions(problem, seen, {})
     if straight is None:
         return None
-    as_given, spread = straight.left(seen.measured), max(_spread(seen.measured), _spread(straight.predicted))
+    as_given = straight.left(seen.measured)
+    spread = max(spread_of(seen.measured), spread_of(straight.predicted))
     if as_given <= MISSES * spread:
         return None
     enough = min(FITS * spread, as_given / MUCH_BETTER)
-    singles = [*_by_axes(straight, seen.measured), *_by_joints(problem, seen, arm)]
-    best = min(singles, key=lambda reading: reading.left, default=None)
+    found = list(_single(problem, seen, arm, straight))
+    if min(reading.left for reading in found) > enough:
+        elsewhere, reachable = _elsewhere(straight, seen.measured)
+        if elsewhere.left <= enough and reachable:
+            return None
+        found = [elsewhere] if elsewhere.left <= enough else list(_several(problem, seen, arm, enough))
+    best = min(found, key=lambda reading: reading.left, default=None)
     if best is None or best.left > enough:
         return None
-    alike = [r for r in singles if r.left <= _ALIKE * best.left and r.of_joints == best.of_joints]
-    told = tuple(reading.words for reading in sorted(alike, key=lambda reading: reading.left))
+    alike = [r for r in found if r.left <= _ALIKE * best.left and r.of_joints == best.of_joints]
+    told = tuple(reading.words for reading in sorted(alike, key=lambda reading: reading.left)[:_MOST_NAMED])
     name = problem.kernels[seen.kernel].factor.name
     return Mixup(name, told, as_given * _MM, best.left * _MM, best.of_joints)
 
 
-def _spread(positions: Array) -> float:
-    """Root mean square distance from their middle (m)."""
-    return float(np.sqrt(np.sum(np.var(positions, axis=1))))
-
-
-def _positions(problem: Problem, seen: _Seen, read_as: Mapping[str, tuple[str, float]]) -> _Positions | None:
+def _positions(problem: Problem, seen: _Seen, read_as: Wires) -> _Positions | None:
     """At the nominal values, channels read as others, times a factor; None where a record has no equilibrium."""
     kernel, own, parameters = problem.kernels[seen.kernel], seen.records, problem.parameters
     records = replace(own, record=_rewired(own.record, kernel.factor.channels, read_as), state=np.zeros_like(own.state))
@@ -187,7 +203,7 @@ def _positions(problem: Problem, seen: _Seen, read_as: Mapping[str, tuple[str, f
     return _Positions(seen.measured - residual * noise, basis @ ways[:, kept], sizes[kept])
 
 
-def _rewired(record: Array, channels: Sequence[str], read_as: Mapping[str, tuple[str, float]]) -> Array:
+def _rewired(record: Array, channels: Sequence[str], read_as: Wires) -> Array:
     rewired = record.copy()
     for channel, (other, factor) in read_as.items():
         if channel in channels and other in channels:
@@ -195,50 +211,48 @@ def _rewired(record: Array, channels: Sequence[str], read_as: Mapping[str, tuple
     return rewired
 
 
-def _by_axes(straight: _Positions, measured: Array) -> Iterator[_Reading]:
+def _of_axes(straight: _Positions, measured: Array) -> list[tuple[str, Array]]:
     """All exchanges and signs of axes, but turns that the free parameters make by themselves; and other units."""
+    readings = []
     for order in permutations(range(3)):
         for signs in product((1.0, -1.0), repeat=3):
             turn = np.zeros((3, 3))
             turn[range(3), order] = signs
             proper = np.linalg.det(turn) > 0
-            if not np.array_equal(turn, np.eye(3)) and not (proper and straight.can_turn(turn)):
-                yield _Reading(straight.left(turn @ measured), _axes_told(order, signs), False)
-    for factor in _LENGTHS:
-        yield _Reading(straight.left(factor * measured), f"positions {factor:.3g} times as large", False)
+            if not np.array_equal(turn, np.eye(3)) and not (proper and straight.can_move(turn, np.zeros(3))):
+                readings.append((axes_words(order, signs), turn @ measured))
+    readings += [(f"positions {factor:.3g} times as large", factor * measured) for factor in _LENGTHS]
+    for axis, factor in product(range(3), _AXIS_LENGTHS):
+        scaled = np.diag([factor if i == axis else 1.0 for i in range(3)]) @ measured
+        readings.append((f"{_AXES[axis]} {factor:.3g} times as large", scaled))
+    return readings
 
 
-def _axes_told(order: Sequence[int], signs: Sequence[float]) -> str:
-    moved = [i for i in range(3) if order[i] != i]
-    negative = [_AXES[order[i]] for i in range(3) if signs[i] < 0]
-    if len(moved) == 2 and not negative:
-        return f"{_AXES[moved[0]]} and {_AXES[moved[1]]} exchanged"
-    if not moved:
-        return f"the sign{'s' * (len(negative) > 1)} of {' and '.join(negative)} reversed"
-    taken = (f"{'-' if sign < 0 else ''}{_AXES[axis]}" for axis, sign in zip(order, signs, strict=True))
-    return f"({', '.join(taken)}) taken for (x, y, z)"
+def _elsewhere(straight: _Positions, measured: Array) -> tuple[_Reading, bool]:
+    """The base elsewhere, and whether the free parameters can move it there by themselves."""
+    turn, shift = rigid_fit(straight.predicted, measured)
+    angle = np.rad2deg(np.linalg.norm(Rotation.from_matrix(turn).as_rotvec()))
+    words = f"the arm's base elsewhere by {np.linalg.norm(shift) * _MM:.3g} mm and {angle:.2g} deg"
+    left = straight.left(turn.T @ (measured - shift[:, None]))
+    return _Reading(left, words, False), straight.can_move(turn, shift)
 
 
-def _by_joints(problem: Problem, seen: _Seen, arm: Arm) -> Iterator[_Reading]:
-    """Each joint's sign, each two joints of a kind exchanged, and all angles in another unit."""
-    joints = tuple(arm.commanded)
-    angles = {joint: joint for joint, dimension in arm.commanded.items() if dimension == "angle"}
-    readings = [(f"the sign of {joint} reversed", _wires(arm, {joint: joint}, -1.0)) for joint in joints]
-    for one, other in combinations(joints, 2):
-        if arm.commanded[one] == arm.commanded[other]:
-            readings.append((f"{one} and {other} exchanged", _wires(arm, {one: other, other: one}, 1.0)))
-    for factor in (_DEGREES, 1 / _DEGREES):
-        readings.append((f"joint angles {factor:.3g} times as large", _wires(arm, angles, factor)))
-    for words, read_as in readings:
+def _several(problem: Problem, seen: _Seen, arm: Arm, enough: float) -> Iterator[_Reading]:
+    """Signs of several joints, joints in another order, and either or one joint's mix-up beside one of axes."""
+    seen = seen.thinned(_SEVERAL_RECORDS)
+    straight = _positions(problem, seen, {})
+    axes = [] if straight is None else _of_axes(straight, seen.measured)
+    for words, read_as in [*single_joints(arm), *several_joints(arm)]:
+        found = _positions(problem, seen, read_as)
+        if found is not None:
+            yield _Reading(found.left(seen.measured, enough), words, True)
+            yield from (_Reading(found.left(moved, enough), f"{words} and {own}", True) for own, moved in axes)
+
+
+def _single(problem: Problem, seen: _Seen, arm: Arm, straight: _Positions) -> Iterator[_Reading]:
+    for words, measured in _of_axes(straight, seen.measured):
+        yield _Reading(straight.left(measured), words, False)
+    for words, read_as in single_joints(arm):
         found = _positions(problem, seen, read_as)
         if found is not None:
             yield _Reading(found.left(seen.measured), words, True)
-
-
-def _wires(arm: Arm, joints: Mapping[str, str], factor: float) -> dict[str, tuple[str, float]]:
-    """Commands and approaches of some joints read as those of others, times a factor; of approaches, times its sign."""
-    return {
-        f"{arm.name}.{part}{joint}": (f"{arm.name}.{part}{other}", scale)
-        for joint, other in joints.items()
-        for part, scale in (("", factor), ("approach.", float(np.sign(factor))))
-    }

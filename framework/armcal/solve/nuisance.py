@@ -11,11 +11,12 @@ from armcal.base.domains import Array
 from armcal.base.parameters import Parameters
 from armcal.measure.groups import group_name, owner_of
 from armcal.measure.measurement import GroupedMeasurement
+from armcal.solve.polish import descended
 from armcal.solve.posed import PosedProblem
 from armcal.solve.problem import FactorRecords, Problem
 
 _MOST_STEPS = 50
-_AT_REST = 1e-12
+_DAMPING = 1e-9
 
 
 def started(problem: Problem, records: Sequence[FactorRecords]) -> Problem:
@@ -74,19 +75,7 @@ def settled(problem: Problem, values: Array, records: Sequence[FactorRecords]) -
     parameters = _without_priors(problem.parameters.with_nominal(values)).with_free(names)
     inner = replace(problem, parameters=parameters, known_ties=())
     posed = PosedProblem(inner, records)
-    at = np.zeros(len(posed.scales))
-    model, damping = posed.model(at), 1e-9
-    for _ in range(_MOST_STEPS):
-        diagonal = np.maximum(np.diag(model.hessian), 1e-12 * max(float(np.trace(model.hessian)), 1e-300))
-        step = -np.linalg.solve(model.hessian + damping * np.diag(diagonal), model.gradient)
-        tried = posed.model(at + step)
-        if tried.cost <= model.cost * (1 + 1e-12):
-            at, model, damping = at + step, tried, max(damping * 0.1, 1e-12)
-        else:
-            damping = max(damping * 10, 1e-6)
-        if float(np.abs(step).max(initial=0.0)) < _AT_REST or damping > 1e6:
-            break
-    return posed.values(at)
+    return posed.values(descended(posed, np.zeros(len(posed.scales)), _MOST_STEPS, _DAMPING))
 
 
 def _without_priors(parameters: Parameters) -> Parameters:

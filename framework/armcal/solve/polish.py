@@ -21,6 +21,7 @@ MOST_STEPS = 50
 AT_REST = 1e-10
 """A step this many standard deviations long (of the noise found) changes nothing anybody can see."""
 _ROUNDING = 1e-12
+_LEAST_RETRY, _MOST_DAMPING, _STILL = 1e-6, 1e6, 1e-12
 _LINEAR, _FLAT = 0.1, 0.9
 """Of a slope that a step leaves: below the one it did what it should, above the other it says nothing of how far."""
 
@@ -57,6 +58,27 @@ def polish(posed: PosedProblem, x: Array) -> Array:
         tried = x, step, float(model.gradient @ step)
         x = x + step
     return kept
+
+
+def descended(posed: PosedProblem, x: Array, most_steps: int, damping: float) -> Array:
+    """Damped Gauss-Newton steps [Nocedal2006] within the bounds, until nothing moves or no step lowers the cost.
+
+    Raises:
+        NotConvergedError: a record has no elastic equilibrium at ``x`` itself.
+    """
+    (lower, upper), model = posed.bounds(), posed.model(x)
+    for _ in range(most_steps):
+        diagonal = np.maximum(np.diag(model.hessian), 1e-12 * max(float(np.trace(model.hessian)), 1e-300))
+        step = -np.linalg.solve(model.hessian + damping * np.diag(diagonal), model.gradient)
+        there = np.clip(x + step, lower, upper)
+        tried = posed.model(there) if posed.cost(there) <= model.cost * (1 + _ROUNDING) else None
+        if tried is not None:
+            x, model, damping = there, tried, max(damping * 0.1, _ROUNDING)
+        else:
+            damping = max(damping * 10, _LEAST_RETRY)
+        if float(np.abs(step).max(initial=0.0)) < _STILL or damping > _MOST_DAMPING:
+            break
+    return x
 
 
 def _secant(tried: tuple[Array, Array, float], gradient: Array) -> float | None:

@@ -18,11 +18,12 @@ from armcal.solve.parallel import Executor, Sequential
 from armcal.solve.problem import FactorRecords, Problem
 
 Indices = NDArray[np.intp]
+FEWEST_FOR_P95 = 20
 
 
 @dataclass(frozen=True)
 class ErrorSummary:
-    """Errors over some records, all in the unit of the errors given; None where there are no records."""
+    """Errors over some records, all in the unit of the errors given; None where there are no, or too few, records."""
 
     mean: float | None
     rms: float | None
@@ -44,13 +45,13 @@ class Split:
 
 
 def summarise(errors: Array) -> ErrorSummary:
-    """Mean, root mean square, 95th percentile and maximum."""
+    """Mean, root mean square, maximum, and the 95th percentile where a record in twenty lies beyond it."""
     if not len(errors):
         return ErrorSummary(None, None, None, None, 0)
     return ErrorSummary(
         float(np.mean(errors)),
         float(np.sqrt(np.mean(errors**2))),
-        float(np.percentile(errors, 95)),
+        float(np.percentile(errors, 95)) if len(errors) >= FEWEST_FOR_P95 else None,
         float(np.max(errors)),
         len(errors),
     )
@@ -77,11 +78,18 @@ def record_errors(
         return np.asarray(np.sqrt(squares / count))
 
 
-def hold_out(count: int, fraction: float, seed: int) -> Split:
-    """A random split; the same for the same count and seed."""
-    order = np.random.default_rng(seed).permutation(count)
-    held = round(fraction * count)
-    return Split(np.sort(order[held:]).astype(np.intp), np.sort(order[:held]).astype(np.intp))
+def hold_out(count: int, fraction: float, seed: int, poses: Indices | None = None) -> Split:
+    """A random split; the same for the same count and seed. Records of one pose (numbers, N) stay together."""
+    poses, number = _poses(count, poses)
+    order = np.random.default_rng(seed).permutation(number)
+    held = np.isin(poses, order[: round(fraction * number)])
+    return Split(np.flatnonzero(~held).astype(np.intp), np.flatnonzero(held).astype(np.intp))
+
+
+def _poses(count: int, poses: Indices | None) -> tuple[Indices, int]:
+    """The number of each record's pose, and how many there are; each record its own where nothing is known."""
+    poses = np.arange(count, dtype=np.intp) if poses is None else np.unique(poses, return_inverse=True)[1]
+    return poses, int(poses.max(initial=-1)) + 1
 
 
 def split_by_id(ids: Sequence[str], train_ids: Sequence[str]) -> Split:
@@ -117,15 +125,17 @@ def split_by_label(labels: Sequence[str], train: Sequence[str]) -> Split:
     return Split(np.flatnonzero(inside), np.flatnonzero(~inside))
 
 
-def folds(count: int, number: int, seed: int) -> tuple[Split, ...]:
-    """Random folds of nearly equal size; every record judges once."""
-    if not 2 <= number <= count:
+def folds(count: int, number: int, seed: int, poses: Indices | None = None) -> tuple[Split, ...]:
+    """Random folds of nearly equal size; every record judges once. Records of one pose (numbers, N) stay together."""
+    poses, different = _poses(count, poses)
+    if not 2 <= number <= different:
         raise ProblemError(
-            f"{number} folds of {count} records.", hint="Take at least 2 folds and no more than records."
+            f"{number} folds of {different} {'records' if different == count else f'poses ({count} records)'}.",
+            hint="Take at least 2 folds, and no more than there are records of different poses.",
         )
-    order = np.random.default_rng(seed).permutation(count)
-    parts = [np.sort(part).astype(np.intp) for part in np.array_split(order, number)]
-    return tuple(Split(np.setdiff1d(order, part).astype(np.intp), part) for part in parts)
+    order = np.random.default_rng(seed).permutation(different)
+    judging = [np.isin(poses, part) for part in np.array_split(order, number)]
+    return tuple(Split(np.flatnonzero(~held).astype(np.intp), np.flatnonzero(held).astype(np.intp)) for held in judging)
 
 
 @dataclass(frozen=True)

@@ -16,11 +16,13 @@ from armcal.solve.evidence_findings import MOST_TOLD, determined_told, misses_to
 from armcal.solve.identifiability import POOR_CONDITION, bound_together, correlated_pairs
 from armcal.solve.noise_findings import Finding, components_told, suspects_told
 from armcal.solve.suggestion import CANDIDATES, Suggestion
+from armcal.solve.validation import summarise
 from armcal.solve.weighing import WeighedFit
 
 LEVEL = 0.05
 SHARE = 0.95
 DEVIATIONS = 5.0
+DO_NOT_USE = "Do not use this calibration"
 _ORDER = {"bad": 0, "warning": 1, "note": 2, "good": 3}
 _SMALLEST_SPREAD_MM = 1e-6
 
@@ -32,6 +34,11 @@ class Verdict:
     headline: str
     findings: tuple[Finding, ...]
     paragraph: str = ""
+
+    @property
+    def bad(self) -> tuple[Finding, ...]:
+        """Why the values are not to be used; empty if they may be."""
+        return tuple(finding for finding in self.findings if finding.grade == "bad")
 
 
 def judge(
@@ -73,19 +80,32 @@ def judge(
     findings += neighbours_told(seen.leftover) or _neighbours(whitened, kept)
     findings += [*_correlated(estimate), *predicted, *misses_told(seen.misses), *_outliers(suspicious, own, fitted)]
     findings += _next(estimate, suggestions)
-    sentences = [_good_for(judged_mm, judged_on), *_in_short(estimate, determined, seen, suspicious, suggestions)]
+    ranked = tuple(sorted(findings, key=lambda finding: _ORDER[finding.grade]))
+    first = _first(judged_mm, judged_on, ranked[0])
+    sentences = [first, *_in_short(estimate, determined, seen, suspicious, suggestions)]
     if not estimate.verdict.converged:
         sentences = ["The solver did not converge: these values are no calibration."]
-    ranked = tuple(sorted(findings, key=lambda finding: _ORDER[finding.grade]))
-    return Verdict(_headline(judged_mm, judged_on), ranked, " ".join(sentences))
+    return Verdict(_headline(judged_mm, judged_on, ranked[0]), ranked, " ".join(sentences))
 
 
-def _headline(judged_mm: Array, judged_on: str) -> str:
+def _first(judged_mm: Array, judged_on: str, worst: Finding) -> str:
+    return f"{DO_NOT_USE}: {worst.text}" if worst.grade == "bad" else _good_for(judged_mm, judged_on)
+
+
+def _headline(judged_mm: Array, judged_on: str, worst: Finding) -> str:
+    if worst.grade == "bad":
+        return f"{DO_NOT_USE}. {_errors_told(judged_mm, judged_on)}"
+    return _errors_told(judged_mm, judged_on)
+
+
+def _errors_told(judged_mm: Array, judged_on: str) -> str:
     if not len(judged_mm):
         return "No record was held out: how good the model is on new poses is not known."
+    errors = summarise(judged_mm)
+    most = "all of them" if errors.p95 is None else "95 % of poses"
     return (
-        f"Tip error {float(np.mean(judged_mm)):.2f} mm on average, 95 % of poses below "
-        f"{float(np.percentile(judged_mm, 95)):.2f} mm, judged on {judged_on}."
+        f"Tip error {errors.mean:.2f} mm on average, {most} below "
+        f"{errors.max if errors.p95 is None else errors.p95:.2f} mm, judged on {judged_on}."
     )
 
 

@@ -215,7 +215,11 @@ def fit(
     """The fit of any estimator, weighing or not."""
     if isinstance(estimator, Weighing):
         return estimator.fit(problem, records, start, progress)
-    solution = estimator.solve(problem, records, start, progress)
+    return plain_fit(problem, records, estimator.solve(problem, records, start, progress))
+
+
+def plain_fit(problem: Problem, records: Sequence[FactorRecords], solution: Solution) -> WeighedFit:
+    """A solution of least squares as a fit."""
     return WeighedFit(solution, _estimate(problem, records, solution), tuple(records), ones(records))
 
 

@@ -56,8 +56,8 @@ class Calibration:
         ``accept_lost``: even one whose recalibration found that it no longer holds.
 
         Raises:
-            ConfigError: not a calibration, of another schema, damaged, changed since it was written, lost, or made with
-                other physics than that of the plugins that are there now.
+            ConfigError: not a calibration, of another schema, damaged, changed since it was written, lost, of a bad
+                verdict that nobody accepted, or made with other physics than that of the plugins that are there now.
             PluginError: it needs a plugin that is not there.
         """
         registry = registry or discover()
@@ -82,6 +82,12 @@ class Calibration:
                 "the solver did not converge: these values are no calibration.",
                 where=Location(str(path)),
                 hint="Run the calibration again with better start values or more data.",
+            )
+        if not (record.verdict.get("usable", True) or record.verdict.get("accepted", False)):
+            raise ConfigError(
+                f"its verdict is bad: {record.verdict['findings'][0]}",
+                where=Location(str(path)),
+                hint="Correct the data or the configuration; or, if you know better, run again with --accept.",
             )
         rows = record.information.square_root
         if [len(row) for row in rows] != [len(record.information.increments)] * len(record.information.increments):
@@ -115,12 +121,16 @@ class Calibration:
         return replace(self, record=self.record.model_copy(update=physics))
 
     def notices(self, path: str | Path, registry: PluginRegistry) -> list[str]:
-        """What its user should know: edits by hand, and other versions whose predictions agree; a sentence's rest each.
+        """What its user should know, the rest of a sentence each: what was accepted, versions whose predictions agree.
 
         Raises:
             ConfigError: the physics is not that which it was made with: its check poses are predicted elsewhere.
         """
         found, record = [], self.record
+        if record.level == "lost":
+            found.append(f"is lost: {(record.recalibrated or {}).get('why')}")
+        if not record.verdict.get("usable", True):
+            found.append(f"is used although its verdict is bad: {record.verdict['findings'][0]}")
         if record.accepted:
             found.append(f"was {record.accepted}: no records stand behind what it predicts now.")
         changed = differences(record.components, components(self.system, registry))

@@ -109,7 +109,7 @@ def _training(experiment: Experiment, dataset: Dataset) -> np.ndarray[tuple[int]
         labels = labels_of(experiment, dataset)
         chosen = np.array([i for i, label in enumerate(labels) if label in asked.train_groups], dtype=np.intp)
     elif asked.holdout and asked.train_ids is None and len(dataset) > 2:
-        chosen = hold_out(len(dataset), asked.holdout, asked.seed).train
+        chosen = hold_out(len(dataset), asked.holdout, asked.seed, experiment.poses(dataset)).train
     else:
         chosen = everything
     return chosen if len(chosen) else everything

@@ -1,0 +1,106 @@
+"""Gross faults are refused or graded bad, named where they can be; clean recordings never are."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import planted_mistakes
+import pytest
+from armcal.cli.main import cli
+from armcal.errors import ConfigError
+from armcal.use.calibration import Calibration
+from click.testing import CliRunner
+from planted_mistakes import DEMO, MISTAKES, Mistake, PlantedArm, outcome
+
+PRINTED = PlantedArm("printed", DEMO, "arm.mdh.base_*", 0.42)
+BY_NAME = {mistake.name: mistake for mistake in MISTAKES}
+SEEN = [mistake for mistake in MISTAKES if mistake.visible]
+
+
+def planted(name: str, folder: Path, arm: PlantedArm = PRINTED, seed: int = 1) -> planted_mistakes.Outcome:
+    mistake: Mistake = BY_NAME[name]
+    data = mistake.make(arm, arm.recording(seed), np.random.default_rng(7))
+    return outcome(arm, data, folder, ["validation.folds=0", *mistake.overrides(arm)])
+
+
+@pytest.mark.parametrize(
+    ("name", "grade", "words"),
+    [
+        ("rows of positions shuffled", "bad", "given up"),
+        ("two signs", "refused", "the signs of q2 and q4 reversed"),
+        ("x and y exchanged, one sign", "refused", "the sign of q4 reversed and x and y exchanged"),
+        ("z in centimetres for millimetres", "refused", "with z 10 times as large"),
+        ("half the rows in metres", "refused", "100 of 200 positions are about 0.001 times as far"),
+        ("base 200 mm off and held", "refused", "the arm's base elsewhere by 197 mm"),
+        ("base turned by 3 deg and held", "bad", "does not explain it"),
+        ("a slip of 3 deg after a third", "bad", "contradict the others"),
+    ],
+)
+def test_gross_faults_are_not_usable(tmp_path: Path, name: str, grade: str, words: str) -> None:
+    found = planted(name, tmp_path)
+    assert found.grade == grade and words in found.said
+
+
+def test_a_bad_verdict_ends_with_3_and_its_calibration_is_loaded_by_nothing_unless_accepted(tmp_path: Path) -> None:
+    mistake = BY_NAME["30 % off by 50 mm"]
+    data = mistake.make(PRINTED, PRINTED.recording(1), np.random.default_rng(7))
+    path = PRINTED.write(data, tmp_path / "data.csv")
+    run = ["run", str(DEMO), "--data", str(path), "--set", "validation.folds=0", "--out", str(tmp_path / "run")]
+    ran = CliRunner().invoke(cli, [*run, "--json"])
+    text = " ".join(ran.stderr.split())
+    assert ran.exit_code == 3 and "no command loads" in text and "--accept" in text
+    told = json.loads(ran.stdout)["verdict"]
+    assert told["headline"].startswith("Do not use this calibration.") and not told["usable"]
+    assert told["paragraph"].startswith("Do not use this calibration: ") and "Good for" not in told["paragraph"]
+    kept = tmp_path / "run" / "calibration.yaml.do-not-use"
+    assert kept.is_file() and not (tmp_path / "run" / "calibration.yaml").exists()
+    assert (tmp_path / "run" / "report.html").is_file() and (tmp_path / "run" / "residuals.csv").is_file()
+    with pytest.raises(ConfigError, match=r"verdict is bad.*--accept"):
+        Calibration.load(kept)
+    assert CliRunner().invoke(cli, [*run, "--accept"]).exit_code == 0
+    calibration = tmp_path / "run" / "calibration.yaml"
+    predicted = ["predict", str(calibration), "--poses", str(path), "--out", str(tmp_path / "tips.csv")]
+    said = CliRunner().invoke(cli, predicted)
+    assert said.exit_code == 0 and "verdict is bad, and was accepted" in " ".join(said.stderr.split())
+    assert not kept.exists()
+
+
+def test_what_data_cannot_show_is_stated(tmp_path: Path) -> None:
+    """A tracker 1 % too large fits as well: the note says how large an error of its scale would not show."""
+    found = planted("a tracker's scale off by 1 %", tmp_path)
+    assert found.grade != "bad" and found.true > 2 * found.claimed
+    assert "instrument's scale of up to" in found.notes
+
+
+def test_a_clean_recording_is_not_graded_bad(tmp_path: Path) -> None:
+    found = outcome(PRINTED, PRINTED.recording(5), tmp_path, ["validation.folds=0"])
+    assert found.grade in ("good", "warning") and found.true < 0.5
+
+
+@pytest.mark.slow
+def test_no_planted_mistake_is_graded_usable(tmp_path: Path) -> None:
+    """Fifty mistakes on three arms; what data cannot show is stated instead."""
+    for arm in planted_mistakes.arms(tmp_path):
+        usual = outcome(arm, arm.recording(2), tmp_path)
+        for mistake in MISTAKES:
+            data = mistake.make(arm, arm.recording(1), np.random.default_rng(7))
+            found = outcome(arm, data, tmp_path, mistake.overrides(arm))
+            usable = found.grade in ("good", "warning")
+            harmless = found.true < 5 * usual.true
+            stated = "times a typical" in found.said or "its prior" in found.said or "times as large" in found.said
+            assert not usable or harmless or (not mistake.visible and (stated or "scale" in found.notes)), (
+                f"{arm.name}, {mistake.name}: {found}"
+            )
+
+
+@pytest.mark.slow
+def test_no_clean_recording_is_graded_bad(tmp_path: Path) -> None:
+    """Two hundred recordings of three arms."""
+    printed, industrial, seven = planted_mistakes.arms(tmp_path)
+    runs = [(printed, seed) for seed in range(100, 160)] + [(industrial, seed) for seed in range(100, 170)]
+    runs += [(seven, seed) for seed in range(100, 170)]
+    for arm, seed in runs:
+        found = outcome(arm, arm.recording(seed), tmp_path, ["validation.folds=0"])
+        assert found.grade in ("good", "warning"), f"{arm.name}, seed {seed}: {found.said}"
