@@ -204,6 +204,8 @@ def _check_header(walk: _Walk, frame: Frame, before: Link | None) -> None:
             where=Location(str(walk.path), line=1),
             hint="Read it with the version of armcal that wrote it.",
         )
+    if not isinstance(payload.get("content"), dict):
+        raise walk.damaged("found a header that says nothing of its writer")
     if payload.get("segment") != walk.number:
         raise walk.damaged(f"found segment {payload.get('segment')!r}, expected {walk.number} as in its name")
     if before is not None and payload.get("previous") != f"{before.crc:08x}":

@@ -11,7 +11,7 @@ from armcal.online.journal.segment import Cut, JournalDamagedError, Segment
 from armcal.online.replaying.salvage import good_segments
 from armcal.online.replaying.walk import Walk, Witness
 from armcal.online.replaying.witness import DiffersError
-from armcal.online.running.course import ROLLBACK
+from armcal.online.running.course import ROLLBACK, parsing
 from armcal.online.tracking.recalibrator import Recalibrator
 
 Progress = Callable[[str, float], None]
@@ -63,7 +63,10 @@ def kept(folder: Path) -> Kept:
         for segment in good_segments(folder):
             first, last = first or segment, segment
             entries += len(segment.entries)
-            targets += [int(entry.content["to"]) for entry in segment.entries if entry.kind == ROLLBACK]
+            for entry in segment.entries:
+                if entry.kind == ROLLBACK:
+                    with parsing(entry.sequence, str(folder)):
+                        targets.append(int(entry.content["to"]))
     except JournalDamagedError as fault:
         if first is None:
             raise

@@ -9,7 +9,7 @@ from typing import Any, Protocol
 
 from armcal.errors import DataError
 from armcal.online.journal.segment import CHECKPOINT, Entry, Segment
-from armcal.online.running.course import DECISION, RECORD, ROLLBACK, Course, Event, JournalEntry
+from armcal.online.running.course import DECISION, RECORD, ROLLBACK, Course, Event, JournalEntry, parsing
 from armcal.online.running.outputs import finite
 from armcal.online.tracking.recalibrator import Recalibrator
 
@@ -126,14 +126,17 @@ class Walk:
             self._witness.checkpoint(checkpoint, self.session)
 
     def _entry(self, entry: Entry) -> None:
-        content: Mapping[str, Any] = entry.content or {}
+        with parsing(entry.sequence):
+            content: Mapping[str, Any] = dict(entry.content or {})
+            if entry.kind == ROLLBACK:
+                to = int(content["to"])
         if entry.kind == DECISION:
             self._noted(entry.sequence, content)
             return
         self._close_pending(entry.kind)
         noted = content.get("digest") if entry.kind == ROLLBACK else None
         if entry.kind == ROLLBACK:
-            self._rollback(entry.sequence, int(content["to"]))
+            self._rollback(entry.sequence, to)
         elif not self._is_lost:
             events = self._course.apply(entry.sequence, entry.kind, {k: v for k, v in content.items() if k != "digest"})
             self._keep(entry, events)
@@ -171,10 +174,12 @@ class Walk:
     def _noted(self, sequence: int, content: Mapping[str, Any]) -> None:
         if self._is_lost:
             return
-        found = self._pending if content["after"] == self._pending_after else []
+        with parsing(sequence):
+            after, events, digest = int(content["after"]), [dict(e) for e in content["events"]], str(content["digest"])
+        found = self._pending if after == self._pending_after else []
         self._pending = []
-        self._witness.told(int(content["after"]), content["events"], found)
-        self._witness.digest(sequence, content["digest"], self.session)
+        self._witness.told(after, events, found)
+        self._witness.digest(sequence, digest, self.session)
 
     def _close_pending(self, kind: str) -> None:
         """A note is written right after its record, unless the writer was stopped between the two."""

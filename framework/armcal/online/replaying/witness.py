@@ -7,7 +7,7 @@ from typing import Any
 
 from armcal.online.journal.segment import Entry, Segment
 from armcal.online.replaying.state_distance import BOUND, Distance, distance
-from armcal.online.running.course import Event
+from armcal.online.running.course import Event, parsing
 from armcal.online.tracking.evaluator import differences
 from armcal.online.tracking.recalibrator import Recalibrator
 from armcal.online.tracking.state import State
@@ -59,12 +59,14 @@ class Comparer:
 
     def checkpoint(self, checkpoint: Entry, session: Recalibrator) -> None:
         """As the protocol says. Where the journal's evaluator changes, the session goes on from its state."""
-        noted, is_new, self._is_new = checkpoint.content, self._is_new, False
+        is_new, self._is_new = self._is_new, False
         self.states += 1
-        if noted["digest"] == session.digest():
-            self.equal += 1
-            return
-        written = State.of(noted["state"])
+        with parsing(checkpoint.sequence):
+            noted = checkpoint.content
+            if noted["digest"] == session.digest():
+                self.equal += 1
+                return
+            written = State.of(noted["state"])
         apart = distance(session.ground.chart, written, session.state)
         self.measured += 1
         self.widest = self.widest.widest(apart)

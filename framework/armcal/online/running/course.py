@@ -5,7 +5,8 @@ Everything that changes the estimate goes through ``Course.apply``, with what wa
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any, Protocol
 
 from armcal.errors import ArmcalError, DataError, Location
@@ -62,6 +63,23 @@ class ReplayDiffersError(DataError):
     """Going through the journal again gives another state than was noted in it."""
 
 
+@contextmanager
+def parsing(sequence: int, journal: str = "") -> Iterator[None]:
+    """For what is read of an entry whose checksum is right.
+
+    Raises:
+        DataError: it is not what this version writes there.
+    """
+    try:
+        yield
+    except (KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError) as fault:
+        raise DataError(
+            f"entry {sequence} is whole, but none that this version writes ({type(fault).__name__}: {fault}).",
+            where=Location(journal or None),
+            hint="Read it with the version of armcal that wrote it, or begin a new --out from its calibration.yaml.",
+        ) from fault
+
+
 class Course:
     """An estimate and how far its source was taken, moved on by journal entries."""
 
@@ -90,9 +108,12 @@ class Course:
             self._estimation.restore(self._initial)
             self.progress = Progress()
             return
-        self._estimation.restore(checkpoint["state"])
-        self.progress = Progress.from_dict(checkpoint["progress"])
-        self._compare(checkpoint["digest"], sequence)
+        with parsing(sequence, self._name):
+            state, digest = checkpoint["state"], str(checkpoint["digest"])
+            progress = Progress.from_dict(checkpoint["progress"])
+            self._estimation.restore(state)
+        self.progress = progress
+        self._compare(digest, sequence)
 
     def apply(self, sequence: int, kind: str, content: Mapping[str, Any]) -> tuple[Event, ...]:
         """What an entry does, and what there is to tell of it.
@@ -102,13 +123,17 @@ class Course:
             DataError: a rollback goes to where the journal no longer reaches.
         """
         if kind == RECORD:
-            return self._take(sequence, Incoming.from_dict(content))
+            with parsing(sequence, self._name):
+                incoming = Incoming.from_dict(content)
+            return self._take(sequence, incoming)
         if kind in (PAUSE, RESUME):
             self.progress.paused = kind == PAUSE
         elif kind == ROLLBACK:
-            self.go_back(int(content["to"]))
+            with parsing(sequence, self._name):
+                to = int(content["to"])
+            self.go_back(to)
         if kind in (ROLLBACK, DECISION) and "digest" in content:
-            self._compare(content["digest"], sequence)
+            self._compare(str(content["digest"]), sequence)
         return ()
 
     def go_back(self, sequence: int) -> None:

@@ -302,7 +302,7 @@ class Recalibrator:
         """
         try:
             state = State.of(snapshot)
-        except (KeyError, TypeError, ValueError) as fault:
+        except (KeyError, TypeError, ValueError, AttributeError, IndexError) as fault:
             raise DataError(f"what the journal keeps is no state of a recalibration ({fault}).") from fault
         if len(state.belief.gaussian.mean) != self._ground.observer.size:
             raise DataError(

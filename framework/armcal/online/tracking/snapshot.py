@@ -61,7 +61,7 @@ def candidate_kept(candidate: Candidate) -> dict[str, Any]:
 
 def candidate_of(kept: Mapping[str, Any]) -> Candidate:
     """The hypothesis again."""
-    return Candidate(kept["place"], kept["log_evidence"], belief_of(kept["belief"]))
+    return Candidate(int(kept["place"]), float(kept["log_evidence"]), belief_of(kept["belief"]))
 
 
 def recent_kept(recent: Recent) -> dict[str, Any]:
@@ -81,14 +81,14 @@ def recent_kept(recent: Recent) -> dict[str, Any]:
 def recent_of(kept: Mapping[str, Any]) -> Recent:
     """The record again."""
     return Recent(
-        sequence=kept["sequence"],
+        sequence=int(kept["sequence"]),
         readings=tuple(_reading_of(each) for each in kept["readings"]),
         joint_noise=tuple(None if each is None else decoded(each) for each in kept["joint_noise"]),
-        passed=dict(kept["passed"]),
+        passed={str(channel): float(distance) for channel, distance in kept["passed"].items()},
         before=belief_of(kept["before"]),
-        rejected=kept["rejected"],
-        nis=kept["nis"],
-        dof=kept["dof"],
+        rejected=bool(kept["rejected"]),
+        nis=float(kept["nis"]),
+        dof=int(kept["dof"]),
     )
 
 
@@ -102,4 +102,4 @@ def _reading_kept(reading: Reading) -> dict[str, Any]:
 
 
 def _reading_of(kept: Mapping[str, Any]) -> Reading:
-    return Reading(kept["factor"], decoded(kept["record"]), kept["group"], decoded(kept["noise"]))
+    return Reading(int(kept["factor"]), decoded(kept["record"]), int(kept["group"]), decoded(kept["noise"]))
