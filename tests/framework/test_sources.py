@@ -352,6 +352,12 @@ def test_a_pipe_of_json_lines_or_of_csv() -> None:
     assert "may have been cut short" in found[-1].fault
 
 
+def test_json_of_any_depth_is_a_fault_and_no_exception() -> None:
+    """At some depth it can just be read, and not be written again."""
+    for depth in (*range(800, 1020), 100_000):
+        assert rows().json_text("[" * depth + "]" * depth, PLACE).fault
+
+
 def test_datagrams_are_acknowledged_to_their_sender() -> None:
     source = Udp("127.0.0.1", 0, rows())
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:

@@ -317,8 +317,31 @@ def test_the_present_state_is_printed_once(tmp_path: Path) -> None:
         assert part in shown.output
     state = json.loads(CliRunner().invoke(cli, ["watch", str(folder), "--once", "--json"]).output)
     assert state["level"] == "nominal" and len(state["records"]) == 300
-    early = CliRunner().invoke(cli, ["watch", str(tmp_path / "none"), "--once"])
+    (tmp_path / "early").mkdir()
+    early = CliRunner().invoke(cli, ["watch", str(tmp_path / "early"), "--once"])
     assert early.exit_code == 0 and "Waiting for a recalibration" in early.output
+    nowhere = CliRunner().invoke(cli, ["watch", str(tmp_path / "none"), "--once"])
+    assert nowhere.exit_code == 2 and "there is no such folder" in nowhere.stderr
+
+
+def test_what_has_finished_is_not_shown_as_if_it_went_on(tmp_path: Path) -> None:
+    folder, said = made_up_folder(tmp_path / "dir", 20), "The recalibration has finished."
+    (folder / "status.json").write_text(json.dumps({"level": "nominal", "finished": False}))
+    going = CliRunner().invoke(cli, ["watch", str(folder), "--once"])
+    (folder / "status.json").write_text(json.dumps({"level": "nominal", "finished": True}))
+    over = CliRunner().invoke(cli, ["watch", str(folder), "--once"])
+    assert said not in going.output and said in over.output
+
+
+def test_a_calibration_that_is_nested_deeply_does_not_end_the_watcher(tmp_path: Path) -> None:
+    """In a process of its own: where the nesting is followed by recursion in C, the process is killed."""
+    (tmp_path / "events.jsonl").write_text(written([{"event": "estimate", "sequence": 9, "parameters": {"a": [1, 2]}}]))
+    for opening in ("[", "{a: "):
+        (tmp_path / "calibration.yaml").write_text("parameters: " + opening * 200_000)
+        command = [sys.executable, "-m", "armcal.cli", "watch", str(tmp_path), "--once", "--json"]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+        assert done.returncode == 0, done.stderr
+        assert json.loads(done.stdout)["estimates"]["parameters"][0]["name"] == "a"
 
 
 def test_a_watcher_that_draws_nothing_stays_light() -> None:

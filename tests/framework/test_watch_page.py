@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import subprocess
 import sys
@@ -102,6 +103,9 @@ def test_a_browser_shows_the_state_and_what_comes_after(browser: Browser, tmp_pa
         browser.wait_for("document.getElementById('last-nis').textContent === '98.7'")
         assert content(browser, "events").startswith("level lost") and content(browser, "sentence") == "Gone."
         assert "A planted sentence." in content(browser, "events")
+        assert content(browser, "connection").startswith("live")
+        (folder / "status.json").write_text(json.dumps({"level": "lost", "finished": True}))
+        browser.wait_for("document.getElementById('connection').textContent.startsWith('ended')")
         host = urlsplit(served.server.address).netloc
         assert {urlsplit(url).netloc for url in browser.requested if not url.startswith("data:")} == {host}
         assert browser.logged == []

@@ -55,6 +55,12 @@ def _check(folder: Path, once: bool, as_json: bool) -> None:
             where=Location(str(folder)),
             hint="Give what armcal recalibrate was given as --out.",
         )
+    if once and not folder.exists():
+        raise InputError(
+            "there is no such folder.",
+            where=Location(str(folder)),
+            hint="Give what armcal recalibrate was given as --out; without --once it is waited for.",
+        )
     if as_json and not once:
         raise InputError(
             "it is only for --once.",

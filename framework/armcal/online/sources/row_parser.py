@@ -90,7 +90,8 @@ class RowParser:
     def object(self, content: Any, place: Place) -> Incoming:
         """The record in a JSON object, name to number or text."""
         if not isinstance(content, dict):
-            return faulty(place, f"Found {_short(json.dumps(content), 40)}, expected a JSON object.")
+            found = "an array" if isinstance(content, list) else _short(json.dumps(content), 40)
+            return faulty(place, f"Found {found}, expected a JSON object.")
         names = tuple(content)
         plan = self._plan(names)
         if isinstance(plan, str):

@@ -163,7 +163,9 @@ function spoken(since) {
 function age() {
   const state = Known.state;
   const known = state && (state.last || state.told.length);
-  const connection = Known.connection || "loading";
+  const ended = Known.connection === "live" && state && (state.status || {}).finished;
+  const connection = ended ? "ended" : Known.connection || "loading";
+  if (Known.connection === "live") byId("connection").dataset.state = connection;
   say("connection", known ? `${connection}; newest event ${spoken(Known.heard)} ago` : connection);
   if (state) drawAlive(state);
 }

@@ -54,6 +54,8 @@ def _health(state: Mapping[str, Any]) -> Panel:
     if sentence:
         text.append(f"  {sentence}")
     text.append("\n" + ", ".join(f"{count:,.0f} {verdict}" for verdict, count in counts.items()))
+    if state["status"].get("finished"):
+        text.append("\nThe recalibration has finished.")
     if state["last"]:
         text.append(f"\nlast record {_name(state['last'])}, {_when(state['last'])}, heard {state['heard_s']:.0f} s ago")
     return Panel(text, title=Text(str(state["folder"])), title_align="left", border_style=style)
