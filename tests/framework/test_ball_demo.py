@@ -47,6 +47,15 @@ def test_without_the_known_distance_the_size_is_not_seen(tmp_path):
     assert not (tmp_path / "run").exists()
 
 
+def test_a_known_distance_that_is_ten_times_too_small_is_no_calibration(tmp_path):
+    """Everything shrinks with it, and fits: only the nominal arm contradicts."""
+    wrong = "measurements.sockets.distances=[{between: [hole_0, hole_1], distance_mm: 5, noise_mm: 0.05}]"
+    ran = armcal("run", DEMO, "--out", tmp_path / "run", "--set", wrong)
+    assert ran.returncode == 3
+    assert "0.1 times as large as the nominal one" in " ".join((ran.stdout + ran.stderr).split())
+    assert not (tmp_path / "run" / "calibration.yaml").exists()
+
+
 def test_the_shipped_recording_is_what_its_configuration_simulates(tmp_path):
     assert armcal("simulate", DEMO, "--out", tmp_path / "again.csv").returncode == 0
     shipped, again = ((p).read_text().splitlines() for p in (DEMO.with_name("demo.csv"), tmp_path / "again.csv"))

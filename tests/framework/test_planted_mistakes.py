@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import planted_mistakes
 import pytest
+from armcal.base.dataset import Dataset
 from armcal.cli.main import cli
 from armcal.errors import ConfigError
+from armcal.run.experiment import Experiment
+from armcal.run.pipeline import calibrate
+from armcal.solve.validation import folds, hold_out
 from armcal.use.calibration import Calibration
 from click.testing import CliRunner
 from planted_mistakes import DEMO, MISTAKES, Mistake, PlantedArm, outcome
@@ -77,6 +82,42 @@ def test_what_data_cannot_show_is_stated(tmp_path: Path) -> None:
 def test_a_clean_recording_is_not_graded_bad(tmp_path: Path) -> None:
     found = outcome(PRINTED, PRINTED.recording(5), tmp_path, ["validation.folds=0"])
     assert found.grade in ("good", "warning") and found.true < 0.5
+
+
+def repeated(data: Dataset, noise: float) -> Dataset:
+    """Every pose measured twice, the repeats after all others, commands read back a hundredth of a degree off."""
+    random, count = np.random.default_rng(3), len(data)
+    twice = {name: np.tile(column, 2) for name, column in data.channels.items()}
+    for name in (f"tracker.{axis}" for axis in "xyz"):
+        twice[name][count:] += noise * random.normal(size=count)
+    for name in PRINTED.joints:
+        twice[name][count:] += np.deg2rad(0.01) * random.normal(size=count)
+    return replace(data, ids=tuple(map(str, range(2 * count))), channels=twice, rows=())
+
+
+def test_records_of_one_pose_are_held_out_together_and_counted(tmp_path: Path) -> None:
+    """Else what was fitted to judges, and the error claimed is half of the true one."""
+    few = PRINTED.recording(4).subset(np.arange(0, 200, 5))
+    path = PRINTED.write(repeated(few, 0.0005), tmp_path / "twice.csv")
+    result = calibrate(Experiment.load(DEMO, ["validation.folds=4"], path))
+    assert any("80 records at 40 poses" in text for text in result.warnings)
+    poses = np.arange(80) % 40
+    assert not set(poses[result.split.train]) & set(poses[result.split.holdout])
+    for split in folds(80, 4, 0, poses):
+        assert not set(poses[split.train]) & set(poses[split.holdout]) and len(split.holdout) == 20
+    judged = result.table.calibrated["holdout"].mean
+    once = calibrate(Experiment.load(DEMO, ["validation.folds=0"], PRINTED.write(few, tmp_path / "once.csv")))
+    fitted = result.table.calibrated["train"].mean
+    assert judged is not None and fitted is not None and judged > 1.3 * fitted
+    assert once.table.calibrated["holdout"].mean == pytest.approx(judged, rel=0.5)
+
+
+def test_distinct_poses_are_split_as_before() -> None:
+    """Numbers of poses that are all different change nothing, whatever they are."""
+    numbers = np.random.default_rng(0).permutation(30).astype(np.intp)
+    held = hold_out(30, 0.2, 5, np.arange(30, dtype=np.intp)).holdout
+    np.testing.assert_array_equal(held, hold_out(30, 0.2, 5).holdout)
+    assert len(hold_out(30, 0.2, 5, numbers).holdout) == 6
 
 
 @pytest.mark.slow

@@ -177,17 +177,35 @@ def turned_and_placed(q, offsets, body):
     return turn * body, place + turn.apply([0.02, 0, 0.06])
 
 
-def test_a_calibration_finds_offsets_and_the_bodys_rotation_from_a_file(tmp_path):
-    """Noisy poses, quaternions of either sign; what is found lies within five standard deviations of the truth."""
-    random, offsets = np.random.default_rng(3), (0, 0.02, -0.03, 0.015, 0)
-    body = Rotation.from_rotvec([0.03, -0.5, 0.2])
+def recorded(path, offsets, body):
+    """Noisy poses, quaternions of either sign."""
+    random = np.random.default_rng(3)
     lines = ["q1_rad,q2_rad,q3_rad,q4_rad,q5_rad,x_m,y_m,z_m,a,b,c,d"]
     for q in random.uniform(-1.5, 1.5, (60, 5)):
         turn, place = turned_and_placed(q, offsets, body)
         seen = turn * Rotation.from_rotvec(2e-4 * random.normal(size=3))
         read = [*q, *(place + 1e-4 * random.normal(size=3)), *(seen.as_quat() * random.choice([-1, 1]))]
         lines.append(",".join(repr(float(x)) for x in read))
-    (tmp_path / "poses.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def test_what_priors_alone_hold_is_a_note_where_tips_do_not_depend_on_it(tmp_path):
+    """The last joint's zero trades with the target's place and rotation: a gauge, and no reason not to use it."""
+    recorded(tmp_path / "poses.csv", (0, 0.02, -0.03, 0.015, 0), Rotation.from_rotvec([0.03, -0.5, 0.2]))
+    (tmp_path / "arm.yaml").write_text(CONFIG, encoding="utf-8")
+    free = 'parameters.free=["arm.mdh.theta[2-5]", "arm.mdh.a3", "tracker.target_*"]'
+    result = calibrate(Experiment.load(tmp_path / "arm.yaml", [free, 'parameters.priors={"*.theta5": 2 deg}']))
+    finding = next(f for f in result.verdict.findings if "held by priors alone" in f.text)
+    assert finding.grade == "note" and "does not depend on them" in finding.text
+    assert not result.verdict.bad
+    known = result.estimate.identifiability
+    assert len(known) - known.rank == len(known.undetermined) == 1 and finding.text.startswith("1 combination ")
+
+
+def test_a_calibration_finds_offsets_and_the_bodys_rotation_from_a_file(tmp_path):
+    """What is found lies within five standard deviations of the truth."""
+    offsets, body = (0, 0.02, -0.03, 0.015, 0), Rotation.from_rotvec([0.03, -0.5, 0.2])
+    recorded(tmp_path / "poses.csv", offsets, body)
     path = tmp_path / "arm.yaml"
     path.write_text(CONFIG, encoding="utf-8")
     result = calibrate(Experiment.load(path))

@@ -61,6 +61,7 @@ def _content(experiment: Experiment, ready: Prepared, known: Identifiability) ->
         for name, arm in experiment.system.arms.items()
         for joint in arm.commanded
     }
+    every = ready.problem.parameters.with_free(ready.problem.parameters.names)
     return {
         "experiment": experiment.name,
         "records": {
@@ -71,7 +72,7 @@ def _content(experiment: Experiment, ready: Prepared, known: Identifiability) ->
         },
         "equations": ready.problem.equations(ready.training),
         "parameters": {
-            "all": list(ready.problem.parameters.names),
+            "all": list(every.coordinate_names),
             "free": list(known.names),
             "rank": known.rank,
             "scaled_condition": known.condition if np.isfinite(known.condition) else None,

@@ -100,7 +100,7 @@ def files(
 
 def metrics(result: RunResult) -> dict[str, Any]:
     """The numbers of a run for other programs."""
-    estimate, told = result.estimate, result.estimate.verdict
+    estimate, told, known = result.estimate, result.estimate.verdict, result.estimate.identifiability
     return {
         "experiment": result.name,
         "error_mm": _errors(result),
@@ -113,12 +113,12 @@ def metrics(result: RunResult) -> dict[str, Any]:
             "rejected": len(result.noise.set_aside),
         },
         "parameters": {
-            "free": len(estimate.names),
-            "determined": int(sum(estimate.told_by_data)),
+            "free": len(known),
+            "determined": known.rank,
             "held_by_priors": [n for n, seen in zip(estimate.names, estimate.told_by_data, strict=True) if not seen],
             "at_bound": list(estimate.at_bound),
-            "undetermined": [str(combination) for combination in estimate.identifiability.undetermined],
-            "scaled_condition": _finite(estimate.identifiability.condition),
+            "undetermined": [str(combination) for combination in known.undetermined],
+            "scaled_condition": _finite(known.condition),
         },
         "noise": _noise(result),
         "solver": {

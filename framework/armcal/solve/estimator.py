@@ -314,7 +314,9 @@ def require_solvable(problem: Problem, records: Sequence[FactorRecords], start: 
         if unseen_scale:
             warnings.append(f"{UNSEEN_SCALE}; its priors hold it. To know it, {GIVE_A_LENGTH}.")
         told = listed if len(explained) <= FEW_HELD else "armcal identify lists them"
-        warnings.append(f"{text}; their priors hold them: {told}.")
+        warnings.append(
+            f"at the nominal values {text}; their priors hold them: {told}. The verdict counts at the answer."
+        )
     if known.condition > POOR_CONDITION and not has_prior.all():
         warnings.append(f"the scaled condition is {known.condition:.1e}: {known.weakest} is hardly determined.")
     return tuple(warnings)

@@ -30,7 +30,7 @@ class PriorsAlone:
     Attributes:
         worst_mm: the largest standard deviation of the tip that they leave, over the poses looked at.
         poses: how many unseen poses were looked at.
-        up_to: motions that were left out, because contacts do not see them either; empty where none were.
+        up_to: motions that were left out, because nothing that was measured sees them; empty where none were.
     """
 
     worst_mm: float
@@ -76,7 +76,7 @@ def priors_alone(problem: Problem, estimate: Estimate, poses: Dataset) -> Priors
     Their covariance is what the priors give them, V (V'PV)^-1 V' over the undetermined directions V.
 
     Returns:
-        None if there are none, if no prior holds one of them, or if measurements read something, but no position.
+        None if there are none, or if no prior holds one of them.
     """
     null = estimate.identifiability.null
     rows = _position_rows(problem)
@@ -84,10 +84,8 @@ def priors_alone(problem: Problem, estimate: Estimate, poses: Dataset) -> Priors
     information = null * (scales**2 * estimate.parameters.prior_information()) @ null.T
     if not len(null) or not len(poses) or np.linalg.cond(information) > 1 / np.finfo(float).eps:
         return None
-    if not any(kernel.factor.output_channels for kernel in problem.kernels):
-        return _of_tools(problem, estimate, poses, np.asarray(np.linalg.inv(information), dtype=float))
     if not len(rows):
-        return None
+        return _of_tools(problem, estimate, poses, np.asarray(np.linalg.inv(information), dtype=float))
     noise = np.concatenate([kernel.factor.noise for kernel in problem.kernels])
     seen = whitened_rows(problem, estimate.values, poses)[rows] * noise[rows, None, None] @ null.T
     covariance: Array = np.asarray(np.linalg.inv(information), dtype=float)
@@ -96,7 +94,7 @@ def priors_alone(problem: Problem, estimate: Estimate, poses: Dataset) -> Priors
 
 
 def _of_tools(problem: Problem, estimate: Estimate, poses: Dataset, covariance: Array) -> PriorsAlone:
-    """Where contacts read nothing: of the tools themselves, up to what no contact could see."""
+    """Where nothing reads a position in the base frame: of the tools themselves, up to what no contact could see."""
     records, values = problem.records(poses), estimate.values
     at, axes = tools(problem, values, records)
     moves = np.array([along(problem, values, records, way).ravel() for way in estimate.identifiability.null]).T
@@ -109,7 +107,9 @@ def _position_rows(problem: Problem) -> list[int]:
     """Which residual numbers, all factors stacked, are those of the first position in a base frame."""
     start = 0
     for kernel in problem.kernels:
-        if [c.rpartition(".")[2] for c in kernel.factor.output_channels] == _AXES:
+        factor = kernel.factor
+        own = [channel.rpartition(".")[2] for channel in factor.output_channels[:3]]
+        if own == _AXES and factor.dimensions[:3] == ("length",) * 3:
             return list(range(start, start + 3))
-        start += len(kernel.factor.noise)
+        start += len(factor.noise)
     return []

@@ -41,7 +41,7 @@ def determined_told(estimate: Estimate, alone: PriorsAlone | None, typical_mm: f
     held = f"{_plural(count, 'combination is', 'combinations are')} held by priors alone"
     held += f" ({listed})" if count <= FEW_NAMED else ""
     test = f"{test}; the tip at {alone.poses} unseen poses, joints approached as in the records"
-    test += f"; positions, not orientations, up to {alone.up_to}, which no contact tells" if alone.up_to else ""
+    test += f"; positions, not orientations, up to {alone.up_to}, which nothing measured shows" if alone.up_to else ""
     if typical_mm is None or alone.worst_mm <= NEGLIGIBLE_SHARE * typical_mm:
         most = f"{alone.worst_mm:.2g}" if alone.worst_mm >= 0.001 else "0.001"
         text = f"{held}; the tip at unseen poses does not depend on them (at most {most} {_MM}, 1 sd)."
@@ -85,8 +85,8 @@ def structures_told(found: Leftover | None) -> list[Finding]:
 def _structure_told(s: Structure, mean_mm: float, test: str) -> Finding:
     size = f" ({s.size})" if s.size else ""
     text = (
-        f"Residuals still depend on {s.words}{size}: modelled, the mean error of {mean_mm:.2f} {_MM} would fall by "
-        f"{s.falls_mm:.2f} {_MM}."
+        f"Residuals still depend on {s.words}{size}: modelled, the mean training residual of {mean_mm:.2f} {_MM} "
+        f"would fall by {s.falls_mm:.2f} {_MM}."
     )
     if s.alternatives:
         text += f" These data hardly tell it from {'; or '.join(s.alternatives)}."

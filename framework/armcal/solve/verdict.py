@@ -211,10 +211,11 @@ def _size(estimate: Estimate) -> Finding:
     total, test = ratio**2 * freedom, "chi-square, 5 %"
     if total > chdtri(freedom, LEVEL / 2):
         text = (
-            f"Residuals are {ratio:.1f} times the declared noise: what is left is the model's error, not the "
-            "tracker's. Intervals are widened to the residuals."
+            f"Residuals are {ratio:.1f} times the declared noise: the model lacks something, or the noise is larger "
+            "than declared. Intervals are widened to the residuals."
         )
-        return Finding("warning", text, test, "Model what residuals still depend on.")
+        action = "Model what residuals still depend on; a pose measured several times shows the noise itself."
+        return Finding("warning", text, test, action)
     if ratio < 0.5:
         text = f"Residuals are only {ratio:.2f} times the declared noise: was it stated too large?"
         return Finding("note", text, "ratio below 0.5", "State the noise as the instrument's data sheet does.")
