@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import random
 import re
+import subprocess
+import sys
 import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -118,7 +121,7 @@ def test_no_damage_of_one_byte_is_taken_or_ends_in_a_traceback(calibration: Path
     assert predicted(path).exit_code == 2
 
 
-@pytest.mark.parametrize("count", [6, pytest.param(3000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("count", [6, pytest.param(300, marks=pytest.mark.slow)])
 def test_what_is_accepted_by_hand_is_used_or_refused_without_a_traceback(
     calibration: Path, tmp_path: Path, count: int
 ) -> None:
@@ -153,6 +156,17 @@ def test_an_edit_on_purpose_is_checked_noted_and_said_until_the_next_run(calibra
     followed = armcal(*recalibrate(path, kept), "-q")
     assert followed.exit_code == 0, followed.output
     assert "edited by hand" in predicted(kept / "calibration.yaml").stderr
+
+
+def test_a_server_says_that_its_calibration_was_edited(calibration: Path, tmp_path: Path) -> None:
+    path = tmp_path / "edited.yaml"
+    path.write_text(calibration.read_text().rpartition("#")[0])
+    assert armcal("calibration", "accept", str(path)).exit_code == 0
+    command = [sys.executable, "-m", "armcal.cli", "serve", str(path), "--workers", "1", "--evaluator", "interpreted"]
+    asked = b'{"do": "forward", "joint_angles_deg": [10, -20, 30, 40, -50, 60]}\n'
+    done = subprocess.run([*command, "-q"], input=asked, capture_output=True, timeout=120, check=False)
+    assert done.returncode == 0 and json.loads(done.stdout)["ok"]
+    assert done.stderr.decode().count("edited by hand and accepted on") == 1
 
 
 def test_what_no_run_could_have_written_is_not_accepted(calibration: Path, tmp_path: Path) -> None:

@@ -214,7 +214,7 @@ def test_real_runs_killed_at_random_moments_leave_one_set_or_the_other(tmp_path:
     began = time.monotonic()
     subprocess.run(command, check=True)
     lasts = time.monotonic() - began
-    for number in range(40):
+    for number in range(20):
         process = subprocess.Popen(command)
         time.sleep(dice.uniform(0.6, 1.05) * lasts)
         process.kill()

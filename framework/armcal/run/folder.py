@@ -177,7 +177,7 @@ def _staged(texts: Mapping[str, str | bytes], beside: Path, prefix: str) -> Path
                 file.flush()
                 os.fsync(file.fileno())
         _sync(staging)
-    except OSError:
+    except BaseException:
         shutil.rmtree(staging, ignore_errors=True)
         raise
     return staging
@@ -230,9 +230,9 @@ def _one_by_one(staging: Path, folder: Path, present: list[str], names: list[str
             kept.mkdir()
         moves = [(folder / name, kept / name) for name in reversed(present)]
         for source, target in (*moves, *((staging / name, folder / name) for name in names)):
-            source.rename(target)
             done.append((source, target))
-    except OSError:
+            source.rename(target)
+    except BaseException:  # an interrupt too
         for source, target in reversed(done):
             with suppress(OSError):
                 target.rename(source)

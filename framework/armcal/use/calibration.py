@@ -26,7 +26,7 @@ from armcal.use.calibration_file import CalibrationFile, identity_of, read_recor
 from armcal.use.compensation.compensator import Compensator
 from armcal.use.compensation.request import Commands, Options
 from armcal.use.intervals import PlusMinus, Uncertainty
-from armcal.use.physics import SHARE, check_record, components, differences, movement, predict, readable
+from armcal.use.physics import SHARE, UNSTATED_M, check_record, components, differences, movement, predict, readable
 from armcal.use.tool_expression import ToolExpression, arm_expression
 
 _OTHER_PHYSICS = (
@@ -143,10 +143,12 @@ class Calibration:
             text = f"its check poses cannot be predicted any more ({fault})."
             raise ConfigError(f"{text}{made_with}", where=Location(str(path)), hint=_OTHER_PHYSICS) from fault
         if moved.share > SHARE:
+            stated = f"{moved.name} by {moved.share:.2g} times its stated accuracy (limit {SHARE:g})"
+            if moved.name in record.checks.tools and record.checks.radius is None:
+                stated = f"no accuracy is stated for them (limit {UNSTATED_M * 1000:g} mm)"
             raise ConfigError(
                 f"the physics is another than when it was written: at its {len(record.checks.records)} check poses "
-                f"tools moved by up to {moved.tool_m * 1000:.3g} mm, {moved.name} by {moved.share:.2g} times its "
-                f"stated accuracy (limit {SHARE:g}).{made_with}",
+                f"tools moved by up to {moved.tool_m * 1000:.3g} mm; {stated}.{made_with}",
                 where=Location(str(path)),
                 hint=_OTHER_PHYSICS,
             )

@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import os
+import re
 import tempfile
+import time
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 
 from armcal.errors import InputError, Location
+
+_LEFT_BEHIND_S = 3600.0
+"""A file that was staged so long ago is nobody's any more."""
 
 
 def write_new(files: Mapping[Path, bytes]) -> None:
@@ -44,6 +49,7 @@ def _write(files: Mapping[Path, bytes], keep: bool) -> None:
     place = Path()
     try:
         for place, content in files.items():
+            _clean_up(place)
             staged[place] = _staged(place, content)
         if keep:
             require_new(list(files))
@@ -53,8 +59,10 @@ def _write(files: Mapping[Path, bytes], keep: bool) -> None:
         for place, ready in staged.items():
             ready.replace(place)
             done.append(place)
-    except OSError as fault:
+    except BaseException as fault:  # an interrupt too must leave the earlier files
         _undo(done, kept)
+        if not isinstance(fault, OSError):
+            raise
         hint = "Give --out a place that can be written."
         raise InputError(f"it cannot be written ({fault.strerror}).", where=Location(str(place)), hint=hint) from fault
     finally:
@@ -71,16 +79,29 @@ def _undo(done: list[Path], kept: Mapping[Path, Path]) -> None:
                 place.unlink()
 
 
+def _clean_up(place: Path) -> None:
+    """Remove what was staged for a file by a process that was killed."""
+    own = re.compile(re.escape(_prefix(place)) + r"[a-z0-9_]{8}")
+    for path in place.parent.iterdir():
+        with suppress(OSError):
+            if own.fullmatch(path.name) and time.time() - path.stat().st_mtime > _LEFT_BEHIND_S:
+                path.unlink()
+
+
+def _prefix(place: Path) -> str:
+    return f".armcal-{place.name}-"
+
+
 def _staged(place: Path, content: bytes) -> Path:
     """The content beside its place, safely on disk."""
-    descriptor, name = tempfile.mkstemp(prefix=f".{place.name}.", dir=place.parent)
+    descriptor, name = tempfile.mkstemp(prefix=_prefix(place), dir=place.parent)
     try:
         with os.fdopen(descriptor, "wb") as file:
             file.write(content)
             file.flush()
             os.fsync(file.fileno())
         Path(name).chmod(0o666 & ~_umask())
-    except OSError:
+    except BaseException:
         Path(name).unlink(missing_ok=True)
         raise
     return Path(name)
