@@ -17,6 +17,8 @@ ORDER = [
     "armcal.hook_trace",
     "armcal.registration",
     "armcal.plugins",
+    "armcal.base.shown",
+    "armcal.base.plain_files",
     "armcal.base.units",
     "armcal.base.config_text",
     "armcal.base.quantities",

@@ -12,6 +12,8 @@ EXIT_DO_NOT_USE = EXIT_NOT_CONVERGED
 """A calibration whose verdict is bad is as little use as none."""
 EXIT_STOPPED = 4
 """A measuring run held or parked before its end; it can be resumed."""
+EXIT_INTERRUPTED = 130
+"""Ctrl-C: 128 and the number of SIGINT, as shells have it."""
 
 
 @dataclass(frozen=True)

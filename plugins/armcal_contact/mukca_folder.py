@@ -7,9 +7,9 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from stat import S_ISREG
 from typing import NoReturn
 
+from armcal.base.plain_files import input_bytes
 from armcal.errors import DataError, Location
 
 POSITION, SOCKET = "position", "socket"
@@ -62,7 +62,7 @@ def _found(folder: Path) -> tuple[tuple[SocketFile, ...], tuple[str, ...]]:
         inside = sorted(place.iterdir())
         sockets = [path for path in inside if _SOCKET_FILE.fullmatch(path.name)]
         warnings += [_ignored(path) for path in inside if path not in sockets and _is_table(path)]
-        files += [_file(path) for path in sockets]
+        files += [_file(path, folder) for path in sockets]
         if len(sockets) < 2:
             named = f"has only {sockets[0].name}" if sockets else "has no file hole_0.csv, hole_1.csv, ..."
             rest = "nothing is known of the distance of its sockets" if sockets else "it is ignored"
@@ -75,13 +75,10 @@ def _found(folder: Path) -> tuple[tuple[SocketFile, ...], tuple[str, ...]]:
     return tuple(files), tuple(warnings)
 
 
-def _file(path: Path) -> SocketFile:
-    found = path.stat()
-    if not S_ISREG(found.st_mode):
-        _refuse(path, "it is not a regular file, expected a CSV file.", "Remove or replace it.")
-    if found.st_size > MAX_BYTES:
-        _refuse(path, f"it has {found.st_size / 1024**2:.0f} MiB, expected at most 64.", "Is it a recording?")
-    raw = path.read_bytes()
+def _file(path: Path, folder: Path) -> SocketFile:
+    if not path.resolve().is_relative_to(folder.resolve()):
+        _refuse(path, "it is a link that leads out of the folder.", "Put the recording itself there.")
+    raw = input_bytes(path, MAX_BYTES, "a CSV file")
     try:
         text = raw.decode("utf-8-sig")
     except UnicodeDecodeError as fault:

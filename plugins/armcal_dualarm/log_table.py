@@ -9,11 +9,11 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
-from stat import S_ISREG
 from typing import NoReturn
 
 import numpy as np
 from armcal.base.domains import Array
+from armcal.base.plain_files import input_bytes
 from armcal.errors import DataError, Location
 from armcal.measure.cells import is_missing, is_number
 
@@ -72,15 +72,7 @@ def read_table(path: Path, delimiter: str, numbers: Sequence[Column], texts: Seq
 
 
 def _read(path: Path) -> bytes:
-    if not path.exists():
-        _refuse(path, "there is no such file.", "Check the path.")
-    found = path.stat()
-    if not S_ISREG(found.st_mode):
-        kind = "a directory" if path.is_dir() else "not a regular file"
-        _refuse(path, f"it is {kind}, expected a log.", "Give the path of the file itself.")
-    if found.st_size > MAX_BYTES:
-        _refuse(path, f"it has {found.st_size / 1024**3:.1f} GiB, expected at most 2 GiB.", "Split it.")
-    return path.read_bytes()
+    return input_bytes(path, MAX_BYTES, "a log")
 
 
 def _rows(path: Path, raw: bytes, delimiter: str) -> Iterator[tuple[int, list[str]]]:

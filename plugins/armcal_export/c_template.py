@@ -5,6 +5,8 @@ from __future__ import annotations
 import re
 from importlib import resources
 
+from armcal.base.shown import shown
+
 _PLACE = re.compile(r"\{\{(\w+)\}\}")
 _PREFIX = re.compile(r"\b(arm|ARM)_")
 
@@ -22,7 +24,7 @@ def with_prefix(text: str, prefix: str) -> str:
 
 def in_comment(text: str) -> str:
     """Text of a user's as it can stand in a comment: ASCII, one line, and no end of a comment."""
-    line = " ".join(text.split()).encode("ascii", "replace").decode()
+    line = shown(" ".join(text.split())).encode("ascii", "replace").decode()
     return line.replace("*/", "* /").replace("/*", "/ *").replace("\\", "/").replace("??", "? ?")
 
 

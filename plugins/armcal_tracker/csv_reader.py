@@ -8,17 +8,18 @@ from __future__ import annotations
 
 import csv
 import hashlib
+import os
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import islice
 from pathlib import Path
-from stat import S_ISREG
 from typing import Any, BinaryIO, ClassVar, Literal, NoReturn
 
 import numpy as np
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
+from armcal.base.plain_files import input_file
 from armcal.base.settings import InputPath, Settings
 from armcal.base.units import from_unit
 from armcal.errors import DataError, Location
@@ -84,19 +85,11 @@ def _refuse_file(path: Path, message: str, hint: str, line: int | None = None) -
 
 def _opened(path: Path) -> BinaryIO:
     """The file, once it is known to be one and of a size that can be read."""
-    try:
-        found = path.stat()
-    except FileNotFoundError:
-        _refuse_file(path, "there is no such file.", "Check the path.")
-    if not S_ISREG(found.st_mode):
-        kind = "a directory" if path.is_dir() else "not a regular file"
-        _refuse_file(path, f"it is {kind}, expected a CSV file.", "Give the path of the file itself.")
-    if found.st_size > MAX_BYTES:
-        size = f"{found.st_size / 1024**3:.1f} GiB"
-        _refuse_file(path, f"it has {size}, expected at most 2 GiB.", "Split it into several files.")
-    if not found.st_size:
+    file = input_file(path, MAX_BYTES, "a CSV file")
+    if not os.fstat(file.fileno()).st_size:
+        file.close()
         _refuse_file(path, "it is empty.", "Give a header and one line a record.")
-    return path.open("rb")
+    return file
 
 
 def _text_lines(handle: BinaryIO, source: str, digest: Any) -> Iterator[str]:

@@ -7,12 +7,15 @@ import re
 from pathlib import Path
 from typing import Literal, get_args
 
+from armcal.base.plain_files import input_bytes
 from armcal.errors import ConfigError, Location
 
 Encoding = Literal["utf-8", "utf-16-le", "utf-16-be", "iso-8859-1", "us-ascii"]
 
 MAX_BYTES = 256 * 1024
 """Of a URDF: a calibration holds it whole, and may have four times as many itself."""
+_MOST = 1 << 26
+"""Read at all, so that what is too large is refused with the reason."""
 _MARKS: tuple[tuple[bytes, Encoding], ...] = (
     (codecs.BOM_UTF8, "utf-8"),
     (codecs.BOM_UTF16_LE, "utf-16-le"),
@@ -35,18 +38,7 @@ def read_text(path: Path) -> tuple[str, Encoding]:
     Raises:
         ConfigError: it cannot be read, is too large, or is not in the encoding that it declares.
     """
-    where = Location(str(path))
-    if path.is_dir():
-        raise ConfigError("this is a directory, expected a URDF file.", where=where, hint="Name the file in it.")
-    if not path.is_file():
-        raise ConfigError("there is no such file.", where=where, hint="Check the spelling and the directory.")
-    try:
-        with path.open("rb") as stream:
-            data = stream.read(MAX_BYTES + 1)
-    except OSError as fault:
-        hint = "Check its permissions."
-        raise ConfigError(f"the file cannot be read ({fault.strerror}).", where=where, hint=hint) from fault
-    return decode(data, str(path))
+    return decode(input_bytes(path, _MOST, "a URDF file", ConfigError), str(path))
 
 
 def decode(data: bytes, label: str) -> tuple[str, Encoding]:

@@ -416,7 +416,7 @@ COMMANDS = {
     "a tip of rows": (["--tip", "hand"], "found --tip without --urdf"),
     "a convention of nothing": (["--convention", "standard"], "found --convention without --dh"),
     "no file": (["--dh", "none.csv", "--convention", "standard"], "none.csv: there is no such file"),
-    "a folder": (["--dh", ".", "--convention", "standard"], "no regular file"),
+    "a folder": (["--dh", ".", "--convention", "standard"], "it is a directory"),
     "no URDF": (["--urdf", "none.urdf"], "none.urdf: there is no such file"),
     "a folder that is there": (
         ["--dh", "rows.csv", "--convention", "standard", "--out", "taken"],

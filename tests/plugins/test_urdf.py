@@ -392,7 +392,7 @@ def test_files_that_cannot_be_read_are_refused(tmp_path):
             (tmp_path / name).write_bytes(content)
         with pytest.raises(ConfigError, match=match):
             UrdfSettings.model_validate({"path": tmp_path / name})
-    with pytest.raises(ConfigError, match="this is a directory"):
+    with pytest.raises(ConfigError, match="it is a directory, expected a URDF file"):
         UrdfSettings.model_validate({"path": tmp_path})
     for given, match in (({}, "neither path nor text"), ({"text": ODD, "path": tmp_path / "x"}, "both path and text")):
         with pytest.raises(ValidationError, match=match):

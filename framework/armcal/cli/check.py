@@ -12,6 +12,7 @@ import numpy as np
 from rich.table import Table
 
 from armcal.cli.common import Voice, overrides, speaking
+from armcal.cli.outlet import say
 from armcal.errors import ProblemError
 from armcal.plugins import discover
 from armcal.run.experiment import Experiment
@@ -50,7 +51,7 @@ def check(voice: Voice, config: Path, data: Path | None, overrides: tuple[str, .
     voice.result(content)
     _show(voice, experiment, content)
     if refused:
-        click.echo(f"armcal: {refused}", err=True)
+        say(f"armcal: {refused}", err=True)
         sys.exit(refused.exit_code)
     voice.out.print("Ready to run.", style="green")
 

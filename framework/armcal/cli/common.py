@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import click
-from rich.console import Console
 
+from armcal.cli.console import Screen
 from armcal.errors import CalibrationWarning, DataError, Location
 from armcal.hooks import ContractDeprecationWarning
 from armcal.plugins import PluginRegistry
@@ -33,14 +33,14 @@ class Voice:
     verbose: bool
 
     @property
-    def out(self) -> Console:
+    def out(self) -> Screen:
         """For results."""
-        return Console(soft_wrap=False, quiet=self.quiet or self.json, highlight=False)
+        return Screen(soft_wrap=False, quiet=self.quiet or self.json)
 
     @property
-    def err(self) -> Console:
+    def err(self) -> Screen:
         """For warnings and progress."""
-        return Console(stderr=True, quiet=self.quiet, highlight=False)
+        return Screen(stderr=True, quiet=self.quiet)
 
     def warn(self, text: str) -> None:
         """One warning line."""
@@ -89,7 +89,7 @@ class Voice:
         from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
         from rich.progress import Progress as Bar
 
-        columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())
+        columns = (TextColumn("{task.description}", markup=False), BarColumn(), TimeRemainingColumn())
         with Bar(*columns, console=self.err, transient=True) as bar:
             tasks: dict[str, Any] = {}
 

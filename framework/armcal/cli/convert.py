@@ -9,6 +9,7 @@ from typing import Any
 import click
 import yaml
 
+from armcal.base.plain_files import check_output
 from armcal.cli.common import Voice, speaking
 from armcal.errors import ArmcalError, InputError, Location, PluginError
 from armcal.plugins import PluginRegistry, discover
@@ -123,6 +124,7 @@ def _write(out: Path, source: Path, text: str) -> None:
     if out.resolve() == source.resolve():
         raise InputError("it is the file to convert itself.", where=Location(str(out)), hint="Give another --out.")
     try:
+        check_output(out, InputError)
         out.write_text(text, encoding="utf-8")
     except OSError as fault:
         raise InputError(

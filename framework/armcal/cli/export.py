@@ -6,6 +6,7 @@ from pathlib import Path
 
 import click
 
+from armcal.base.plain_files import check_output
 from armcal.cli.common import Voice, accept_lost, speaking
 from armcal.config.options import settings_from
 from armcal.errors import InputError, Location, PluginError
@@ -79,6 +80,7 @@ def _check_place(out: Path, calibration: Path, force: bool) -> None:
         if out.is_dir() or not out.name:
             raise InputError("it is a directory, expected a file.", where=where, hint="Name the file in it.")
         _not_the_calibration(out, calibration)
+        check_output(out, InputError)
         if not force:
             require_new([out])
     except OSError as fault:
@@ -100,6 +102,7 @@ def _files(out: Path, found: Exported, calibration: Path) -> dict[Path, bytes]:
             hint = "Move it, or give --out another name."
             raise InputError("it is a directory, expected a file.", where=Location(str(beside)), hint=hint)
         _not_the_calibration(beside, calibration)
+        check_output(beside, InputError)
         files[beside] = content
     return files
 

@@ -9,7 +9,8 @@ from importlib import import_module
 import click
 
 from armcal import __version__
-from armcal.errors import EXIT_FAULT, ArmcalError
+from armcal.cli.outlet import Outlet, say
+from armcal.errors import EXIT_DONE, EXIT_FAULT, EXIT_INTERRUPTED, ArmcalError
 
 COMMANDS = {
     "new": ("armcal.cli.new:new", "Begin a robot's files, or a plugin of your own."),
@@ -92,11 +93,36 @@ def main() -> None:
     # One BLAS thread: sums come out the same to the last bit whatever the number of processors.
     for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(variable, "1")
+    outlets = {name: Outlet(stream) for name in ("stdout", "stderr") if (stream := getattr(sys, name)) is not None}
+    for name, outlet in outlets.items():
+        setattr(sys, name, outlet)
     try:
-        cli.main(prog_name="armcal", standalone_mode=True)
-    except BrokenPipeError:
-        sys.stderr.close()
-        sys.exit(EXIT_FAULT)
+        code = _exit_code()
+        if "stdout" in outlets and (lost := outlets["stdout"].lost()):
+            say(f"armcal: standard output cannot be written ({lost}).", err=True)
+            code = code or EXIT_FAULT
+    finally:
+        for outlet in outlets.values():
+            outlet.finish()
+    sys.exit(code)
+
+
+def _exit_code() -> int:
+    """Run the command that was called; how it ended. Ctrl-C ends as programs end by it, with 128 and SIGINT."""
+    try:
+        done = cli.main(prog_name="armcal", standalone_mode=False)
+    except click.ClickException as fault:
+        fault.show()
+        return fault.exit_code
+    except click.Abort as fault:
+        if isinstance(fault.__cause__, EOFError):
+            say("armcal: the input ended before the last question.", err=True)
+            return EXIT_FAULT
+        say("armcal: stopped by Ctrl-C.", err=True)
+        return EXIT_INTERRUPTED
+    except SystemExit as end:
+        done = end.code
+    return done if isinstance(done, int) else EXIT_DONE
 
 
 def _missing(fault: ImportError) -> ArmcalError:
@@ -119,4 +145,4 @@ def _report(fault: ArmcalError) -> None:
         import json
 
         click.echo(json.dumps({"error": {"message": str(fault), "exit_code": fault.exit_code}}, indent=2))
-    click.echo(f"armcal: {fault}", err=True)
+    say(f"armcal: {fault}", err=True)

@@ -6,9 +6,8 @@ import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import click
-
 from armcal.cli.common import Voice, command_line
+from armcal.cli.outlet import say
 from armcal.cli.robot_questions import ask_rows, ask_up, direction
 from armcal.errors import EXIT_FAULT, EXIT_NOT_CONVERGED, ConfigError
 from armcal.plugins import PluginRegistry, discover
@@ -43,7 +42,7 @@ def begin(voice: Voice, name: str, source: Source, folder: Path) -> None:
         trial = try_out(made, registry, command_line(), progress)
     _show(voice, robot, made, trial)
     if trial.fault:
-        click.echo(f"armcal: {made.folder}: the calibration of simulated records failed: {trial.fault}.", err=True)
+        say(f"armcal: {made.folder}: the calibration of simulated records failed: {trial.fault}.", err=True)
         sys.exit(EXIT_FAULT if trial.result.estimate.verdict.converged else EXIT_NOT_CONVERGED)
 
 

@@ -9,7 +9,6 @@ from typing import Any
 
 import click
 import numpy as np
-from rich.markup import escape
 from rich.table import Table
 
 from armcal.base.units import display_unit, to_unit
@@ -168,5 +167,5 @@ def _table(parameters: list[dict[str, Any]]) -> Table:
         dimension = DIMENSION_OF_UNIT.get(p["unit"])
         unit = display_unit(dimension).name if dimension else p["unit"]
         texts = ["-" if p[k] is None else f"{to_unit(p[k], unit):.3g}" for k in ("sd_before", "sd_after")]
-        table.add_row(escape(p["name"]), *texts, unit)
+        table.add_row(p["name"], *texts, unit)
     return table

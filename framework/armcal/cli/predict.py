@@ -14,6 +14,7 @@ import numpy as np
 from armcal.base.config_text import ConfigText
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
+from armcal.base.plain_files import input_file
 from armcal.base.pose_settings import quaternion_of
 from armcal.base.units import DIMENSIONLESS, split_suffix, to_unit
 from armcal.cli.common import Voice, accept_lost, speaking
@@ -25,6 +26,7 @@ from armcal.plugins import PluginRegistry, discover
 from armcal.use.calibration import Calibration
 from armcal.use.intervals import PlusMinus
 
+_MOST_BYTES, _LONGEST_HEADER = 1 << 31, 1 << 20
 _RECORDINGS: Mapping[str, Literal["same", "new"]] = {"calibrated": "same", "new": "new"}
 
 
@@ -127,9 +129,10 @@ def _kept(loaded: Calibration, poses: Path, wanted: Sequence[WantedChannel]) -> 
     kept = loaded.record.prediction
     used = {name for channel in wanted for name in channel.columns}
     try:
-        with poses.open(encoding="utf-8-sig", newline="") as file:
-            header = {cell.strip() for cell in next(csv.reader(file), [])}
-    except (OSError, UnicodeDecodeError, csv.Error):
+        with input_file(poses, _MOST_BYTES, "a CSV file") as file:
+            line = file.readline(_LONGEST_HEADER).decode("utf-8-sig")
+        header = {cell.strip() for cell in next(csv.reader([line]), [])}
+    except (DataError, OSError, UnicodeDecodeError, csv.Error):
         return {}  # the reader says what is wrong
     columns = kept.columns if kept else {}
     return {

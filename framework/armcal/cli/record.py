@@ -22,6 +22,7 @@ from armcal.bench.recording.recorder import KEYS
 from armcal.bench.recording.session import Course, record
 from armcal.bench.recording.told import Told
 from armcal.cli.common import Voice, overrides, speaking
+from armcal.cli.outlet import say
 from armcal.config.yaml_source import ConfigSource, load_config
 from armcal.errors import InputError, Location
 from armcal.online.running.signals import Signals
@@ -68,7 +69,7 @@ def record_command(
         ending = record(bench, course)
     tell(ending)
     if ending.content["postures"] and not (voice.json or voice.quiet):
-        click.echo(f"next: armcal run {config} {_data(experiment, out / DATASET)} --out DIR")
+        say(f"next: armcal run {config} {_data(experiment, out / DATASET)} --out DIR")
 
 
 def _with_source(source: ConfigSource, name: str | None) -> ConfigSource:
@@ -130,7 +131,7 @@ def _teller(voice: Voice) -> Callable[[Told], None]:
         if voice.json:
             click.echo(json.dumps({"event": told.kind, **told.content, "sentence": told.sentence}))
         elif not voice.quiet:
-            click.echo(told.sentence)
+            say(told.sentence)
 
     return tell
 

@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any, Literal, cast
 
 import click
-from rich.markup import escape
 from rich.table import Table
 
 from armcal.cli.common import Voice, overrides, speaking
+from armcal.cli.outlet import say
 from armcal.errors import EXIT_BAD_INPUT, EXIT_FAULT, InputError, Location
 from armcal.online.journal.files import REAL_FILES, write_whole
 from armcal.online.replaying.begin import begun, journal_folder, kept_calibration, kept_settings
@@ -117,7 +117,7 @@ def _leave(held: Kept, done: Replayed) -> None:
     """End with what the replay found."""
     context = click.get_current_context()
     if held.damage is not None:
-        click.echo(f"armcal: {held.damage}", err=True)
+        say(f"armcal: {held.damage}", err=True)
         context.exit(EXIT_BAD_INPUT)
     if done.difference is not None:
         context.exit(EXIT_FAULT)
@@ -165,7 +165,7 @@ def _table(walk: Walk, other: _Other) -> Table:
     for heading in ("", "done", "with other settings"):
         table.add_column(heading, overflow="fold")
     for number, one, two in side_by_side(walk, other.walk):
-        table.add_row(f"entry {number}", escape(one) or "-", escape(two) or "-")
+        table.add_row(f"entry {number}", one or "-", two or "-")
     table.add_section()
     states = walk.session.state, other.walk.session.state
     for what in states[0].counts:
@@ -173,7 +173,7 @@ def _table(walk: Walk, other: _Other) -> Table:
     table.add_row("level at the end", *(state.health.level for state in states))
     name = f"mean innovation of {found.records} records after the first {WARM_UP} that both accept"
     table.add_row(name, *("-" if math.isnan(size) else f"{1000 * size:.3f} mm" for size in found.innovation_m))
-    table.add_row("largest difference of a parameter", "", escape(f"{found.apart_sd:.3g} sd, {found.parameter}"))
+    table.add_row("largest difference of a parameter", "", f"{found.apart_sd:.3g} sd, {found.parameter}")
     return table
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import click
 
 from armcal.cli.common import Voice, command_line, overrides, parallel, speaking
+from armcal.cli.outlet import say
 from armcal.cli.tables import show_run
 from armcal.errors import EXIT_DO_NOT_USE, EXIT_NOT_CONVERGED
 from armcal.plugins import discover
@@ -77,7 +78,7 @@ def _end(result: RunResult, folder: Path, accept: bool) -> None:
     """Exit with what is to be done, where there is no calibration to be used."""
     told = result.estimate.verdict
     if not told.converged:
-        click.echo(
+        say(
             f"armcal: {told.name} did not converge ({told.status}). "
             f"Nothing was exported as calibrated. {CHECK_THE_DATA}",
             err=True,
@@ -85,7 +86,7 @@ def _end(result: RunResult, folder: Path, accept: bool) -> None:
         sys.exit(EXIT_NOT_CONVERGED)
     if result.verdict.bad and not accept:
         name = outputs.calibration_name(result, accept)
-        click.echo(
+        say(
             f"armcal: {result.verdict.bad[0].text} The calibration is {folder / name}, which no command loads. "
             "Correct the data or the configuration; or, if you know better, run again with --accept.",
             err=True,

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import click
-from rich.markup import escape
 from rich.table import Table
 
 from armcal.bench.faults import DeviceError
@@ -24,6 +23,7 @@ from armcal.bench.servo.setup import Setup
 from armcal.bench.servo.trial import Verdict, swapped
 from armcal.cli.common import Voice, overrides, speaking
 from armcal.cli.energising import Question, energise_option
+from armcal.cli.outlet import say
 from armcal.errors import EXIT_FAULT, EXIT_STOPPED, InputError
 from armcal.online.running.signals import Signals
 from armcal.plugins import discover
@@ -129,11 +129,11 @@ def _stoppable(voice: Voice, action: Callable[[], None]) -> None:
 
 @contextmanager
 def _talking(voice: Voice, setup: Setup, may_energise: Question) -> Iterator[Conversation]:
-    def say(text: str) -> None:
-        click.echo(text, err=voice.json)
+    def heard(text: str) -> None:
+        say(text, err=voice.json)
 
     with Signals() as signals, voice.progress() as show:
-        yield Conversation(lambda: signals.finish, may_energise, _teller(show), say, lambda: wishes_from(0))
+        yield Conversation(lambda: signals.finish, may_energise, _teller(show), heard, lambda: wishes_from(0))
 
 
 def _teller(show: Progress) -> Callable[[str, int, int], None]:
@@ -152,7 +152,7 @@ def _show(voice: Voice, outcome: Outcome, content: Mapping[str, Any]) -> None:
             lag = found["backlash_deg"]
             play = "-" if lag is None else f"{lag:.2f} +- {found['backlash_sd_deg'] or 0:.2f}"
             table.add_row(
-                escape(joint) if i == 0 else "",
+                joint if i == 0 else "",
                 f"{knot['angle_deg']:g}",
                 f"{knot['pulse_us']:.1f}",
                 "-" if knot["sd_us"] is None else f"{knot['sd_us']:.1f}",

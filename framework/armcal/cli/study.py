@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import click
-from rich.markup import escape
 from rich.table import Table
 
 from armcal.cli.common import Voice, command_line, overrides, parallel, speaking
@@ -72,7 +71,7 @@ def _show_study(voice: Voice, result: StudyResult) -> None:
         figures = [_number(x) for x in (v.train.mean, v.crossed.mean, v.crossed.p95)]
         if v.failed_folds:  # over fewer records than the others
             figures[1:] = [f"({x})" for x in figures[1:]]
-        table.add_row(escape(v.name), str(v.free), *figures, *moved)
+        table.add_row(v.name, str(v.free), *figures, *moved)
         voice.detail(f"{v.name}: {v.fit_seconds:.2f} s for the fit on all records, {v.seconds:.2f} s for all fits")
     voice.out.print(table)
     for text in conclusions(result):

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 from rich.box import HORIZONTALS
-from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 
 from armcal.base.domains import Semidefinite, symmetric
 from armcal.cli.common import Voice
@@ -47,9 +47,10 @@ def _findings(result: RunResult) -> Table:
     table.add_column("what, and how it was tested", ratio=5)
     table.add_column("what to do", ratio=3)
     for finding in result.verdict.findings:
-        style = _STYLES[finding.grade]
-        text = escape(finding.text) + (f" [dim]({escape(finding.test)})[/]" if finding.test else "")
-        table.add_row(f"[{style}]{finding.grade}[/]" if style else finding.grade, text, escape(finding.action))
+        text = Text(finding.text)
+        if finding.test:
+            text.append(f" ({finding.test})", style="dim")
+        table.add_row(Text(finding.grade, style=_STYLES[finding.grade]), text, finding.action)
     return table
 
 
@@ -79,7 +80,7 @@ def _groups(result: RunResult) -> Table:
         numbers = [f"{group.nominal_error_mm:.3f}", f"-> {group.error_mm:.3f}"]
         if distances:
             numbers += _before_after(group.nominal_distance_error_mm, group.distance_error_mm)
-        table.add_row(escape(group.name), str(group.records), part_of(group), *numbers)
+        table.add_row(group.name, str(group.records), part_of(group), *numbers)
     return table
 
 
@@ -105,7 +106,7 @@ def _compliances(result: RunResult) -> Table:
         ends = f"{interval.lower:.{digits}f} to {interval.upper:.{digits}f}"
         span = f"up to {interval.upper:.{digits}f}" if interval.one_sided else ends
         flag = "at its bound" if name in estimate.at_bound else _held(estimate, i)
-        table.add_row(escape(name), f"{value:.{digits}f}", f"{sd:.{digits}f}", span, flag)
+        table.add_row(name, f"{value:.{digits}f}", f"{sd:.{digits}f}", span, flag)
     return table
 
 
@@ -124,7 +125,7 @@ def _matrices(result: RunResult) -> Table:
     for block in estimate.parameters.free:
         if isinstance(block.domain, Semidefinite):
             sizes = np.linalg.eigvalsh(symmetric(estimate.values[estimate.parameters.entries_of(block.name)]))
-            table.add_row(escape(block.name), *(f"{max(size, 0.0):.4f}" for size in sizes))
+            table.add_row(block.name, *(f"{max(size, 0.0):.4f}" for size in sizes))
     return table
 
 
@@ -140,7 +141,7 @@ def _bootstrap(result: RunResult, found: Bootstrap) -> Table:
         sd, low, high = (float(x) for x in (found.deviations[i], *found.intervals[i]))
         digits = _digits(sd)
         numbers = [estimate.values[estimate.free_entries[i]], estimate.deviations[i], sd]
-        table.add_row(escape(name), *(f"{x:.{digits}f}" for x in numbers), f"{low:.{digits}f} to {high:.{digits}f}")
+        table.add_row(name, *(f"{x:.{digits}f}" for x in numbers), f"{low:.{digits}f} to {high:.{digits}f}")
     return table
 
 

@@ -7,15 +7,13 @@ import signal
 import sys
 import threading
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
+from armcal.cli.console import Screen
+from armcal.cli.outlet import say
 from armcal.errors import InputError, Location
 from armcal.online.watch.feed import Feed
-
-if TYPE_CHECKING:
-    from rich.console import Console
 
 DEFAULT_PORT = 8642
 _REFRESH = 1.0
@@ -78,12 +76,12 @@ def _print_once(feed: Feed, as_json: bool) -> None:
         return
     from armcal.online.watch.terminal import picture
 
-    console = _console()
+    console = Screen()
     console.print(picture(state, console.width))
 
 
 def _terminal(feed: Feed, stop: threading.Event) -> None:
-    console = _console()
+    console = Screen()
     if not console.is_terminal:
         _lines(feed, stop)
         return
@@ -103,12 +101,12 @@ def _lines(feed: Feed, stop: threading.Event) -> None:
     from armcal.online.watch.terminal import line
 
     told: str | None = None
-    while not stop.is_set():
+    while not stop.is_set() and getattr(sys.stdout, "fault", None) is None:  # who went away reads no more
         messages = feed.step()
         for text in filter(None, map(line, messages)):
-            click.echo(text)
+            say(text)
         if feed.waiting and feed.waiting != told:
-            click.echo(feed.waiting, err=True)
+            say(feed.waiting, err=True)
         told = feed.waiting
         if not messages:
             sys.stdout.flush()
@@ -125,7 +123,7 @@ def _serve(folder: Path, host: str, port: int, stop: threading.Event) -> None:
         threads.append(threading.Thread(target=server.serve_forever, daemon=True))
         for thread in threads:
             thread.start()
-        click.echo(f"Watching {folder}: {server.address}")
+        say(f"Watching {folder}: {server.address}")
         sys.stdout.flush()
         try:
             while not stop.wait(_REFRESH):
@@ -133,9 +131,3 @@ def _serve(folder: Path, host: str, port: int, stop: threading.Event) -> None:
         finally:
             server.ending.set()
             server.shutdown()
-
-
-def _console() -> Console:
-    from rich.console import Console
-
-    return Console(highlight=False)

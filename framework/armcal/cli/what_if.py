@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import click
-from rich.markup import escape
 from rich.table import Table
 
 from armcal.base.dataset import Dataset
+from armcal.base.plain_files import check_output
 from armcal.cli.common import Voice, speaking
 from armcal.cli.predict import read_commands
 from armcal.errors import InputError, Location
@@ -71,6 +71,7 @@ def _shrinks(told: Mapping[str, float]) -> str:
 
 
 def _write(out: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    check_output(out)
     with out.open("w", newline="", encoding="utf-8") as file:
         table = csv.writer(file)
         table.writerow(_HEADINGS)
@@ -85,5 +86,5 @@ def _table(rows: Sequence[Mapping[str, Any]]) -> Table:
         table.add_column(heading, overflow="fold")
     for row in rows[:_SHOWN]:
         known = f"{row['prediction_sd_mm']:.3g} mm"
-        table.add_row(escape(str(row["id"])), f"{row['bits']:.2f}", known, escape(_shrinks(row["tells_most"])))
+        table.add_row(str(row["id"]), f"{row['bits']:.2f}", known, _shrinks(row["tells_most"]))
     return table

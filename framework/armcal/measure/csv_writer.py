@@ -14,6 +14,7 @@ from typing import TextIO
 
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
+from armcal.base.plain_files import check_output
 from armcal.base.units import DIMENSIONLESS, display_unit, to_unit, units_of
 from armcal.errors import DataError, Location
 from armcal.measure.reader import WantedChannel
@@ -30,8 +31,8 @@ def write_csv(
 ) -> None:
     """Write all records: ``pose_id``, the channels in the order of ``wanted``, then the extra columns.
 
-    The file appears whole or not at all; one that is there already is replaced. Numbers are written in full, so
-    that reading them back gives the same SI values within one unit in the last place.
+    The file appears whole or not at all; one that is there already is replaced, but no link and no device. Numbers are
+    written in full, so that reading them back gives the same SI values within one unit in the last place.
 
     Args:
         path: where to; its folder must exist.
@@ -117,6 +118,7 @@ def _text(number: float) -> str:
 @contextmanager
 def _replacing(path: Path) -> Iterator[TextIO]:
     """A stream beside ``path`` that takes its place once all is written; on any fault nothing is left of it."""
+    check_output(path)
     beside = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
     try:
         with beside.open("x", encoding="utf-8", newline="") as stream:

@@ -5,7 +5,10 @@ from __future__ import annotations
 import csv
 from pathlib import Path
 
+from armcal.base.plain_files import input_bytes
 from armcal.errors import DataError, Location
+
+MAX_BYTES = 1 << 26
 
 
 def read_ids(path: Path) -> tuple[str, ...]:
@@ -16,10 +19,8 @@ def read_ids(path: Path) -> tuple[str, ...]:
     """
     where = Location(str(path))
     try:
-        text = path.read_text(encoding="utf-8-sig")
-    except FileNotFoundError as fault:
-        raise DataError("there is no such file.", where=where, hint="Check the path.") from fault
-    except (OSError, UnicodeDecodeError) as fault:
+        text = input_bytes(path, MAX_BYTES, "a list of ids").decode("utf-8-sig")
+    except UnicodeDecodeError as fault:
         raise DataError(f"it cannot be read as UTF-8 text ({fault}).", where=where) from fault
     rows = [row for row in csv.reader(text.splitlines()) if any(cell.strip() for cell in row)]
     if not rows:

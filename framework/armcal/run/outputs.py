@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from armcal.base.shown import shown
 from armcal.config.yaml_source import ConfigSource
 from armcal.errors import NotConvergedError
 from armcal.measure.reader import surroundings
@@ -273,7 +274,7 @@ def log_text(result: RunResult) -> str:
         for s in result.noise.suspicious
     ]
     lines += [f"seconds in {stage}: {seconds:.3f}" for stage, seconds in result.seconds.items()]
-    return "\n".join(lines) + "\n"
+    return "\n".join(map(shown, lines)) + "\n"
 
 
 def _bootstrap_metrics(result: RunResult) -> dict[str, Any] | None:

@@ -13,9 +13,10 @@ from armcal.arm.clearance import ClearanceCheck, Mask
 from armcal.base.config_text import ConfigText
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
+from armcal.base.plain_files import input_file
 from armcal.config.system import build_component
 from armcal.errors import ConfigError, DataError, Location, ProblemError
-from armcal.measure.id_list import read_ids
+from armcal.measure.id_list import MAX_BYTES, read_ids
 from armcal.measure.reader import Reader
 from armcal.run.experiment import Experiment
 from armcal.run.plan_settings import PlanSettings
@@ -243,10 +244,11 @@ def _usual(experiment: Experiment, limits: Array) -> str:
 def _is_id_list(path: Path) -> bool:
     """A file of one column."""
     try:
-        with path.open(encoding="utf-8-sig") as stream:
-            return not any(mark in stream.readline(1000) for mark in ",;\t|")
-    except (OSError, UnicodeDecodeError):
-        return False
+        with input_file(path, MAX_BYTES, "a list of ids") as stream:
+            line = stream.readline(1000).decode("utf-8-sig", "replace")
+    except DataError:
+        return False  # the reader says what is wrong
+    return not any(mark in line for mark in ",;\t|")
 
 
 def _grid(settings: PlanSettings, space: JointSpace) -> Dataset:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NoReturn
 
+from armcal.base.plain_files import input_bytes
 from armcal.base.units import Unit, display_unit, from_unit, split_suffix, units_of
 from armcal.errors import DataError, Location
 from armcal.measure.cells import CellFault, read_cell
@@ -100,17 +101,7 @@ def read_rows(path: Path) -> tuple[Row, ...]:
 
 
 def _text(path: Path) -> str:
-    where = Location(str(path))
-    try:
-        if not path.exists():
-            raise DataError("there is no such file.", where=where, hint="Check the path.")
-        if not path.is_file():
-            raise DataError("it is no regular file.", where=where, hint="Give the path of a CSV file.")
-        if path.stat().st_size > MAX_BYTES:
-            raise DataError("it has more than 1 MiB, expected a table of joints.", where=where, hint="Check the path.")
-        content = path.read_bytes()
-    except OSError as fault:
-        raise DataError(f"it cannot be read ({fault.strerror}).", where=where, hint="Check its permissions.") from fault
+    content = input_bytes(path, MAX_BYTES, "a CSV file, a table of joints")
     try:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError as fault:

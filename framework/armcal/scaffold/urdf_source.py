@@ -28,8 +28,6 @@ def robot_of_urdf(name: str, path: Path, tip: str | None, registry: PluginRegist
         PluginError: no plugin reads URDFs.
     """
     where = Location(str(path))
-    if not path.is_file():
-        raise DataError("there is no such file.", where=where, hint="Check the path.")
     model = _model(path, tip, registry)
     chain = numeric_chain(model, nominal_values(model))
     joints = tuple(_joint(joint, where) for joint in chain.joints if joint.mimic is None)

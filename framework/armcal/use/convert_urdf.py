@@ -8,6 +8,7 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 
 from armcal.base.domains import Array
+from armcal.base.shown import shown
 from armcal.use.convert_poe import numbers
 from armcal.use.rigid_chain import RigidChain, RigidJoint, require_plain_axes, rpy_of
 
@@ -23,7 +24,7 @@ def urdf_text(chain: RigidChain, name: str) -> str:
         ProblemError: a joint has pitch or scale.
     """
     require_plain_axes(chain, "a URDF")
-    return "\n".join([f"<robot name={quoteattr(name)}>", *_elements(chain), "</robot>", ""])
+    return "\n".join([f"<robot name={_attribute(name)}>", *_elements(chain), "</robot>", ""])
 
 
 def _elements(chain: RigidChain) -> Iterator[str]:
@@ -31,14 +32,14 @@ def _elements(chain: RigidChain) -> Iterator[str]:
     parent, here = BASE, np.eye(4)
     for number, joint in enumerate(chain.joints, start=1):
         child = f"link{number}"
-        yield f"  <joint name={quoteattr(joint.name)} type={quoteattr(_kind(joint))}>"
+        yield f"  <joint name={_attribute(joint.name)} type={_attribute(_kind(joint))}>"
         yield from _placed(here, joint.base_T_joint, parent, child)
         yield f'    <axis xyz="{_words(numbers(joint.axis))}"/>'
         yield from _bounds(joint)
         yield "  </joint>"
         yield f'  <link name="{child}"/>'
         parent, here = child, joint.base_T_joint
-    yield f'  <joint name={quoteattr(_unused("tip", chain))} type="fixed">'
+    yield f'  <joint name={_attribute(_unused("tip", chain))} type="fixed">'
     yield from _placed(here, chain.base_T_tool, parent, TIP)
     yield "  </joint>"
     yield f'  <link name="{TIP}"/>'
@@ -68,7 +69,7 @@ def _bounds(joint: RigidJoint) -> Iterator[str]:
         yield f'    <limit effort="{UNKNOWN}" velocity="{UNKNOWN}"/>'
     if joint.mimic is not None:
         told = (f'{key}="{getattr(joint.mimic, key)!r}"' for key in ("multiplier", "offset"))
-        yield f"    <mimic joint={quoteattr(joint.mimic.master)} {' '.join(told)}/>"
+        yield f"    <mimic joint={_attribute(joint.mimic.master)} {' '.join(told)}/>"
 
 
 def _unused(name: str, chain: RigidChain) -> str:
@@ -80,3 +81,8 @@ def _unused(name: str, chain: RigidChain) -> str:
 
 def _words(values: list[float]) -> str:
     return " ".join(repr(value) for value in values)
+
+
+def _attribute(text: str) -> str:
+    """A text as the value of an XML attribute, in quotes; XML has no control characters. [URDF]"""
+    return quoteattr(shown(text, keep=""))

@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 
+from armcal.base.plain_files import check_output
 from armcal.errors import InputError, Location
 
 _LEFT_BEHIND_S = 3600.0
@@ -48,6 +49,8 @@ def _write(files: Mapping[Path, bytes], keep: bool) -> None:
     done: list[Path] = []
     place = Path()
     try:
+        for place in files:
+            check_output(place, InputError)
         for place, content in files.items():
             _clean_up(place)
             staged[place] = _staged(place, content)

@@ -1,0 +1,83 @@
+"""Regular files alone: of a stated size where they are read, and never a link or a device where one is written."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from stat import S_ISDIR, S_ISLNK, S_ISREG
+from typing import BinaryIO
+
+from armcal.errors import DataError, InputError, Location
+
+_UNITS = ((1 << 30, "GiB"), (1 << 20, "MiB"), (1 << 10, "KiB"))
+
+
+def input_file(path: Path, most: int, expected: str, refusal: type[InputError] = DataError) -> BinaryIO:
+    """The file, opened to be read; its size was checked.
+
+    A pipe is opened without waiting for its writer, and refused like a device: neither says how much it holds.
+
+    Args:
+        path: of the file; links are followed.
+        most: bytes that it may have.
+        expected: what it should be, with its article.
+        refusal: what is raised.
+
+    Raises:
+        InputError: of the kind ``refusal``: there is none, it is a directory, a device or a pipe, it is too large, or
+            it may not be read.
+    """
+    where = Location(str(path))
+    try:
+        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | os.O_NOCTTY)
+    except FileNotFoundError as fault:
+        hint = "Check the spelling and the directory."
+        raise refusal("there is no such file.", where=where, hint=hint) from fault
+    except (OSError, ValueError) as fault:
+        message, hint = f"it cannot be read ({getattr(fault, 'strerror', None) or fault}).", "Check its permissions."
+        raise refusal(message, where=where, hint=hint) from fault
+    found = os.fstat(descriptor)
+    message = hint = ""
+    if S_ISDIR(found.st_mode):
+        message, hint = f"it is a directory, expected {expected}.", "Give the path of the file itself."
+    elif not S_ISREG(found.st_mode):
+        message, hint = f"it is a device or pipe, expected {expected}.", "Save what it gives to a file, and give that."
+    elif found.st_size > most:
+        message, hint = f"it is larger than {_size(most)}, expected {expected}.", "Check the path, or split it."
+    if message:
+        os.close(descriptor)
+        raise refusal(message, where=where, hint=hint)
+    return os.fdopen(descriptor, "rb")
+
+
+def input_bytes(path: Path, most: int, expected: str, refusal: type[InputError] = DataError) -> bytes:
+    """The whole content of a file, as ``input_file`` opens it."""
+    with input_file(path, most, expected, refusal) as stream:
+        return stream.read(most)
+
+
+def check_output(path: Path, refusal: type[InputError] = DataError) -> None:
+    """What stands at an output's path must be nothing, or a regular file that may be replaced.
+
+    Replacing a device would take it away, and through a link something else would be written than was named.
+
+    Raises:
+        InputError: of the kind ``refusal``: it is a link, a directory, a device or a pipe.
+    """
+    try:
+        mode = path.lstat().st_mode
+    except (OSError, ValueError):  # nothing is there; whatever else it is, who writes will say
+        return
+    if S_ISREG(mode):
+        return
+    kind = "a link" if S_ISLNK(mode) else "a directory" if S_ISDIR(mode) else "a device or pipe"
+    raise refusal(
+        f"it is {kind}, expected a file or nothing there: {kind} is never replaced nor written through.",
+        where=Location(str(path)),
+        hint="Give the path of the file itself.",
+    )
+
+
+def _size(count: int) -> str:
+    unit, name = next(((unit, name) for unit, name in _UNITS if count >= unit), (1, "bytes"))
+    return f"{count / unit:.3g} {name}"
