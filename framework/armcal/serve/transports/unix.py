@@ -23,7 +23,7 @@ FIRST_LINE_S = 30.0
 _LEAST_IDLE_S = 1.0
 """A client that has asked nothing for so long gives way where there is no place left."""
 _PAUSE_S = 1.0
-"""Nobody is let in for so long after the system had no descriptor left: who waits would be reported for ever."""
+"""Nobody is let in for so long where the system has no descriptor and no client is idle: who waits is reported on."""
 _NO_MORE = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM)
 
 
@@ -109,8 +109,7 @@ class UnixSocket:
         try:
             connection, _ = self._listener.accept()
         except OSError as fault:
-            if fault.errno in _NO_MORE:
-                self._make_room("the system has no place for another")
+            if fault.errno in _NO_MORE and not self._make_room("the system has no place for another"):
                 self._poller.watch(self._listener)
                 self._opens_at = time.monotonic() + _PAUSE_S
             return
