@@ -31,7 +31,7 @@ def accept(voice: Voice, path: Path) -> None:
     voice.plugin_faults(registry)
     found = accepted(path, datetime.now(UTC).date().isoformat(), registry)
     if found.was_needed:
-        write_over({path: sealed(found.calibration.record.to_config()).encode()})
+        write_over({path.resolve(): sealed(found.calibration.record.to_config()).encode()})
     moved = None if found.moved_m is None else found.moved_m * 1000
     voice.result({"file": str(path), "edited": found.was_edited, "moved_mm": moved})
     told = "it keeps no check poses" if moved is None else f"tools at its check poses moved by up to {moved:.3f} mm"

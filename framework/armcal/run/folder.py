@@ -150,8 +150,10 @@ def _locked(folder: Path) -> int:
 
 
 def _movable(folder: Path) -> bool:
-    """Whether another directory may take its place: nobody's view of it must be lost."""
-    return not (os.path.ismount(folder) or folder.samefile(Path.cwd())) and os.access(folder.parent, os.W_OK)
+    """Whether another directory may take its place: nobody's view of it, and no protection, must be lost."""
+    if os.path.ismount(folder) or folder.samefile(Path.cwd()):
+        return False
+    return os.access(folder, os.W_OK) and os.access(folder.parent, os.W_OK)
 
 
 def _alike(staging: Path, folder: Path) -> bool:
@@ -213,12 +215,13 @@ def _recover(folder: Path) -> None:
         else:
             path.unlink(missing_ok=True)
     own = re.compile(re.escape(_beside(folder)) + r"[a-z0-9_]{8}")
-    for path in sorted(folder.parent.iterdir()):
-        if own.fullmatch(path.name) and path.is_dir():
-            if (path / _UNFINISHED).exists():
-                shutil.rmtree(path, ignore_errors=True)
-            else:
-                _settle(folder, path)
+    with suppress(OSError):  # a folder above that may not be listed
+        for path in sorted(folder.parent.iterdir()):
+            if own.fullmatch(path.name) and path.is_dir():
+                if (path / _UNFINISHED).exists():
+                    shutil.rmtree(path, ignore_errors=True)
+                else:
+                    _settle(folder, path)
 
 
 def _one_by_one(staging: Path, folder: Path, present: list[str], names: list[str]) -> None:
