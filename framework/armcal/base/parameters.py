@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import fnmatch
 import math
+import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -14,6 +15,8 @@ import numpy as np
 from armcal.base.domains import Array, Domain, Interval, Rotation
 from armcal.errors import ConfigError
 
+FIT_NAME = re.compile(r"""[^\s.*?\[\]<>"'\\@]+""")
+"""What a part of a parameter's name may be: dots join parts, brackets name entries, the others make patterns."""
 _EVERYWHERE = (-math.inf, math.inf)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Literal, TypeVar
 
@@ -10,7 +10,7 @@ from pydantic import Field, field_validator
 
 from armcal.arm.assembly import PLACEMENT, Arm, MassiveModel, MassSpec, prefixed
 from armcal.arm.statics import frame_names
-from armcal.base.parameters import ParameterBlock, Parameters
+from armcal.base.parameters import FIT_NAME, ParameterBlock, Parameters
 from armcal.base.pose_settings import PoseSettings
 from armcal.base.settings import Acceleration3, Angle, Force3, Length3, Mass, Settings, Torque3
 from armcal.config.validate import validate
@@ -199,6 +199,9 @@ def _arm(source: ConfigSource, registry: PluginRegistry, name: str) -> tuple[Arm
         masses = (*(mass for mass in model.masses() if mass.name not in settings.links), *masses)
     placement = settings.placement.blocks(PLACEMENT) if settings.placement else ()
     parts = (model, effects, masses, placement, settings.joint_noise)
+    _part_names(source, (*at, "model"), "joint", model.joint_names)
+    _part_names(source, (*at, "effects"), "effect", effects, (described_model["type"], "links"))
+    _part_names(source, (*at, "links"), "link", [mass.name for mass in masses])
     arm = _refusable(source, at, lambda: Arm(name, described_model["type"], *parts))
     _refusable(source, (*at, "effects"), lambda: surroundings({name: arm}))
     known = _refusable(source, at, lambda: frame_names(arm.nominal_chain))
@@ -242,6 +245,21 @@ def _instance_names(source: ConfigSource, names: list[str]) -> None:
                 where=source.where(section),
                 hint="Use letters, digits and underscores, beginning with a letter.",
             )
+
+
+def _part_names(source: ConfigSource, at: Path, kind: str, names: Collection[str], taken: Collection[str] = ()) -> None:
+    """Names below an arm are parts of parameter names, which patterns match and where dots and brackets mean something.
+
+    Raises:
+        ConfigError: a name cannot be such a part, stands twice, or is taken.
+    """
+    for name in names:
+        where = source.where((*at, name))
+        if not FIT_NAME.fullmatch(name) or not name.isprintable():
+            found = f"found the {kind} name {name!r}, expected letters, digits, underscores and dashes."
+            raise ConfigError(found, where=where, hint="It becomes a part of parameters' names; patterns address them.")
+        if name in taken or list(names).count(name) > 1:
+            raise ConfigError(f"found the {kind} name {name!r}, which is taken.", where=where, hint="Rename one.")
 
 
 def _refusable(source: ConfigSource, at: Path, build: Callable[[], T]) -> T:

@@ -91,7 +91,7 @@ def record_keys(dataset: Dataset, measurement: GroupedMeasurement) -> tuple[str,
     # A slash would join labels of different groups to the same key.
     forbidden = _FORBIDDEN | ({"/"} if len(columns) > 1 else set())
     for index, cells in enumerate(zip(*columns, strict=True)):
-        if any(forbidden.intersection(cell) for cell in cells):
+        if any(forbidden.intersection(cell) or not cell.isprintable() for cell in cells):
             raise DataError(
                 f"found the label {'/'.join(cells)[:60]!r}, which is no name.",
                 where=Location(dataset.source or None, row=dataset.rows[index] if dataset.rows else index + 1),

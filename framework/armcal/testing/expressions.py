@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
@@ -11,7 +10,7 @@ import casadi as ca
 import numpy as np
 
 from armcal.base.domains import Array
-from armcal.base.parameters import ParameterBlock, Parameters
+from armcal.base.parameters import FIT_NAME, ParameterBlock, Parameters
 from armcal.base.se3 import Expression
 from armcal.base.units import UNITS, si_unit
 from armcal.testing.results import ContractError, Recorder, expect
@@ -19,7 +18,6 @@ from armcal.testing.unit_checks import expect_plausible
 
 JACOBIAN_TOLERANCE = 1e-6
 _STEP = 1e-5
-_NAME = re.compile(r"[^\s.*?\[\]<>]+")
 _CHOICES = {
     getattr(ca, name): name.removeprefix("OP_").lower()
     for name in (
@@ -51,8 +49,8 @@ def _named(blocks: tuple[ParameterBlock, ...]) -> tuple[ParameterBlock, ...]:
             f"found {type(block).__name__} among the parameters, expected ParameterBlock",
         )
         expect(
-            _NAME.fullmatch(block.name) is not None,
-            f"found the parameter {block.name!r}, expected a name without spaces, dots and * ? [ ] < >",
+            FIT_NAME.fullmatch(block.name) is not None,
+            f"found the parameter {block.name!r}, expected a name without spaces, dots, quotes and * ? [ ] < > @",
         )
     names = [block.name for block in blocks]
     twice = sorted({name for name in names if names.count(name) > 1})
