@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -48,7 +47,10 @@ class Run:
 
     @property
     def metrics(self) -> dict[str, Any]:
-        """The numbers of metrics.json; errors in mm, by model and records: ``metrics["error_mm"]["calibrated"]``."""
+        """The numbers of metrics.json; errors in mm, by model and records: ``metrics["error_mm"]["calibrated"]``.
+
+        Where nothing measured is a length they are ``metrics["error_mrad"]``.
+        """
         return outputs.metrics(self.result)
 
     @property
@@ -63,10 +65,8 @@ class Run:
                 f"{self.estimate.verdict.name} did not converge ({self.estimate.verdict.status}).",
                 hint=CHECK_THE_DATA,
             )
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / "calibration.yaml"
-            path.write_text(sealed(outputs.calibration_content(self.result, self.experiment)), encoding="utf-8")
-            return Calibration.load(path, self.experiment.registry)
+        text = sealed(outputs.calibration_content(self.result, self.experiment))
+        return outputs.read_back(text, self.experiment.registry)
 
     def write(self, folder: str | Path, accept: bool = False) -> Path:
         """Write what ``armcal run`` writes: calibration.yaml, report.html, metrics.json and the rest.

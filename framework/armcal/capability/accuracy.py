@@ -12,13 +12,14 @@ from armcal.base.domains import Array
 from armcal.capability.quantities import AT_ONCE, Postures
 from armcal.capability.subject import Subject
 from armcal.measure.contact import ArmsAlone
+from armcal.measure.measurement import residual_dimensions
 from armcal.solve.kernel import EvaluatorChoice
 from armcal.solve.problem import Problem
 from armcal.use.calibration import Calibration
 from armcal.use.compensation.equilibrium import Equilibrium
 
 _MM = 1000.0
-_POSITION = 3
+_POSITION = ("length",) * 3
 
 
 @dataclass(frozen=True)
@@ -37,7 +38,7 @@ class Unexplained:
 def unexplained(calibration: Calibration) -> Unexplained | None:
     """From the calibration's residuals; None where it measured no positions."""
     noise = calibration.record.noise
-    declared = [m.noise() for m in calibration.readable.values() if len(m.noise()) == _POSITION]
+    declared = [m.noise() for m in calibration.readable.values() if residual_dimensions(m) == _POSITION]
     if not declared:
         return None
     instrument = float(np.sqrt(np.mean([np.sum(np.square(each)) for each in declared])))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from functools import partial
 from importlib import import_module
@@ -13,6 +12,7 @@ import click
 from rich.box import SIMPLE_HEAD
 from rich.table import Table as ScreenTable
 
+from armcal.base.config_text import as_json
 from armcal.capability import outputs
 from armcal.capability.loading import Task, load_task
 from armcal.capability.quantities import BY_NAME
@@ -124,7 +124,7 @@ def _write(
         texts["areas.csv"] = outputs.areas_text(designs or {found.subject.name: found})
     if designs:
         texts["designs.csv"] = outputs.table_text(*outputs.design_rows(_by_design(told)))
-    texts["capability.json"] = json.dumps(told, indent=2) + "\n"
+    texts["capability.json"] = as_json(told) + "\n"
     texts["capability.html"] = page
     kept.place(texts)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shlex
 import sys
 import warnings
@@ -14,6 +13,7 @@ from typing import Any, TypeVar
 
 import click
 
+from armcal.base.config_text import as_json
 from armcal.cli.console import Screen
 from armcal.errors import CalibrationWarning, DataError, Location
 from armcal.hooks import ContractDeprecationWarning
@@ -54,7 +54,7 @@ class Voice:
     def result(self, content: Mapping[str, Any]) -> None:
         """The machine-readable result, with --json."""
         if self.json:
-            click.echo(json.dumps(content, indent=2))
+            click.echo(as_json(content))
 
     def plugin_faults(self, registry: PluginRegistry) -> None:
         """One line a broken plugin."""

@@ -9,6 +9,7 @@ from typing import Any
 import click
 from rich.table import Table
 
+from armcal.base.config_text import as_json
 from armcal.cli.common import Voice, overrides, speaking
 from armcal.cli.mission_session import loop_session
 from armcal.errors import InputError, Location
@@ -58,7 +59,7 @@ def _write(folder: Path, plan: MissionPlan, result: MissionResult, told: dict[st
         "truth.csv": truth_text(result.mission, plan.experiment.parameters),
         "truth.json": json.dumps(schedule(result.mission), indent=2) + "\n",
         "mission.csv": curve_text(curve, truth.temperature_at(curve.times)),
-        "mission.json": json.dumps(told, indent=2) + "\n",
+        "mission.json": as_json(told) + "\n",
     }
     try:
         for name, text in texts.items():

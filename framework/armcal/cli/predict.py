@@ -71,12 +71,14 @@ def predict(
     if not loaded.readable:
         wanted = (*wanted, *_tool_channels(tuple(system.arms)))
     shown = [channel for channel in wanted if channel.channel in channels]
-    extra = _columns(found, shown) if found else {}
+    extra, medians = (_columns(found, shown), _medians(found, shown)) if found else ({}, {})
     write_csv(out, replace(commands, channels=channels, extra=extra), shown)
-    _report(voice, commands, out, recording, found)
+    _report(voice, commands, out, recording, found, medians)
 
 
-def _report(voice: Voice, commands: Dataset, out: Path, recording: str, found: PlusMinus | None) -> None:
+def _report(
+    voice: Voice, commands: Dataset, out: Path, recording: str, found: PlusMinus | None, medians: Mapping[str, float]
+) -> None:
     voice.result(
         {
             "poses": len(commands),
@@ -84,16 +86,22 @@ def _report(voice: Voice, commands: Dataset, out: Path, recording: str, found: P
             "out": str(out),
             "recording": recording,
             **_typical(found),
+            "half_width_90": medians,
         }
     )
     voice.out.print(f"{len(commands)} poses predicted: {out}", markup=False)
-    if found is not None and found.radii:
-        typical = _typical(found)
-        voice.out.print(
-            f"+- {typical['half_width_90_mm']:.2f} mm a coordinate (90 %), {typical['radius_95_mm']:.2f} mm in all "
-            "(95 %), in the median pose",
-            markup=False,
-        )
+    _show_typical(voice, _typical(found), medians)
+
+
+def _show_typical(voice: Voice, told: Mapping[str, Any], medians: Mapping[str, float]) -> None:
+    """How far a prediction may be off in the median pose: of a position, else of every column."""
+    text = ", ".join(f"{column} {half:.2g}" for column, half in medians.items())
+    if told:
+        text = f"{told['half_width_90_mm']:.2f} mm a coordinate (90 %), {told['radius_95_mm']:.2f} mm in all (95 %)"
+    elif text:
+        text += " (90 %)"
+    if text:
+        voice.out.print(f"+- {text}, in the median pose", markup=False, soft_wrap=not told)
 
 
 def _tools(placed: Array, arms: Sequence[str]) -> dict[str, Array]:
@@ -158,15 +166,13 @@ def _tell_missing(voice: Voice, loaded: Calibration, commands: Dataset, recordin
     """What the calibration knew and these poses do not say."""
     order = ("time", "sequence")
     missing = [name for name in loaded.record.environment_columns if not commands.has(name) and name not in order]
-    for name in missing:
-        readers = [
-            f"{arm.name}.{effect}"
-            for arm in loaded.system.arms.values()
-            for effect, c in arm.declared
-            if c.name == name
-        ]
-        taken = f"the reference of {' and '.join(readers)}" if readers else "the configured value"
-        voice.warn(f"the calibration's records had {name}; these poses take {taken}.")
+    declared = [(f"{arm.name}.{effect}", c.name) for arm in loaded.system.arms.values() for effect, c in arm.declared]
+    for effect, name in declared:
+        if name in missing:
+            voice.warn(f"the effect {effect} reads {name}, which these poses do not state: it takes its reference.")
+    plain = [name for name in missing if name not in {column for _, column in declared}]
+    if plain:
+        voice.warn(f"the calibration's records had {', '.join(plain)}; these poses take the configured values.")
     for text in commands.warnings:
         voice.warn(text)
     kept = loaded.record.prediction
@@ -186,6 +192,13 @@ def _columns(found: PlusMinus, shown: Sequence[WantedChannel]) -> dict[str, tupl
     for name, radius in found.radii.items():
         columns["radius95_mm" if len(found.radii) == 1 else f"{name}.radius95_mm"] = _texts(to_unit(radius, "mm"))
     return columns
+
+
+def _medians(found: PlusMinus, shown: Sequence[WantedChannel]) -> dict[str, float]:
+    """Half widths of 90 % intervals by column, in its unit: medians over the poses."""
+    columns = column_names(shown).items()
+    half = {column: to_unit(found.half_widths[c], unit) for c, (column, unit) in columns if c in found.half_widths}
+    return {column: float(np.nanmedian(each)) for column, each in half.items() if np.isfinite(each).any()}
 
 
 def _texts(values: Array) -> tuple[str, ...]:

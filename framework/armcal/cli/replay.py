@@ -11,6 +11,7 @@ from typing import Any, Literal, cast
 import click
 from rich.table import Table
 
+from armcal.base.config_text import finite
 from armcal.cli.common import Voice, overrides, speaking
 from armcal.cli.outlet import say
 from armcal.errors import EXIT_BAD_INPUT, EXIT_FAULT, InputError, Location
@@ -20,7 +21,6 @@ from armcal.online.replaying.courses import WARM_UP, Comparison, compared, side_
 from armcal.online.replaying.replay import Kept, Replayed, check_until, kept, replay
 from armcal.online.replaying.walk import NoWitness, Walk
 from armcal.online.replaying.witness import Comparer
-from armcal.online.running.outputs import finite
 from armcal.online.running.session import OURS
 from armcal.online.tracking.settings import RecalibrateSettings, load_settings
 from armcal.plugins import discover

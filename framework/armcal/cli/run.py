@@ -49,7 +49,7 @@ def run(
         result = calibrate(experiment, command_line(), progress, watch, parallel)
     _show_details(voice, result)
     result.seconds["total"] = watch.total()
-    reserved.place(outputs.files(result, experiment, render, accept))
+    outputs.place(reserved, result, experiment, render, accept)
     converged = result.estimate.verdict.converged
     for text in registry.notify("armcal_run_ended", name=result.name, folder=str(folder), converged=converged):
         voice.warn(text)

@@ -63,7 +63,7 @@ def _show_study(voice: Voice, result: StudyResult) -> None:
     records = f"{len(result.dataset)} records, {result.folds} folds"
     records += f" drawn {result.repeats} times" if result.repeats > 1 else ""
     columns = ("free", "train", "cv", "cv 95 %", "change", "± se", "helps")
-    table = _table(f"{result.name}: mean error, mm; cross-validated (cv): {records}", ("variant",), columns)
+    table = _table(f"{result.name}: mean error, {result.unit}; cross-validated (cv): {records}", ("variant",), columns)
     for v in result.variants:
         moved = ["", "", ""]
         if v.change:

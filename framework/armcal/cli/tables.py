@@ -55,7 +55,8 @@ def _findings(result: RunResult) -> Table:
 
 
 def _errors(result: RunResult) -> Table:
-    table = Table(title=f"Tip error, mm: {result.name}", title_justify="left")
+    unit = result.errors.unit
+    table = Table(title=f"{'Tip' if unit == 'mm' else 'Angle'} error, {unit}: {result.name}", title_justify="left")
     for column in ("records", "count", "", "mean", "rms", "95 %", "max"):
         table.add_column(column, justify="left" if column in ("records", "") else "right")
     for key, words in _SETS.items():
@@ -72,7 +73,7 @@ def _errors(result: RunResult) -> Table:
 
 def _groups(result: RunResult) -> Table:
     """A row a group: what its records miss each other by, and what its known distances miss."""
-    table = Table(title="By group, mean, mm: before and after", title_justify="left")
+    table = Table(title=f"By group, mean, {result.errors.unit}: before and after", title_justify="left")
     distances = any(group.distance_error_mm is not None for group in result.groups.errors)
     for column in ("group", "records", "", "error", "", *(("distance error", "") if distances else ())):
         table.add_column(column, justify="left" if column in ("group", "") else "right")

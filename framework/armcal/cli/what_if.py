@@ -19,10 +19,10 @@ from armcal.online.tracking.pose_worth import PoseWorth, ranked
 from armcal.online.tracking.settings import RecalibrateSettings
 from armcal.online.tracking.start import footing
 from armcal.plugins import discover
+from armcal.solve.validation import error_unit
 from armcal.use.calibration import Calibration
 
 _SHOWN = 10
-_HEADINGS = ("rank", "id", "row", "bits", "prediction_sd_mm", "tells_most")
 
 
 @click.command()
@@ -43,25 +43,27 @@ def what_if(voice: Voice, calibration: Path, poses: Path, out: Path | None, colu
     commands = read_commands(registry, loaded, poses, columns)
     if out is not None and (out.resolve() in (poses.resolve(), calibration.resolve()) or not out.parent.is_dir()):
         raise InputError("it cannot be written there.", where=Location(str(out)), hint="Give another --out.")
-    found, lost = ranked(footing(loaded, RecalibrateSettings(evaluator="auto"), shares=False), commands)
+    ground = footing(loaded, RecalibrateSettings(evaluator="auto"), shares=False)
+    found, lost = ranked(ground, commands)
     if lost:
         voice.warn(f"{len(lost)} poses have no elastic equilibrium, the first is {commands.ids[lost[0]]}.")
-    rows = [_row(rank, each, commands) for rank, each in enumerate(found, 1)]
+    unit = error_unit(ground.problem)
+    rows = [_row(rank, each, commands, unit) for rank, each in enumerate(found, 1)]
     if out is not None:
-        _write(out, rows)
+        _write(out, rows, unit)
     voice.result({"poses": rows, "no_equilibrium": [commands.ids[place] for place in lost]})
-    voice.out.print(_table(rows))
+    voice.out.print(_table(rows, unit))
     if out is not None:
         voice.out.print(f"{len(rows)} poses, best first: {out}", markup=False, soft_wrap=True)
 
 
-def _row(rank: int, each: PoseWorth, commands: Dataset) -> dict[str, Any]:
+def _row(rank: int, each: PoseWorth, commands: Dataset, unit: str) -> dict[str, Any]:
     return {
         "rank": rank,
         "id": commands.ids[each.place],
         "row": commands.rows[each.place] if commands.rows else each.place + 1,
         "bits": each.worth.bits,
-        "prediction_sd_mm": 1000 * each.worth.deviation,
+        f"prediction_sd_{unit}": 1000 * each.worth.deviation,
         "tells_most": dict(each.worth.tells_most),
     }
 
@@ -70,21 +72,22 @@ def _shrinks(told: Mapping[str, float]) -> str:
     return ", ".join(f"{name} -{100 * (1 - left):.1f} %" for name, left in told.items())
 
 
-def _write(out: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+def _write(out: Path, rows: Sequence[Mapping[str, Any]], unit: str) -> None:
     check_output(out)
+    headings = ("rank", "id", "row", "bits", f"prediction_sd_{unit}", "tells_most")
     with out.open("w", newline="", encoding="utf-8") as file:
         table = csv.writer(file)
-        table.writerow(_HEADINGS)
+        table.writerow(headings)
         for row in rows:
-            table.writerow([*(row[name] for name in _HEADINGS[:-1]), _shrinks(row["tells_most"])])
+            table.writerow([*(row[name] for name in headings[:-1]), _shrinks(row["tells_most"])])
 
 
-def _table(rows: Sequence[Mapping[str, Any]]) -> Table:
+def _table(rows: Sequence[Mapping[str, Any]], unit: str) -> Table:
     """The best poses."""
     table = Table(title=f"what one more record would tell: the best {min(_SHOWN, len(rows))} of {len(rows)} poses")
     for heading in ("pose", "bits", "prediction known to", "standard deviations that shrink most"):
         table.add_column(heading, overflow="fold")
     for row in rows[:_SHOWN]:
-        known = f"{row['prediction_sd_mm']:.3g} mm"
+        known = f"{row[f'prediction_sd_{unit}']:.3g} {unit}"
         table.add_row(str(row["id"]), f"{row['bits']:.2f}", known, _shrinks(row["tells_most"]))
     return table

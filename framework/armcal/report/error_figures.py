@@ -40,7 +40,7 @@ def distribution(result: RunResult) -> Figure | None:
     medians = [float(np.median(errors)) for _, _, errors in curves]
     log = min(medians) > 0 and max(medians) / min(medians) > _LOG_FROM and float(values.min()) > 0
     named = zip(curves, medians, strict=True)
-    said = "; ".join(f"{name}: median {significant(middle)} mm" for (_, name, _), middle in named)
+    said = "; ".join(f"{name}: median {significant(middle)} {result.errors.unit}" for (_, name, _), middle in named)
     caption = "The further left a curve, the better. The dashed lines mark half and 95 % of the records."
     caption += " The error axis is logarithmic." if log else ""
     entries = [(f'<path class="curve {css}" d="M0 0h22"/>', name) for css, name, _ in curves]
@@ -50,7 +50,9 @@ def distribution(result: RunResult) -> Figure | None:
         box = Box(52, top + 2, width - 16, top + (270 if width > svg.NARROW else 220))
         x = _error_axis(values, box, log)
         y = Axis(0, 100, box.bottom, box.top)
-        parts += svg.frame(box, x, y, ("error, mm", "records below, %"), (8 if width > svg.NARROW else 5, 5))
+        parts += svg.frame(
+            box, x, y, (f"error, {result.errors.unit}", "records below, %"), (8 if width > svg.NARROW else 5, 5)
+        )
         parts += [svg.line(box.left, y.of(p), box.right, y.of(p), "guide") for p in (50, 95)]
         parts += [_ecdf(errors, x, y, f"curve {css}") for css, _, errors in curves]
         return box.bottom + 44, parts
@@ -101,15 +103,15 @@ def in_order(result: RunResult, worst: NDArray[np.intp]) -> Figure | None:
     thinned = len(errors) > PLAIN_POINTS
     words = _order_words(len(errors), thinned, int(np.sum(finite > top)) if clipped else 0)
     few = len(finite) < FEWEST_FOR_P95
-    most = f"all lie below {significant(largest)} mm" if few else f"95 % lie below {significant(ninety_five)} mm"
-    said = f"{plural(len(errors), 'record')}; {most}."
+    most = f"all lie below {significant(largest)}" if few else f"95 % lie below {significant(ninety_five)}"
+    said = f"{plural(len(errors), 'record')}; {most} {result.errors.unit}."
 
     def draw(width: float) -> tuple[float, list[str]]:
         start, parts = svg.legend(52, 12, width - 60, _order_legend(result, thinned))
         box = Box(52, start + 2, width - 16, start + (270 if width > svg.NARROW else 220))
         x = Axis(0.5, len(errors) + 0.5, box.left, box.right)
         y = Axis(0, top, box.bottom, box.top)
-        labels = ("record, in recorded order", "calibrated error, mm")
+        labels = ("record, in recorded order", f"calibrated error, {result.errors.unit}")
         parts += svg.frame(box, x, y, labels, (10 if width > svg.NARROW else 5, 5))
         parts.append(svg.line(box.left, y.of(ninety_five), box.right, y.of(ninety_five), "guide"))
         parts += _banded(result, x, y) if thinned else _one_by_one(result, x, y)

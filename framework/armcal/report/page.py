@@ -53,6 +53,7 @@ def _content(result: RunResult) -> dict[str, Any]:
     grades = [finding.grade for finding in result.verdict.findings]
     return {
         "result": result,
+        "unit": result.errors.unit,
         "version": armcal.__version__,
         "words": _WORDS,
         "symbols": _SYMBOLS,

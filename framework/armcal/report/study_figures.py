@@ -24,7 +24,9 @@ def ladder(result: StudyResult) -> Figure:
     changed = [v for v in result.variants if v.change]
     numbers = [x for v in result.variants for x in (v.train.mean, v.crossed.mean, v.crossed.p95) if x is not None]
     spreads = {v.name: _spread(result, v) for v in changed}
-    said = "; ".join(f"{v.name}: mean {_said(v.crossed.mean)}, 95 % {_said(v.crossed.p95)} mm" for v in result.variants)
+    said = "; ".join(
+        f"{v.name}: mean {_said(v.crossed.mean)}, 95 % {_said(v.crossed.p95)} {result.unit}" for v in result.variants
+    )
     caption = "The further left, the better. Beside it, on a wide page, the change of each record's error: "
     caption += "median, half and 90 % of the records; left of the line they gain."
     entries = [
@@ -42,7 +44,7 @@ def ladder(result: StudyResult) -> Figure:
         beside = 0.0 if narrow or not changed else 0.4 * (width - left)
         box = Box(left, start + 4, width - beside - 14, bottom)
         x = _axis(numbers, box)
-        parts += svg.frame(box, x, None, ("error, mm", ""), (4 if narrow else 7, 0))
+        parts += svg.frame(box, x, None, (f"error, {result.unit}", ""), (4 if narrow else 7, 0))
         for place, v in enumerate(result.variants):
             y = start + 4 + _ROW * (place + 0.5)
             parts.append(svg.text(left - 9, y + 4, svg.shorten(v.name, most), "mono", "end"))
@@ -92,7 +94,7 @@ def _changes(result: StudyResult, spreads: dict[str, Array], box: Box) -> list[s
     low, high = min(known.min(initial=0.0), 0.0), max(known.max(initial=0.0), 0.0)
     room = (high - low) * 0.06 or 1.0
     x = Axis(low - room, high + room, box.left, box.right)
-    parts = svg.frame(box, x, None, ("change of a record's error, mm", ""), (5, 0))
+    parts = svg.frame(box, x, None, (f"change of a record's error, {result.unit}", ""), (5, 0))
     parts.append(svg.line(x.of(0), box.top, x.of(0), box.bottom, "bound"))
     for place, v in enumerate(result.variants):
         spread = spreads.get(v.name)
@@ -113,7 +115,7 @@ def transfers(result: TransferResult) -> Figure:
         rows.setdefault((cell.variant, cell.trained_g), []).append(cell)
     numbers = [c.errors.mean for c in result.cells if c.errors.mean is not None]
     said = "; ".join(
-        f"{c.variant} {_trained(c.trained_g)} judged at {c.judged_g:g} g: {_said(c.errors.mean)} mm"
+        f"{c.variant} {_trained(c.trained_g)} judged at {c.judged_g:g} g: {_said(c.errors.mean)} {result.unit}"
         for c in result.cells
     )
     caption = "Mean errors. A filled dot: at a payload that also trained (cross-validated); a ring: at another load."
@@ -124,7 +126,7 @@ def transfers(result: TransferResult) -> Figure:
         left = MONO * max(len(svg.shorten(label, most)) for label in labels.values()) + 18
         box = Box(left, 8, width - 14, 8 + _ROW * len(rows))
         x = _axis(numbers, box)
-        parts = svg.frame(box, x, None, ("mean error, mm", ""), (4 if width <= svg.NARROW else 8, 0))
+        parts = svg.frame(box, x, None, (f"mean error, {result.unit}", ""), (4 if width <= svg.NARROW else 8, 0))
         for place, (key, cells) in enumerate(rows.items()):
             y = box.top + _ROW * (place + 0.5)
             parts.append(svg.text(left - 9, y + 4, svg.shorten(labels[key], most), "mono", "end"))

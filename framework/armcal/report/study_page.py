@@ -72,21 +72,21 @@ def conclusions(result: StudyResult) -> list[str]:
     """What to conclude from a comparison."""
     best = result.variant(result.best)
     found = [
-        f"Lowest cross-validated error: {best.name}, {_mm(best.crossed.mean)} on average, 95 % below "
-        f"{_mm(best.crossed.p95)}."
+        f"Lowest cross-validated error: {best.name}, {_shown(best.crossed.mean, result.unit)} on average, 95 % below "
+        f"{_shown(best.crossed.p95, result.unit)}."
     ]
     if result.simplest != result.best:
         simple = result.variant(result.simplest)
         found.append(
             f"Simplest within one standard error of it: {simple.name}, {simple.free} free parameters, "
-            f"{_mm(simple.crossed.mean)}."
+            f"{_shown(simple.crossed.mean, result.unit)}."
         )
     found += _nested_words(result, best)
     for v in result.variants:
         if abs((v.at_rest.mean or 0.0) - (v.crossed.mean or 0.0)) > _SAME_MM:
             found.append(
                 f"{v.name} knows the drift at a record from the training records near it; without that, "
-                f"{_mm(v.at_rest.mean)} on average, 95 % below {_mm(v.at_rest.p95)}."
+                f"{_shown(v.at_rest.mean, result.unit)} on average, 95 % below {_shown(v.at_rest.p95, result.unit)}."
             )
     compared = [v.change for v in result.variants if v.change]
     if compared:
@@ -109,9 +109,10 @@ def _nested_words(result: StudyResult, best: VariantResult) -> list[str]:
     chosen = result.nested.chosen
     listed = ", ".join(f"{name} in {chosen.count(name)}" for name in dict.fromkeys(chosen))
     return [
-        f"The choice itself, made inside each fold's training records and judged outside: "
-        f"{_mm(result.nested.crossed.mean)} on average, 95 % below {_mm(result.nested.crossed.p95)} (picked by the "
-        f"records that judge it: {_mm(best.crossed.mean)}). Chosen: {listed} of {result.folds} folds."
+        "The choice itself, made inside each fold's training records and judged outside: "
+        f"{_shown(result.nested.crossed.mean, result.unit)} on average, 95 % below "
+        f"{_shown(result.nested.crossed.p95, result.unit)} (picked by the records that judge it: "
+        f"{_shown(best.crossed.mean, result.unit)}). Chosen: {listed} of {result.folds} folds."
     ]
 
 
@@ -122,7 +123,8 @@ def transfer_conclusions(result: TransferResult) -> list[str]:
         single = [c for c in result.cells if c.variant == name and len(c.trained_g) == 1 and c.errors.mean is not None]
         own = {c.judged_g: c.errors.mean for c in single if c.seen}
         pairs = [
-            f"{c.trained_g[0]:g} g to {c.judged_g:g} g {_mm(c.errors.mean)}, against {_mm(own.get(c.judged_g))} there"
+            f"{c.trained_g[0]:g} g to {c.judged_g:g} g {_shown(c.errors.mean, result.unit)}, against "
+            f"{_shown(own.get(c.judged_g), result.unit)} there"
             for c in single
             if not c.seen
         ]
@@ -144,9 +146,8 @@ def _variants(result: StudyResult) -> StudyTable:
         failed = v.failed_folds + (not v.converged)
         remark = f"{plural(failed, 'fit')} failed, {plural(v.crossed.count, 'record')} judged" if failed else ""
         rows.append((v.name, count(v.free), *errors, *moved, duration(v.fit_seconds), remark))
-    words = (
-        f"Distance between measured and predicted, mm; {plural(len(result.dataset), 'record')}, {result.folds} folds"
-    )
+    words = f"Distance between measured and predicted, {result.unit}; "
+    words += f"{plural(len(result.dataset), 'record')}, {result.folds} folds"
     words += f" drawn {result.repeats} times" if result.repeats > 1 else ""
     names = ("Free", "Train mean", "Train 95 %", "Mean", "RMS", "95 %", "Max", "Change", "Helps", "Fit")
     return StudyTable(words, (("Variant", False), *((n, True) for n in names), ("", False)), tuple(rows))
@@ -171,10 +172,10 @@ def transfer_table(result: TransferResult) -> StudyTable:
     headings = [("Variant", False), ("Trained at", False)]
     headings += [(f"{g:g} g, {name}", True) for g in result.payloads_g for name in ("mean", "95 %")]
     counts = ", ".join(f"{n} at {g:g} g" for g, n in zip(result.payloads_g, result.counts, strict=True))
-    caption = f"error, mm; {'simulated' if result.simulated else 'measured'} records: {counts}. "
+    caption = f"error, {result.unit}; {'simulated' if result.simulated else 'measured'} records: {counts}. "
     caption += "Cross-validated; with *, judged at another load than it trained at"
     return StudyTable(caption, tuple(headings), tuple(rows))
 
 
-def _mm(value: float | None) -> str:
-    return f"{value:.3f} mm" if value is not None else "not known"
+def _shown(value: float | None, unit: str) -> str:
+    return f"{value:.3f} {unit}" if value is not None else "not known"

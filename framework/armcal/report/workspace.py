@@ -31,7 +31,8 @@ def views(result: RunResult) -> list[Figure]:
     chosen = _thinned(known, errors)
     chosen = chosen[np.argsort(errors[chosen], kind="stable")]
     vectors = _vectors(result, chosen)
-    return [_view(position, errors, chosen, len(known), vectors, axes) for axes in ((0, 1), (0, 2))]
+    parts = (position, errors, chosen, len(known), vectors)
+    return [_view(*parts, axes, result.errors.unit) for axes in ((0, 1), (0, 2))]
 
 
 def _thinned(known: NDArray[np.intp], errors: Array) -> NDArray[np.intp]:
@@ -46,6 +47,8 @@ def _thinned(known: NDArray[np.intp], errors: Array) -> NDArray[np.intp]:
 def _vectors(result: RunResult, chosen: NDArray[np.intp]) -> Array | None:
     """Residual vectors of the chosen records, where the residual is one measured position."""
     residual = result.errors.calibrated_residual_mm
+    if result.errors.unit != "mm":
+        return None
     ends = [name.removesuffix(".x") for name in result.dataset.channels if name.endswith(".x")]
     positions = [p for p in ends if result.dataset.has(f"{p}.y") and result.dataset.has(f"{p}.z")]
     if residual.shape[0] != 3 or len(positions) != 1 or len(chosen) > _MOST_VECTORS:
@@ -55,7 +58,13 @@ def _vectors(result: RunResult, chosen: NDArray[np.intp]) -> Array | None:
 
 
 def _view(
-    position: Array, errors: Array, chosen: NDArray[np.intp], total: int, vectors: Array | None, axes: tuple[int, int]
+    position: Array,
+    errors: Array,
+    chosen: NDArray[np.intp],
+    total: int,
+    vectors: Array | None,
+    axes: tuple[int, int],
+    unit: str,
 ) -> Figure:
     shown = position[list(axes)][:, chosen]
     across, up = (_NAMES[i] for i in axes)
@@ -65,7 +74,7 @@ def _view(
     worst = chosen[-1]
     said = (
         f"{plural(len(chosen), 'tip position')} seen along {({'xy': 'z', 'xz': 'y'})[across + up]}; the largest error, "
-        f"{significant(float(errors[worst]))} mm, at {across} {position[axes[0], worst]:.0f}, "
+        f"{significant(float(errors[worst]))} {unit}, at {across} {position[axes[0], worst]:.0f}, "
         f"{up} {position[axes[1], worst]:.0f} mm."
     )
 
@@ -80,7 +89,7 @@ def _view(
         for number, colour in enumerate(_COLOURS):
             here = level == number
             parts.append(svg.dots(x.at(shown[0, here]), y.at(shown[1, here]), css, colour))
-        parts += _colour_key(box, step)
+        parts += _colour_key(box, step, unit)
         return box.bottom + 104, parts
 
     title = "Workspace from above (x, y)" if up == "y" else "Workspace from the side (x, z)"
@@ -118,7 +127,7 @@ def _equal_axes(shown: Array, width: float) -> tuple[Box, Axis, Axis]:
     return box, x, Axis(float(middle[1] - half[1]), float(middle[1] + half[1]), box.bottom, box.top)
 
 
-def _colour_key(box: Box, step: float) -> list[str]:
+def _colour_key(box: Box, step: float, unit: str) -> list[str]:
     width = min((box.right - box.left) / len(_COLOURS), 44.0)
     left = (box.left + box.right - width * len(_COLOURS)) / 2
     y = box.bottom + 50
@@ -126,7 +135,7 @@ def _colour_key(box: Box, step: float) -> list[str]:
     decimals = decimals_for(step, 2 if round(step / 10 ** np.floor(np.log10(step)), 6) % 1 else 1)
     for i in range(len(_COLOURS)):
         parts.append(svg.text(left + i * width, y + 24, fixed(i * step, decimals), "tick", "middle"))
-    words = "calibrated error, mm; the darkest: and more"
+    words = f"calibrated error, {unit}; the darkest: and more"
     return [*parts, svg.text((box.left + box.right) / 2, y + 44, words, "tick", "middle")]
 
 

@@ -28,7 +28,7 @@ from armcal.solve.moved import Moved, moved_findings, moved_groups
 from armcal.solve.noise_findings import Finding
 from armcal.solve.problem import FactorRecords, Problem
 from armcal.solve.suggestion import suggest
-from armcal.solve.validation import Split
+from armcal.solve.validation import Split, error_unit
 from armcal.solve.verdict import Verdict, judge
 from armcal.solve.weighing import WeighedFit
 
@@ -77,7 +77,7 @@ def verdict_of(
         run.fitted,
         [
             *_gross(run, judged, evidence),
-            *worse_than_nominal(judged, errors.nominal_mm),
+            *worse_than_nominal(judged, errors.nominal_mm, errors.unit),
             *intervals.findings(),
             *moved_findings(_moved(run)),
             *gravity,
@@ -94,7 +94,7 @@ def gather(run: FittedRecords, judged_mm: Array, system: System, limit: float | 
     """
     problem, found, dataset = run.problem, run.fitted.estimate, run.dataset
     if not found.verdict.converged:
-        return Evidence()
+        return Evidence(unit=error_unit(problem))
     position, motion = recorded_position(dataset), Motion.of(problem, found.values, run.records, dataset)
     judged = Judged(judged_mm, residuals(problem, found.values, run.records, run.fitted.records), position)
     limit_mm = None if limit is None else limit * _MM
@@ -105,7 +105,8 @@ def gather(run: FittedRecords, judged_mm: Array, system: System, limit: float | 
         alone = priors_alone(problem, found, unseen_poses(training, motion.channels))
     acting = problem.weighted(run.fitted.records, run.fitted.weights)
     own = (training, motion.subset(train), position[train])
-    return Evidence(leftover(problem, acting, found, *own, modelled=effect_types(system)), missed, alone)
+    left = leftover(problem, acting, found, *own, modelled=effect_types(system))
+    return Evidence(left, missed, alone, error_unit(problem))
 
 
 def _gross(run: FittedRecords, judged_mm: Array, evidence: Evidence) -> list[Finding]:

@@ -15,7 +15,7 @@ from armcal.errors import ConfigError, DataError, Location
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import Stopwatch
 from armcal.run.provenance import provenance
-from armcal.run.study import Study, Trainable, compiled, finite_summary, interpreted_first, naming
+from armcal.run.study import Study, Trainable, compiled, interpreted_first, naming
 from armcal.run.study_result import TransferCell, TransferResult
 from armcal.run.study_settings import LoadTransferSettings
 from armcal.solve.drift import with_drift
@@ -23,7 +23,17 @@ from armcal.solve.estimator import Progress, no_progress, require_solvable
 from armcal.solve.parallel import Executor
 from armcal.solve.problem import Problem
 from armcal.solve.simulation import SimulationRequest, with_channels
-from armcal.solve.validation import FitTask, Indices, JudgedFit, Split, fit_and_judge, folds, record_errors
+from armcal.solve.validation import (
+    FitTask,
+    Indices,
+    JudgedFit,
+    Split,
+    error_unit,
+    fit_and_judge,
+    folds,
+    record_errors,
+    summarise,
+)
 
 _MM = 1000.0
 _GRAMS = 1000.0
@@ -81,6 +91,7 @@ def transfer(
         warnings=dataset.warnings,
         seconds=watch.seconds,
         provenance=provenance(first, dataset),
+        unit=error_unit(next(iter(ready.values())).problem),
     )
 
 
@@ -205,7 +216,7 @@ def _cells(
     name, trained = key
     at = tuple(payloads[i] for i in trained)
     return [
-        TransferCell(name, at, payloads[i], finite_summary(errors[group]), i in trained, failed)
+        TransferCell(name, at, payloads[i], summarise(errors[group]), i in trained, failed)
         for i, group in enumerate(groups)
     ]
 
@@ -215,6 +226,6 @@ def _nominal_cells(
 ) -> list[TransferCell]:
     errors = record_errors(ready.problem, ready.problem.parameters.nominal(), ready.records) * _MM
     return [
-        TransferCell(name, (), payload, finite_summary(errors[group]), False, 0)
+        TransferCell(name, (), payload, summarise(errors[group]), False, 0)
         for group, payload in zip(groups, payloads, strict=True)
     ]

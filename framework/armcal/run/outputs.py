@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import csv
 import io
-import json
+import tempfile
+import warnings
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import asdict
@@ -14,16 +15,19 @@ from typing import Any
 
 import numpy as np
 
+from armcal.base.config_text import as_json, finite
 from armcal.base.shown import shown
 from armcal.config.yaml_source import ConfigSource
-from armcal.errors import NotConvergedError
+from armcal.errors import ArmcalError, CalibrationWarning, NotConvergedError
 from armcal.measure.reader import surroundings
+from armcal.plugins import PluginRegistry
 from armcal.run import folder as folders
 from armcal.run.experiment import Experiment
 from armcal.run.groups import GroupError
 from armcal.run.result import RunResult
 from armcal.solve.bootstrap import Bootstrap
 from armcal.solve.profile import Profile
+from armcal.solve.validation import in_unit
 from armcal.use.calibration import Calibration
 from armcal.use.calibration_file import SCHEMA, CalibrationFile, InformationRecord, dump, parameter_records, sealed
 from armcal.use.physics import check_poses
@@ -32,6 +36,7 @@ FILES = ("experiment.yaml", "residuals.csv", "metrics.json", "report.html", "log
 """In the order in which they are put in place: the calibration last."""
 NOT_CONVERGED_SUFFIX = ".not-converged"
 DO_NOT_USE_SUFFIX = ".do-not-use"
+UNREADABLE_SUFFIX = ".unreadable"
 BOOTSTRAP_FILE = "bootstrap.csv"
 """Only where a bootstrap was asked for."""
 PROFILE_FILE = "profile.json"
@@ -39,7 +44,7 @@ PROFILE_FILE = "profile.json"
 _OURS = (
     BOOTSTRAP_FILE,
     PROFILE_FILE,
-    *(f"calibration.yaml{suffix}" for suffix in (NOT_CONVERGED_SUFFIX, DO_NOT_USE_SUFFIX)),
+    *(f"calibration.yaml{suffix}" for suffix in (NOT_CONVERGED_SUFFIX, DO_NOT_USE_SUFFIX, UNREADABLE_SUFFIX)),
     *FILES,
 )
 
@@ -71,9 +76,36 @@ def write(
 
     Raises:
         InputError: the folder cannot be written, or is not ours to write to.
+        ArmcalError: the calibration cannot be read back; everything else is written.
     """
     with reserved(folder) as held:
-        held.place(files(result, experiment, render, accepted))
+        place(held, result, experiment, render, accepted)
+
+
+def place(
+    held: folders.Reservation,
+    result: RunResult,
+    experiment: Experiment,
+    render: Callable[[RunResult], str],
+    accepted: bool = False,
+) -> None:
+    """Write all files into a reserved folder.
+
+    Raises:
+        InputError: the folder cannot be written.
+        ArmcalError: the calibration cannot be read back: it is left as ``calibration.yaml.unreadable``.
+    """
+    texts, fault = files(result, experiment, render, accepted), None
+    if "calibration.yaml" in texts:
+        try:
+            read_back(texts["calibration.yaml"], experiment.registry)
+        except ArmcalError as found:
+            fault = found
+            texts[f"calibration.yaml{UNREADABLE_SUFFIX}"] = texts.pop("calibration.yaml")
+    held.place(texts)
+    if fault is not None:
+        hint = f"It was left as calibration.yaml{UNREADABLE_SUFFIX}, which nothing loads. {fault.hint}"
+        raise ArmcalError(f"the calibration cannot be read back: {fault.message}", hint=hint) from fault
 
 
 def files(
@@ -87,7 +119,7 @@ def files(
     texts = {
         "experiment.yaml": experiment_text(experiment.source),
         "residuals.csv": residuals_text(result),
-        "metrics.json": json.dumps(metrics(result), indent=2) + "\n",
+        "metrics.json": as_json(metrics(result)) + "\n",
         "report.html": render(result),
         "log.txt": log_text(result),
         calibration_name(result, accepted): sealed(calibration_content(result, experiment, accepted)),
@@ -102,7 +134,7 @@ def files(
 def metrics(result: RunResult) -> dict[str, Any]:
     """The numbers of a run for other programs."""
     estimate, told, known = result.estimate, result.estimate.verdict, result.estimate.identifiability
-    return {
+    content = {
         "experiment": result.name,
         "error_mm": _errors(result),
         "groups": result.groups.as_dict(),
@@ -141,6 +173,7 @@ def metrics(result: RunResult) -> dict[str, Any]:
         "seconds": dict(result.seconds),
         "provenance": result.provenance,
     }
+    return dict(in_unit(content, result.errors.unit))
 
 
 def _errors(result: RunResult) -> dict[str, Any]:
@@ -161,7 +194,7 @@ def _judging(groups: Sequence[GroupError]) -> list[GroupError]:
 
 def calibration_content(result: RunResult, experiment: Experiment, accepted: bool = False) -> dict[str, Any]:
     """The content of calibration.yaml; nothing loads one whose verdict is bad, unless it was ``accepted``."""
-    estimate, provenance = result.estimate, result.provenance
+    estimate, provenance, unit = result.estimate, result.provenance, result.errors.unit
     information = InformationRecord(
         increments=estimate.parameters.coordinate_names,
         square_root=tuple(tuple(float(x) for x in row) for row in estimate.square_root_information),
@@ -178,8 +211,8 @@ def calibration_content(result: RunResult, experiment: Experiment, accepted: boo
             "source": provenance["data"],
         },
         environment_columns=tuple(filter(result.dataset.has, surroundings(experiment.system.arms))),
-        noise=_noise(result),
-        quality_mm=result.table.as_dict(),
+        noise=in_unit(_noise(result), unit),
+        **{f"quality_{unit}": result.table.as_dict()},
         verdict={
             "headline": result.verdict.headline,
             "usable": not result.verdict.bad,
@@ -194,7 +227,7 @@ def calibration_content(result: RunResult, experiment: Experiment, accepted: boo
         prediction=result.prediction,
         information=information,
     )
-    return _checked(record, result, experiment).to_config()
+    return dict(finite(_checked(record, result, experiment).to_config()))
 
 
 def _checked(record: CalibrationFile, result: RunResult, experiment: Experiment) -> CalibrationFile:
@@ -206,6 +239,20 @@ def _checked(record: CalibrationFile, result: RunResult, experiment: Experiment)
         return made.checked(check_poses(system, result.dataset, result.split.train), registry).record
     except NotConvergedError:
         return made.checked(None, registry).record
+
+
+def read_back(text: str, registry: PluginRegistry) -> Calibration:
+    """The calibration that a text is once it is a file.
+
+    Raises:
+        ArmcalError: it is none.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "calibration.yaml"
+        path.write_text(text, encoding="utf-8")
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", CalibrationWarning)
+            return Calibration.load(path, registry)
 
 
 def _noise(result: RunResult) -> dict[str, Any]:
@@ -224,11 +271,12 @@ def residuals_text(result: RunResult) -> str:
     errors, dataset = result.errors, result.dataset
     held = np.zeros(len(dataset), dtype=bool)
     held[result.split.holdout] = True
-    numbered = [f"residual{i}_mm" for i in range(1, len(errors.calibrated_residual_mm) + 1)]
+    numbered = [f"residual{i}_{errors.unit}" for i in range(1, len(errors.calibrated_residual_mm) + 1)]
     axes = list(errors.residual_columns) or numbered
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    columns = ["pose_id", "source_row", "set", "weight", "nominal_mm", "calibrated_mm", "cross_validated_mm", *axes]
+    columns = ["pose_id", "source_row", "set", "weight"]
+    columns += [*(f"{model}_{errors.unit}" for model in ("nominal", "calibrated", "cross_validated")), *axes]
     writer.writerow(columns)
     for i, record in enumerate(dataset.ids):
         numbers = [errors.nominal_mm[i], errors.calibrated_mm[i], errors.cross_validated_mm[i]]
@@ -256,7 +304,7 @@ def bootstrap_text(resampled: Bootstrap, result: RunResult) -> str:
 
 def profile_text(found: tuple[Profile, ...]) -> str:
     """Each profile by its parameter (SI), with its curve."""
-    return json.dumps({each.name: each.as_dict() for each in found}, indent=2) + "\n"
+    return as_json({each.name: each.as_dict() for each in found}) + "\n"
 
 
 def log_text(result: RunResult) -> str:

@@ -11,7 +11,7 @@ import numpy as np
 
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
-from armcal.errors import NotConvergedError, ProblemError
+from armcal.errors import ConfigError, NotConvergedError, ProblemError
 from armcal.measure.id_list import read_ids
 from armcal.plugins import PluginRegistry
 from armcal.run.experiment import Experiment
@@ -39,6 +39,7 @@ from armcal.solve.validation import (
     ErrorSummary,
     Split,
     cross_validate,
+    error_unit,
     folds,
     hold_out,
     record_errors,
@@ -51,6 +52,7 @@ from armcal.solve.weighing import WeighedFit, fit, plain_fit
 from armcal.use.intervals import PredictionRecord, covariance_rows, recording_record, stretch_records
 
 _MM = 1000.0
+"""Thousandths of m; of rad where errors are angles."""
 
 
 @dataclass(frozen=True)
@@ -128,6 +130,10 @@ def assemble(experiment: Experiment, watch: Stopwatch) -> Prepared:
         check_mixups(problem, records, dataset)
         split = _split(experiment, dataset)
         _check_folds(experiment, dataset, split)
+        if experiment.settings.validation.limit is not None and error_unit(problem) != "mm":
+            where = experiment.source.where(("validation", "limit"))
+            hint = "Leave it out: records are explained that miss by far more than the median."
+            raise ConfigError("it is a length, and nothing that is measured is one.", where=where, hint=hint)
         problem = restricted(problem, problem.subset(records, split.train))
         profiled(problem, experiment.settings.uncertainty.profile)
     return Prepared(dataset, problem, records, split, (*experiment.warnings, *dataset.warnings))
@@ -356,6 +362,7 @@ def _errors_of(
         at_rest_mm=record_errors(problem, values, records) * _MM if drifts else None,
         cross_validated_at_rest_mm=at_rest if drifts else None,
         residual_columns=_residual_columns(problem),
+        unit=error_unit(problem),
     )
 
 

@@ -21,7 +21,7 @@ from armcal.use.intervals import PredictionRecord
 
 @dataclass(frozen=True)
 class RecordErrors:
-    """Error of each record of the dataset, in dataset order (mm).
+    """Error of each record of the dataset, in dataset order: in mm, or in ``unit`` where nothing measured is a length.
 
     Attributes:
         nominal_mm: with nominal parameters (N).
@@ -34,6 +34,7 @@ class RecordErrors:
         at_rest_mm: with the calibrated parameters where nothing is known of a drift (N); None if nothing drifts.
         cross_validated_at_rest_mm: the same by the fold that did not train on it.
         residual_columns: names of the rows of the residuals, with their units (mm; mrad for angles).
+        unit: of all errors, ``mm`` or ``mrad``.
     """
 
     nominal_mm: Array
@@ -46,6 +47,7 @@ class RecordErrors:
     at_rest_mm: Array | None = None
     cross_validated_at_rest_mm: Array | None = None
     residual_columns: tuple[str, ...] = ()
+    unit: str = "mm"
 
 
 @dataclass(frozen=True)

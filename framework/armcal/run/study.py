@@ -10,7 +10,6 @@ from typing import TypeVar
 
 import numpy as np
 
-from armcal.base.domains import Array
 from armcal.config.variants import load_variants
 from armcal.config.yaml_source import ConfigSource
 from armcal.errors import InputError, NotConvergedError, ProblemError
@@ -31,6 +30,7 @@ from armcal.solve.validation import (
     Indices,
     JudgedFit,
     Split,
+    error_unit,
     fit_and_judge,
     folds,
     record_errors,
@@ -146,6 +146,7 @@ def compare(
         warnings=_warnings(ready, variants),
         seconds=watch.seconds,
         provenance=provenance(next(iter(study.experiments.values())), dataset),
+        unit=error_unit(next(iter(ready.values())).problem),
     )
 
 
@@ -207,9 +208,9 @@ def _judged(name: str, ready: Prepared, fits: Sequence[JudgedFit], drawn: Sequen
         name=name,
         free=ready.problem.increments,
         nominal=summarise(nominal * _MM),
-        train=finite_summary(whole.errors * _MM),
-        crossed=_averaged([finite_summary(row) for row in repeats]),
-        at_rest=_averaged([finite_summary(row) for row in at_rest]),
+        train=summarise(whole.errors * _MM),
+        crossed=_averaged([summarise(row) for row in repeats]),
+        at_rest=_averaged([summarise(row) for row in at_rest]),
         errors_mm=repeats.mean(axis=0),
         change=None,
         converged=whole.converged,
@@ -217,11 +218,6 @@ def _judged(name: str, ready: Prepared, fits: Sequence[JudgedFit], drawn: Sequen
         fit_seconds=whole.seconds,
         seconds=sum(fit.seconds for fit in fits),
     )
-
-
-def finite_summary(errors: Array) -> ErrorSummary:
-    """Of the errors there are."""
-    return summarise(errors[np.isfinite(errors)])
 
 
 def _averaged(summaries: Sequence[ErrorSummary]) -> ErrorSummary:
@@ -275,7 +271,7 @@ def _nested(
         chosen.append(best)
         errors[split.holdout] = fits[best][1 + number].errors * _MM
         at += len(inside)
-    return NestedResult(finite_summary(errors), tuple(chosen), errors)
+    return NestedResult(summarise(errors), tuple(chosen), errors)
 
 
 def _require_same_records(ready: Mapping[str, Prepared]) -> None:

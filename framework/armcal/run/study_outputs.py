@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import csv
 import io
-import json
 from typing import Any
 
 import numpy as np
 
+from armcal.base.config_text import as_json
 from armcal.config.variants import SECTION
 from armcal.run.study import Study
 from armcal.run.study_result import StudyResult, TransferResult
@@ -22,7 +22,7 @@ def files(result: StudyResult | TransferResult, study: Study, page: str) -> dict
     return {
         "experiment.yaml": dump(self_contained(study)),
         "study.csv": _csv_text(result),
-        "study.json": json.dumps(result.as_dict(), indent=2) + "\n",
+        "study.json": as_json(result.as_dict()) + "\n",
         "study.html": page,
     }
 
@@ -41,14 +41,14 @@ def self_contained(study: Study) -> dict[str, Any]:
 
 
 def _csv_text(result: StudyResult | TransferResult) -> str:
-    """A row a record, an error a variant (mm), by a fit that did not see the record."""
+    """A row a record, an error a variant, by a fit that did not see the record."""
     if isinstance(result, StudyResult):
-        columns = {f"{v.name}_mm": v.errors_mm for v in result.variants}
+        columns = {f"{v.name}_{result.unit}": v.errors_mm for v in result.variants}
         if result.nested:
-            columns["chosen_inside_mm"] = result.nested.errors_mm
+            columns[f"chosen_inside_{result.unit}"] = result.nested.errors_mm
     else:
         columns = {
-            f"{name}_trained_at_{'_and_'.join(f'{g:g}' for g in trained)}_g_mm": errors
+            f"{name}_trained_at_{'_and_'.join(f'{g:g}' for g in trained)}_g_{result.unit}": errors
             for (name, trained), errors in result.errors_mm.items()
         }
     text = io.StringIO()

@@ -8,7 +8,7 @@ from typing import Any
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.solve.comparison import Change
-from armcal.solve.validation import ErrorSummary
+from armcal.solve.validation import ErrorSummary, in_unit
 
 
 @dataclass(frozen=True)
@@ -90,6 +90,7 @@ class StudyResult:
         warnings: of configs, data and problems.
         seconds: of each stage.
         provenance: hashes and versions.
+        unit: of all errors; ``mrad`` where nothing measured is a length.
     """
 
     name: str
@@ -104,6 +105,7 @@ class StudyResult:
     warnings: tuple[str, ...]
     seconds: dict[str, float]
     provenance: dict[str, Any]
+    unit: str = "mm"
 
     def variant(self, name: str) -> VariantResult:
         """One by its name."""
@@ -112,7 +114,7 @@ class StudyResult:
     def as_dict(self) -> dict[str, Any]:
         """For JSON."""
         nested = self.nested
-        return {
+        content = {
             "study": self.name,
             "kind": "models",
             "records": len(self.dataset),
@@ -126,6 +128,7 @@ class StudyResult:
             "seconds": dict(self.seconds),
             "provenance": self.provenance,
         }
+        return dict(in_unit(content, self.unit))
 
 
 @dataclass(frozen=True)
@@ -170,10 +173,11 @@ class TransferResult:
     warnings: tuple[str, ...]
     seconds: dict[str, float]
     provenance: dict[str, Any]
+    unit: str = "mm"
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON."""
-        return {
+        content = {
             "study": self.name,
             "kind": "load_transfer",
             "simulated": self.simulated,
@@ -184,3 +188,4 @@ class TransferResult:
             "seconds": dict(self.seconds),
             "provenance": self.provenance,
         }
+        return dict(in_unit(content, self.unit))

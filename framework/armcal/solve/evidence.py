@@ -40,11 +40,12 @@ class PriorsAlone:
 
 @dataclass(frozen=True)
 class Evidence:
-    """All of it; what was not looked at, or cannot be told, is None."""
+    """All of it; what was not looked at, or cannot be told, is None. ``unit`` is that of all errors, mm or mrad."""
 
     leftover: Leftover | None = None
     misses: Misses | None = None
     priors_alone: PriorsAlone | None = None
+    unit: str = "mm"
 
     def as_dict(self) -> dict[str, Any]:
         """For metrics.json."""

@@ -50,7 +50,7 @@ def determined_told(estimate: Estimate, alone: PriorsAlone | None, typical_mm: f
     return Finding("warning", text, test, "armcal identify names them, and armcal plan the poses that would tell.")
 
 
-def worse_than_nominal(judged_mm: Array, nominal_mm: Array) -> list[Finding]:
+def worse_than_nominal(judged_mm: Array, nominal_mm: Array, unit: str = _MM) -> list[Finding]:
     """Where records that did not train are missed by more than before calibration (N each; nan where not judged)."""
     seen = np.isfinite(judged_mm) & np.isfinite(nominal_mm)
     if not seen.any():
@@ -59,13 +59,14 @@ def worse_than_nominal(judged_mm: Array, nominal_mm: Array) -> list[Finding]:
     if after <= before:
         return []
     text = (
-        f"Worse than the nominal arm on records that did not train it: {after:.2f} mm on average, {before:.2f} before."
+        f"Worse than the nominal arm on records that did not train it: {after:.2f} {unit} on average, "
+        f"{before:.2f} before."
     )
     action = "Do not use it. Look at what trained: too few postures, too much alike, or some of them wrong."
     return [Finding("bad", text, "means over the same records", action)]
 
 
-def structures_told(found: Leftover | None) -> list[Finding]:
+def structures_told(found: Leftover | None, unit: str = _MM) -> list[Finding]:
     """What residuals still depend on."""
     if found is None:
         return []
@@ -75,18 +76,18 @@ def structures_told(found: Leftover | None) -> list[Finding]:
         slight = f" {_plural(len(found.structures), 'dependence', 'dependences')} found would not lower it by 1 %."
         text = f"Of {found.tested} things that residuals might depend on none explains the error left."
         return [Finding("good", text + (slight if found.structures else ""), test)]
-    findings = [_structure_told(s, found.mean_mm, test) for s in kept]
+    findings = [_structure_told(s, found.mean_mm, unit, test) for s in kept]
     if found.more:
         text = "Residuals depend on more than these; model them first, then look again."
         findings.append(Finding("note", text, test))
     return findings
 
 
-def _structure_told(s: Structure, mean_mm: float, test: str) -> Finding:
+def _structure_told(s: Structure, mean_mm: float, unit: str, test: str) -> Finding:
     size = f" ({s.size})" if s.size else ""
     text = (
-        f"Residuals still depend on {s.words}{size}: modelled, the mean training residual of {mean_mm:.2f} {_MM} "
-        f"would fall by {s.falls_mm:.2f} {_MM}."
+        f"Residuals still depend on {s.words}{size}: modelled, the mean training residual of {mean_mm:.2f} {unit} "
+        f"would fall by {s.falls_mm:.2f} {unit}."
     )
     if s.alternatives:
         text += f" These data hardly tell it from {'; or '.join(s.alternatives)}."
@@ -137,20 +138,20 @@ def _tell_apart(found: Leftover) -> str:
     return "Repeat one pose at the start, in the middle and at the end; visit the others in random order."
 
 
-def misses_told(found: Misses | None) -> list[Finding]:
+def misses_told(found: Misses | None, unit: str = _MM) -> list[Finding]:
     """Records beyond the limit, each with what is unusual about it."""
     if found is None:
         return []
     limit = "validation.limit_mm" if found.configured else f"{MEDIANS:g} times the median"
     test = f"errors of {found.judged} records by fits that did not see them, limit {limit}"
     if not found.beyond:
-        return [Finding("good", f"No judged record is missed by more than {found.limit_mm:.2f} {_MM}.", test)]
+        return [Finding("good", f"No judged record is missed by more than {found.limit_mm:.2f} {unit}.", test)]
     listed = "; ".join(
-        f"{miss.record_id} ({miss.error_mm:.2f} {_MM}: {', '.join(miss.reasons)})"
+        f"{miss.record_id} ({miss.error_mm:.2f} {unit}: {', '.join(miss.reasons)})"
         for miss in found.explained[:MOST_TOLD]
     )
     more = f"; and {found.beyond - MOST_TOLD} more, in the report" if found.beyond > MOST_TOLD else ""
-    text = f"{_plural(found.beyond, 'record is', 'records are')} missed by more than {found.limit_mm:.2f} {_MM}: "
+    text = f"{_plural(found.beyond, 'record is', 'records are')} missed by more than {found.limit_mm:.2f} {unit}: "
     advice = _shared_advice([miss.advice for miss in found.explained[:MOST_TOLD]])
     return [Finding("warning", f"{text}{listed}{more}.", test, advice)]
 

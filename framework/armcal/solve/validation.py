@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import re
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,6 +48,7 @@ class Split:
 
 def summarise(errors: Array) -> ErrorSummary:
     """Mean, root mean square, maximum, and the 95th percentile where a record in twenty lies beyond it."""
+    errors = errors[~np.isnan(errors)]
     if not len(errors):
         return ErrorSummary(None, None, None, None, 0)
     return ErrorSummary(
@@ -62,20 +65,42 @@ def record_errors(
 ) -> Array:
     """How far each record's measurement lies from the prediction; root mean square over several measurements (N).
 
-    Angles are left out. Groups that the problem holds, as those that no training record touched, are fitted to these
-    records first: what is left is how far the records of a group disagree.
-    ``told_by`` are the records that tell how far drifting parameters had drifted; without them they are at rest.
+    In m, angles left out; in rad where nothing measured is a length (``error_unit``). Groups that the problem holds,
+    as those that no training record touched, are fitted to these records first: what is left is how far the records
+    of a group disagree. ``told_by`` are the records that tell how far drifting parameters had drifted; without them
+    they are at rest.
     """
     values = settled(problem, values, records)
     found = problem.residuals(values, records) if told_by is None else residuals(problem, values, records, told_by)
     squares, count = np.zeros((2, records[0].count))
+    counted = error_dimension(problem)
     for kernel, each, residual in zip(problem.kernels, records, found, strict=True):
-        lengths = np.array([dimension == "length" for dimension in kernel.factor.dimensions], dtype=bool)
-        if lengths.any():
-            squares += np.where(each.measured, np.sum(residual[lengths] ** 2, axis=0), 0.0)
+        rows = np.array([dimension == counted for dimension in kernel.factor.dimensions], dtype=bool)
+        if rows.any():
+            squares += np.where(each.measured, np.sum(residual[rows] ** 2, axis=0), 0.0)
             count += each.measured
     with np.errstate(invalid="ignore"):
         return np.asarray(np.sqrt(squares / count))
+
+
+def error_unit(problem: Problem) -> str:
+    """The unit in which errors are shown: mm, or mrad where nothing measured is a length; a thousandth of SI each."""
+    return {"length": "mm", "angle": "mrad"}[error_dimension(problem)]
+
+
+def in_unit(content: Any, unit: str) -> Any:
+    """Content for JSON or YAML whose keys that end in ``_mm`` name the unit of its errors (``error_unit``)."""
+    if unit == "mm":
+        return content
+    if isinstance(content, Mapping):
+        return {re.sub("_mm$", f"_{unit}", str(key)): in_unit(value, unit) for key, value in content.items()}
+    return [in_unit(each, unit) for each in content] if isinstance(content, list | tuple) else content
+
+
+def error_dimension(problem: Problem) -> str:
+    """``length``, or ``angle`` where nothing measured is a length."""
+    lengths = any("length" in kernel.factor.dimensions for kernel in problem.kernels)
+    return "length" if lengths else "angle"
 
 
 def hold_out(count: int, fraction: float, seed: int, poses: Indices | None = None) -> Split:

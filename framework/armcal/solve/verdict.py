@@ -70,46 +70,50 @@ def judge(
         evidence: what residuals still depend on, which records are missed, what priors alone hold.
     """
     seen = evidence or Evidence()
-    kept = train if fitted is None else train[fitted.kept]
     typical = float(np.median(judged_mm)) if len(judged_mm) else None
     determined = determined_told(estimate, seen.priors_alone, typical)
-    own = [ids[i] for i in train]
+    own, kept = [ids[i] for i in train], train if fitted is None else train[fitted.kept]
     suspicious = _suspicious(errors_mm[train], own, fitted)
     findings = [_convergence(estimate), determined, *_condition(estimate), *_bounds(estimate)]
-    findings += [*_noise(estimate, fitted), *structures_told(seen.leftover)]
+    findings += [*_noise(estimate, fitted), *structures_told(seen.leftover, seen.unit)]
     findings += neighbours_told(seen.leftover) or _neighbours(whitened, kept)
-    findings += [*_correlated(estimate), *predicted, *misses_told(seen.misses), *_outliers(suspicious, own, fitted)]
+    findings += [
+        *_correlated(estimate),
+        *predicted,
+        *misses_told(seen.misses, seen.unit),
+        *_outliers(suspicious, own, fitted),
+    ]
     findings += _next(estimate, suggestions)
     ranked = tuple(sorted(findings, key=lambda finding: _ORDER[finding.grade]))
-    first = _first(judged_mm, judged_on, ranked[0])
+    first = _first(judged_mm, judged_on, ranked[0], seen.unit)
     sentences = [first, *_in_short(estimate, determined, seen, suspicious, suggestions)]
     if not estimate.verdict.converged:
         sentences = ["The solver did not converge: these values are no calibration."]
-    return Verdict(_headline(judged_mm, judged_on, ranked[0]), ranked, " ".join(sentences))
+    return Verdict(_headline(judged_mm, judged_on, ranked[0], seen.unit), ranked, " ".join(sentences))
 
 
-def _first(judged_mm: Array, judged_on: str, worst: Finding) -> str:
-    return f"{DO_NOT_USE}: {worst.text}" if worst.grade == "bad" else _good_for(judged_mm, judged_on)
+def _first(judged_mm: Array, judged_on: str, worst: Finding, unit: str) -> str:
+    return f"{DO_NOT_USE}: {worst.text}" if worst.grade == "bad" else _good_for(judged_mm, judged_on, unit)
 
 
-def _headline(judged_mm: Array, judged_on: str, worst: Finding) -> str:
+def _headline(judged_mm: Array, judged_on: str, worst: Finding, unit: str) -> str:
     if worst.grade == "bad":
-        return f"{DO_NOT_USE}. {_errors_told(judged_mm, judged_on)}"
-    return _errors_told(judged_mm, judged_on)
+        return f"{DO_NOT_USE}. {_errors_told(judged_mm, judged_on, unit)}"
+    return _errors_told(judged_mm, judged_on, unit)
 
 
-def _errors_told(judged_mm: Array, judged_on: str) -> str:
+def _errors_told(judged_mm: Array, judged_on: str, unit: str) -> str:
     if not len(judged_mm):
         return "No record was held out: how good the model is on new poses is not known."
     errors = summarise(judged_mm)
     most = "all of them" if errors.p95 is None else "95 % of poses"
     return (
-        f"Tip error {errors.mean:.2f} mm on average, {most} below "
-        f"{errors.max if errors.p95 is None else errors.p95:.2f} mm, judged on {judged_on}."
+        f"{'Tip' if unit == 'mm' else 'Angle'} error {errors.mean:.2f} {unit} on average, {most} below "
+        f"{errors.max if errors.p95 is None else errors.p95:.2f} {unit}, judged on {judged_on}."
     )
 
 
-def _good_for(judged_mm: Array, judged_on: str) -> str:
+def _good_for(judged_mm: Array, judged_on: str, unit: str = "mm") -> str:
     """Below what 95 % of unseen poses lie, with 95 % confidence, by order statistics. [Wilks1941]"""
     if not len(judged_mm):
         return "How good the model is on unseen poses is not known: hold records out, or cross-validate."
@@ -117,9 +121,11 @@ def _good_for(judged_mm: Array, judged_on: str) -> str:
     enough = np.flatnonzero(bdtr(below, len(judged_mm), SHARE) >= 1 - LEVEL)
     if not len(enough):
         largest = float(np.max(judged_mm))
-        return f"The largest error on {judged_on} is {largest:.2f} mm; {len(judged_mm)} are too few to say more."
+        return f"The largest error on {judged_on} is {largest:.2f} {unit}; {len(judged_mm)} are too few to say more."
     limit = float(np.sort(judged_mm)[enough[0]])
-    return f"Good for +- {limit:.2f} mm on unseen poses like these: 95 % of them, with 95 % confidence ({judged_on})."
+    return (
+        f"Good for +- {limit:.2f} {unit} on unseen poses like these: 95 % of them, with 95 % confidence ({judged_on})."
+    )
 
 
 def _in_short(
@@ -137,10 +143,10 @@ def _in_short(
     if missed is not None and missed.beyond:
         ids = ", ".join(miss.record_id for miss in missed.explained[:MOST_TOLD])
         more = f" and {missed.beyond - MOST_TOLD} more" if missed.beyond > MOST_TOLD else ""
-        sentences.append(f"Missed by more than {missed.limit_mm:.2f} mm: {ids}{more}.")
+        sentences.append(f"Missed by more than {missed.limit_mm:.2f} {seen.unit}: {ids}{more}.")
     sentences.append(f"Suspicious records: {_few(suspicious)}." if suspicious else "No training record is suspicious.")
     if seen.leftover is not None and seen.leftover.worthwhile:
-        listed = "; ".join(f"{s.words} ({s.falls_mm:.2f} mm)" for s in seen.leftover.worthwhile)
+        listed = "; ".join(f"{s.words} ({s.falls_mm:.2f} {seen.unit})" for s in seen.leftover.worthwhile)
         sentences.append(f"Residuals still depend on {listed}.")
     elif seen.leftover is not None and seen.leftover.lag_after_p <= seen.leftover.level:
         after = f"{seen.leftover.lag_after:.2f}"

@@ -62,7 +62,11 @@ class InformationRecord(Settings):
 
 
 class CalibrationFile(Settings):
-    """The schema of calibration.yaml; ``accepted`` says why and when it was last accepted by hand."""
+    """The schema of calibration.yaml.
+
+    ``accepted`` says why and when it was last accepted by hand; errors are ``quality_mrad`` where nothing measured is a
+    length.
+    """
 
     armcal_calibration: int
     created: str
@@ -72,7 +76,8 @@ class CalibrationFile(Settings):
     identity: dict[str, str]
     environment_columns: tuple[str, ...] = ()
     noise: dict[str, Any]
-    quality_mm: dict[str, Any]
+    quality_mm: dict[str, Any] = Field(default_factory=dict)
+    quality_mrad: dict[str, Any] = Field(default_factory=dict)
     verdict: dict[str, Any]
     arms: dict[str, Any]
     measurements: dict[str, Any]

@@ -7,10 +7,10 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol
 
+from armcal.base.config_text import finite
 from armcal.errors import DataError
 from armcal.online.journal.segment import CHECKPOINT, Entry, Segment
 from armcal.online.running.course import DECISION, RECORD, ROLLBACK, Course, Event, JournalEntry, parsing
-from armcal.online.running.outputs import finite
 from armcal.online.tracking.recalibrator import Recalibrator
 
 TOLD = ("decision", "level")

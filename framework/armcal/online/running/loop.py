@@ -8,9 +8,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol
 
+from armcal.base.config_text import finite
 from armcal.online.journal.journal import Journal, JournalFullError
 from armcal.online.running.course import DECISION, PAUSE, RECORD, RESUME, ROLLBACK, Course, Estimation, Event
-from armcal.online.running.outputs import Outputs, finite
+from armcal.online.running.outputs import Outputs
 from armcal.online.running.signals import Signals
 from armcal.online.sources.incoming import Incoming
 from armcal.online.sources.source import Source

@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from armcal.base.config_text import as_json
 from armcal.online.journal.files import REAL_FILES, FileLayer, is_full, write_whole
 from armcal.online.running.event_file import EventFile
 from armcal.online.running.standard_output import StandardOutput
@@ -158,13 +159,4 @@ def as_line(content: Mapping[str, Any]) -> str:
     try:
         return json.dumps(content, allow_nan=False)
     except ValueError:
-        return json.dumps(finite(content), allow_nan=False)
-
-
-def finite(value: Any) -> Any:
-    """The same as JSON can hold it: null for a number that is not finite."""
-    if isinstance(value, Mapping):
-        return {str(key): finite(entry) for key, entry in value.items()}
-    if isinstance(value, list | tuple):
-        return [finite(entry) for entry in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+        return as_json(content, indent=None)

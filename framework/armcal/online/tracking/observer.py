@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -102,6 +102,27 @@ class Observer:
     def freedom(self, readings: Sequence[Reading]) -> float:
         """Degrees of freedom with which the noise of a record is known: those of its least known reading."""
         return min(self._freedoms[reading.factor] for reading in readings)
+
+    def predicted(self, values: Array, channels: Mapping[str, float]) -> tuple[Reading, ...]:
+        """Readings of a record with these joints and surroundings, as they are predicted at values.
+
+        Raises:
+            NotConvergedError: no equilibrium there.
+        """
+        measured = {name: 0.0 for kernel in self.problem.kernels for name in kernel.factor.output_channels}
+        return tuple(self._as_predicted(values, each) for each in self.readings({**measured, **channels}, {}))
+
+    def _as_predicted(self, values: Array, reading: Reading) -> Reading:
+        kernel, slots = self.problem.kernels[reading.factor], self.problem.slots[reading.factor]
+        factor, record = kernel.factor, np.repeat(reading.record[:, None], LANES, axis=1)
+        shown = np.empty((factor.outputs.numel() + factor.tools.numel(), LANES))
+        state = np.zeros((factor.state.numel(), LANES))
+        kernel.predict(slots.values(values, reading.group), record, state, shown)
+        read = reading.record.copy()
+        for row, channel in enumerate(factor.output_channels):
+            if channel in factor.channels:
+                read[factor.channels.index(channel)] = shown[row, 0]
+        return replace(reading, record=read)
 
     def _group(self, instance: str, known: Mapping[str, float], labels: Mapping[str, str]) -> int:
         plan = self.problem.blueprint

@@ -10,7 +10,7 @@ from armcal.base.dataset import Dataset
 from armcal.errors import ConfigError, NotConvergedError
 from armcal.online.tracking.observer import Seen
 from armcal.online.tracking.start import Footing
-from armcal.online.tracking.what_if import Worth, worth
+from armcal.online.tracking.what_if import Worth, of_errors, worth
 from armcal.solve.online import Linearised
 
 
@@ -26,7 +26,7 @@ def ranked(ground: Footing, commands: Dataset) -> tuple[tuple[PoseWorth, ...], t
     """All poses, the one that would tell most first, and those at which the arm finds no equilibrium.
 
     Each is seen by itself: a second record at the best pose tells less. The error that the calibration's residuals
-    had counts as noise; of an instrument that also reads directions, ``deviation`` is that of the position.
+    had counts as noise; ``deviation`` is of what errors count: of a position, where directions are read beside it.
 
     Raises:
         ConfigError: no measurement reads a single pose.
@@ -34,23 +34,21 @@ def ranked(ground: Footing, commands: Dataset) -> tuple[tuple[PoseWorth, ...], t
     found, lost = [], []
     for place in range(len(commands)):
         try:
-            seen = _seen(ground, {name: float(values[place]) for name, values in commands.channels.items()})
+            seen, counted = _seen(ground, {name: float(values[place]) for name, values in commands.channels.items()})
         except NotConvergedError:
             lost.append(place)
             continue
         own = worth(ground.chart, ground.belief, seen)
-        position = Linearised(seen.innovation[:3], seen.slope[:3], seen.noise[:3, :3])
-        deviation = worth(ground.chart, ground.belief, position).deviation
+        deviation = worth(ground.chart, ground.belief, counted).deviation
         found.append(PoseWorth(place, replace(own, deviation=deviation)))
     return tuple(sorted(found, key=lambda each: -each.worth.bits)), tuple(lost)
 
 
-def _seen(ground: Footing, channels: dict[str, float]) -> Linearised:
-    """A record with these commands, as the calibration looks at it. What it will read does not matter."""
+def _seen(ground: Footing, channels: dict[str, float]) -> tuple[Linearised, Linearised]:
+    """A record with these commands that reads what the calibration predicts, and the part of it that errors count."""
     observer, belief = ground.observer, ground.belief
-    measured = {name: 0.0 for kernel in ground.problem.kernels for name in kernel.factor.output_channels}
     known = {name: value for name, value in channels.items() if np.isfinite(value)}
-    readings = observer.readings({**measured, **known}, {})
+    readings = observer.predicted(belief.origin, known)
     if not readings:
         raise ConfigError(
             "no measurement of the calibration reads a single pose.",
@@ -58,4 +56,5 @@ def _seen(ground: Footing, channels: dict[str, float]) -> Linearised:
         )
     noise = observer.joint_noise(belief.origin, readings)
     mean = belief.gaussian.mean
-    return Seen(observer, belief.origin, mean, readings, noise).at(mean)
+    seen = Seen(observer, belief.origin, mean, readings, noise).at(mean)
+    return seen, of_errors(ground.problem, readings, seen)

@@ -36,9 +36,10 @@ from armcal.online.tracking.settings import RecalibrateSettings
 from armcal.online.tracking.start import Footing, footing
 from armcal.online.tracking.state import REMEMBERED, State
 from armcal.online.tracking.updated import calibration_text, deviations
-from armcal.online.tracking.what_if import worth
+from armcal.online.tracking.what_if import of_errors, worth
 from armcal.plugins import PluginRegistry, discover
 from armcal.solve.online import Linearised, OnlineEstimator, surprise
+from armcal.solve.validation import error_unit
 from armcal.use.calibration import Calibration
 
 _TOO_MANY = 1e-3
@@ -276,17 +277,18 @@ class Recalibrator:
         missing = [name for name in wanted if name not in joints]
         if missing:
             raise DataError(f"found no angle for {', '.join(missing)}.", hint="Give one for each joint.")
-        measured = {c: 0.0 for kernel in observer.problem.kernels for c in kernel.factor.output_channels}
-        readings = observer.readings({**measured, **joints}, {})
+        belief = self.state.belief
+        readings = observer.predicted(belief.origin, joints)
         if not readings:
             raise DataError(
                 "no measurement reads a single pose.", hint="Only instruments foretell what they would tell."
             )
-        belief = self.state.belief
-        told = worth(self._ground.chart, belief, self._advance.seen(belief, readings, ()).at(belief.gaussian.mean))
+        seen = self._advance.seen(belief, readings, ()).at(belief.gaussian.mean)
+        told = worth(self._ground.chart, belief, seen)
+        known = worth(self._ground.chart, belief, of_errors(observer.problem, readings, seen)).deviation
         return {
             "bits": told.bits,
-            "prediction_sd_mm": 1000 * told.deviation,
+            f"prediction_sd_{error_unit(observer.problem)}": 1000 * known,
             "tells_most": dict(told.tells_most),
         }
 

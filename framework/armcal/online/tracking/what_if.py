@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from armcal.online.tracking.belief import Belief
 from armcal.online.tracking.chart import Chart
+from armcal.online.tracking.observer import Reading
 from armcal.solve.online import Linearised
+from armcal.solve.problem import Problem
+from armcal.solve.validation import error_dimension
 
 
 @dataclass(frozen=True)
@@ -25,6 +29,18 @@ class Worth:
     bits: float
     deviation: float
     tells_most: tuple[tuple[str, float], ...]
+
+
+def of_errors(problem: Problem, readings: Sequence[Reading], seen: Linearised) -> Linearised:
+    """The rows of a record that errors count: those of the first measurement that has any in ``error_unit``."""
+    counted, start = error_dimension(problem), 0
+    for reading in readings:
+        dimensions = problem.kernels[reading.factor].factor.dimensions
+        rows = [start + i for i, dimension in enumerate(dimensions) if dimension == counted]
+        if rows:
+            return Linearised(seen.innovation[rows], seen.slope[rows], seen.noise[np.ix_(rows, rows)])
+        start += len(dimensions)
+    return seen
 
 
 def worth(chart: Chart, belief: Belief, seen: Linearised, most: int = 3) -> Worth:
