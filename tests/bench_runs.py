@@ -116,7 +116,7 @@ class BenchRun:
     def acquire(self, asked: Callable[[], bool] = lambda: False, prepared: Prepared | None = None) -> Outcome:
         """Begin or go on."""
         there = (self.out / "journal").is_dir()
-        course = Course(self.out, "resume" if there else "anew", asked, lambda joints: True, lambda progress: None)
+        course = Course(self.out, "resume" if there else "anew", asked, lambda start: True, lambda progress: None, True)
         return acquire(prepared or self.prepared(), self.plan, course)
 
     def acquire_until_killed(self, sleeps: int) -> bool:

@@ -10,6 +10,8 @@ EXIT_BAD_INPUT = 2
 EXIT_NOT_CONVERGED = 3
 EXIT_DO_NOT_USE = EXIT_NOT_CONVERGED
 """A calibration whose verdict is bad is as little use as none."""
+EXIT_INCOMPLETE = 3
+"""It came to its end, and a part of what was asked for is missing: tables, poses, or the safety of a rehearsal."""
 EXIT_STOPPED = 4
 """A measuring run held or parked before its end; it can be resumed."""
 EXIT_INTERRUPTED = 130

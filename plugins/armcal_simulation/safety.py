@@ -7,6 +7,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from armcal.arm.clearance import ClearanceCheck
@@ -56,6 +57,8 @@ class Safety:
         self._past: dict[str, deque[tuple[float, float]]] = {joint: deque() for joint in servos}
         self._first_pulse: tuple[float, str] = (_NO_TIME, "")
         self._logged: set[tuple[str, str]] = set()
+        self._worst: dict[str, tuple[float, dict[str, Any]]] = {}
+        self._dropped: dict[str, float] = {}
         self._moved = False
         self._poses: list[tuple[float, list[float]]] = []
 
@@ -102,10 +105,21 @@ class Safety:
             if margin < -self._settings.clearance_slack:
                 self._offend("clearance", "", now, float(margin), -self._settings.clearance_slack)
 
-    def summary(self) -> dict[str, dict[str, int]]:
-        """Both counters."""
+    def summary(self) -> dict[str, Any]:
+        """Both counters, and the worst of each kind: its joint, and its value and limit as in the log.
+
+        A drop's is how far its joint has fallen (rad) until now.
+        """
         self.judge_clearance()
-        return {"offences": dict(self.offences), "events": dict(self.events)}
+        for joint, angle in self._dropped.items():
+            self._weigh("drop", joint, abs(self._servos[joint].angle - angle), value=self._servos[joint].angle - angle)
+        worst = {kind: told for kind, (_, told) in self._worst.items()}
+        return {"offences": dict(self.offences), "events": dict(self.events), "worst": worst}
+
+    def _weigh(self, kind: str, joint: str, amount: float, **told: float) -> None:
+        """Remember it if it is the worst of its kind."""
+        if kind not in self._worst or amount > self._worst[kind][0]:
+            self._worst[kind] = amount, {"joint": joint, **told}
 
     def _judge_speed(self, joint: str, commit: Commit, angle: float, period: float) -> None:
         window, now, past = self._settings.window, commit.time, self._past[joint]
@@ -141,16 +155,20 @@ class Safety:
             self._offend("energised_together", joint, now, now - last, self._settings.together)
         self._first_pulse = now, joint
         jump = angle - self._servos[joint].angle
+        self._dropped.pop(joint, None)
+        self._weigh("first_pulse", joint, abs(jump), value=jump)
         self._note("first_pulse", joint, now, jump)
 
     def _ended(self, joint: str, now: float, torque: float, friction: float) -> None:
         self._told.pop(joint, None)
         self._past[joint].clear()
         if abs(torque) > friction:
+            self._dropped[joint] = self._servos[joint].angle
             self._note("drop", joint, now, torque)
 
     def _offend(self, kind: str, joint: str, now: float, value: float, limit: float) -> None:
         self.offences[kind] += 1
+        self._weigh(kind, joint, abs(value - limit), value=value, limit=limit)
         if (kind, joint) in self._logged:
             return
         self._logged.add((kind, joint))

@@ -53,7 +53,8 @@ def there(run: BenchRun) -> tuple[str, ...]:
 
 
 def quiet_course(run: BenchRun, **changes: object) -> Course:
-    told = {"asked_to_end": lambda: False, "may_energise": lambda joints: True, "told": lambda progress: None}
+    told = {"asked_to_end": lambda: False, "may_energise": lambda start: True, "told": lambda progress: None}
+    told["unchecked"] = True
     return Course(**{"folder": run.out, "start": "anew", **told, **changes})  # type: ignore[arg-type]
 
 
@@ -138,7 +139,7 @@ class TestRefusedBeforeAnythingMoves:
     def test_nobody_who_can_say_yes(self, run: BenchRun) -> None:
         with run.simulated() as clock:
             words = [word for text in (*run.sets, *there(run)) for word in ("--set", text)]
-            command = [*ACQUIRE, "--plan", str(run.plan)]
+            command = [*ACQUIRE, "--unchecked", "--plan", str(run.plan)]
             done = subprocess.run(
                 [*command, "--out", str(run.out), *words], capture_output=True, text=True, stdin=subprocess.DEVNULL
             )
@@ -233,7 +234,7 @@ class TestRehearsal:
 
 def test_ctrl_c_parks_the_arm_and_resume_measures_the_rest(run: BenchRun) -> None:
     sets = [word for text in (*run.sets, *there(run)) for word in ("--set", text)]
-    command = [*ACQUIRE, "--plan", str(run.plan), "--out", str(run.out)]
+    command = [*ACQUIRE, "--unchecked", "--plan", str(run.plan), "--out", str(run.out)]
     with run.simulated() as clock:
         process = subprocess.Popen([*command, "--yes", *sets], stdout=subprocess.PIPE, text=True)
         until = time.monotonic() + 60

@@ -23,6 +23,7 @@ from armcal.bench.acquisition.ways import Ways
 from armcal.bench.bench import Bench
 from armcal.bench.clock import SimulatedClock
 from armcal.bench.faults import DeviceError, DeviceRefusedError
+from armcal.bench.hazards import FirstMotion
 from armcal.cli.main import cli
 from armcal.config.servo_file import load_servo_file
 from armcal.errors import ArmcalError, InputError
@@ -129,12 +130,12 @@ class TestHostThatStalls:
             assert run.acquire_until_killed(300)
             clock.ask({"fault": {"kind": "silent"}})
 
-            def thinks(joints: tuple[str, ...]) -> bool:
+            def thinks(motion: FirstMotion) -> bool:
                 clock.ask({"advance": 20.0})
                 return True
 
             clock.ask({"fault": {"kind": "seen"}})
-            course = Course(run.out, "resume", never, thinks, lambda progress: None)
+            course = Course(run.out, "resume", never, thinks, lambda progress: None, unchecked=True)
             assert acquire(run.prepared(), run.plan, course).ending.how == "done"
             assert clock.ask({"state": True})["offences"] == {}
 
@@ -204,7 +205,7 @@ class TestJournalThatFails:
             raise fault
 
         with run.simulated() as clock:
-            course = Course(run.out, "anew", never, lambda joints: True, told)
+            course = Course(run.out, "anew", never, lambda start: True, told, unchecked=True)
             with pytest.raises(type(fault)):
                 acquire(run.prepared(), run.plan, course)
             state = clock.ask({"state": True})
@@ -239,12 +240,12 @@ class TestAskedToEnd:
     def test_while_the_question_is_put(self, run: BenchRun) -> None:
         answered = [False]
 
-        def answer(joints: tuple[str, ...]) -> bool:
+        def answer(motion: FirstMotion) -> bool:
             answered[0] = True
             return True
 
         with run.simulated() as clock:
-            course = Course(run.out, "anew", lambda: answered[0], answer, lambda progress: None)
+            course = Course(run.out, "anew", lambda: answered[0], answer, lambda progress: None, unchecked=True)
             with pytest.raises(InputError, match="nothing was moved"):
                 acquire(run.prepared(), run.plan, course)
             assert clock.ask({"state": True})["events"] == {}
@@ -319,7 +320,7 @@ class TestBoard:
                 run.acquire()
         other = BenchRun(tmp_path, (*SETS, "bench.acquisition.settle.window_s=0.9"))
         with other.simulated():
-            course = Course(other.out, "anew", never, lambda joints: True, lambda progress: None)
+            course = Course(other.out, "anew", never, lambda start: True, lambda progress: None, unchecked=True)
             assert acquire(other.prepared(), other.plan, course).ending.how == "done"
 
     def test_pulses_that_are_not_those_that_were_told_are_not_measured(self) -> None:
@@ -423,7 +424,7 @@ class TestNobodyFeelsWhereTheArmIs:
                 return len(seen)
 
             seen: list[Any] = []
-            course = Course(run.out, "anew", asked, lambda joints: True, seen.append)
+            course = Course(run.out, "anew", asked, lambda start: True, seen.append, unchecked=True)
             with pytest.MonkeyPatch.context() as patch:
                 patch.setattr(TrackerEyes, "settled", slipped)
                 outcome = acquire(run.prepared(), run.plan, course)

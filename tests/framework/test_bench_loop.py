@@ -74,6 +74,7 @@ def loop(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Loop]:
     found.armcal("plan", config, "--candidates", candidates, "--poses", str(FRESH), "--out", found.fresh)
     with simulated_bench(config, ports, folder / "bench"):
         found.armcal("servo", config, "--out", folder / "servo", "--yes", "--set", "bench.servo.step_deg=20")
+        found.armcal("servo", config, "--check", "--yes", "--set", "bench.servo.base={q2: 30 deg, q4: -40 deg}")
         found.armcal("acquire", config, "--plan", found.plan, "--out", folder / "runs", "--yes")
         found.armcal("acquire", config, "--plan", found.fresh, "--out", folder / "again", "--yes")
     found.armcal("run", config, "--data", "runs/dataset.csv", "--out", "calibrated")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,8 @@ import numpy as np
 import pytest
 import yaml
 from armcal.bench.clock import SimulatedClock
+from armcal.bench.waiting import Waits
+from click.testing import Result
 
 from tests.own_arms import POST, POST_SERVOS, TOWER, TOWER_SERVOS, OwnArm
 
@@ -149,3 +152,186 @@ class TestPulsesThatNoServoBears:
         said = " ".join(refused.output.split())
         assert refused.exit_code == 2 and "b, at 50.0 deg, needs a pulse of 2625 us" in said, refused.output
         assert post.first_pulses() == 0
+
+
+@pytest.fixture(scope="module")
+def calibrated(tmp_path_factory: pytest.TempPathFactory) -> OwnArm:
+    """An arm that was checked, and of which one servo was calibrated then."""
+    arm = OwnArm(tmp_path_factory.mktemp("calibrated"), POST)
+    with arm.run.simulated():
+        assert arm.armcal("servo", "--check", "--yes").exit_code == 0
+        assert arm.armcal("servo", "--out", arm.out, "--yes", sets=FEW).exit_code == 0
+    return arm
+
+
+@pytest.fixture(params=[pytest.param(TOWER, marks=pytest.mark.slow), POST], ids=["tower", "post"])
+def either(request: pytest.FixtureRequest, tmp_path: Path) -> OwnArm:
+    """One of the two arms; its bench does not run yet."""
+    return OwnArm(tmp_path, request.param)
+
+
+def said_by(result: Result) -> str:
+    return " ".join(result.output.split())
+
+
+def dangers(arm: OwnArm, plan: Path, *sets: str) -> dict[str, Any]:
+    """What a dry run says to programs."""
+    return dict(json.loads(arm.armcal("acquire", "--plan", plan, "--dry-run", "--json", "-q", sets=sets).output))
+
+
+class TestUncheckedWiring:
+    def test_exchanged_plugs_are_not_driven_until_they_are_put_right_and_seen(self, tmp_path: Path) -> None:
+        """The plan keeps within the limits of b and c; exchanged, b is driven 25 degrees beyond its own."""
+        arm = OwnArm(tmp_path, POST)
+        arm.swap("b", "c")
+        plan = arm.plan((0, 30, 85))
+        drive = ("acquire", "--plan", plan, "--out", arm.out, "--yes")
+        with arm.run.simulated() as clock:
+            bench = Bench(arm, clock)
+            refused = arm.armcal(*drive)
+            assert refused.exit_code == 2 and "(a, b, c: never checked); nothing was moved" in said_by(refused)
+            assert bench.first_pulses() == 0
+            assert arm.armcal("servo", "--check", "--yes").exit_code == 1
+            refused = arm.armcal(*drive)
+            assert refused.exit_code == 2 and "(b, c: the last check did not find it right)" in said_by(refused)
+            assert "limits" not in bench.offences()
+            text = arm.servos.read_text().replace("channel: 1", "channel: 9").replace("channel: 2", "channel: 1")
+            arm.servos.write_text(text.replace("channel: 9", "channel: 2"))
+            assert arm.armcal(*drive).exit_code == 2  # put right, but not seen
+            assert arm.armcal("servo", "--check", "--yes").exit_code == 0
+            assert arm.armcal(*drive).exit_code == 0
+            assert bench.offences() == {}
+
+    @pytest.mark.slow
+    def test_what_it_is_refused_for_is_real(self, tmp_path: Path) -> None:
+        arm = OwnArm(tmp_path, POST)
+        arm.swap("b", "c")
+        plan = arm.plan((0, 30, 85))
+        with arm.run.simulated() as clock:
+            arm.armcal("acquire", "--plan", plan, "--out", arm.out, "--yes", "--unchecked")
+            worst = clock.ask({"state": True})["worst"]["limits"]
+        assert worst["joint"] == "b" and math.degrees(worst["value"]) == pytest.approx(85, abs=1)
+
+    def test_a_check_outlasts_armcals_own_changes_and_no_others(self, calibrated: OwnArm) -> None:
+        plan, servos = calibrated.plan((0, 0, 0)), calibrated.servos.read_text()
+        record = calibrated.folder / "servos.yaml.checked"
+        assert servos != POST_SERVOS and dangers(calibrated, plan)["unchecked"] == ""
+        calibrated.servos.write_text(servos.replace("channel: 0", "channel: 5"))
+        assert "(a: changed since it was checked)" in dangers(calibrated, plan)["unchecked"]
+        calibrated.servos.write_text(servos)
+        seen = record.read_text()
+        record.write_text("{torn")
+        assert "(a, b, c: never checked)" in dangers(calibrated, plan)["unchecked"]
+        record.write_text(seen)
+
+
+class TestFirstAndLastMotion:
+    def test_jump_and_fall_are_foretold_as_the_simulated_arm_then_bears_them(self, either: OwnArm) -> None:
+        plan = either.plan((0,) * len(either.kind["joints"]))
+        foretold = {each["kind"]: each for each in dangers(either, plan)["hazards"]}
+        done = either.armcal("rehearse", "--plan", plan, "--out", either.out)
+        said = said_by(done)
+        assert done.exit_code == 0, done.output
+        fell = re.search(r"the deepest fall when let go: (\w+) (-?[\d.]+) deg", said)
+        jumped = re.search(r"the largest jump at a first pulse: (\w+) (-?[\d.]+) deg", said)
+        assert fell and jumped
+        assert fell[1] == foretold["drop"]["joint"]
+        assert abs(float(fell[2])) == pytest.approx(foretold["drop"]["amount_deg"], abs=2)
+        assert abs(float(jumped[2])) <= foretold["first_pulse"]["amount_deg"]
+        for kind in ("drop", "first_pulse"):
+            amount = f"{foretold[kind]['amount_deg']:.1f} deg"
+            assert foretold[kind]["joint"] in foretold[kind]["what"] and amount in foretold[kind]["what"]
+            assert " ".join(foretold[kind]["what"].split()) in said
+
+    def test_servos_that_hold_are_not_let_go_and_so_nothing_falls(self, tmp_path: Path) -> None:
+        arm = OwnArm(tmp_path, POST)
+        kinds = [each["kind"] for each in dangers(arm, arm.plan((0, 0, 0)), "bench.acquisition.at_end=hold")["hazards"]]
+        assert kinds == ["first_pulse"]
+
+    def test_a_park_pose_in_which_a_servo_would_not_cool_is_refused(self, tmp_path: Path) -> None:
+        arm = OwnArm(tmp_path, POST)
+        for words in (("acquire", "--dry-run"), ("rehearse", "--out", arm.out)):
+            refused = arm.armcal(*words, "--plan", arm.plan((0, 0, 0)), sets=(TOO_HOT,))
+            assert refused.exit_code == 2 and "the servo of b would not cool where the arm parks" in said_by(refused)
+            assert "at 30.2 deg" in said_by(refused)
+
+    def test_a_powered_arm_is_not_moved_unasked_and_where_it_stands_is_judged(self, post: Bench) -> None:
+        arm, clock = post.arm, post.clock
+        sets = ("bench.acquisition.at_end=hold", "bench.acquisition.lost={hold_s: 0.3, park_s: 2}")
+        run = ("acquire", "--plan", arm.plan((0, 50, 0), (10, 20, 10)), "--out", arm.out)
+        first = arm.armcal("servo", "--check", "--yes", sets=("bench.servo.base={b: 50 deg}",))
+        assert first.exit_code == 0 and re.search(r"its first pulse turns b by 12\d\.\d deg", said_by(first))
+        clock.ask({"fault": {"kind": "lost", "at": clock.ask({"advance": 0})["now"] + 4}})
+        parked = arm.armcal(*run, "--yes", sets=sets)
+        assert parked.exit_code == 4, parked.output
+        clock.ask({"fault": {"kind": "seen"}})
+        pulses = clock.ask({"state": True})["pulses_s"]
+        unasked = arm.armcal(*run, "--resume", sets=sets)
+        assert unasked.exit_code == 2 and "have pulses, and nobody can be asked" in said_by(unasked)
+        assert clock.ask({"state": True})["pulses_s"] == pulses and all(pulses.values())
+        narrow = ("plan.limits.b=[-20 deg, 20 deg]", "bench.acquisition.park={}", *sets)
+        other = ("acquire", "--plan", arm.plan((0, 10, 0)), "--out", arm.folder / "other")
+        moved = arm.armcal(*other, "--yes", sets=narrow)
+        assert moved.exit_code == 0 and "b stands at 30.2 deg, 10.2 deg beyond its limits" in said_by(moved)
+
+
+class TestWhatIsMissingIsNoSuccess:
+    def test_a_plan_of_which_some_poses_could_not_be_measured(self, post: Bench) -> None:
+        """None comes to stand as still as is asked for."""
+        arm, clock = post.arm, post.clock
+        plan = arm.plan((0, 30, 20), (80, 0, 60))
+        sets = ("bench.acquisition.settle.longest_s=3", "bench.acquisition.settle.spread_mm=0.0001")
+        done = arm.armcal("acquire", "--plan", plan, "--out", arm.out, "--yes", "--unchecked", sets=sets)
+        said = said_by(done)
+        assert done.exit_code == 3, done.output
+        assert "2 of 2 poses are missing" in said and "pose p2 is tried again later" in said
+        again = arm.armcal("acquire", "--plan", plan, "--out", arm.out, "--yes", "--unchecked", "--resume", sets=sets)
+        assert again.exit_code == 3  # nor is it one when it is asked again
+        assert clock.ask({"state": True})["offences"] == {}
+
+    def test_a_calibration_of_which_some_tables_could_not_be_told(self, calibrated: OwnArm) -> None:
+        """One joint was measured; what there is is fitted for all three."""
+        done = calibrated.armcal("servo", "--out", calibrated.out, "--evaluate")
+        assert done.exit_code == 3, done.output
+        assert "1 of 3 tables were found; those of a, b are left as they were" in said_by(done)
+        pulses = calibrated.pulses()
+        assert pulses["a"] == [600, 1500, 2400] and pulses["c"] != [600, 1500, 2400]
+
+    @pytest.mark.slow
+    def test_a_rehearsal_in_which_something_was_unsafe(self, tmp_path: Path) -> None:
+        """The true servo of b turns a tenth farther than its table says."""
+        arm = OwnArm(tmp_path, POST)
+        truth = yaml.safe_load(POST_SERVOS)
+        truth["servos"]["b"]["angles_deg"] = [-110, 0, 110]
+        (tmp_path / "true.yaml").write_text(yaml.safe_dump(truth))
+        done = arm.armcal("rehearse", "--plan", arm.plan((0, 59, 0)), "--out", arm.out)
+        assert done.exit_code == 3, done.output
+        assert re.search(r"limits \d+ times \(worst: b 64\.[5-9] deg, where 62\.0 deg is the limit\)", said_by(done))
+
+
+class TestWhatIsWaitedFor:
+    def test_a_lost_tracker_and_a_lost_board_are_named_at_once_with_the_time_that_is_left(self, post: Bench) -> None:
+        arm, clock = post.arm, post.clock
+        for kind, at in (("lost", 6), ("seen", 8), ("unplug", 14), ("replug", 17)):
+            clock.ask({"fault": {"kind": kind, "at": at}})
+        plan = arm.plan((60, 30, 20), (-60, -30, 60), (60, 0, 0))
+        done = arm.armcal("acquire", "--plan", plan, "--out", arm.out, "--yes", "--unchecked")
+        said = said_by(done)
+        assert done.exit_code == 0, done.output
+        assert re.search(r"the arm holds: .*tool body .*; waiting for up to (29|30) s\. going on after [12] s\.", said)
+        assert re.search(r"the device is looked for: .*; waiting for up to 30 s\. going on after [1-4] s\.", said)
+
+    def test_a_long_one_is_named_again_each_minute(self) -> None:
+        said: list[str] = []
+        waits = Waits(said.append)
+        for second in range(200):
+            waits.goes_on("rest", "the servos rest", 200.0 - second, float(second))
+        waits.over("rest", 200.0)
+        waits.over("rest", 201.0)
+        assert [line.split("; ")[-1] for line in said] == [
+            "waiting for up to 3 min.",
+            "waiting for 60 s now, for up to 2 min more.",
+            "waiting for 2 min now, for up to 80 s more.",
+            "waiting for 3 min now, for up to 20 s more.",
+            "going on after 3 min.",
+        ]

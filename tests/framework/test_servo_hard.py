@@ -270,14 +270,8 @@ class TestTracker:
 
 def _of_mover(setup: Setup) -> tuple[Any, ...]:
     read_by = {joint: (setup.known(joint), setup.file.boards["front"].clock) for joint in setup.base}
-    clock = FakeClock()
-    return (
-        clock,
-        read_by,
-        read_by,
-        Motion(0.3, 0.02, {joint: setup.pulses_of(joint) for joint in setup.base}),
-        lambda: False,
-    )
+    clock, pulses = FakeClock(), {joint: setup.pulses_of(joint) for joint in setup.base}
+    return clock, read_by, read_by, Motion(0.3, 0.02, pulses), lambda: False
 
 
 @pytest.mark.slow

@@ -9,6 +9,7 @@ import pytest
 from armcal.arm.servo import PulseClock, PulseTable, quantised
 from armcal.bench.device import JointDevice, PulseDevice
 from armcal.bench.faults import DeviceError, DeviceLostError, DeviceRefusedError, DeviceResetError
+from armcal.config.servo_file import ServoFile
 from armcal.errors import ConfigError
 from armcal_pca9685.device import Pca9685Device
 from board_bench import JOINTS, LRM_PULSES_US, Clock, ModelLink, servo_file, written
@@ -95,6 +96,25 @@ def test_what_stands_can_be_commanded_again_at_the_ends_too(tmp_path):
         before = [link.chips[0].pulse_s(i) for i in range(len(JOINTS))]
         device.command(device.standing(standing))
         assert [link.chips[0].pulse_s(i) for i in range(len(JOINTS))] == before
+
+
+@pytest.mark.parametrize("oscillator_hz", [23.7e6, 25e6, 26.3e6])
+def test_the_nearest_count_is_never_one_that_the_servo_does_not_bear(tmp_path, oscillator_hz):
+    """Tables that end where the range does: half a count beyond is beyond."""
+    file = servo_file((oscillator_hz,))
+    ends = {joint: (servo.pulses[0], servo.pulses[-1]) for joint, servo in file.servos.items()}
+    borne = {j: type(s).si(**{**s.model_dump(), "pulse_range": ends[j]}) for j, s in file.servos.items()}
+    clock = Clock()
+    link = ModelLink(clock, (oscillator_hz,))
+    settings = Pca9685Device.Settings(servos=written(tmp_path, ServoFile(file.boards, borne)))
+    device = Pca9685Device(settings, JOINTS, link)
+    device.open(clock)
+    for angle in np.radians([-100, 100]):
+        for channel, joint in enumerate(JOINTS):
+            device.energise(joint, float(angle))
+            assert ends[joint][0] - 1e-12 <= link.chips[0].pulse_s(channel) <= ends[joint][1] + 1e-12
+            with pytest.raises(DeviceRefusedError, match=f"pulse of .* for {joint}, expected .* which its servo bears"):
+                device.set_pulse(joint, ends[joint][1] + 5e-6)
 
 
 def test_outside_a_table_is_refused_and_nothing_moves(tmp_path):

@@ -13,11 +13,13 @@ import numpy as np
 from armcal.bench.acquisition.outputs import DATASET
 from armcal.bench.acquisition.preparation import Prepared, prepare
 from armcal.bench.acquisition.progress import Progress
+from armcal.bench.acquisition.run_log import Start
 from armcal.bench.acquisition.schedule import LeaveOut, Measure, Outlook, foretell
 from armcal.bench.acquisition.session import Course, Outcome, acquire
+from armcal.bench.wiring import check_wiring
 from armcal.cli.common import Voice, overrides, speaking
-from armcal.cli.energising import Question, energise_option
-from armcal.errors import EXIT_DONE, EXIT_STOPPED, InputError
+from armcal.cli.energising import Question, energise_option, show_hazards, waits, warned
+from armcal.errors import EXIT_DONE, EXIT_INCOMPLETE, EXIT_STOPPED, InputError
 from armcal.online.running.signals import Signals
 from armcal.plugins import discover
 from armcal.run.experiment import Experiment
@@ -33,6 +35,7 @@ _ANGLE = 180 / np.pi
 @click.option("--out", type=_FILE, help="The folder to keep data and journal in.")
 @click.option("--resume", is_flag=True, help="Go on with the run in that folder.")
 @click.option("--dry-run", is_flag=True, help="Say what the run would take, and open nothing.")
+@click.option("--unchecked", is_flag=True, help="Drive servos too that armcal servo --check has not seen to be right.")
 @energise_option
 @overrides
 @speaking
@@ -43,6 +46,7 @@ def acquire_command(
     out: Path | None,
     resume: bool,
     dry_run: bool,
+    unchecked: bool,
     may_energise: Question,
     overrides: tuple[str, ...],
 ) -> None:
@@ -53,16 +57,23 @@ def acquire_command(
     prepared = prepare(experiment, plan)
     outlook = outlook_of(prepared)
     if dry_run:
-        voice.result(_foretold(prepared, outlook))
-        show_outlook(voice, prepared, outlook)
+        _foretell(voice, prepared, outlook)
         return
     if out is None:
         raise InputError("found no --out.", hint="Say where data and journal are to be kept, or give --dry-run.")
     if not voice.json:
         show_outlook(voice, prepared, outlook)
-    outcome = driven(voice, prepared, plan, out, "resume" if resume else "anew", may_energise)
+    start: Start = "resume" if resume else "anew"
+    outcome = driven(voice, prepared, plan, (out, start), may_energise, unchecked=unchecked)
     show_outcome(voice, outcome, config, out)
-    sys.exit(EXIT_DONE if outcome.ending.how == "done" else EXIT_STOPPED)
+    sys.exit(exit_code_of(outcome))
+
+
+def exit_code_of(outcome: Outcome) -> int:
+    """Done, done without some of the poses, or stopped before the end."""
+    if outcome.ending.how != "done":
+        return EXIT_STOPPED
+    return EXIT_INCOMPLETE if outcome.summary["left_out"] else EXIT_DONE
 
 
 def outlook_of(prepared: Prepared) -> Outlook:
@@ -71,10 +82,13 @@ def outlook_of(prepared: Prepared) -> Outlook:
     return foretell(scheduler, scheduler.park, scheduler.model.cold, list(range(len(scheduler.ids))))
 
 
-def driven(voice: Voice, prepared: Prepared, plan: Path, out: Path, start: Any, question: Question) -> Outcome:
-    """The run, with a progress line, and signals that park the arm."""
+def driven(
+    voice: Voice, prepared: Prepared, plan: Path, to: tuple[Path, Start], question: Question, *, unchecked: bool
+) -> Outcome:
+    """The run, into a folder, with a progress line, and signals that park the arm."""
     with Signals() as signals, voice.progress() as show:
-        course = Course(out, start, lambda: signals.finish, question, _teller(prepared, show))
+        tell = _teller(prepared, show)
+        course = Course(*to, lambda: signals.finish, warned(voice, question), tell, unchecked, waits(voice))
         return acquire(prepared, plan, course)
 
 
@@ -114,7 +128,13 @@ def show_outcome(voice: Voice, outcome: Outcome, config: Path, out: Path) -> Non
         voice.warn(f"pose {name} was left out: {why}.")
     if outcome.ending.how != "done":
         voice.out.print("Go on with --resume.", markup=False)
-    elif summary["measured"]:
+        return
+    if summary["left_out"]:
+        voice.warn(
+            f"{len(summary['left_out'])} of {summary['poses']} poses are missing. Mend what is said of them, and "
+            "measure them with another --out."
+        )
+    if summary["measured"]:
         voice.out.print(f"next: armcal run {config} --data {out / DATASET} --out DIR", markup=False, soft_wrap=True)
 
 
@@ -125,6 +145,24 @@ def _teller(prepared: Prepared, show: ShowProgress) -> Callable[[Progress], None
         show("measuring", (len(progress.measured) + len(progress.left_out)) / total)
 
     return tell
+
+
+def _foretell(voice: Voice, prepared: Prepared, outlook: Outlook) -> None:
+    """What a run would take, and what is dangerous in it, as far as that is known without a device."""
+    hazards = prepared.judge.first_motion({}, {}, releases=prepared.settings.at_end == "release").hazards
+    unchecked = ""
+    try:
+        check_wiring(prepared.bench, prepared.device.joint_names)
+    except InputError as fault:
+        unchecked = str(fault)
+    dangers = {"hazards": [hazard.content for hazard in hazards], "unchecked": unchecked}
+    voice.result({**_foretold(prepared, outlook), **dangers})
+    show_outlook(voice, prepared, outlook)
+    if voice.json:  # the dangers stand in the result
+        return
+    show_hazards(voice, hazards)
+    if unchecked:
+        voice.warn(f"armcal acquire would refuse this: {unchecked}")
 
 
 def _foretold(prepared: Prepared, outlook: Outlook) -> dict[str, Any]:

@@ -1,43 +1,69 @@
-"""The question before servos get their first pulses."""
+"""The question before the arm moves for the first time."""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any, TypeVar
 
 import click
 
+from armcal.bench.hazards import FirstMotion, Hazard
+from armcal.bench.waiting import Waits
+from armcal.cli.common import Voice
 from armcal.errors import InputError
 
 F = TypeVar("F", bound=Callable[..., Any])
-Question = Callable[[tuple[str, ...]], bool]
-"""Whether joints that get no pulses may be energised."""
+Question = Callable[[FirstMotion], bool]
+"""Whether the arm may be moved."""
 
 
-def always(joints: tuple[str, ...]) -> bool:
+def always(motion: FirstMotion) -> bool:
     """Nobody is asked."""
     return True
 
 
-def asked(joints: tuple[str, ...]) -> bool:
-    """Whether somebody at the terminal says that these joints may be energised.
+def asked(motion: FirstMotion) -> bool:
+    """Whether somebody at the terminal says that the arm may be moved.
 
     Raises:
         InputError: there is nobody.
     """
-    named = ", ".join(joints)
+    named = ", ".join(motion.free or motion.powered)
+    pulses = "get no pulses yet" if motion.free else "have pulses"
     if not sys.stdin.isatty():
         raise InputError(
-            f"{named} get no pulses yet, and nobody can be asked whether they may; nothing was moved.",
+            f"{named} {pulses}, and nobody can be asked whether the arm may be moved; nothing was moved.",
             hint="Stand clear of the arm and give --yes.",
         )
-    click.echo(
-        f"{named} get no pulses yet. A servo tells nobody where it stands, so each may jump when its first pulse "
-        "comes, one after the other.",
-        err=True,
+    jumps = (
+        "A servo tells nobody where it stands, so each may jump when its first pulse comes, one after the other."
+        if motion.free
+        else "The arm moves as soon as you say yes."
     )
+    click.echo(f"{named} {pulses}. {jumps}", err=True)
     return click.confirm("Is everybody clear of the arm?", err=True)
+
+
+def warned(voice: Voice, question: Question) -> Question:
+    """The question, after what is dangerous has been named: whoever gave --yes reads it too."""
+
+    def ask(motion: FirstMotion) -> bool:
+        show_hazards(voice, motion.hazards)
+        return question(motion)
+
+    return ask
+
+
+def waits(voice: Voice) -> Waits:
+    """What is waited for, on standard error: a progress bar alone does not say that."""
+    return Waits(lambda text: voice.err.print(text, markup=False, soft_wrap=True))
+
+
+def show_hazards(voice: Voice, hazards: Iterable[Hazard]) -> None:
+    """A warning line each."""
+    for hazard in hazards:
+        voice.warn(hazard.sentence)
 
 
 def energise_option(command: F) -> F:
@@ -47,5 +73,5 @@ def energise_option(command: F) -> F:
         "may_energise",
         is_flag=True,
         callback=lambda ctx, option, yes: always if yes else asked,
-        help="Energise the joints without asking.",
+        help="Move the arm without asking.",
     )(command)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from pathlib import Path
 from typing import Any
@@ -11,14 +12,15 @@ import click
 from armcal.bench.acquisition.outputs import BENCH, OURS
 from armcal.bench.acquisition.preparation import prepare
 from armcal.bench.acquisition.rehearsal import overrides_for, port_instead_of_adapter, simulated_bench, truth
-from armcal.cli.acquire import driven, outlook_of, show_outcome, show_outlook
+from armcal.cli.acquire import driven, exit_code_of, outlook_of, show_outcome, show_outlook
 from armcal.cli.common import Voice, overrides, speaking
 from armcal.cli.energising import always
-from armcal.errors import EXIT_DONE, EXIT_STOPPED
+from armcal.errors import EXIT_DONE, EXIT_INCOMPLETE
 from armcal.plugins import discover
 from armcal.run.experiment import Experiment
 from armcal.run.folder import check_folder
 
+_ANGLE = 180 / math.pi
 _FILE = click.Path(path_type=Path)
 
 
@@ -40,16 +42,45 @@ def rehearse(voice: Voice, config: Path, plan: Path, out: Path, overrides: tuple
     if not voice.json:
         show_outlook(voice, prepared, outlook_of(prepared))
     with simulated_bench(config, overrides, bench):
-        outcome = driven(voice, prepared, plan, out, "anew", always)
+        outcome = driven(voice, prepared, plan, (out, "anew"), always, unchecked=True)
         found = truth(bench)
     outcome.summary["truth"] = found
     show_outcome(voice, outcome, config, out)
     _show_truth(voice, found)
-    sys.exit(EXIT_DONE if outcome.ending.how == "done" else EXIT_STOPPED)
+    code = exit_code_of(outcome)
+    sys.exit(EXIT_INCOMPLETE if code == EXIT_DONE and any(found.get("offences", {}).values()) else code)
 
 
 def _show_truth(voice: Voice, found: dict[str, Any]) -> None:
-    """What the simulated arm had to bear."""
-    offences = found.get("offences", {})
-    told = ", ".join(f"{kind} {count} times" for kind, count in offences.items() if count) or "nothing"
-    voice.out.print(f"on the simulated arm's side, unsafe was: {told}.", markup=False, soft_wrap=True)
+    """What the simulated arm had to bear: how often, and the worst of each kind."""
+    offences, worst = found.get("offences", {}), found.get("worst", {})
+    counted = [f"{kind} {count} times{_worst(kind, worst)}" for kind, count in offences.items() if count]
+    voice.out.print(
+        f"on the simulated arm's side, unsafe was: {'; '.join(counted) or 'nothing'}.", markup=False, soft_wrap=True
+    )
+    for kind, what in (("first_pulse", "the largest jump at a first pulse"), ("drop", "the deepest fall when let go")):
+        if kind in worst:
+            voice.out.print(f"{what}: {_amount(kind, worst[kind])}.", markup=False, soft_wrap=True)
+
+
+_UNITS = {
+    **dict.fromkeys(("limits", "first_pulse", "drop"), (_ANGLE, "deg")),
+    "speed": (_ANGLE, "deg/s"),
+    "clearance": (1e3, "mm"),
+    "pulse": (1e6, "us"),
+    "heat": (1e2, "% of what the servo bears"),
+    "energised_together": (1.0, "s apart"),
+}
+"""Of the bench's own account: what its numbers are multiplied by, and the unit that they then have."""
+
+
+def _worst(kind: str, worst: dict[str, Any]) -> str:
+    if kind not in worst:
+        return ""
+    factor, unit = _UNITS.get(kind, (1.0, ""))
+    return f" (worst: {_amount(kind, worst[kind])}, where {factor * worst[kind]['limit']:.1f} {unit} is the limit)"
+
+
+def _amount(kind: str, entry: dict[str, Any]) -> str:
+    factor, unit = _UNITS.get(kind, (1.0, ""))
+    return f"{entry['joint'] or 'the arm'} {factor * entry['value']:.1f} {unit}".rstrip()

@@ -21,10 +21,11 @@ from armcal.bench.servo.record import NAME
 from armcal.bench.servo.session import Conversation, adapter_of, evaluated, measure, park, tried
 from armcal.bench.servo.setup import Setup
 from armcal.bench.servo.trial import Verdict, swapped
+from armcal.bench.wiring import carry_over
 from armcal.cli.common import Voice, overrides, speaking
-from armcal.cli.energising import Question, energise_option
+from armcal.cli.energising import Question, energise_option, waits, warned
 from armcal.cli.outlet import say
-from armcal.errors import EXIT_FAULT, EXIT_STOPPED, InputError
+from armcal.errors import EXIT_FAULT, EXIT_INCOMPLETE, EXIT_STOPPED, InputError
 from armcal.online.running.signals import Signals
 from armcal.plugins import discover
 from armcal.run.experiment import Experiment
@@ -88,11 +89,26 @@ def _calibrated(voice: Voice, setup: Setup, out: Path, how: str | None, keep: bo
     content = results(outcome, changed)
     write_results(out, content)
     kept = None if keep else write_servo_file(setup.path, changed)
+    if kept is not None:
+        carry_over(setup.path, setup.file, changed)
     written = {"servo_file": str(setup.path), "before": None if kept is None else str(kept)}
     voice.result({**content, **written})
     _show(voice, outcome, content)
     if kept is not None:
         voice.out.print(f"{setup.path}: written; the one before is {kept.name}", markup=False, soft_wrap=True)
+    _exit_if_incomplete(voice, setup, content)
+
+
+def _exit_if_incomplete(voice: Voice, setup: Setup, content: Mapping[str, Any]) -> None:
+    """Tables that were asked for and are not there must not look like a success to a script."""
+    left = [joint for joint in setup.joints if not content["servos"].get(joint, {"written": False})["written"]]
+    if left:
+        found = len(setup.joints) - len(left)
+        voice.warn(
+            f"{found} of {len(setup.joints)} tables were found; those of {', '.join(left)} are left as they were. Why "
+            "is said above: mend that, and give the same command again."
+        )
+        sys.exit(EXIT_INCOMPLETE)
 
 
 def _checked(voice: Voice, setup: Setup, talk: Conversation, seen: str) -> None:
@@ -133,7 +149,8 @@ def _talking(voice: Voice, setup: Setup, may_energise: Question) -> Iterator[Con
         say(text, err=voice.json)
 
     with Signals() as signals, voice.progress() as show:
-        yield Conversation(lambda: signals.finish, may_energise, _teller(show), heard, lambda: wishes_from(0))
+        may_move = warned(voice, may_energise)
+        yield Conversation(lambda: signals.finish, may_move, _teller(show), heard, lambda: wishes_from(0), waits(voice))
 
 
 def _teller(show: Progress) -> Callable[[str, int, int], None]:

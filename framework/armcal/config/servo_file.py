@@ -178,7 +178,7 @@ class ServoFile:
                 found = f"found channel {servo.channel}, which {first!r} has, expected its own"
                 raise ServoFileError(found, ("servos", joint, "channel"))
             try:
-                _check_borne(servo)
+                _check_borne(servo, self.boards[servo.board].clock)
                 _check_longest(servo.table, self.boards[servo.board].clock)
             except ValueError as fault:
                 raise ServoFileError(str(fault), ("servos", joint, "pulses")) from fault
@@ -247,8 +247,13 @@ def digest(servos: Mapping[str, CalibratedServo]) -> str:
     return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
 
 
-def _check_borne(servo: ServoSettings) -> None:
+def _check_borne(servo: ServoSettings, clock: PulseClock) -> None:
     low, high = servo.pulse_range
+    if high - low < 2 * clock.tick:
+        raise ValueError(
+            f"found a pulse_range of {1e6 * (high - low):g} us, expected more than two counts of the board, "
+            f"{2e6 * clock.tick:.1f} us"
+        )
     outside = [pulse for pulse in servo.pulses if not low <= pulse <= high]
     if outside:
         raise ValueError(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
@@ -22,6 +22,7 @@ from armcal.bench.acquisition.watch import Blind, Patient, Watch
 from armcal.bench.clock import Clock
 from armcal.bench.faults import DeviceError
 from armcal.bench.settling import Settled
+from armcal.bench.waiting import Waits
 
 T = TypeVar("T")
 _TRIES = 2
@@ -69,6 +70,7 @@ class Parts:
     patient: Patient
     told: Callable[[Progress], None]
     arrival: Arrival | None = None
+    waits: Waits = field(default_factory=Waits)
 
 
 class Conduct:
@@ -135,14 +137,18 @@ class Conduct:
             self._measure(step)
 
     def _rest(self, step: Rest) -> None:
-        drive = self._parts.drive
+        drive, waits, now = self._parts.drive, self._parts.waits, self._parts.clock.now
+        until, why = now() + step.seconds, f"the servos rest where the arm parks: {drive.hottest}"
         self._told("rest", f"the servos rest for {step.seconds / 60:.1f} min")
+        waits.goes_on("rest", why, step.seconds, now())
         drive.go(step.way, self._parts.patient)
         drive.note()
         while True:  # a second at least: whoever comes to rest here again and again must let time pass
             drive.stand(1.0, self._parts.patient)
             if not drive.hotter_than(step.warmth):
+                waits.over("rest", now())
                 return
+            waits.goes_on("rest", why, max(until - now(), 1.0), now())
 
     def _measure(self, step: Measure) -> None:
         drive, name = self._parts.drive, self._parts.scheduler.ids[step.pose]
@@ -239,7 +245,9 @@ class Conduct:
         if self._tries[pose] >= _TRIES:
             self._leave_out(pose, why)
             return
-        self._told("later", f"pose {self._parts.scheduler.ids[pose]} is tried again later: {why}")
+        sentence = f"pose {self._parts.scheduler.ids[pose]} is tried again later: {why}"
+        self._told("later", sentence)
+        self._parts.waits.say(f"{sentence}.")
         self._left.remove(pose)
         self._left.append(pose)
 

@@ -201,8 +201,17 @@ class Drive:
             TooHot: they are not.
         """
         if self._model.over(self.warmth):
-            hottest = self._joints[int(np.argmax(self._model.heat(self.warmth) / self._model.budget))]
-            raise TooHot(f"the servo of {hottest} has come to its budget")
+            raise TooHot(f"the servo of {self._hottest} has come to its budget")
+
+    @property
+    def hottest(self) -> str:
+        """The servo that is nearest to its budget, in words."""
+        share = float(np.max(self._model.heat(self.warmth) / self._model.budget))
+        return f"that of {self._hottest} is at {100 * share:.0f} % of its budget"
+
+    @property
+    def _hottest(self) -> str:
+        return self._joints[int(np.argmax(self._model.heat(self.warmth) / self._model.budget))]
 
     def hotter_than(self, warmth: Array) -> bool:
         """Whether a servo is hotter than with some warmth (joints x 2), and cools still where the arm stands."""

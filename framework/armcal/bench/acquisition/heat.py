@@ -78,6 +78,11 @@ class HeatModel:
         """Whether a servo is above its budget."""
         return bool(np.any(self.heat(warmth) > self.budget))
 
+    def too_hot_for_ever(self, torque: Array, part: float = 1.0) -> int | None:
+        """The first servo that stays above a part of its budget under a torque (joints, N m); None if none does."""
+        over = self.steady(torque)[:, 0] > part * self.budget
+        return int(np.argmax(over)) if over.any() else None
+
     def cooled_in(self, warmth: Array, torque: Array, wanted: Array) -> float:
         """Seconds of holding a torque until no heat is above what is wanted (joints); infinite if it never comes so."""
 

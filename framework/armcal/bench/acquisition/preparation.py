@@ -20,6 +20,7 @@ from armcal.bench.acquisition.ways import Ways
 from armcal.bench.bench import Bench
 from armcal.bench.device import JointDevice
 from armcal.bench.faults import DeviceRefusedError
+from armcal.bench.hazards import HazardJudge
 from armcal.errors import ConfigError, DataError, Location
 from armcal.run.experiment import Experiment
 from armcal.run.plan_clearance import clearance_check
@@ -39,6 +40,7 @@ class Prepared:
         ways: between poses.
         heat: the servos' model, and the torques that heat them.
         arrival: whether the arm is where it was told to be.
+        judge: of what is dangerous in the first motions and the last.
     """
 
     bench: Bench
@@ -48,6 +50,7 @@ class Prepared:
     ways: Ways
     heat: tuple[HeatModel, Torques]
     arrival: Arrival
+    judge: HazardJudge
 
     @property
     def settings(self) -> AcquisitionSettings:
@@ -82,6 +85,7 @@ def prepare(experiment: Experiment, plan: Path) -> Prepared:
             hint="Choose another.",
         )
     heat = heat_of(experiment, settings, arm)
+    _rests_cool(experiment, device.joint_names, heat, standing_park)
     settle = settings.settle
     scheduler = Scheduler(
         poses=poses,
@@ -95,7 +99,8 @@ def prepare(experiment: Experiment, plan: Path) -> Prepared:
         order=settings.order,
     )
     arrival = Arrival(tool_poses(arm, poses), settings.arrival)
-    return Prepared(bench, device, commands, scheduler, ways, heat, arrival)
+    judge = HazardJudge(device.joint_names, device.joint_names, limits, heat[1], standing_park)
+    return Prepared(bench, device, commands, scheduler, ways, heat, arrival, judge)
 
 
 def joint_limits(experiment: Experiment, settings: AcquisitionSettings, arm: Arm) -> Array:
@@ -143,6 +148,19 @@ def _park(experiment: Experiment, settings: AcquisitionSettings, device: JointDe
         raise ConfigError(f"{joint} would park outside its limits.", where=where, hint="Choose another pose.")
     standing = device.standing(dict(zip(joints, park.tolist(), strict=True)))
     return np.array([standing[joint] for joint in joints])
+
+
+def _rests_cool(experiment: Experiment, joints: tuple[str, ...], heat: tuple[HeatModel, Torques], park: Array) -> None:
+    model, torques = heat
+    torque = torques(park)
+    if (hot := model.too_hot_for_ever(torque)) is not None:
+        share = 100 * float(model.steady(torque)[hot, 0] / model.budget[hot])
+        raise ConfigError(
+            f"the servo of {joints[hot]} would not cool where the arm parks: it carries {abs(torque[hot]):.2f} N m at "
+            f"{np.rad2deg(park[hot]):.1f} deg, which heats it to {share:.0f} % of its budget.",
+            where=experiment.source.where((*_AT, "park")),
+            hint="Choose a pose in which it carries less.",
+        )
 
 
 def _settable(device: JointDevice, limits: Array, inside: Array) -> Array:

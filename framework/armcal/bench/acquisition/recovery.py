@@ -11,6 +11,7 @@ from armcal.bench.acquisition.watch import Blind
 from armcal.bench.clock import Clock
 from armcal.bench.device import DeviceIdentity, JointDevice
 from armcal.bench.faults import DeviceError, DeviceRefusedError
+from armcal.bench.waiting import Waits
 
 _AGAIN_EVERY_S = 0.25
 _MOST_IN_A_ROW = 10
@@ -38,11 +39,12 @@ class Recovery:
         announce: Announce,
         asked_to_end: Callable[[], bool],
         identity: DeviceIdentity | None = None,
+        waits: Waits | None = None,
     ) -> None:
         """Take the parts of a run, and who the device is where it is open already."""
         self._device, self._drive, self._clock, self._settings = device, drive, clock, settings
         self._announce, self._asked = announce, asked_to_end
-        self._identity = identity
+        self._identity, self._waits = identity, waits or Waits()
         self._in_a_row, self._since = 0, clock.now()
         self._begun = False
 
@@ -90,19 +92,23 @@ class Recovery:
     def _again(self, fault: DeviceError, then: Callable[[], None]) -> None:
         self._count(fault)
         began, last = self._clock.now(), fault
-        while self._clock.now() < began + self._settings.lost.park:
+        while (left := began + self._settings.lost.park - self._clock.now()) > 0:
+            why = f"the arm holds, the device is looked for: {last.message.rstrip('.')}"
+            self._waits.goes_on("device", why, left, self._clock.now())
             if self._asked() and self._clock.now() >= began + _LAST_TRIES_S:
                 raise StaysLost(f"it was asked to stop while the device was lost ({last}); {_AS_IT_IS}")
             self._clock.sleep(_AGAIN_EVERY_S)
             try:
                 self._same(self._device.open(self._clock))
                 then()
+                self._waits.over("device", self._clock.now())
                 return
             except DeviceRefusedError as refused:
                 # Another program or another board may hold the port for a while.
                 last = DeviceError(str(refused))
             except DeviceError as again:
                 last = again
+        self._waits.given_up("device")
         raise StaysLost(f"the device did not come back in {self._settings.lost.park:.0f} s ({last}); {_AS_IT_IS}")
 
     def standing(self) -> dict[str, float]:

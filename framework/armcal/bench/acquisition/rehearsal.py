@@ -19,6 +19,7 @@ from armcal.run.experiment import Experiment
 
 _STARTED_IN_S = 60.0
 _ENDED_IN_S = 10.0
+_FALLEN_IN_S = 5.0
 _LONGEST_SOCKET_PATH = 107
 
 
@@ -70,14 +71,14 @@ def simulated_bench(config: Path, overrides: Sequence[str], folder: Path) -> Ite
 
 
 def truth(folder: Path) -> dict[str, Any]:
-    """What the simulated bench knows: the arm's true state, and what was unsafe.
+    """What the simulated bench knows, once the arm has come to hang: its true state, and what was unsafe.
 
     Raises:
         InputError: it does not answer.
     """
     clock = SimulatedClock(folder / CLOCK)
     try:
-        return clock.ask({"state": True})
+        return clock.ask({"advance": _FALLEN_IN_S, "state": True})
     finally:
         clock.close()
 

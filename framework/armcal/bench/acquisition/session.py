@@ -6,7 +6,7 @@ import hashlib
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,11 +23,13 @@ from armcal.bench.acquisition.preparation import Prepared
 from armcal.bench.acquisition.progress import Progress
 from armcal.bench.acquisition.recovery import Recovery
 from armcal.bench.acquisition.run_log import RunLog, Start, opened_log
-from armcal.bench.acquisition.settings import AcquisitionSettings
 from armcal.bench.acquisition.watch import Patient, Watch
 from armcal.bench.clock import Clock
 from armcal.bench.device import DeviceIdentity, JointDevice
 from armcal.bench.faults import DeviceRefusedError
+from armcal.bench.hazards import FirstMotion
+from armcal.bench.waiting import Waits
+from armcal.bench.wiring import check_wiring
 from armcal.errors import InputError, Location
 from armcal.use.calibration_file import identity_of
 
@@ -42,15 +44,19 @@ class Course:
         folder: where everything of it is kept.
         start: ``anew``, or ``resume`` what is there.
         asked_to_end: whether somebody wants it parked.
-        may_energise: asked once, with the joints that hang free, before they get their first pulses.
+        may_energise: asked once, with what is about to move and what is dangerous in it, before anything does.
         told: called after each pose.
+        unchecked: drive servos too of which nobody has checked that they move their joint.
+        waits: says what is waited for.
     """
 
     folder: Path
     start: Start
     asked_to_end: Callable[[], bool]
-    may_energise: Callable[[tuple[str, ...]], bool]
+    may_energise: Callable[[FirstMotion], bool]
     told: Callable[[Progress], None]
+    unchecked: bool = False
+    waits: Waits = field(default_factory=Waits)
 
 
 @dataclass(frozen=True)
@@ -73,7 +79,7 @@ def acquire(prepared: Prepared, plan: Path, course: Course) -> Outcome:
     with prepared.bench.clock() as clock, opened_log(course.folder, course.start, _header(prepared, plan)) as log:
         if log.identity is not None and _is_over(prepared, log):
             return _written(prepared, course, log.progress, Ending("done", "it was done before"), log.identity)
-        with _opened(prepared, clock, log) as (device, eyes, identity):
+        with _opened(prepared, course, clock, log) as (device, eyes, identity):
             log.record(entry.STARTED, {"at": clock.wall(), "device": identity.digest, "name": identity.name})
             ending, progress = _conducted(prepared, course, clock, log, (device, eyes, identity))
         return _written(prepared, course, progress, ending, identity)
@@ -95,7 +101,9 @@ def _written(
 
 
 @contextmanager
-def _opened(prepared: Prepared, clock: Clock, log: RunLog) -> Iterator[tuple[JointDevice, TrackerEyes, DeviceIdentity]]:
+def _opened(
+    prepared: Prepared, course: Course, clock: Clock, log: RunLog
+) -> Iterator[tuple[JointDevice, TrackerEyes, DeviceIdentity]]:
     """Device and tracker, both alive; nothing moves."""
     device, settings = prepared.device, prepared.settings
     eyes = TrackerEyes(prepared.bench, clock)
@@ -106,6 +114,8 @@ def _opened(prepared: Prepared, clock: Clock, log: RunLog) -> Iterator[tuple[Joi
                 f"the run was begun with another board, or another calibration of it, than {identity.name}.",
                 hint="Connect the board that the run began with, with the servo file that it began with.",
             )
+        if not course.unchecked:
+            check_wiring(prepared.bench, device.joint_names, identity.adapter)
         eyes.open()
         until = clock.now() + _FIRST_FRAME_S
         while eyes.trouble()[0] and clock.now() < until:
@@ -142,35 +152,35 @@ def _conducted(
     drive = Drive(device, clock, prepared.ways, settings, prepared.heat, note)
     prepared.ways.meanwhile = drive.keep_alive  # the board would take a host that plans for one that died
     _warmed(drive, progress, clock)
-    _permitted(device, course, settings)
+    _permitted(prepared, course, progress)
     parts = Parts(
         drive=drive,
-        recovery=Recovery(device, drive, clock, settings, announce, course.asked_to_end, identity),
+        recovery=Recovery(device, drive, clock, settings, announce, course.asked_to_end, identity, course.waits),
         scheduler=prepared.scheduler,
         eyes=eyes,
         clock=clock,
         settings=settings,
         log=log,
-        watch=Watch(clock, eyes, settings.lost, course.asked_to_end),
+        watch=Watch(clock, eyes, settings.lost, course.asked_to_end, course.waits),
         patient=Patient(eyes, course.asked_to_end),
         told=course.told,
         arrival=prepared.arrival,
+        waits=course.waits,
     )
     conduct = Conduct(parts, replace(progress, ended=""))
     return conduct.run(), conduct.progress
 
 
-def _permitted(device: JointDevice, course: Course, settings: AcquisitionSettings) -> None:
-    """Ask before joints get their first pulses."""
+def _permitted(prepared: Prepared, course: Course, progress: Progress) -> None:
+    """Ask before anything moves, be it limp or powered."""
+    device, settings = prepared.device, prepared.settings
     angles = device.state().angles
-    free = tuple(joint for joint in device.joint_names if joint not in angles)
-    if not free:
-        return
+    start = prepared.judge.first_motion(angles, progress.angles, releases=settings.at_end == "release")
     if angles:  # nobody beats while somebody thinks: joints that hold are to stay where they are
         device.guard([angles], float(np.deg2rad(settings.rate_deg_per_s)), settings.silence)
     before = course.asked_to_end()
-    if not course.may_energise(free) or (course.asked_to_end() and not before):
-        raise InputError("the joints may not be energised; nothing was moved.", hint="Say yes, or give --yes.")
+    if not course.may_energise(start) or (course.asked_to_end() and not before):
+        raise InputError("the arm may not be moved; nothing was moved.", hint="Say yes, or give --yes.")
 
 
 def _warmed(drive: Drive, progress: Progress, clock: Clock) -> None:

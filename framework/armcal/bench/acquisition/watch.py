@@ -8,6 +8,7 @@ from typing import Protocol
 from armcal.bench.acquisition.endings import OutOfSight, ParkWish
 from armcal.bench.acquisition.settings import LostSettings
 from armcal.bench.clock import Clock
+from armcal.bench.waiting import Waits
 
 
 class Sight(Protocol):
@@ -26,8 +27,16 @@ class Watch:
     Raises ParkWish where somebody asks for the end, or the tracker stays away for too long.
     """
 
-    def __init__(self, clock: Clock, sight: Sight, lost: LostSettings, asked_to_end: Callable[[], bool]) -> None:
+    def __init__(
+        self,
+        clock: Clock,
+        sight: Sight,
+        lost: LostSettings,
+        asked_to_end: Callable[[], bool],
+        waits: Waits | None = None,
+    ) -> None:
         self._clock, self._sight, self._lost, self._asked = clock, sight, lost, asked_to_end
+        self._waits = waits or Waits()
         self.why_held = ""
 
     def may_go_on(self) -> bool:
@@ -41,8 +50,13 @@ class Watch:
             raise ParkWish("it was asked to stop")
         seconds, why = self._sight.trouble()
         if seconds >= self._lost.park:
+            self._waits.given_up("tracker")
             raise OutOfSight(f"the tracker has told nothing for {seconds:.0f} s: {why}")
         self.why_held = why if seconds >= self._lost.hold else ""
+        if self.why_held:
+            self._waits.goes_on("tracker", f"the arm holds: {why}", self._lost.park - seconds, self._clock.now())
+        elif not seconds:
+            self._waits.over("tracker", self._clock.now())
         return not self.why_held
 
 

@@ -96,12 +96,16 @@ class Automatic:
             self.mover.tick()
             found = self.eyes.settled()
             if found is not None:
+                self.mover.waits.over("tracker", self.mover.clock.now())
                 return found
             seconds, why = self.eyes.trouble()
             if seconds >= settings.lost.park:
+                self.mover.waits.given_up("tracker")
                 told = f"the tracker has told nothing for {seconds:.0f} s ({why})"
                 raise OutOfSightError(told, "the arm holds its base pose")
             if seconds >= settings.lost.hold:
+                left = settings.lost.park - seconds
+                self.mover.waits.goes_on("tracker", f"the arm holds: {why}", left, self.mover.clock.now())
                 if self.warmth.must_rest:
                     return _WARM
                 until = self.mover.clock.now() + settings.settle.longest
@@ -116,8 +120,11 @@ class Automatic:
         """In the base pose, once a servo is near its budget."""
         if self.warmth.must_rest:
             to_base(self.setup, self.mover)
+            waits, clock = self.mover.waits, self.mover.clock
             while (left_s := self.warmth.rest_s) > 0:
+                waits.goes_on("rest", "the servos cool in the base pose", left_s, clock.now())
                 self.mover.stand(min(left_s, _LOOKED_AT_EVERY_S))
+            waits.over("rest", clock.now())
 
     def _measure(self, point: Point) -> None:
         found: Settled | str = _WARM

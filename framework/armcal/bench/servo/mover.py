@@ -14,6 +14,7 @@ from armcal.bench.clock import Clock
 from armcal.bench.device import DeviceIdentity, JointDevice, PulseDevice
 from armcal.bench.faults import DeviceError, DeviceRefusedError
 from armcal.bench.servo.known import KnownServo
+from armcal.bench.waiting import Waits
 from armcal.errors import InputError
 
 _ALIVE_EVERY_S = 0.1
@@ -67,6 +68,7 @@ class Mover:
         motion: how fast, and how far.
         asked_to_stop: looked at in every step.
         look: called after every pause, for who watches the arm meanwhile.
+        waits: says what is waited for.
     """
 
     device: ServoDevice
@@ -76,6 +78,7 @@ class Mover:
     motion: Motion
     asked_to_stop: Callable[[], bool]
     look: Callable[[], None] = field(default=lambda: None)
+    waits: Waits = field(default_factory=Waits)
     identity: DeviceIdentity | None = None
     told: dict[str, int] = field(default_factory=dict)
     came: dict[str, int] = field(default_factory=dict)
@@ -185,11 +188,13 @@ class Mover:
             DeviceError: it does not come back.
         """
         until, last = self.clock.now() + _LONGEST_LOSS_S, fault
-        while self.clock.now() < until:
+        while (left := until - self.clock.now()) > 0:
+            self.waits.goes_on("device", f"the board is looked for: {last.message.rstrip('.')}", left, self.clock.now())
             self._stop_if_asked()
             self.clock.sleep(_AGAIN_EVERY_S)
             try:
                 self._taken_up()
+                self.waits.over("device", self.clock.now())
                 return
             except DeviceRefusedError as refused:
                 # Another program or another board may hold the port for a while.

@@ -5,14 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 from armcal.arm.servo import PulseClock
 from armcal.bench.acquisition.eyes import TrackerEyes
 from armcal.bench.clock import Clock
 from armcal.bench.faults import DeviceRefusedError
+from armcal.bench.hazards import FirstMotion
 from armcal.bench.servo.automatic import Automatic, Told
 from armcal.bench.servo.beginning import begin, check_same, stated_by
 from armcal.bench.servo.guided import Guided
@@ -24,6 +25,8 @@ from armcal.bench.servo.setup import Setup
 from armcal.bench.servo.sweep import angles_told, to_base
 from armcal.bench.servo.trial import Move, Verdict, answered, judged, wrapped
 from armcal.bench.servo.warmth import Warmth
+from armcal.bench.waiting import Waits
+from armcal.bench.wiring import note_checked
 from armcal.errors import InputError, Location
 
 _FIRST_FRAME_S = 3.0
@@ -37,17 +40,19 @@ class Conversation:
 
     Attributes:
         asked_to_stop: whether somebody wants it to hold and end.
-        may_energise: asked once, with the joints that hang free, before they get their first pulses.
+        may_energise: asked once, with what is about to move and what is dangerous in it, before anything does.
         told: how far a tracked calibration is.
         say: a line, of a guided one.
         wishes: what somebody presses or writes, while it is asked for.
+        waits: says what is waited for.
     """
 
     asked_to_stop: Callable[[], bool]
-    may_energise: Callable[[tuple[str, ...]], bool]
+    may_energise: Callable[[FirstMotion], bool]
     told: Told
     say: Callable[[str], None]
     wishes: Callable[[], AbstractContextManager[Wishes]]
+    waits: Waits = field(default_factory=Waits)
 
 
 def measure(setup: Setup, folder: Path, talk: Conversation, how: str) -> None:
@@ -95,19 +100,36 @@ def adapter_of(folder: Path) -> str:
 def tried(setup: Setup, talk: Conversation, seen: str) -> list[Verdict]:
     """Move each joint a little, and say what it did; ``seen`` by the ``tracker`` or by ``somebody``.
 
+    Joints that turned as told, and can be told from all others, are written down as checked beside the servo file.
+
     Raises: as ``measure``.
     """
     away = [verdict for verdict in (_wrapped(setup, joint) for joint in setup.joints) if verdict is not None]
     if away:  # by such a table no joint can be moved
+        _note(setup, away, {})
         return away
     with setup.bench.clock() as clock, _opened(setup, clock, talk, None) as mover:
         if seen == "tracker":
             with _eyes(setup, mover) as eyes:
                 to_base(setup, mover)
-                return _tracked(setup, mover, eyes)
-        to_base(setup, mover)
-        with talk.wishes() as wishes:
-            return [_by_eye(setup, mover, joint, talk, wishes) for joint in setup.joints]
+                verdicts = _tracked(setup, mover, eyes)
+        else:
+            to_base(setup, mover)
+            with talk.wishes() as wishes:
+                verdicts = [_by_eye(setup, mover, joint, talk, wishes) for joint in setup.joints]
+        adapter = mover.identity.adapter if mover.identity else ""
+        _note(setup, verdicts, {"adapter": adapter, "by": seen, "at": clock.wall()})
+        return verdicts
+
+
+def _note(setup: Setup, verdicts: list[Verdict], seen: dict[str, Any]) -> None:
+    right = [verdict.joint for verdict in verdicts if verdict.kind == "right" and not verdict.other]
+    others = [verdict.joint for verdict in verdicts if verdict.joint not in right]
+    try:
+        note_checked(setup.path, setup.file, right, others, seen)
+    except InputError as fault:  # what was seen must not be lost with it
+        told = " ".join(f"{verdict.sentence} {verdict.mend}".rstrip() for verdict in verdicts)
+        raise InputError(f"{fault.message} The check itself: {told}", where=fault.where, hint=fault.hint) from fault
 
 
 def park(setup: Setup, talk: Conversation, how: str) -> None:
@@ -115,7 +137,7 @@ def park(setup: Setup, talk: Conversation, how: str) -> None:
 
     Raises: as ``measure``.
     """
-    with setup.bench.clock() as clock, _opened(setup, clock, talk, None) as mover:
+    with setup.bench.clock() as clock, _opened(setup, clock, talk, None, releases=how == "release") as mover:
         to_base(setup, mover)
         mover.guard({})
         for joint in reversed(tuple(setup.base)) if how == "release" else ():
@@ -124,7 +146,9 @@ def park(setup: Setup, talk: Conversation, how: str) -> None:
 
 
 @contextmanager
-def _opened(setup: Setup, clock: Clock, talk: Conversation, record: Record | None) -> Iterator[Mover]:
+def _opened(
+    setup: Setup, clock: Clock, talk: Conversation, record: Record | None, *, releases: bool = False
+) -> Iterator[Mover]:
     device = cast(ServoDevice, setup.bench.device())
     settings = setup.settings
     pulses = {joint: setup.pulses_of(joint) for joint in setup.base}
@@ -134,14 +158,14 @@ def _opened(setup: Setup, clock: Clock, talk: Conversation, record: Record | Non
     if record is not None and record.is_measured:
         stated = stated_by(setup, record.of_kind(BEGUN)[0], tuple(setup.base))[0]
         servos = {each.joint: (each, _clock(setup, each.joint)) for each in stated}
-    mover = Mover(device, clock, servos, read_by, motion, talk.asked_to_stop)
+    mover = Mover(device, clock, servos, read_by, motion, talk.asked_to_stop, waits=talk.waits)
     try:
         identity = mover.open()
         if record is not None and record.is_measured:
             check_same(setup, record, identity)
-        free = tuple(joint for joint in setup.base if joint not in mover.told)
-        if free and not talk.may_energise(free):
-            raise InputError("the joints may not be energised; nothing was moved.", hint="Say yes, or give --yes.")
+        start = setup.judge.first_motion(angles_told(mover), {}, releases=releases)
+        if (start.free or start.hazards) and not talk.may_energise(start):
+            raise InputError("the arm may not be moved; nothing was moved.", hint="Say yes, or give --yes.")
         yield mover
     except StoppedError as stop:
         if not mover.hold():

@@ -11,13 +11,14 @@ from typing import Any
 import numpy as np
 
 from armcal.arm.clearance import ClearanceCheck
-from armcal.base.config_text import resolve_path
 from armcal.bench.acquisition.heat import HeatModel, Torques
 from armcal.bench.acquisition.preparation import clearance_of, heat_of, joint_limits
 from armcal.bench.bench import SECTION, Bench
+from armcal.bench.hazards import HazardJudge
 from armcal.bench.servo.known import KnownBoard, KnownServo, MeasuredPulse
 from armcal.bench.servo.nominal import NominalArm
 from armcal.bench.servo.settings import ServoCalibrationSettings
+from armcal.bench.wiring import servo_file_of
 from armcal.config.servo_file import ServoFile, load_servo_file
 from armcal.config.validate import validate
 from armcal.errors import ConfigError
@@ -42,6 +43,7 @@ class Setup:
         nominal: what the model says.
         heat: of the servos, and the torques that heat them.
         check: what is too near, if that is stated.
+        judge: of what is dangerous in the first motions.
     """
 
     bench: Bench
@@ -54,6 +56,7 @@ class Setup:
     nominal: NominalArm
     heat: tuple[HeatModel, Torques]
     check: ClearanceCheck | None
+    judge: HazardJudge
 
     @classmethod
     def of(cls, experiment: Experiment) -> Setup:
@@ -80,7 +83,9 @@ class Setup:
         joints = settings.joints or moved
         heat = heat_of(experiment, bench.settings.acquisition, arm)
         check = clearance_of(experiment, arm)
-        found = cls(bench, settings, path, file, joints, base, {}, nominal, heat, check)
+        rest = np.array([base.get(joint, 0.0) for joint in arm.commanded])
+        judge = HazardJudge(tuple(arm.commanded), moved, np.array(list(limits.values())), heat[1], rest)
+        found = cls(bench, settings, path, file, joints, base, {}, nominal, heat, check, judge)
         found._check_base_pulses(experiment)
         return replace(found, ranges=found.clear_ranges(experiment, limits))
 
@@ -173,14 +178,14 @@ class Setup:
 
 
 def _path_of_device(experiment: Experiment, bench: Bench) -> Path:
-    stated = (bench.settings.device or {}).get("servos")
-    if not isinstance(stated, str):
+    found = servo_file_of(bench)
+    if found is None:
         raise ConfigError(
             "found no servo file.",
             where=experiment.source.where((SECTION, "device")),
             hint="Name it in bench.device.servos, or in bench.servo.servos.",
         )
-    return resolve_path(stated)
+    return found
 
 
 def _check_names(

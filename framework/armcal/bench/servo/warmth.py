@@ -65,8 +65,8 @@ class Warmth:
     @property
     def base_is_too_heavy(self) -> str:
         """The joint that would not cool in the base pose; empty if all do."""
-        over = self._model.steady(self._torques(self._base))[:, 0] > _COOLED_TO * self._model.budget
-        return self._joints[int(np.argmax(over))] if over.any() else ""
+        hot = self._model.too_hot_for_ever(self._torques(self._base), _COOLED_TO)
+        return "" if hot is None else self._joints[hot]
 
     def _pose(self, angles: Mapping[str, float]) -> Array:
         return np.array([angles.get(joint, 0.0) for joint in self._joints])
