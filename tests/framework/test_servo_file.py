@@ -7,6 +7,7 @@ import struct
 
 import pytest
 from armcal.arm.servo import PulseClock, PulseTable
+from armcal.bench.servo.outputs import write_servo_file
 from armcal.config.servo_file import (
     BoardSettings,
     ServoFile,
@@ -173,3 +174,70 @@ def test_the_digest_hangs_on_every_number(tmp_path):
     assert len(found) == len(changes) + 1
     renamed = TEXT.replace("front", "left")
     assert of(renamed) == of(TEXT) == of(TEXT.replace("25300000", "25300000.0"))
+
+
+BY_HAND = """# mine
+boards:
+  front:            # first
+    address: 0x40
+    # measured at a pin
+    oscillator_hz: 25.0e+6
+  back: {address: 0x41}   # nobody knows its id
+servos:
+  q1: {board: front, channel: 0, angles_deg: [-100, 0, 100], pulses_ms: [0.62, 1.54, 2.46]}  # shoulder
+  q2:
+    board: back
+    channel: 3   # was 1
+    angles_deg: [-135, 0, 135]
+    pulses_us:
+      - 500
+      - 1500
+      - 2500
+    # trailing
+# the end
+"""
+
+
+def changed(file):
+    """Other numbers everywhere that armcal servo may change them."""
+    boards, servos = {}, {}
+    for name, board in file.boards.items():
+        boards[name] = BoardSettings.si(**{**board.model_dump(), "id": "A1", "oscillator_hz": 25.1e6})
+    for joint, servo in file.servos.items():
+        servos[joint] = ServoSettings.si(**{**servo.model_dump(), "pulses": tuple(1.01 * p for p in servo.pulses)})
+    return ServoFile(boards, servos)
+
+
+def test_numbers_are_changed_where_they_stand_and_comments_stay(tmp_path):
+    meant = changed(load(tmp_path, BY_HAND))
+    kept = write_servo_file(tmp_path / "servos.yaml", meant)
+    text = (tmp_path / "servos.yaml").read_text()
+    assert load_servo_file(tmp_path / "servos.yaml") == meant and kept.read_text() == BY_HAND
+    for comment in (
+        "# mine",
+        "# first",
+        "# measured at a pin",
+        "# nobody",
+        "# shoulder",
+        "# was 1",
+        "# trailing",
+        "# the end",
+    ):
+        assert comment in text
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["servos.yaml", "servos.yaml.before-1"]
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        BY_HAND.replace("[-100, 0, 100]", "&a [-100, 0, 100]").replace("[-135, 0, 135]", "*a"),
+        BY_HAND.replace("\n", "\r\n"),
+        "extends: base.yaml\nservos:\n  q1: {channel: 5}   # moved\n",
+    ],
+)
+def test_a_file_that_cannot_be_edited_in_place_still_says_what_is_meant(tmp_path, text):
+    (tmp_path / "base.yaml").write_text(BY_HAND)
+    meant = changed(load(tmp_path, text))
+    write_servo_file(tmp_path / "servos.yaml", meant)
+    assert load_servo_file(tmp_path / "servos.yaml") == meant
+    assert (tmp_path / "base.yaml").read_text() == BY_HAND
