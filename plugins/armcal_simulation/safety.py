@@ -113,13 +113,13 @@ class Safety:
         self.judge_clearance()
         for joint, angle in self._dropped.items():
             self._weigh("drop", joint, abs(self._servos[joint].angle - angle), value=self._servos[joint].angle - angle)
-        worst = {kind: told for kind, (_, told) in self._worst.items()}
+        worst = {kind: entry for kind, (_, entry) in self._worst.items()}
         return {"offences": dict(self.offences), "events": dict(self.events), "worst": worst}
 
-    def _weigh(self, kind: str, joint: str, amount: float, **told: float) -> None:
+    def _weigh(self, kind: str, joint: str, amount: float, **entry: float) -> None:
         """Remember it if it is the worst of its kind."""
         if kind not in self._worst or amount > self._worst[kind][0]:
-            self._worst[kind] = amount, {"joint": joint, **told}
+            self._worst[kind] = amount, {"joint": joint, **entry}
 
     def _judge_speed(self, joint: str, commit: Commit, angle: float, period: float) -> None:
         window, now, past = self._settings.window, commit.time, self._past[joint]

@@ -86,20 +86,20 @@ class HazardJudge:
             releases: whether servos are let go where the arm rests.
         """
         free = tuple(joint for joint in self.moved if joint not in standing)
-        found = [self._jump(free, first), self._outside(standing), self._drop() if releases else None]
+        hazards = [self._jump(free, first), self._outside(standing), self._drop() if releases else None]
         powered = tuple(joint for joint in self.moved if joint in standing)
-        return FirstMotion(free, powered, tuple(hazard for hazard in found if hazard is not None))
+        return FirstMotion(free, powered, tuple(hazard for hazard in hazards if hazard is not None))
 
     def _jump(self, free: Sequence[str], first: Mapping[str, float]) -> Hazard | None:
         """A limp joint hangs anywhere: at an end of its range, or as it falls from where the arm rests."""
         goals = [first.get(joint, float(self.rest[i])) for i, joint in enumerate(self.joints)]
-        found = [
+        jumps = [
             max((abs(goals[i] - end), end, i) for end in (*self.limits[i], self._fallen[i]))
             for i in map(self.joints.index, free)
         ]
-        if not found:
+        if not jumps:
             return None
-        amount, end, i = max(found)
+        amount, end, i = max(jumps)
         return Hazard(
             "first_pulse",
             self.joints[i],

@@ -103,10 +103,10 @@ def _digest(file: ServoFile, joint: str) -> str:
 def _read(servos: Path) -> dict[str, Any]:
     """Entries by joint; a record that is damaged says nothing, so that its joints are checked again."""
     try:
-        found = json.loads(record_of(servos).read_bytes())
+        content = json.loads(record_of(servos).read_bytes())
     except (OSError, ValueError):
         return {}
-    return {joint: e for joint, e in found.items() if isinstance(e, dict)} if isinstance(found, dict) else {}
+    return {joint: e for joint, e in content.items() if isinstance(e, dict)} if isinstance(content, dict) else {}
 
 
 def _write(servos: Path, entries: Mapping[str, Any]) -> None:

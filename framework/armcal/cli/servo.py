@@ -103,9 +103,9 @@ def _exit_if_incomplete(voice: Voice, setup: Setup, content: Mapping[str, Any]) 
     """Tables that were asked for and are not there must not look like a success to a script."""
     left = [joint for joint in setup.joints if not content["servos"].get(joint, {"written": False})["written"]]
     if left:
-        found = len(setup.joints) - len(left)
+        count = len(setup.joints) - len(left)
         voice.warn(
-            f"{found} of {len(setup.joints)} tables were found; those of {', '.join(left)} are left as they were. Why "
+            f"{count} of {len(setup.joints)} tables were found; those of {', '.join(left)} are left as they were. Why "
             "is said above: mend that, and give the same command again."
         )
         sys.exit(EXIT_INCOMPLETE)

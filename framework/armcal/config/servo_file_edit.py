@@ -68,10 +68,10 @@ def _bare(key: str) -> str:
 
 def _entry(node: yaml.Node | None, field: str) -> tuple[yaml.Node, yaml.Node]:
     pairs = node.value if isinstance(node, yaml.MappingNode) else []
-    found = [(pair[0], pair[1]) for pair in pairs if field in (pair[0].value, _bare(str(pair[0].value)))]
-    if not found:
+    matches = [(pair[0], pair[1]) for pair in pairs if field in (pair[0].value, _bare(str(pair[0].value)))]
+    if not matches:
         raise LookupError(field)
-    return found[0]
+    return matches[0]
 
 
 def _value(node: yaml.Node | None, field: str) -> yaml.Node:

@@ -128,8 +128,10 @@ def _note(setup: Setup, verdicts: list[Verdict], seen: dict[str, Any]) -> None:
     try:
         note_checked(setup.path, setup.file, right, others, seen)
     except InputError as fault:  # what was seen must not be lost with it
-        told = " ".join(f"{verdict.sentence} {verdict.mend}".rstrip() for verdict in verdicts)
-        raise InputError(f"{fault.message} The check itself: {told}", where=fault.where, hint=fault.hint) from fault
+        said = " ".join(f"{verdict.sentence} {verdict.mend}".rstrip() for verdict in verdicts)
+        raise InputError(
+            f"{fault.message} The check itself: {sentences}", where=fault.where, hint=fault.hint
+        ) from fault
 
 
 def park(setup: Setup, talk: Conversation, how: str) -> None:
