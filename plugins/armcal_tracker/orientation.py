@@ -1,4 +1,4 @@
-"""Columns of an orientation: a quaternion or a rotation matrix, and what else the same columns might mean."""
+"""Columns of an orientation: quaternion, rotation matrix, angles or rotation vector; what else they might mean."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from armcal.base.settings import Settings
 from scipy.spatial.transform import Rotation
 
 QUATERNION = ("qw", "qx", "qy", "qz")
+TURNS = ("turn1", "turn2", "turn3")
 MATRIX = tuple(f"r{row}{column}" for row in (1, 2, 3) for column in (1, 2, 3))
 _OTHER = {"xyzw": "wxyz", "wxyz": "xyzw"}
 _Nine = tuple[str, str, str, str, str, str, str, str, str]
@@ -127,6 +128,75 @@ class RotationColumns(Settings):
     def others(self, values: Array) -> dict[str, Rotation]:
         """Column by column, which is the inverse as well."""
         return {"it column by column, that is as body_T_base,": self.rotations(values).inv()}
+
+
+class AnglesColumns(Settings):
+    """The three columns of roll, pitch and yaw: R = Rz(yaw) Ry(pitch) Rx(roll), turns about fixed axes."""
+
+    columns: tuple[str, str, str]
+    unit: Literal["deg", "rad"]
+
+    @property
+    def kind(self) -> str:
+        """See ``Orientation``, as below."""
+        return "triple of roll, pitch and yaw"
+
+    @property
+    def declared(self) -> str:
+        """The order."""
+        return f"R = Rz(yaw) Ry(pitch) Rx(roll) in {self.unit}"
+
+    def mapped(self) -> dict[str, str]:
+        """turn1 to turn3, in the order of the columns."""
+        return dict(zip(TURNS, self.columns, strict=True))
+
+    def size(self, values: Array) -> Array:
+        """One: three zeros are a rotation too."""
+        return np.ones(len(values))
+
+    def fault(self, values: Array) -> Array:
+        """None: any three angles are a rotation."""
+        return np.zeros(len(values))
+
+    def rotations(self, values: Array) -> Rotation:
+        """About the fixed axes x, y, z, in this order."""
+        return Rotation.from_euler("xyz", values, degrees=self.unit == "deg")
+
+    def others(self, values: Array) -> dict[str, Rotation]:
+        """Turns about the axes that turned before, and the other unit."""
+        degrees = self.unit == "deg"
+        moving = Rotation.from_euler("XYZ", values, degrees=degrees)
+        return {
+            "R = Rx(roll) Ry(pitch) Rz(yaw)": moving,
+            f"unit: {'rad' if degrees else 'deg'}": Rotation.from_euler("xyz", values, degrees=not degrees),
+        }
+
+
+class VectorColumns(AnglesColumns):
+    """The three columns of a rotation vector: its direction is the axis, its length the angle."""
+
+    @property
+    def kind(self) -> str:
+        """See ``Orientation``, as below."""
+        return "rotation vector"
+
+    @property
+    def declared(self) -> str:
+        """What it is."""
+        return f"the rotation vector of base_T_body in {self.unit}"
+
+    def rotations(self, values: Array) -> Rotation:
+        """By the exponential map."""
+        return Rotation.from_rotvec(values, degrees=self.unit == "deg")
+
+    def others(self, values: Array) -> dict[str, Rotation]:
+        """The inverse, and the other unit."""
+        degrees = self.unit == "deg"
+        other = Rotation.from_rotvec(values, degrees=not degrees)
+        return {
+            "it as that of body_T_base": self.rotations(values).inv(),
+            f"unit: {'rad' if degrees else 'deg'}": other,
+        }
 
 
 def reflections(values: Array) -> Array:

@@ -17,7 +17,15 @@ from armcal.measure.reader import ReadRequest, WantedChannel
 from pydantic import model_validator
 
 from armcal_tracker.csv_reader import CsvReader, CsvSettings
-from armcal_tracker.orientation import QUATERNION, Orientation, QuaternionColumns, RotationColumns, reflections
+from armcal_tracker.orientation import (
+    QUATERNION,
+    AnglesColumns,
+    Orientation,
+    QuaternionColumns,
+    RotationColumns,
+    VectorColumns,
+    reflections,
+)
 from armcal_tracker.rotation_match import misfit, nominal_rotations
 
 TOLERANCE = 1e-3
@@ -30,27 +38,33 @@ _ZERO = 1e-6
 
 
 class PoseCsvSettings(CsvSettings):
-    """As ``csv``, and base_T_body's orientation: either ``quaternion`` or ``rotation`` says which columns hold it.
+    """As ``csv``, and base_T_body's orientation: one of ``quaternion``, ``rotation``, ``rpy`` and ``rotation_vector``.
 
     ``measurement`` names the measurement that reads orientations; by default the only one.
     """
 
     quaternion: QuaternionColumns | None = None
     rotation: RotationColumns | None = None
+    rpy: AnglesColumns | None = None
+    rotation_vector: VectorColumns | None = None
     measurement: str | None = None
 
     @model_validator(mode="after")
     def _one_orientation(self) -> PoseCsvSettings:
-        if (self.quaternion is None) == (self.rotation is None):
-            raise ValueError("expected one of quaternion: {columns: [...], order: xyzw} and rotation: {columns: [...]}")
+        if sum(given is not None for given in self._given()) != 1:
+            raise ValueError(
+                "expected one of quaternion: {columns: [...], order: xyzw}, rotation: {columns: [...]}, "
+                "rpy: {columns: [...], unit: deg} and rotation_vector: {columns: [...], unit: rad}"
+            )
         return self
+
+    def _given(self) -> tuple[Orientation | None, ...]:
+        return self.quaternion, self.rotation, self.rpy, self.rotation_vector
 
     @property
     def orientation(self) -> Orientation:
         """Whichever is given."""
-        found = self.quaternion or self.rotation
-        assert found is not None
-        return found
+        return next(found for found in self._given() if found is not None)
 
 
 class PoseCsvReader:

@@ -243,3 +243,20 @@ def _process(*arguments: str, path: Path | None = None) -> subprocess.CompletedP
     environment = {**os.environ, **({"PYTHONPATH": str(path)} if path else {})}
     command = [sys.executable, "-m", "armcal.cli", *arguments]
     return subprocess.run(command, capture_output=True, text=True, env=environment, timeout=120, check=False)
+
+
+def test_a_misspelt_command_is_answered_with_the_nearest() -> None:
+    ran = armcal("rnu")
+    assert ran.exit_code == 2 and "No such command 'rnu'. Did you mean 'run'?" in ran.output
+    ran = armcal("xyzzy")
+    assert ran.exit_code == 2 and "Did you mean" not in ran.output
+
+
+def test_the_judging_of_a_run_shows_progress(tmp_path: Path) -> None:
+    from armcal.run.experiment import Experiment
+    from armcal.run.pipeline import calibrate
+
+    seen: list[tuple[str, float]] = []
+    config = Path(__file__).resolve().parents[2] / "configs" / "ball" / "demo.yaml"
+    calibrate(Experiment.load(config), progress=lambda what, fraction: seen.append((what, fraction)))
+    assert seen.index(("judging", 0.0)) < seen.index(("judging", 1.0))

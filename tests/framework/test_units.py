@@ -125,14 +125,14 @@ def test_a_quantity_is_read(text: str, dimension: str, si: float) -> None:
 def test_a_refused_quantity_says_why_and_lists_the_units(text: str, complaint: str) -> None:
     with pytest.raises(ValueError, match=complaint) as caught:
         parse_quantity(text, "length")
-    assert 'one of m, cm, mm, um, for example "5 mm"' in str(caught.value)
+    assert 'one of m, cm, mm, um, inch, for example "5 mm"' in str(caught.value)
 
 
 def test_unknown_names_are_refused_with_the_known_ones() -> None:
-    with pytest.raises(ValueError, match=r"'inch' is not known; expected one of m, cm, mm"):
-        from_unit(1.0, "inch")
-    with pytest.raises(ValueError, match=r"'inch' is not known"):
-        to_unit(1.0, "inch")
+    with pytest.raises(ValueError, match=r"'furlong' is not known; expected one of m, cm, mm"):
+        from_unit(1.0, "furlong")
+    with pytest.raises(ValueError, match=r"'furlong' is not known"):
+        to_unit(1.0, "furlong")
     with pytest.raises(ValueError, match=r"'size' is not known; expected one of length, angle"):
         units_of("size")
 
@@ -148,10 +148,15 @@ def test_every_dimension_has_an_si_unit_and_one_to_show() -> None:
 
 def test_the_table_of_units_cannot_be_changed() -> None:
     with pytest.raises(TypeError):
-        UNITS["inch"] = Unit("inch", "length", 0.0254)  # type: ignore[index]
+        UNITS["furlong"] = Unit("furlong", "length", 0.0254)  # type: ignore[index]
 
 
 def test_units_import_nothing_heavy() -> None:
     code = "import sys, armcal.base.units; print({'numpy', 'pydantic', 'yaml'} & set(sys.modules))"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert result.stdout.strip() == "set()"
+
+
+def test_an_inch_is_25_4_mm_to_the_last_bit() -> None:
+    assert parse_quantity("10 inch", "length") == 0.254
+    assert split_suffix("x_inch") == ("x", UNITS["inch"])

@@ -99,6 +99,44 @@ def test_quaternions_of_either_order_and_sign_are_the_same_rotations(tmp_path, o
     np.testing.assert_allclose(dataset.column("tracker.x"), np.arange(40) / 1000)
 
 
+@pytest.mark.parametrize("unit", ["deg", "rad"])
+@pytest.mark.parametrize("kind", ["rpy", "rotation_vector"])
+def test_angles_and_rotation_vectors_are_the_same_rotations(tmp_path, kind, unit):
+    """Roll, pitch and yaw by hand: Rz Ry Rx. Columns may say their unit."""
+    angles = joints(40)
+    truth = seen(angles)
+    columns, scale = [f"{name}_{unit}" for name in ("u", "v", "w")], 180 / np.pi if unit == "deg" else 1.0
+    numbers = truth.as_rotvec()
+    if kind == "rpy":
+        r = truth.as_matrix()
+        pitch = np.arctan2(-r[:, 2, 0], np.hypot(r[:, 0, 0], r[:, 1, 0]))
+        numbers = np.stack([np.arctan2(r[:, 2, 1], r[:, 2, 2]), pitch, np.arctan2(r[:, 1, 0], r[:, 0, 0])], axis=1)
+    text = table(angles, scale * numbers, columns)
+    dataset = read(tmp_path, text, **{kind: {"columns": columns, "unit": unit}})
+    assert (rotations_of(dataset).inv() * truth).magnitude().max() < 1e-12
+    other = "rad" if unit == "deg" else "deg"
+    assert f"unit: {unit}" in refusal(tmp_path, text, **{kind: {"columns": columns, "unit": other}})
+
+
+def test_angles_of_the_other_order_and_inverse_vectors_are_refused(tmp_path):
+    angles = joints(40)
+    truth = seen(angles)
+    moving = table(angles, truth.as_euler("XYZ"), "abc")
+    told = refusal(tmp_path, moving, rpy={"columns": list("abc"), "unit": "rad"})
+    assert "with R = Rx(roll) Ry(pitch) Rz(yaw) by" in told
+    inverse = table(angles, truth.inv().as_rotvec(), "abc")
+    told = refusal(tmp_path, inverse, rotation_vector={"columns": list("abc"), "unit": "rad"})
+    assert "as that of body_T_base" in told
+
+
+def test_a_pose_that_is_not_turned_is_kept(tmp_path):
+    angles = joints(40)
+    numbers = seen(angles).as_rotvec()
+    numbers[7] = 0.0
+    dataset = read(tmp_path, table(angles, numbers, "abc"), rotation_vector={"columns": list("abc"), "unit": "rad"})
+    assert len(dataset) == 40
+
+
 def test_matrices_row_by_row(tmp_path):
     angles = joints(40)
     truth = seen(angles)

@@ -42,6 +42,7 @@ _ALL = (
     Unit("cm", "length", 1.0, 100.0),
     Unit("mm", "length", 1.0, 1000.0),
     Unit("um", "length", 1.0, 1e6),
+    Unit("inch", "length", 127.0, 5000.0),
     Unit("rad", "angle"),
     Unit("deg", "angle", _DEGREE),
     Unit("mrad", "angle", 1.0, 1000.0),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import os
 import sys
 from importlib import import_module
@@ -64,6 +65,15 @@ class LazyGroup(click.Group):
         except ImportError as fault:
             raise _missing(fault) from fault
         return command
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """A name that is none is refused with the nearest that is."""
+        near = difflib.get_close_matches(args[0], COMMANDS, n=1, cutoff=0.6)
+        if args[0] not in COMMANDS and near and not args[0].startswith("-"):
+            ctx.fail(f"No such command {args[0]!r}. Did you mean {near[0]!r}?")
+        return super().resolve_command(ctx, args)
 
     def invoke(self, ctx: click.Context) -> object:
         """Armcal's own errors become one message and an exit code, never a traceback."""

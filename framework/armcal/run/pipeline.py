@@ -157,7 +157,9 @@ def calibrate(
     with watch.stage("validate"):
         crossed = _crossed(experiment, ready, fitted, progress, executor)
         errors, intervals = _errors(ready, fitted, crossed), _intervals(experiment, ready, fitted, crossed)
+    progress("judging", 0.0)
     verdict, evidence = _judge(experiment, ready, fitted, errors, intervals, watch)
+    progress("judging", 1.0)
     noise = noise_result(ready.problem, fitted, ready.dataset, ready.split, errors.calibrated_mm)
     faults += _tell_rejected(registry, [(s.row, s.record_id, s.reason) for s in noise.set_aside])
     return RunResult(
