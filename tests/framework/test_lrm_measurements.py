@@ -25,7 +25,7 @@ PUBLISHED_COMPLIANCE = (0.01832, 0.07149, 0.06617, 0.07887, 0.07902, 0.37994, 0.
 def run(repository: Path, data: Path, model: int | str, out: Path, *settings: str) -> dict:
     """``armcal run`` of an option (its number) or another configuration of the arm (its name); its metrics."""
     config = repository / "configs" / "lrm_arm" / f"{model if isinstance(model, str) else f'option{model}'}.yaml"
-    arguments = ["run", str(config), "--data", str(data / "poses.csv"), "--out", str(out), "--json"]
+    arguments = ["run", str(config), "--data", str(data / "poses.csv"), "--out", str(out), "--json", "--accept"]
     result = CliRunner().invoke(cli, arguments + [x for s in settings for x in ("--set", s)])
     assert result.exit_code == 0, result.output
     return json.loads(result.stdout)

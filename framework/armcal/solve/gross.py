@@ -12,16 +12,19 @@ from numpy.typing import NDArray
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.base.parameters import ParameterBlock
+from armcal.errors import NotConvergedError
 from armcal.solve.combination import Measure
 from armcal.solve.estimator import Estimate
 from armcal.solve.fit_rows import FitRows
 from armcal.solve.problem import FactorRecords, Problem
 from armcal.solve.rigid import rigid_fit, spread_of
+from armcal.solve.structure import random_records
 from armcal.solve.tool_motion import along, apart_from, tools, unseen_motions
 
 BEYOND, FAR_BEYOND = 4.0, 20.0
 """Standard deviations of a prior, or typical corrections where there is none: what is worth a look, what is gross."""
 MOST_RECORDS = 300
+_POSES = 60
 _SAME_MOTION = 0.02
 """Of a parameter's motion of the tool: what may differ from that of the base or of the tool's point."""
 
@@ -52,7 +55,7 @@ class Figure:
     """The calibrated arm beside the nominal one.
 
     Attributes:
-        reach_mm: largest distance of the nominal tool from the first joint, over the records.
+        reach_mm: largest distance of the nominal tool from the first joint, over the poses.
         size: extent of the calibrated tool positions by that of the nominal ones; nan where they do not move.
         moved_mm, turned_deg: how the calibrated arm as a whole stands away from the nominal one.
         displaced: parameters beyond what their priors say, the farthest first.
@@ -71,24 +74,34 @@ def thinned(chosen: NDArray[np.intp], most: int) -> NDArray[np.intp]:
 
 
 def figure_of(problem: Problem, estimate: Estimate, records: Sequence[FactorRecords]) -> Figure:
-    """Of the first tool of all; ``records`` are those whose poses count.
+    """Of the first tool of all, at random poses about the recorded ones: what touches a socket hardly moves in them.
 
     Raises:
         NotConvergedError: a record has no elastic equilibrium.
     """
-    nominal, _ = tools(problem, problem.parameters.nominal(), records)
-    calibrated, _ = tools(problem, estimate.values, records)
+    poses = problem.subset(random_records(problem, records), np.arange(_POSES, dtype=np.intp))
+    try:
+        nominal, calibrated = _both(problem, estimate, poses)
+    except NotConvergedError:
+        poses = tuple(records)
+        nominal, calibrated = _both(problem, estimate, poses)
     arm = problem.blueprint.arms[problem.blueprint.measurements[problem.kernels[0].factor.name].arms[0]]
     chain = arm.nominal_chain
     first = np.array(ca.evalf((chain.base_T_mount @ chain.joints[0].parent_T_joint).translation)).ravel()
-    extent, turn, shift = spread_of(nominal[0]), *rigid_fit(nominal[0], calibrated[0])
+    extent, turn, shift = spread_of(nominal), *rigid_fit(nominal, calibrated)
     return Figure(
-        reach_mm=float(np.max(np.linalg.norm(nominal[0] - first[:, None], axis=0))) * 1000.0,
-        size=spread_of(calibrated[0]) / extent if extent > 0 else float("nan"),
+        reach_mm=float(np.max(np.linalg.norm(nominal - first[:, None], axis=0))) * 1000.0,
+        size=spread_of(calibrated) / extent if extent > 0 else float("nan"),
         moved_mm=float(np.linalg.norm(turn @ first + shift - first)) * 1000.0,
         turned_deg=float(np.degrees(np.arccos(np.clip((np.trace(turn) - 1) / 2, -1.0, 1.0)))),
-        displaced=displaced(problem, estimate, records),
+        displaced=displaced(problem, estimate, poses),
     )
+
+
+def _both(problem: Problem, estimate: Estimate, poses: Sequence[FactorRecords]) -> tuple[Array, Array]:
+    """Places of the first tool, nominal and calibrated (3 x N, m)."""
+    at_nominal, at_estimate = (tools(problem, v, poses)[0] for v in (problem.parameters.nominal(), estimate.values))
+    return at_nominal[0], at_estimate[0]
 
 
 def displaced(problem: Problem, estimate: Estimate, records: Sequence[FactorRecords]) -> tuple[Displaced, ...]:

@@ -17,7 +17,9 @@ OF_REACH = 0.03
 """An error beyond this share of the arm's reach is gross, whatever the arm."""
 UNEXPLAINED_OF_REACH, EXPLAINED_OF_REACH, TIMES_NOISE, EXPLAINED = 0.005, 0.02, 5.0, 1 / 3
 """An error beyond the second share of the reach and so many times the declared noise is gross; beyond the first one
-where no structure in the residuals makes up a third of it, as gravity does of a printed arm whose base is rigid."""
+where no structure in the residuals makes up a third of it, as gravity does of a printed arm whose base is rigid. What
+goes with time is no explanation: something may as well have slipped or moved."""
+_OF_TIME = "order"
 SIZE, GROSS_SIZE = 0.02, 0.1
 """How far the calibrated arm may be larger or smaller than the nominal one: worth a look, and gross."""
 UNSEEN_SCALE = 0.2
@@ -35,7 +37,10 @@ def gross_error(judged_mm: Array, figure: Figure, estimate: Estimate, left: Left
     if share > OF_REACH:
         test = f"mean, limit {100 * OF_REACH:g} % of the reach of {figure.reach_mm:.0f} mm"
         return [Finding("bad", f"{told}: the values do not describe this arm.", test, CHECK_THE_DATA)]
-    found = 0.0 if left is None else max((s.falls_mm for s in left.worthwhile), default=0.0) / max(left.mean_mm, 1e-12)
+    found = 0.0
+    if left is not None:
+        causes = [s.falls_mm for s in left.worthwhile if s.kind != _OF_TIME]
+        found = max(causes, default=0.0) / max(left.mean_mm, 1e-12)
     limit = UNEXPLAINED_OF_REACH if found < EXPLAINED else EXPLAINED_OF_REACH
     if share <= limit or scale <= TIMES_NOISE:
         return []
