@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 from armcal.base.config_text import plain
-from armcal.config.system import build_system
+from armcal.config.system import System, build_system
 from armcal.config.yaml_source import load_config
 from armcal.plugins import discover
 from armcal.use.calibration import Calibration
@@ -71,10 +71,20 @@ def made_record(
 @cache
 def made_calibration(config: Path, overrides: tuple[str, ...] = (), seed: int = 1) -> Calibration:
     """Every parameter of the arms moved at random; springs of 0.03 rad/(N m) or so, play and lag of a few mrad."""
-    source = load_config(config, overrides)
-    system = build_system(source, discover())
+    system = build_system(load_config(config, overrides), discover())
+    return _made(system, _moved(system.parameters({}), np.random.default_rng(seed)))
+
+
+def exact_calibration(config: Path, values: Mapping[str, float]) -> Calibration:
+    """The arm of a configuration, with these values of parameters and the nominal ones of all others."""
+    system = build_system(load_config(config), discover())
     parameters = system.parameters({})
-    values = _moved(parameters, np.random.default_rng(seed))
+    numbers = zip(parameters.entry_names, parameters.nominal().tolist(), strict=True)
+    return _made(system, [values.get(name, nominal) for name, nominal in numbers])
+
+
+def _made(system: System, values: Sequence[float]) -> Calibration:
+    parameters = system.parameters({})
     own = {block.name for arm in system.arms.values() for block in arm.parameters()}
     free = [name for name in parameters.names if name in own]
     units = [block.entry_unit for block in parameters.blocks for _ in block.entry_names]

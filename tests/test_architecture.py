@@ -62,6 +62,7 @@ ORDER = [
     "armcal.solve.compiler",
     "armcal.solve.factor",
     "armcal.solve.kernel_trial",
+    "armcal.solve.stability",
     "armcal.solve.kernel",
     "armcal.solve.batch_function",
     "armcal.solve.blueprint",

@@ -8,6 +8,7 @@ import casadi as ca
 import numpy as np
 from armcal.base.domains import Array
 from armcal.errors import NotConvergedError
+from armcal.solve.stability import lowest
 from armcal.use.exporter import random_commands
 from armcal.use.tool_expression import ToolExpression
 
@@ -84,7 +85,8 @@ class Equilibrium:
             state = state + step * min(1.0, _LONGEST_STEP / max(length, AT_REST))
             if length <= AT_REST:
                 break
-        if not length <= _NEAR_REST or np.abs(state).max() > _FARTHEST:
+        held = lowest(self._newton(record, state)[1].full()[None])[0] > 0
+        if not (held and length <= _NEAR_REST and np.abs(state).max() <= _FARTHEST):
             raise NotConvergedError(
                 "the arm has no elastic equilibrium in a pose within its limits.",
                 hint="Check masses and compliances: springs this soft do not hold the arm.",

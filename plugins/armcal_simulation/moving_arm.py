@@ -8,9 +8,9 @@ from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.errors import NotConvergedError
 from armcal.solve.factor import Factor
-from armcal.solve.kernel import MOST_PASSES, REST_RAD
 from armcal.solve.problem import Problem
 from armcal.solve.simulation import SimulationRequest
+from armcal.solve.stability import MOST_PASSES, REST_RAD
 
 _BLOCK = 256
 

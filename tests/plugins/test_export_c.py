@@ -282,6 +282,7 @@ def test_arms_that_passes_lead_astray_settle_by_newton(arms):
         if status == DONE:
             following, slope = (each.full() for each in function(record, state))
             np.testing.assert_allclose(following.ravel(), state, rtol=0, atol=1e-10)
+            assert np.linalg.eigvals(slope).real.max() < 1, "springs do not hold the arm there"
             astray += np.abs(np.linalg.eigvals(slope)).max() > 1.0
     assert astray > 5
 

@@ -170,7 +170,14 @@ class Arm:
     @cached_property
     def deflection_size(self) -> int:
         """How many numbers an elastic state of this arm has."""
-        return sum(site.size for site in elastic_sites(self.nominal_chain, self.springs(self._nominal)))
+        return len(self.spring_names)
+
+    @cached_property
+    def spring_names(self) -> tuple[str, ...]:
+        """What gives, in words, for each number of an elastic state."""
+        sites = elastic_sites(self.nominal_chain, self.springs(self._nominal))
+        names = (f"the mount of {self.name}", *(f"joint {joint} of {self.name}" for joint in self.joint_names))
+        return tuple(names[site.site] for site in sites for _ in range(site.size))
 
     def state(self, values: Mapping[str, Expression], inputs: ArmInputs) -> ArmState:
         """One elastic pass: the arm's frames at a deflection, and the deflection these frames lead to."""

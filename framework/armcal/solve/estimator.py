@@ -131,6 +131,8 @@ class Estimate:
         determined: per free entry, whether data and priors together determine it.
         told_by_data: per free entry, whether the data alone does; else only a prior holds it, if anything does.
         verdict: the solver's.
+        widened: by what the standard deviations of free entries grew because neighbouring records err alike; empty
+            where they do and nothing grew by it, None where no such correlation was found.
     """
 
     parameters: Parameters
@@ -145,11 +147,17 @@ class Estimate:
     determined: tuple[bool, ...]
     told_by_data: tuple[bool, ...]
     verdict: SolverVerdict
+    widened: tuple[float, ...] | None = None
 
     @cached_property
     def names(self) -> tuple[str, ...]:
         """Names of the free canonical entries."""
         return tuple(self.parameters.entry_names[i] for i in self.free_entries)
+
+    @cached_property
+    def free_values(self) -> Array:
+        """Values of the free canonical entries, in the order of ``names``, ``deviations`` and ``intervals``."""
+        return self.values[list(self.free_entries)]
 
     @cached_property
     def deviations(self) -> Array:
@@ -170,7 +178,8 @@ class Estimate:
     def intervals(self) -> tuple[Interval95, ...]:
         """95 % intervals of the free entries, by Student's t.
 
-        Within 3 deviations of a bound an interval reaches from the bound to the two-sided one's other end. A
+        Within 3 deviations of a bound, or beyond it, an interval reaches from the bound to the other end of the
+        two-sided one about the estimate without bounds, or about the bound where that lies beyond it. A
         one-sided quantile there would be shorter, but choosing between the two kinds by the estimate itself
         would then hold the truth in less than 95 % of cases [Feldman1998].
         """
@@ -209,7 +218,11 @@ def estimate(
     were stated against the declared noise, so its covariance is the sandwich H^-1 (s^2 J'J + P) H^-1 with
     H = b J'J + P; s is the influence's spread and b its slope, 1 in least squares.
     A parameter at a bound keeps its full covariance: the bound is not evidence.
+
+    Raises:
+        NotConvergedError: springs do not hold the arm in a record.
     """
+    problem.require_held(solution.values, records)
     parameters = problem.parameters
     scales, prior = parameters.scales(), parameters.prior_information()
     slope = 1.0 if influence is None else influence.slope
@@ -222,16 +235,14 @@ def estimate(
     half, freedom = inverse.root, problem.equations(records) - inverse.spent
     influence = influence or _of_least_squares(equations.cost, freedom)
     by_data = influence.spread * half @ (half.T @ triangle.T)
-    by_priors = half @ (half.T * np.sqrt(prior))
-    covariance = by_data @ by_data.T + by_priors @ by_priors.T
-    gradient = equations.gradient + prior * moved
-    step = -(half @ (half.T @ gradient))
+    by_both = np.hstack([by_data, half @ (half.T * np.sqrt(prior))])
+    step = -(half @ (half.T @ (equations.gradient + prior * moved)))
     unseen = np.linalg.norm(inverse.null, axis=0)
     return Estimate(
         parameters=parameters,
         values=solution.values,
         free_entries=parameters.free_entries,
-        covariance=chain @ covariance @ chain.T,
+        covariance=chain @ (by_both @ by_both.T) @ chain.T,
         unconstrained=solution.values[list(parameters.free_entries)] + chain @ step,
         square_root_information=_square_root(triangle, prior, influence),
         noise_scale=influence.noise_scale,
@@ -343,7 +354,8 @@ def _poses(records: Sequence[FactorRecords]) -> int:
 def _interval(value: float, unconstrained: float, sd: float, lower: float, upper: float, quantile: float) -> Interval95:
     if not np.isfinite(sd):
         return Interval95(lower, upper, False)
-    low, high = unconstrained - quantile * sd, unconstrained + quantile * sd
+    # Beyond a bound the interval starts there: an estimate that noise pushed far out is no surer than one at the bound.
+    low, high = min(unconstrained, upper) - quantile * sd, max(unconstrained, lower) + quantile * sd
     if unconstrained - lower < NEAR_A_BOUND_SD * sd and unconstrained - lower <= upper - unconstrained:
         return Interval95(lower, float(np.clip(high, lower, upper)), True)
     if upper - unconstrained < NEAR_A_BOUND_SD * sd:

@@ -11,6 +11,7 @@ parameters, and r* is the residual in equilibrium up to the square of what is le
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -63,6 +64,8 @@ class Factor:
         told: what the record alone says of these, to start from; empty where it says nothing.
         told_names: local names of the group's parameters that ``told`` holds the entries of, one an entry.
         mean_weight: how many times more the mean of a group's residuals weighs.
+        springs: of each number of the state, what gives, in words.
+        joints: channels of commanded joints, each with ``angle`` or ``length``.
     """
 
     name: str
@@ -81,6 +84,8 @@ class Factor:
     told: Expression = None
     told_names: tuple[str, ...] = ()
     mean_weight: float = 1.0
+    springs: tuple[str, ...] = ()
+    joints: tuple[tuple[str, str], ...] = ()
 
     @property
     def _inputs(self) -> list[Expression]:
@@ -111,10 +116,20 @@ class Factor:
         outputs = [self.next_state, ca.densify(residual), ca.densify(jacobian.T)]
         return ca.Function("linearise", self._inputs, outputs, {"cse": True})
 
-    def newton_function(self) -> ca.Function:
-        """(values, record, state) -> (state after a Newton step on the equilibrium, how far it moves)."""
-        step = se3.solve_near_identity(self._one_minus_slope(), self.next_state - self.state)
-        return ca.Function("newton", self._inputs, [self.state + step, step], {"cse": True})
+    def slope_function(self) -> ca.Function:
+        """(values, record, state) -> (next state, its slope by the state)."""
+        slope = ca.densify(ca.jacobian(self.next_state, self.state))
+        return ca.Function("slope", self._inputs, [self.next_state, slope], {"cse": True})
+
+    def pose_of(self, record: Any) -> str:
+        """The commanded joints of one record (n_c numbers), as people read them."""
+        shown = []
+        for channel, dimension in self.joints:
+            if channel in self.channels:
+                number = float(record[self.channels.index(channel)])
+                size = f"{math.degrees(number):.1f} deg" if dimension == "angle" else f"{1000 * number:.1f} mm"
+                shown.append(f"{channel.partition('.')[2]} {size}")
+        return ", ".join(shown) or "no joint"
 
     def hessian_function(self) -> ca.Function:
         """(values, record, state, W) -> exact Hessian (n_v x n_v) of half of |W residual|^2, in equilibrium.
@@ -226,6 +241,7 @@ def build_factor(
         tools=tools,
         told=told,
         told_names=told_names,
+        **_of_arms(measurement, arms),
         **_of_residual(name, measurement),
     )
 
@@ -251,6 +267,13 @@ def _check_rows(name: str, measurement: Measurement, residual: Expression) -> No
             f"the measurement {name} has a residual of {rows} entries ({', '.join(dimensions)}), and {', '.join(odd)}.",
             hint="Its plugin is wrong: armcal plugins check says how.",
         )
+
+
+def _of_arms(measurement: Measurement, arms: Mapping[str, Arm]) -> dict[str, Any]:
+    """What a state's numbers and commanded joints are called."""
+    own = [(name, arms[name.removesuffix(OTHER)]) for name in measurement.arms]
+    joints = [(a.name + "." + j + n.removeprefix(a.name), dim) for n, a in own for j, dim in a.commanded.items()]
+    return {"springs": tuple(spring for _, arm in own for spring in arm.spring_names), "joints": tuple(joints)}
 
 
 def _of_residual(name: str, measurement: Measurement) -> dict[str, Any]:

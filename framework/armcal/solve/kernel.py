@@ -10,29 +10,30 @@ import ctypes
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, NoReturn, Protocol
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 
 from armcal.base.domains import Array
-from armcal.errors import NotConvergedError
 from armcal.solve import c_source, compiler, kernel_trial
 from armcal.solve.factor import Factor
+from armcal.solve.stability import (
+    MOST_DEFLECTION,
+    MOST_PASSES,
+    NEAR_REST_RAD,
+    REST_RAD,
+    Evaluate,
+    lowest,
+    refusal,
+    settle,
+)
 
 EvaluatorChoice = Literal["auto", "compiled", "interpreted"]
 
-REST_RAD = 1e-13
-"""A residual is taken when no deflection moves more than this in a pass: below 1e-6 mm on any arm."""
-NEAR_REST_RAD = 1e-10
-"""The linearisation corrects to second order, so it may start from here."""
 AS_IT_STANDS = 1e300
 """Any state is at rest: take the one given, to which repeated passes might not lead."""
-MOST_DEFLECTION = 1.0
-"""rad, or m: a spring that gives more does not hold the arm, and more than one equilibrium may be near."""
-LONGEST_STEP = 0.3
-"""rad, or m: of Newton's method."""
-MOST_PASSES = 100
 WORTH_COMPILING_RECORDS = 5000
 """From this many records on, waiting for the compiler costs less than the virtual machine does."""
 _BLOCK, _FEW = 64, 8
@@ -168,9 +169,9 @@ class Kernel:
     identity: str = f"casadi {ca.CasadiMeta.version()}"
 
     @cached_property
-    def _newton(self) -> Mapped:
-        """Newton steps on the equilibrium, for records whose passes do not settle."""
-        return Mapped(self.factor.newton_function(), _FEW)
+    def _slope(self) -> Mapped:
+        """How the next state follows the state."""
+        return Mapped(self.factor.slope_function(), _FEW)
 
     @cached_property
     def _by_channels(self) -> dict[tuple[str, ...], Mapped]:
@@ -220,37 +221,51 @@ class Kernel:
             self.backend.linearise(values, record, state, residual, jacobian, AS_IT_STANDS)
 
     def _settle_by_newton(self, values: Array, record: Array, state: Array, before: Array) -> None:
-        """Bring every record to an equilibrium in place, where repeated passes lead away from it.
+        """Bring every record to an equilibrium that the springs hold in place, where passes lead away from it.
 
         ``state`` is where the passes ended. Records that they brought to rest stay there; the others start anew from
-        ``before``, or from no deflection if that is too much. If one has no equilibrium, all are left at ``before``.
+        ``before``, or from no deflection if that is too much. If one has none, all are left at ``before``.
         """
         at_rest = np.abs(state).max(axis=0, initial=0.0) <= MOST_DEFLECTION
         state[:, ~at_rest] = 0.0
-        at_rest &= np.abs(self._newton_step(values, record, state)).max(axis=0, initial=0.0) < NEAR_REST_RAD
-        held = np.abs(before).max(axis=0, initial=0.0) <= MOST_DEFLECTION
-        state[:, ~at_rest] = np.where(held, before, 0.0)[:, ~at_rest]
-        lengths = np.full(state.shape[1], np.inf)
-        moving = np.arange(state.shape[1])
-        for _ in range(MOST_PASSES):
-            step = self._newton_step(values, record[:, moving], state[:, moving])
-            length = np.abs(step).max(axis=0, initial=0.0)
-            state[:, moving] += step * np.minimum(1.0, LONGEST_STEP / np.maximum(length, LONGEST_STEP))
-            lengths[moving] = length
-            moving = moving[np.isfinite(length) & (length >= REST_RAD)]
-            if not len(moving):
-                break
-        if not (np.all(lengths < NEAR_REST_RAD) and np.abs(state).max(initial=0.0) <= MOST_DEFLECTION):
-            state[:] = before
-            raise NotConvergedError(
-                "the elastic equilibrium of a record did not settle.",
-                hint="Bound the compliances, or check masses and units: springs this soft do not hold the arm.",
-            )
+        following, slopes = self._slopes(values, record, state)(np.arange(state.shape[1]))
+        at_rest &= (np.abs(following - state).max(axis=0, initial=0.0) < NEAR_REST_RAD) & (lowest(slopes) > 0)
+        within = np.abs(before).max(axis=0, initial=0.0) <= MOST_DEFLECTION
+        moving = np.flatnonzero(~at_rest)
+        moved = np.where(within, before, 0.0)[:, moving]
+        settled = settle(self._slopes(values, record[:, moving], moved), moved)
+        state[:, moving] = moved
+        if not settled.sound.all():
+            bad = int(np.argmin(settled.sound))
+            self._refuse(values, record[:, moving[bad]], moved[:, bad], not settled.at_rest[bad], state, before)
 
-    def _newton_step(self, values: Array, record: Array, state: Array) -> Array:
-        step = np.empty_like(state)
-        self._newton(values, (record, state), (np.empty_like(state), step))
-        return step
+    def require_held(self, values: Array, record: Array, state: Array) -> None:
+        """Refuse states in equilibrium that springs do not hold, such as a load balanced upright on a soft joint.
+
+        Raises:
+            NotConvergedError: of a record.
+        """
+        if len(state):
+            low = lowest(self._slopes(values, record, state)(np.arange(state.shape[1]))[1])
+            bad = int(np.argmin(low))
+            if not low[bad] > 0:
+                self._refuse(values, record[:, bad], state[:, bad], False, state, np.zeros_like(state))
+
+    def _refuse(self, values: Array, record: Array, at: Array, far: bool, state: Array, before: Array) -> NoReturn:
+        """Of one record at a state; all states are left at ``before``."""
+        _, slopes = self._slopes(values, record[:, None], at[:, None].copy())(np.arange(1))
+        state[:] = before
+        raise refusal(f"a record ({self.factor.pose_of(record)})", self.factor.springs, at, slopes[0], far)
+
+    def _slopes(self, values: Array, record: Array, state: Array) -> Evaluate:
+        """What ``settle`` asks for, of these records at their states."""
+
+        def evaluate(places: NDArray[np.intp]) -> tuple[Array, Array]:
+            following, slopes = (np.empty((size, len(places))) for size in (len(state), len(state) ** 2))
+            self._slope(values, (record[:, places], state[:, places]), (following, slopes))
+            return following, slopes.reshape(len(state), len(state), -1).transpose(2, 1, 0)
+
+        return evaluate
 
     def predict(self, values: Array, record: Array, state: Array, shown: Array) -> None:
         """Outputs and tool poses in equilibrium (n_o + 12 an arm x records).
@@ -271,6 +286,7 @@ class Kernel:
             moved = np.abs(following - state).max(initial=0.0)
             state[:] = following
             if moved <= REST_RAD and not _out_of_hand(state):
+                self.require_held(values, record, state)
                 return
         self._settle_by_newton(values, record, state, before)
         mapped(values, (record, state), (following, shown))

@@ -15,7 +15,8 @@ import numpy as np
 
 from armcal.base.domains import Array
 from armcal.solve.c_source import LANES
-from armcal.solve.kernel import MOST_DEFLECTION, MOST_PASSES, NEAR_REST_RAD, Compiled, Kernel, direct_access
+from armcal.solve.kernel import Compiled, Kernel, direct_access
+from armcal.solve.stability import MOST_DEFLECTION, MOST_PASSES, NEAR_REST_RAD
 
 
 class OneRecord:

@@ -165,6 +165,16 @@ class Problem:
             result.append(residual[:, : each.count])
         return tuple(result)
 
+    def require_held(self, values: Array, records: Sequence[FactorRecords]) -> None:
+        """Refuse values at which springs do not hold the arm in every record.
+
+        Raises:
+            NotConvergedError: a record has no elastic equilibrium, or one that is not stable.
+        """
+        self.residuals(values, records)
+        for kernel, slots, each in zip(self.kernels, self.slots, records, strict=True):
+            gather.evaluated(slots, values, each.group, kernel.require_held, each.record, each.state)
+
     def cost(self, values: Array, records: Sequence[FactorRecords]) -> float:
         """Half the weighted squared whitened residuals."""
         raw = self.residuals(values, records)

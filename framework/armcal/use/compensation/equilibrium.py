@@ -6,23 +6,33 @@ from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 
 from armcal.base.domains import Array
-from armcal.errors import NotConvergedError
 from armcal.solve.batch_function import BatchFunction
-from armcal.solve.kernel import MOST_DEFLECTION, REST_RAD, EvaluatorChoice
+from armcal.solve.kernel import EvaluatorChoice
+from armcal.solve.stability import (
+    LONGEST_STEP,
+    MOST_DEFLECTION,
+    NEAR_REST_RAD,
+    REST_RAD,
+    Evaluate,
+    lowest,
+    refusal,
+    settle,
+)
 from armcal.use.compensation.request import Mask
 from armcal.use.compensation.step import sample_inputs
 from armcal.use.tool_expression import ToolExpression
 
 _MOST_STEPS = 50
-_LONGEST = 0.3
-"""rad: a longer Newton step is shortened."""
+_TOGETHER = 4096
+"""Records whose slopes are in memory at once."""
 
 
 @dataclass(frozen=True)
 class Standing:
-    """Arms in equilibrium: states (n_d x N), tools (N x 4 x 4), and which of them settled (N)."""
+    """Arms in equilibrium: states (n_d x N), tools (N x 4 x 4), and which settled where their springs hold them (N)."""
 
     states: Array
     base_T_tool: Array
@@ -36,11 +46,14 @@ class Equilibrium:
         left = expression.next_state - expression.state
         step = expression.to_equilibrium(left)[0] if expression.state.numel() else left
         tool = ca.vec(expression.base_T_tool.matrix()[:3, :])
-        self._size = expression.state.numel()
+        self._size, self._expression = expression.state.numel(), expression
         function = ca.Function(
             "equilibrium", [expression.record, expression.state], [ca.densify(step), ca.densify(tool)], {"cse": True}
         )
         self._function = BatchFunction(function, sample_inputs(expression), choice)
+        slope = [expression.next_state, expression.slope()]
+        function = ca.Function("equilibrium_slope", [expression.record, expression.state], slope, {"cse": True})
+        self._slope = BatchFunction(function, sample_inputs(expression), choice)
 
     def __call__(self, record: Array, state: Array | None = None) -> Standing:
         """Arms for records (channels x N), from states near or from none."""
@@ -53,8 +66,26 @@ class Equilibrium:
             settled = (length <= REST_RAD) & (np.abs(states).max(axis=0, initial=0.0) <= MOST_DEFLECTION)
             if settled.all() or not np.isfinite(length).any():
                 break
-            states += step * np.minimum(1.0, _LONGEST / np.maximum(length, _LONGEST))
+            states += step * np.minimum(1.0, LONGEST_STEP / np.maximum(length, LONGEST_STEP))
+        for start in range(0, count if self._size else 0, _TOGETHER):
+            part = np.arange(start, min(start + _TOGETHER, count))
+            settled[part] &= lowest(self._slopes(record[:, part], states[:, part])(np.arange(len(part)))[1]) > 0
+            lost = part[~settled[part]]
+            if len(lost):
+                # Newton's method may lead to where springs do not hold the arm, though they hold it elsewhere.
+                found = np.zeros((self._size, len(lost)))
+                settled[lost] = settle(self._slopes(record[:, lost], found), found).sound
+                states[:, lost], tools[:, lost] = found, self._function(record[:, lost], found)[1]
         return Standing(states, _poses(tools), settled)
+
+    def _slopes(self, record: Array, states: Array) -> Evaluate:
+        """What ``settle`` asks for, of these records at their states."""
+
+        def evaluate(places: NDArray[np.intp]) -> tuple[Array, Array]:
+            following, slopes = self._slope(record[:, places], states[:, places])
+            return following, slopes.reshape(self._size, self._size, -1).transpose(2, 1, 0)
+
+        return evaluate
 
     def required(self, record: Array, state: Array | None = None) -> Standing:
         """The same, for records that must settle.
@@ -65,10 +96,10 @@ class Equilibrium:
         standing = self(record, state)
         if not standing.settled.all():
             at = int(np.flatnonzero(~standing.settled)[0])
-            raise NotConvergedError(
-                f"the elastic equilibrium of command {at + 1} did not settle.",
-                hint="The load is more than the springs hold there: command another pose, or a smaller load.",
-            )
+            own, state = record[:, [at]], standing.states[:, [at]]
+            following, slopes = self._slopes(own, state)(np.arange(1))
+            far = bool(np.abs(following - state).max() > NEAR_REST_RAD or np.abs(state).max() > MOST_DEFLECTION)
+            raise refusal(f"command {at + 1}", self._expression.arm.spring_names, state[:, 0], slopes[0], far)
         return standing
 
 
