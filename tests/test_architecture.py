@@ -119,6 +119,7 @@ ORDER = [
     "armcal.solve.fit_rows",
     "armcal.solve.score_tests",
     "armcal.solve.neighbours",
+    "armcal.solve.clustered",
     "armcal.solve.leftover",
     "armcal.solve.misses",
     "armcal.solve.gross",

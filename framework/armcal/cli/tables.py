@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +12,8 @@ from rich.text import Text
 from armcal.base.domains import Semidefinite, symmetric
 from armcal.cli.common import Voice
 from armcal.report.group_table import part_of
+from armcal.report.numbers import MINUS, NONE, decimals_for, shown_unit, significant
+from armcal.report.tables import parameter_rows
 from armcal.run.result import RunResult
 from armcal.solve.bootstrap import Bootstrap
 from armcal.solve.estimator import Estimate
@@ -95,20 +96,22 @@ def _numbers(summary: ErrorSummary) -> list[str]:
 
 def _compliances(result: RunResult) -> Table:
     estimate = result.estimate
-    table = Table(title="Compliance, rad/(N m)", title_justify="left")
+    table = Table(title=f"Compliance, {shown_unit('rad_per_Nm')[1]}", title_justify="left")
     for column in ("parameter", "value", "sd", "95 % interval", ""):
         table.add_column(column, justify="left" if column in ("parameter", "") else "right")
-    for i, name in enumerate(estimate.names):
-        block = estimate.parameters[name.partition("[")[0]]
-        if block.unit != "rad_per_Nm" or block.size > 1:
+    for i, row in enumerate(parameter_rows(estimate)):
+        if row.si_unit != "rad_per_Nm" or estimate.parameters[row.name.partition("[")[0]].size > 1:
             continue
-        value, interval, sd = estimate.values[estimate.free_entries[i]], estimate.intervals[i], estimate.deviations[i]
-        digits = _digits(float(sd))
-        ends = f"{interval.lower:.{digits}f} to {interval.upper:.{digits}f}"
-        span = f"up to {interval.upper:.{digits}f}" if interval.one_sided else ends
-        flag = "at its bound" if name in estimate.at_bound else _held(estimate, i)
-        table.add_row(name, f"{value:.{digits}f}", f"{sd:.{digits}f}", span, flag)
+        flag = "at its bound" if row.at_bound else _held(estimate, i)
+        table.add_row(row.name, *map(_in_ascii, (row.value, row.sd, row.interval)), flag)
     return table
+
+
+def _in_ascii(text: str) -> str:
+    """A number of the report for terminals of any encoding."""
+    for sign, word in ((MINUS, "-"), (NONE, "-"), ("≤", "up to"), ("≥", "from")):
+        text = text.replace(sign, word)
+    return text.strip()
 
 
 def _held(estimate: Estimate, index: int) -> str:
@@ -120,13 +123,14 @@ def _held(estimate: Estimate, index: int) -> str:
 def _matrices(result: RunResult) -> Table:
     """Compliance matrices by their principal values, the softest direction last."""
     estimate = result.estimate
-    table = Table(title="Principal compliances, rad/(N m)", title_justify="left")
+    factor, unit = shown_unit("rad_per_Nm")
+    table = Table(title=f"Principal compliances, {unit}", title_justify="left")
     for column in ("parameter", "stiffest", "", "softest"):
         table.add_column(column, justify="left" if column == "parameter" else "right")
     for block in estimate.parameters.free:
         if isinstance(block.domain, Semidefinite):
             sizes = np.linalg.eigvalsh(symmetric(estimate.values[estimate.parameters.entries_of(block.name)]))
-            table.add_row(block.name, *(f"{max(size, 0.0):.4f}" for size in sizes))
+            table.add_row(block.name, *(_in_ascii(significant(factor * max(size, 0.0))) for size in sizes))
     return table
 
 
@@ -140,14 +144,7 @@ def _bootstrap(result: RunResult, found: Bootstrap) -> Table:
     estimate = result.estimate
     for i, name in enumerate(found.names):
         sd, low, high = (float(x) for x in (found.deviations[i], *found.intervals[i]))
-        digits = _digits(sd)
+        digits = decimals_for(sd) or 5
         numbers = [estimate.values[estimate.free_entries[i]], estimate.deviations[i], sd]
         table.add_row(name, *(f"{x:.{digits}f}" for x in numbers), f"{low:.{digits}f} to {high:.{digits}f}")
     return table
-
-
-def _digits(deviation: float) -> int:
-    """Decimals that show a standard deviation to two significant digits."""
-    if not math.isfinite(deviation) or deviation <= 0:
-        return 5
-    return min(12, max(3, 1 - math.floor(math.log10(deviation))))

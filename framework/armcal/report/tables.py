@@ -28,7 +28,6 @@ _SETS = (("train", "Train"), ("holdout", "Holdout"), ("cross_validated", "Cross-
 _STATISTICS = ("mean", "rms", "p95", "max")
 _EMPTY = ErrorSummary(None, None, None, None, 0)
 _FIGURE_SPACE, _POINT_SPACE = "\u2007", "\u2008"
-_MOST_DECIMALS = 6
 
 
 @dataclass(frozen=True)
@@ -145,7 +144,7 @@ def parameter_rows(estimate: Estimate) -> tuple[ParameterRow, ...]:
 def _decimals(raw: RawParameter) -> int:
     """Two digits of the standard deviation; five of the value where there is none, three decimals of a zero."""
     size = raw.sd if math.isfinite(raw.sd) and raw.sd > 0 else max(abs(raw.value), abs(raw.nominal)) / 1000
-    return min(decimals_for(size), _MOST_DECIMALS) if size else 3
+    return decimals_for(size) if size else 3
 
 
 def _row(

@@ -24,11 +24,13 @@ from armcal.run.provenance import provenance
 from armcal.run.reach import check_reach
 from armcal.run.result import ErrorTable, RecordErrors, RunResult
 from armcal.solve.bootstrap import Bootstrap, bootstrap
+from armcal.solve.clustered import widened
 from armcal.solve.coverage import fit_and_predict
 from armcal.solve.drift import residuals, with_drift
 from armcal.solve.estimator import Estimate, Progress, gave_up, no_progress, require_solvable, spread
 from armcal.solve.evidence import Evidence
 from armcal.solve.joint_noise import with_joint_noise
+from armcal.solve.motion import recorded_position
 from armcal.solve.nuisance import restricted, settled, started, untrained
 from armcal.solve.parallel import Executor
 from armcal.solve.problem import FactorRecords, Problem
@@ -225,11 +227,19 @@ def _announce(experiment: Experiment, ready: Prepared) -> list[str]:
 
 
 def _fitted(experiment: Experiment, ready: Prepared, progress: Progress, executor: Executor | None) -> WeighedFit:
-    estimator, nominal = spread(experiment.estimator, executor), ready.problem.parameters.nominal()
-    given_up = hopeless(ready.problem, ready.training, ready.dataset.subset(ready.split.train), nominal)
+    """The fit to the training records, as sure as records that may err alike allow."""
+    problem, estimator, nominal = (
+        ready.problem,
+        spread(experiment.estimator, executor),
+        ready.problem.parameters.nominal(),
+    )
+    own = ready.dataset.subset(ready.split.train)
+    given_up = hopeless(problem, ready.training, own, nominal)
     if given_up is not None:
-        return plain_fit(ready.problem, ready.training, given_up)
-    return fit(ready.problem, ready.training, estimator, nominal, progress)
+        return plain_fit(problem, ready.training, given_up)
+    fitted = fit(problem, ready.training, estimator, nominal, progress)
+    acting = problem.weighted(fitted.records, fitted.weights)
+    return replace(fitted, estimate=widened(problem, acting, fitted.estimate, recorded_position(own)))
 
 
 def _judge(

@@ -2,9 +2,11 @@
 
 Residuals of records that took no part in a fit are put in units of what was predicted for them. If the model's own
 error is not Gaussian, or larger in some poses than in others, the shares held differ from the levels claimed. The
-intervals are then stretched by the quantile of these scores (split conformal prediction with scores in units of
-the predicted spread [Lei2018]), level by level. A stretch is never judged by the records it comes from: each fold of
-a cross-validation is judged by the stretch that the scores of the other folds give (cross-conformal [Vovk2015]).
+intervals are then stretched by the quantile of these scores, level by level, as conformal prediction does with scores
+in units of the predicted spread [Lei2018]. Its guarantee is not had: scores are those of folds, set against what the
+whole fit predicts, so that they are not exchangeable with those of new records, and all rests on poses alike. A
+stretch is never judged by the records it comes from: each fold of a cross-validation is judged by the stretch that the
+scores of the other folds give (cross-conformal [Vovk2015]).
 """
 
 from __future__ import annotations

@@ -6,8 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from armcal.base.domains import Array
-from armcal.solve.estimator import Estimate
+from armcal.base.domains import Array, Semidefinite, symmetric
+from armcal.base.parameters import ParameterBlock
+from armcal.solve.estimator import AT_BOUND, Estimate
 from armcal.solve.evidence import PriorsAlone
 from armcal.solve.leftover import Leftover, Structure
 from armcal.solve.misses import MEDIANS, Misses
@@ -18,6 +19,8 @@ FEW_NAMED = 2
 """So many combinations that only priors hold are named in the verdict; of more, armcal identify tells."""
 NEGLIGIBLE_SHARE = 0.1
 """Of the typical error: what moves the tip by less than this does not matter to it."""
+NOTICEABLE_SD = 0.3
+"""A shift by less than so many standard deviations is not told."""
 _FOLLOW_UP = 0.025
 """Two questions are asked why neighbours are alike, at 5 % together."""
 _MM = "mm"
@@ -48,6 +51,31 @@ def determined_told(estimate: Estimate, alone: PriorsAlone | None, typical_mm: f
         return Finding("note", text, test, "Nothing for the tip; armcal identify names them.")
     text = f"{held}, and the tip at unseen poses depends on them, by up to {alone.worst_mm:.2g} {_MM} (1 sd)."
     return Finding("warning", text, test, "armcal identify names them, and armcal plan the poses that would tell.")
+
+
+def shifted_told(estimate: Estimate) -> list[Finding]:
+    """Which estimates are moved by bounds and cones that hold others, and by how many standard deviations."""
+    blocks = {block.name for block in estimate.parameters.free if _at_its_edge(estimate, block)}
+    sd = np.where(estimate.deviations > 0, estimate.deviations, np.inf)
+    moved = np.nan_to_num((estimate.free_values - estimate.unconstrained) / sd)
+    seen = [i for i, name in enumerate(estimate.names) if name.partition("[")[0] not in blocks]
+    seen = [i for i in seen if abs(moved[i]) > NOTICEABLE_SD] if blocks else []
+    if not seen:
+        return []
+    worst = sorted(seen, key=lambda i: -abs(moved[i]))
+    listed = ", ".join(f"{estimate.names[i]} ({moved[i]:+.1f} sd)" for i in worst[:MOST_TOLD])
+    more = f" and {len(worst) - MOST_TOLD} more" if len(worst) > MOST_TOLD else ""
+    held = ", ".join(sorted(blocks)[:MOST_TOLD]) + (" and others" if len(blocks) > MOST_TOLD else "")
+    text = f"Bounds that hold {held} shift other estimates: {listed}{more}. Their intervals do not count this shift."
+    return [Finding("note", text, f"step without bounds, more than {NOTICEABLE_SD:g} sd")]
+
+
+def _at_its_edge(estimate: Estimate, block: ParameterBlock) -> bool:
+    """Whether a block lies on a bound, or a matrix on its cone."""
+    if isinstance(block.domain, Semidefinite):
+        sizes = np.linalg.eigvalsh(symmetric(estimate.values[estimate.parameters.entries_of(block.name)]))
+        return bool(sizes.min() <= AT_BOUND * block.scale)
+    return not set(block.entry_names).isdisjoint(estimate.at_bound)
 
 
 def worse_than_nominal(judged_mm: Array, nominal_mm: Array, unit: str = _MM) -> list[Finding]:
@@ -100,8 +128,8 @@ def _test_of(found: Leftover) -> str:
     return f"score test, {100 * found.level:g} % over all {found.tested} dependences{blocks}"
 
 
-def neighbours_told(found: Leftover | None) -> list[Finding]:
-    """Whether records that follow one another miss alike, and why."""
+def neighbours_told(found: Leftover | None, estimate: Estimate) -> list[Finding]:
+    """Whether records that follow one another miss alike, why, and whether that made intervals wider."""
     if found is None:
         return []
     test = f"lag-one correlation, {100 * found.level:g} % over all dependences and this"
@@ -111,8 +139,20 @@ def neighbours_told(found: Leftover | None) -> list[Finding]:
     if found.lag_after_p > found.level:
         return [Finding("note", f"{text}; what was found above explains it.", test)]
     after = f", by {found.lag_after:.2f} still beside what was found" if found.structures else ""
-    text += f"{after}: they are no noise, so the intervals are too narrow. {_why(found)}"
+    text += f"{after}: they are no noise. {what_neighbours_cost(estimate)} {_why(found)}"
     return [Finding("warning", text, test, _tell_apart(found))]
+
+
+def what_neighbours_cost(estimate: Estimate) -> str:
+    """What correlated neighbours do to the intervals of the parameters."""
+    factors = estimate.widened
+    if not factors:
+        return "Intervals of the parameters hold all the same, in the order in which these poses were measured."
+    widest = int(np.argmax(factors))
+    return (
+        "By independent errors the intervals of the parameters would be too narrow; they are wider by a factor of "
+        f"{float(np.median(factors)):.1f} (median), at most {max(factors):.1f} ({estimate.names[widest]})."
+    )
 
 
 def _why(found: Leftover) -> str:

@@ -12,7 +12,15 @@ from scipy.special import bdtr, chdtri, ndtri
 from armcal.base.domains import Array
 from armcal.solve.estimator import CHECK_THE_DATA, Estimate
 from armcal.solve.evidence import Evidence
-from armcal.solve.evidence_findings import MOST_TOLD, determined_told, misses_told, neighbours_told, structures_told
+from armcal.solve.evidence_findings import (
+    MOST_TOLD,
+    determined_told,
+    misses_told,
+    neighbours_told,
+    shifted_told,
+    structures_told,
+    what_neighbours_cost,
+)
 from armcal.solve.identifiability import POOR_CONDITION, bound_together, correlated_pairs
 from armcal.solve.noise_findings import Finding, components_told, suspects_told
 from armcal.solve.suggestion import CANDIDATES, Suggestion
@@ -75,8 +83,9 @@ def judge(
     own, kept = [ids[i] for i in train], train if fitted is None else train[fitted.kept]
     suspicious = _suspicious(errors_mm[train], own, fitted)
     findings = [_convergence(estimate), determined, *_condition(estimate), *_bounds(estimate)]
+    findings += shifted_told(estimate)
     findings += [*_noise(estimate, fitted), *structures_told(seen.leftover, seen.unit)]
-    findings += neighbours_told(seen.leftover) or _neighbours(whitened, kept)
+    findings += neighbours_told(seen.leftover, estimate) or _neighbours(whitened, kept, estimate)
     findings += [
         *_correlated(estimate),
         *predicted,
@@ -228,7 +237,7 @@ def _size(estimate: Estimate) -> Finding:
     return Finding("good", "Residuals are as large as the declared noise: the model explains the data.", test)
 
 
-def _neighbours(whitened: Array, train: NDArray[np.intp]) -> list[Finding]:
+def _neighbours(whitened: Array, train: NDArray[np.intp], estimate: Estimate) -> list[Finding]:
     """Do training records that follow one another correlate? Against independence, two-sided, at 5 %."""
     first = train[:-1][np.diff(train) == 1]
     spread = float(np.mean(whitened[:, train] ** 2))
@@ -238,8 +247,9 @@ def _neighbours(whitened: Array, train: NDArray[np.intp]) -> list[Finding]:
     lag_one, test = float(np.mean(products)) / spread, "lag-one correlation, 5 %"
     if abs(lag_one) < ndtri(1 - LEVEL / 2) / np.sqrt(products.size):
         return [Finding("good", "Residuals of neighbouring records do not correlate.", test)]
-    text = f"Residuals of neighbouring records correlate by {lag_one:.2f}: they are no noise, so the intervals are too"
-    return [Finding("warning", f"{text} narrow.", test, "Repeat one pose at the start, in the middle and at the end.")]
+    text = f"Residuals of neighbouring records correlate by {lag_one:.2f}: they are no noise."
+    text += f" {what_neighbours_cost(estimate)}" if estimate.widened is not None else ""
+    return [Finding("warning", text, test, "Repeat one pose at the start, in the middle and at the end.")]
 
 
 def _correlated(estimate: Estimate) -> list[Finding]:

@@ -128,7 +128,7 @@ def _note(setup: Setup, verdicts: list[Verdict], seen: dict[str, Any]) -> None:
     try:
         note_checked(setup.path, setup.file, right, others, seen)
     except InputError as fault:  # what was seen must not be lost with it
-        said = " ".join(f"{verdict.sentence} {verdict.mend}".rstrip() for verdict in verdicts)
+        sentences = " ".join(f"{verdict.sentence} {verdict.mend}".rstrip() for verdict in verdicts)
         raise InputError(
             f"{fault.message} The check itself: {sentences}", where=fault.where, hint=fault.hint
         ) from fault

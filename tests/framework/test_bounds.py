@@ -1,0 +1,104 @@
+"""Estimates at and beyond bounds: honest intervals, what a bound does to others, and numbers that can be read."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from io import StringIO
+from pathlib import Path
+
+import numpy as np
+import pytest
+from armcal.cli.tables import _compliances, _matrices
+from armcal.run.experiment import Experiment
+from armcal.solve.estimator import Estimate, estimate
+from armcal.solve.evidence_findings import shifted_told
+from armcal.solve.problem import Problem
+from armcal.solve.simulation import SimulationRequest, measured_without_noise, with_channels
+from rich.console import Console
+
+CONFIGS = Path(__file__).resolve().parents[2] / "configs" / "lrm_arm"
+NOISE_M = 0.0005
+
+
+def fitted(free: str, truth: dict[str, float], *settings: str, seed: int = 3) -> Estimate:
+    """A fit of the free parameters to 60 poses of an arm with these values; SI."""
+    loaded = Experiment.load(CONFIGS / "demo.yaml", [f"parameters.free={free}", "evaluator=interpreted", *settings])
+    system, parameters = loaded.system, loaded.parameters
+    commands = loaded.read().subset(np.arange(0, 180, 3))
+    values, random = parameters.nominal(), np.random.default_rng(seed)
+    for name, value in truth.items():
+        values[parameters.entry_names.index(name)] = value
+    request = SimulationRequest(system.arms, system.measurements, parameters.with_nominal(values), system.environment)
+    exact = measured_without_noise(request, commands)
+    dataset = with_channels(commands, {n: x + random.normal(0, NOISE_M, len(x)) for n, x in exact.items()})
+    problem = Problem.build(system.arms, system.measurements, parameters, system.environment, dataset, "interpreted")
+    records = problem.records(dataset)
+    return estimate(problem, records, loaded.estimator.solve(problem, records, parameters.nominal()))
+
+
+SPRINGS = '["arm.spring.k[2-4]", "arm.mdh.theta[2-4]"]'
+BEYOND = {"arm.spring.k2": -0.01, "arm.spring.k3": 0.05, "arm.spring.k4": 0.05}
+
+
+@pytest.fixture(scope="module")
+def beyond() -> Estimate:
+    """The second spring would have to push with its load: its estimate lies far beyond its bound at zero."""
+    return fitted(SPRINGS, BEYOND)
+
+
+def test_an_estimate_far_beyond_its_bound_keeps_an_interval_as_wide_as_its_deviation(beyond: Estimate) -> None:
+    place = beyond.names.index("arm.spring.k2")
+    interval, sd = beyond.intervals[place], beyond.deviations[place]
+    assert beyond.unconstrained[place] < -5 * sd and "arm.spring.k2" in beyond.at_bound
+    assert interval.one_sided and interval.lower == 0
+    assert 1.9 * sd < interval.upper < 2.1 * sd
+
+
+def test_what_a_bound_shifts_beside_itself_is_named(beyond: Estimate) -> None:
+    (finding,) = shifted_told(beyond)
+    assert finding.grade == "note" and "Bounds that hold arm.spring.k2 shift other estimates" in finding.text
+    moved = (beyond.free_values - beyond.unconstrained) / beyond.deviations
+    worst = max((n for n in beyond.names if n != "arm.spring.k2"), key=lambda n: abs(moved[beyond.names.index(n)]))
+    assert f"{worst} ({moved[beyond.names.index(worst)]:+.1f} sd)" in finding.text
+    free = fitted(SPRINGS, {**BEYOND, "arm.spring.k2": 0.05})
+    assert not shifted_told(free)
+
+
+def test_names_and_values_pair(beyond: Estimate) -> None:
+    assert len(beyond.names) == len(beyond.free_values) == len(beyond.intervals) < len(beyond.values)
+    all_values = dict(zip(beyond.parameters.entry_names, beyond.values, strict=True))
+    assert dict(zip(beyond.names, beyond.free_values, strict=True)) == {n: all_values[n] for n in beyond.names}
+
+
+def printed(table) -> str:
+    """As a terminal shows it."""
+    console = Console(file=StringIO(), width=120)
+    console.print(table)
+    return console.file.getvalue()
+
+
+def test_compliances_of_a_stiff_arm_are_printed_with_their_digits(beyond: Estimate) -> None:
+    """A spring of 5e-6 rad/(N m), known to 2e-7."""
+    place = beyond.names.index("arm.spring.k3")
+    values, covariance = beyond.values.copy(), beyond.covariance * 1e-12
+    values[beyond.free_entries[place]], covariance[place, place] = 5.04e-6, (2e-7) ** 2
+    stiff = replace(beyond, values=values, unconstrained=values[list(beyond.free_entries)], covariance=covariance)
+    row = next(line for line in printed(_compliances(stiff_result(stiff))).splitlines() if "k3" in line)
+    assert "0.00000504" in row and "0.00000020" in row
+
+
+def test_principal_compliances_of_a_stiff_arm_are_printed_with_their_digits() -> None:
+    flex = "arms.arm.effects.flex={type: compliance, compliance_rad_per_Nm: 4.0e-6}"
+    loaded = Experiment.load(CONFIGS / "demo.yaml", ["parameters.free=[arm.flex.C2]", flex])
+    values, parameters = loaded.parameters.nominal(), loaded.parameters
+
+    class Result:
+        estimate = type("Estimate", (), {"parameters": parameters, "values": values})()
+
+    row = next(line for line in printed(_matrices(Result())).splitlines() if "arm.flex.C2" in line)
+    assert row.count("4.00e-06") == 3
+
+
+def stiff_result(found: Estimate):
+    """A run's result as far as the table of compliances reads it."""
+    return type("Result", (), {"estimate": found})()
