@@ -15,7 +15,6 @@ from armcal.solve.evidence import priors_alone, unseen_poses
 from armcal.solve.leftover import LEVEL, leftover
 from armcal.solve.misses import Judged, misses
 from armcal.solve.motion import Motion, recorded_position
-from armcal.solve.neighbours import alikeness
 from armcal.solve.score_tests import DRAWS, family_test, linear_fit, own_basis
 from armcal.solve.weighing import fit
 from armcal_ipopt.estimator import IpoptEstimator
@@ -250,23 +249,6 @@ def test_a_fit_takes_up_its_own_columns_and_finds_the_others():
     assert float(coefficients[0, 0] * (own.T @ fit_.residual)[0]) == pytest.approx(0.5 / 3, rel=0.2)
     plain = np.linalg.lstsq(np.hstack([slopes, other]), residual, rcond=None)
     assert test.share[0] == pytest.approx(1 - plain[1][0] / (fit_.residual @ fit_.residual), rel=1e-9)
-
-
-@pytest.mark.parametrize("cause", ["time", "pose"])
-def test_why_neighbours_are_alike(cause):
-    """A pose that wanders slowly, and errors that follow it, or the time and nothing else."""
-    count, by_time, by_pose = 400, 0, 0
-    for seed in range(20):
-        rng = np.random.default_rng(seed)
-        walk = np.cumsum(rng.normal(size=(count, 2)), axis=0) / 4
-        stance = np.column_stack([np.sin(walk[:, 0]), np.cos(walk[:, 1])])
-        slow = np.convolve(rng.normal(size=count + 9), np.ones(10) / np.sqrt(10), "valid")
-        told = slow if cause == "time" else np.sin(3 * stance[:, 0]) + stance[:, 1]
-        residual = (told - told.mean())[:, None] + 0.2 * rng.normal(size=(count, 1))
-        found = alikeness(residual, stance, np.ones(count - 1, dtype=bool), np.arange(count) // 10)
-        by_time, by_pose = by_time + (found.time_p < 0.025), by_pose + (found.pose_p < 0.025)
-    right, wrong = (by_time, by_pose) if cause == "time" else (by_pose, by_time)
-    assert right >= 19 and wrong <= 3
 
 
 def test_loads_and_levers_against_plain_numbers(lrm):

@@ -122,7 +122,7 @@ def _gross(run: FittedRecords, judged_mm: Array, evidence: Evidence) -> list[Fin
     dataset = run.dataset.subset(looked_at)
     position = recorded_position(run.dataset)[looked_at]
     return [
-        *gross_error(judged_mm, figure, found, evidence.leftover),
+        *gross_error(judged_mm, figure, found, evidence.leftover, evidence.unit),
         *contradicting(minority(rows, found.noise_scale, position), dataset.ids),
         *size_told(figure),
         *displaced_told(figure),

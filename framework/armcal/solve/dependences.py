@@ -22,7 +22,7 @@ from armcal.solve.problem import Problem
 
 MOST_LEVELS = 12
 """Levels of a joint are told apart one by one up to so many; beyond, by a cubic."""
-_WAVES = 3
+_SLOW = 3
 _CUBIC = 3
 _AXES = ("x", "y", "z")
 _SYMMETRIC = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
@@ -36,7 +36,8 @@ class Dependence:
     """One thing that residuals might depend on.
 
     Attributes:
-        kind: ``offset``, ``order``, ``level``, ``approach``, ``torque``, ``moment``, ``payload`` or ``temperature``.
+        kind: ``offset``, ``order``, ``level``, ``approach``, ``coupling``, ``torque``, ``moment``, ``payload``,
+            ``temperature``; of what is outside of the arm ``step``, ``slip``, ``gravity``, ``load``, ``scale``.
         subject: the joint or site, as a user names it; empty where it is none.
         arm: the arm's name; empty where it is none.
         words: what residuals depend on, as the end of a sentence.
@@ -44,7 +45,7 @@ class Dependence:
         measure: which measurement would tell.
         columns: raw residual by coefficient, one (n_r x N x k) array a factor.
         labels: what each coefficient is (k), for those that have a unit.
-        unit: of the coefficients in SI (``rad``, ``m``, ``rad_per_Nm``); empty if they have none.
+        unit: of the coefficients in SI (``rad``, ``m``, ``rad_per_Nm``; ``1`` for shares); empty if they have none.
     """
 
     kind: str
@@ -59,7 +60,7 @@ class Dependence:
 
 
 @dataclass(frozen=True)
-class _Records:
+class Records:
     """Records that dependences are made from."""
 
     dataset: Dataset
@@ -88,7 +89,7 @@ class _Records:
 
 def dependences(problem: Problem, motion: Motion, dataset: Dataset) -> Iterator[Dependence]:
     """Everything that could be told of these records; what does not vary is left out."""
-    arms, here = problem.blueprint.arms, _Records(dataset, motion)
+    arms, here = problem.blueprint.arms, Records(dataset, motion)
     yield from _of_offset(here)
     yield from _of_order(here)
     for name, arm in arms.items():
@@ -99,12 +100,13 @@ def dependences(problem: Problem, motion: Motion, dataset: Dataset) -> Iterator[
             angle = dimension == "angle"
             yield from _of_level(here, name, f"{name}.{joint}", shown, dimension)
             yield from _of_approach(here, name, joint, shown, "rad" if angle else "m")
+            yield from _of_coupling(here, name, arm, joint, shown)
             yield from _of_torque(here, name, f"{name}.{joint}", shown, loads.efforts[index], angle)
         yield from _of_moments(problem, here, arm, loads, len(arms) == 1)
     yield from _of_surroundings(here)
 
 
-def _of_offset(here: _Records) -> Iterator[Dependence]:
+def _of_offset(here: Records) -> Iterator[Dependence]:
     """What does not change from record to record, and the model still cannot take up."""
     ones, measure = np.ones((len(here.dataset), 1)), "any poses tell this: free the parameter"
     words = "a constant shift of what is measured"
@@ -115,12 +117,12 @@ def _of_offset(here: _Records) -> Iterator[Dependence]:
         yield Dependence("offset", joint, arm, f"the zero of {joint}", effect, measure, here.along(channel, ones))
 
 
-def _of_order(here: _Records) -> Iterator[Dependence]:
+def _of_order(here: Records) -> Iterator[Dependence]:
     order = recorded_order(here.dataset)
     if np.ptp(order) <= 0:
         return
     place = (order - order.min()) / np.ptp(order)
-    waves = np.stack([np.cos(np.pi * (i + 1) * place) for i in range(_WAVES)], axis=1)
+    slow = legendre.legvander(2 * place - 1, _SLOW)  # with its mean, which a drift has
     yield Dependence(
         "order",
         "",
@@ -128,16 +130,16 @@ def _of_order(here: _Records) -> Iterator[Dependence]:
         "the recorded order: what is measured drifts slowly as a whole",
         "parameters.drift on the base's position",
         _REPEATS,
-        here.axes(waves),
+        here.axes(slow),
     )
     for channel in here.motion.channels:
         arm, _, joint = channel.partition(".")
         words = f"the recorded order: {joint} drifts slowly along its own motion"
         effect = f"parameters.drift on the zero of {joint}"
-        yield Dependence("order", joint, arm, words, effect, _REPEATS, here.along(channel, waves))
+        yield Dependence("order", joint, arm, words, effect, _REPEATS, here.along(channel, slow))
 
 
-def _of_level(here: _Records, arm: str, channel: str, shown: str, dimension: str) -> Iterator[Dependence]:
+def _of_level(here: Records, arm: str, channel: str, shown: str, dimension: str) -> Iterator[Dependence]:
     command = here.dataset.column(channel)
     levels = np.unique(np.round(_stated(command), 9))
     if len(levels) < 2:
@@ -166,21 +168,51 @@ def _of_level(here: _Records, arm: str, channel: str, shown: str, dimension: str
     )
 
 
-def _of_approach(here: _Records, arm: str, joint: str, shown: str, si: str) -> Iterator[Dependence]:
-    channel = f"{arm}.approach.{joint}"
-    if not here.dataset.has(channel) or _spread(here.dataset.column(channel)) <= 0:
+def _of_approach(here: Records, arm: str, joint: str, shown: str, si: str) -> Iterator[Dependence]:
+    channel, command = f"{arm}.approach.{joint}", here.dataset.column(f"{arm}.{joint}")
+    effect, side = f"approach_backlash on {shown}", f"the side {shown} was approached from"
+    if here.dataset.has(channel):
+        came = here.dataset.column(channel)
+    else:
+        came = _came_from(command, recorded_order(here.dataset))
+        effect += ", with a column for the approach"
+        side += ", if it went from pose to pose in the recorded order"
+    if _spread(came) <= 0:
         return
-    sign = np.nan_to_num(-here.dataset.column(channel)[:, None])
-    effect, measure = f"approach_backlash on {shown}", _BOTH_SIDES.format(joint=shown)
-    words = f"the side {shown} was approached from, along its own motion"
+    sign, measure = np.nan_to_num(-came[:, None]), _BOTH_SIDES.format(joint=shown)
     along = here.along(f"{arm}.{joint}", sign)
-    yield Dependence("approach", shown, arm, words, effect, measure, along, ("half of its play",), si)
-    words = f"the side {shown} was approached from, in directions that {shown} does not move"
+    yield Dependence(
+        "approach", shown, arm, f"{side}, along its own motion", effect, measure, along, ("half of its play",), si
+    )
+    words = f"{side}, in directions that {shown} does not move"
     yield Dependence("approach", shown, arm, words, "", measure, here.axes(sign))
 
 
+def _came_from(command: Array, order: Array) -> Array:
+    """The sign of each joint's last move before each record (N), 0 before its first."""
+    place = np.argsort(order, kind="stable")
+    moved = np.sign(np.diff(np.nan_to_num(command[place]), prepend=np.nan_to_num(command[place[:1]])))
+    last = np.maximum.accumulate(np.where(moved != 0, np.arange(len(moved)), 0))
+    came = np.empty(len(command))
+    came[place] = moved[last]
+    return came
+
+
+def _of_coupling(here: Records, name: str, arm: Arm, joint: str, shown: str) -> Iterator[Dependence]:
+    """A share of another joint's command on this one, as a belt or a gear that runs through it would add."""
+    for other, dimension in arm.commanded.items():
+        command = here.dataset.column(f"{name}.{other}")
+        if other == joint or dimension != arm.commanded[joint] or _spread(command) <= 0:
+            continue
+        feature = _centred(np.nan_to_num(command)[:, None], command)
+        words = f"the command of {other}, along {shown}'s own motion: {other} moves {shown} with it"
+        measure = f"move {other} alone from end to end, and watch {shown}"
+        columns = here.along(f"{name}.{joint}", feature)
+        yield Dependence("coupling", f"{other} on {shown}", name, words, "", measure, columns, ("share",), "1")
+
+
 def _of_torque(
-    here: _Records, arm: str, channel: str, shown: str, effort: Array, revolute: bool
+    here: Records, arm: str, channel: str, shown: str, effort: Array, revolute: bool
 ) -> Iterator[Dependence]:
     if _spread(effort) <= 1e-9 * max(1.0, float(np.abs(_stated(effort)).max(initial=0.0))):
         return
@@ -200,7 +232,7 @@ def _of_torque(
             yield Dependence("torque", shown, arm, words, effect, measure, columns, (label,), unit)
 
 
-def _of_moments(problem: Problem, here: _Records, arm: Arm, loads: SiteLoads, alone: bool) -> Iterator[Dependence]:
+def _of_moments(problem: Problem, here: Records, arm: Arm, loads: SiteLoads, alone: bool) -> Iterator[Dependence]:
     """A symmetric compliance at each site, seen by the factors that measure this arm's tip in its base frame."""
     seen = [_is_position_of(problem, i, arm.name) for i in range(len(problem.kernels))]
     if not any(seen):
@@ -246,7 +278,7 @@ def _is_position_of(problem: Problem, factor: int, arm: str) -> bool:
     return axes == list(_AXES) and tuple(problem.blueprint.measurements[one.name].arms) == (arm,)
 
 
-def _of_surroundings(here: _Records) -> Iterator[Dependence]:
+def _of_surroundings(here: Records) -> Iterator[Dependence]:
     asked = (
         ("payload", "the payload", "torsional_spring or compliance; the payload's centre", _SECOND_LOAD),
         ("temperature", "the temperature", "thermal_length", "repeat some poses cold and warm"),

@@ -13,16 +13,18 @@ from armcal.solve.evidence import PriorsAlone
 from armcal.solve.leftover import Leftover, Structure
 from armcal.solve.misses import MEDIANS, Misses
 from armcal.solve.noise_findings import Finding
+from armcal.solve.odds import UNLISTED
+from armcal.solve.smooth import CLEAR, IMITATED, TimeOrPose
 
 MOST_TOLD = 5
 FEW_NAMED = 2
 """So many combinations that only priors hold are named in the verdict; of more, armcal identify tells."""
+_LIKELY = 0.05
+"""A cause with less of the odds is not named first."""
 NEGLIGIBLE_SHARE = 0.1
 """Of the typical error: what moves the tip by less than this does not matter to it."""
 NOTICEABLE_SD = 0.3
-"""A shift by less than so many standard deviations is not told."""
-_FOLLOW_UP = 0.025
-"""Two questions are asked why neighbours are alike, at 5 % together."""
+"""A shift by less than so many standard deviations is not reported."""
 _MM = "mm"
 
 
@@ -100,27 +102,62 @@ def structures_told(found: Leftover | None, unit: str = _MM) -> list[Finding]:
         return []
     test = _test_of(found)
     kept = found.worthwhile
-    if not kept:
+    findings = [_structure_told(s, found, unit, test) for s in kept] + _unlisted(found)
+    if not findings:
         slight = f" {_plural(len(found.structures), 'dependence', 'dependences')} found would not lower it by 1 %."
         text = f"Of {found.tested} things that residuals might depend on none explains the error left."
-        return [Finding("good", text + (slight if found.structures else ""), test)]
-    findings = [_structure_told(s, found.mean_mm, unit, test) for s in kept]
-    if found.more:
+        findings.append(Finding("good", text + (slight if found.structures else ""), test))
+    if kept and found.more:
         text = "Residuals depend on more than these; model them first, then look again."
         findings.append(Finding("note", text, test))
-    return findings
+    return [*findings, *_scatter(found)]
 
 
-def _structure_told(s: Structure, mean_mm: float, unit: str, test: str) -> Finding:
-    size = f" ({s.size})" if s.size else ""
-    text = (
-        f"Residuals still depend on {s.words}{size}: modelled, the mean training residual of {mean_mm:.2f} {unit} "
-        f"would fall by {s.falls_mm:.2f} {unit}."
+def _structure_told(s: Structure, found: Leftover, unit: str, test: str) -> Finding:
+    """One cause if it is clearly the likeliest, else all that it does not beat."""
+    falls = f"the mean training residual of {found.mean_mm:.2f} {unit} would fall by {s.falls_mm:.2f} {unit}"
+    what = s.words + (f" ({s.size})" if s.size else "")
+    test = f"p {_p(s.p_value)}, {test}; odds among all of them and what is none of them"
+    if not s.alternatives:
+        model = f"Model it: {s.effect}. " if s.effect else "No effect of armcal says this. "
+        text = f"Residuals still depend on {what}: modelled, {falls}. It has {_share(s.odds)} of the odds."
+        return Finding("warning", text, test, f"{model}To be sure: {s.measure}.")
+    named = [what, *s.alternatives] if s.odds >= _LIKELY else [s.alternatives[0], what, *s.alternatives[1:]]
+    more = len(named) - MOST_TOLD
+    text = f"Residuals still depend on {'; or on '.join(named[:MOST_TOLD])}"
+    text += f"; or on {more} more (metrics.json). " if more > 0 else ". "
+    text += f"These data cannot tell which. Modelled as {s.words}, which has {_share(s.odds)} of the odds, {falls}."
+    model = f" Then model it: {s.effect}." if s.effect else ""
+    return Finding("warning", text, test, f"To tell: {s.measure}.{model}")
+
+
+def _share(odds: float) -> str:
+    return "over 99 %" if odds > 0.99 else "less than 1 %" if odds < 0.01 else f"{100 * odds:.0f} %"
+
+
+def _unlisted(found: Leftover) -> list[Finding]:
+    """What follows the pose, and is none of the causes; those that may stand for it say so themselves."""
+    if found.unlisted <= CLEAR or any(UNLISTED in s.alternatives for s in found.worthwhile):
+        return []
+    text = f"Residuals follow the pose smoothly in a way that none of the {found.tested} causes tried explains: the "
+    text += "model lacks something that is not among them."
+    test = f"marginal likelihood of a Gaussian process over the poses, odds of {np.exp(CLEAR):.0f} to 1"
+    return [Finding("warning", text, test, "Free more of the geometry; repeat some poses with a second payload.")]
+
+
+def _scatter(found: Leftover) -> list[Finding]:
+    """What the size of residuals depends on."""
+    noise = found.noise
+    if noise is None:
+        return []
+    text = f"The scatter of the residuals depends on {'; or on '.join([noise.words, *noise.alternatives[:MOST_TOLD]])}:"
+    text += f" from {noise.low:.1f} to {noise.high:.1f} times the declared noise, in the thirds of the records with the"
+    text += " least and the most of it. Either the noise varies, or the model errs more there."
+    test = f"regression of squared residuals, p {_p(noise.p_value)} over everything looked at"
+    action = (
+        "Repeat a pose at both ends of it: where repeats scatter alike, it is the model; else state noise by record."
     )
-    if s.alternatives:
-        text += f" These data hardly tell it from {'; or '.join(s.alternatives)}."
-    model = f"Model it: {s.effect}. " if s.effect else "No effect of armcal says this. "
-    return Finding("warning", text, f"p {_p(s.p_value)}, {test}", f"{model}To be sure: {s.measure}.")
+    return [Finding("warning", text, test, action)]
 
 
 def _test_of(found: Leftover) -> str:
@@ -128,7 +165,7 @@ def _test_of(found: Leftover) -> str:
     return f"score test, {100 * found.level:g} % over all {found.tested} dependences{blocks}"
 
 
-def neighbours_told(found: Leftover | None, estimate: Estimate) -> list[Finding]:
+def neighbours_told(found: Leftover | None, estimate: Estimate, unit: str = _MM) -> list[Finding]:
     """Whether records that follow one another miss alike, why, and whether that made intervals wider."""
     if found is None:
         return []
@@ -139,8 +176,9 @@ def neighbours_told(found: Leftover | None, estimate: Estimate) -> list[Finding]
     if found.lag_after_p > found.level:
         return [Finding("note", f"{text}; what was found above explains it.", test)]
     after = f", by {found.lag_after:.2f} still beside what was found" if found.structures else ""
-    text += f"{after}: they are no noise. {what_neighbours_cost(estimate)} {_why(found)}"
-    return [Finding("warning", text, test, _tell_apart(found))]
+    why, cause = ("", "open") if found.alike is None else (f" {_why(found.alike, unit)}", found.alike.cause)
+    text += f"{after}: they are no noise. {what_neighbours_cost(estimate)}{why}"
+    return [Finding("warning", text, test, _TELL_APART[cause])]
 
 
 def what_neighbours_cost(estimate: Estimate) -> str:
@@ -155,27 +193,27 @@ def what_neighbours_cost(estimate: Estimate) -> str:
     )
 
 
-def _why(found: Leftover) -> str:
-    alike = found.alike
-    if alike is None:
-        return "No records far apart in the recording are as alike as neighbours: whether it is time or pose is open."
-    compared = f"{alike.pairs} pairs far apart in the recording with the arm standing as much alike correlate by"
-    if alike.time_p <= _FOLLOW_UP < alike.pose_p:
-        return f"It goes with time: {compared} {alike.far:.2f} only (2.5 %)."
-    if alike.pose_p <= _FOLLOW_UP < alike.time_p:
-        return f"It goes with how the arm stands, not with time: {compared} {alike.far:.2f} too (2.5 %)."
-    if max(alike.pose_p, alike.time_p) <= _FOLLOW_UP:
-        return f"It goes with time and with how the arm stands: {compared} {alike.far:.2f} (2.5 %)."
-    return "Whether it is time or pose these data do not tell (2.5 %)."
+_WHY = {
+    "time": "It goes with time, not with the pose: ",
+    "pose": "It goes with the pose, not with time: ",
+    "open": "Whether it goes with time or with the pose cannot be told: ",
+}
+_TELL_APART = {
+    "time": "Let the base drift (parameters.drift); repeat one pose at the start, in the middle and at the end.",
+    "pose": "The model lacks an effect of pose; visiting the poses in random order would show it plainly.",
+    "open": "Repeat one pose at the start, in the middle and at the end; visit the others in random order.",
+}
 
 
-def _tell_apart(found: Leftover) -> str:
-    alike = found.alike
-    if alike is not None and alike.pose_p <= _FOLLOW_UP < alike.time_p:
-        return "The model lacks an effect of pose; visiting the poses in random order would show it plainly."
-    if alike is not None and alike.time_p <= _FOLLOW_UP < alike.pose_p:
-        return "Let the base drift (parameters.drift); repeat one pose at the start, in the middle and at the end."
-    return "Repeat one pose at the start, in the middle and at the end; visit the others in random order."
+def _why(alike: TimeOrPose, unit: str) -> str:
+    """Smooth functions of both, compared."""
+    text = f"{_WHY[alike.cause]}predicted from the others, a record misses a smooth function of time by "
+    text += f"{alike.time_mm:.2f} {unit} and one of the pose by {alike.pose_mm:.2f} {unit} (log odds against "
+    text += f"noise {alike.time:.0f} and {alike.pose:.0f})"
+    if max(alike.time_imitated, alike.pose_imitated) > IMITATED:
+        shares = f"the pose predicts {_share(alike.time_imitated)} of the one, time {_share(alike.pose_imitated)} of "
+        text += f"; {shares}the other, as the poses were visited in an order"
+    return text + "."
 
 
 def misses_told(found: Misses | None, unit: str = _MM) -> list[Finding]:

@@ -26,16 +26,23 @@ UNSEEN_SCALE = 0.2
 MOST_NAMED = 3
 
 
-def gross_error(judged_mm: Array, figure: Figure, estimate: Estimate, left: Leftover | None) -> list[Finding]:
-    """Errors of records that did not train (N; nan where not judged) beside the reach and the noise."""
+def gross_error(
+    judged_mm: Array, figure: Figure, estimate: Estimate, left: Leftover | None, unit: str = "mm"
+) -> list[Finding]:
+    """Errors of records that did not train (N; nan where not judged) beside the reach and the noise.
+
+    Where nothing measured is a length, errors are in ``mrad`` and stand beside a radian: what the reach is at the
+    distance of the reach.
+    """
     seen = judged_mm[np.isfinite(judged_mm)]
     if not len(seen) or figure.reach_mm <= 0:
         return []
-    mean = float(np.mean(seen))
-    share, scale = mean / figure.reach_mm, estimate.noise_scale
-    told = f"Records that did not train are missed by {mean:.3g} mm on average, {100 * share:.2g} % of the arm's reach"
+    mean, scale = float(np.mean(seen)), estimate.noise_scale
+    whole, name = (figure.reach_mm, "the arm's reach") if unit == "mm" else (1000.0, "a radian")
+    share = mean / whole
+    told = f"Records that did not train are missed by {mean:.3g} {unit} on average, {100 * share:.2g} % of {name}"
     if share > OF_REACH:
-        test = f"mean, limit {100 * OF_REACH:g} % of the reach of {figure.reach_mm:.0f} mm"
+        test = f"mean, limit {100 * OF_REACH:g} % of {whole:.0f} {unit}"
         return [Finding("bad", f"{told}: the values do not describe this arm.", test, CHECK_THE_DATA)]
     found = 0.0
     if left is not None:

@@ -3,7 +3,8 @@
 Dependences are tested all at once (family-wise 5 %). The one that says most for its size [Schwarz1978] is taken into
 the model, to first order, and the others are tested again on what is left: so each is named for what the ones before
 it do not say. Residuals are those of training, less the drift that was found; what the parameters can take up, each
-dependence is freed of first.
+dependence is freed of first. Of those that were found, each is then set against all the others and against what is
+not among them: it is named alone only where it is clearly the likeliest.
 """
 
 from __future__ import annotations
@@ -19,13 +20,16 @@ from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.base.units import display_unit, to_unit
 from armcal.solve.blocks import automatic_block_length
-from armcal.solve.dependences import Dependence, dependences
+from armcal.solve.dependences import Dependence, Records, dependences
 from armcal.solve.estimator import Estimate
 from armcal.solve.fit_rows import FitRows
 from armcal.solve.motion import Motion
-from armcal.solve.neighbours import Alikeness, alikeness
+from armcal.solve.noise_trend import NoiseTrend, noise_trend
+from armcal.solve.odds import Contest, Odds
+from armcal.solve.outside import measured_position, outside
 from armcal.solve.problem import FactorRecords, Problem
 from armcal.solve.score_tests import FamilyTest, Fit, family_test, linear_fit, own_basis
+from armcal.solve.smooth import TimeOrPose, left_out, pose_kernels, smooth, time_kernels
 
 LEVEL = 0.05
 MOST_FOUND = 5
@@ -35,9 +39,8 @@ FEWEST_RECORDS = 30
 _MOST_BLOCKS, _FEWEST_BLOCKS = 60, 30
 _FOLDS = 5
 _MM = 1000.0
-_MOST_ALIKE = 3
-_ALIKE, _SPENT = 0.7, 0.3
-"""Another dependence says the same if it takes up 70 % as much, and 30 % of that once the first is in the model."""
+_NEGLIGIBLE = 0.1
+"""Of what the causes found so far take up: less than this may be what is not linear in them. Model them first."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +53,8 @@ class Structure:
         share: of the squared residuals left by the ones before it.
         falls_mm: by how much the mean error would fall if it were modelled, judged on records left out.
         size: how large it is, in words; empty if its coefficients have no unit.
-        alternatives: dependences that would say nearly the same; only a measurement can tell.
+        odds: its share of the odds of everything that was tried, and of what was not.
+        alternatives: what it does not beat 20 to 1, the most likely first; only a measurement can tell.
     """
 
     kind: str
@@ -62,6 +66,7 @@ class Structure:
     share: float
     falls_mm: float
     size: str
+    odds: float
     alternatives: tuple[str, ...]
 
 
@@ -75,7 +80,9 @@ class Leftover:
         lag_one: correlation of neighbouring residuals, less what the fit itself makes of it.
         lag_p: its p-value, in the same family.
         lag_after, lag_after_p: the same once the structures found are modelled.
-        alike: why neighbours resemble each other even then; None if they do not, or there are too few pairs.
+        alike: why neighbours resemble each other even then; None if they do not.
+        unlisted: logarithm of the odds that residuals follow the pose beside what was found, against noise.
+        noise: what their scatter depends on; None if on nothing.
         mean_mm: mean residual of the training records.
         tested: how many dependences were tested.
         records: how many records were looked at.
@@ -89,7 +96,9 @@ class Leftover:
     lag_p: float
     lag_after: float
     lag_after_p: float
-    alike: Alikeness | None
+    alike: TimeOrPose | None
+    unlisted: float
+    noise: NoiseTrend | None
     mean_mm: float
     tested: int
     records: int
@@ -115,19 +124,10 @@ def leftover(
     position: NDArray[np.intp],
     modelled: frozenset[str] = frozenset(),
 ) -> Leftover | None:
-    """Test the residuals of a fit.
+    """Test the residuals of a fit to records, with the weights they had; None where there are too few to tell.
 
-    Args:
-        problem: of the fit.
-        records: it was fitted to, with the weights they had.
-        estimate: what it found.
-        dataset: the same records.
-        motion: how the arm stands in them.
-        position: how many of all records were recorded before each (N).
-        modelled: the types of the effects that the model has.
-
-    Returns:
-        None where there are too few records to tell.
+    ``motion`` is how the arm stands in them, ``position`` how many of all records were recorded before each (N),
+    ``modelled`` the types of the effects that the model has.
     """
     taking_part = np.any([each.weight[: each.count] > 0 for each in records], axis=0)
     chosen = _looked_at(np.flatnonzero(taking_part), position)
@@ -137,7 +137,13 @@ def leftover(
     rows = FitRows.of(problem, records, estimate)
     block, consecutive = _blocks_of(rows, len(dataset)), np.diff(position) == 1
     fit, basis = _fit_of(rows, block, consecutive)
-    found = _search(rows, fit, basis, list(dependences(problem, motion.subset(chosen), dataset)), modelled)
+    motion = motion.subset(chosen)
+    causes = [*dependences(problem, motion, dataset), *outside(problem, motion, dataset)]
+    columns = [rows.columns(one.columns) for one in causes]
+    kernels = pose_kernels(problem, dataset), time_kernels(len(dataset))
+    contest = Contest(causes, columns, fit.residual, basis, rows.by_record, fit.block * _FOLDS // fit.blocks, *kernels)
+    found = _search(rows, fit, contest, modelled)
+    residual, whole = contest.beside(found.chosen)
     return Leftover(
         found.structures,
         found.more,
@@ -145,7 +151,9 @@ def leftover(
         found.first.lag_adjusted,
         found.last.lag_one,
         found.last.lag_adjusted,
-        _alike(found, rows, problem.increments, consecutive, block),
+        _alike(residual, whole, rows, contest) if found.last.lag_adjusted <= LEVEL else None,
+        smooth(residual, whole, rows.by_record, contest.pose).evidence,
+        noise_trend(residual, whole, rows.by_record, Records(dataset, motion), _read(problem, dataset)),
         rows.mean_error(fit.residual) * _MM,
         found.tested,
         len(dataset),
@@ -153,12 +161,24 @@ def leftover(
     )
 
 
-def _alike(
-    found: _Search, rows: FitRows, count: int, consecutive: NDArray[np.bool_], block: NDArray[np.intp]
-) -> Alikeness | None:
-    if found.last.lag_adjusted > LEVEL:
-        return None
-    return alikeness(found.residual[rows.by_record], rows.stance(count), consecutive, block)
+def _read(problem: Problem, dataset: Dataset) -> Array:
+    """The first position that is measured (3 x N; m), or nothing (0 x N)."""
+    read = [measured_position(problem, i, dataset) for i in range(len(problem.kernels))]
+    return next((each for each in read if len(each)), np.zeros((0, len(dataset))))
+
+
+def _alike(residual: Array, basis: Array, rows: FitRows, contest: Contest) -> TimeOrPose:
+    time, pose = (smooth(residual, basis, rows.by_record, k) for k in (contest.time, contest.pose))
+    left = (left_out(each, residual, basis, rows.by_record) for each in (time, pose))
+    time_mm, pose_mm = (rows.mean_error(each) * _MM for each in left)
+    return TimeOrPose(
+        time.evidence,
+        pose.evidence,
+        time_mm,
+        pose_mm,
+        contest.pose.imitate(time.function[rows.by_record]),
+        contest.time.imitate(pose.function[rows.by_record]),
+    )
 
 
 def _fit_of(rows: FitRows, block: NDArray[np.intp], consecutive: NDArray[np.bool_]) -> tuple[Fit, Array]:
@@ -189,57 +209,70 @@ def _blocks_of(rows: FitRows, count: int) -> NDArray[np.intp]:
 @dataclass(frozen=True)
 class _Search:
     structures: tuple[Structure, ...]
+    chosen: tuple[int, ...]
     more: bool
     first: FamilyTest
     last: FamilyTest
     tested: int
-    residual: Array
 
 
-def _search(
-    rows: FitRows, fit: Fit, basis: Array, candidates: Sequence[Dependence], modelled: frozenset[str]
-) -> _Search:
-    columns = [rows.columns(one.columns) for one in candidates]
-    owned = [own_basis(each, basis) for each in columns]
-    left = [(i, *own) for i, own in enumerate(owned) if own[0].shape[1]]
-    first = test = family_test(fit, [own for _, own, _ in left])
-    tested, structures = len(left), list[Structure]()
-    while len(structures) < MOST_FOUND:
-        chosen = _best(test, [own.shape[1] for _, own, _ in left], fit)
-        if chosen is None:
+def _search(rows: FitRows, fit: Fit, contest: Contest, modelled: frozenset[str]) -> _Search:
+    """Causes one after another as long as one is significant, then each set against all others."""
+    left = [(i, own) for i, each in enumerate(contest.columns) if (own := own_basis(each, contest.basis)[0]).shape[1]]
+    first = test = family_test(fit, [own for _, own in left])
+    tested, chosen, p_values, whole = len(left), list[int](), list[float](), float(fit.residual @ fit.residual)
+    while len(chosen) < MOST_FOUND:
+        best = _best(test, [own.shape[1] for _, own in left], fit)
+        now = float(fit.residual @ fit.residual)
+        if best is None or test.share[best] * now < _NEGLIGIBLE * (whole - now):
             break
-        before, (index, own, coefficients) = test, left[chosen]
-        size = _size(candidates[index], -coefficients @ (own.T @ fit.residual))
-        falls = rows.mean_error(fit.residual) - rows.mean_error(_left_out(fit, own))
-        fit, basis = fit.with_fewer_draws().without(own), np.hstack([basis, own])
-        past = [i for i, _, _ in left]
-        left = [each for each in ((i, *own_basis(columns[i], basis)) for i in past) if each[1].shape[1]]
-        test = family_test(fit, [own for _, own, _ in left])
-        same = _saying_the_same(dict(zip(past, before.share, strict=True)), _shares(left, test), index)
-        numbers = (float(before.adjusted[chosen]), float(before.share[chosen]), max(0.0, falls) * _MM)
-        told = tuple(candidates[i].words for i in same)
-        structures.append(_structure(candidates[index], numbers, size, told, modelled))
-    return _Search(tuple(structures), bool(np.any(test.adjusted <= LEVEL)), first, test, tested, fit.residual)
+        chosen.append(left[best][0])
+        p_values.append(float(test.adjusted[best]))
+        fit = fit.with_fewer_draws().without(left[best][1])
+        basis = contest.beside(chosen)[1]
+        left = [(i, own) for i, _ in left if (own := own_basis(contest.columns[i], basis)[0]).shape[1]]
+        test = family_test(fit, [own for _, own in left])
+    worth = (1 - max(test.lag_one, 0.0)) / (1 + max(test.lag_one, 0.0))
+    chosen, odds = _settled(contest, chosen, worth)
+    structures = [
+        _structure(rows, contest, i, [j for j in chosen if j != i], modelled, p, own)
+        for i, p, own in zip(chosen, p_values, odds, strict=False)
+    ]
+    return _Search(tuple(structures), tuple(chosen), bool(np.any(test.adjusted <= LEVEL)), first, test, tested)
 
 
-def _shares(left: Sequence[tuple[int, Array, Array]], test: FamilyTest) -> dict[int, float]:
-    return {i: float(share) for (i, _, _), share in zip(left, test.share, strict=True)}
-
-
-def _saying_the_same(before: dict[int, float], after: dict[int, float], chosen: int) -> list[int]:
-    """What took up nearly as much as the chosen one, and takes up little beside it."""
-    taken = before[chosen]
-    left = {i: after.get(i, 0.0) * (1 - taken) for i in before}
-    same = [i for i, share in before.items() if i != chosen and share >= _ALIKE * taken and left[i] < _SPENT * share]
-    return sorted(same, key=lambda i: -before[i])[:_MOST_ALIKE]
+def _settled(contest: Contest, chosen: Sequence[int], worth: float) -> tuple[list[int], list[Odds]]:
+    """Each cause beside the others: the likeliest in its place, and none that nothing speaks for any more."""
+    settled = list(chosen)
+    for _ in range(len(settled)):
+        before = list(settled)
+        for place in range(len(settled)):
+            others = settled[:place] + settled[place + 1 :]
+            settled[place] = contest.likeliest(others, worth)
+        if settled == before:
+            break
+    return settled, [contest.odds(each, [o for o in settled if o != each], worth) for each in settled]
 
 
 def _structure(
-    one: Dependence, numbers: tuple[float, float, float], size: str, same: tuple[str, ...], modelled: frozenset[str]
+    rows: FitRows,
+    contest: Contest,
+    cause: int,
+    others: Sequence[int],
+    modelled: frozenset[str],
+    p_value: float,
+    odds: Odds,
 ) -> Structure:
+    """What a cause takes up beside the others."""
+    one, (residual, basis) = contest.causes[cause], contest.beside(others)
+    own, coefficients = own_basis(contest.columns[cause], basis)
     present = one.effect.split(" ")[0] in modelled
     effect = f"{one.effect} (it is in the model: free it, or loosen its prior)" if present else one.effect
-    return Structure(one.kind, one.subject, one.words, effect, one.measure, *numbers, size, same)
+    share = float(np.sum((own.T @ residual) ** 2) / max(float(residual @ residual), 1e-300))
+    falls = rows.mean_error(residual) - rows.mean_error(_left_out(residual, own, contest.fold))
+    size = _size(one, -coefficients @ (own.T @ residual))
+    told = (one.kind, one.subject, one.words, effect, one.measure)
+    return Structure(*told, p_value, share, max(0.0, falls) * _MM, size, odds.share, odds.alternatives)
 
 
 def _best(test: FamilyTest, sizes: Sequence[int], fit: Fit) -> int | None:
@@ -253,27 +286,31 @@ def _best(test: FamilyTest, sizes: Sequence[int], fit: Fit) -> int | None:
     return int(significant[np.argmin(count * np.log(left) + size * np.log(count))])
 
 
-def _left_out(fit: Fit, own: Array) -> Array:
+def _left_out(residual: Array, own: Array, fold: NDArray[np.intp]) -> Array:
     """The residual less what a dependence takes up, its coefficients found without the records that are judged."""
-    fold = np.where(fit.block >= 0, fit.block * _FOLDS // fit.blocks, 0)
-    left = fit.residual.copy()
+    left = residual.copy()
     for number in range(_FOLDS):
         judged = fold == number
         gram = own[~judged].T @ own[~judged]
         ridge = 1e-9 * max(float(np.trace(gram)), 1e-300) * np.eye(len(gram))
-        coefficients = np.linalg.solve(gram + ridge, own[~judged].T @ fit.residual[~judged])
+        coefficients = np.linalg.solve(gram + ridge, own[~judged].T @ residual[~judged])
         left[judged] -= own[judged] @ coefficients
     return left
 
 
 def _size(one: Dependence, coefficients: Array) -> str:
-    """The largest coefficient in a customary unit."""
+    """Its coefficients in a customary unit, of levels the largest."""
     if not one.labels or not one.unit:
         return ""
     unit = {"rad": display_unit("angle"), "m": display_unit("length")}.get(one.unit)
-    largest = int(np.argmax(np.abs(coefficients)))
-    number = float(coefficients[largest])
-    shown = f"{to_unit(number, unit.name):.2g} {unit.name}" if unit else f"{number:.2g} {one.unit}"
-    if len(one.labels) > 1:
-        return f"{shown} off at {one.labels[largest]}, beside its other levels"
-    return f"{one.labels[0]}: {shown}"
+    numbers = coefficients[: len(one.labels)]
+
+    def shown(number: float) -> str:
+        if one.unit == "1":
+            return f"{100 * number:.2g} %"
+        return f"{to_unit(number, unit.name):.2g} {unit.name}" if unit else f"{number:.2g} {one.unit}"
+
+    if one.kind == "level":
+        largest = int(np.argmax(np.abs(numbers)))
+        return f"{shown(float(numbers[largest]))} off at {one.labels[largest]}, beside its other levels"
+    return ", ".join(f"{label}: {shown(float(n))}" for label, n in zip(one.labels, numbers, strict=True))

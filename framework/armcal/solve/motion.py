@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,8 @@ from armcal.base.domains import Array
 from armcal.solve.problem import FactorRecords, Problem
 
 ORDER_CHANNELS = ("sequence", "time")
+LOADS = ("turn_x", "turn_y", "turn_z", "gravity", "mass", "moment_x", "moment_y", "moment_z")
+"""Gravity turned about base axes (rad) and multiplied; a mass at the payload's centre (kg), its moments (kg m)."""
 
 
 @dataclass(frozen=True)
@@ -25,11 +27,13 @@ class Motion:
         channels: the command channels of all joints of all arms.
         slopes: raw residual by these channels, one (n_r x joints x N) array a factor (m/rad and the like).
         loads: of each arm.
+        by_load: raw residual by ``LOADS``, one (n_r x 8 x N) array a factor; empty if nothing gives way under loads.
     """
 
     channels: tuple[str, ...]
     slopes: tuple[Array, ...]
     loads: Mapping[str, SiteLoads]
+    by_load: tuple[Array, ...] = ()
 
     @classmethod
     def of(cls, problem: Problem, values: Array, records: Sequence[FactorRecords], dataset: Dataset) -> Motion:
@@ -38,7 +42,8 @@ class Motion:
         channels = tuple(f"{name}.{joint}" for name, arm in arms.items() for joint in arm.commanded)
         blocks = {b.name: values[problem.parameters.entries_of(b.name)] for b in problem.parameters.blocks}
         loads = {name: site_loads(arm, blocks, *_inputs(problem, arm, dataset)) for name, arm in arms.items()}
-        return cls(channels, problem.channel_slopes(values, records, channels), loads)
+        by_load = _by_load(problem, values, dataset) if any(len(each.state) for each in records) else ()
+        return cls(channels, problem.channel_slopes(values, records, channels), loads, by_load)
 
     def subset(self, chosen: NDArray[np.intp]) -> Motion:
         """Some records of all."""
@@ -46,7 +51,8 @@ class Motion:
             name: SiteLoads(each.moments[..., chosen], each.efforts[..., chosen], each.levers[..., chosen])
             for name, each in self.loads.items()
         }
-        return Motion(self.channels, tuple(slope[..., chosen] for slope in self.slopes), loads)
+        by_load = tuple(slope[..., chosen] for slope in self.by_load)
+        return Motion(self.channels, tuple(slope[..., chosen] for slope in self.slopes), loads, by_load)
 
     def along(self, channel: str) -> tuple[Array, ...]:
         """Raw residual by one joint's command, one (n_r x N) array a factor."""
@@ -70,12 +76,37 @@ def recorded_position(dataset: Dataset) -> NDArray[np.intp]:
 
 
 def _inputs(problem: Problem, arm: Arm, dataset: Dataset) -> tuple[Array, Array]:
-    """Commands and loads of each record, those of the environment where a record says nothing."""
+    """Commands and loads of each record."""
+    commands = [dataset.column(f"{arm.name}.{joint}") for joint in arm.commanded]
+    return np.array(arm.joint_commands(commands)), np.array(list(_acting(problem, dataset).values()))
+
+
+def _acting(problem: Problem, dataset: Dataset) -> dict[str, Array]:
+    """The loads of each record (N each), those of the environment where a record says nothing."""
     e = problem.environment
     stated = (*e.gravity, e.payload_mass, *e.payload_com, *e.force, *e.torque)
-    acting = [
-        dataset.column(channel) if dataset.has(channel) else np.full(len(dataset), default)
+    return {
+        channel: dataset.column(channel) if dataset.has(channel) else np.full(len(dataset), default)
         for channel, default in zip(LOAD_CHANNELS, stated, strict=True)
-    ]
-    commands = [dataset.column(f"{arm.name}.{joint}") for joint in arm.commanded]
-    return np.array(arm.joint_commands(commands)), np.array(acting)
+    }
+
+
+def _by_load(problem: Problem, values: Array, dataset: Dataset) -> tuple[Array, ...]:
+    """Raw residual by ``LOADS`` in equilibrium, by a problem whose records all carry their loads."""
+    plan, acting = problem.blueprint, _acting(problem, dataset)
+    loaded = replace(dataset, channels={**dataset.channels, **acting})
+    parts = (plan.arms, plan.measurements, problem.parameters, plan.environment, loaded)
+    other = Problem.build(*parts, "interpreted", plan.groups)
+
+    def slopes(of: Dataset, names: Sequence[str]) -> tuple[Array, ...]:
+        return other.channel_slopes(values, other.records(of), names)
+
+    g = np.array([acting[f"gravity_{axis}"] for axis in "xyz"])
+    ways = np.stack([np.cross(axis, g, axisb=0, axisc=0) for axis in np.eye(3)] + [g], axis=1)
+    pulled = [np.einsum("rgn,gkn->rkn", s, ways) for s in slopes(loaded, LOAD_CHANNELS[:3])]
+    hung = [slopes(loaded, ("payload",))]
+    for axis in "xyz":  # what a mass does is linear in its centre
+        moved = {**loaded.channels, f"payload_{axis}": acting[f"payload_{axis}"] + 1.0}
+        hung.append(slopes(replace(loaded, channels=moved), ("payload",)))
+    masses = [np.concatenate([own[0], *(each - own[0] for each in own[1:])], axis=1) for own in zip(*hung, strict=True)]
+    return tuple(np.concatenate([one, other_], axis=1) for one, other_ in zip(pulled, masses, strict=True))

@@ -105,15 +105,11 @@ class FamilyTest:
 def family_test(fit: Fit, bases: Sequence[Array]) -> FamilyTest:
     """Test the residual against orthonormal bases (rows x k each), and against its neighbours."""
     both = np.column_stack([fit.residual, fit.draws])
-    sizes = [basis.shape[1] for basis in bases]
-    stacked = np.hstack([*bases, np.zeros((len(both), 0))])
-    products = _block_products(stacked, both, fit.block, fit.blocks)
-    small, place, share = [], 0, []
-    for size in sizes:
-        mine = products[:, place : place + size]
+    products = (_block_products(basis, both, fit.block, fit.blocks) for basis in bases)
+    small, share = [], []
+    for mine in products:
         small.append(_p_values(mine))
         share.append(float(np.sum(mine[:, :, 0].sum(axis=0) ** 2)))
-        place += size
     lag, lag_p = _neighbours(fit, both)
     all_p = np.array([*small, lag_p])
     least = np.sort(all_p[:, 1:].min(axis=0))

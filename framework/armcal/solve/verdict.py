@@ -84,8 +84,8 @@ def judge(
     suspicious = _suspicious(errors_mm[train], own, fitted)
     findings = [_convergence(estimate), determined, *_condition(estimate), *_bounds(estimate)]
     findings += shifted_told(estimate)
-    findings += [*_noise(estimate, fitted), *structures_told(seen.leftover, seen.unit)]
-    findings += neighbours_told(seen.leftover, estimate) or _neighbours(whitened, kept, estimate)
+    findings += [*_noise(estimate, fitted, seen), *structures_told(seen.leftover, seen.unit)]
+    findings += neighbours_told(seen.leftover, estimate, seen.unit) or _neighbours(whitened, kept, estimate)
     findings += [
         *_correlated(estimate),
         *predicted,
@@ -155,7 +155,10 @@ def _in_short(
         sentences.append(f"Missed by more than {missed.limit_mm:.2f} {seen.unit}: {ids}{more}.")
     sentences.append(f"Suspicious records: {_few(suspicious)}." if suspicious else "No training record is suspicious.")
     if seen.leftover is not None and seen.leftover.worthwhile:
-        listed = "; ".join(f"{s.words} ({s.falls_mm:.2f} {seen.unit})" for s in seen.leftover.worthwhile)
+        listed = "; ".join(
+            f"{s.words}{', or on another cause' if s.alternatives else ''} ({s.falls_mm:.2f} {seen.unit})"
+            for s in seen.leftover.worthwhile
+        )
         sentences.append(f"Residuals still depend on {listed}.")
     elif seen.leftover is not None and seen.leftover.lag_after_p <= seen.leftover.level:
         after = f"{seen.leftover.lag_after:.2f}"
@@ -213,23 +216,25 @@ def _few(listed: Sequence[str], separator: str = ", ") -> str:
     return separator.join(listed[:MOST_TOLD]) + more
 
 
-def _noise(estimate: Estimate, fitted: WeighedFit | None) -> list[Finding]:
+def _noise(estimate: Estimate, fitted: WeighedFit | None, seen: Evidence) -> list[Finding]:
     """Whose the scatter is if that was estimated, else whether it is as large as declared."""
     if fitted is not None and fitted.components is not None:
         return components_told(fitted.components)
-    return [_size(estimate)]
+    return [_size(estimate, seen)]
 
 
-def _size(estimate: Estimate) -> Finding:
+def _size(estimate: Estimate, seen: Evidence) -> Finding:
     """Are the residuals as large as the declared noise? Chi-square, two-sided, at 5 %."""
     freedom, ratio = max(1, estimate.degrees_of_freedom), estimate.noise_scale
     total, test = ratio**2 * freedom, "chi-square, 5 %"
     if total > chdtri(freedom, LEVEL / 2):
-        text = (
-            f"Residuals are {ratio:.1f} times the declared noise: the model lacks something, or the noise is larger "
-            "than declared. Intervals are widened to the residuals."
-        )
-        action = "Model what residuals still depend on; a pose measured several times shows the noise itself."
+        found = seen.leftover
+        why = "the model's error or the instrument's, which this test cannot tell apart"
+        if found is not None:
+            known = "some of it is the model's: what residuals depend on is named below"
+            why += f"; {known if found.structures else 'no cause that was looked for is in it'}"
+        text = f"Residuals are {ratio:.1f} times the declared noise: {why}. Intervals are widened to the residuals."
+        action = "Repeat some poses, each from elsewhere: what scatters there is noise, the rest the model's error."
         return Finding("warning", text, test, action)
     if ratio < 0.5:
         text = f"Residuals are only {ratio:.2f} times the declared noise: was it stated too large?"
