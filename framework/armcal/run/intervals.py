@@ -69,11 +69,12 @@ class IntervalResult:
     def _typical(self) -> str:
         """How wide the intervals are."""
         half, radius = self.half_width_mm, self.radius_mm
+        first: Recording = "new" if "new" in half else "same"
         text = "In the median pose, of poses like the recorded ones, a prediction is good to "
-        text += f"+- {half['same']:.2f} mm a coordinate (90 %), "
-        text += f"{radius['same']:.2f} mm in all (95 %)"
-        if "new" in half:
-            text += f"; in a new recording to +- {half['new']:.2f} mm and {radius['new']:.2f} mm"
+        text += f"+- {half[first]:.2f} mm a coordinate (90 %), "
+        text += f"{radius[first]:.2f} mm in all (95 %)"
+        if first == "new":
+            text += f"; within this recording to +- {half['same']:.2f} mm and {radius['same']:.2f} mm"
         return text + ", the measurement's noise included."
 
     def as_dict(self) -> dict[str, Any]:

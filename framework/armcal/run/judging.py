@@ -33,6 +33,7 @@ from armcal.solve.verdict import Verdict, judge
 from armcal.solve.weighing import WeighedFit
 
 _MM = 1000.0
+_AT_REST = ", as in a new recording (its drift not known)"
 
 
 @dataclass(frozen=True)
@@ -71,7 +72,7 @@ def verdict_of(
         errors.calibrated_mm,
         run.split.train,
         judged[np.isfinite(judged)],
-        f"{held} held-out records" if held else "cross-validation",
+        (f"{held} held-out records" if held else "cross-validation") + (_AT_REST if _drifts(run) else ""),
         run.dataset.ids,
         suggest(run.problem, training, found, joints) if found.names and _can_be_helped(run) else (),
         run.fitted,
@@ -96,7 +97,7 @@ def gather(run: FittedRecords, judged_mm: Array, system: System, limit: float | 
     if not found.verdict.converged:
         return Evidence(unit=error_unit(problem))
     position, motion = recorded_position(dataset), Motion.of(problem, found.values, run.records, dataset)
-    judged = Judged(judged_mm, residuals(problem, found.values, run.records, run.fitted.records), position)
+    judged = Judged(judged_mm, problem.residuals(found.values, run.records), position)
     limit_mm = None if limit is None else limit * _MM
     missed = misses(problem, run.records, found, dataset, motion, judged, limit_mm)
     training, train = dataset.subset(run.split.train), run.split.train
@@ -155,12 +156,23 @@ def effect_types(system: System) -> frozenset[str]:
 
 
 def _judged(run: FittedRecords, errors: RecordErrors) -> Array:
-    """Errors of the records that judge: held-out ones, else cross-validated ones (N; nan elsewhere)."""
+    """Errors of the records that judge: held-out ones, else cross-validated ones (N; nan elsewhere).
+
+    Where something drifts they are those of a new recording, as ``predict`` takes its poses to be: the drift of this
+    one, which its neighbours show, is of no help there.
+    """
+    after, crossed = errors.at_rest_mm, errors.cross_validated_at_rest_mm
+    if after is None or crossed is None:
+        after, crossed = errors.calibrated_mm, errors.cross_validated_mm
     if not len(run.split.holdout):
-        return errors.cross_validated_mm
+        return crossed
     judged = np.full(len(run.dataset), np.nan)
-    judged[run.split.holdout] = errors.calibrated_mm[run.split.holdout]
+    judged[run.split.holdout] = after[run.split.holdout]
     return judged
+
+
+def _drifts(run: FittedRecords) -> bool:
+    return any(block.drift is not None for block in run.problem.parameters.free)
 
 
 def _whitened(run: FittedRecords) -> Array:
