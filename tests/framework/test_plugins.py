@@ -149,7 +149,7 @@ FAULTS = [
     ("effect", "SingularLaw", "zero load"),
     ("effect", "DeadZoneLaw", "branch neither"),
     ("measurement", "UnknownDimension", "channels have names"),
-    ("measurement", "ManyNoises", "noise is positive"),
+    ("measurement", "ManyNoises", "makes a residual"),
     ("measurement", "NoNoise", "noise is positive"),
     ("measurement", "Biased", "residual is zero"),
     ("measurement", "UnknownOutput", "outputs are channels"),

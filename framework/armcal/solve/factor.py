@@ -265,7 +265,7 @@ def _check_rows(name: str, measurement: Measurement, residual: Expression) -> No
     if odd:
         raise ProblemError(
             f"the measurement {name} has a residual of {rows} entries ({', '.join(dimensions)}), and {', '.join(odd)}.",
-            hint="Its plugin is wrong: armcal plugins check says how.",
+            hint="Correct noise(), dimensions() or noise_channels() in its plugin.",
         )
 
 

@@ -102,7 +102,7 @@ def readings_by_residual(by_reading: Array, noise: Array) -> Array | None:
 
     ``noise`` is that of the residual's entries (n_r). None where some part of the residual depends on no reading.
     """
-    if by_reading.shape[1] > by_reading.shape[2]:
+    if by_reading.shape[1] > by_reading.shape[2] or not (noise > 0).all():
         return None
     whitened = by_reading / noise[:, None]
     sizes = np.abs(whitened).max(axis=(0, 1), initial=0.0)
