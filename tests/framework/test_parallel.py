@@ -305,7 +305,7 @@ def hostile(tmp_path: Path) -> Path:
     [
         ("run", DEMO, "--out", "../out", "--parallel", "2", *FEW),
         pytest.param(
-            ("run", DEMO, "--out", "../out", "--parallel", "2", "--set", "bootstrap.refits=20", *FEW),
+            ("run", DEMO, "--out", "../out", "--parallel", "2", "--set", "uncertainty.bootstrap=20", *FEW),
             marks=pytest.mark.slow,
         ),
         pytest.param(
@@ -323,7 +323,7 @@ def test_no_process_executes_a_file_of_the_working_directory(hostile: Path, comm
     """A numpy.py among downloaded data was executed by every worker."""
     start = Path(sys.executable).with_name("armcal")
     if command[0] == "rehearse":
-        plan = ["plan", str(CONFIGS / "bench.yaml"), "--poses", "3", "--out", str(hostile.parent / "plan.csv"), "-q"]
+        plan = ["plan", str(CONFIGS / "bench.yaml"), "--poses", "20", "--out", str(hostile.parent / "plan.csv"), "-q"]
         assert CliRunner().invoke(cli, plan).exit_code == 0
     done = subprocess.run([start, *command], cwd=hostile, capture_output=True, text=True, timeout=500, check=False)
     assert [path.name for path in hostile.parent.glob("executed-*")] == []
