@@ -64,7 +64,7 @@ class ReplayDiffersError(DataError):
 
 
 @contextmanager
-def parsing(sequence: int, journal: str = "") -> Iterator[None]:
+def parsing(sequence: int, journal: str = "the journal") -> Iterator[None]:
     """For what is read of an entry whose checksum is right.
 
     Raises:
