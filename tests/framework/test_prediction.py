@@ -370,7 +370,8 @@ def test_what_is_kept_predicts_as_the_fit_itself(extra: tuple[str, ...], tmp_pat
         csv.writer(file).writerows([rows[0], *([str(i), *row[1:]] for i, row in enumerate(rows[1:], 1))])
     settings = [FREE, *extra, "evaluator=interpreted", "validation.folds=0"]
     folder = tmp_path / "run"
-    assert armcal("run", DEMO, "--data", str(poses), "--out", str(folder), *setting(*settings)).exit_code == 0
+    run = ("run", DEMO, "--data", str(poses), "--out", str(folder), "--accept")
+    assert armcal(*run, *setting(*settings)).exit_code == 0
     kept = Calibration.load(folder / "calibration.yaml")
     loaded = Experiment.load(DEMO, settings, poses)
     dataset = loaded.read()
