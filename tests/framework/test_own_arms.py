@@ -202,6 +202,12 @@ class TestUncheckedWiring:
             assert arm.armcal(*drive).exit_code == 0
             assert bench.offences() == {}
 
+    def test_what_was_seen_is_said_where_it_cannot_be_written_down(self, post: Bench) -> None:
+        (post.arm.folder / "servos.yaml.checked").mkdir()
+        seen = post.arm.armcal("servo", "--check", "--yes")
+        assert seen.exit_code == 2 and "servos.yaml.checked: it cannot be written" in said_by(seen)
+        assert "b turned by +" in said_by(seen) and "make the folder" in said_by(seen).lower()
+
     @pytest.mark.slow
     def test_what_it_is_refused_for_is_real(self, tmp_path: Path) -> None:
         arm = OwnArm(tmp_path, POST)
