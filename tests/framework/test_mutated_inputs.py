@@ -213,6 +213,12 @@ def test_mutated_files_are_taken_or_refused_with_a_sentence(desk: Path) -> None:
     assert hunger_kib() - before < MOST_KIB
 
 
+def test_a_truth_that_names_several_parameters_is_refused(desk: Path) -> None:
+    (desk / "truth.yaml").write_text("arm.mdh.theta*: 0.4 deg\n", encoding="utf-8")
+    code, said = call("simulate arm.yaml --out o.csv")
+    assert code == 2 and "truth.yaml:1" in said and "stands for several names" in said and "arm.mdh.theta2" in said
+
+
 @pytest.mark.slow
 def test_ten_thousand_mutated_files_are_taken_or_refused_with_a_sentence(desk: Path) -> None:
     before = hunger_kib()

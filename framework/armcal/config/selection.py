@@ -132,7 +132,12 @@ def with_values(
         place = (*at, name)
         owner = name.partition("[")[0]
         if owner not in parameters.names:
-            _matching(parameters, name, source, place)
+            listed = ", ".join(_matching(parameters, name, source, place))
+            raise ConfigError(
+                f"{name} stands for several names: a value is of one parameter.",
+                where=source.where(place) if source else None,
+                hint=f"Give each its own: {listed}.",
+            )
         block = parameters[owner]
         if name not in block.entry_names:
             raise ConfigError(
