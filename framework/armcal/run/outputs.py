@@ -212,7 +212,8 @@ def calibration_content(result: RunResult, experiment: Experiment, accepted: boo
         },
         environment_columns=tuple(filter(result.dataset.has, surroundings(experiment.system.arms))),
         noise=in_unit(_noise(result), unit),
-        **{f"quality_{unit}": result.table.as_dict()},
+        quality_mm=result.table.as_dict() if unit == "mm" else {},
+        quality_mrad=result.table.as_dict() if unit == "mrad" else {},
         verdict={
             "headline": result.verdict.headline,
             "usable": not result.verdict.bad,
