@@ -385,7 +385,7 @@ def test_datagrams_are_acknowledged_to_their_sender() -> None:
 
 def test_records_of_other_machines_need_a_named_sender() -> None:
     for text in ("udp:0.0.0.0:0", "udp:[::]:0"):
-        with pytest.raises(InputError, match="no sender is named: anybody could change the calibration"):
+        with pytest.raises(InputError, match="no sender is named: anybody could send records"):
             open_source(text, rows())
     for text in ("udp:0.0.0.0:0?from=", "udp:0.0.0.0:0?from=,", "udp:0.0.0.0:0?from=no such.host"):
         with pytest.raises(InputError, match="it is no address"):

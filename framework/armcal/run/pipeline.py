@@ -27,7 +27,7 @@ from armcal.solve.bootstrap import Bootstrap, bootstrap
 from armcal.solve.clustered import widened
 from armcal.solve.coverage import fit_and_predict
 from armcal.solve.drift import residuals, with_drift
-from armcal.solve.estimator import Estimate, Progress, gave_up, no_progress, require_solvable, spread
+from armcal.solve.estimator import Progress, gave_up, no_progress, require_solvable, spread
 from armcal.solve.evidence import Evidence
 from armcal.solve.joint_noise import with_joint_noise
 from armcal.solve.motion import recorded_position
@@ -201,22 +201,19 @@ def _uncertainty(
     executor: Executor | None,
     watch: Stopwatch,
 ) -> tuple[Bootstrap | None, tuple[Profile, ...]]:
-    """What was asked for beyond the covariance."""
-    with watch.stage("bootstrap"):
-        resampled = _resampled(experiment, ready, fitted.estimate, executor, progress)
-    with watch.stage("profile"):
-        return resampled, _profiles(experiment, ready, fitted, progress, executor)
-
-
-def _resampled(
-    experiment: Experiment, ready: Prepared, found: Estimate, executor: Executor | None, progress: Progress
-) -> Bootstrap | None:
-    """By bootstrap, if it is asked for and there is something to resample."""
-    asked = experiment.settings.uncertainty
-    if not (asked.bootstrap and found.verdict.converged and found.names):
-        return None
-    poses = experiment.poses(ready.dataset.subset(ready.split.train))
-    return bootstrap(ready.problem, ready.training, experiment.estimator, found, asked, executor, progress, poses)
+    """What was asked for beyond the covariance, of a fit that converged."""
+    asked, estimate = experiment.settings.uncertainty, fitted.estimate
+    resampled: Bootstrap | None = None
+    found: tuple[Profile, ...] = ()
+    if asked.bootstrap and estimate.verdict.converged and estimate.names:
+        with watch.stage("bootstrap"):
+            poses = experiment.poses(ready.dataset.subset(ready.split.train))
+            parts = (ready.training, experiment.estimator, estimate, asked, executor, progress, poses)
+            resampled = bootstrap(ready.problem, *parts)
+    if asked.profile and estimate.verdict.converged:
+        with watch.stage("profile"):
+            found = profiles(ready.problem, fitted, experiment.estimator, asked.profile, executor, progress)
+    return resampled, found
 
 
 def _announce(experiment: Experiment, ready: Prepared) -> list[str]:
@@ -253,16 +250,6 @@ def _judge(
     run = FittedRecords(ready.problem, ready.records, ready.dataset, ready.split, fitted)
     with watch.stage("judge"):
         return verdict_of(run, errors, intervals, experiment.system, experiment.settings.validation.limit)
-
-
-def _profiles(
-    experiment: Experiment, ready: Prepared, fitted: WeighedFit, progress: Progress, executor: Executor | None
-) -> tuple[Profile, ...]:
-    """Of the numbers asked for."""
-    asked = experiment.settings.uncertainty.profile
-    if not (asked and fitted.estimate.verdict.converged):
-        return ()
-    return profiles(ready.problem, fitted, experiment.estimator, asked, executor, progress)
 
 
 def _tell_rejected(registry: PluginRegistry, records: Sequence[tuple[int, str, str]]) -> list[str]:

@@ -83,16 +83,10 @@ def judge(
     own, kept = [ids[i] for i in train], train if fitted is None else train[fitted.kept]
     suspicious = _suspicious(errors_mm[train], own, fitted)
     findings = [_convergence(estimate), determined, *_condition(estimate), *_bounds(estimate)]
-    findings += shifted_told(estimate)
-    findings += [*_noise(estimate, fitted, seen), *structures_told(seen.leftover, seen.unit)]
+    findings += [*shifted_told(estimate), *_noise(estimate, fitted, seen), *structures_told(seen.leftover, seen.unit)]
     findings += neighbours_told(seen.leftover, estimate, seen.unit) or _neighbours(whitened, kept, estimate)
-    findings += [
-        *_correlated(estimate),
-        *predicted,
-        *misses_told(seen.misses, seen.unit),
-        *_outliers(suspicious, own, fitted),
-    ]
-    findings += _next(estimate, suggestions)
+    findings += [*_correlated(estimate), *predicted, *misses_told(seen.misses, seen.unit)]
+    findings += [*_outliers(suspicious, own, fitted), *_next(estimate, suggestions)]
     ranked = tuple(sorted(findings, key=lambda finding: _ORDER[finding.grade]))
     first = _first(judged_mm, judged_on, ranked[0], seen.unit)
     sentences = [first, *_in_short(estimate, determined, seen, suspicious, suggestions)]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 import select
 import socket
 import stat
@@ -16,15 +15,15 @@ from pydantic import BeforeValidator
 
 from armcal.base.config_text import resolve_path
 from armcal.bench.faults import DeviceRefusedError
-from armcal.errors import ConfigError, Location
+from armcal.errors import ConfigError, InputError, Location
 from armcal.online.sources.line_cutter import LineCutter
+from armcal.online.sources.udp import UDP_KINDS, listening, parsed
 
 STANDARD_INPUT = "-"
-KINDS = "- (standard input), udp:PORT, udp:HOST:PORT, or a file that another program writes"
+KINDS = f"- (standard input), {UDP_KINDS}, or a file that another program writes"
 Begin = Literal["start", "end"]
 """From where a file is read: ``end`` passes over what was in it before."""
 
-_UDP = re.compile(r"udp:(?:(?P<host>[^:\[\]]+):)?(?P<port>[0-9]{1,5})")
 _LONGEST_LINE = 64 * 1024
 _CHUNK = 1 << 20
 _MOST_AT_ONCE = 16
@@ -37,7 +36,7 @@ def _named(value: object) -> object:
     if not isinstance(value, str) or value == STANDARD_INPUT:
         return value
     if value.startswith("udp:"):
-        if _address(value) is None:
+        if parsed(value) is None:
             raise ValueError(f"found {value!r}, expected {KINDS}")
         return str(value)
     try:
@@ -47,7 +46,7 @@ def _named(value: object) -> object:
 
 
 SourceName = Annotated[str, BeforeValidator(_named)]
-"""``-``, ``udp:PORT``, ``udp:HOST:PORT``, or the path of a file."""
+"""``-``, ``udp:PORT``, ``udp:HOST:PORT?from=SENDER``, or the path of a file."""
 
 
 class LineSource(Protocol):
@@ -138,18 +137,15 @@ class UdpLines:
     """Lines of datagrams on a port of this machine; what comes while nobody looks waits in the system's queue."""
 
     def __init__(self, name: str) -> None:
-        address = _address(name)
+        address = parsed(name)
         if address is None:
             raise _refusal(name, "it is no address")
-        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._socket.setblocking(False)
-        self._open = True
         try:
-            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER_BYTES)
-            self._socket.bind(address)
-        except (OSError, UnicodeError) as fault:
-            self.close()
-            raise _refusal(name, f"the port cannot be had ({fault})") from fault
+            self._socket, self._is_ours = listening(*address)
+        except InputError as fault:
+            raise DeviceRefusedError(fault.message, where=Location(name), hint=fault.hint) from fault
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER_BYTES)
+        self._open = True
 
     @property
     def port(self) -> int:
@@ -166,9 +162,11 @@ class UdpLines:
         found: list[bytes | None] = []
         for _ in range(1000 * _MOST_AT_ONCE if self._open else 0):
             try:
-                data, _, flags, _ = self._socket.recvmsg(_LONGEST_LINE)
+                data, _, flags, sender = self._socket.recvmsg(_LONGEST_LINE)
             except OSError:  # nothing is left, or the network is gone for now: both are silence
                 break
+            if not self._is_ours(sender[0]):
+                continue
             found += [None] if flags & socket.MSG_TRUNC else data.split(b"\n")
         return found
 
@@ -226,13 +224,6 @@ class FileLines:
         size = os.fstat(self._file.fileno()).st_size
         start = max(0, size - _LONGEST_LINE)
         return start + os.pread(self._file.fileno(), size - start, start).rfind(b"\n") + 1
-
-
-def _address(name: str) -> tuple[str, int] | None:
-    found = _UDP.fullmatch(name)
-    if found is None or int(found["port"]) > 65535:
-        return None
-    return found["host"] or "127.0.0.1", int(found["port"])
 
 
 def _refusal(name: str, why: str) -> DeviceRefusedError:

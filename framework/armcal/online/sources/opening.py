@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import sys
 import time
 from pathlib import Path
@@ -13,14 +12,9 @@ from armcal.online.sources.folder import Folder
 from armcal.online.sources.lines import Lines
 from armcal.online.sources.row_parser import RowParser
 from armcal.online.sources.source import AtEnd, Clock, Source
-from armcal.online.sources.udp import LOOPBACK, Udp
+from armcal.online.sources.udp import UDP_KINDS, Udp, parsed
 
-KINDS = "- (standard input), udp:PORT, udp:HOST:PORT?from=SENDER, a directory, or a CSV file"
-
-_UDP = re.compile(
-    r"udp:(?:(?P<host>[^:\[\]]+|\[[0-9a-fA-F:.]+\]):)?(?P<port>[0-9]{1,5})"
-    r"(?:\?from=(?P<senders>[^,\s]+(?:,[^,\s]+)*))?"
-)
+KINDS = f"- (standard input), {UDP_KINDS}, a directory, or a CSV file"
 
 
 def open_source(text: str, rows: RowParser, at_end: AtEnd = "stop", clock: Clock = time.time) -> Source:
@@ -33,11 +27,11 @@ def open_source(text: str, rows: RowParser, at_end: AtEnd = "stop", clock: Clock
     if text == "-":
         return Lines(sys.stdin.fileno(), rows, clock)
     if text.startswith("udp:"):
-        found = _UDP.fullmatch(text)
-        if found is None or int(found["port"]) > 65535:
+        address = parsed(text)
+        if address is None:
             raise InputError("it is no address.", where=Location(text), hint=f"Give {KINDS}.")
-        senders = tuple(found["senders"].split(",")) if found["senders"] else ()
-        return Udp((found["host"] or LOOPBACK).strip("[]"), int(found["port"]), rows, clock, senders)
+        host, port, senders = address
+        return Udp(host, port, rows, clock, senders)
     path = Path(text)
     if path.is_dir():
         return Folder(path, rows, clock)

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import json
+import re
 import select
 import socket
 import time
 from collections import OrderedDict
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from ipaddress import IPv4Address, IPv6Address, ip_address
 from typing import Any
 
@@ -20,6 +21,11 @@ from armcal.online.sources.source import Clock
 MAX_DATAGRAM_BYTES = 16 * 1024
 LOOPBACK = "127.0.0.1"
 ANYBODY = "any"
+UDP_KINDS = "udp:PORT, udp:HOST:PORT?from=SENDER"
+_NAME = re.compile(
+    r"udp:(?:(?P<host>[^:\[\]]+|\[[0-9a-fA-F:.]+\]):)?(?P<port>[0-9]{1,5})"
+    r"(?:\?from=(?P<senders>[^,\s]+(?:,[^,\s]+)*))?"
+)
 
 _WAITING = 64
 """So many senders are remembered until their records are acknowledged; there is one unless a disk is full."""
@@ -45,18 +51,8 @@ class Udp:
         self._clock = clock
         self._row = 0
         self._senders: OrderedDict[int, Any] = OrderedDict()
-        self._from = None if tuple(senders) == (ANYBODY,) else _addresses(senders)
-        self._strange = False
-        self._socket = bound(host, port)
-        if not senders and not _plain(self.address[0]).is_loopback:
-            self._socket.close()
-            raise InputError(
-                "other machines reach this address, and no sender is named: anybody could change the calibration.",
-                where=Location(f"udp:{host}:{port}"),
-                hint=f"Name who sends the records: udp:{host}:{port}?from=ADDRESS, several with commas between them "
-                f"(?from={ANYBODY} takes those of everybody), or take udp:{port}, which this machine alone reaches.",
-            )
-        self._open = True
+        self._socket, self._is_ours = listening(host, port, senders)
+        self._strange, self._open = False, True
 
     @property
     def address(self) -> tuple[str, int]:
@@ -94,9 +90,6 @@ class Udp:
         except UnicodeDecodeError as fault:
             return faulty(place, f"The datagram holds the byte 0x{data[fault.start]:02x}, which is not UTF-8 text.")
 
-    def _is_ours(self, sender: str) -> bool:
-        return self._from is None or (_plain(sender) in self._from if self._from else _plain(sender).is_loopback)
-
     def _stranger(self, sender: str) -> Incoming | None:
         """A fault for the first datagram of a sender that is not named; whoever sends many fills no journal."""
         if self._strange:
@@ -121,6 +114,36 @@ class Udp:
         """See ``Source``."""
         self._open = False
         self._socket.close()
+
+
+def parsed(text: str) -> tuple[str, int, tuple[str, ...]] | None:
+    """Host, port and senders of ``udp:PORT`` or ``udp:HOST:PORT?from=SENDER``; None if it is neither."""
+    found = _NAME.fullmatch(text)
+    if found is None or int(found["port"]) > 65535:
+        return None
+    senders = tuple(found["senders"].split(",")) if found["senders"] else ()
+    return (found["host"] or LOOPBACK).strip("[]"), int(found["port"]), senders
+
+
+def listening(host: str, port: int, senders: Sequence[str]) -> tuple[socket.socket, Callable[[str], bool]]:
+    """A bound socket, and whether the datagrams of an address are taken.
+
+    ``senders`` are the addresses whose datagrams are taken, or ``any``; those of this machine by default.
+
+    Raises:
+        InputError: the port cannot be had, or other machines reach it and no sender is named.
+    """
+    known = None if tuple(senders) == (ANYBODY,) else _addresses(senders)
+    opened = bound(host, port)
+    if not senders and not _plain(str(opened.getsockname()[0])).is_loopback:
+        opened.close()
+        raise InputError(
+            "other machines reach this address, and no sender is named: anybody could send records.",
+            where=Location(f"udp:{host}:{port}"),
+            hint=f"Name who sends them: udp:{host}:{port}?from=ADDRESS, several with commas between them "
+            f"(?from={ANYBODY} takes those of everybody), or take udp:{port}, which this machine alone reaches.",
+        )
+    return opened, lambda sender: known is None or (_plain(sender) in known if known else _plain(sender).is_loopback)
 
 
 def _plain(address: str) -> IPv4Address | IPv6Address:
