@@ -144,7 +144,7 @@ def _placed(request: ExportRequest) -> tuple[str, ...]:
 
 def _base_moved(model: UrdfModel, values: Mapping[str, float]) -> tuple[str, ...]:
     """Whether the first joint that moves stands elsewhere than in the file, by more than an arm is made wrong."""
-    before, now = (_first(model, {**_nominal(model), **told}) for told in ({}, values))
+    before, now = (_first(model, {**_nominal(model), **changed}) for changed in ({}, values))
     shift = 1000 * float(np.linalg.norm(now[:3, 3] - before[:3, 3]))
     cosine = (float(np.trace(before[:3, :3].T @ now[:3, :3])) - 1) / 2
     turn = math.degrees(math.acos(min(1.0, max(-1.0, cosine))))

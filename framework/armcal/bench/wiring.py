@@ -17,7 +17,7 @@ from armcal.errors import InputError, Location
 from armcal.online.journal.files import REAL_FILES, write_whole
 
 _WRONG = ""
-"""In the place of the fingerprint of a servo that did not do what it was told."""
+"""In the place of the fingerprint of a servo that did not do what was commanded."""
 
 
 def servo_file_of(bench: Bench) -> Path | None:
@@ -34,13 +34,13 @@ def record_of(servos: Path) -> Path:
 def note_checked(
     servos: Path, file: ServoFile, right: Iterable[str], others: Iterable[str], seen: Mapping[str, Any]
 ) -> None:
-    """Write down which joints were seen to turn as told, and which were not.
+    """Write down which joints were seen to turn as commanded, and which were not.
 
     Args:
         servos: the servo file's path.
         file: as it was when they were seen.
         right: the joints seen to turn.
-        others: joints that were tried and did not, or cannot be told from another one.
+        others: joints that were tried and did not, or cannot be distinguished from another one.
         seen: ``adapter``, ``by`` (``tracker`` or ``somebody``) and ``at`` (unix s).
 
     Raises:

@@ -34,6 +34,8 @@ def accept(voice: Voice, path: Path) -> None:
         write_over({path.resolve(): sealed(found.calibration.record.to_config()).encode()})
     moved = None if found.moved_m is None else found.moved_m * 1000
     voice.result({"file": str(path), "edited": found.was_edited, "moved_mm": moved})
-    told = "it keeps no check poses" if moved is None else f"tools at its check poses moved by up to {moved:.3f} mm"
+    moved_text = (
+        "it keeps no check poses" if moved is None else f"tools at its check poses moved by up to {moved:.3f} mm"
+    )
     done = "accepted" if found.was_needed else "nothing to accept, it is as armcal wrote it"
-    voice.out.print(f"{done}: {path} ({told})", markup=False, soft_wrap=True)
+    voice.out.print(f"{done}: {path} ({moved_text})", markup=False, soft_wrap=True)

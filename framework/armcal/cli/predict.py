@@ -93,15 +93,17 @@ def _report(
     _show_typical(voice, _typical(found), medians)
 
 
-def _show_typical(voice: Voice, told: Mapping[str, Any], medians: Mapping[str, float]) -> None:
+def _show_typical(voice: Voice, typical: Mapping[str, Any], medians: Mapping[str, float]) -> None:
     """How far a prediction may be off in the median pose: of a position, else of every column."""
     text = ", ".join(f"{column} {half:.2g}" for column, half in medians.items())
-    if told:
-        text = f"{told['half_width_90_mm']:.2f} mm a coordinate (90 %), {told['radius_95_mm']:.2f} mm in all (95 %)"
+    if typical:
+        text = (
+            f"{typical['half_width_90_mm']:.2f} mm a coordinate (90 %), {typical['radius_95_mm']:.2f} mm in all (95 %)"
+        )
     elif text:
         text += " (90 %)"
     if text:
-        voice.out.print(f"+- {text}, in the median pose", markup=False, soft_wrap=not told)
+        voice.out.print(f"+- {text}, in the median pose", markup=False, soft_wrap=not typical)
 
 
 def _tools(placed: Array, arms: Sequence[str]) -> dict[str, Array]:

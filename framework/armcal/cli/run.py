@@ -76,10 +76,10 @@ def _show_details(voice: Voice, result: RunResult) -> None:
 
 def _end(result: RunResult, folder: Path, accept: bool) -> None:
     """Exit with what is to be done, where there is no calibration to be used."""
-    told = result.estimate.verdict
-    if not told.converged:
+    solver = result.estimate.verdict
+    if not solver.converged:
         say(
-            f"armcal: {told.name} did not converge ({told.status}). "
+            f"armcal: {solver.name} did not converge ({solver.status}). "
             f"Nothing was exported as calibrated. {CHECK_THE_DATA}",
             err=True,
         )

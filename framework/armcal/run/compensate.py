@@ -37,7 +37,7 @@ class Assessed:
         nominal_distances: how far from its target the real arm is with the nominal arm's command (N; m); nan where the
             nominal arm has none.
         tools: where the tool's frame is at the commands (N x 4 x 4), whichever point of it was brought to the targets.
-        nominal_T_tool: where the nominal arm's would be (N x 4 x 4): what a controller must be told that takes the
+        nominal_T_tool: where the nominal arm's would be (N x 4 x 4): what to command to a controller that takes the
             nominal arm for the real one.
         radii: of the ball about the expected place that holds a measurement of it with 95 % (N; m); None if unknown.
     """

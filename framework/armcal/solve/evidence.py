@@ -40,7 +40,7 @@ class PriorsAlone:
 
 @dataclass(frozen=True)
 class Evidence:
-    """All of it; what was not looked at, or cannot be told, is None. ``unit`` is that of all errors, mm or mrad."""
+    """All of it; what was not looked at, or is not known, is None. ``unit`` is that of all errors, mm or mrad."""
 
     leftover: Leftover | None = None
     misses: Misses | None = None

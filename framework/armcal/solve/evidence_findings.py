@@ -196,7 +196,7 @@ def what_neighbours_cost(estimate: Estimate) -> str:
 _WHY = {
     "time": "It goes with time, not with the pose: ",
     "pose": "It goes with the pose, not with time: ",
-    "open": "Whether it goes with time or with the pose cannot be told: ",
+    "open": "Time and pose explain it about equally well, so the cause is not known: ",
 }
 _TELL_APART = {
     "time": "Let the base drift (parameters.drift); repeat one pose at the start, in the middle and at the end.",

@@ -40,10 +40,10 @@ def gross_error(
     mean, scale = float(np.mean(seen)), estimate.noise_scale
     whole, name = (figure.reach_mm, "the arm's reach") if unit == "mm" else (1000.0, "a radian")
     share = mean / whole
-    told = f"Records that did not train are missed by {mean:.3g} {unit} on average, {100 * share:.2g} % of {name}"
+    error = f"Records that did not train are missed by {mean:.3g} {unit} on average, {100 * share:.2g} % of {name}"
     if share > OF_REACH:
         test = f"mean, limit {100 * OF_REACH:g} % of {whole:.0f} {unit}"
-        return [Finding("bad", f"{told}: the values do not describe this arm.", test, CHECK_THE_DATA)]
+        return [Finding("bad", f"{error}: the values do not describe this arm.", test, CHECK_THE_DATA)]
     found = 0.0
     if left is not None:
         causes = [s.falls_mm for s in left.worthwhile if s.kind != _OF_TIME]
@@ -51,7 +51,7 @@ def gross_error(
     limit = UNEXPLAINED_OF_REACH if found < EXPLAINED else EXPLAINED_OF_REACH
     if share <= limit or scale <= TIMES_NOISE:
         return []
-    text = f"{told} and {scale:.0f} times the declared noise; what was found in the residuals does not explain it."
+    text = f"{error} and {scale:.0f} times the declared noise; what was found in the residuals does not explain it."
     test = f"limits {100 * limit:g} % and {TIMES_NOISE:g} times; one cause explains at most {100 * found:.0f} %"
     return [Finding("bad", text, test, f"The cause is not known. {CHECK_THE_DATA}")]
 

@@ -271,8 +271,8 @@ def _structure(
     share = float(np.sum((own.T @ residual) ** 2) / max(float(residual @ residual), 1e-300))
     falls = rows.mean_error(residual) - rows.mean_error(_left_out(residual, own, contest.fold))
     size = _size(one, -coefficients @ (own.T @ residual))
-    told = (one.kind, one.subject, one.words, effect, one.measure)
-    return Structure(*told, p_value, share, max(0.0, falls) * _MM, size, odds.share, odds.alternatives)
+    named = (one.kind, one.subject, one.words, effect, one.measure)
+    return Structure(*named, p_value, share, max(0.0, falls) * _MM, size, odds.share, odds.alternatives)
 
 
 def _best(test: FamilyTest, sizes: Sequence[int], fit: Fit) -> int | None:

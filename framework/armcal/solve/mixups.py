@@ -180,9 +180,9 @@ def _of(problem: Problem, seen: _Seen, arm: Arm) -> Mixup | None:
     if best is None or best.left > enough:
         return None
     alike = [r for r in found if r.left <= _ALIKE * best.left and r.of_joints == best.of_joints]
-    told = tuple(reading.words for reading in sorted(alike, key=lambda reading: reading.left)[:_MOST_NAMED])
+    words = tuple(reading.words for reading in sorted(alike, key=lambda reading: reading.left)[:_MOST_NAMED])
     name = problem.kernels[seen.kernel].factor.name
-    return Mixup(name, told, as_given * _MM, best.left * _MM, best.of_joints)
+    return Mixup(name, words, as_given * _MM, best.left * _MM, best.of_joints)
 
 
 def _positions(problem: Problem, seen: _Seen, read_as: Wires) -> _Positions | None:

@@ -21,7 +21,7 @@ from armcal.solve.problem import Problem
 CLEAR = 3.0
 """Logarithm of the odds, 20 to 1, from which on one explanation is preferred."""
 IMITATED = 0.1
-"""An explanation of which another predicts this share cannot be told from it."""
+"""An explanation of which another predicts this share cannot be distinguished from it."""
 _POSE_LENGTHS = (1.0, 2.0, 4.0)
 _TIME_LENGTHS = (3.0, 10.0, 30.0, 100.0)
 _MOST_FEATURES = 180

@@ -1,4 +1,4 @@
-"""Elastic equilibria d = F(d) that springs hold, found by Newton's method; others are told from them.
+"""Elastic equilibria d = F(d) that springs hold, found by Newton's method; others are distinguished from them.
 
 With the compliance C and the loads g, F = C g(d), and the Hessian of the potential energy is C^-1 (I - S), S = dF/dd:
 the springs hold the arm where every eigenvalue of I - S is positive, and where one is negative the load grows faster

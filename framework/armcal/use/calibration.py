@@ -333,9 +333,10 @@ def arm_named(calibration: Calibration, arm: str | None) -> str:
 
 def lost_calibration(record: CalibrationFile, path: str | Path) -> ConfigError:
     """What is wrong with a calibration whose recalibration ended at the level lost."""
-    told = record.recalibrated or {}
+    recalibrated = record.recalibrated or {}
+    reason = str(recalibrated.get("why", "")).rstrip(".")
     return ConfigError(
-        f"its level is lost since record {told.get('sequence')}: {str(told.get('why', '')).rstrip('.')}.",
+        f"its level is lost since record {recalibrated.get('sequence')}: {reason}.",
         where=Location(str(path)),
         hint="Calibrate on the bench again. To use it all the same: --accept-lost of predict, compensate, "
         "correction-table, export and serve.",

@@ -100,7 +100,7 @@ def adapter_of(folder: Path) -> str:
 def tried(setup: Setup, talk: Conversation, seen: str) -> list[Verdict]:
     """Move each joint a little, and say what it did; ``seen`` by the ``tracker`` or by ``somebody``.
 
-    Joints that turned as told, and can be told from all others, are written down as checked beside the servo file.
+    Joints that turned as commanded, and as no other joint did, are written down as checked beside the servo file.
 
     Raises: as ``measure``.
     """

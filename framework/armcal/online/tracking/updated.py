@@ -71,11 +71,11 @@ def calibration_text(calibration: Calibration, chart: Chart, belief: Belief, tol
     return sealed(content.to_config())
 
 
-def _verdict(before: Mapping[str, Any], told: Mapping[str, Any]) -> dict[str, Any]:
+def _verdict(before: Mapping[str, Any], recalibrated: Mapping[str, Any]) -> dict[str, Any]:
     """Of the calibration's own run, under another headline where it no longer holds."""
-    if told["level"] != "lost":
+    if recalibrated["level"] != "lost":
         return dict(before)
-    return {**before, "headline": f"Lost, do not use: {told['why']}"}
+    return {**before, "headline": f"Lost, do not use: {recalibrated['why']}"}
 
 
 def _bounds(chart: Chart) -> dict[int, tuple[float, float]]:
