@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import oracle
@@ -163,7 +164,7 @@ def test_time_is_blamed_only_where_poses_do_not_follow_it(lrm, name, in_order, c
     found = found_in(lrm, name, 0, in_order)
     assert found.lag_p <= LEVEL
     assert found.alike is not None and found.alike.cause == cause
-    finding = neighbours_told(found)[0]
+    finding = neighbours_told(found, SimpleNamespace(widened=()))[0]
     assert ("It goes with time" in finding.text) == (cause == "time")
     assert ("Let the base drift" in finding.action) == (cause == "time")
     assert ("the cause is not known" in finding.text) == (cause == "open")
