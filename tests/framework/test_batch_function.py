@@ -100,9 +100,9 @@ def test_what_was_compiled_once_serves_without_waiting() -> None:
 def test_a_library_that_gives_other_numbers_is_not_used(monkeypatch) -> None:
     x, y = ca.SX.sym("x", 3), ca.SX.sym("y", 2)
     other = ca.Function("other", [x, y], [ca.vertcat(x, y), x[0], ca.SX(0, 1)])
-    wrong = batch_function._library(other, "compiled", None)
+    wrong = BatchFunction(other, inputs(8), "compiled")._library
     assert wrong is not None
-    monkeypatch.setattr(batch_function, "_library", lambda function, choice, loop: wrong)
+    monkeypatch.setattr(batch_function, "_library", lambda *asked: (wrong, lambda: None))
     made = BatchFunction(mixture(), inputs(8), "compiled")
     assert not made.compiled
     given = inputs(10)

@@ -308,7 +308,7 @@ def test_paths_that_lead_nowhere(desk: Desk) -> None:
         assert said in told(armcal("compensate", bad, "--targets", targets, "--out", desk.out), 2)
     for out, said in (
         (desk.folder / "no" / "out.csv", "it cannot be written (No such file or directory)"),
-        (desk.folder, "it cannot be written (Is a directory)"),
+        (desk.folder, "expected a file or nothing there"),
         (targets, "it is one of the inputs"),
         (desk.calibration, "it is one of the inputs"),
     ):

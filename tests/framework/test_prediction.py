@@ -15,6 +15,7 @@ from armcal.errors import DataError
 from armcal.measure.reader import ReadRequest, wanted_channels
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import Stopwatch, calibrate, prepare
+from armcal.solve.clustered import widened
 from armcal.solve.coverage import (
     FEWEST,
     Coverage,
@@ -29,6 +30,7 @@ from armcal.solve.coverage import (
     whitened_like,
 )
 from armcal.solve.drift import with_drift
+from armcal.solve.motion import recorded_position
 from armcal.solve.prediction import LEVELS, Spread
 from armcal.solve.simulation import SimulationRequest, measured_without_noise, with_channels
 from armcal.solve.validation import folds
@@ -380,6 +382,8 @@ def test_what_is_kept_predicts_as_the_fit_itself(extra: tuple[str, ...], tmp_pat
     records = with_drift(problem, problem.records(dataset), dataset, loaded.parameters.nominal())
     train = problem.subset(records, split.train)
     fitted = fit(problem, train, loaded.estimator, loaded.parameters.nominal())
+    acting, position = problem.weighted(fitted.records, fitted.weights), recorded_position(dataset)[split.train]
+    fitted = replace(fitted, estimate=widened(problem, acting, fitted.estimate, position))
     by = predictor(problem, fitted)
     alike = whitened_like(problem, fitted, records, loaded.estimator)
     for recording, spreads in (("same", by.in_recording(alike)), ("new", by.in_new_recording(alike))):

@@ -225,18 +225,14 @@ def _announce(experiment: Experiment, ready: Prepared) -> list[str]:
 
 def _fitted(experiment: Experiment, ready: Prepared, progress: Progress, executor: Executor | None) -> WeighedFit:
     """The fit to the training records, as sure as records that may err alike allow."""
-    problem, estimator, nominal = (
-        ready.problem,
-        spread(experiment.estimator, executor),
-        ready.problem.parameters.nominal(),
-    )
-    own = ready.dataset.subset(ready.split.train)
-    given_up = hopeless(problem, ready.training, own, nominal)
+    problem, train = ready.problem, ready.split.train
+    estimator, nominal = spread(experiment.estimator, executor), problem.parameters.nominal()
+    given_up = hopeless(problem, ready.training, ready.dataset.subset(train), nominal)
     if given_up is not None:
         return plain_fit(problem, ready.training, given_up)
     fitted = fit(problem, ready.training, estimator, nominal, progress)
-    acting = problem.weighted(fitted.records, fitted.weights)
-    return replace(fitted, estimate=widened(problem, acting, fitted.estimate, recorded_position(own)))
+    acting, position = problem.weighted(fitted.records, fitted.weights), recorded_position(ready.dataset)[train]
+    return replace(fitted, estimate=widened(problem, acting, fitted.estimate, position))
 
 
 def _judge(

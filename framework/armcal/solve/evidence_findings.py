@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.special import stdtrit
 
 from armcal.base.domains import Array, Semidefinite, symmetric
 from armcal.base.parameters import ParameterBlock
@@ -88,12 +89,14 @@ def worse_than_nominal(judged_mm: Array, nominal_mm: Array, unit: str = _MM) -> 
     after, before = float(np.mean(judged_mm[seen])), float(np.mean(nominal_mm[seen]))
     if after <= before:
         return []
-    text = (
-        f"Worse than the nominal arm on records that did not train it: {after:.2f} {unit} on average, "
-        f"{before:.2f} before."
-    )
+    which = f"on records that did not train it: {after:.2f} {unit} on average, {before:.2f} before."
+    more = judged_mm[seen] - nominal_mm[seen]
+    test = "paired differences, one-sided, 5 %"
+    if len(more) > 1 and after - before <= stdtrit(len(more) - 1, 0.95) * np.std(more, ddof=1) / np.sqrt(len(more)):
+        action = "Nothing is gained by it on poses like these: keep the nominal arm, or look at what trained."
+        return [Finding("warning", f"No better than the nominal arm {which}", test, action)]
     action = "Do not use it. Look at what trained: too few postures, too much alike, or some of them wrong."
-    return [Finding("bad", text, "means over the same records", action)]
+    return [Finding("bad", f"Worse than the nominal arm {which}", test, action)]
 
 
 def structures_told(found: Leftover | None, unit: str = _MM) -> list[Finding]:
@@ -196,7 +199,7 @@ def what_neighbours_cost(estimate: Estimate) -> str:
 _WHY = {
     "time": "It goes with time, not with the pose: ",
     "pose": "It goes with the pose, not with time: ",
-    "open": "Time and pose explain it about equally well, so the cause is not known: ",
+    "open": "Whether time or the pose is the cause is not known: ",
 }
 _TELL_APART = {
     "time": "Let the base drift (parameters.drift); repeat one pose at the start, in the middle and at the end.",
