@@ -47,6 +47,13 @@ def test_mean_errors_over_all_poses_are_the_published_ones(
     assert told["parameters"]["free"] == told["parameters"]["determined"] == FREE[option]
 
 
+@pytest.mark.parametrize(("option", "usable"), [(1, True), (2, False)])
+def test_a_model_that_misses_more_than_3_percent_of_the_reach_is_not_to_be_used(
+    repository: Path, lrm_data: Path, tmp_path: Path, option: int, usable: bool
+) -> None:
+    assert run(repository, lrm_data, option, tmp_path / "out")["verdict"]["usable"] == usable
+
+
 def test_the_published_training_set_gives_the_published_compliances(
     repository: Path, lrm_data: Path, tmp_path: Path
 ) -> None:

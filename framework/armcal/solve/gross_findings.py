@@ -17,9 +17,9 @@ OF_REACH = 0.03
 """An error beyond this share of the arm's reach is gross, whatever the arm."""
 UNEXPLAINED_OF_REACH, EXPLAINED_OF_REACH, TIMES_NOISE, EXPLAINED = 0.005, 0.02, 5.0, 1 / 3
 """An error beyond the second share of the reach and so many times the declared noise is gross; beyond the first one
-where no structure in the residuals makes up a third of it, as gravity does of a printed arm whose base is rigid. One of
-several possible causes is no explanation, nor is what goes with time: something may as well have slipped or moved."""
-_OF_TIME = "order"
+where no structure in the residuals makes up a third of it, as gravity does of a printed arm whose base is rigid."""
+_NO_EXCUSE = frozenset({"order", "step", "slip", "scale"})
+"""Kinds of structure that explain no gross error: something may have moved, or a frame be wrong."""
 SIZE, GROSS_SIZE = 0.02, 0.1
 """How far the calibrated arm may be larger or smaller than the nominal one: worth a look, and gross."""
 UNSEEN_SCALE = 0.2
@@ -46,7 +46,7 @@ def gross_error(
         return [Finding("bad", f"{error}: the values do not describe this arm.", test, CHECK_THE_DATA)]
     found = 0.0
     if left is not None:
-        causes = [s.falls_mm for s in left.worthwhile if s.kind != _OF_TIME and not s.alternatives]
+        causes = [s.falls_mm for s in left.worthwhile if s.kind not in _NO_EXCUSE]
         found = max(causes, default=0.0) / max(left.mean_mm, 1e-12)
     limit = UNEXPLAINED_OF_REACH if found < EXPLAINED else EXPLAINED_OF_REACH
     if share <= limit or scale <= TIMES_NOISE:
