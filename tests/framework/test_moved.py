@@ -60,11 +60,11 @@ def test_few_records_say_nothing():
 
 
 def test_a_calibration_that_is_worse_than_none_is_told_by_the_records_that_judge():
-    judged, nominal = np.array([np.nan, 12.0, 9.0]), np.array([90.0, 6.0, 7.0])
+    judged, nominal = np.array([np.nan, 12.0, 9.0, 11.0, 10.0]), np.array([90.0, 6.0, 7.0, 6.0, 7.0])
     (finding,) = worse_than_nominal(judged, nominal)
     assert finding.grade == "bad" and "10.50 mm" in finding.text and "6.50" in finding.text
     assert worse_than_nominal(nominal / 2, nominal) == []
-    assert worse_than_nominal(np.full(3, np.nan), nominal) == []
+    assert worse_than_nominal(np.full(5, np.nan), nominal) == []
 
 
 def test_what_chance_makes_worse_than_nominal_is_a_warning() -> None:
