@@ -76,5 +76,5 @@ def test_in_random_order_they_do_not_and_nobody_says_so() -> None:
 @pytest.mark.slow
 def test_intervals_hold_whatever_the_order() -> None:
     path, mixed = estimates("path", range(20), 150), estimates("random", range(20), 150)
-    assert held(path, 0) < 0.7 and held(path, 1) > 0.85
-    assert held(mixed, 0) > 0.92 and 0.92 < held(mixed, 1) < 0.98
+    assert held(path, 0) < 0.7 and 0.92 < held(path, 1) < 0.98
+    assert 0.92 < held(mixed, 1) < 0.98
