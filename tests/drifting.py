@@ -52,12 +52,10 @@ def dense_slopes(problem, values, records, step=1e-7):
 
 
 def dense_drift(loaded, places, nominal_slopes):
-    """Residuals by knots of both processes times their Cholesky factors, in plain numpy."""
+    """Residuals by both processes at the records' places times their Cholesky factors, in plain numpy."""
     parts = []
     for name, sd, over in (("arm.mdh.base_x", 2e-3, 8.0), ("arm.mdh.theta1", np.deg2rad(0.3), 12.0)):
-        knots = over * np.arange(np.floor(places.min() / over), np.ceil(places.max() / over) + 2)
-        hats = np.maximum(0, 1 - np.abs(places[:, None] - knots) / over)
-        root = sd * np.linalg.cholesky(np.exp(-np.abs(knots[:, None] - knots) / over))
+        root = sd * np.linalg.cholesky(np.exp(-np.abs(places[:, None] - places) / over))
         free = [b.name for b in loaded.parameters.free]
-        parts.append(nominal_slopes[:, [free.index(name)]] * np.repeat(hats @ root, 3, axis=0))
+        parts.append(nominal_slopes[:, [free.index(name)]] * np.repeat(root, 3, axis=0))
     return np.hstack(parts)

@@ -27,6 +27,7 @@ ORDER = [
     "armcal.base.quaternions",
     "armcal.base.twists",
     "armcal.base.domains",
+    "armcal.base.process",
     "armcal.base.directions",
     "armcal.base.parameters",
     "armcal.base.pose_blocks",

@@ -233,7 +233,9 @@ def test_percentiles_are_of_the_refits(lrm) -> None:
 def test_what_was_not_measured_cannot_be_made_up(lrm) -> None:
     experiment, problem, records, found = _fitted(lrm)
     slopes = np.zeros((3, records[0].record.shape[1], 1))
-    drifting = tuple(replace(each, correlation=Correlation((slopes,), (slopes,))) for each in records)
+    node = np.arange(slopes.shape[1])
+    shared = Correlation((slopes,), (slopes,), node, np.ones((len(node) - 1, 1)))
+    drifting = tuple(replace(each, correlation=shared) for each in records)
     with pytest.raises(ProblemError, match="make up"):
         bootstrap(problem, drifting, experiment.estimator, found, BootstrapSettings(bootstrap=2, method="parametric"))
 

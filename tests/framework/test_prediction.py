@@ -165,9 +165,8 @@ def _planted(loaded: Experiment, commands, random, noise: float = 5e-4):
     request = SimulationRequest(system.arms, system.measurements, parameters, system.environment)
     exact = measured_without_noise(request, commands)
     places = commands.column("sequence")
-    knots = 8.0 * np.arange(np.floor(places.min() / 8), np.ceil(places.max() / 8) + 2)
-    root = np.linalg.cholesky(4e-6 * np.exp(-np.abs(knots[:, None] - knots) / 8.0))
-    wander = np.interp(places, knots, root @ random.normal(size=len(knots)))
+    root = np.linalg.cholesky(4e-6 * np.exp(-np.abs(places[:, None] - places) / 8.0))
+    wander = root @ random.normal(size=len(places))
     noisy = {name: values + random.normal(0, noise, len(values)) for name, values in exact.items()}
     noisy["tracker.x"] = noisy["tracker.x"] + wander
     return with_channels(commands, noisy)

@@ -51,7 +51,7 @@ def widened(
     fit, _ = linear_fit(rows.slopes, rows.residual, block, rows.by_record, np.diff(place) == 1)
     if family_test(fit, []).lag_adjusted > LEVEL:
         return estimate
-    shared = _shared(rows, place, estimate.noise_scale)
+    shared = _shared(rows, place, estimate.noise_scale, problem.increments)
     chain = problem.parameters.entries_jacobian(estimate.values) * problem.parameters.scales()
     weights = np.vstack([np.eye(problem.increments), chain]) @ np.linalg.pinv(rows.slopes)[: problem.increments]
     factors = _factors(weights, rows, shared, estimate.noise_scale)
@@ -72,29 +72,48 @@ def _correlation(place: NDArray[np.intp], share: float, distance: float) -> Arra
     return np.asarray((1 - share) * (apart == 0) + share * np.exp(-apart / distance))
 
 
-def _shared(rows: FitRows, place: NDArray[np.intp], noise_scale: float) -> Array:
-    """The likeliest covariance of the errors of records (N x N), in squares of the noise scale, of a grid of shares."""
-    first = rows.by_record[:_MOST_FITTED]
+def _shared(rows: FitRows, place: NDArray[np.intp], noise_scale: float, parameters: int) -> Array:
+    """The likeliest covariance of the errors of records (N x N), in squares of the noise scale, of a grid of shares.
+
+    Of the columns the first ones are the parameters', the others a drift's.
+    """
+    first, drifts = rows.by_record[:_MOST_FITTED], rows.slopes.shape[1] - parameters
     slopes, residual = rows.slopes[first] / noise_scale, rows.residual[first] / noise_scale
-    held, below = rows.slopes[len(rows.record_of) :], rows.residual[len(rows.record_of) :]
+    residual = residual - slopes[:, :, parameters:] @ rows.residual[len(rows.residual) - drifts :]
+    priors = slice(len(rows.record_of), len(rows.residual) - drifts)
+    held, below = rows.slopes[priors, :parameters], rows.residual[priors]
     count, size, columns = slopes.shape
-    spare = max(count * size + len(held) - columns, 1)
+    spare = max(count * size + len(held) - parameters, 1)
 
     def fitted(share: float, distance: float) -> tuple[float, float, float, float]:
         root = np.linalg.cholesky(_correlation(place[:count], share, distance) + 1e-9 * np.eye(count))
-        both = np.concatenate([slopes.reshape(count, -1), residual], axis=1)
-        white = np.asarray(solve_triangular(root, both, lower=True))
-        part = np.vstack([white[:, : size * columns].reshape(-1, columns), held])
-        target = np.concatenate([white[:, size * columns :].ravel(), below])
+        both = np.concatenate([slopes, residual[:, :, None]], axis=2).reshape(count, -1)
+        white = np.asarray(solve_triangular(root, both, lower=True)).reshape(-1, columns + 1)
+        white, drifted = _without_drift(white, parameters, drifts)
+        part = np.vstack([white[:, :parameters], held])
+        target = np.concatenate([white[:, -1], below])
         lengths = np.maximum(np.linalg.norm(part, axis=0), 1e-300)
         basis, triangle = np.linalg.qr(part / lengths)
         left = float(target @ target - np.sum((basis.T @ target) ** 2))
         spread = np.log(np.maximum(np.abs(np.diag(triangle)), 1e-12) * lengths)
-        determinant = size * float(np.sum(np.log(np.diag(root)))) + float(np.sum(spread))
+        determinant = size * float(np.sum(np.log(np.diag(root)))) + drifted + float(np.sum(spread))
         return 2 * determinant + spare * float(np.log(max(left, 1e-300))), share, distance, left / spare
 
     _, share, distance, variance = min(fitted(s, d) for s in _SHARES for d in _DISTANCES)
     return variance * _correlation(place, share, distance)
+
+
+def _without_drift(white: Array, parameters: int, drifts: int) -> tuple[Array, float]:
+    """Rows by parameters, drifts' innovations and the residual, made independent of these; half their log covariance.
+
+    The innovations have unit covariance: the rows' own is I + A A', whose factor takes them out.
+    """
+    if not drifts:
+        return white, 0.0
+    drifting = white[:, parameters : parameters + drifts]
+    root = np.linalg.cholesky(np.eye(len(white)) + drifting @ drifting.T)
+    kept = np.delete(white, np.s_[parameters : parameters + drifts], axis=1)
+    return np.asarray(solve_triangular(root, kept, lower=True)), float(np.sum(np.log(np.diag(root))))
 
 
 def _factors(weights: Array, rows: FitRows, shared: Array, noise_scale: float) -> Array:

@@ -1,21 +1,48 @@
 """Residuals that hang together across records, because a drift moves them together.
 
-With A (rows of residuals by independent standard normal innovations z) the whitened residuals have the covariance
-I + A A'. Minimising half of |r + A z|^2 + |z|^2 over z leaves half of r' (I + A A')^-1 r, which needs nothing larger
-than I + A'A (the matrix inversion lemma). [Rasmussen2006]
+What drifts are states of unit variance along a chain of nodes (the places of the records); each forgets from node to
+node by itself (Ornstein-Uhlenbeck). With A, the whitened residuals by the states at their nodes, and K, the covariance
+of these, the residuals have the covariance I + A K A'. As the states are a Markov process, a Kalman filter along the
+chain makes the rows independent in time and memory that grow with the records alone, and the smoother on its way back
+tells the states [Rasmussen2006].
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_solve, solve_triangular
+from scipy.linalg.lapack import dpstrf
 
 from armcal.base.domains import Array
+from armcal.base.process import kept, passed_on
+
+_LEAST_SHARED = 1e-3
+"""Of the noise's variance: a part of the covariance that is smaller is left out of its root."""
+
+
+@dataclass(frozen=True)
+class _Node:
+    """One step of the filter.
+
+    Attributes:
+        left: how much of each state the node before passes on (n_s); none to the first.
+        records: those at this node.
+        slopes: their rows by the states (m x n_s).
+        covariance: of the states before these rows tell of them (n_s x n_s).
+        whitening: inverse of the lower Cholesky factor of these rows' covariance (m x m).
+        gain: what these rows change of the states (n_s x m).
+    """
+
+    left: Array
+    records: NDArray[np.intp]
+    slopes: Array
+    covariance: Array
+    whitening: Array
+    gain: Array
 
 
 @dataclass(frozen=True)
@@ -23,51 +50,126 @@ class Correlation:
     """What all records share.
 
     Attributes:
-        slopes: whitened and weighted residuals by innovations, one (n_r x width x n_z) array a factor.
-        raw: the residuals themselves (m or rad) by innovations, of the same shapes.
+        slopes: whitened and weighted residuals by states, one (n_r x width x n_s) array a factor.
+        raw: the residuals themselves (m or rad) by states, of the same shapes.
+        node: where on the chain each record is (width).
+        apart: from each node to the next, in distances over which each state forgets (n_k - 1 x n_s).
     """
 
     slopes: tuple[Array, ...]
     raw: tuple[Array, ...]
+    node: NDArray[np.intp]
+    apart: Array
 
-    @property
-    def size(self) -> int:
-        """How many innovations there are."""
-        return int(self.slopes[0].shape[2])
+    def independent(self, rows: Sequence[Array]) -> tuple[Array, ...]:
+        """Whitened and weighted rows, one (n_r x N x k) a factor, made independent: of covariance I (same shapes)."""
+        both = self._stacked(rows)
+        made, state = np.empty_like(both), np.zeros((len(self._start), both.shape[2]))
+        for step in self._steps:
+            state = step.left[:, None] * state
+            new = both[step.records].reshape(-1, both.shape[2]) - step.slopes @ state
+            made[step.records] = (step.whitening @ new).reshape(-1, *both.shape[1:])
+            state = state + step.gain @ new
+        return self._apart(made, rows)
+
+    def states(self, rows: Sequence[Array]) -> Array:
+        """The most likely states (n_k x n_s x k) if whitened and weighted rows are A times them and noise."""
+        both = self._stacked(rows)
+        state, found, told = np.zeros((len(self._start), both.shape[2])), [], []
+        for step in self._steps:
+            state = step.left[:, None] * state
+            new = both[step.records].reshape(-1, both.shape[2]) - step.slopes @ state
+            found.append(state)
+            told.append(step.whitening.T @ (step.whitening @ new))
+            state = state + step.gain @ new
+        later = np.zeros_like(state)
+        for k in reversed(range(len(found))):
+            step = self._steps[k]
+            later = later + step.slopes.T @ (told[k] - step.gain.T @ later)
+            found[k] = found[k] + step.covariance @ later
+            later = step.left[:, None] * later
+        return np.array(found)
 
     @cached_property
-    def root(self) -> Array:
-        """Lower Cholesky factor of I + A'A."""
-        total = np.eye(self.size)
-        for slope in self.slopes:
-            rows = slope.reshape(-1, self.size)
-            total += rows.T @ rows
-        return np.asarray(np.linalg.cholesky(total))
+    def covariance(self) -> Array:
+        """Of the states at each node after all rows told of them (n_k x n_s x n_s)."""
+        found, later = [], np.zeros((len(self._start),) * 2)
+        for step in reversed(self._steps):
+            passed = np.eye(len(later)) - step.gain @ step.slopes
+            own = step.whitening @ step.slopes
+            later = own.T @ own + passed.T @ later @ passed
+            found.append(step.covariance - step.covariance @ later @ step.covariance)
+            later = step.left[:, None] * later * step.left
+        return np.array(found[::-1])
 
-    def absorbed(self, products: Array) -> Array:
-        """L^-1 times A' times something (n_z x k): the part of it that the drift can take up."""
-        return np.asarray(solve_triangular(self.root, products, lower=True))
+    def taken_up(self, factor: int, states: Array) -> Array:
+        """What states (n_k x n_s x k) make of a factor's whitened and weighted residuals (n_r x width x k)."""
+        return np.asarray(np.einsum("rns,nsk->rnk", self.slopes[factor], states[self.node], optimize=True))
 
-    def products(self, residuals: Sequence[Array]) -> Array:
-        """A' times whitened and weighted residuals, one (n_r x N, padding left out) a factor."""
-        total = np.zeros(self.size)
-        for slope, residual in zip(self.slopes, residuals, strict=True):
-            total += np.tensordot(slope[:, : residual.shape[1]], residual, axes=([0, 1], [0, 1]))
-        return total
+    def shift(self, factor: int, states: Array) -> Array:
+        """What states (n_k x n_s x k) make of a factor's raw residuals (n_r x width x k)."""
+        return np.asarray(np.einsum("rns,nsk->rnk", self.raw[factor], states[self.node], optimize=True))
 
-    def innovations(self, residuals: Sequence[Array]) -> Array:
-        """The most likely z under whitened and weighted residuals."""
-        return -np.asarray(cho_solve((self.root, True), self.products(residuals)))
-
-    def moved(self, factor: int, innovations: Array) -> Array:
-        """What innovations add to the raw residuals of a factor (n_r x width)."""
-        return np.asarray(self.raw[factor] @ innovations)
+    def shared(self) -> tuple[Array, ...]:
+        """B with B B' = A K A', one (n_r x width x n_z) a factor, of as few columns as the covariance needs."""
+        stacked = self._stacked(self.slopes)
+        place = np.vstack([np.zeros_like(self._start), np.cumsum(self.apart, axis=0)])[self.node]
+        count, size = stacked.shape[:2]
+        whole = np.zeros((count, size, count, size))
+        for state, at in enumerate(place.T):
+            kernel = kept(np.abs(at[:, None] - at))
+            own = stacked[:, :, state]
+            whole += own[:, :, None, None] * kernel[:, None, :, None] * own
+        root, order, rank, _ = dpstrf(whole.reshape(count * size, -1), tol=_LEAST_SHARED, lower=1)
+        made = np.zeros((count * size, rank))
+        made[order - 1] = np.tril(root)[:, :rank]
+        return self._apart(made.reshape(count, size, rank), self.slopes)
 
     def subset(self, chosen: NDArray[np.intp]) -> Correlation:
-        """Some records of all; the same innovations."""
-        return Correlation(tuple(s[:, chosen] for s in self.slopes), tuple(s[:, chosen] for s in self.raw))
+        """Some records of all; the same states."""
+        slopes, raw = (tuple(s[:, chosen] for s in each) for each in (self.slopes, self.raw))
+        return Correlation(slopes, raw, self.node[chosen], self.apart)
 
     def weighted(self, factors: Sequence[Array]) -> Correlation:
         """With every record's weight multiplied, factor by factor (width each)."""
         pairs = zip(self.slopes, factors, strict=True)
-        return Correlation(tuple(slope * np.sqrt(factor)[None, :, None] for slope, factor in pairs), self.raw)
+        slopes = tuple(slope * np.sqrt(factor)[None, :, None] for slope, factor in pairs)
+        return Correlation(slopes, self.raw, self.node, self.apart)
+
+    @property
+    def _start(self) -> Array:
+        """What the first node has of the one before it."""
+        return np.zeros(self.apart.shape[1])
+
+    @cached_property
+    def _steps(self) -> tuple[_Node, ...]:
+        """The filter, which hangs on slopes and places alone."""
+        return tuple(self._filtered())
+
+    def _filtered(self) -> Iterator[_Node]:
+        by_record, order = self._stacked(self.slopes), np.argsort(self.node, kind="stable")
+        ends = np.searchsorted(self.node[order], np.arange(len(self.apart) + 2))
+        covariance = np.eye(len(self._start))
+        for k, left in enumerate([self._start, *kept(self.apart)]):
+            covariance = passed_on(covariance, left)
+            records = order[ends[k] : ends[k + 1]]
+            slopes = by_record[records].reshape(-1, len(left))
+            across = slopes @ covariance
+            root = np.linalg.cholesky(np.eye(len(slopes)) + across @ slopes.T)
+            whitening = np.linalg.inv(root)
+            own = whitening @ across
+            yield _Node(left, records, slopes, covariance, whitening, own.T @ whitening)
+            covariance = covariance - own.T @ own
+
+    def _stacked(self, rows: Sequence[Array]) -> Array:
+        """Rows of all factors, a record's together (width x R x k); zero where they end before the records."""
+        width = len(self.node)
+        padded = [np.pad(each, ((0, 0), (0, width - each.shape[1]), (0, 0))) for each in rows]
+        return np.concatenate(padded).transpose(1, 0, 2)
+
+    @staticmethod
+    def _apart(stacked: Array, like: Sequence[Array]) -> tuple[Array, ...]:
+        """Stacked rows factor by factor, as long as others."""
+        ends = np.cumsum([len(each) for each in like])[:-1]
+        parts = np.split(stacked.transpose(1, 0, 2), ends)
+        return tuple(part[:, : each.shape[1]] for part, each in zip(parts, like, strict=True))

@@ -1,9 +1,9 @@
 """Parameters that drift over a recording: what moves slowly between records and is none of the arm.
 
 A drifting parameter is its value plus a stationary process whose correlation falls by e over a stated distance in
-recorded order or time (Ornstein-Uhlenbeck [Rasmussen2006]), given at knots that distance apart and linear between
-them. It is no further parameter but a covariance of the residuals: the values found stay those of the
-arm at rest, their uncertainty counts the drift, and where records lie near others the drift can be told.
+recorded order or time (Ornstein-Uhlenbeck [Rasmussen2006]), exactly so at the records' own places. It is no further
+parameter but a covariance of the residuals: the values found stay those of the arm at rest, their uncertainty counts
+the drift, and where records lie near others the drift can be told.
 """
 
 from __future__ import annotations
@@ -12,106 +12,107 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
-from armcal.base.parameters import ParameterBlock
-from armcal.errors import DataError, Location, ProblemError
+from armcal.base.parameters import Drift, ParameterBlock
+from armcal.errors import DataError, Location
 from armcal.solve.correlation import Correlation
 from armcal.solve.problem import FactorRecords, Problem
 
-MOST_INNOVATIONS = 3000
-
 
 @dataclass(frozen=True)
-class DriftTrack:
-    """One drifting parameter over a recording.
+class Chain:
+    """The places of records in a recording, in order, each once.
 
     Attributes:
-        name: the parameter's.
-        channel: what it drifts over (``sequence``, or ``time`` in s).
-        knots: where the process is stated (K).
-        spread: process values at the knots by independent standard normal innovations (K x K).
+        channels: what parameters drift over (``sequence``, or ``time`` in s).
+        places: of each node in each channel (n_k x channels).
     """
 
-    name: str
-    channel: str
-    knots: Array
-    spread: Array
+    channels: tuple[str, ...]
+    places: Array
 
-    def weights(self, at: Array) -> Array:
-        """Process values at some places (N x K) by innovations; zero beyond the knots."""
-        step = self.knots[1] - self.knots[0]
-        hats = np.maximum(0.0, 1 - np.abs(at[:, None] - self.knots[None]) / step)
-        return np.asarray(hats @ self.spread)
+    def nodes(self, dataset: Dataset) -> NDArray[np.intp]:
+        """Which node each record is at (N); all their places must be on the chain."""
+        own = np.stack([dataset.column(channel) for channel in self.channels], axis=1)
+        found = np.unique(np.vstack([self.places, own]), axis=0, return_inverse=True)[1].ravel()
+        return found[len(self.places) :]
+
+    def apart(self, drifting: Sequence[ParameterBlock]) -> Array:
+        """From each node to the next, in distances over which each parameter forgets (n_k - 1 x parameters)."""
+        steps = [np.abs(np.diff(self.places[:, self.channels.index(d.channel)])) / d.over for d in _drifts(drifting)]
+        return np.stack(steps, axis=1)
 
 
-def track(block: ParameterBlock, dataset: Dataset) -> DriftTrack:
-    """The track of a drifting block over a dataset.
+def chain(problem: Problem, *datasets: Dataset) -> Chain | None:
+    """The places of the records of a recording; None where nothing drifts.
 
     Raises:
-        DataError: the records do not say their order, or time.
-        ProblemError: the distance is too short.
+        DataError: the records do not say their order, or time, or these contradict one another.
     """
-    drift = block.drift
-    if drift is None:
-        raise ValueError(f"{block.name} does not drift")
+    drifting = _drifting(problem)
+    if not drifting:
+        return None
+    channels = tuple(dict.fromkeys(drift.channel for drift in _drifts(drifting)))
+    for block, dataset in ((b, d) for b in drifting for d in datasets):
+        _require_place(block, dataset)
+    columns = [np.concatenate([dataset.column(name) for dataset in datasets]) for name in channels]
+    found = Chain(channels, np.unique(np.stack(columns, axis=1), axis=0))
+    steps = np.diff(found.places, axis=0)
+    if not np.all(np.all(steps >= 0, axis=0) | np.all(steps <= 0, axis=0)):
+        raise DataError(
+            f"the records do not have the same order by {' and by '.join(channels)}, and parameters drift over both.",
+            where=Location(datasets[0].source or None),
+            hint="Correct the columns, or let all parameters drift over the same one.",
+        )
+    return found
+
+
+def _require_place(block: ParameterBlock, dataset: Dataset) -> None:
+    drift = _drifts([block])[0]
     if not dataset.has(drift.channel):
         raise DataError(
             f"{block.name} drifts over {drift.channel}, and the records do not carry it.",
             where=Location(dataset.source or None),
             hint=f"Add a column {drift.channel}, or name the one that is: columns: {{{drift.channel}: pose_id}}.",
         )
-    at = dataset.column(drift.channel)
-    step = drift.over
-    first, last = np.floor(at.min() / step), np.ceil(at.max() / step) + 1
-    _require_few(last - first + 1)
-    knots = step * np.arange(first, last + 1)
-    return DriftTrack(block.name, drift.channel, knots, spread(knots, drift.sd, drift.over))
 
 
-def spread(knots: Array, sd: float, over: float) -> Array:
-    """Lower Cholesky factor of the process's covariance at the knots."""
-    distance = np.abs(knots[:, None] - knots[None])
-    return sd * np.asarray(np.linalg.cholesky(np.exp(-distance / over)))
+def _drifting(problem: Problem) -> list[ParameterBlock]:
+    return [block for block in problem.parameters.free if block.drift is not None]
 
 
-def tracks(problem: Problem, dataset: Dataset) -> tuple[DriftTrack, ...]:
-    """The tracks of all drifting parameters.
-
-    Raises:
-        DataError: the records do not say their order, or time.
-        ProblemError: the distances are so short that the drift would not be small beside the data.
-    """
-    found = tuple(track(block, dataset) for block in problem.parameters.free if block.drift is not None)
-    _require_few(sum(len(each.knots) for each in found))
-    return found
-
-
-def _require_few(knots: float) -> None:
-    if not knots <= MOST_INNOVATIONS:
-        raise ProblemError(
-            f"the drifts have {knots:.0f} knots over these records, at most {MOST_INNOVATIONS} are possible.",
-            hint="Let fewer parameters drift, or over a longer distance.",
-        )
+def _drifts(drifting: Sequence[ParameterBlock]) -> list[Drift]:
+    return [block.drift for block in drifting if block.drift is not None]
 
 
 def with_drift(
-    problem: Problem, records: Sequence[FactorRecords], dataset: Dataset, values: Array
+    problem: Problem,
+    records: Sequence[FactorRecords],
+    dataset: Dataset,
+    values: Array,
+    along: Chain | None = None,
 ) -> tuple[FactorRecords, ...]:
     """The records of a dataset, correlated as drifting parameters demand; slopes are taken at ``values``.
 
+    ``along`` is the chain of a recording that has more records than these.
+
     Raises:
-        DataError: the records do not say their order, or time.
-        ProblemError: the distances are too short.
+        DataError: the records do not say their order, or time, or these contradict one another.
     """
-    found = tracks(problem, dataset)
-    if not found:
+    along = along or chain(problem, dataset)
+    if along is None:
         return tuple(records)
+    drifting = _drifting(problem)
     shared = [replace(each, weight=np.ones_like(each.weight), correlation=None) for each in records]
-    slopes = _slopes(problem, shared, dataset, values, found)
+    slopes = _slopes(problem, shared, values, drifting)
     raw = [_raw(kernel.factor.noise, each, s) for kernel, each, s in zip(problem.kernels, shared, slopes, strict=True)]
-    correlation = Correlation(tuple(slopes), tuple(raw)).weighted([each.weight for each in records])
+    node = along.nodes(dataset)
+    node = np.pad(node, (0, len(records[0].weight) - len(node)), mode="edge")
+    correlation = Correlation(tuple(slopes), tuple(raw), node, along.apart(drifting))
+    correlation = correlation.weighted([each.weight for each in records])
     return tuple(replace(each, correlation=correlation) for each in records)
 
 
@@ -123,26 +124,21 @@ def residuals(
     here, there = records[0].correlation, told_by[0].correlation
     if here is None or there is None:
         return found
-    z = there.innovations(problem.weighted_residuals(values, told_by))
-    return tuple(r + here.moved(i, z)[:, : r.shape[1]] for i, r in enumerate(found))
+    states = there.states([r[:, :, None] for r in problem.weighted_residuals(values, told_by)])
+    return tuple(r - here.shift(i, states)[:, : r.shape[1], 0] for i, r in enumerate(found))
 
 
 def _slopes(
-    problem: Problem, records: Sequence[FactorRecords], dataset: Dataset, values: Array, found: Sequence[DriftTrack]
+    problem: Problem, records: Sequence[FactorRecords], values: Array, drifting: Sequence[ParameterBlock]
 ) -> list[Array]:
-    """Whitened residuals by innovations."""
+    """Whitened residuals by states, each a standard deviation of a parameter's drift."""
     place = {name: i for i, name in enumerate(problem.free_names)}
-    blocks = problem.jacobians(values, records)
-    slopes = []
+    chosen, sizes = [place[block.name] for block in drifting], [drift.sd for drift in _drifts(drifting)]
+    blocks, slopes = problem.jacobians(values, records), []
     for each in records:
-        width = each.record.shape[1]
-        jacobian = _whole(blocks, width)
-        columns: list[Array] = []
-        for one in found:
-            weights = np.zeros((width, len(one.knots)))
-            weights[: each.count] = one.weights(dataset.column(one.channel))
-            columns.append(jacobian[:, place[one.name], :, None] * weights[None])
-        slopes.append(np.concatenate(columns, axis=2))
+        slope = np.moveaxis(_whole(blocks, each.record.shape[1])[:, chosen], 1, 2) * np.array(sizes)
+        slope[:, each.count :] = 0.0
+        slopes.append(slope)
     return slopes
 
 

@@ -40,10 +40,11 @@ class FitRows:
         parts = [np.einsum("rvn,vc->rnc", block, chain) for block in _by_factor(problem, values, records)]
         weighted = problem.weighted_residuals(values, records)
         shared = records[0].correlation
-        drift = np.zeros(0) if shared is None else shared.innovations(weighted)
+        drifted = [np.zeros((*r.shape, 0)) for r in weighted] if shared is None else shared.shared()
+        drifted = [slope[:, :count] for slope in drifted]
+        drift = np.zeros(0) if shared is None else _innovations(weighted, drifted)
         data, slopes = [], []
-        for i, (residual, part) in enumerate(zip(weighted, parts, strict=True)):
-            slope = np.zeros((*residual.shape, 0)) if shared is None else shared.slopes[i][:, :count]
+        for residual, part, slope in zip(weighted, parts, drifted, strict=True):
             data.append((residual + slope @ drift).ravel())
             slopes.append(np.concatenate([part, slope], axis=2).reshape(residual.size, -1))
         prior = np.sqrt(parameters.prior_information())
@@ -103,6 +104,13 @@ def _by_factor(problem: Problem, values: Array, records: Sequence[FactorRecords]
             parts.append(next(blocks))
         whole.append(np.concatenate(parts, axis=2)[:, :, : each.count])
     return whole
+
+
+def _innovations(residuals: Sequence[Array], slopes: Sequence[Array]) -> Array:
+    """The most likely ones of a drift (n_z), by whitened residuals (n_r x N a factor) and their slopes by them."""
+    residual = np.concatenate([each.ravel() for each in residuals])
+    slope = np.vstack([each.reshape(-1, each.shape[2]) for each in slopes])
+    return -np.linalg.solve(np.eye(slope.shape[1]) + slope.T @ slope, slope.T @ residual)
 
 
 def _whitening(noise: Sequence[float], records: FactorRecords) -> Array:

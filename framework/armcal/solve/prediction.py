@@ -3,9 +3,9 @@
 The residual of a record that took no part in a fit has the covariance s^2 N + H C H' + s^2 D. N is the noise declared
 of it, s the noise found in units of the declared one, C the covariance of the values and H the slope of its residual
 by them. D is what a drift does: in another recording than the fit's, where nothing is known of it, its full variance;
-in the same one G K G', with the slope G of the residual by the drift's innovations and their covariance
-K = (I + A'A)^-1 after the training records. What those tell of the drift depends on the values as well, which adds
--G K A'J to H. (Gaussian processes with explicit basis functions, [Rasmussen2006].)
+in the same one G K G', with the slope G of the residual by the drift's states there and their covariance K after the
+training records. What those tell of the drift depends on the values as well: H has what they make of the drift taken
+off. (Gaussian processes with explicit basis functions, [Rasmussen2006].)
 """
 
 from __future__ import annotations
@@ -15,11 +15,9 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.linalg import cho_solve
 from scipy.special import fdtri, stdtrit
 
 from armcal.base.domains import Array
-from armcal.solve.correlation import Correlation
 from armcal.solve.kernel import Kernel
 from armcal.solve.problem import FactorRecords, Problem
 
@@ -77,14 +75,14 @@ class ToldDrift:
     """What the records of a fit tell of a drift.
 
     Attributes:
-        correlation: of those records.
-        slopes: A'J, what the values found change of it (n_z x n_v).
-        innovations: the most likely ones (n_z).
+        states: the most likely ones (n_k x n_s x 1).
+        slopes: of the states by the values found (n_k x n_s x n_v).
+        covariance: of the states at each node (n_k x n_s x n_s).
     """
 
-    correlation: Correlation
+    states: Array
     slopes: Array
-    innovations: Array
+    covariance: Array
 
     @classmethod
     def by(cls, problem: Problem, values: Array, records: Sequence[FactorRecords]) -> ToldDrift | None:
@@ -93,10 +91,9 @@ class ToldDrift:
         if shared is None:
             return None
         blocks = problem.jacobians(values, records)
-        slopes = np.zeros((shared.size, len(problem.free_names)))
-        for slope in shared.slopes:
-            slopes += np.tensordot(slope, _whole(blocks, slope.shape[1]), axes=([0, 1], [0, 2]))
-        return cls(shared, slopes, shared.innovations(problem.weighted_residuals(values, records)))
+        jacobians = [np.moveaxis(_whole(blocks, each.record.shape[1]), 1, 2) for each in records]
+        told = shared.states([r[:, :, None] for r in problem.weighted_residuals(values, records)])
+        return cls(told, shared.states(jacobians), shared.covariance)
 
 
 @dataclass(frozen=True)
@@ -129,8 +126,8 @@ class Predictor:
         found, here = self.problem.residuals(self.values, records), records[0].correlation
         if here is None or self.drift is None:
             return found
-        z = self.drift.innovations
-        return tuple(r + here.moved(i, z)[:, : r.shape[1]] for i, r in enumerate(found))
+        states = self.drift.states
+        return tuple(r - here.shift(i, states)[:, : r.shape[1], 0] for i, r in enumerate(found))
 
     def in_new_recording(self, records: Sequence[FactorRecords]) -> tuple[Spread, ...]:
         """Scatter about predictions without drift, where nothing is known of it; one a factor."""
@@ -139,7 +136,7 @@ class Predictor:
     def in_recording(self, records: Sequence[FactorRecords]) -> tuple[Spread, ...]:
         """Scatter about predictions with the drift that the recording of the fit tells; one a factor.
 
-        The records must share the innovations of their drift with those of the fit.
+        The records must be on the same chain as those of the fit.
         """
         return tuple(Spread(noise + values + drift, self.freedom) for noise, values, drift in self._told(records))
 
@@ -172,14 +169,13 @@ class Predictor:
         here, there = records[0].correlation, self.drift
         if here is None or there is None:
             return self._unknown(records)
-        told = cho_solve((there.correlation.root, True), there.slopes)
         slopes, spreads = [], []
-        for raw, slope in zip(here.raw, self._slopes(records), strict=True):
-            by_innovation = raw[:, : slope.shape[2]]
-            slopes.append(slope - np.einsum("rnz,zv->rvn", by_innovation, told, optimize=True))
-            left = there.correlation.absorbed(by_innovation.reshape(-1, here.size).T)
-            parts = left.reshape(here.size, *by_innovation.shape[:2])
-            spreads.append(self.noise_scale**2 * np.einsum("zrn,zsn->nrs", parts, parts, optimize=True))
+        for i, slope in enumerate(self._slopes(records)):
+            count = slope.shape[2]
+            slopes.append(slope - np.moveaxis(here.shift(i, there.slopes)[:, :count], 1, 2))
+            by_state, left = here.raw[i][:, :count], there.covariance[here.node[:count]]
+            spread = np.einsum("rnd,nde,sne->nrs", by_state, left, by_state, optimize=True)
+            spreads.append(self.noise_scale**2 * spread)
         return self._parts(records, slopes, spreads)
 
     def _parts(self, records: Sequence[FactorRecords], slopes: Sequence[Array], drift: Sequence[Array]) -> list[_Parts]:

@@ -24,7 +24,7 @@ from armcal.solve.factor import Environment
 from armcal.solve.factor_records import FactorRecords, correlation_of
 from armcal.solve.gather import Slots
 from armcal.solve.kernel import EvaluatorChoice, Kernel
-from armcal.solve.linearised import BLOCK_RECORDS, linearised, linearised_means, mean_shares
+from armcal.solve.linearised import linearised, linearised_means, mean_shares
 from armcal.solve.normal_equations import ExtraRows, NormalEquations, TieFunction, stacked
 from armcal.solve.whitening import declared, transformed
 
@@ -179,17 +179,16 @@ class Problem:
         """Half the weighted squared whitened residuals."""
         raw = self.residuals(values, records)
         whitened = zip(records, self.whitened(raw, records), strict=True)
-        weighted = [residual * np.sqrt(each.weight[: each.count]) for each, residual in whitened]
+        weighted = tuple(residual * np.sqrt(each.weight[: each.count]) for each, residual in whitened)
+        shared = correlation_of(records)
+        if shared is not None:
+            weighted = shared.independent([residual[:, :, None] for residual in weighted])
         total = sum(0.5 * float(np.sum(residual**2)) for residual in weighted)
         for kernel, each, residual in zip(self.kernels, records, raw, strict=True):
             declared_ones = residual / np.array(kernel.factor.noise)[:, None]
             for share in mean_shares(kernel.factor, each):
                 total += 0.5 * float(np.sum((declared_ones @ share[: each.count]) ** 2))
-        total += sum(0.5 * float(np.sum((tie.residual(values) / tie.noise) ** 2)) for tie in self.ties)
-        shared = correlation_of(records)
-        if shared is None:
-            return total
-        return total - 0.5 * float(np.sum(shared.absorbed(shared.products(weighted)) ** 2))
+        return total + sum(0.5 * float(np.sum((tie.residual(values) / tie.noise) ** 2)) for tie in self.ties)
 
     def weighted_residuals(self, values: Array, records: Sequence[FactorRecords]) -> tuple[Array, ...]:
         """Residuals in units of their noise, times the roots of their weights, one (n_r x N) matrix a factor."""
@@ -210,36 +209,25 @@ class Problem:
         )
 
     def normal_equations(self, values: Array, records: Sequence[FactorRecords]) -> NormalEquations:
-        """Cost, gradient and Gauss-Newton Hessian, accumulated in blocks: memory does not grow with the records."""
-        blocks = [_block_sums(*block) for block in self._shared_blocks(values, records)]
-        entries, shared = len(self.parameters.free_entries), correlation_of(records)
+        """Cost, gradient and Gauss-Newton Hessian, accumulated in blocks: memory does not grow with the records.
+
+        But where they hang together, all are made independent at once.
+        """
+        blocks = [_block_sums(*block) for block in self._independent_blocks(values, records)]
+        entries = len(self.parameters.free_entries)
         cost = sum((b[0] for b in blocks), 0.0)
         gradient = sum((b[1] for b in blocks), np.zeros(entries))
         hessian = sum((b[2] for b in blocks), np.zeros((entries, entries)))
-        equations = self._extra(values, records).added_to(NormalEquations(cost, gradient, hessian))
-        if shared is None:
-            return equations
-        by_entries = shared.absorbed(sum((b[3] for b in blocks), np.zeros((shared.size, entries))))
-        by_residual = shared.absorbed(sum((b[4] for b in blocks), np.zeros(shared.size)))
-        return NormalEquations(
-            equations.cost - 0.5 * float(by_residual @ by_residual),
-            equations.gradient - by_entries.T @ by_residual,
-            equations.hessian - by_entries.T @ by_entries,
-        )
+        return self._extra(values, records).added_to(NormalEquations(cost, gradient, hessian))
 
     def triangular_factor(self, values: Array, records: Sequence[FactorRecords]) -> Array:
         """R with R'R = J'J of the whitened residuals by coordinates: singular values keep their condition."""
-        chain, shared = self.parameters.entries_jacobian(values), correlation_of(records)
-        innovations = 0 if shared is None else shared.size
-        triangle = np.hstack([np.eye(innovations), np.zeros((innovations, self.increments))])
-        for jacobian, _, slope in self._shared_blocks(values, records):
+        chain = self.parameters.entries_jacobian(values)
+        triangle = np.zeros((0, self.increments))
+        for jacobian, _ in self._independent_blocks(values, records):
             rows = np.concatenate([chain.T @ part for part in jacobian], axis=1).T
-            if slope is not None:
-                rows = np.hstack([slope.reshape(-1, innovations), rows])
             triangle = triangular(np.vstack([triangle, rows]))
-        beside = self._extra(values, records).jacobian @ chain
-        triangle = triangular(np.vstack([triangle, np.hstack([np.zeros((len(beside), innovations)), beside])]))
-        return triangle[innovations:, innovations:]
+        return triangular(np.vstack([triangle, self._extra(values, records).jacobian @ chain]))
 
     def jacobians(self, values: Array, records: Sequence[FactorRecords]) -> Iterator[Array]:
         """Whitened Jacobians by free canonical entries, in blocks of records (n_r x n_v x B), factor by factor."""
@@ -315,16 +303,19 @@ class Problem:
         """Where each free entry stands among the free ones."""
         return {entry: i for i, entry in enumerate(self.parameters.free_entries)}
 
-    def _shared_blocks(
-        self, values: Array, records: Sequence[FactorRecords]
-    ) -> Iterator[tuple[Array, Array, Array | None]]:
-        """Blocks, each with its slopes by the innovations of a drift (n_r x B x n_z), if there is one."""
+    def _independent_blocks(self, values: Array, records: Sequence[FactorRecords]) -> Iterator[tuple[Array, Array]]:
+        """Blocks whose rows are independent: as they are, or made so where records hang together."""
         shared = correlation_of(records)
-        blocks = self._blocks(values, records)
-        for factor, each in enumerate(records):
-            for start in range(0, each.record.shape[1], BLOCK_RECORDS):
-                slope = None if shared is None else shared.slopes[factor][:, start : start + BLOCK_RECORDS]
-                yield (*next(blocks), slope)
+        if shared is None:
+            yield from self._blocks(values, records)
+            return
+        self._check_fixed(values)
+        rows = []
+        for kernel, slots, each in zip(self.kernels, self.slots, records, strict=True):
+            blocks = linearised(kernel, slots, each, values)
+            rows.append(np.concatenate([np.concatenate([j, r[:, None]], axis=1) for j, r in blocks], axis=2))
+        for made in shared.independent([np.moveaxis(row, 1, 2) for row in rows]):
+            yield np.moveaxis(made[:, :, :-1], 1, 2), made[:, :, -1]
 
     def _blocks(self, values: Array, records: Sequence[FactorRecords]) -> Iterator[tuple[Array, Array]]:
         """Whitened, weighted Jacobians (n_r x n_v x B) and residuals (n_r x B), in order."""
@@ -362,12 +353,8 @@ def triangular(rows: Array) -> Array:
     return np.asarray(np.linalg.qr(rows, mode="r"))
 
 
-def _block_sums(jacobian: Array, residual: Array, slope: Array | None) -> tuple[Any, ...]:
-    """Cost, gradient and Hessian of a block, and what of gradient and residual the innovations see."""
+def _block_sums(jacobian: Array, residual: Array) -> tuple[float, Array, Array]:
+    """Cost, gradient and Hessian of a block."""
     hessian = sum((part @ part.T for part in jacobian), np.zeros((jacobian.shape[1],) * 2))
     gradient = np.einsum("kvb,kb->v", jacobian, residual)
-    sums = (0.5 * float(np.sum(residual**2)), gradient, hessian)
-    if slope is None:
-        return sums
-    by_entries = np.tensordot(slope, jacobian, axes=([0, 1], [0, 2]))
-    return (*sums, by_entries, np.tensordot(slope, residual, axes=([0, 1], [0, 1])))
+    return 0.5 * float(np.sum(residual**2)), gradient, hessian

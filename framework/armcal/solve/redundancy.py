@@ -83,9 +83,8 @@ def remaining(
     told = told_by[0].correlation
     if shared is None or told is None:
         return found
-    innovations = told.innovations(problem.weighted_residuals(values, told_by))
-    pairs = zip(found, shared.slopes, strict=True)
-    return tuple(residual + slope[:, : residual.shape[1]] @ innovations for residual, slope in pairs)
+    states = told.states([r[:, :, None] for r in problem.weighted_residuals(values, told_by)])
+    return tuple(r - shared.taken_up(i, states)[:, : r.shape[1], 0] for i, r in enumerate(found))
 
 
 def _reached(

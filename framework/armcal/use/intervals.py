@@ -1,6 +1,6 @@
 """How far a calibrated arm may be off its predictions: what a calibration keeps for that, and its use.
 
-A drift is not kept as values at knots: with its covariance, and with how both hang on every parameter, they are many
+A drift is not kept as its states: with their covariance, and with how both hang on every parameter, they are many
 times larger than the records that tell of it. Those are kept instead, and the drift is told again from them, exactly.
 """
 
@@ -21,7 +21,7 @@ from armcal.base.settings import Settings
 from armcal.config.system import System
 from armcal.errors import DataError, Location
 from armcal.solve.coverage import Recording, Stretch, level_name
-from armcal.solve.drift import with_drift
+from armcal.solve.drift import Chain, chain, with_drift
 from armcal.solve.prediction import LEVELS, STATED, Predictor, Spread, ToldDrift, is_position
 from armcal.solve.problem import FactorRecords, Problem
 from armcal.solve.readings import reading_slopes
@@ -33,8 +33,6 @@ _AT_ONCE = 1000
 _FORGOTTEN = 5.0
 """So many correlation distances beyond the recording nothing is known of its drift."""
 _DIGITS = 12
-Span = Mapping[str, tuple[float, float]]
-"""First and last place of a recording, by channel."""
 
 
 class DriftRecord(Settings):
@@ -164,10 +162,11 @@ class Uncertainty:
             near = self._near(told, commands)
         parts = [self._apart(problem, commands.subset(chunk), chunk) for chunk in _chunks(np.flatnonzero(~near))]
         if told is not None and near.any():
-            span = _span(told, commands.subset(np.flatnonzero(near)))
-            drift = self._told(told, span)
+            recorded = _dataset(told)
+            along = chain(problem, recorded, commands.subset(np.flatnonzero(near)))
+            drift = self._told(told, recorded, along)
             for chunk in _chunks(np.flatnonzero(near)):
-                parts.append(self._within(problem, commands.subset(chunk), chunk, drift, span))
+                parts.append(self._within(problem, commands.subset(chunk), chunk, drift, along))
         return _joined(problem, parts, len(commands), self.record.stretches)
 
     def _apart(self, problem: Problem, commands: Dataset, places: Indices) -> _Part:
@@ -178,22 +177,23 @@ class Uncertainty:
         still = tuple(np.zeros_like(spread.deviations) for spread in spreads)
         return _Part(places, recording, still, spreads, reading_slopes(problem, self.values, records))
 
-    def _within(self, problem: Problem, commands: Dataset, places: Indices, drift: ToldDrift, span: Span) -> _Part:
+    def _within(
+        self, problem: Problem, commands: Dataset, places: Indices, drift: ToldDrift, along: Chain | None
+    ) -> _Part:
         """In the recording, which tells of a drift."""
-        records = self._drifted(problem, commands, span)
+        records = self._drifted(problem, commands, along)
         spreads = self._predictor(problem, drift).in_recording(records)
-        moved = [each.correlation.moved(i, drift.innovations) for i, each in enumerate(records) if each.correlation]
-        off = tuple(-m[:, : len(places)] for m in moved)
+        moved = [each.correlation.shift(i, drift.states) for i, each in enumerate(records) if each.correlation]
+        off = tuple(m[:, : len(places), 0] for m in moved)
         return _Part(places, "same", off, spreads, reading_slopes(problem, self.values, records))
 
     def _predictor(self, problem: Problem, drift: ToldDrift | None) -> Predictor:
         return Predictor(problem, self.values, self._covariance, self.noise_scale, self.freedom, drift)
 
-    def _told(self, told: RecordingRecord, span: Span) -> ToldDrift:
-        """The drift of the recording, told by its records, over a span of places."""
-        dataset = _dataset(told)
+    def _told(self, told: RecordingRecord, dataset: Dataset, along: Chain | None) -> ToldDrift:
+        """The drift of the recording, told by its records, along a chain of places."""
         problem = self._problem(dataset)
-        records = self._drifted(problem, dataset, span)
+        records = self._drifted(problem, dataset, along)
         if told.weights:
             records = problem.weighted(records, [np.array(row) for row in told.weights])
         found = ToldDrift.by(problem, self.values, records)
@@ -201,14 +201,8 @@ class Uncertainty:
             raise TypeError("a recording is kept only where something drifts")
         return found
 
-    def _drifted(self, problem: Problem, dataset: Dataset, span: Span) -> tuple[FactorRecords, ...]:
-        """Records that share the innovations of a span: two more at its ends are put in, and taken out again."""
-        count = len(dataset)
-        both = dataset.subset([*range(count), 0, 0])
-        ends = {name: np.concatenate([dataset.column(name), places]) for name, places in span.items()}
-        both = replace(both, channels={**both.channels, **ends})
-        records = with_drift(problem, problem.records(both), both, self.parameters.nominal())
-        return problem.subset(records, np.arange(count, dtype=np.intp))
+    def _drifted(self, problem: Problem, dataset: Dataset, along: Chain | None) -> tuple[FactorRecords, ...]:
+        return with_drift(problem, problem.records(dataset), dataset, self.parameters.nominal(), along)
 
     def _with_predictions(self, commands: Dataset) -> Dataset:
         """The commands with what instruments read there: residuals may depend on readings in any way."""
@@ -321,13 +315,6 @@ def _joined(
 
 def _chunks(places: Indices) -> list[Indices]:
     return [places[start : start + _AT_ONCE] for start in range(0, len(places), _AT_ONCE)]
-
-
-def _span(told: RecordingRecord, commands: Dataset) -> Span:
-    """Over the recording and some records."""
-    recorded, names = _dataset(told), {drift.channel for drift in told.drifts.values()}
-    places = {name: np.concatenate([recorded.column(name), commands.column(name)]) for name in names}
-    return {name: (float(at.min()), float(at.max())) for name, at in places.items()}
 
 
 def _dataset(told: RecordingRecord) -> Dataset:

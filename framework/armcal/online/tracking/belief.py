@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from armcal.base.domains import Array
+from armcal.base.process import passed_on
 from armcal.online.tracking.chart import Chart
 from armcal.online.tracking.companions import Companions
 from armcal.solve.online import Gaussian, checked
@@ -64,8 +65,7 @@ class Fading:
         if len(self.companions):
             kept = np.ones(len(mean))
             kept[n:] = self.companions.kept(passed)
-            covariance = covariance * kept[:, None] * kept
-            covariance[np.arange(n, len(kept)), np.arange(n, len(kept))] += 1 - kept[n:] ** 2
+            covariance = passed_on(covariance, kept)
             mean = mean * kept
         return Belief(belief.origin, checked(Gaussian(mean, covariance)))
 

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armcal.base.domains import Array
+from armcal.base.process import kept
 
 
 @dataclass(frozen=True)
@@ -62,7 +63,7 @@ class Companions:
 
     def kept(self, passed: Mapping[str, float]) -> Array:
         """How much of each is left after some distance in each channel (m)."""
-        return np.array([np.exp(-max(passed.get(c.channel, 0.0), 0.0) / c.over) for c in self.each])
+        return kept(np.array([max(passed.get(c.channel, 0.0), 0.0) / c.over for c in self.each]))
 
 
 def shared_error(instance: str, covariance: Array, over: float, channel: str) -> Sequence[Companion]:
