@@ -260,3 +260,18 @@ def test_the_judging_of_a_run_shows_progress(tmp_path: Path) -> None:
     config = Path(__file__).resolve().parents[2] / "configs" / "ball" / "demo.yaml"
     calibrate(Experiment.load(config), progress=lambda what, fraction: seen.append((what, fraction)))
     assert seen.index(("judging", 0.0)) < seen.index(("judging", 1.0))
+
+
+def test_the_shell_completes_commands_without_importing_them() -> None:
+    """A key press is answered at once: the names come from a table, and nothing heavy is imported."""
+    script = (
+        "import os, sys; os.environ.update(COMP_WORDS='armcal c', COMP_CWORD='1', _ARMCAL_COMPLETE='bash_complete')\n"
+        "from armcal.cli.main import cli\n"
+        "try: cli.main(prog_name='armcal')\n"
+        "finally: print('heavy:', [name for name in ('numpy', 'casadi', 'pydantic') if name in sys.modules])\n"
+    )
+    ran = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    *offered, heavy = ran.stdout.splitlines()
+    commands = ("check", "compensate", "correction-table", "calibration", "capability", "convert", "control")
+    assert offered == [f"plain,{command}" for command in commands], ran.stderr
+    assert heavy == "heavy: []"
