@@ -19,7 +19,7 @@ from armcal.cli.main import cli
 from armcal.errors import ArmcalError, CalibrationWarning, ConfigError
 from armcal.plugins import PluginRegistry, discover
 from armcal.use.calibration import Calibration
-from armcal.use.calibration_file import sealed
+from armcal.use.calibration_file import read_record, sealed
 from armcal_joints.springs import TorsionalSprings
 from click.testing import CliRunner, Result
 
@@ -295,3 +295,15 @@ def test_a_source_that_was_changed_under_the_same_version_is_named(calibration: 
     path.write_text(sealed(content))
     with pytest.warns(CalibrationWarning, match="the model mdh of armcal .* with another source"):
         Calibration.load(path, registry)
+
+
+def test_a_calibration_of_many_free_parameters_is_read(tmp_path: Path) -> None:
+    """Covariance and information of 200 free parameters, such as many sockets bring: more than a mebibyte."""
+    square = np.random.default_rng(1).normal(size=(200, 200))
+    covariance = [row[: i + 1] for i, row in enumerate(square.tolist())]
+    information = {"square_root": square.tolist()}
+    path = tmp_path / "calibration.yaml"
+    path.write_text(sealed({"armcal_calibration": 1, "prediction": covariance, "information": information}))
+    assert path.stat().st_size > 1 << 20
+    source, whole = read_record(path)
+    assert whole and source.data["information"] == information

@@ -6,6 +6,7 @@ import os
 from pathlib import Path
 
 import pytest
+from armcal.config.yaml_source import MAX_BYTES
 from armcal.errors import ConfigError
 from armcal.serve.calibration_watch import AGAIN_S, QUIET_S, CalibrationWatch
 from serving import put
@@ -94,7 +95,7 @@ def test_a_new_file_that_grows_is_read_when_it_rests(watch: CalibrationWatch, cl
 
 @pytest.mark.parametrize(
     ("text", "why"),
-    [("", "empty"), ("cut", "no end"), ("recalibrated: null\n", "the line that ends"), ("x" * (2**20 + 1), "larger")],
+    [("", "empty"), ("cut", "no end"), ("recalibrated: null\n", "the line that ends"), ("x" * (MAX_BYTES + 1), "larger")],
 )
 def test_what_is_not_whole_is_refused_and_the_next_is_taken(
     watch: CalibrationWatch, clock: Clock, text: str, why: str

@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 import yaml
+from armcal.config import yaml_nodes
 from armcal.config.yaml_nodes import Origin, read_nodes
 from armcal.config.yaml_source import ConfigSource, ConfigText, load_config
 from armcal.errors import ConfigError
@@ -143,7 +144,7 @@ BOMB = "a0: &a0 [x, x, x, x, x, x, x, x, x, x]\n" + "".join(
         ("b: &b {c: 1}\na:\n  <<: *b\n", 3, [", a:", "merge keys", "'extends'"]),
         ("a: *nowhere\n", 1, [", a:", "*nowhere names no anchor", "Write &nowhere"]),
         ("a: &a [1, *a]\n", 1, ["a.1", "inside what it names", "Write the value out"]),
-        (BOMB, 5, ["more than 100000 values", "CSV"]),
+        (BOMB, 5, ["more than 1000000 values", "CSV"]),
         (f"b: 1\n{DEEP}\n", 2, ["deeper than 50 levels", "Flatten"]),
         ("a: " + "- " * 5 + "1\n", 1, ["not valid YAML"]),
         ("a:\n  " + "- " * 200_000 + "1\n", 2, ["deeper than 50 levels"]),
@@ -163,15 +164,17 @@ def test_a_refusal_names_file_line_field_and_mend(
     assert all(words in message for words in says), message
 
 
-def test_a_file_over_one_mebibyte_is_refused_and_one_at_the_limit_is_read(tmp_path: Path) -> None:
+def test_a_file_over_sixteen_mebibytes_is_refused_and_one_at_the_limit_is_read(tmp_path: Path) -> None:
     body = b"a: 1\n#"
-    assert load(tmp_path, body + b"x" * ((1 << 20) - len(body))).data == {"a": 1}
-    message = refusal(tmp_path, body + b"x" * ((1 << 20) - len(body) + 1))
-    assert "larger than 1048576 bytes" in message and "CSV" in message
+    assert load(tmp_path, body + b"x" * ((16 << 20) - len(body))).data == {"a": 1}
+    message = refusal(tmp_path, body + b"x" * ((16 << 20) - len(body) + 1))
+    assert "larger than 16 MiB" in message and "CSV" in message
 
 
-def test_fifty_levels_and_a_hundred_thousand_values_are_read(tmp_path: Path) -> None:
+def test_fifty_levels_are_read_and_values_up_to_the_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert load(tmp_path, "a: " + "[" * 49 + "]" * 49).data["a"] is not None
+    assert yaml_nodes.MAX_NODES == 1_000_000
+    monkeypatch.setattr(yaml_nodes, "MAX_NODES", 100_000)
     assert len(load(tmp_path, f"a: [{'1,' * 99_990}]").data["a"]) == 99_990
     assert "more than 100000 values" in refusal(tmp_path, f"a: [{'1,' * 100_000}]")
 

@@ -43,7 +43,7 @@ def input_file(path: Path, most: int, expected: str, refusal: type[InputError] =
     elif not S_ISREG(found.st_mode):
         message, hint = f"it is a device or pipe, expected {expected}.", "Save what it gives to a file, and give that."
     elif found.st_size > most:
-        message, hint = f"it is larger than {_size(most)}, expected {expected}.", "Check the path, or split it."
+        message, hint = f"it is larger than {size_text(most)}, expected {expected}.", "Check the path, or split it."
     if message:
         os.close(descriptor)
         raise refusal(message, where=where, hint=hint)
@@ -78,6 +78,7 @@ def check_output(path: Path, refusal: type[InputError] = DataError) -> None:
     )
 
 
-def _size(count: int) -> str:
+def size_text(count: int) -> str:
+    """A number of bytes as people read it."""
     unit, name = next(((unit, name) for unit, name in _UNITS if count >= unit), (1, "bytes"))
     return f"{count / unit:.3g} {name}"

@@ -17,7 +17,7 @@ from armcal.config.yaml_scalars import Scalar, ScalarError, read_plain
 from armcal.errors import ConfigError, Location
 
 MAX_DEPTH = 50
-MAX_NODES = 100_000
+MAX_NODES = 1_000_000
 
 Step = str | int
 

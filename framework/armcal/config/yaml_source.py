@@ -11,6 +11,7 @@ from typing import Any, NoReturn
 import yaml
 
 from armcal.base.config_text import ConfigText, resolve_path
+from armcal.base.plain_files import size_text
 from armcal.base.units import split_suffix
 from armcal.config.yaml_nodes import Node, Origin, Step, dotted, read_nodes
 from armcal.config.yaml_tree import entries_of, merge, override
@@ -18,7 +19,8 @@ from armcal.errors import ConfigError, Location
 
 __all__ = ["ConfigSource", "ConfigText", "find_key", "load_config", "resolve_path"]
 
-MAX_BYTES = 1 << 20
+MAX_BYTES = 16 << 20
+"""A calibration with 600 free parameters, or with 50 000 records of a drift, is smaller."""
 MAX_FILES = 32
 
 
@@ -136,7 +138,7 @@ def _read_text(path: Path) -> str:
     except (OSError, ValueError) as fault:
         _refuse_file(path, f"the file cannot be read ({fault}).", "Check the path and its permissions.")
     if len(raw) > MAX_BYTES:
-        _refuse_file(path, f"the file is larger than {MAX_BYTES} bytes.", "Keep measured data in a CSV file.")
+        _refuse_file(path, f"the file is larger than {size_text(MAX_BYTES)}.", "Keep measured data in a CSV file.")
     try:
         return raw.decode("utf-8").removeprefix("\ufeff")
     except UnicodeDecodeError as fault:

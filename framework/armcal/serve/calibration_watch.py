@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO, Literal
 
+from armcal.base.plain_files import size_text
 from armcal.config.yaml_source import MAX_BYTES
 from armcal.errors import ConfigError, Location
 
@@ -178,7 +179,7 @@ def _not_whole(snapshot: Snapshot) -> str:
     if not snapshot.data:
         return "the file is empty."
     if len(snapshot.data) > MAX_BYTES:
-        return f"the file is larger than {MAX_BYTES} bytes: this is no calibration."
+        return f"the file is larger than {size_text(MAX_BYTES)}: this is no calibration."
     if not snapshot.data.endswith(b"\n"):
         return "the last line of the file has no end: this is no whole calibration."
     if not _LAST_LINE.search(snapshot.data):
