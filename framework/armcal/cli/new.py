@@ -46,6 +46,7 @@ def new_plugin(voice: Voice, name: str, kind: str, out: Path | None) -> None:
 @click.option("--urdf", type=click.Path(path_type=Path), help="A URDF.")
 @click.option("--tip", metavar="LINK", help="The URDF's link at the arm's end, where there are several.")
 @click.option("--up", metavar="AXIS|X,Y,Z", help="Which way is up in the tracker's frame: z, -y, or three numbers.")
+@click.option("--target", metavar="X,Y,Z", help="Where the target sits in the tool's frame, roughly, in mm or as 2 cm.")
 @click.option("--out", type=click.Path(path_type=Path), help="The folder to make [default: NAME].")
 @speaking
 def new_robot(voice: Voice, name: str, out: Path | None, **source: Any) -> None:

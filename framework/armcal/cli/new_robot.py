@@ -8,7 +8,7 @@ from pathlib import Path
 
 from armcal.cli.common import Voice, command_line
 from armcal.cli.outlet import say
-from armcal.cli.robot_questions import ask_rows, ask_up, direction
+from armcal.cli.robot_questions import ask_rows, ask_target, ask_up, direction, place
 from armcal.errors import EXIT_FAULT, EXIT_NOT_CONVERGED, ConfigError
 from armcal.plugins import PluginRegistry, discover
 from armcal.scaffold.dh_table import read_rows
@@ -30,13 +30,14 @@ class Source:
     urdf: Path | None
     tip: str | None
     up: str | None
+    target: str | None
 
 
 def begin(voice: Voice, name: str, source: Source, folder: Path) -> None:
     """Write a robot's folder, calibrate its simulated records, and say how that went."""
     registry = discover()
     voice.plugin_faults(registry)
-    robot = _upright(_robot(robot_name(name), source, registry), source.up)
+    robot = _measured(_upright(_robot(robot_name(name), source, registry), source.up), source.target)
     made = write_robot(robot, folder, registry)
     with voice.progress() as progress:
         trial = try_out(made, registry, command_line(), progress)
@@ -71,6 +72,13 @@ def _upright(robot: Robot, up: str | None) -> Robot:
     if up is None and robot.has_masses and sys.stdin.isatty():
         up = ask_up()
     return replace(robot, up=direction(up)) if up else robot
+
+
+def _measured(robot: Robot, target: str | None) -> Robot:
+    """With the target's place on the tool, asked where somebody is there to ask."""
+    if target is None and sys.stdin.isatty():
+        target = ask_target()
+    return replace(robot, target=place(target)) if target else robot
 
 
 def _show(voice: Voice, robot: Robot, made: RobotFolder, trial: Trial) -> None:

@@ -80,6 +80,37 @@ def direction(text: str) -> tuple[float, float, float]:
     return x, y, z
 
 
+def ask_target() -> str:
+    """Where the target sits in the tool's frame, as ``place`` takes it."""
+    return str(
+        click.prompt("the target in the tool's frame, roughly, x,y,z in mm", default="0,0,0", value_proc=_placed)
+    )
+
+
+def _placed(text: str) -> str:
+    try:
+        place(text)
+    except ConfigError as fault:
+        raise click.BadParameter(fault.message) from fault
+    return text
+
+
+def place(text: str) -> tuple[float, float, float]:
+    """A point (m) from ``30,0,12.5`` in mm, or with units: ``3 cm, 0, 12.5 mm``.
+
+    Raises:
+        ConfigError: it is none.
+    """
+    try:
+        x, y, z = (_quantity(part.strip(), "mm", "length") for part in text.split(","))
+    except (ValueError, click.BadParameter) as fault:
+        raise ConfigError(
+            f"found {text!r} for the target, expected three lengths such as 30,0,12.5 (mm) or 3 cm,0,0.",
+            hint="Give the target's place in the frame of the last row, or of the URDF's tip.",
+        ) from fault
+    return x, y, z
+
+
 def _row(number: int) -> Row:
     name = f"q{number}"
     click.echo(f"joint {number}, {name}:", err=True)
