@@ -258,3 +258,17 @@ def test_a_plan_about_a_calibration_takes_its_values(tmp_path: Path) -> None:
     nominal = planned(tmp_path / "n.csv", "--poses", "30")
     about = planned(tmp_path / "c.csv", "--poses", "30", "--calibration", str(folder / "calibration.yaml"))
     assert about["log_det"] != pytest.approx(nominal["log_det"], abs=0.01)
+
+
+@pytest.mark.parametrize("command", ["check", "identify", "plan", "run", "study"])
+def test_another_data_file_wins_over_an_absolute_path_that_leads_nowhere(command: str, tmp_path: Path) -> None:
+    """The configured path is not even looked at."""
+    away = f"data.path={tmp_path / 'away' / 'records.csv'}"
+    config = "study_demo.yaml" if command == "study" else "demo.yaml"
+    more = {"plan": ["--poses", "12"], "run": ["--set", "validation.folds=0"], "study": ["--set", "validation.folds=2"]}
+    out = [] if command in ("check", "identify") else ["--out", str(tmp_path / "out.csv")]
+    arguments = [command, str(CONFIGS / config), "--set", away, *QUICK[:2], *more.get(command, []), *out]
+    refused = CliRunner().invoke(cli, arguments)
+    assert refused.exit_code == 2, refused.output
+    ran = CliRunner().invoke(cli, [*arguments, "--data", DATA])
+    assert ran.exit_code == 0, ran.output

@@ -88,7 +88,7 @@ class Experiment:
         """Check a configuration that was read; else as ``load``."""
         registry = registry or discover()
         if data is not None:
-            source = _with_data(source, data)
+            source = with_data(source, data)
         settings = validate(ExperimentSettings, source)
         system = build_system(source, registry)
         known = without_groups(settings.parameters, grouped_instances(system.measurements))
@@ -186,7 +186,7 @@ def _estimator(source: ConfigSource, registry: PluginRegistry) -> Estimator:
     return built
 
 
-def _with_data(source: ConfigSource, data: str | Path) -> ConfigSource:
+def with_data(source: ConfigSource, data: str | Path) -> ConfigSource:
     """The configuration with another data file, given on the command line and so free to lie anywhere."""
     section: dict[str, Any] = dict(source.data.get("data") or {"type": "csv"})
     section["path"] = ConfigText(str(data))

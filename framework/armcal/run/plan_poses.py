@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 
 from armcal.arm.clearance import ClearanceCheck, Mask
-from armcal.base.config_text import ConfigText
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.base.plain_files import input_file
@@ -18,7 +17,7 @@ from armcal.config.system import build_component
 from armcal.errors import ConfigError, DataError, Location, ProblemError
 from armcal.measure.id_list import MAX_BYTES, read_ids
 from armcal.measure.reader import Reader
-from armcal.run.experiment import Experiment
+from armcal.run.experiment import Experiment, with_data
 from armcal.run.plan_settings import PlanSettings
 
 _OF_THE_MOMENT = ("time", "temperature")
@@ -135,8 +134,7 @@ def read_poses(experiment: Experiment, path: Path | None) -> Dataset:
     """
     source = experiment.source
     if path is not None:
-        section = {**(source.data.get("data") or {"type": "csv"}), "path": ConfigText(str(path))}
-        source = replace(source, data={**source.data, "data": section})
+        source = with_data(source, path)
     elif experiment.settings.data is None:
         raise ConfigError(
             "found no poses to choose from.",
