@@ -5,17 +5,21 @@ from __future__ import annotations
 import csv
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
 import time
+from io import StringIO
 from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
+from armcal.cli.console import Screen
 from armcal.cli.main import cli
 from click.testing import CliRunner, Result
+from rich.table import Table
 
 ROOT = Path(__file__).resolve().parents[2]
 DEMO = str(ROOT / "configs" / "lrm_arm" / "demo.yaml")
@@ -275,3 +279,38 @@ def test_the_shell_completes_commands_without_importing_them() -> None:
     commands = ("check", "compensate", "correction-table", "calibration", "capability", "convert", "control")
     assert offered == [f"plain,{command}" for command in commands], ran.stderr
     assert heavy == "heavy: []"
+
+
+def numbers_of(text: str) -> set[str]:
+    return set(re.findall(r"\d+(?:\.\d+)?", re.sub(r"\(\d+\.\d s\)", "", text)))
+
+
+@pytest.mark.parametrize("columns", [24, 40, 80])
+@pytest.mark.parametrize("command", ["check", "run", "plan"])
+def test_a_narrow_terminal_gets_every_number_of_the_tables(command: str, columns: int, tmp_path: Path) -> None:
+    more = {"plan": ["--poses", "12", "--set", "plan.starts=1"]}.get(command, [])
+    out = [] if command == "check" else ["--out", str(tmp_path / "out.csv")]
+    shown = []
+    for width in (300, columns):
+        arguments = [command, DEMO, *FAST, *more, *out]
+        result = CliRunner().invoke(cli, arguments, env={"COLUMNS": str(width)})
+        assert result.exit_code == 0, result.output
+        shown.append(result.stdout)
+    wide, narrow = shown
+    assert "…" not in narrow
+    assert numbers_of(wide) <= numbers_of(narrow)
+
+
+def test_a_table_that_is_too_wide_is_a_list_of_its_rows() -> None:
+    table = Table("servo", "deg", "backlash, deg", title="Pulses")
+    table.add_row("q1", "-100", "0.12 +- 0.03")
+    table.add_row("", "0", "")
+    screen = Screen(width=14, file=StringIO())
+    screen.print(table)
+    expected = ["Pulses", "q1", "  deg: -100", "  backlash,", "  deg: 0.12 +-", "  0.03", "q1", "  deg: 0"]
+    assert [line.rstrip() for line in screen.file.getvalue().splitlines()] == expected
+    wide = Screen(width=60, file=StringIO())
+    wide.print(table)
+    assert any(
+        all(cell in line for cell in ("q1", "-100", "0.12 +- 0.03")) for line in wide.file.getvalue().splitlines()
+    )

@@ -132,7 +132,7 @@ def _write(
 def _screen(table: Table) -> ScreenTable:
     made = ScreenTable(title=table.caption, title_justify="left", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
     for words, number in table.headings:
-        made.add_column(words, justify="right" if number else "left", overflow="fold")
+        made.add_column(words, justify="right" if number else "left")
     for row in table.rows:
         made.add_row(*row)
     return made

@@ -1,14 +1,20 @@
-"""What a command shows on a screen: names are data."""
+"""What a command shows on a screen: names are data, and a table that is too wide becomes a list of its rows."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from typing import Any
 
-from rich.console import Console, ConsoleOptions, RenderableType
+from rich.console import Console, ConsoleOptions, Group, RenderableType
+from rich.padding import Padding
 from rich.segment import Segment
+from rich.table import Table
+from rich.text import Text
 
 from armcal.base.shown import shown
+
+_CUT = "\u2026"
+"""What rich ends a word with that its column has no room for."""
 
 
 class Screen(Console):
@@ -22,6 +28,34 @@ class Screen(Console):
         for segment in super().render(renderable, options):
             yield segment if segment.control else Segment(shown(segment.text), segment.style)
 
+    def print(self, *objects: Any, **more: Any) -> None:
+        """As rich does; a table whose words and numbers would be cut is shown row by row."""
+        super().print(*(self._fitting(each) for each in objects), **more)
+
+    def _fitting(self, shown_object: Any) -> Any:
+        if not isinstance(shown_object, Table):
+            return shown_object
+        lines = self.render_lines(shown_object, pad=False)
+        return as_list(shown_object) if any(_CUT in part.text for line in lines for part in line) else shown_object
+
     def on_broken_pipe(self) -> None:
         """Nobody reads any longer: said to nobody, as ``Outlet`` has it."""
         self.quiet = True
+
+
+def as_list(table: Table) -> Group:
+    """A table's rows one below another, a line a cell under its heading; a first cell that is empty is as above."""
+    lines: list[RenderableType] = [Text.assemble((str(table.title or ""), "italic"))]
+    above: RenderableType = ""
+    for first, *others in zip(*(column.cells for column in table.columns), strict=True):
+        above = first or above
+        lines.append(above)
+        headings = [str(column.header) for column in table.columns[1:]]
+        cells = [(heading, cell) for heading, cell in zip(headings, others, strict=True) if cell]
+        lines += [Padding(_under(heading, cell), (0, 0, 0, 2), expand=False) for heading, cell in cells]
+    return Group(*lines)
+
+
+def _under(heading: str, cell: RenderableType) -> Text:
+    text = cell if isinstance(cell, Text) else Text(str(cell))
+    return Text.assemble(f"{heading}: ", text) if heading else text

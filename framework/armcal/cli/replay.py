@@ -163,7 +163,7 @@ def _table(walk: Walk, other: _Other) -> Table:
     found = other.comparison
     table = Table(title="what was done, and what other settings would have done")
     for heading in ("", "done", "with other settings"):
-        table.add_column(heading, overflow="fold")
+        table.add_column(heading)
     for number, one, two in side_by_side(walk, other.walk):
         table.add_row(f"entry {number}", one or "-", two or "-")
     table.add_section()

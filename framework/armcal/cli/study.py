@@ -92,7 +92,7 @@ def _show_transfer(voice: Voice, result: TransferResult) -> None:
 def _table(title: str, words: Sequence[str], numbers: Sequence[str]) -> Table:
     table = Table(title=title, title_justify="left")
     for column in words:
-        table.add_column(column, overflow="fold")
+        table.add_column(column)
     for column in numbers:
         table.add_column(column, justify="right")
     return table

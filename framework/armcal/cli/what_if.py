@@ -86,7 +86,7 @@ def _table(rows: Sequence[Mapping[str, Any]], unit: str) -> Table:
     """The best poses."""
     table = Table(title=f"what one more record would tell: the best {min(_SHOWN, len(rows))} of {len(rows)} poses")
     for heading in ("pose", "bits", "prediction known to", "standard deviations that shrink most"):
-        table.add_column(heading, overflow="fold")
+        table.add_column(heading)
     for row in rows[:_SHOWN]:
         known = f"{row[f'prediction_sd_{unit}']:.3g} {unit}"
         table.add_row(str(row["id"]), f"{row['bits']:.2f}", known, _shrinks(row["tells_most"]))
