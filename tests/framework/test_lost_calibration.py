@@ -63,14 +63,14 @@ def test_every_use_refuses_it(name: str, lost: Path) -> None:
 
 @pytest.mark.parametrize("name", ["predict", "compensate", "export"])
 def test_it_is_used_where_that_is_asked_for_with_a_warning(name: str, lost: Path) -> None:
-    done = armcal(name, lost, "--accept-lost")
+    done = armcal(name, lost, "--accept")
     assert done.exit_code == 0, done.output
     assert f"is lost: {WHY}" in " ".join(done.stderr.split())
     assert (lost.parent / "out").exists()
 
 
 def test_its_headline_is_not_that_of_the_run_any_more(texts: dict[str, str], lost: Path) -> None:
-    assert Calibration.load(lost, accept_lost=True).record.verdict["headline"] == f"Lost, do not use: {WHY}"
+    assert Calibration.load(lost, accept=True).record.verdict["headline"] == f"Lost, do not use: {WHY}"
     lost.write_text(texts["suspect"], encoding="utf-8")
     found = Calibration.load(lost).record
     assert found.level == "suspect" and found.verdict == calibration().record.verdict
@@ -92,6 +92,6 @@ def test_a_server_answers_with_the_level_and_with_an_error_once_it_is_lost(texts
         answer = ask(loaded(orders["lost"][1], texts["lost"].encode()), **asked)
         assert not answer["ok"] and "its level is lost" in answer["error"]
         assert answer["calibration"]["level"] == "lost"
-    accepted = Order("c.yaml", 2, sha256(texts["lost"]), evaluator="interpreted", accept_lost=True)
+    accepted = Order("c.yaml", 2, sha256(texts["lost"]), evaluator="interpreted", accept=True)
     answer = ask(loaded(accepted, texts["lost"].encode()), **request)
     assert answer["ok"] and answer["calibration"]["level"] == "lost"

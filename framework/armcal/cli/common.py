@@ -129,10 +129,10 @@ def overrides(command: F) -> F:
     )(command)
 
 
-def accept_lost(command: F) -> F:
-    """The option --accept-lost."""
+def accept(command: F) -> F:
+    """The option --accept."""
     text = "Use a calibration whose recalibration found that it no longer holds."
-    return click.option("--accept-lost", is_flag=True, help=text)(command)
+    return click.option("--accept", is_flag=True, help=text)(command)
 
 
 def parallel(command: F) -> F:

@@ -11,7 +11,7 @@ import numpy as np
 
 from armcal.base.domains import Array
 from armcal.base.units import parse_quantity
-from armcal.cli.common import Voice, accept_lost, spare_inputs, speaking
+from armcal.cli.common import Voice, accept, spare_inputs, speaking
 from armcal.errors import InputError, Location
 from armcal.plugins import discover
 from armcal.run.command_file import write_commands
@@ -48,14 +48,14 @@ _ARRIVES = {"tool": "by the tool frame's origin", "target": "by the measured tar
     help="What arrives: the tool frame's origin, or the target that was measured [default: tool].",
 )
 @click.option("--angles", type=click.Choice(["deg", "rad"]), default="deg", show_default=True, help="Unit of commands.")
-@accept_lost
+@accept
 @speaking
 def compensate(voice: Voice, calibration: Path, targets: Path, out: Path, angles: str, **asked: Any) -> None:
     """Find what to command so that the arm in CALIBRATION, as it really is, arrives at targets."""
     spare_inputs(out, calibration, targets, asked["within"])
     registry = discover()
     voice.plugin_faults(registry)
-    loaded = Calibration.load(calibration, registry, asked["accept_lost"])
+    loaded = Calibration.load(calibration, registry, asked["accept"])
     to_target = asked["point"] == "target"
     bench = Bench.of(loaded, asked["arm"], asked["within"], asked["redundancy"], registry, to_target)
     file = bench.read(targets, registry)

@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 import numpy as np
 
-from armcal.cli.common import Voice, accept_lost, spare_inputs, speaking
+from armcal.cli.common import Voice, accept, spare_inputs, speaking
 from armcal.plugins import discover
 from armcal.run.compensate import Bench
 from armcal.run.correction_table import correction_table as made_table
@@ -21,17 +21,17 @@ from armcal.use.calibration import Calibration
 @click.option("--out", required=True, type=click.Path(path_type=Path), help="The CSV to write.")
 @click.option("--arm", metavar="NAME", help="Which arm, where there are several.")
 @click.option("--within", type=click.Path(path_type=Path), help="A configuration whose plan has limits and clearance.")
-@accept_lost
+@accept
 @speaking
 def correction_table(
-    voice: Voice, calibration: Path, grid: Path, out: Path, arm: str | None, within: Path | None, accept_lost: bool
+    voice: Voice, calibration: Path, grid: Path, out: Path, arm: str | None, within: Path | None, accept: bool
 ) -> None:
     """Make a table of what to tell a controller that takes the arm in CALIBRATION for the nominal one."""
     spare_inputs(out, calibration, grid, within)
     registry = discover()
     voice.plugin_faults(registry)
     settings = read_table_settings(grid)
-    loaded = Calibration.load(calibration, registry, accept_lost)
+    loaded = Calibration.load(calibration, registry, accept)
     loaded.require_payload(settings.payload is not None)
     bench = Bench.of(loaded, arm, within, "nearest", registry)
     table = made_table(bench.compensator(), bench.nominal(), settings)

@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from armcal.base.plain_files import check_output
-from armcal.cli.common import Voice, accept_lost, speaking
+from armcal.cli.common import Voice, accept, speaking
 from armcal.config.options import settings_from
 from armcal.errors import InputError, Location, PluginError
 from armcal.plugins import PluginRegistry, discover
@@ -25,7 +25,7 @@ _NOTHING_MM = 1e-6
 @click.option("--arm", metavar="NAME", help="Which arm, where there are several.")
 @click.option("--option", "options", multiple=True, metavar="KEY=VALUE", help="A setting of the format: prefix=lrm.")
 @click.option("--force", is_flag=True, help="Overwrite files that are there.")
-@accept_lost
+@accept
 @speaking
 def export(
     voice: Voice,
@@ -35,7 +35,7 @@ def export(
     arm: str | None,
     options: tuple[str, ...],
     force: bool,
-    accept_lost: bool,
+    accept: bool,
 ) -> None:
     """Write the arm in CALIBRATION in the format of another program.
 
@@ -45,7 +45,7 @@ def export(
     voice.plugin_faults(registry)
     exporter = _exporter(registry, kind, options)
     _check_place(out, calibration, force)
-    loaded = Calibration.load(calibration, registry, accept_lost)
+    loaded = Calibration.load(calibration, registry, accept)
     request = request_of(loaded, arm, out.name)
     found = exporter.export(request)
     reach = _reach(loaded, request, found)

@@ -17,7 +17,7 @@ from armcal.base.domains import Array
 from armcal.base.plain_files import input_file
 from armcal.base.pose_settings import quaternion_of
 from armcal.base.units import DIMENSIONLESS, split_suffix, to_unit
-from armcal.cli.common import Voice, accept_lost, speaking
+from armcal.cli.common import Voice, accept, speaking
 from armcal.errors import DataError, InputError, Location
 from armcal.measure.csv_writer import column_names, write_csv
 from armcal.measure.environment import noticed
@@ -42,15 +42,15 @@ _RECORDINGS: Mapping[str, Literal["same", "new"]] = {"calibrated": "same", "new"
     help="Whether the poses belong to the calibration's recording, which tells how parameters drifted.",
 )
 @click.option("--columns", multiple=True, metavar="NAME=COLUMN", help="What the CSV calls a column: sequence=pose_id.")
-@accept_lost
+@accept
 @speaking
 def predict(
-    voice: Voice, calibration: Path, poses: Path, out: Path, recording: str, columns: tuple[str, ...], accept_lost: bool
+    voice: Voice, calibration: Path, poses: Path, out: Path, recording: str, columns: tuple[str, ...], accept: bool
 ) -> None:
     """Predict the tip of the arm in CALIBRATION for each row of commanded joint angles, and how far it may be off."""
     registry = discover()
     voice.plugin_faults(registry)
-    loaded = Calibration.load(calibration, registry, accept_lost)
+    loaded = Calibration.load(calibration, registry, accept)
     system = loaded.system
     commands = read_commands(registry, loaded, poses, columns)
     _tell_missing(voice, loaded, commands, recording)

@@ -12,7 +12,7 @@ from typing import Any, get_args
 
 import click
 
-from armcal.cli.common import Voice, accept_lost, speaking
+from armcal.cli.common import Voice, accept, speaking
 from armcal.errors import InputError
 from armcal.online.running.outputs import as_line
 from armcal.online.running.signals import Signals
@@ -53,7 +53,7 @@ _ALWAYS = ("refused", "worker_lost", "missing", "status", "notice")
     show_default=True,
     help="Compiled C where a compiler is found: answers come sooner, a new calibration some seconds later.",
 )
-@accept_lost
+@accept
 @speaking
 def serve(
     voice: Voice,
@@ -64,7 +64,7 @@ def serve(
     redundancy: Redundancy,
     workers: int | None,
     evaluator: EvaluatorChoice,
-    accept_lost: bool,
+    accept: bool,
 ) -> None:
     """Answer requests by CALIBRATION, a JSON object a line: forward, compensate, status.
 
@@ -78,7 +78,7 @@ def serve(
     if not openings:
         openings.append(_standard_streams())
     said = _Said(voice, StandardOutput(getattr(sys.stderr, "buffer", None), patience_s=0.0))
-    how = {"redundancy": redundancy, "within": str(within or ""), "evaluator": evaluator, "accept_lost": accept_lost}
+    how = {"redundancy": redundancy, "within": str(within or ""), "evaluator": evaluator, "accept": accept}
     with Signals() as signals:
         Server(calibration, workers or min(2, os.cpu_count() or 1), how, openings, said.tell).run(signals)
 

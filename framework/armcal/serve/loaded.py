@@ -38,7 +38,7 @@ class Order:
         redundancy: which of many commands.
         within: a configuration whose plan has limits and clearance; empty: none.
         evaluator: ``compiled`` where a compiler is found, or ``interpreted``.
-        accept_lost: whether one whose level is lost answers as any other; else the first is refused, and a later
+        accept: whether one whose level is lost answers as any other; else the first is refused, and a later
             one, which says of those before it that they no longer hold either, answers with that error.
     """
 
@@ -49,7 +49,7 @@ class Order:
     redundancy: Redundancy = "nearest"
     within: str = ""
     evaluator: EvaluatorChoice = "compiled"
-    accept_lost: bool = False
+    accept: bool = False
 
 
 def loaded(order: Order, data: bytes) -> Answerer:
@@ -80,7 +80,7 @@ def loaded(order: Order, data: bytes) -> Answerer:
     _tried(answerer)
     gc.collect()
     gc.freeze()
-    lost = found.level == "lost" and not order.accept_lost
+    lost = found.level == "lost" and not order.accept
     return replace(answerer, fault=lost_calibration(found, order.shown)) if lost else answerer
 
 
@@ -89,7 +89,7 @@ def _read(order: Order, data: bytes) -> Calibration:
         path = Path(folder) / "calibration.yaml"
         path.write_bytes(data)
         with _shown_as(str(path), order.shown):
-            return Calibration.load(path, accept_lost=order.accept_lost or order.sequence > 1)
+            return Calibration.load(path, accept=order.accept or order.sequence > 1)
 
 
 @contextmanager

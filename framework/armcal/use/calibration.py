@@ -50,10 +50,10 @@ class Calibration:
     record: CalibrationFile
 
     @classmethod
-    def load(cls, path: str | Path, registry: PluginRegistry | None = None, accept_lost: bool = False) -> Calibration:
+    def load(cls, path: str | Path, registry: PluginRegistry | None = None, accept: bool = False) -> Calibration:
         """Read a calibration; a ``CalibrationWarning`` for what its user should know of it.
 
-        ``accept_lost``: even one whose recalibration found that it no longer holds.
+        ``accept``: even one whose recalibration found that it no longer holds.
 
         Raises:
             ConfigError: not a calibration, of another schema, damaged, changed since it was written, lost, of a bad
@@ -62,7 +62,7 @@ class Calibration:
         """
         registry = registry or discover()
         loaded = cls.built(read_record(path)[0], path, registry)
-        if loaded.record.level == "lost" and not accept_lost:
+        if loaded.record.level == "lost" and not accept:
             raise lost_calibration(loaded.record, path)
         for notice in loaded.notices(path, registry):
             warnings.warn(f"the calibration {notice}", CalibrationWarning, stacklevel=2)
@@ -338,7 +338,7 @@ def lost_calibration(record: CalibrationFile, path: str | Path) -> ConfigError:
     return ConfigError(
         f"its level is lost since record {recalibrated.get('sequence')}: {reason}.",
         where=Location(str(path)),
-        hint="Calibrate on the bench again. To use it all the same: --accept-lost of predict, compensate, "
+        hint="Calibrate on the bench again. To use it all the same: --accept of predict, compensate, "
         "correction-table, export and serve.",
     )
 

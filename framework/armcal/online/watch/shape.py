@@ -41,7 +41,7 @@ def drawing_of(path: Path) -> Drawing:
 
     from armcal.use.calibration import Calibration
 
-    calibration = Calibration.load(path, accept_lost=True)
+    calibration = Calibration.load(path, accept=True)
     environment = calibration.system.environment
     values = {block.name: ca.SX(list(block.nominal)) for block in calibration.parameters.blocks}
     arms = {
