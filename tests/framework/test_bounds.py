@@ -102,3 +102,21 @@ def test_principal_compliances_of_a_stiff_arm_are_printed_with_their_digits() ->
 def stiff_result(found: Estimate):
     """A run's result as far as the table of compliances reads it."""
     return type("Result", (), {"estimate": found})()
+
+
+def test_what_a_cone_shifts_beside_its_matrix_is_named() -> None:
+    """A joint that would have to push one way: its matrix ends on the cone, and no entry of it on a bound."""
+    give = "arms.arm.effects.flex={type: compliance, compliance_rad_per_Nm: 0.02}"
+    free = '["arm.flex.C2", "arm.mdh.theta[2-4]"]'
+    truth = {"arm.flex.C2[xx]": 0.02, "arm.flex.C2[yy]": 0.02}
+    edge, inside = (
+        fitted(free, {**truth, "arm.flex.C2[zz]": along}, "arms.arm.effects.spring=null", give)
+        for along in (-0.01, 0.05)
+    )
+    assert not edge.at_bound
+    (finding,) = shifted_told(edge)
+    moved = dict(zip(edge.names, (edge.free_values - edge.unconstrained) / edge.deviations, strict=True))
+    worst = max((n for n in edge.names if n.startswith("arm.mdh")), key=lambda n: abs(moved[n]))
+    assert f"Bounds that hold arm.flex.C2 shift other estimates: {worst} ({moved[worst]:+.1f} sd)" in finding.text
+    assert finding.grade == "note" and "C2[" not in finding.text
+    assert not shifted_told(inside)
