@@ -6,6 +6,7 @@ import sys
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -13,7 +14,8 @@ from armcal.errors import InputError, ProblemError
 from armcal.use.exporter import random_commands, request_of, rigid_tools
 from armcal.use.rigid_chain import rigid_chain
 from armcal_export import mujoco_model
-from armcal_export.describe import chain_of
+from armcal_export.describe import chain_of, describe
+from armcal_export.mjcf import Drive, Hinge, mjcf
 from armcal_export.mujoco_model import MujocoExporter, MujocoSettings
 from armcal_export.mujoco_rest import LoadedModel
 
@@ -137,6 +139,20 @@ def test_an_arm_that_reads_back_differently_is_not_written(monkeypatch):
     monkeypatch.setattr(mujoco_model, "mjcf", lambda *a: whole(*a).replace(b"hinge", b"hunge"))
     with pytest.raises(ProblemError, match="does not take the model"):
         exported(LRM)
+
+
+def test_names_of_a_urdf_stay_names_in_the_model():
+    """Whatever XML lets a joint be called; MuJoCo need not be there."""
+    request = request_of(made_calibration(CONFIGS / "mukca" / "panda.yaml"), None)
+    rigid, told, odd = rigid_chain(chain_of(request)), describe(request), "j<2>&\"'é"
+    named = replace(rigid, joints=(replace(rigid.joints[0], name=odd), *rigid.joints[1:]))
+    springs = {1: [Hinge((0.0, 0.0, 1.0), False, 0.01)]}
+    named_arm = told.model_copy(update={"arm": odd})
+    model = ElementTree.fromstring(mjcf(named_arm, named, springs, Drive(1000.0, 20.0, 0.01)))
+    assert model.get("model") == odd
+    names = [each.get("name") for each in model.iter("joint")]
+    assert names[:2] == [odd, f"{odd}_spring1"]
+    assert next(iter(model.find("actuator"))).get("joint") == odd
 
 
 def test_without_mujoco_the_export_is_refused_with_the_way_to_get_it(monkeypatch):
