@@ -8,10 +8,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
+from armcal.base.dataset import Dataset
 from armcal.cli.main import cli
+from armcal.plugins import discover
+from armcal.run.compensate import Bench, commanded
+from armcal.serve.loaded import Order, loaded
+from armcal.use.compensation.grid import over_grid
 from armcal.use.measured_point import measured_point
 from click.testing import CliRunner, Result
 from made_calibrations import written
+from scipy.spatial.transform import Rotation
+from serving import sha256, told
 from small_arms import calibration, compensator, drawn
 
 OFF_MM = "measurements.tracker.target_mm=[12, -9, 20]"
@@ -86,6 +94,52 @@ def test_where_nobody_says_which_point_arrives_the_miss_is_named(tmp_path: Path)
     assert content["point"] == "tool" and np.linalg.norm(content["target_mm"]) == pytest.approx(1000 * known.distance)
     _, quiet = missed(tmp_path, found, "--point", "tool")
     assert "--point target" not in quiet.output
+
+
+def test_a_program_and_a_server_can_ask_for_the_measured_target(tmp_path: Path) -> None:
+    """What the tracker would read at their commands is the goal; without the choice it is the tool's origin."""
+    off = calibration("three", OFF_MM)
+    measured(tmp_path, "three", (OFF_MM,))
+    goals = rows(tmp_path / "shown.csv", "x_mm y_mm z_mm")
+    commands = off.compensate(goals / 1000, point="target")
+    text = (tmp_path / "calibration.yaml").read_text(encoding="utf-8")
+    order = Order("c.yaml", 1, sha256(text), point="target", evaluator="interpreted")
+    answerer = loaded(order, text.encode())
+    assert answerer.arms["arm"].shown["point"] == "target"
+    asked = {"targets": [{"position_mm": goal} for goal in goals.tolist()], "units": "rad"}
+    served = told(answerer, do="compensate", **asked)["commands"]
+    angles = np.array([row["joint_angles_rad"] for row in served])
+    for found in (commands.joint_angles, angles):
+        records = Dataset(tuple("abcde"), {f"arm.q{i + 1}": found[:, i] for i in range(3)})
+        read = off.predict(records)[0]
+        assert 1000 * np.stack([read[f"tracker.{axis}"] for axis in "xyz"], axis=1) == pytest.approx(goals, abs=1e-4)
+    tools = told(answerer, do="forward", joint_angles_rad=angles.tolist())["tools"]
+    assert np.array([tool["position_mm"] for tool in tools]) == pytest.approx(goals, abs=1e-4)
+    plain = off.compensate(goals[:1] / 1000)
+    assert off.forward(plain.joint_angles)[0, :3, 3] * 1000 == pytest.approx(goals[0], abs=1e-4)
+
+
+def test_a_table_can_be_of_the_measured_target(tmp_path: Path) -> None:
+    """At a node the nominal arm's target is told the corrected place; the tracker then reads the node."""
+    lrm = calibration("lrm", OFF_MM)
+    box = {"low_mm": [170, -20, 160], "high_mm": [220, 20, 200], "nodes": [2, 2, 2], "rpy_deg": [0, 90, 0]}
+    (tmp_path / "grid.yaml").write_text(yaml.safe_dump({"table": {**box, "payload_g": 0, "tried": 5}}))
+    found, out = written(lrm, tmp_path / "calibration.yaml"), tmp_path / "table.csv"
+    table = ("correction-table", found, "--grid", tmp_path / "grid.yaml", "--out", out)
+    ran = armcal(*table, "--point", "target", "--json")
+    assert ran.exit_code == 0, ran.output
+    assert json.loads(ran.stdout)["point"] == "target" and "the tool frame's origin" not in ran.stderr
+    nodes, shifts = rows(out, "x_mm y_mm z_mm"), rows(out, "dx_mm dy_mm dz_mm")
+    bench = Bench.of(lrm, None, None, "nearest", discover(), "target")
+    real, nominal = bench.compensator(), bench.nominal()
+    turned = np.repeat(Rotation.from_euler("xyz", [0, 90, 0], degrees=True).as_matrix()[None], len(nodes), axis=0)
+    targets = real.targets(nodes / 1000, turned, payload=0.0)
+    commands = over_grid(real, targets, (2, 2, 2))  # all nodes in one posture
+    read = lrm.predict(commanded(real, targets, commands))[0]
+    assert 1000 * np.stack([read[f"tracker.{axis}"] for axis in "xyz"], axis=1) == pytest.approx(nodes, abs=1e-3)
+    assert 1000 * nominal.forward(commands.joint_angles)[:, :3, 3] == pytest.approx(nodes + shifts, abs=1e-3)
+    warned = armcal(*table)
+    assert "this table brings the tool frame's origin" in warned.stderr
 
 
 def test_a_measured_body_arrives_with_its_rotation(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, get_args
 
 import click
 
@@ -20,8 +20,10 @@ from armcal.hooks import ContractDeprecationWarning
 from armcal.plugins import PluginRegistry
 from armcal.solve.estimator import Progress, no_progress
 from armcal.solve.parallel import parse_executor
+from armcal.use.measured_point import MeasuredPoint, Point
 
 F = TypeVar("F", bound=Callable[..., Any])
+_SAME_POINT_M = 1e-5
 
 
 @dataclass(frozen=True)
@@ -135,6 +137,12 @@ def accept(command: F) -> F:
     return click.option("--accept", is_flag=True, help=text)(command)
 
 
+def point(command: F) -> F:
+    """The option --point; None where it is not given."""
+    text = "What arrives: the tool frame's origin, or the target that was measured [default: tool]."
+    return click.option("--point", type=click.Choice(get_args(Point)), help=text)(command)
+
+
 def parallel(command: F) -> F:
     """The option --parallel, handed on as an executor."""
     return click.option(
@@ -155,6 +163,17 @@ def spare_inputs(out: Path, *given: Path | None) -> None:
     for path in given:
         if path is not None and out.exists() and path.exists() and out.samefile(path):
             raise DataError("it is one of the inputs.", where=Location(str(out)), hint="Give another --out.")
+
+
+def warn_of_target(voice: Voice, subject: str, target: MeasuredPoint | None) -> None:
+    """Nobody said which point shall arrive, and it matters."""
+    if target is not None and target.distance > _SAME_POINT_M:
+        x, y, z = 1000 * target.tool_T_target[:3, 3]
+        voice.warn(
+            f"{subject} the tool frame's origin to the targets. The target that "
+            f"{target.measurement} measured sits at ({x:.3f}, {y:.3f}, {z:.3f}) mm on the tool and misses them by "
+            f"{1000 * target.distance:.3g} mm. To bring that one there, give --point target; otherwise --point tool."
+        )
 
 
 def command_line() -> str:

@@ -11,7 +11,7 @@ import numpy as np
 
 from armcal.base.domains import Array
 from armcal.base.units import parse_quantity
-from armcal.cli.common import Voice, accept, spare_inputs, speaking
+from armcal.cli.common import Voice, accept, point, spare_inputs, speaking, warn_of_target
 from armcal.errors import InputError, Location
 from armcal.plugins import discover
 from armcal.run.command_file import write_commands
@@ -20,10 +20,8 @@ from armcal.run.target_file import TargetFile, check_units
 from armcal.use.calibration import Calibration
 from armcal.use.compensation.compensator import Compensator
 from armcal.use.compensation.request import Redundancy
-from armcal.use.measured_point import MeasuredPoint
 
 _SHOWN = 5
-_SAME_POINT_M = 1e-5
 _ARRIVES = {"tool": "by the tool frame's origin", "target": "by the measured target"}
 
 
@@ -42,11 +40,7 @@ _ARRIVES = {"tool": "by the tool frame's origin", "target": "by the measured tar
     show_default=True,
     help="Which of many commands.",
 )
-@click.option(
-    "--point",
-    type=click.Choice(["tool", "target"]),
-    help="What arrives: the tool frame's origin, or the target that was measured [default: tool].",
-)
+@point
 @click.option("--angles", type=click.Choice(["deg", "rad"]), default="deg", show_default=True, help="Unit of commands.")
 @accept
 @speaking
@@ -56,8 +50,7 @@ def compensate(voice: Voice, calibration: Path, targets: Path, out: Path, angles
     registry = discover()
     voice.plugin_faults(registry)
     loaded = Calibration.load(calibration, registry, asked["accept"])
-    to_target = asked["point"] == "target"
-    bench = Bench.of(loaded, asked["arm"], asked["within"], asked["redundancy"], registry, to_target)
+    bench = Bench.of(loaded, asked["arm"], asked["within"], asked["redundancy"], registry, asked["point"] or "tool")
     file = bench.read(targets, registry)
     for text in file.dataset.warnings:
         voice.warn(text)
@@ -65,7 +58,7 @@ def compensate(voice: Voice, calibration: Path, targets: Path, out: Path, angles
     check_units(targets, file.targets, compensator.reach)
     _warn_of_free_joints(voice, compensator)
     if asked["point"] is None:
-        _warn_of_target(voice, bench.target)
+        warn_of_target(voice, "these commands bring", bench.target)
     start = _start(asked["start"], compensator)
     if asked["kind"] == "path":
         commands = compensator.follow(file.targets, start)
@@ -74,17 +67,6 @@ def compensate(voice: Voice, calibration: Path, targets: Path, out: Path, angles
     assessed = assess(loaded, compensator, bench.nominal(), file.targets, commands)
     write_commands(out, compensator, file.targets, file.dataset, assessed, angles)
     _tell(voice, file, assessed, bench, out)
-
-
-def _warn_of_target(voice: Voice, target: MeasuredPoint | None) -> None:
-    """Nobody said which point shall arrive, and it matters."""
-    if target is not None and target.distance > _SAME_POINT_M:
-        x, y, z = 1000 * target.tool_T_target[:3, 3]
-        voice.warn(
-            "these commands bring the tool frame's origin to the targets. The target that "
-            f"{target.measurement} measured sits at ({x:.3f}, {y:.3f}, {z:.3f}) mm on the tool and misses them by "
-            f"{1000 * target.distance:.3g} mm. To bring that one there, give --point target; otherwise --point tool."
-        )
 
 
 def _warn_of_free_joints(voice: Voice, compensator: Compensator) -> None:
@@ -116,7 +98,6 @@ def _start(stated: Sequence[str], compensator: Compensator) -> Array | None:
 
 
 def _tell(voice: Voice, file: TargetFile, assessed: Assessed, bench: Bench, out: Path) -> None:
-    point = "target" if bench.to_target else "tool"
     found, commands = summary(assessed), assessed.commands
     missed = [
         {"id": name, "reason": reason, "nearest_mm": 1000 * float(distance) if np.isfinite(distance) else None}
@@ -126,7 +107,7 @@ def _tell(voice: Voice, file: TargetFile, assessed: Assessed, bench: Bench, out:
     set_aside = [{"row": each.row, "reason": each.reason} for each in file.dataset.set_aside]
     offset = None if bench.target is None else [1000 * float(x) for x in bench.target.tool_T_target[:3, 3]]
     voice.result(
-        {**found, "point": point, "target_mm": offset, "missed": missed, "set_aside": set_aside, "out": str(out)}
+        {**found, "point": bench.point, "target_mm": offset, "missed": missed, "set_aside": set_aside, "out": str(out)}
     )
     for each in missed[:_SHOWN]:
         away = each["nearest_mm"]
@@ -136,7 +117,7 @@ def _tell(voice: Voice, file: TargetFile, assessed: Assessed, bench: Bench, out:
     for cell in set_aside[:_SHOWN]:
         voice.warn(f"row {cell['row']} is set aside: {cell['reason']}")
     voice.out.print(
-        f"{found['had']} of {found['targets']} targets are reached, {_ARRIVES[point]}: {out}",
+        f"{found['had']} of {found['targets']} targets are reached, {_ARRIVES[bench.point]}: {out}",
         markup=False,
         soft_wrap=True,
     )

@@ -7,12 +7,13 @@ from pathlib import Path
 import click
 import numpy as np
 
-from armcal.cli.common import Voice, accept, spare_inputs, speaking
+from armcal.cli.common import Voice, accept, point, spare_inputs, speaking, warn_of_target
 from armcal.plugins import discover
 from armcal.run.compensate import Bench
 from armcal.run.correction_table import correction_table as made_table
 from armcal.run.correction_table import read_table_settings, write_table
 from armcal.use.calibration import Calibration
+from armcal.use.measured_point import Point
 
 
 @click.command("correction-table")
@@ -21,10 +22,18 @@ from armcal.use.calibration import Calibration
 @click.option("--out", required=True, type=click.Path(path_type=Path), help="The CSV to write.")
 @click.option("--arm", metavar="NAME", help="Which arm, where there are several.")
 @click.option("--within", type=click.Path(path_type=Path), help="A configuration whose plan has limits and clearance.")
+@point
 @accept
 @speaking
 def correction_table(
-    voice: Voice, calibration: Path, grid: Path, out: Path, arm: str | None, within: Path | None, accept: bool
+    voice: Voice,
+    calibration: Path,
+    grid: Path,
+    out: Path,
+    arm: str | None,
+    within: Path | None,
+    point: Point | None,
+    accept: bool,
 ) -> None:
     """Make a table of what to tell a controller that takes the arm in CALIBRATION for the nominal one."""
     spare_inputs(out, calibration, grid, within)
@@ -33,7 +42,9 @@ def correction_table(
     settings = read_table_settings(grid)
     loaded = Calibration.load(calibration, registry, accept)
     loaded.require_payload(settings.payload is not None)
-    bench = Bench.of(loaded, arm, within, "nearest", registry)
+    bench = Bench.of(loaded, arm, within, "nearest", registry, point or "tool")
+    if point is None:
+        warn_of_target(voice, "this table brings", bench.target)
     table = made_table(bench.compensator(), bench.nominal(), settings)
     write_table(out, table)
     with_table, without = (1000 * column[np.isfinite(column)] for column in table.tried.T)
@@ -46,7 +57,7 @@ def correction_table(
         "error_95_mm": float(np.percentile(with_table, 95)) if with_table.size else None,
         "nominal_error_mm": float(without.mean()) if without.size else None,
     }
-    voice.result({**found, "out": str(out)})
+    voice.result({**found, "point": bench.point, "out": str(out)})
     voice.out.print(f"{found['had']} of {found['nodes']} nodes are had: {out}", markup=False, soft_wrap=True)
     if not with_table.size:
         voice.warn("no cell has all its corners: nothing between the nodes could be tried")

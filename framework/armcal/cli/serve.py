@@ -12,7 +12,7 @@ from typing import Any, get_args
 
 import click
 
-from armcal.cli.common import Voice, accept, speaking
+from armcal.cli.common import Voice, accept, point, speaking
 from armcal.errors import InputError
 from armcal.online.running.outputs import as_line
 from armcal.online.running.signals import Signals
@@ -23,6 +23,7 @@ from armcal.serve.transports.standard import StandardStreams
 from armcal.serve.transports.unix import UnixSocket
 from armcal.solve.kernel import EvaluatorChoice
 from armcal.use.compensation.request import Redundancy
+from armcal.use.measured_point import Point
 
 _ALWAYS = ("refused", "worker_lost", "missing", "status", "notice")
 """Events that are told although all is to be quiet."""
@@ -53,6 +54,7 @@ _ALWAYS = ("refused", "worker_lost", "missing", "status", "notice")
     show_default=True,
     help="Compiled C where a compiler is found: answers come sooner, a new calibration some seconds later.",
 )
+@point
 @accept
 @speaking
 def serve(
@@ -64,6 +66,7 @@ def serve(
     redundancy: Redundancy,
     workers: int | None,
     evaluator: EvaluatorChoice,
+    point: Point | None,
     accept: bool,
 ) -> None:
     """Answer requests by CALIBRATION, a JSON object a line: forward, compensate, status.
@@ -78,7 +81,8 @@ def serve(
     if not openings:
         openings.append(_standard_streams())
     said = _Said(voice, StandardOutput(getattr(sys.stderr, "buffer", None), patience_s=0.0))
-    how = {"redundancy": redundancy, "within": str(within or ""), "evaluator": evaluator, "accept": accept}
+    how: dict[str, Any] = {"redundancy": redundancy, "within": str(within or ""), "evaluator": evaluator}
+    how |= {"point": point or "tool", "accept": accept}
     with Signals() as signals:
         Server(calibration, workers or min(2, os.cpu_count() or 1), how, openings, said.tell).run(signals)
 

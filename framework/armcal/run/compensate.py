@@ -12,7 +12,6 @@ import numpy as np
 from armcal.arm.loading import LOAD_CHANNELS
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
-from armcal.base.parameters import Parameters
 from armcal.errors import ArmcalError, ConfigError
 from armcal.plugins import PluginRegistry
 from armcal.run.target_file import TargetFile, read_targets
@@ -21,8 +20,8 @@ from armcal.solve.kernel import EvaluatorChoice
 from armcal.use.calibration import Calibration, arm_named
 from armcal.use.compensation.compensator import Compensator
 from armcal.use.compensation.request import Commands, Options, Redundancy, Targets
-from armcal.use.measured_point import MeasuredPoint, measured_point
-from armcal.use.tool_expression import APPROACH, ToolExpression, arm_expression
+from armcal.use.measured_point import MeasuredPoint, Point, measured_point, pointed
+from armcal.use.tool_expression import APPROACH, arm_expression
 
 _WORTH_COMPILING = 5000
 """From this many targets on, waiting for the compiler costs less than doing without it."""
@@ -59,7 +58,7 @@ class Bench:
         options: of compensation.
         space: where it may go.
         target: what its instrument reads, if it reads a point of the tool.
-        to_target: whether that point is brought to targets, and not the tool's origin.
+        point: what is brought to targets.
     """
 
     calibration: Calibration
@@ -67,7 +66,7 @@ class Bench:
     options: Options
     space: Workspace
     target: MeasuredPoint | None
-    to_target: bool = False
+    point: Point = "tool"
 
     @classmethod
     def of(
@@ -77,25 +76,19 @@ class Bench:
         within: Path | None,
         redundancy: Redundancy,
         registry: PluginRegistry,
-        to_target: bool = False,
+        point: Point = "tool",
     ) -> Bench:
         """One arm (the only one if no name is given), with the limits and the clearance of a configuration's plan.
 
         Raises:
-            ConfigError: no such arm, or several and no name; the configuration plans for another arm; or no measurement
-                reads the target that shall be brought.
+            ConfigError: no such arm, or several and no name; or the configuration plans for another arm.
         """
         name = arm_named(calibration, arm)
         joints = tuple(calibration.system.arms[name].commanded)
         space = workspace_of(within, joints, registry) if within else Workspace()
         target = measured_point(calibration.system, name, calibration.parameters)
-        if to_target and target is None:
-            raise ConfigError(
-                f"no measurement reads the place of a target on the tool of {name!r} in the base frame.",
-                hint="Leave --point target out: then the tool frame's origin arrives.",
-            )
         options = Options(limits=space.limits, redundancy=redundancy)
-        return cls(calibration, name, options, space, target, to_target)
+        return cls(calibration, name, options, space, target, point)
 
     def read(self, path: Path, registry: PluginRegistry) -> TargetFile:
         """Targets from a CSV.
@@ -112,14 +105,13 @@ class Bench:
         """What finds commands, for targets that tell of such surroundings.
 
         Raises:
-            ConfigError: the limits leave a joint no room.
+            ConfigError: the limits leave a joint no room, or no measurement reads the target that shall arrive.
         """
         told = () if targets is None else tuple(targets.conditions)
         choice: EvaluatorChoice = "compiled" if targets is not None and len(targets) >= _WORTH_COMPILING else "auto"
         try:
-            parameters = self.calibration.parameters
-            expression = self._pointed(self.calibration.expression(self.arm, told), parameters)
-            return Compensator(expression, parameters, self.options, self.space.allowed, choice)
+            expression = self.calibration.expression(self.arm, told, self.point)
+            return Compensator(expression, self.calibration.parameters, self.options, self.space.allowed, choice)
         except ValueError as fault:
             raise ConfigError(f"{fault}.", hint="Correct the limits in the plan.") from fault
 
@@ -128,13 +120,9 @@ class Bench:
         stated = np.array([entry.nominal for entry in self.calibration.record.parameters])
         plain = replace(self.calibration.system.arms[self.arm], effects={}, masses=())
         nominal = self.calibration.parameters.with_nominal(stated)
-        expression = arm_expression(plain, nominal, self.calibration.system.environment)
-        return Compensator(self._pointed(expression, nominal), nominal, Options(limits=self.options.limits))
-
-    def _pointed(self, expression: ToolExpression, parameters: Parameters) -> ToolExpression:
-        """With the measured target where the tool's frame is, if that is to arrive."""
-        point = measured_point(self.calibration.system, self.arm, parameters) if self.to_target else None
-        return expression if point is None else expression.at(point.transform)
+        system = self.calibration.system
+        expression = pointed(arm_expression(plain, nominal, system.environment), self.point, system, nominal)
+        return Compensator(expression, nominal, Options(limits=self.options.limits))
 
 
 def assess(

@@ -19,6 +19,7 @@ from armcal.serve.served_arm import TEMPERATURE, TEMPERATURE_KEY, ServedArm
 from armcal.solve.kernel import EvaluatorChoice
 from armcal.use.calibration import Calibration, lost_calibration
 from armcal.use.compensation.request import Options, Redundancy
+from armcal.use.measured_point import Point
 
 _TRIES = 20
 _LONGEST_S = 1.0
@@ -37,6 +38,7 @@ class Order:
         arm: the identity that its arm must have; empty: any.
         redundancy: which of many commands.
         within: a configuration whose plan has limits and clearance; empty: none.
+        point: what forward and compensate are about: the tool's frame, or the target that was measured.
         evaluator: ``compiled`` where a compiler is found, or ``interpreted``.
         accept: whether one whose level is lost answers as any other; else the first is refused, and a later
             one, which says of those before it that they no longer hold either, answers with that error.
@@ -48,6 +50,7 @@ class Order:
     arm: str = ""
     redundancy: Redundancy = "nearest"
     within: str = ""
+    point: Point = "tool"
     evaluator: EvaluatorChoice = "compiled"
     accept: bool = False
 
@@ -121,7 +124,7 @@ def _arm(calibration: Calibration, name: str, order: Order) -> ServedArm:
     options = Options(limits=limits, redundancy=order.redundancy)
     try:
         # A request never waits for a compiler, so the compiler is waited for here.
-        parts: dict[str, Any] = {"allowed": allowed, "choice": order.evaluator}
+        parts: dict[str, Any] = {"allowed": allowed, "choice": order.evaluator, "point": order.point}
         compensator, heated = calibration.compensator(name, options, **parts), None
         if TEMPERATURE in arm.conditions:
             heated = calibration.compensator(name, options, (TEMPERATURE,), **parts)
@@ -129,7 +132,7 @@ def _arm(calibration: Calibration, name: str, order: Order) -> ServedArm:
         hint = "Correct the limits in the plan."
         raise ConfigError(f"{fault}.", where=Location(order.within or order.shown), hint=hint) from fault
     needs_payload = bool(arm.deflection_size) and statics.payload is None
-    return ServedArm(name, dict(arm.commanded), compensator, needs_payload, heated)
+    return ServedArm(name, dict(arm.commanded), compensator, needs_payload, heated, order.point)
 
 
 def _space(within: str, joints: tuple[str, ...]) -> tuple[Mapping[str, tuple[float, float]], Any]:

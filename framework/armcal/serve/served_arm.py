@@ -17,6 +17,7 @@ from armcal.serve.protocol import Acting
 
 if TYPE_CHECKING:
     from armcal.use.compensation.compensator import Compensator
+    from armcal.use.measured_point import Point
 
 TEMPERATURE = "temperature"
 TEMPERATURE_KEY = "temperature_C"
@@ -35,6 +36,7 @@ class ServedArm:
         compensator: of the calibration as it was loaded.
         needs_payload: whether it gives under load and nothing says what hangs on it.
         heated: the compensator of requests that tell the temperature; None where the arm does not change with it.
+        point: what requests and answers are about: the tool's frame, or the target that was measured.
     """
 
     name: str
@@ -42,6 +44,7 @@ class ServedArm:
     compensator: Compensator
     needs_payload: bool
     heated: Compensator | None = None
+    point: Point = "tool"
 
     @property
     def joints(self) -> tuple[str, ...]:
@@ -54,10 +57,10 @@ class ServedArm:
         return set(self.dimensions.values()) <= {"angle"}
 
     @property
-    def shown(self) -> Mapping[str, list[str]]:
-        """What a client can know of it: its joints, and the keys of the surroundings that it changes with."""
-        joints = [*self.joints]
-        return {"joints": joints} if self.heated is None else {"joints": joints, "conditions": [TEMPERATURE_KEY]}
+    def shown(self) -> Mapping[str, str | list[str]]:
+        """What a client can know of it: joints, what arrives, and the keys of the surroundings that it changes with."""
+        found: dict[str, str | list[str]] = {"joints": [*self.joints], "point": self.point}
+        return found if self.heated is None else {**found, "conditions": [TEMPERATURE_KEY]}
 
     def angles(self, given: Sequence[Sequence[float] | Mapping[str, float]], field: str) -> Array:
         """Postures (N x n; rad) from angles in order or by name.

@@ -26,6 +26,7 @@ from armcal.use.calibration_file import CalibrationFile, identity_of, read_recor
 from armcal.use.compensation.compensator import Compensator
 from armcal.use.compensation.request import Commands, Options
 from armcal.use.intervals import PlusMinus, Uncertainty
+from armcal.use.measured_point import Point, pointed
 from armcal.use.physics import SHARE, UNSTATED_M, check_record, components, differences, movement, predict, readable
 from armcal.use.tool_expression import ToolExpression, arm_expression
 
@@ -247,27 +248,39 @@ class Calibration:
             )
         return self.uncertainty.plus_minus(commands, recording)
 
-    def expression(self, arm: str | None = None, conditions: Sequence[str] = ()) -> ToolExpression:
+    def expression(
+        self, arm: str | None = None, conditions: Sequence[str] = (), point: Point = "tool"
+    ) -> ToolExpression:
         """One arm (the first if no name is given) as expressions of commands, load and elastic state.
+
+        ``point`` says what is where the tool's frame is: that frame itself, or the ``target`` that was measured.
 
         Raises:
             ValueError: no such arm.
+            ConfigError: no measurement reads the target.
         """
         system, name = self.system, self._named(arm)
-        return arm_expression(system.arms[name], self.parameters, system.environment, conditions)
+        found = arm_expression(system.arms[name], self.parameters, system.environment, conditions)
+        return pointed(found, point, system, self.parameters)
 
     def compensator(
-        self, arm: str | None = None, options: Options | None = None, conditions: Sequence[str] = (), **parts: Any
+        self,
+        arm: str | None = None,
+        options: Options | None = None,
+        conditions: Sequence[str] = (),
+        point: Point = "tool",
+        **parts: Any,
     ) -> Compensator:
         """What finds commands for one arm (the first if no name is given); build it once and ask it often.
 
-        ``conditions`` of the surroundings are those that targets will tell; ``parts`` are further ones of
-        ``Compensator``.
+        ``conditions`` of the surroundings are those that targets will tell, ``point`` is what arrives at them (see
+        ``expression``); ``parts`` are further ones of ``Compensator``.
 
         Raises:
             ValueError: no such arm, or limits of a joint that it does not have.
+            ConfigError: no measurement reads the target that shall arrive.
         """
-        return Compensator(self.expression(arm, conditions), self.parameters, options, **parts)
+        return Compensator(self.expression(arm, conditions, point), self.parameters, options, **parts)
 
     def compensate(
         self,
@@ -276,9 +289,12 @@ class Calibration:
         start: Array | None = None,
         arm: str | None = None,
         options: Options | None = None,
+        point: Point = "tool",
         **told: Any,
     ) -> Commands:
         """What to command so that the tool is at positions (N x 3; m; base frame), turned as base_R_tool (N x 3 x 3).
+
+        With the ``point`` ``target`` the target that was measured arrives there, in place of the tool frame's origin.
 
         ``start`` (n or N x n; rad or m) is where the arm comes from, ``told`` the rest of ``Compensator.targets``:
         payload, gravity, approach, conditions of the surroundings. Who asks often keeps a ``compensator``.
@@ -286,9 +302,10 @@ class Calibration:
         Raises:
             ValueError: no such arm, limits of a joint that it does not have, or arrays of other shapes.
             DataError: the arm is elastic and nothing says what hangs on the tool.
+            ConfigError: no measurement reads the target that shall arrive.
         """
         self.require_payload(told.get("payload") is not None)
-        compensator = self.compensator(arm, options, tuple(told.get("conditions") or ()))
+        compensator = self.compensator(arm, options, tuple(told.get("conditions") or ()), point)
         return compensator.solve(compensator.targets(positions, rotations, **told), start)
 
     def _named(self, arm: str | None) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Literal
 
 import casadi as ca
 import numpy as np
@@ -15,7 +16,12 @@ from armcal.base.parameters import Parameters
 from armcal.base.quaternions import rotation_matrix
 from armcal.base.se3 import Transform
 from armcal.config.system import System
+from armcal.errors import ConfigError
 from armcal.measure.measurement import Measurement
+from armcal.use.tool_expression import ToolExpression
+
+Point = Literal["tool", "target"]
+"""What arrives: the origin of the tool's frame, or the target that was measured."""
 
 _QUATERNION = ("qw", "qx", "qy", "qz")
 _SAME_M = 1e-9
@@ -56,6 +62,23 @@ def measured_point(system: System, name: str, parameters: Parameters) -> Measure
         if np.abs(first - second).max() <= _SAME_M:
             return MeasuredPoint(instance, first)
     return None
+
+
+def pointed(expression: ToolExpression, point: Point, system: System, parameters: Parameters) -> ToolExpression:
+    """The arm with the measured target where the tool's frame is, if that is the point that arrives.
+
+    Raises:
+        ConfigError: no measurement reads it.
+    """
+    if point == "tool":
+        return expression
+    target = measured_point(system, expression.name, parameters)
+    if target is None:
+        raise ConfigError(
+            f"no measurement reads the place of a target on the tool of {expression.name!r} in the base frame.",
+            hint="Leave the point target out: then the tool frame's origin arrives.",
+        )
+    return expression.at(target.transform)
 
 
 def _on_tool(
