@@ -15,11 +15,12 @@ import pytest
 import yaml
 from armcal.base.dataset import Dataset
 from armcal.cli.main import cli
-from armcal.errors import ConfigError
+from armcal.cli.mission import _write
+from armcal.errors import ConfigError, InputError
 from armcal.online.mission.errors import error_curve
 from armcal.online.mission.files import curve_text, figures, schedule, truth_text
 from armcal.online.mission.judge import Judgement, judge
-from armcal.online.mission.mission import before_launch, recalibrated, simulated
+from armcal.online.mission.mission import MissionResult, before_launch, recalibrated, simulated
 from armcal.online.mission.settings import MissionPlan
 from armcal.online.mission.source import MissionSource, PowerCutError
 from armcal.online.mission.story import Story
@@ -363,3 +364,13 @@ def test_records_of_the_mission_are_what_was_simulated(short: tuple[Path, dict[s
     assert [row["pose_id"] for row in rows] == list(mission().records.ids)
     read = np.array([[float(row[f"{axis}_mm"]) for axis in "xyz"] for row in rows]) / 1000
     assert np.allclose(read.T, mission().records.stacked([f"tracker.{axis}" for axis in "xyz"]), atol=1e-12)
+
+
+def test_a_mission_writes_through_no_link(start: Calibration, knowing: tuple[Story, Judgement], tmp_path: Path) -> None:
+    """One that stands by its end where one of its files goes, however it came there."""
+    folder, elsewhere = tmp_path / "out", tmp_path / "elsewhere.csv"
+    folder.mkdir()
+    (folder / "mission.csv").symlink_to(elsewhere)
+    with pytest.raises(InputError, match=r"mission\.csv: it is a link"):
+        _write(folder, plan(), MissionResult(mission(), start, *knowing), {})
+    assert not elsewhere.exists()

@@ -226,3 +226,15 @@ def test_real_runs_killed_at_random_moments_leave_one_set_or_the_other(tmp_path:
         assert content["created"]
     subprocess.run(command, check=True)
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+def test_a_link_that_leads_nowhere_is_moved_away_as_a_file_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Left there, what is written later under its name would be written elsewhere."""
+    monkeypatch.setattr(folders, "_movable", lambda folder: False)  # as in the working directory
+    folder, elsewhere = tmp_path / "run", tmp_path / "elsewhere.txt"
+    folder.mkdir()
+    (folder / "notes.txt").symlink_to(elsewhere)
+    with reserved(folder, OURS) as held:
+        held.place({})
+    assert not os.path.lexists(folder / "notes.txt") and (folder / "earlier" / "1" / "notes.txt").is_symlink()
+    assert not elsewhere.exists()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import threading
 from pathlib import Path
 
 import pytest
@@ -95,7 +96,12 @@ def test_a_new_file_that_grows_is_read_when_it_rests(watch: CalibrationWatch, cl
 
 @pytest.mark.parametrize(
     ("text", "why"),
-    [("", "empty"), ("cut", "no end"), ("recalibrated: null\n", "the line that ends"), ("x" * (MAX_BYTES + 1), "larger")],
+    [
+        ("", "empty"),
+        ("cut", "no end"),
+        ("recalibrated: null\n", "the line that ends"),
+        ("x" * (MAX_BYTES + 1), "larger"),
+    ],
 )
 def test_what_is_not_whole_is_refused_and_the_next_is_taken(
     watch: CalibrationWatch, clock: Clock, text: str, why: str
@@ -148,3 +154,19 @@ def test_a_file_that_cannot_be_had_at_the_start_is_an_error(tmp_path: Path) -> N
     for name in ("none", ".", "empty", "pipe"):
         with pytest.raises(ConfigError):
             CalibrationWatch(tmp_path / name).first()
+
+
+def test_a_pipe_in_the_place_of_the_calibration_is_refused_and_not_waited_for(
+    watch: CalibrationWatch, clock: Clock
+) -> None:
+    """Nobody writes to it: to open it as a file is opened would hold the server up for ever."""
+    watch.path.unlink()
+    os.mkfifo(watch.path)
+    looking = threading.Thread(target=looks, args=(watch, clock, 2), daemon=True)
+    looking.start()
+    looking.join(5)
+    assert not looking.is_alive()
+    assert watch.state == "refused" and watch.why == "it is a device or pipe, expected a calibration.yaml."
+    watch.path.unlink()
+    put(watch.path, SECOND)
+    assert looks(watch, clock, QUIET_S + 2) == [SECOND.encode()]  # it may have the pipe's inode

@@ -433,3 +433,20 @@ def test_memory_stays_flat_over_a_long_line_and_many_records(tmp_path: Path) -> 
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert count == 5001 and peak < 12_000_000
+
+
+def test_a_pipe_in_the_place_of_a_followed_file_is_not_waited_for(tmp_path: Path) -> None:
+    """It counts as a file that is away; what takes its place is read."""
+    path = tmp_path / "poses.csv"
+    path.write_text(table(2))
+    source = CsvFile(path, rows(), "wait")
+    assert len(everything(source)) == 2
+    path.unlink()
+    os.mkfifo(path)
+    looking = threading.Thread(target=everything, args=(source,), daemon=True)
+    looking.start()
+    looking.join(5)
+    assert not looking.is_alive()
+    path.unlink()
+    path.write_text(table(3, 7))
+    assert len(everything(source)) == 3

@@ -12,7 +12,9 @@ from armcal.errors import DataError, InputError, Location
 _UNITS = ((1 << 30, "GiB"), (1 << 20, "MiB"), (1 << 10, "KiB"))
 
 
-def input_file(path: Path, most: int, expected: str, refusal: type[InputError] = DataError) -> BinaryIO:
+def input_file(
+    path: Path, most: int, expected: str, refusal: type[InputError] = DataError, buffering: int = -1
+) -> BinaryIO:
     """The file, opened to be read; its size was checked.
 
     A pipe is opened without waiting for its writer, and refused like a device: neither says how much it holds.
@@ -22,6 +24,7 @@ def input_file(path: Path, most: int, expected: str, refusal: type[InputError] =
         most: bytes that it may have.
         expected: what it should be, with its article.
         refusal: what is raised.
+        buffering: as of ``open``.
 
     Raises:
         InputError: of the kind ``refusal``: there is none, it is a directory, a device or a pipe, it is too large, or
@@ -47,7 +50,7 @@ def input_file(path: Path, most: int, expected: str, refusal: type[InputError] =
     if message:
         os.close(descriptor)
         raise refusal(message, where=where, hint=hint)
-    return os.fdopen(descriptor, "rb")
+    return os.fdopen(descriptor, "rb", buffering)
 
 
 def input_bytes(path: Path, most: int, expected: str, refusal: type[InputError] = DataError) -> bytes:

@@ -10,6 +10,7 @@ import click
 from rich.table import Table
 
 from armcal.base.config_text import as_json
+from armcal.base.plain_files import check_output
 from armcal.cli.common import Voice, overrides, speaking
 from armcal.cli.mission_session import loop_session
 from armcal.errors import InputError, Location
@@ -62,10 +63,10 @@ def _write(folder: Path, plan: MissionPlan, result: MissionResult, told: dict[st
         "mission.json": as_json(told) + "\n",
     }
     try:
-        for name, text in texts.items():
-            (folder / name).write_text(text, encoding="utf-8")
         picture = mission_figure(result.mission, result.judgement, plan.experiment.name)
-        (folder / "mission.png").write_bytes(picture)
+        for name, content in {**{n: text.encode() for n, text in texts.items()}, "mission.png": picture}.items():
+            check_output(folder / name, InputError)
+            (folder / name).write_bytes(content)
     except OSError as fault:
         raise InputError(
             f"it cannot be written ({fault.strerror or fault}).",

@@ -58,7 +58,7 @@ class Reservation:
                     return
             else:
                 staging = _staged(texts, folder, _STAGING)
-            _one_by_one(staging, folder, [name for name in self.ours if (folder / name).exists()], list(texts))
+            _one_by_one(staging, folder, [name for name in self.ours if os.path.lexists(folder / name)], list(texts))
         except OSError as fault:
             raise InputError(
                 f"it cannot be written ({fault}).",

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO, Literal
 
-from armcal.base.plain_files import size_text
+from armcal.base.plain_files import input_file
 from armcal.config.yaml_source import MAX_BYTES
 from armcal.errors import ConfigError, Location
 
@@ -137,6 +137,9 @@ class CalibrationWatch:
         except (OSError, ValueError) as fault:
             self._say("refused", f"the file cannot be read ({fault}).")
             return None
+        except ConfigError as fault:
+            self._say("refused", fault.message)
+            return None
         if snapshot is None:
             return None
         if snapshot.sha256 == self._taken_sha256:
@@ -153,11 +156,11 @@ class CalibrationWatch:
         return snapshot
 
     def _read(self) -> Snapshot | None:
-        """What is in the file; None if it changed meanwhile."""
-        file = self.path.open("rb")
+        """What is in the file; None if it changed meanwhile. A pipe that took its place is refused, not waited for."""
+        file = input_file(self.path, MAX_BYTES, "a calibration.yaml", ConfigError)
         try:
             before = _key(os.fstat(file.fileno()))
-            data = file.read(MAX_BYTES + 1)
+            data = file.read(MAX_BYTES)
             if _key(os.fstat(file.fileno())) != before:
                 file.close()
                 return None
@@ -178,8 +181,6 @@ def _not_whole(snapshot: Snapshot) -> str:
     """What shows at once that it is no whole calibration; empty if nothing does."""
     if not snapshot.data:
         return "the file is empty."
-    if len(snapshot.data) > MAX_BYTES:
-        return f"the file is larger than {size_text(MAX_BYTES)}: this is no calibration."
     if not snapshot.data.endswith(b"\n"):
         return "the last line of the file has no end: this is no whole calibration."
     if not _LAST_LINE.search(snapshot.data):

@@ -9,7 +9,8 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from armcal.errors import ConfigError, NotConvergedError
+from armcal.base.plain_files import check_output
+from armcal.errors import ConfigError, InputError, NotConvergedError
 from armcal.measure.csv_writer import write_csv
 from armcal.online.mission.errors import error_curve
 from armcal.online.mission.judge import Judgement, judge
@@ -100,6 +101,7 @@ def before_launch(plan: MissionPlan, folder: Path, progress: Progress = no_progr
             "the calibration before launch did not converge.", hint=f"Try armcal run {settings.experiment}."
         )
     path = folder / CALIBRATION
+    check_output(path, InputError)
     path.write_text(sealed(calibration_content(result, again)), encoding="utf-8")
     return path
 

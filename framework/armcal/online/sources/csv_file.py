@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import os
+import sys
 import time
 from collections.abc import Mapping
 from pathlib import Path
 from stat import S_ISREG
 from zlib import crc32
 
+from armcal.base.plain_files import input_file
 from armcal.errors import DataError, InputError, Location
 from armcal.online.sources.incoming import Incoming
 from armcal.online.sources.line_parser import Kind, LineParser
@@ -91,8 +93,8 @@ class CsvFile:
     def _opened(self) -> LineReading | None:
         """The file, once its first lines are there, which tell which file it is."""
         try:
-            file = self._path.open("rb", buffering=0)
-        except OSError:
+            file = input_file(self._path, sys.maxsize, "a file of records", buffering=0)
+        except InputError:  # it is away, or a pipe or device stands in its place: nobody waits for those
             return None
         head = file.read(2 * MAX_LINE_BYTES) or b""
         kind = _kind(self._path)
