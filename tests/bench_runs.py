@@ -66,6 +66,8 @@ class BenchRun:
         port = free_port()
         self.bench.mkdir(parents=True, exist_ok=True)
         ports = (f"bench.tracker.port={port}", f"bench.simulator.tracker.port={port}")
+        if self.config == CONFIG:  # it holds the arm at the end; these runs see the servos let go unless they say so
+            ports = (*ports, "bench.acquisition.at_end=release")
         self.experiment = Experiment.load(self.config, (*ports, *self.sets, *overrides_for(self.bench)))
         self.plan = write_plan(self.folder / "plan.csv")
 

@@ -24,7 +24,7 @@ from tests.bench_runs import CONFIG, BenchRun, free_port, positions, write_plan
 
 NEAR = (0, 50, 0, 100, 0, 0)
 """Bent down to the table."""
-ACQUIRE = (sys.executable, "-m", "armcal.cli", "acquire", str(CONFIG))
+ACQUIRE = (sys.executable, "-m", "armcal.cli", "acquire", str(CONFIG), "--set", "bench.acquisition.at_end=release")
 SETS = ("bench.acquisition.period_s=0.04",)
 
 
@@ -70,6 +70,11 @@ class TestDryRun:
         assert told["poses"] == 4 and told["resting_s"] == 0 and told["left_out"] == []
         slowest = told["travel_deg"] / 20
         assert told["seconds"] == pytest.approx(slowest + 4 * 2.0)
+
+    def test_the_shipped_bench_lets_no_arm_fall_at_its_end(self, plan: Path) -> None:
+        """Let go where it parks, joint 2 would fall by 166 deg."""
+        told = json.loads(armcal("acquire", CONFIG, "--plan", plan, "--dry-run", "--json", "-q").output)
+        assert "drop" not in [hazard["kind"] for hazard in told["hazards"]]
 
 
 class TestRefusedBeforeAnythingMoves:
