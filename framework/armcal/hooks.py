@@ -15,31 +15,21 @@ from typing import Any, Protocol
 import pluggy
 
 PROJECT = "armcal"
-CONTRACT_VERSION = "1.4"
-"""Version of the plugin contract: the major number changes when an existing plugin would break."""
-WRITTEN_FOR = "ARMCAL_CONTRACT"
-"""What a registration module may call the contract that it was written for: ``ARMCAL_CONTRACT = "1.4"``."""
 
 hookspec = pluggy.HookspecMarker(PROJECT)
 hookimpl = pluggy.HookimplMarker(PROJECT)
 
 
-class ContractDeprecationWarning(DeprecationWarning):
-    """Something of the contract still works, and goes with its next major version."""
-
-
 class Register(Protocol):
     """What registration hooks are handed."""
 
-    def __call__(self, name: str, target: str, summary: str = "", deprecated: str = "") -> None:
+    def __call__(self, name: str, target: str, summary: str = "") -> None:
         """Announce a component.
 
         Args:
             name: what a configuration calls it (``type: NAME``).
             target: ``module:attribute`` of its class.
             summary: one line for ``armcal plugins list``.
-            deprecated: what to use in its place (``use ball_in_socket``); whoever still names it is warned. Since
-                contract 1.4.
         """
 
 
@@ -62,106 +52,67 @@ class ComponentKind:
 
 @hookspec
 def armcal_register_models(register: Register) -> None:
-    """Arm models: the chain of joints, as an expression of its parameters.
-
-    Since contract 1.0.
-    """
+    """Arm models: the chain of joints, as an expression of its parameters."""
 
 
 @hookspec
 def armcal_register_effects(register: Register) -> None:
-    """Joint effects: what stands between the commanded and the real displacement of a joint.
-
-    Since contract 1.0.
-    """
+    """Joint effects: what stands between the commanded and the real displacement of a joint."""
 
 
 @hookspec
 def armcal_register_measurements(register: Register) -> None:
-    """Measurements: what an instrument or a contact says of the arm in one record, or in two.
-
-    Since contract 1.0.
-    """
+    """Measurements: what an instrument or a contact says of the arm in one record, or in two."""
 
 
 @hookspec
 def armcal_register_readers(register: Register) -> None:
-    """Readers: datasets from files.
-
-    Since contract 1.0.
-    """
+    """Readers: datasets from files."""
 
 
 @hookspec
 def armcal_register_estimators(register: Register) -> None:
-    """Batch estimators: all records at once.
-
-    Since contract 1.0.
-    """
+    """Batch estimators: all records at once."""
 
 
 @hookspec
 def armcal_register_online_estimators(register: Register) -> None:
-    """Online estimators: one record at a time.
-
-    Since contract 1.2.
-    """
+    """Online estimators: one record at a time."""
 
 
 @hookspec
 def armcal_register_simulators(register: Register) -> None:
-    """Simulators: datasets from a stated truth.
-
-    Since contract 1.0.
-    """
+    """Simulators: datasets from a stated truth."""
 
 
 @hookspec
 def armcal_register_exporters(register: Register) -> None:
-    """Exporters: a calibrated arm as a file of another program.
-
-    Since contract 1.1.
-    """
+    """Exporters: a calibrated arm as a file of another program."""
 
 
 @hookspec
 def armcal_register_links(register: Register) -> None:
-    """Links: what carries bytes to a servo board.
-
-    Since contract 1.3.
-    """
+    """Links: what carries bytes to a servo board."""
 
 
 @hookspec
 def armcal_register_devices(register: Register) -> None:
-    """Devices: what moves joints, over a link.
-
-    Since contract 1.3.
-    """
+    """Devices: what moves joints, over a link."""
 
 
 @hookspec
 def armcal_register_trackers(register: Register) -> None:
-    """Live trackers: where bodies are, frame by frame.
-
-    Since contract 1.3.
-    """
+    """Live trackers: where bodies are, frame by frame."""
 
 
 @hookspec
 def armcal_register_joint_streams(register: Register) -> None:
-    """Live joint readings of arms that are guided by hand.
-
-    Since contract 1.3.
-    """
+    """Live joint readings of arms that are guided by hand."""
 
 
 @hookspec
 def armcal_register_benches(register: Register) -> None:
-    """Simulated benches: what stands in for board, arm and tracker in a rehearsal.
-
-    Since contract 1.3.
-    """
+    """Simulated benches: what stands in for board, arm and tracker in a rehearsal."""
 
 
 @hookspec
@@ -171,8 +122,6 @@ def armcal_run_started(name: str, records: int) -> None:
     Args:
         name: of the experiment.
         records: how many records it begins with.
-
-    Since contract 1.0.
     """
 
 
@@ -184,8 +133,6 @@ def armcal_record_rejected(row: int, record_id: str, reason: str) -> None:
         row: where it stood in its source (from 1; the line of a CSV file).
         record_id: as written in the source.
         reason: in words.
-
-    Since contract 1.0.
     """
 
 
@@ -195,8 +142,6 @@ def armcal_estimate_changed(estimate: Any) -> None:
 
     Args:
         estimate: an ``armcal.solve.estimator.Estimate``.
-
-    Since contract 1.0.
     """
 
 
@@ -208,8 +153,6 @@ def armcal_run_ended(name: str, folder: str, converged: bool) -> None:
         name: of the experiment.
         folder: where the results are.
         converged: whether the solver did.
-
-    Since contract 1.0.
     """
 
 
@@ -277,6 +220,3 @@ COMPONENTS: Mapping[str, ComponentKind] = MappingProxyType(
 
 KINDS: Mapping[str, str] = MappingProxyType({kind: component.hook for kind, component in COMPONENTS.items()})
 """The kinds of component and the hook that registers each."""
-
-DEPRECATED_METHODS: Mapping[str, Mapping[str, str]] = MappingProxyType({})
-"""By kind: methods that a component no longer needs, and what to write in their place. None at present."""

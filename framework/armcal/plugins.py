@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import difflib
 import time
-import warnings
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -16,8 +15,7 @@ import pluggy
 
 from armcal.errors import PluginError
 from armcal.hook_trace import Answer, HookTrace
-from armcal.hooks import ContractDeprecationWarning
-from armcal.registration import Specifications, registered, said
+from armcal.registration import new_manager, registered, said
 
 GROUP = "armcal"
 
@@ -30,8 +28,6 @@ class Component:
         target: ``module:attribute``.
         plugin: the entry point that registered it.
         module: what that entry point names.
-        deprecated: what to use in its place; empty while it is here to stay.
-        deprecated_methods: methods of its kind that are to go, and what to write in their place.
     """
 
     kind: str
@@ -40,29 +36,21 @@ class Component:
     summary: str
     plugin: str
     module: str = ""
-    deprecated: str = ""
-    deprecated_methods: Mapping[str, str] = field(default_factory=dict, repr=False, compare=False)
 
     def load(self) -> Any:
-        """The component's class; a ``ContractDeprecationWarning`` for each of its methods that is to go.
+        """The component's class.
 
         Raises:
             PluginError: its module does not import, or lacks the attribute.
         """
         module, _, attribute = self.target.partition(":")
         try:
-            made = getattr(import_module(module), attribute)
+            return getattr(import_module(module), attribute)
         except (Exception, SystemExit) as fault:  # a plugin may fail in any way; the user is told which and how
             raise PluginError(
                 f"the {self.kind} {self.name!r} of the plugin {self.plugin!r} does not load: {said(fault)}.",
                 hint="Repair or update that plugin.",
             ) from fault
-        for method in (name for name in self.deprecated_methods if hasattr(made, name)):
-            _warn(
-                f"the {self.kind} {self.name!r} of the plugin {self.plugin} has {method}(), which is deprecated: "
-                f"{self.deprecated_methods[method]}."
-            )
-        return made
 
 
 @dataclass(frozen=True)
@@ -72,7 +60,6 @@ class PluginInfo:
     Attributes:
         distribution: that it came with, if any, and ``version`` of that.
         fault: why it is left out; empty if it is not.
-        notices: what it uses of the contract that is to go.
     """
 
     name: str
@@ -80,7 +67,6 @@ class PluginInfo:
     distribution: str
     version: str
     fault: str = ""
-    notices: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -109,7 +95,7 @@ class PluginRegistry:
         return index
 
     def find(self, kind: str, name: str) -> Component:
-        """The component of that kind and name; a ``ContractDeprecationWarning`` if it is to go.
+        """The component of that kind and name.
 
         Raises:
             PluginError: there is none (the nearest and the failed plugins are named), or two offer it.
@@ -119,8 +105,6 @@ class PluginRegistry:
             offered = " and ".join(f"{c.plugin} ({c.target})" for c in found)
             raise PluginError(f"the {kind} {name!r} is offered twice, by {offered}.", hint="Uninstall one of them.")
         if found:
-            if found[0].deprecated:
-                _warn(f"{kind} {name!r} of the plugin {found[0].plugin} is deprecated: {found[0].deprecated}.")
             return found[0]
         known = sorted(n for k, n in self._by_name if k == kind)
         near = difflib.get_close_matches(name, known, n=1)
@@ -151,26 +135,20 @@ def _spoken(kind: str) -> str:
     return f"{'an' if name[0] in 'aeiou' else 'a'} {name}"
 
 
-def _warn(text: str) -> None:
-    warnings.warn(text, ContractDeprecationWarning, stacklevel=3)
-
-
-def discover(found: Iterable[EntryPoint] | None = None, contract: Specifications | None = None) -> PluginRegistry:
+def discover(found: Iterable[EntryPoint] | None = None) -> PluginRegistry:
     """Load every registration module.
 
-    A plugin that fails to import, has a hook that armcal does not know, or is written for a contract that this armcal
-    has not, is listed with its fault and breaks nothing else. What a plugin uses that is to go is a
-    ``ContractDeprecationWarning``. Calls are traced as the environment variable ``ARMCAL_TRACE_HOOKS`` asks now.
+    A plugin that fails to import, or has a hook that armcal does not know, is listed with its fault and breaks nothing
+    else. Calls are traced as the environment variable ``ARMCAL_TRACE_HOOKS`` asks now.
 
     Raises:
         ConfigError: that variable names a file that cannot be written.
     """
-    contract, trace = contract or Specifications(), HookTrace.from_environment()
-    manager = contract.manager()
+    trace, manager = HookTrace.from_environment(), new_manager()
     plugins, components = [], []
     points = entry_points(group=GROUP) if found is None else found
     for point in sorted({(p.name, p.value): p for p in points}.values(), key=lambda p: (p.name, p.value)):
-        outcome, distribution = registered(manager, point, contract, trace), point.dist
+        outcome, distribution = registered(manager, point, trace), point.dist
         plugins.append(
             PluginInfo(
                 point.name,
@@ -178,13 +156,10 @@ def discover(found: Iterable[EntryPoint] | None = None, contract: Specifications
                 distribution.name if distribution else "",
                 distribution.version if distribution else "",
                 outcome.fault,
-                outcome.notices,
             )
         )
-        for notice in outcome.notices:
-            _warn(f"plugin {point.name} ({point.value}): {notice}")
-        for each in outcome.announced:
-            old = contract.deprecated_methods.get(each.kind, {})
-            said_of_it = (each.kind, each.name, each.target, each.summary, point.name, point.value)
-            components.append(Component(*said_of_it, deprecated=each.deprecated, deprecated_methods=old))
+        components += [
+            Component(each.kind, each.name, each.target, each.summary, point.name, point.value)
+            for each in outcome.announced
+        ]
     return PluginRegistry(tuple(plugins), tuple(components), manager, trace)

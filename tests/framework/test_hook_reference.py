@@ -65,15 +65,6 @@ def test_every_public_method_of_a_protocol_is_on_the_page(kind: str) -> None:
         assert getattr(getattr(import_module(module), name), "_is_protocol", False), f"{entry.name} is no protocol"
 
 
-def test_no_hook_is_newer_than_the_contract() -> None:
-    def version(text: str) -> tuple[int, ...]:
-        return tuple(map(int, text.split(".")))
-
-    found = reference()
-    for hook in (*(kind.hook for kind in found.kinds), *found.observers):
-        assert version(hook.since) <= version(hooks.CONTRACT_VERSION), hook.name
-
-
 def changed(**functions: Any) -> SimpleNamespace:
     """The specifications with hooks added or exchanged."""
     for function in functions.values():
@@ -88,7 +79,6 @@ def test_a_hook_without_a_word_is_found() -> None:
     found = missing(reference(changed(armcal_arm_parked=armcal_arm_parked)))
     assert "armcal_arm_parked: a docstring" in found
     assert "armcal_arm_parked: the argument arm" in found
-    assert "armcal_arm_parked: since which contract" in found
 
 
 def test_an_argument_that_is_not_explained_is_found() -> None:
@@ -99,8 +89,6 @@ def test_an_argument_that_is_not_explained_is_found() -> None:
             name: of the experiment.
             folder: where the results are,
                 all of them.
-
-        Since contract 1.0.
         """
 
     specifications = changed(armcal_run_ended=armcal_run_ended)
@@ -113,6 +101,5 @@ def test_the_page_has_no_line_of_markup_left_over() -> None:
     text = PAGE.read_text(encoding="utf-8")
     assert "``" not in text.replace("```", "")
     assert "Args:" not in text
-    assert "Since contract" in text
     for link in re.findall(r"\]\(#(\w+)\)", text):
         assert f"\n## {link}\n" in text

@@ -279,6 +279,7 @@ BROKEN = {
     "raises": (GOOD.replace('register("NAME", "TARGET")', "1 / 0"), "ZeroDivisionError"),
     "exits": ("raise SystemExit(4)", "SystemExit"),
     "no_colon": (GOOD.replace("TARGET", "some.module"), "expected module:attribute"),
+    "no_text": (GOOD.replace('"TARGET"', "3"), "TypeError: register() was given 'NAME', 3"),
     "lines": ("raise RuntimeError('one\\ntwo')", "one two"),
 }
 

@@ -16,7 +16,6 @@ import click
 from armcal.base.config_text import as_json
 from armcal.cli.console import Screen
 from armcal.errors import CalibrationWarning, DataError, Location
-from armcal.hooks import ContractDeprecationWarning
 from armcal.plugins import PluginRegistry
 from armcal.solve.estimator import Progress, no_progress
 from armcal.solve.parallel import parse_executor
@@ -64,16 +63,14 @@ class Voice:
             self.warn(f"plugin {plugin.name} ({plugin.module}) is left out: {plugin.fault}")
 
     @contextmanager
-    def telling_what_is_to_go(self) -> Iterator[None]:
-        """One line, once, for each deprecated part of the plugin contract and each notice about a calibration."""
-        kinds = (ContractDeprecationWarning, CalibrationWarning)
+    def telling_notices(self) -> Iterator[None]:
+        """One line, once, for each notice about a calibration."""
         with warnings.catch_warnings():
-            for kind in kinds:
-                warnings.simplefilter("always", kind)
+            warnings.simplefilter("always", CalibrationWarning)
             others, told = warnings.showwarning, set()
 
             def show(message: Any, category: type[Warning], *where: Any, **more: Any) -> None:
-                if not issubclass(category, kinds):
+                if not issubclass(category, CalibrationWarning):
                     others(message, category, *where, **more)
                 elif str(message) not in told:
                     told.add(str(message))
@@ -112,7 +109,7 @@ def speaking(command: F) -> F:
     @click.pass_context
     def wrapped(ctx: click.Context, /, as_json: bool, quiet: bool, verbose: bool, **given: Any) -> Any:
         voice = Voice(as_json, quiet, verbose)
-        with voice.telling_what_is_to_go():
+        with voice.telling_notices():
             return ctx.invoke(command, voice=voice, **given)
 
     wrapped.__doc__ = command.__doc__

@@ -17,7 +17,6 @@ from typing import Any
 
 from armcal import hooks
 
-_SINCE = re.compile(r"Since contract ([0-9]+\.[0-9]+)\.")
 _SECTION = re.compile(r"^(Args|Attributes|Raises|Returns):$")
 _ENTRY = re.compile(r"^(\w+): (.*)$")
 
@@ -61,14 +60,13 @@ class Argument:
 
 @dataclass(frozen=True)
 class Entry:
-    """A hook or a method: how it is called, what it does, what it raises, since which contract (hooks alone)."""
+    """A hook or a method: how it is called, what it does, what it raises."""
 
     name: str
     call: str
     text: str
     arguments: tuple[Argument, ...]
     raises: tuple[tuple[str, str], ...] = ()
-    since: str = ""
 
 
 @dataclass(frozen=True)
@@ -95,7 +93,6 @@ class KindEntry:
 class Reference:
     """All of a contract."""
 
-    version: str
     register: Entry
     kinds: tuple[KindEntry, ...]
     observers: tuple[Entry, ...]
@@ -117,14 +114,12 @@ def reference(specifications: Any = hooks) -> Reference:
     marked = [f for f in vars(specifications).values() if hasattr(f, f"{hooks.PROJECT}_spec")]
     observers = tuple(_entry(hook) for hook in marked if hook.__name__ not in registering)
     register = _entry(specifications.Register.__call__, "register")
-    return Reference(specifications.CONTRACT_VERSION, register, kinds, observers)
+    return Reference(register, kinds, observers)
 
 
 def missing(found: Reference) -> list[str]:
     """What a reader would not find explained: hooks and methods without a docstring, arguments without a word."""
     gaps = []
-    for hook in (*(kind.hook for kind in found.kinds), *found.observers):
-        gaps += [f"{hook.name}: since which contract"] if not hook.since else []
     entries = [("", hook) for hook in (found.register, *(k.hook for k in found.kinds), *found.observers)]
     for protocol in _protocols(found):
         gaps += [f"{protocol.name}: a docstring"] if not protocol.text else []
@@ -167,7 +162,6 @@ def _entry(function: Callable[..., Any], name: str = "", around: str = "", is_pr
     """A function as the reference shows it; ``around`` is the docstring of its class."""
     name = name or function.__name__
     text, sections = _sections(inspect.cleandoc(function.__doc__ or ""))
-    since = _SINCE.search(text)
     signature = inspect.signature(function)
     given = [p for p in signature.parameters.values() if p.name != "self"]
     arguments = tuple(
@@ -176,8 +170,7 @@ def _entry(function: Callable[..., Any], name: str = "", around: str = "", is_pr
     call = name if is_property else f"{name}({', '.join(map(_shown, given))})"
     if signature.return_annotation not in (inspect.Signature.empty, "None"):
         call += f" -> {signature.return_annotation}"
-    told = _SINCE.sub("", text).strip()
-    return Entry(name, call, told, arguments, tuple(sections.get("Raises", {}).items()), since[1] if since else "")
+    return Entry(name, call, text, arguments, tuple(sections.get("Raises", {}).items()))
 
 
 def _shown(parameter: inspect.Parameter) -> str:
@@ -237,15 +230,15 @@ def as_markdown(found: Reference) -> str:
         "# Hooks and kinds of component",
         "",
         "This page is made from armcal's own specifications: `armcal plugins hooks --markdown > docs/hooks.md`. Do not",
-        f"edit it. It shows contract {found.version}. How to write a plugin is in [plugins](plugins.md).",
+        "edit it. How to write a plugin is in [write a plugin](write_a_plugin.md).",
         "",
         "A registration module marks each hook with `@hookimpl` and may leave out any hook, and any argument of one.",
         "",
-        "| Kind | Hook | Since | Built as | Must have |",
-        "| --- | --- | --- | --- | --- |",
+        "| Kind | Hook | Built as | Must have |",
+        "| --- | --- | --- | --- |",
     ]
     for kind in found.kinds:
-        row = (f"[{kind.kind}](#{kind.kind})", f"`{kind.hook.name}`", kind.hook.since)
+        row = (f"[{kind.kind}](#{kind.kind})", f"`{kind.hook.name}`")
         lines.append(f"| {' | '.join((*row, f'`{kind.built_as}`', f'`{kind.protocol.name}`'))} |")
     lines += [
         "",
@@ -255,10 +248,10 @@ def as_markdown(found: Reference) -> str:
     lines += ["## Announcing a component", "", *_markdown(found.register)]
     lines += ["## Observers", "", "They are told what happens; what they return is ignored.", ""]
     for hook in found.observers:
-        lines += [f"### `{hook.name}`", "", *_markdown(hook), f"Since contract {hook.since}.", ""]
+        lines += [f"### `{hook.name}`", "", *_markdown(hook)]
     for kind in found.kinds:
         lines += [f"## {kind.kind}", "", _marked(kind.hook.text), ""]
-        lines += [f"Announced in `{kind.hook.call}`, built as `{kind.built_as}`. Since contract {kind.hook.since}.", ""]
+        lines += [f"Announced in `{kind.hook.call}`, built as `{kind.built_as}`.", ""]
         for protocol in (kind.protocol, *kind.beside):
             may = "Must have" if protocol is kind.protocol else "May have"
             lines += [f"### {may}: `{protocol.name}`", "", *_paragraphs(protocol.text)]
@@ -298,15 +291,15 @@ def _marked(text: str) -> str:
 
 def as_text(found: Reference) -> str:
     """For a terminal."""
-    lines = [f"Contract {found.version}", ""]
+    lines: list[str] = []
     for kind in found.kinds:
-        lines += [f"{kind.kind}: {kind.hook.name}, since {kind.hook.since}", *_indented(kind.hook.text, 2)]
+        lines += [f"{kind.kind}: {kind.hook.name}", *_indented(kind.hook.text, 2)]
         lines += [f"  built as {kind.built_as}; {kind.protocol.name}:"]
         lines += [f"    {method.call}" for method in kind.protocol.methods]
         lines += [f"  may have {protocol.name}" for protocol in kind.beside] + [""]
     lines += ["observers:"]
     for hook in found.observers:
-        lines += [f"  {hook.call}, since {hook.since}", *_indented(hook.text, 4)]
+        lines += [f"  {hook.call}", *_indented(hook.text, 4)]
     return "\n".join(lines) + "\n"
 
 

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from armcal.errors import EXIT_BAD_INPUT, PluginError
-from armcal.hooks import CONTRACT_VERSION
 from armcal.plugins import Component, PluginInfo, PluginRegistry, discover
 
 if TYPE_CHECKING:
@@ -44,17 +43,13 @@ def _show(plugin: PluginInfo, registry: PluginRegistry, quiet: bool, verbose: bo
     click.echo(f"{plugin.name}  ({plugin.distribution} {plugin.version}, {plugin.module})")
     if plugin.fault:
         click.echo(f"  does not load: {plugin.fault}")
-    for notice in plugin.notices:
-        click.echo(f"  to be changed: {notice}")
     for component in registry.announced_by(plugin):
         place = f"  [{component.target}]" if verbose else ""
-        gone = f"  (deprecated: {component.deprecated})" if component.deprecated else ""
-        click.echo(f"  {component.kind:<12} {component.name:<18} {component.summary}{gone}{place}")
+        click.echo(f"  {component.kind:<12} {component.name:<18} {component.summary}{place}")
 
 
 def _content(registry: PluginRegistry) -> dict[str, Any]:
     return {
-        "contract": CONTRACT_VERSION,
         "plugins": [
             {
                 "name": plugin.name,
@@ -62,7 +57,6 @@ def _content(registry: PluginRegistry) -> dict[str, Any]:
                 "distribution": plugin.distribution,
                 "version": plugin.version,
                 "fault": plugin.fault or None,
-                "notices": list(plugin.notices),
                 "components": [_told(component) for component in registry.announced_by(plugin)],
             }
             for plugin in registry.plugins
@@ -72,7 +66,7 @@ def _content(registry: PluginRegistry) -> dict[str, Any]:
 
 def _told(component: Component) -> dict[str, Any]:
     names = ("kind", "name", "target", "summary")
-    return {**{name: getattr(component, name) for name in names}, "deprecated": component.deprecated or None}
+    return {name: getattr(component, name) for name in names}
 
 
 @dataclass(frozen=True)
@@ -118,9 +112,6 @@ class _Report:
             if verbose or result.fault:
                 mark, fault = ("FAIL", f": {result.fault}") if result.fault else ("ok  ", "")
                 click.echo(f"{'--  ' if result.not_run else mark} {result.component}: {result.check}{fault}")
-        for plugin in self.plugins:
-            for notice in plugin.notices:
-                click.echo(f"to be changed: {notice}")
         left = f", {len(self.left)} not run" if self.left else ""
         why = f"{left} (-v says why)" if left and not verbose else left
         click.echo(f"{self.name}: {self.ran - len(self.failed)} of {self.ran} checks passed{why}.")

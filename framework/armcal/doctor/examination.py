@@ -47,7 +47,6 @@ def _guarded(named: _Named) -> list[Finding]:
 def _checks(ask: libraries.Ask) -> Iterator[_Named]:
     always, extras = libraries.requirements()
     yield _Named("armcal", "armcal", libraries.itself)
-    yield _Named("armcal", "plugin contract", lambda: [libraries.contract()])
     for one in always:
         yield _Named("libraries", one.name, lambda r=one: [libraries.library(r, ask)])  # type: ignore[misc]
     for name, needed in extras.items():

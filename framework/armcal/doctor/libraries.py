@@ -39,13 +39,6 @@ def itself() -> Iterator[Finding]:
         yield Finding("armcal", "armcal", "ok", f"{told}, in {where}", detail=facts)
 
 
-def contract() -> Finding:
-    """The version of the plugin contract."""
-    from armcal.hooks import CONTRACT_VERSION
-
-    return Finding("armcal", "plugin contract", "ok", CONTRACT_VERSION, detail={"version": CONTRACT_VERSION})
-
-
 def library(requirement: Requirement, ask: Ask) -> Finding:
     """One library that armcal declares: whether it imports, in what time, and whether its version is in the range."""
     purpose = LIBRARIES.get(requirement.key) or Purpose(requirement.key.replace("-", "_"), "a part of armcal")

@@ -7,7 +7,6 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from armcal.hooks import CONTRACT_VERSION
 from armcal.hooks import KINDS as HOOKS
 from armcal.scaffold.folder import staged, write_texts
 from armcal.scaffold.naming import PREFIX
@@ -60,7 +59,6 @@ def _context(name: str, kind: str) -> dict[str, Any]:
         "component": f"{title}{kind.capitalize()}",
         "settings": f"{title}Settings",
         "hook": HOOKS[kind],
-        "contract": CONTRACT_VERSION,
         "summary": summary,
         "checks": checks,
         "example": example.replace("{{ name }}", name).rstrip(),

@@ -54,8 +54,6 @@ class Origin:
 class ExportRequest:
     """What is to be written: an arm, its instance name, and its calibrated parameters by full name.
 
-    Since contract 1.4 also:
-
     Attributes:
         name: the arm's instance name.
         arm: the arm.
@@ -102,10 +100,10 @@ class Exported:
         content: of the file that was asked for.
         changed: how many numbers are not the nominal ones.
         left_out: what the format cannot hold.
-        companions: further files by name, which are written beside it. Since contract 1.4.
-        remarks: what whoever uses the files should know, a sentence each. Since contract 1.4.
+        companions: further files by name, which are written beside it.
+        remarks: what whoever uses the files should know, a sentence each.
         reach: how far what is left out moves the tool, at most over random poses (m), where the exporter measured it;
-            None for all effects together, which armcal measures. Since contract 1.4.
+            None for all effects together, which armcal measures.
     """
 
     content: bytes
