@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from armcal.arm.assembly import Arm, prefixed
+from armcal.arm.effects import JointEffect
 from armcal.base.dataset import Dataset
 from armcal.base.parameters import Parameters, scalar
 from armcal.solve.factor import Environment
@@ -21,7 +22,7 @@ POSES = 40
 
 
 @dataclass(frozen=True)
-class Servo:
+class Servo(JointEffect):
     """A test's own effect: every joint has an offset and a gain error."""
 
     joints: int
@@ -31,11 +32,8 @@ class Servo:
         return tuple(scalar(f"{k}{i}", u, 0.0, s) for k, u, s in kinds for i in range(1, self.joints + 1))
 
     def displacement(self, command, values):
-        i = command.index + 1
+        i = command.joint
         return values[f"offset{i}"] + values[f"gain{i}"] * command.commanded
-
-    def springs(self, values):
-        return ()
 
 
 def full(name: str) -> str:

@@ -1,7 +1,7 @@
 """armcal finds what a robot arm really is, and how sure it is of each number.
 
-The names below are the public Python interface; each is imported when it is first used, so that
-``import armcal`` stays light.
+The names below are the public Python interface, first what runs and uses calibrations, then what plugins are made of;
+each is imported when it is first used, so that ``import armcal`` stays light.
 """
 
 from __future__ import annotations
@@ -11,8 +11,20 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from armcal.api import Experiment, Run
+    from armcal.arm.effects import XYZ as XYZ
+    from armcal.arm.effects import Condition as Condition
+    from armcal.arm.effects import EffectSettings as EffectSettings
+    from armcal.arm.effects import JointCommand as JointCommand
+    from armcal.arm.effects import JointEffect as JointEffect
+    from armcal.arm.effects import Spring as Spring
+    from armcal.arm.effects import chosen as chosen
     from armcal.base.dataset import Dataset
+    from armcal.base.domains import Interval as Interval
     from armcal.base.parameters import ParameterBlock, Parameters
+    from armcal.base.parameters import scalar as scalar
+    from armcal.base.settings import Angle as Angle
+    from armcal.base.settings import Length as Length
+    from armcal.base.settings import Length3 as Length3
     from armcal.base.settings import Settings
     from armcal.errors import ArmcalError, InputError, NotConvergedError
     from armcal.hooks import hookimpl
@@ -67,9 +79,24 @@ _HOMES = {
     "calibrate": "armcal.run.pipeline",
     "hookimpl": "armcal.hooks",
 }
+_FOR_PLUGINS = {
+    "Angle": "armcal.base.settings",
+    "Condition": "armcal.arm.effects",
+    "EffectSettings": "armcal.arm.effects",
+    "Interval": "armcal.base.domains",
+    "JointCommand": "armcal.arm.effects",
+    "JointEffect": "armcal.arm.effects",
+    "Length": "armcal.base.settings",
+    "Length3": "armcal.base.settings",
+    "Spring": "armcal.arm.effects",
+    "XYZ": "armcal.arm.effects",
+    "chosen": "armcal.arm.effects",
+    "scalar": "armcal.base.parameters",
+}
 
 
 def __getattr__(name: str) -> Any:
-    if name in _HOMES:
-        return getattr(import_module(_HOMES[name]), name)
+    home = _HOMES.get(name) or _FOR_PLUGINS.get(name)
+    if home:
+        return getattr(import_module(home), name)
     raise AttributeError(f"module 'armcal' has no attribute {name!r}")

@@ -169,7 +169,7 @@ COMPONENTS: Mapping[str, ComponentKind] = MappingProxyType(
             "armcal_register_effects",
             "Effect(settings, joint_names)",
             "armcal.arm.effects:JointEffect",
-            ("armcal.arm.effects:ShapeEffect",),
+            ("armcal.arm.servo:SteppedEffect",),
         ),
         "measurement": ComponentKind(
             "armcal_register_measurements",

@@ -10,7 +10,7 @@ from typing import Annotated, Any, ClassVar
 import casadi as ca
 import numpy as np
 from armcal.arm.assembly import scoped
-from armcal.arm.effects import JointCommand, ShapeEffect
+from armcal.arm.effects import JointCommand, reshapes
 from armcal.base.domains import Array
 from armcal.base.settings import Settings
 from armcal.errors import InputError, NotConvergedError, ProblemError
@@ -144,7 +144,7 @@ def _left_out(request: ExportRequest, springs: Sequence[SpringNumbers], told: Ar
 def _displaces(request: ExportRequest, name: str) -> bool:
     """Whether an effect moves a joint, or changes the arm's shape, without any load."""
     effect = request.arm.effects[name]
-    if isinstance(effect, ShapeEffect):
+    if reshapes(effect):
         return True
     values = {full: ca.SX(list(map(float, value))) for full, value in request.values.items()}
     local = scoped(values, f"{request.name}.{name}.")

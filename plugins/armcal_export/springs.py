@@ -7,12 +7,14 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 from armcal.arm.assembly import scoped
-from armcal.arm.effects import Spring
+from armcal.arm.effects import MOUNT, JointCommand, Spring
 from armcal.arm.model import Chain
 from armcal.base.domains import Array
 from armcal.use.exporter import ExportRequest
 
 _LOADS = (-3.0, -0.5, 0.1, 2.0)
+_COMMANDS = ((0.0, 0.0), (0.7, 1.0), (-1.1, -1.0))
+"""Commanded displacements (rad or m) and approaches."""
 _LINEAR = 1e-12
 
 
@@ -26,8 +28,8 @@ class SpringNumbers:
         axes: unit vectors in the site's frame, columns (3 x n); of a spring on a joint's own axis that axis.
         along: whether it gives along a sliding joint's own axis and not about it.
         own: whether it acts on the joint's own axis.
-        compliance: of its coordinates under a small load (n x n; rad/(N m) or m/N).
-        linear: whether that holds for every load.
+        compliance: of its coordinates under a small load at zero command (n x n; rad/(N m) or m/N).
+        linear: whether that holds for every load and command.
     """
 
     effect: str
@@ -53,17 +55,18 @@ def _numbers(effect: str, spring: Spring, chain: Chain) -> SpringNumbers:
     joint = chain.joints[spring.site - 1] if spring.site else None
     own = not spring.directions
     axes = np.array(spring.directions or ((joint.axis,) if joint else ()), dtype=float).T
-    load = ca.SX.sym("load", spring.size)
-    given = ca.densify(ca.SX(spring.law(load)))
-    law = ca.Function("law", [load], [given, ca.densify(ca.jacobian(given, load))])
-    compliance = np.asarray(law(np.zeros(spring.size))[1].full())
-    linear = all(_follows(law, compliance, size) for size in _LOADS)
+    load, recorded = ca.SX.sym("load", spring.size), ca.SX.sym("recorded", 2)
+    command = JointCommand(spring.site - 1, recorded[0], recorded[1]) if spring.site else MOUNT
+    given = ca.densify(ca.SX(spring.law(load, command)))
+    law = ca.Function("law", [load, recorded], [given, ca.densify(ca.jacobian(given, load))])
+    compliance = np.asarray(law(np.zeros(spring.size), _COMMANDS[0])[1].full())
+    linear = all(_follows(law, compliance, size, told) for size in _LOADS for told in _COMMANDS)
     return SpringNumbers(
         effect, spring.site, axes, own and joint is not None and not joint.is_revolute, own, compliance, linear
     )
 
 
-def _follows(law: ca.Function, compliance: Array, size: float) -> bool:
+def _follows(law: ca.Function, compliance: Array, size: float, told: tuple[float, float]) -> bool:
     load = size * np.arange(1.0, compliance.shape[0] + 1)
-    given = np.asarray(law(load)[0].full()).ravel()
+    given = np.asarray(law(load, told)[0].full()).ravel()
     return bool(np.allclose(given, compliance @ load, rtol=_LINEAR, atol=_LINEAR * float(np.abs(compliance).max())))

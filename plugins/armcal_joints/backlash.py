@@ -2,58 +2,38 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar
+from collections.abc import Mapping
+from typing import Any
 
 import casadi as ca
-from armcal.arm.effects import JointCommand, Spring
+from armcal.arm.effects import XYZ, EffectSettings, JointCommand, JointEffect, Spring
 from armcal.base.domains import Interval
 from armcal.base.parameters import ParameterBlock, scalar
-from armcal.base.settings import Settings, Torque
+from armcal.base.settings import Torque
 from pydantic import field_validator
 
-from armcal_joints.joints import JointChoice, chosen
-
 PLAY_SCALE_RAD = 0.01
-_XYZ = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
-class ApproachBacklashSettings(Settings):
-    """Which joints."""
-
-    joints: JointChoice = "all"
-
-
-class ApproachBacklash:
+class ApproachBacklash(JointEffect):
     """The effect ``approach_backlash``: ``lag1`` to ``lagn`` (rad), half the difference between both directions.
 
     A joint that came from below (approach +1) stops ``lag`` short of its command; a negative value overshoots. Where
     the approach is not recorded (0) the joint is taken in the middle.
     """
 
-    Settings: ClassVar[type[ApproachBacklashSettings]] = ApproachBacklashSettings
-
-    def __init__(self, settings: ApproachBacklashSettings, joint_names: Sequence[str]) -> None:
-        self._joints = chosen(settings.joints, joint_names)
-
     def parameters(self) -> tuple[ParameterBlock, ...]:
         """One half-width a joint."""
-        return tuple(scalar(f"lag{joint}", "rad", 0.0, PLAY_SCALE_RAD) for joint in self._joints)
+        return tuple(scalar(f"lag{joint}", "rad", 0.0, PLAY_SCALE_RAD) for joint in self.joints)
 
     def displacement(self, command: JointCommand, values: Mapping[str, Any]) -> Any:
         """Against the direction of the last motion (rad)."""
-        joint = command.index + 1
-        return -values[f"lag{joint}"] * command.approach if joint in self._joints else 0
-
-    def springs(self, values: Mapping[str, Any]) -> tuple[Spring, ...]:
-        """None."""
-        return ()
+        return -values[f"lag{command.joint}"] * command.approach if command.joint in self.joints else 0
 
 
-class TorqueBacklashSettings(Settings):
+class TorqueBacklashSettings(EffectSettings):
     """Which joints, and the torque at which 71 % of the play is taken up."""
 
-    joints: JointChoice = "all"
     transition: Torque = 0.05
 
     @field_validator("transition")
@@ -64,34 +44,26 @@ class TorqueBacklashSettings(Settings):
         return value
 
 
-class TorqueBacklash:
+class TorqueBacklash(JointEffect):
     """The effect ``torque_backlash``: ``play1`` to ``playn`` (rad), half the play that the sign of the torque decides.
 
     play * torque / sqrt(torque^2 + transition^2): a smooth sign, so that the elastic equilibrium has a derivative.
     """
 
-    Settings: ClassVar[type[TorqueBacklashSettings]] = TorqueBacklashSettings
-
-    def __init__(self, settings: TorqueBacklashSettings, joint_names: Sequence[str]) -> None:
-        self._transition = settings.transition
-        self._joints = chosen(settings.joints, joint_names)
+    Settings = TorqueBacklashSettings
 
     def parameters(self) -> tuple[ParameterBlock, ...]:
         """One half-width a joint; a torque pushes along, never against itself."""
         physical = Interval(lower=0.0)
-        return tuple(scalar(f"play{joint}", "rad", 0.0, PLAY_SCALE_RAD, physical) for joint in self._joints)
-
-    def displacement(self, command: JointCommand, values: Mapping[str, Any]) -> Any:
-        """Nothing: the torque decides."""
-        return 0
+        return tuple(scalar(f"play{joint}", "rad", 0.0, PLAY_SCALE_RAD, physical) for joint in self.joints)
 
     def springs(self, values: Mapping[str, Any]) -> tuple[Spring, ...]:
         """One coordinate a joint."""
-        return tuple(self._spring(joint, values[f"play{joint}"]) for joint in self._joints)
+        return tuple(self._spring(joint, values[f"play{joint}"]) for joint in self.joints)
 
     def _spring(self, site: int, play: Any) -> Spring:
-        floor = self._transition**2
-        return Spring(site, (), lambda torque: play * torque / ca.sqrt(torque * torque + floor))
+        floor = self.settings.transition**2
+        return Spring(site, (), lambda torque, command: play * torque / ca.sqrt(torque * torque + floor))
 
 
 class BearingPlaySettings(TorqueBacklashSettings):
@@ -100,32 +72,29 @@ class BearingPlaySettings(TorqueBacklashSettings):
     base: bool = True
 
 
-class BearingPlay:
+class BearingPlay(JointEffect):
     """The effect ``bearing_play``: ``tilt0`` (base) and ``tilt1`` to ``tiltn`` (rad), half a bearing's angular play.
 
     The part of the arm beyond a bearing tilts with the moment that it carries, whatever its direction, as far as the
     play lets it: tilt * moment / sqrt(|moment|^2 + transition^2).
     """
 
-    Settings: ClassVar[type[BearingPlaySettings]] = BearingPlaySettings
+    Settings = BearingPlaySettings
 
-    def __init__(self, settings: BearingPlaySettings, joint_names: Sequence[str]) -> None:
-        self._transition = settings.transition
-        self._sites = (*((0,) if settings.base else ()), *chosen(settings.joints, joint_names))
+    @property
+    def sites(self) -> tuple[int, ...]:
+        """Where there is play: 0 for the base, i for joint i."""
+        return (0, *self.joints) if self.settings.base else self.joints
 
     def parameters(self) -> tuple[ParameterBlock, ...]:
         """One half-width a site."""
         physical = Interval(lower=0.0)
-        return tuple(scalar(f"tilt{site}", "rad", 0.0, PLAY_SCALE_RAD, physical) for site in self._sites)
-
-    def displacement(self, command: JointCommand, values: Mapping[str, Any]) -> Any:
-        """Nothing: the moment decides."""
-        return 0
+        return tuple(scalar(f"tilt{site}", "rad", 0.0, PLAY_SCALE_RAD, physical) for site in self.sites)
 
     def springs(self, values: Mapping[str, Any]) -> tuple[Spring, ...]:
         """Three coordinates a site."""
-        return tuple(self._spring(site, values[f"tilt{site}"]) for site in self._sites)
+        return tuple(self._spring(site, values[f"tilt{site}"]) for site in self.sites)
 
     def _spring(self, site: int, tilt: Any) -> Spring:
-        floor = self._transition**2
-        return Spring(site, _XYZ, lambda moment: tilt * moment / ca.sqrt(ca.dot(moment, moment) + floor))
+        floor = self.settings.transition**2
+        return Spring(site, XYZ, lambda moment, command: tilt * moment / ca.sqrt(ca.dot(moment, moment) + floor))

@@ -2,50 +2,36 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar
+from collections.abc import Mapping
+from typing import Any
 
 import casadi as ca
-from armcal.arm.effects import JointCommand, Spring
+from armcal.arm.effects import JointCommand, JointEffect
 from armcal.base.parameters import ParameterBlock, scalar
-from armcal.base.settings import Settings
-
-from armcal_joints.joints import JointChoice, chosen
 
 GEAR_SCALE_RAD = 0.01
 _PERIODS = (1, 2)
 
 
-class GearErrorSettings(Settings):
-    """Which joints."""
-
-    joints: JointChoice = "all"
-
-
-class GearError:
+class GearError(JointEffect):
     """The effect ``gear_error``: ``sin1_3`` and ``cos1_3`` (rad) of joint 3 once a turn, ``sin2_3``, ``cos2_3`` twice.
 
     Cosines count from their value at zero command, so that they do not trade with the joint's offset.
     """
 
-    Settings: ClassVar[type[GearErrorSettings]] = GearErrorSettings
-
-    def __init__(self, settings: GearErrorSettings, joint_names: Sequence[str]) -> None:
-        self._joints = chosen(settings.joints, joint_names)
-
     def parameters(self) -> tuple[ParameterBlock, ...]:
         """Four amplitudes a joint."""
         return tuple(
             scalar(f"{wave}{periods}_{joint}", "rad", 0.0, GEAR_SCALE_RAD)
-            for joint in self._joints
+            for joint in self.joints
             for periods in _PERIODS
             for wave in ("sin", "cos")
         )
 
     def displacement(self, command: JointCommand, values: Mapping[str, Any]) -> Any:
         """The harmonics at the commanded angle (rad)."""
-        joint = command.index + 1
-        if joint not in self._joints:
+        joint = command.joint
+        if joint not in self.joints:
             return 0
         total = ca.SX(0)
         for periods in _PERIODS:
@@ -53,7 +39,3 @@ class GearError:
             total += values[f"sin{periods}_{joint}"] * ca.sin(angle)
             total += values[f"cos{periods}_{joint}"] * (ca.cos(angle) - 1)
         return total
-
-    def springs(self, values: Mapping[str, Any]) -> tuple[Spring, ...]:
-        """None."""
-        return ()

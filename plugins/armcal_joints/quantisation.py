@@ -5,17 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, ClassVar
 
-from armcal.arm.effects import JointCommand, Spring
-from armcal.arm.servo import PulseClock, PulseTable, quantised
+from armcal.arm.effects import JointCommand, chosen
+from armcal.arm.servo import PulseClock, PulseTable, SteppedEffect, quantised
 from armcal.base.config_text import resolve_path
-from armcal.base.parameters import ParameterBlock
 from armcal.base.quantities import UnitOf
 from armcal.base.settings import Settings
 from armcal.config.servo_file import CalibratedServo, load_servo_file
 from armcal.errors import ConfigError
 from pydantic import BeforeValidator, Field, model_validator
-
-from armcal_joints.joints import chosen
 
 Angles = Annotated[tuple[float, ...], UnitOf("angle")]
 Pulses = Annotated[tuple[float, ...], UnitOf("time")]
@@ -81,18 +78,19 @@ class QuantisationSettings(Settings):
         return {joint: (PulseTable(table.angles, table.pulses), clock) for joint, table in self.tables.items()}
 
 
-class Quantisation:
+class Quantisation(SteppedEffect):
     """The effect ``quantisation``: no parameters; the difference between what was told and what the board can set.
 
     A joint without a table is not quantised. A servo file has all joints, and may have servos that are none.
     """
 
-    Settings: ClassVar[type[QuantisationSettings]] = QuantisationSettings
+    Settings = QuantisationSettings
     EXAMPLE: ClassVar[Mapping[str, Any]] = {
         "tables": {"q1": {"angles_deg": [-100, 0, 100], "pulses_us": [620, 1540, 2460]}}
     }
 
     def __init__(self, settings: QuantisationSettings, joint_names: Sequence[str]) -> None:
+        super().__init__(settings, joint_names)
         chosen(tuple(settings.tables), joint_names)
         missing = [joint for joint in joint_names if settings.servos and joint not in settings.servos]
         if missing:
@@ -106,10 +104,6 @@ class Quantisation:
                     f"a pulse of {1e6 * longest:g} us is longer than the board's longest, {1e6 * limit:.0f} us"
                 )
 
-    def parameters(self) -> tuple[ParameterBlock, ...]:
-        """None: the table is known, or it is the servo map's to find."""
-        return ()
-
     def servos(self) -> Mapping[int, tuple[PulseTable, PulseClock]]:
         """Pulse table and clock by the joint's index; a joint without a table is not stepped."""
         return dict(self._servos)
@@ -118,7 +112,3 @@ class Quantisation:
         """From the commanded angle to the one that is set (rad)."""
         servo = self._servos.get(command.index)
         return 0 if servo is None else quantised(command.commanded, *servo) - command.commanded
-
-    def springs(self, values: Mapping[str, Any]) -> tuple[Spring, ...]:
-        """None."""
-        return ()

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, ClassVar, Literal
 
-from armcal.arm.effects import JointCommand, Spring
+from armcal.arm.effects import JointEffect
 from armcal.arm.model import Attachment, Chain
 from armcal.base.domains import Interval
 from armcal.base.parameters import ParameterBlock, scalar
@@ -23,19 +23,19 @@ class ThermalLengthSettings(Settings):
     links: Literal["one", "each"] = "one"
 
 
-class ThermalLength:
+class ThermalLength(JointEffect):
     """The effect ``thermal_length``: ``expansion`` of all links (1/K), or ``expansion1`` to ``expansionN``.
 
     Link i lies before joint i, the last one between the last joint and the tool. Records need a column
     ``temperature_C``; a prediction without one is made at the reference temperature.
     """
 
-    Settings: ClassVar[type[ThermalLengthSettings]] = ThermalLengthSettings
+    Settings = ThermalLengthSettings
     EXAMPLE: ClassVar[Mapping[str, Any]] = {"reference_C": 22, "links": "each"}
-    conditions: ClassVar[tuple[str, ...]] = ("temperature",)
+    conditions = ("temperature",)
 
     def __init__(self, settings: ThermalLengthSettings, joint_names: Sequence[str]) -> None:
-        self._reference = settings.reference
+        super().__init__(settings, joint_names)
         links = range(1, len(joint_names) + 2)
         each = settings.links == "each"
         self._names = tuple(f"expansion{link}" if each else "expansion" for link in links)
@@ -45,20 +45,12 @@ class ThermalLength:
         physical = Interval(lower=0.0)
         return tuple(scalar(name, "per_K", 0.0, EXPANSION_SCALE_PER_K, physical) for name in dict.fromkeys(self._names))
 
-    def displacement(self, command: JointCommand, values: Mapping[str, Any]) -> Any:
-        """Nothing: joints do not turn with the temperature."""
-        return 0
-
-    def springs(self, values: Mapping[str, Any]) -> tuple[Spring, ...]:
-        """None."""
-        return ()
-
     def shaped(self, chain: Chain, conditions: Mapping[str, Any], values: Mapping[str, Any]) -> Chain:
         """Every link's length, the tool's too, times one plus coefficient times temperature difference.
 
         A frame moves with the link that it stands on, so that the one at a link's end stays at the next joint.
         """
-        warmer = conditions.get("temperature", self._reference) - self._reference
+        warmer = conditions.get("temperature", self.settings.reference) - self.settings.reference
         factors = [1 + values[name] * warmer for name in self._names]
         joints = tuple(
             replace(joint, parent_T_joint=_longer(joint.parent_T_joint, factor))

@@ -6,7 +6,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from armcal.arm.assembly import Arm, ArmInputs, MassSpec
-from armcal.arm.effects import Spring
+from armcal.arm.effects import MOUNT, JointCommand, JointEffect, Spring
 from armcal.arm.elastic import deflections, elastic_sites, split_deflection
 from armcal.arm.model import Attachment, Chain, Joint, forward
 from armcal.arm.statics import Load, SiteWrench
@@ -17,11 +17,12 @@ X, Y, Z = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
 XYZ = (X, Y, Z)
 OBLIQUE = (0.6, 0.0, 0.8)
 NONE = (0.0, 0.0, 0.0)
+AT_REST = JointCommand(0, ca.DM(0.0), ca.DM(0.0))
 COMPLIANCE = np.array([[0.05, 0.01, -0.02], [0.01, 0.04, 0.005], [-0.02, 0.005, 0.06]])
 
 
 def linear(matrix):
-    return lambda load: ca.mtimes(ca.DM(np.atleast_2d(matrix)), load)
+    return lambda load, command: ca.mtimes(ca.DM(np.atleast_2d(matrix)), load)
 
 
 def chain():
@@ -71,7 +72,7 @@ def test_an_arm_without_springs_has_no_state():
     assert elastic_sites(chain(), []) == ()
     along, rotations = split_deflection(chain().joints, (), ca.SX(0, 1))
     assert [float(x) for x in along] == [0, 0, 0] and rotations == {}
-    assert deflections(chain(), forward(chain(), [0, 0, 0], {}), (), ()).shape == (0, 1)
+    assert deflections(chain(), forward(chain(), [0, 0, 0], {}), (), (), ()).shape == (0, 1)
 
 
 # ---------------------------------------------------------------- what springs answer
@@ -83,8 +84,8 @@ MERGED = {
     "an axis pair and an axis": [Spring(2, (X, Z), linear([[0.03, 0.01], [0.01, 0.02]])), Spring(2, (), linear(0.1))],
     "the axis twice": [Spring(2, (), linear(0.1)), Spring(2, (), linear(0.05))],
     "a law that is not linear": [
-        Spring(2, (), lambda t: 0.2 * t**3),
-        Spring(2, XYZ, lambda m: 0.1 * m / ca.sqrt(ca.dot(m, m) + 0.01)),
+        Spring(2, (), lambda t, command: 0.2 * t**3),
+        Spring(2, XYZ, lambda m, command: 0.1 * m / ca.sqrt(ca.dot(m, m) + 0.01)),
     ],
 }
 
@@ -94,7 +95,7 @@ def by_hand(springs, moment):
     total = np.zeros(3)
     for spring in springs:
         axes = np.array(spring.directions or (OBLIQUE,))
-        total += axes.T @ numbers(spring.law(ca.DM(axes @ moment))).ravel()
+        total += axes.T @ numbers(spring.law(ca.DM(axes @ moment), AT_REST)).ravel()
     return total
 
 
@@ -106,24 +107,47 @@ def test_springs_at_one_site_answer_its_moment_with_the_sum_of_their_rotation_ve
     frames = forward(arm, list(moved), {})
     moment, force = random.normal(size=3), random.normal(size=3)
     acting = [SiteWrench(ca.DM(moment), ca.DM(force))] * 4
-    found = numbers(deflections(arm, frames, acting, sites)).ravel()
+    found = numbers(deflections(arm, frames, acting, sites, [AT_REST] * 3)).ravel()
     rotation = numbers(frames.sites[2].rotation)
     expected = by_hand(MERGED[case], rotation.T @ moment)
     if found.size == 1:
         found = found[0] * np.array(OBLIQUE)
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-14)
-    along, rotations = split_deflection(arm.joints, sites, ca.DM(numbers(deflections(arm, frames, acting, sites))))
+    along, rotations = split_deflection(
+        arm.joints, sites, ca.DM(numbers(deflections(arm, frames, acting, sites, [AT_REST] * 3)))
+    )
     turned = Rotation.from_rotvec(float(along[1]) * np.array(OBLIQUE)).as_matrix()
     turned = turned @ (numbers(rotations[2]) if rotations else np.eye(3))
     np.testing.assert_allclose(turned, Rotation.from_rotvec(expected).as_matrix(), rtol=0, atol=1e-13)
 
 
+def test_a_law_is_given_what_its_own_joint_was_commanded_and_from_where_it_came():
+    """Softer the farther the joint is turned, and by another share from either side; the mount is not commanded."""
+    springs = [
+        Spring(2, (), lambda load, command: (0.1 + 0.2 * command.commanded + 0.05 * command.approach) * load),
+        Spring(0, XYZ, lambda load, command: ca.DM([1.0, 2.0, 3.0]) * (0.0 if command is MOUNT else 1.0)),
+    ]
+    arm, moment = chain(), np.array([0.3, -0.7, 1.1])
+    sites, frames = elastic_sites(arm, springs), forward(arm, [0.3, -0.5, 0.1], {})
+    commands = [JointCommand(i, ca.DM(at), ca.DM(side)) for i, (at, side) in enumerate([(9, 9), (-0.5, -1), (9, 9)])]
+    acting = [SiteWrench(ca.DM(moment), ca.DM.zeros(3))] * 4
+    found = numbers(deflections(arm, frames, acting, sites, commands)).ravel()
+    torque = OBLIQUE @ numbers(frames.sites[2].rotation).T @ moment
+    np.testing.assert_allclose(found, [(0.1 - 0.1 - 0.05) * torque, 0, 0, 0], rtol=0, atol=1e-15)
+
+
 def test_a_slide_gives_by_the_force_along_it_and_turns_by_the_moment():
     arm = chain()
-    springs = [Spring(3, XYZ, linear(COMPLIANCE)), Spring(3, (), linear(1e-3)), Spring(3, (), lambda f: 1e-4 * f**3)]
+    springs = [
+        Spring(3, XYZ, linear(COMPLIANCE)),
+        Spring(3, (), linear(1e-3)),
+        Spring(3, (), lambda f, command: 1e-4 * f**3),
+    ]
     sites, frames = elastic_sites(arm, springs), forward(arm, [0.3, -0.5, 0.1], {})
     moment, force = np.array([0.3, -0.7, 1.1]), np.array([2.0, 1.0, -3.0])
-    found = numbers(deflections(arm, frames, [SiteWrench(ca.DM(moment), ca.DM(force))] * 4, sites)).ravel()
+    found = numbers(
+        deflections(arm, frames, [SiteWrench(ca.DM(moment), ca.DM(force))] * 4, sites, [AT_REST] * 3)
+    ).ravel()
     rotation = numbers(frames.sites[3].rotation)
     push = rotation[:, 1] @ force
     np.testing.assert_allclose(found[:3], COMPLIANCE @ rotation.T @ moment, rtol=0, atol=1e-15)
@@ -145,17 +169,11 @@ def test_one_coordinate_turns_exactly_about_its_axis(axis):
 # ---------------------------------------------------------------- a whole arm
 
 
-class Springs:
+class Springs(JointEffect):
     """An effect of given springs."""
 
     def __init__(self, *springs):
         self._springs = springs
-
-    def parameters(self):
-        return ()
-
-    def displacement(self, command, values):
-        return 0
 
     def springs(self, values):
         return self._springs

@@ -60,9 +60,13 @@ def test_every_public_method_of_a_protocol_is_on_the_page(kind: str) -> None:
     found = next(each for each in reference().kinds if each.kind == kind)
     for entry in (found.protocol, *found.beside):
         module, _, name = entry.name.rpartition(".")
-        members = {m for m in vars(getattr(import_module(module), name)) if not m.startswith("_")}
-        assert {method.name for method in entry.methods} == members
-        assert getattr(getattr(import_module(module), name), "_is_protocol", False), f"{entry.name} is no protocol"
+        made = getattr(import_module(module), name)
+        members = {m: value for m, value in vars(made).items() if not m.startswith("_")}
+        methods = {m for m, value in members.items() if inspect.isfunction(value) or isinstance(value, property)}
+        assert {method.name for method in entry.methods} == methods
+        explained = inspect.cleandoc(made.__doc__ or "")
+        assert all(f"{m}: " in explained for m in members.keys() - methods)
+        assert entry.is_base == (not getattr(made, "_is_protocol", False))
 
 
 def changed(**functions: Any) -> SimpleNamespace:

@@ -139,6 +139,7 @@ FAULTS = [
     ("model", "Shearing", "rigid motions"),
     ("model", "Mirrored", "rigid motions"),
     ("model", "Stepped", "derivatives agree"),
+    ("effect", "ForeignEffect", "derives from armcal.JointEffect"),
     ("effect", "TwoDisplacements", "a displacement for every joint"),
     ("effect", "BranchingDisplacement", "displacements do not branch"),
     ("effect", "SingularDisplacement", "displacements are finite"),

@@ -9,7 +9,7 @@ import numpy as np
 import oracle
 import pytest
 from armcal.arm.assembly import Arm, MassSpec
-from armcal.arm.effects import Spring
+from armcal.arm.effects import JointEffect, Spring
 from armcal.arm.model import forward
 from armcal.arm.statics import Load, Mass, wrenches
 from armcal.base.parameters import Parameters, scalar
@@ -340,7 +340,7 @@ def moved_arm(arm, shift, angles):
     return replace(arm, model=MdhModel(config.model_copy(update={"base": base})))
 
 
-class FullSprings:
+class FullSprings(JointEffect):
     """A symmetric compliance about all three axes at one site, and one about the joints' own axes as well."""
 
     def __init__(self, site, matrix):
@@ -349,12 +349,11 @@ class FullSprings:
     def parameters(self):
         return (scalar("size", "1", 1.0, 1.0),)
 
-    def displacement(self, command, values):
-        return 0
-
     def springs(self, values):
         directions = tuple(tuple(map(float, row)) for row in np.eye(3))
-        return (Spring(self._site, directions, lambda load: values["size"] * ca.mtimes(ca.DM(self._matrix), load)),)
+        return (
+            Spring(self._site, directions, lambda load, command: values["size"] * ca.mtimes(ca.DM(self._matrix), load)),
+        )
 
 
 TWO_ROWS = [{"alpha": 0.7, "a": 0.2, "theta": 0.3, "d": 0.1}, {"alpha": -0.4, "a": 0.3, "theta": -0.2, "d": 0.05}]

@@ -10,7 +10,7 @@ import frida
 import numpy as np
 import pytest
 from armcal.arm.assembly import Arm, ArmInputs, MassSpec
-from armcal.arm.effects import Spring
+from armcal.arm.effects import JointEffect, Spring
 from armcal.arm.model import Joint, forward
 from armcal.arm.statics import Load, Mass, effort, wrenches
 from armcal.base import se3, twists
@@ -275,20 +275,14 @@ def test_the_effort_on_a_joint_is_the_work_per_displacement(parametrisation):
         assert float(ca.norm_inf(off(angles))) < 1e-13
 
 
-class OwnSprings:
+class OwnSprings(JointEffect):
     """A linear spring on every joint's own axis."""
 
     def __init__(self, compliance):
         self.compliance = compliance
 
-    def parameters(self):
-        return ()
-
-    def displacement(self, command, values):
-        return ca.SX(0)
-
     def springs(self, values):
-        return tuple(Spring(i, (), lambda load: self.compliance * load) for i in range(1, 6))
+        return tuple(Spring(i, (), lambda load, command: self.compliance * load) for i in range(1, 6))
 
 
 def test_springs_on_general_twists_settle_where_the_energy_is_least():

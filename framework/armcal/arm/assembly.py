@@ -10,7 +10,7 @@ from typing import Any, Protocol, runtime_checkable
 
 import casadi as ca
 
-from armcal.arm.effects import Condition, JointCommand, JointEffect, ShapeEffect, Spring
+from armcal.arm.effects import Condition, JointCommand, JointEffect, Spring
 from armcal.arm.elastic import deflections, elastic_sites, split_deflection
 from armcal.arm.model import ArmModel, Chain, forward
 from armcal.arm.statics import Load, Mass, joint_efforts, wrenches
@@ -184,12 +184,13 @@ class Arm:
         chain = self._shaped(values, inputs)
         sites = elastic_sites(chain, self.springs(values))
         along, rotations = split_deflection(chain.joints, sites, inputs.deflection)
+        commands = [JointCommand(i, inputs.joint_angles[i], inputs.approach[i]) for i in range(len(chain.joints))]
         displacements = [
-            joint.offset + along[i] + self._commanded(values, inputs, i) for i, joint in enumerate(chain.joints)
+            joint.offset + along[i] + self.displacement(values, commands[i]) for i, joint in enumerate(chain.joints)
         ]
         frames = forward(chain, displacements, rotations)
         acting = wrenches(chain, frames, self._masses(values), inputs.load)
-        answer = deflections(chain, frames, acting, sites)
+        answer = deflections(chain, frames, acting, sites, commands)
         return ArmState(frames.base_T_tool, frames.named, answer, joint_efforts(chain, frames, acting))
 
     @property
@@ -203,15 +204,12 @@ class Arm:
         return tuple(
             (name, each if isinstance(each, Condition) else Condition(each))
             for name, effect in self.effects.items()
-            if isinstance(effect, ShapeEffect)
             for each in effect.conditions
         )
 
     def _shaped(self, values: Mapping[str, Expression], inputs: ArmInputs) -> Chain:
         chain = self.chain(values)
         for name, effect in self.effects.items():
-            if not isinstance(effect, ShapeEffect):
-                continue
             try:
                 chain = effect.shaped(chain, inputs.conditions, scoped(values, self._scope(name)))
             except KeyError as fault:
@@ -224,8 +222,8 @@ class Arm:
                 ) from fault
         return chain
 
-    def _commanded(self, values: Mapping[str, Expression], inputs: ArmInputs, index: int) -> Expression:
-        command = JointCommand(index, inputs.joint_angles[index], inputs.approach[index])
+    def displacement(self, values: Mapping[str, Expression], command: JointCommand) -> Expression:
+        """What a joint is told, and what its effects add (rad or m)."""
         added = [e.displacement(command, scoped(values, self._scope(n))) for n, e in self.effects.items()]
         return command.commanded + sum(added, ca.SX(0))
 

@@ -4,23 +4,39 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Any, ClassVar, Literal
 
-from armcal.arm.model import Chain, Vector3
+from armcal.arm.model import Z_AXIS, Chain, Vector3
 from armcal.base.parameters import ParameterBlock
 from armcal.base.se3 import Expression
+from armcal.base.settings import Settings
+
+JointChoice = Literal["all"] | tuple[str, ...]
+"""All joints, or some by name."""
+XYZ: tuple[Vector3, ...] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), Z_AXIS)
+"""The directions of a spring that gives about every axis."""
+_Settings = Settings
 
 
 @dataclass(frozen=True)
 class JointCommand:
     """What is recorded of one joint: its commanded displacement (rad or m) and the direction it came from.
 
-    ``approach`` is the sign of the joint's last motion, 0 where it is not known.
+    ``index`` counts from 0; ``approach`` is the sign of the joint's last motion, 0 where it is not known.
     """
 
     index: int
     commanded: Expression
     approach: Expression
+
+    @property
+    def joint(self) -> int:
+        """The joint's number, from 1."""
+        return self.index + 1
+
+
+MOUNT = JointCommand(-1, 0.0, 0.0)
+"""What the law of a spring at the mount is given, which nothing commands."""
 
 
 @dataclass(frozen=True)
@@ -31,12 +47,13 @@ class Spring:
         site: 0 for the mount, i for joint i (from 1).
         directions: unit vectors in the site's frame (after the joint's motion), one a coordinate; empty for the
             joint's own axis.
-        law: generalised loads (N m, or N on a prismatic joint's own axis; one a coordinate) to deflections (rad or m).
+        law: from generalised loads (N m, or N on a prismatic joint's own axis; one a coordinate) and what its joint was
+            commanded (``MOUNT`` at the mount) to deflections (rad or m).
     """
 
     site: int
     directions: tuple[Vector3, ...]
-    law: Callable[[Expression], Expression]
+    law: Callable[[Expression, JointCommand], Expression]
 
     @property
     def size(self) -> int:
@@ -58,34 +75,67 @@ class Condition:
     dimension: str | None = None
 
 
-class JointEffect(Protocol):
-    """What a plugin provides to describe servos, gears and springs; it holds for any arm model.
+class EffectSettings(Settings):
+    """Which joints an effect is on."""
 
-    ``parameters`` have local names; values come as CasADi expressions under the same names. An expression
-    may branch on what was recorded (a command, an approach), never on a parameter.
+    joints: JointChoice = "all"
+
+
+class JointEffect:
+    """Base of joint effects: servos, gears, springs, for any arm model. What a subclass does not say is nothing.
+
+    Values come as CasADi expressions under the names of ``parameters``. An expression may branch on what was recorded
+    (a command, an approach), never on a parameter.
+
+    Attributes:
+        Settings: the class of its checked settings.
+        conditions: the recorded numbers that ``shaped`` reads, each a column; a bare name is one that any record may
+            carry (``temperature``, in C). Every measured record must have them, a prediction may lack them.
+        settings: its own, checked.
+        joints: the numbers (from 1) of the joints that it is on: those that settings called ``joints`` name, or all.
     """
 
+    Settings: ClassVar[type[_Settings]] = EffectSettings
+    conditions: Sequence[str | Condition] = ()
+
+    def __init__(self, settings: Any, joint_names: Sequence[str]) -> None:
+        self.settings = settings
+        self.joints = chosen(getattr(settings, "joints", "all"), joint_names)
+
     def parameters(self) -> Sequence[ParameterBlock]:
-        """Every number of the effect."""
+        """Every number of the effect, under local names."""
+        return ()
 
     def displacement(self, command: JointCommand, values: Mapping[str, Expression]) -> Expression:
-        """What the effect adds to the joint's commanded displacement (rad or m)."""
+        """What the effect adds to a joint's commanded displacement (rad or m); it is asked of every joint."""
+        return 0
 
     def springs(self, values: Mapping[str, Expression]) -> Sequence[Spring]:
         """The effect's elastic deflections."""
-
-
-@runtime_checkable
-class ShapeEffect(JointEffect, Protocol):
-    """A joint effect that also changes the arm's shape with what is recorded of its surroundings."""
-
-    @property
-    def conditions(self) -> Sequence[str | Condition]:
-        """The recorded numbers it reads; a bare name is a column that any record may carry (``temperature``, in C).
-
-        Every measured record must have them. A prediction may lack them: ``shaped`` uses a reference value then, or
-        lets the ``KeyError`` of the missing name pass, and the prediction is refused.
-        """
+        return ()
 
     def shaped(self, chain: Chain, conditions: Mapping[str, Expression], values: Mapping[str, Expression]) -> Chain:
-        """The chain under these conditions."""
+        """The chain under the recorded ``conditions``.
+
+        Where a prediction lacks one, use a reference value, or let the ``KeyError`` of the missing name pass: then it
+        is refused.
+        """
+        return chain
+
+
+def reshapes(effect: JointEffect) -> bool:
+    """Whether an effect changes the arm's shape."""
+    return type(effect).shaped is not JointEffect.shaped
+
+
+def chosen(wanted: JointChoice, joint_names: Sequence[str]) -> tuple[int, ...]:
+    """The numbers (from 1) of the joints wanted, in the order of the chain.
+
+    Raises:
+        ValueError: a name is not one of the joints'.
+    """
+    names = joint_names if wanted == "all" else wanted
+    unknown = [name for name in names if name not in joint_names]
+    if unknown:
+        raise ValueError(f"no joint is called {unknown[0]!r}; the joints are {', '.join(joint_names)}")
+    return tuple(i for i, name in enumerate(joint_names, start=1) if name in names)

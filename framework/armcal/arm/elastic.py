@@ -11,13 +11,11 @@ from dataclasses import dataclass
 
 import casadi as ca
 
-from armcal.arm.effects import Spring
+from armcal.arm.effects import MOUNT, XYZ, JointCommand, Spring
 from armcal.arm.model import Chain, Frames, Joint, Vector3
 from armcal.arm.statics import SiteWrench, effort
 from armcal.base import se3
 from armcal.base.se3 import Expression
-
-_XYZ: tuple[Vector3, ...] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
 @dataclass(frozen=True)
@@ -55,22 +53,32 @@ def elastic_sites(chain: Chain, springs: Sequence[Spring]) -> tuple[ElasticSite,
 
 def _directions(springs: Sequence[Spring]) -> tuple[Vector3, ...]:
     different = {spring.directions for spring in springs}
-    return springs[0].directions if len(different) == 1 else _XYZ
+    return springs[0].directions if len(different) == 1 else XYZ
 
 
-def deflections(chain: Chain, frames: Frames, acting: Sequence[SiteWrench], sites: Sequence[ElasticSite]) -> Expression:
-    """What each site's coordinates deflect under the wrenches (rad, or m on a sliding joint's axis), stacked."""
+def deflections(
+    chain: Chain,
+    frames: Frames,
+    acting: Sequence[SiteWrench],
+    sites: Sequence[ElasticSite],
+    commands: Sequence[JointCommand],
+) -> Expression:
+    """What each site's coordinates deflect under the wrenches (rad, or m on a sliding joint's axis), stacked.
+
+    ``commands`` are what each joint was commanded.
+    """
     parts = []
     for site in sites:
         pose, wrench = frames.sites[site.site], acting[site.site]
         joint = chain.joints[site.site - 1] if site.site else None
+        command = commands[site.site - 1] if site.site else MOUNT
         total = ca.SX(site.size, 1)
         for spring in site.springs:
             axes = spring.directions or ((joint.axis,) if joint else ())
             along = [ca.dot(ca.mtimes(pose.rotation, ca.SX(list(axis))), wrench.moment) for axis in axes]
             if joint is not None and not site.directions:
                 along = [effort(joint, pose, wrench)]
-            given = spring.law(ca.vertcat(*along))
+            given = spring.law(ca.vertcat(*along), command)
             total += given if spring.directions == site.directions else ca.mtimes(_matrix(axes), given)
         parts.append(total)
     return ca.vertcat(*parts) if parts else ca.SX(0, 1)
@@ -109,7 +117,7 @@ def _matrix(directions: Sequence[Vector3]) -> Expression:
 
 def _about(axis: Vector3, angle: Expression) -> Expression:
     """About one constant axis: exact, and cheap for a coordinate axis."""
-    named: Mapping[Vector3, str] = dict(zip(_XYZ, "xyz", strict=True))
+    named: Mapping[Vector3, str] = dict(zip(XYZ, "xyz", strict=True))
     if axis in named:
         return se3.rotation_about(named[axis], angle).rotation
     return se3.rotation_about_unit(ca.SX(list(axis)), angle)

@@ -9,7 +9,6 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Protocol, runtime_checkable
 
 import casadi as ca
 
@@ -99,8 +98,7 @@ def quantised(angle: Expression, table: PulseTable, clock: PulseClock) -> Expres
     return table.angle(clock.counts(table.pulse(angle)) * clock.tick)
 
 
-@runtime_checkable
-class SteppedEffect(JointEffect, Protocol):
+class SteppedEffect(JointEffect):
     """A joint effect by which only some displacements can be set: those of the whole counts of a servo board.
 
     Its expression has no slope. What chooses commands leaves it out, and chooses among the counts afterwards.
@@ -108,6 +106,7 @@ class SteppedEffect(JointEffect, Protocol):
 
     def servos(self) -> Mapping[int, tuple[PulseTable, PulseClock]]:
         """Pulse table and clock by the joint's index (from 0); joints that are not there are not stepped."""
+        return {}
 
 
 def piecewise_linear(x: Expression, at: Sequence[float], values: Sequence[Expression]) -> Expression:

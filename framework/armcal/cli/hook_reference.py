@@ -12,11 +12,12 @@ import typing
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
-from types import MappingProxyType
+from types import FunctionType, MappingProxyType
 from typing import Any
 
 from armcal import hooks
 
+_METHODS: Any = (FunctionType, property)
 _SECTION = re.compile(r"^(Args|Attributes|Raises|Returns):$")
 _ENTRY = re.compile(r"^(\w+): (.*)$")
 
@@ -29,7 +30,6 @@ WORDS: Mapping[str, str] = MappingProxyType(
         "arms": "each arm that takes part, by instance name, as it stands in the record.",
         "chain": "the arm that its model describes.",
         "channels": "what to listen for, each an arm's joint: `arm.q1`.",
-        "conditions": "recorded numbers by name, those that the record has.",
         "count": "how many bytes.",
         "counts_per_s": "how fast each channel may go, by address and channel.",
         "data": "all bytes of the transaction.",
@@ -71,11 +71,15 @@ class Entry:
 
 @dataclass(frozen=True)
 class ProtocolEntry:
-    """What a component has, or may have beside: ``module.class``, its docstring, its methods."""
+    """What a component has, or may have beside: ``module.class``, its docstring, its methods.
+
+    ``is_base``: it is a class to derive from, which gives the methods defaults.
+    """
 
     name: str
     text: str
     methods: tuple[Entry, ...]
+    is_base: bool = False
 
 
 @dataclass(frozen=True)
@@ -153,9 +157,9 @@ def _protocol(target: str) -> ProtocolEntry:
     methods = [
         _entry(getattr(member, "fget", member), name, text, isinstance(member, property))
         for name, member in vars(made).items()
-        if not name.startswith("_") and (callable(member) or isinstance(member, property))
+        if not name.startswith("_") and isinstance(member, _METHODS)
     ]
-    return ProtocolEntry(f"{module}.{name}", text, tuple(methods))
+    return ProtocolEntry(f"{module}.{name}", text, tuple(methods), not getattr(made, "_is_protocol", False))
 
 
 def _entry(function: Callable[..., Any], name: str = "", around: str = "", is_property: bool = False) -> Entry:
@@ -234,7 +238,7 @@ def as_markdown(found: Reference) -> str:
         "",
         "A registration module marks each hook with `@hookimpl` and may leave out any hook, and any argument of one.",
         "",
-        "| Kind | Hook | Built as | Must have |",
+        "| Kind | Hook | Built as | Derives from, or must have |",
         "| --- | --- | --- | --- |",
     ]
     for kind in found.kinds:
@@ -253,7 +257,8 @@ def as_markdown(found: Reference) -> str:
         lines += [f"## {kind.kind}", "", _marked(kind.hook.text), ""]
         lines += [f"Announced in `{kind.hook.call}`, built as `{kind.built_as}`.", ""]
         for protocol in (kind.protocol, *kind.beside):
-            may = "Must have" if protocol is kind.protocol else "May have"
+            must, may = ("Derives from", "May derive from") if protocol.is_base else ("Must have", "May have")
+            may = must if protocol is kind.protocol else may
             lines += [f"### {may}: `{protocol.name}`", "", *_paragraphs(protocol.text)]
             for method in protocol.methods:
                 lines += _markdown(method)

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import Any, Literal, TypeVar
 
 from pydantic import Field, field_validator
 
 from armcal.arm.assembly import PLACEMENT, Arm, MassiveModel, MassSpec, prefixed
+from armcal.arm.effects import JointEffect
 from armcal.arm.statics import frame_names
 from armcal.base.parameters import FIT_NAME, ParameterBlock, Parameters
 from armcal.base.pose_settings import PoseSettings
@@ -24,6 +26,8 @@ from armcal.solve.factor import STATICS, Environment, gravity_tilt
 
 T = TypeVar("T")
 Path = tuple[str | int, ...]
+_BASES: Mapping[str, type] = MappingProxyType({"effect": JointEffect})
+"""What a component of a kind derives from."""
 
 
 class LinkSettings(Settings):
@@ -175,6 +179,9 @@ def build_component(
         raise
     except Exception as fault:  # a plugin may fail in any way; the user is told which and how
         raise _broken(found, f"building it raised {type(fault).__name__}: {fault}") from fault
+    base = _BASES.get(kind, object)
+    if not isinstance(built, base):
+        raise _broken(found, f"it does not derive from armcal.{base.__name__}")
     return built, {"type": name, **settings.to_config()}
 
 

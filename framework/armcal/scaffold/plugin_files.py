@@ -16,7 +16,7 @@ from armcal.scaffold.rendering import TEMPLATES, rendered
 _EXAMPLES: Mapping[str, tuple[str, int]] = MappingProxyType(
     {
         "model": ("an arm whose joints all turn about parallel axes", 28),
-        "effect": ("the error of a gear, once a turn of one of its wheels", 25),
+        "effect": ("the error of a gear, once a turn of one of its wheels", 26),
         "measurement": ("the distance of the tip from a fixed point, read by a draw wire", 28),
         "estimator": ("least squares by SciPy's trust region method", 22),
         "reader": ("records from a file of JSON objects, one a line", 18),

@@ -14,7 +14,7 @@ from armcal.testing.results import CheckResult
 KNOWN_CHECKS: Mapping[str, int] = MappingProxyType(
     {
         "model": 28,
-        "effect": 25,
+        "effect": 26,
         "measurement": 28,
         "reader": 23,
         "estimator": 22,

@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 
 from armcal.arm.assembly import Arm
-from armcal.arm.effects import JointCommand, JointEffect, ShapeEffect, Spring
+from armcal.arm.effects import MOUNT, JointCommand, JointEffect, Spring, reshapes
 from armcal.arm.model import Attachment, Chain, Joint
 from armcal.base import se3
 from armcal.base.domains import Array
@@ -34,6 +34,8 @@ from armcal.testing.settings_checks import Subject
 from armcal.testing.unit_checks import expect_gain, scalars
 
 JOINTS = ("q1", "q2", "q3")
+_STATES = ([0.0, 0.0], [0.4, 1.0], [-1.2, -1.0])
+"""Command and approach of a joint."""
 
 
 def check_effect(record: Recorder, subject: Subject) -> None:
@@ -41,7 +43,8 @@ def check_effect(record: Recorder, subject: Subject) -> None:
     effect: JointEffect | None = record.check(
         f"it builds for the joints {', '.join(JOINTS)}", lambda: subject.made(subject.settings, JOINTS)
     )
-    blocks = None if effect is None else check_parameters(record, effect.parameters)
+    derived = None if effect is None else record.check("it derives from armcal.JointEffect", lambda: _derived(effect))
+    blocks = check_parameters(record, effect.parameters) if effect is not None and derived else None
     if effect is None or blocks is None:
         return
     values = symbols(blocks)
@@ -57,23 +60,31 @@ def check_effect(record: Recorder, subject: Subject) -> None:
         )
     record.check("it is the same each time", lambda: _repeated(subject, effect, blocks))
     record.check("every parameter has an influence", lambda: expect_all_used(_all_of(effect, values), values))
-    if isinstance(effect, ShapeEffect):
+    if reshapes(effect) or effect.conditions:
         record.check("the columns it reads are declared, each with its dimension", lambda: _columns(effect))
         record.check("its shape changes with every column it declares", lambda: _read(effect, values))
     springs = record.check("its springs have a site and unit directions", lambda: _springs(effect, values))
     if not springs:
         return
     loads = ca.SX.sym("loads", sum(spring.size for spring in springs))
-    laws = record.check("every law gives one deflection a coordinate", lambda: _laws(springs, loads))
+    recorded = ca.SX.sym("recorded", 2 * len(JOINTS))
+    laws = record.check("every law gives one deflection a coordinate", lambda: _laws(springs, loads, recorded))
     if laws is None:
         return
-    record.check("laws depend on what is given", lambda: expect_only(laws, [loads, given]))
+    record.check("laws depend on what is given", lambda: expect_only(laws, [loads, recorded, given]))
     record.check(
         "laws branch neither on a parameter nor on a load",
-        lambda: expect_no_choice(laws, ca.SX(0, 1), stacked([loads, given])),
+        lambda: expect_no_choice(laws, recorded, stacked([loads, given])),
     )
-    record.check("laws are finite and smooth, at zero load too", lambda: _smooth(blocks, given, loads, laws))
-    record.check("deflections are in rad, of loads in N m", lambda: _law_gains(blocks, given, loads, laws))
+    told = [ca.substitute(laws, recorded, ca.SX(state * len(JOINTS))) for state in _STATES]
+    record.check("laws are finite and smooth, at zero load too", lambda: _smooth(blocks, given, loads, told))
+    record.check("deflections are in rad, of loads in N m", lambda: _law_gains(blocks, given, loads, stacked(told)))
+
+
+def _derived(effect: JointEffect) -> bool:
+    bases = ", ".join(base.__name__ for base in type(effect).__bases__)
+    expect(isinstance(effect, JointEffect), f"found that it derives from {bases}, expected JointEffect")
+    return True
 
 
 def _displacement(effect: JointEffect, values: Mapping[str, Expression]) -> tuple[Expression, Expression]:
@@ -115,14 +126,13 @@ def _displacement_gains(
 def _all_of(effect: JointEffect, values: Mapping[str, Expression]) -> Expression:
     """Everything that an effect says, on an arm of its joints."""
     loads = ca.SX.sym("loads", 3 * len(JOINTS) + 3)
-    laws = [spring.law(loads[: spring.size]) for spring in effect.springs(values)]
-    shapes: list[Expression] = []
-    if isinstance(effect, ShapeEffect):
-        shapes = [_shape(effect, {name: ca.SX.sym(name) for name in _arm_of(effect).conditions}, values)]
-    return stacked([_displacement(effect, values)[1], *laws, *shapes])
+    recorded = ca.SX.sym("recorded", 2 * len(JOINTS))
+    laws = [spring.law(loads[: spring.size], _command(spring, recorded)) for spring in effect.springs(values)]
+    shape = _shape(effect, {name: ca.SX.sym(name) for name in _arm_of(effect).conditions}, values)
+    return stacked([_displacement(effect, values)[1], *laws, shape])
 
 
-def _shape(effect: ShapeEffect, conditions: Mapping[str, Expression], values: Mapping[str, Expression]) -> Expression:
+def _shape(effect: JointEffect, conditions: Mapping[str, Expression], values: Mapping[str, Expression]) -> Expression:
     """What an effect makes of a chain of links of any length."""
     links = [se3.translation_along("x", ca.SX.sym(f"l{i}")) for i in range(len(JOINTS) + 1)]
     joints = tuple(Joint(name, link) for name, link in zip(JOINTS, links, strict=False))
@@ -134,14 +144,14 @@ def _arm_of(effect: JointEffect) -> Arm:
     return replace(planar_arms((ARM,))[ARM], effects={"effect": effect})
 
 
-def _columns(effect: ShapeEffect) -> None:
+def _columns(effect: JointEffect) -> None:
     try:
         surroundings({ARM: _arm_of(effect)})
     except ValueError as fault:
         raise ContractError(str(fault)) from fault
 
 
-def _read(effect: ShapeEffect, values: Mapping[str, Expression]) -> None:
+def _read(effect: JointEffect, values: Mapping[str, Expression]) -> None:
     """Each column has an influence, and without them the shape is known, or the missing name is a KeyError."""
     given = {name: ca.SX.sym(name) for name in _arm_of(effect).conditions}
     expect_all_used(_shape(effect, given, values), given)
@@ -158,7 +168,7 @@ def _repeated(subject: Subject, effect: JointEffect, blocks: tuple[ParameterBloc
         entries = near_nominal(blocks, np.random.default_rng(4))
         recorded, moved = _displacement(made, values)
         springs = made.springs(values)
-        laws = [spring.law(ca.SX(np.linspace(0.3, 1.1, spring.size))) for spring in springs]
+        laws = [spring.law(ca.SX(np.linspace(0.3, 1.1, spring.size)), _command(spring, recorded)) for spring in springs]
         function = ca.Function("all", [stacked(list(values.values())), recorded], [stacked([moved, *laws])])
         return np.asarray(function(entries, [0.4, 1.0] * len(JOINTS)))
 
@@ -197,10 +207,16 @@ def _springs(effect: JointEffect, values: Mapping[str, Expression]) -> tuple[Spr
     return springs
 
 
-def _laws(springs: Sequence[Spring], loads: Expression) -> Expression:
+def _command(spring: Spring, recorded: Expression) -> JointCommand:
+    """What the joint of a spring was commanded, of the commands and approaches of all (6x1)."""
+    at = 2 * (spring.site - 1)
+    return JointCommand(spring.site - 1, recorded[at], recorded[at + 1]) if spring.site else MOUNT
+
+
+def _laws(springs: Sequence[Spring], loads: Expression, recorded: Expression) -> Expression:
     parts, start = [], 0
     for spring in springs:
-        part = ca.SX(spring.law(loads[start : start + spring.size]))
+        part = ca.SX(spring.law(loads[start : start + spring.size], _command(spring, recorded)))
         start += spring.size
         expect(
             part.shape == (spring.size, 1),
@@ -210,8 +226,8 @@ def _laws(springs: Sequence[Spring], loads: Expression) -> Expression:
     return stacked(parts)
 
 
-def _smooth(blocks: Sequence[ParameterBlock], given: Expression, loads: Expression, laws: Expression) -> None:
-    function = ca.Function("laws", [stacked([loads, given])], [laws])
+def _smooth(blocks: Sequence[ParameterBlock], given: Expression, loads: Expression, laws: Sequence[Expression]) -> None:
+    function = ca.Function("laws", [stacked([loads, given])], [stacked(laws)])
     random = np.random.default_rng(2)
     entries = near_nominal(blocks, random)
     names = (*(f"load {i}" for i in range(1, loads.numel() + 1)), *entry_names(blocks))

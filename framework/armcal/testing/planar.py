@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 
 from armcal.arm.assembly import Arm, ArmState
-from armcal.arm.effects import JointCommand, Spring
+from armcal.arm.effects import JointCommand, JointEffect, Spring
 from armcal.arm.model import Attachment, Chain, Joint
 from armcal.base import se3
 from armcal.base.dataset import Dataset
@@ -69,28 +69,24 @@ class SkewedArm(PlanarArm):
 
 
 @dataclass(frozen=True)
-class Springs:
+class Springs(JointEffect):
     """A spring on every joint's own axis, and one about x and y at the base; all of one compliance."""
 
-    joints: int
+    count: int
     compliance: float = 1e-3
 
     def parameters(self) -> tuple[ParameterBlock, ...]:
         """The compliance (rad/(N m), or m/N on a sliding joint)."""
         return (scalar("k", "rad_per_Nm", self.compliance, 1e-3),)
 
-    def displacement(self, command: JointCommand, values: Mapping[str, Expression]) -> Expression:
-        """Nothing."""
-        return 0
-
     def springs(self, values: Mapping[str, Expression]) -> tuple[Spring, ...]:
         """The base's first."""
 
-        def law(load: Expression) -> Expression:
+        def law(load: Expression, command: JointCommand) -> Expression:
             return values["k"] * load
 
         base = Spring(0, ((1.0, 0.0, 0.0), _Y_AXIS), law)
-        return (base, *(Spring(site, (), law) for site in range(1, self.joints + 1)))
+        return (base, *(Spring(site, (), law) for site in range(1, self.count + 1)))
 
 
 class Walls(Contact):

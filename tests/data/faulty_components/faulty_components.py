@@ -8,7 +8,7 @@ from typing import Annotated, Any, ClassVar
 
 import casadi as ca
 import numpy as np
-from armcal.arm.effects import Spring
+from armcal.arm.effects import JointEffect, Spring
 from armcal.arm.model import Attachment, Chain, Joint
 from armcal.base import se3
 from armcal.base.dataset import Dataset
@@ -155,7 +155,7 @@ class Stepped(Model):
         return super().chain({"length": ca.floor(values["length"] * 1e7) / 1e7})
 
 
-class Effect:
+class Effect(JointEffect):
     """Sound; the faulty ones derive from it."""
 
     Settings: ClassVar[Any] = Nothing
@@ -169,14 +169,29 @@ class Effect:
     def parameters(self) -> Any:
         return (scalar("k", "rad_per_Nm", 0.01, 0.01),)
 
-    def displacement(self, command: Any, values: Any) -> Any:
-        return 0
-
     def law(self, load: Any, k: Any) -> Any:
         return k * load
 
     def springs(self, values: Any) -> Any:
-        return (Spring(self.site, self.directions, lambda load: self.law(load, values["k"])),)
+        return (Spring(self.site, self.directions, lambda load, command: self.law(load, values["k"])),)
+
+
+class ForeignEffect:
+    """It has all methods, and derives from nothing."""
+
+    Settings: ClassVar[Any] = Nothing
+
+    def __init__(self, settings: Any, joint_names: Any) -> None:
+        pass
+
+    def parameters(self) -> Any:
+        return (scalar("k", "rad_per_Nm", 0.01, 0.01),)
+
+    def displacement(self, command: Any, values: Any) -> Any:
+        return values["k"]
+
+    def springs(self, values: Any) -> Any:
+        return ()
 
 
 class TwoDisplacements(Effect):

@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import Any, ClassVar
 
 import casadi as ca
-from armcal.arm.effects import Condition, JointCommand
+from armcal.arm.effects import Condition, JointEffect
 from armcal.arm.model import Chain
 from armcal.base.parameters import scalar
 from armcal.base.se3 import Transform
@@ -111,31 +111,14 @@ class PixelCamera:
         return ("angle", "angle")
 
 
-class SwellingSettings(Settings):
-    """Nothing to set."""
-
-
-class Swelling:
+class Swelling(JointEffect):
     """Every length grows with the relative humidity (0 to 1): parameter ``swelling``."""
 
-    Settings: ClassVar[type[SwellingSettings]] = SwellingSettings
-    EXAMPLE: ClassVar[Mapping[str, Any]] = {}
     conditions: ClassVar[tuple[Condition, ...]] = (Condition("humidity", "dimensionless"),)
-
-    def __init__(self, settings: SwellingSettings, joint_names: Sequence[str]) -> None:
-        self._joints = len(joint_names)
 
     def parameters(self):
         """Growth of a length from dry to wet, a share of it."""
         return (scalar("swelling", "1", 0.0, 0.01),)
-
-    def displacement(self, command: JointCommand, values):
-        """Nothing."""
-        return 0
-
-    def springs(self, values):
-        """None."""
-        return ()
 
     def shaped(self, chain: Chain, conditions, values) -> Chain:
         """Every link and the tool longer; it cannot do without the humidity."""

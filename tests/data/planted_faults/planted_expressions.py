@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 
 import casadi as ca
 import numpy as np
-from armcal.arm.effects import Spring
+from armcal.arm.effects import JointEffect, Spring
 from armcal.arm.model import Attachment, Chain, Joint
 from armcal.base import se3
 from armcal.base.domains import Interval
@@ -223,7 +223,7 @@ class AcceptsAnyKey(Arm):
         model_config = ConfigDict(extra="ignore")
 
 
-class Springy:
+class Springy(JointEffect):
     """Sound: a lag by the approach, and a spring about each joint."""
 
     Settings: ClassVar[Any] = type("SpringySettings", (Settings,), {})
@@ -242,7 +242,9 @@ class Springy:
         return k * load
 
     def springs(self, values: Any) -> Any:
-        return tuple(Spring(site, (self.direction,), lambda load: self.law(load, values["k"])) for site in self.sites)
+        return tuple(
+            Spring(site, (self.direction,), lambda load, command: self.law(load, values["k"])) for site in self.sites
+        )
 
 
 class LagInDegrees(Springy):

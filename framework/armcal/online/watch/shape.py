@@ -64,6 +64,7 @@ def _passes(arm: Arm, values: Values, environment: Environment) -> ca.Function:
     """Commands and deflections to the points (3 x n, m) and the deflections that these lead to."""
     import casadi as ca
 
+    from armcal.arm.effects import JointCommand
     from armcal.arm.elastic import elastic_sites, split_deflection
     from armcal.arm.model import forward
 
@@ -72,7 +73,8 @@ def _passes(arm: Arm, values: Values, environment: Environment) -> ca.Function:
     inputs = _inputs(arm, commands, deflection, environment)
     along, rotations = split_deflection(chain.joints, sites, deflection)
     displacements = [
-        joint.offset + along[i] + _displaced(arm, values, inputs, i) for i, joint in enumerate(chain.joints)
+        joint.offset + along[i] + arm.displacement(values, JointCommand(i, inputs.joint_angles[i], inputs.approach[i]))
+        for i, joint in enumerate(chain.joints)
     ]
     frames = forward(chain, displacements, rotations)
     points = [ca.SX.zeros(3), *(site.origin for site in frames.sites), frames.base_T_tool.translation]
@@ -92,19 +94,6 @@ def _inputs(arm: Arm, commands: ca.SX, deflection: ca.SX, environment: Environme
     gravity, payload_com, force, torque = (ca.SX(list(vector)) for vector in vectors)
     load = Load(gravity, ca.SX(environment.payload_mass), payload_com, force, torque)
     return ArmInputs(told, ca.SX.zeros(told.numel()), load, deflection)
-
-
-def _displaced(arm: Arm, values: Values, inputs: ArmInputs, index: int) -> ca.SX:
-    """What a joint is told, and what its effects add."""
-    import casadi as ca
-
-    from armcal.arm.assembly import scoped
-    from armcal.arm.effects import JointCommand
-
-    command = JointCommand(index, inputs.joint_angles[index], inputs.approach[index])
-    added = [e.displacement(command, scoped(values, f"{arm.name}.{name}.")) for name, e in arm.effects.items()]
-    total: ca.SX = command.commanded + sum(added, ca.SX(0))
-    return total
 
 
 def _settled(function: ca.Function, commands: list[float]) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
