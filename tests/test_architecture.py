@@ -16,6 +16,7 @@ ORDER = [
     "armcal.hooks",
     "armcal.hook_trace",
     "armcal.registration",
+    "armcal.plugin_files",
     "armcal.plugins",
     "armcal.base.shown",
     "armcal.base.plain_files",

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from armcal.base.settings import Settings
     from armcal.errors import ArmcalError, InputError, NotConvergedError
     from armcal.hooks import hookimpl
+    from armcal.plugin_files import use_plugins as use_plugins
     from armcal.run.pipeline import calibrate
     from armcal.run.result import RunResult
     from armcal.solve.estimator import Estimate
@@ -92,6 +93,7 @@ _FOR_PLUGINS = {
     "XYZ": "armcal.arm.effects",
     "chosen": "armcal.arm.effects",
     "scalar": "armcal.base.parameters",
+    "use_plugins": "armcal.plugin_files",
 }
 
 

@@ -23,12 +23,12 @@ hookimpl = pluggy.HookimplMarker(PROJECT)
 class Register(Protocol):
     """What registration hooks are handed."""
 
-    def __call__(self, name: str, target: str, summary: str = "") -> None:
+    def __call__(self, name: str, target: str | type, summary: str = "") -> None:
         """Announce a component.
 
         Args:
             name: what a configuration calls it (``type: NAME``).
-            target: ``module:attribute`` of its class.
+            target: ``module:attribute`` of its class, which is imported when a configuration asks for it; or the class.
             summary: one line for ``armcal plugins list``.
         """
 

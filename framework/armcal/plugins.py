@@ -13,11 +13,10 @@ from typing import Any
 
 import pluggy
 
-from armcal.errors import PluginError
+from armcal import plugin_files
+from armcal.errors import Location, PluginError
 from armcal.hook_trace import Answer, HookTrace
 from armcal.registration import new_manager, registered, said
-
-GROUP = "armcal"
 
 
 @dataclass(frozen=True)
@@ -58,7 +57,7 @@ class PluginInfo:
     """One entry point.
 
     Attributes:
-        distribution: that it came with, if any, and ``version`` of that.
+        distribution: that it came with, if any, and ``version`` of that; of a file its name and digest.
         fault: why it is left out; empty if it is not.
     """
 
@@ -67,6 +66,11 @@ class PluginInfo:
     distribution: str
     version: str
     fault: str = ""
+
+    @property
+    def is_file(self) -> bool:
+        """Whether nobody packaged it."""
+        return self.module.startswith(f"{plugin_files.__name__}.")
 
 
 @dataclass(frozen=True)
@@ -103,7 +107,8 @@ class PluginRegistry:
         found = self._by_name.get((kind, name), [])
         if len(found) > 1:
             offered = " and ".join(f"{c.plugin} ({c.target})" for c in found)
-            raise PluginError(f"the {kind} {name!r} is offered twice, by {offered}.", hint="Uninstall one of them.")
+            hint = "Leave one of them out: --disable-plugin NAME."
+            raise PluginError(f"the {kind} {name!r} is offered twice, by {offered}.", hint=hint)
         if found:
             return found[0]
         known = sorted(n for k, n in self._by_name if k == kind)
@@ -112,6 +117,8 @@ class PluginRegistry:
         if self.faults:
             failed = "; ".join(f"{p.name}: {p.fault}" for p in self.faults)
             hint += f" These plugins failed to load and may have had it: {failed}."
+        if plugin_files.disabled():
+            hint += f" Left out as --disable-plugin asks: {', '.join(plugin_files.disabled())}."
         raise PluginError(f"no plugin offers {_spoken(kind)} called {name!r}.", hint=hint)
 
     def notify(self, event: str, **what: Any) -> list[str]:
@@ -139,27 +146,51 @@ def discover(found: Iterable[EntryPoint] | None = None) -> PluginRegistry:
     """Load every registration module.
 
     A plugin that fails to import, or has a hook that armcal does not know, is listed with its fault and breaks nothing
-    else. Calls are traced as the environment variable ``ARMCAL_TRACE_HOOKS`` asks now.
+    else; one that ``use_plugins`` (``--plugin``) names must load. Calls are traced as the environment variable
+    ``ARMCAL_TRACE_HOOKS`` asks now.
 
     Raises:
         ConfigError: that variable names a file that cannot be written.
+        PluginError: a plugin's file is not there, does not load or registers nothing, or has another plugin's name; or
+            a plugin that is to be left out is not there.
     """
     trace, manager = HookTrace.from_environment(), new_manager()
     plugins, components = [], []
-    points = entry_points(group=GROUP) if found is None else found
-    for point in sorted({(p.name, p.value): p for p in points}.values(), key=lambda p: (p.name, p.value)):
-        outcome, distribution = registered(manager, point, trace), point.dist
-        plugins.append(
-            PluginInfo(
-                point.name,
-                point.value,
-                distribution.name if distribution else "",
-                distribution.version if distribution else "",
-                outcome.fault,
-            )
-        )
+    for point in _chosen(entry_points(group=plugin_files.GROUP) if found is None else found):
+        outcome = registered(manager, point, trace)
+        if isinstance(point, plugin_files.FilePoint) and (outcome.fault or not outcome.works):
+            text = outcome.fault or "it registers nothing: write a function armcal_register_... after @hookimpl."
+            raise PluginError(text, where=None if outcome.fault else Location(str(point.file)))
+        plugins.append(PluginInfo(point.name, point.value, *_release(point), outcome.fault))
         components += [
             Component(each.kind, each.name, each.target, each.summary, point.name, point.value)
             for each in outcome.announced
         ]
     return PluginRegistry(tuple(plugins), tuple(components), manager, trace)
+
+
+def _chosen(installed: Iterable[EntryPoint]) -> list[EntryPoint]:
+    """Installed plugins and files, without those that are to be left out, by name.
+
+    Raises:
+        PluginError: a file takes an installed plugin's name, or one that is to be left out is not there.
+    """
+    points, out = {(p.name, p.value): p for p in installed}, plugin_files.disabled()
+    for name, file in plugin_files.files().items():
+        for other in (p for p in points.values() if p.name == name and name not in out):
+            found = " ".join((other.value, *_release(other))).strip()
+            raise PluginError(f"two plugins are called {name!r}: {file} and {found}.", hint="Rename the file.")
+        point = plugin_files.FilePoint.of(name)
+        points[point.name, point.value] = point
+    names = sorted({name for name, _ in points})
+    for name in out:
+        if name not in names:
+            raise PluginError(f"no plugin is called {name!r}, to be left out.", hint=f"Installed: {', '.join(names)}.")
+    return [points[key] for key in sorted(points) if key[0] not in out]
+
+
+def _release(point: EntryPoint) -> tuple[str, str]:
+    """Distribution and version of an entry point; empty where it has none."""
+    if isinstance(point, plugin_files.FilePoint):
+        return point.file.name, plugin_files.digest(point.file)
+    return (point.dist.name, point.dist.version) if point.dist else ("", "")

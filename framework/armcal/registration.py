@@ -30,10 +30,12 @@ class Registration:
     Attributes:
         fault: why it is left out; empty if it is not.
         announced: its components.
+        works: whether it has any hook.
     """
 
     fault: str = ""
     announced: tuple[Announcement, ...] = ()
+    works: bool = False
 
 
 def new_manager() -> pluggy.PluginManager:
@@ -57,7 +59,7 @@ def registered(manager: pluggy.PluginManager, point: EntryPoint, trace: HookTrac
         manager.register(module, name)
     except (Exception, SystemExit) as fault:  # whatever a third party's module does, the others must work
         return Registration(said(fault))
-    return Registration("", announced)
+    return Registration("", announced, bool(alone.get_hookcallers(module)))
 
 
 def said(fault: BaseException) -> str:
@@ -79,7 +81,9 @@ def _announced(alone: pluggy.PluginManager) -> tuple[Announcement, ...]:
     announced: list[Announcement] = []
     for kind, hook in hooks.KINDS.items():
 
-        def register(name: str, target: str, summary: str = "", kind: str = kind) -> None:
+        def register(name: str, target: str | type, summary: str = "", kind: str = kind) -> None:
+            if isinstance(target, type):
+                target = f"{target.__module__}:{target.__qualname__}"
             if not all(isinstance(text, str) for text in (name, target, summary)):
                 given = ", ".join(map(repr, (name, target, summary)))
                 raise TypeError(f"register() was given {given}; expected text")

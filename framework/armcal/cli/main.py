@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import itertools
 import os
 import sys
 from importlib import import_module
@@ -13,6 +14,7 @@ from click.shell_completion import CompletionItem
 from armcal import __version__
 from armcal.cli.outlet import Outlet, say
 from armcal.errors import EXIT_DONE, EXIT_FAULT, EXIT_INTERRUPTED, ArmcalError
+from armcal.plugin_files import use_plugins
 
 COMMANDS = {
     "new": ("armcal.cli.new:new", "Begin a robot's files, or a plugin of your own."),
@@ -48,6 +50,8 @@ COMMANDS = {
     "doctor": ("armcal.cli.doctor:doctor", "What is installed, what works, and what is missing."),
 }
 
+_GLOBAL = ("--plugin", "--disable-plugin")
+
 
 class LazyGroup(click.Group):
     """A group that knows its commands by name and imports one only to run it."""
@@ -66,6 +70,10 @@ class LazyGroup(click.Group):
         except ImportError as fault:
             raise _missing(fault) from fault
         return command
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Options of the whole program may also stand after the command."""
+        return super().parse_args(ctx, _global_first(args))
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]
@@ -100,8 +108,18 @@ class LazyGroup(click.Group):
 
 @click.command(cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(__version__, prog_name="armcal")
-def cli() -> None:
+@click.option(
+    "--plugin",
+    "plugins",
+    multiple=True,
+    metavar="FILE",
+    help="Load a plugin, or a folder of them.",
+)
+@click.option("--disable-plugin", "disabled", multiple=True, metavar="NAME", help="Leave a plugin out.")
+def cli(plugins: tuple[str, ...], disabled: tuple[str, ...]) -> None:
     """Find what a robot arm really is: its geometry, its joints, its compliance, and how sure that is."""
+    if plugins or disabled:
+        use_plugins(*plugins, disabled=disabled)
 
 
 def main() -> None:
@@ -121,6 +139,19 @@ def main() -> None:
         for outlet in outlets.values():
             outlet.finish()
     sys.exit(code)
+
+
+def _global_first(args: list[str]) -> list[str]:
+    """The same arguments, those about plugins before the others; what stands after ``--`` stays."""
+    first, rest, waiting = list[str](), list[str](), iter(args)
+    for each in waiting:
+        if each == "--":
+            rest += [each, *waiting]
+        elif each in _GLOBAL:
+            first += [each, *itertools.islice(waiting, 1)]
+        else:
+            (first if each.startswith(tuple(f"{name}=" for name in _GLOBAL)) else rest).append(each)
+    return first + rest
 
 
 def _exit_code() -> int:

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from armcal import plugin_files
 from armcal.testing.results import Recorder, expect
 
 _DEEPEST = 4
@@ -71,10 +72,14 @@ class _Place:
 
 def _of_modules(made: Any) -> dict[str, _Place]:
     """Every variable of the modules of a component's package."""
-    package = str(getattr(made, "__module__", "")).partition(".")[0]
-    if package in ("", "builtins", "armcal"):
+    own = str(getattr(made, "__module__", ""))
+    package = own.partition(".")[0]
+    if own.startswith(f"{plugin_files.__name__}."):
+        found = [sys.modules[own]]
+    elif package in ("", "builtins", "armcal"):
         return {}
-    found = [module for name, module in sorted(sys.modules.items()) if name.partition(".")[0] == package]
+    else:
+        found = [module for name, module in sorted(sys.modules.items()) if name.partition(".")[0] == package]
     return {f"{where}.{place.name}": place for module in found for where, place in _places(module)}
 
 

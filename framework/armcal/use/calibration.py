@@ -17,7 +17,7 @@ from armcal.base.parameters import Parameters
 from armcal.config.system import System, build_system
 from armcal.config.validate import validate
 from armcal.config.yaml_source import ConfigSource
-from armcal.errors import ArmcalError, CalibrationWarning, ConfigError, DataError, Location
+from armcal.errors import ArmcalError, CalibrationWarning, ConfigError, DataError, Location, PluginError
 from armcal.measure.measurement import Measurement
 from armcal.plugins import PluginRegistry, discover
 from armcal.solve.coverage import Recording
@@ -27,7 +27,18 @@ from armcal.use.compensation.compensator import Compensator
 from armcal.use.compensation.request import Commands, Options
 from armcal.use.intervals import PlusMinus, Uncertainty
 from armcal.use.measured_point import Point, pointed
-from armcal.use.physics import SHARE, UNSTATED_M, check_record, components, differences, movement, predict, readable
+from armcal.use.physics import (
+    SHARE,
+    UNSTATED_M,
+    ComponentRecord,
+    absent,
+    check_record,
+    components,
+    differences,
+    movement,
+    predict,
+    readable,
+)
 from armcal.use.tool_expression import ToolExpression, arm_expression
 
 _OTHER_PHYSICS = (
@@ -104,9 +115,13 @@ class Calibration:
                 where=Location(str(path)),
                 hint="Change the experiment's configuration and run it again.",
             )
+        missing = absent(record.components, registry)
+        if missing is not None:
+            raise _absent(missing, path)
         system = build_system(source, registry)
         parameters = system.parameters(record.groups)
-        return cls(system, parameters.with_nominal(_values(parameters, record, path)), record)
+        changed = differences(record.components, components(system, registry))
+        return cls(system, parameters.with_nominal(_values(parameters, record, path, changed)), record)
 
     def checked(self, commands: Dataset | None, registry: PluginRegistry) -> Calibration:
         """The same with what its components are now and predictions at check poses (no poses: none).
@@ -366,13 +381,25 @@ def _component(kept: Mapping[str, Any]) -> Component:
     return Component(**known)
 
 
-def _values(parameters: Parameters, record: CalibrationFile, path: str | Path) -> Array:
+def _absent(missing: ComponentRecord, path: str | Path) -> PluginError:
+    """What is wrong with a calibration whose plugin is not there."""
+    given = f"{missing.distribution or missing.plugin} {missing.version}".strip()
+    is_file = missing.distribution.endswith(".py")
+    return PluginError(
+        f"it was made with the {missing.kind} {missing.name!r} of the plugin{' file' if is_file else ''} {given}, "
+        "which is not loaded.",
+        where=Location(str(path)),
+        hint=f"Give that file: --plugin {missing.distribution}." if is_file else "Install that plugin.",
+    )
+
+
+def _values(parameters: Parameters, record: CalibrationFile, path: str | Path, changed: Sequence[str]) -> Array:
     kept = {entry.name: entry.value for entry in record.parameters}
     if tuple(kept) != parameters.entry_names:
         differing: Sequence[str] = sorted(set(kept) ^ set(parameters.entry_names))
         raise ConfigError(
             f"its parameters are not those of its arm: {', '.join(differing[:5]) or 'their order differs'}.",
             where=Location(str(path)),
-            hint="It was written by another version of a plugin; run the calibration again.",
+            hint=f"It was made with {'; '.join(changed) or 'another version of a plugin'}; run the calibration again.",
         )
     return np.array(list(kept.values()))

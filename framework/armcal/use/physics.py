@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 import armcal
+from armcal import plugin_files
 from armcal.arm import assembly
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
@@ -138,6 +139,12 @@ def components(system: System, registry: PluginRegistry) -> tuple[ComponentRecor
     return tuple(records.values())
 
 
+def absent(kept: tuple[ComponentRecord, ...], registry: PluginRegistry) -> ComponentRecord | None:
+    """The first component that no plugin offers."""
+    offered = {(component.kind, component.name) for component in registry.components} | {("core", "arm")}
+    return next((each for each in kept if (each.kind, each.name) not in offered), None)
+
+
 def differences(kept: tuple[ComponentRecord, ...], now: tuple[ComponentRecord, ...]) -> list[str]:
     """What is another than it was, a phrase each: versions, and sources of the same version."""
     found: dict[str, None] = {}
@@ -234,7 +241,8 @@ def _source(module: str) -> str:
         return ""
     path, digest = Path(file), hashlib.sha256()
     try:
-        for each in sorted(path.parent.glob("*.py")) if getattr(loaded, "__package__", "") else [path]:
+        packaged = getattr(loaded, "__package__", "") not in ("", plugin_files.__name__)
+        for each in sorted(path.parent.glob("*.py")) if packaged else [path]:
             digest.update(f"{each.name}\0".encode() + each.read_bytes() + b"\0")
     except OSError:
         return ""
