@@ -45,6 +45,7 @@ ORDER = [
     "armcal.arm.loading",
     "armcal.measure.measurement",
     "armcal.measure.contact",
+    "armcal.measure.instrument",
     "armcal.measure.groups",
     "armcal.measure.partners",
     "armcal.measure.reader",

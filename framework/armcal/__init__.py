@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from armcal.api import Experiment, Run
+    from armcal.arm.assembly import ArmState as ArmState
     from armcal.arm.effects import XYZ as XYZ
     from armcal.arm.effects import Condition as Condition
     from armcal.arm.effects import EffectSettings as EffectSettings
@@ -28,6 +29,10 @@ if TYPE_CHECKING:
     from armcal.base.settings import Settings
     from armcal.errors import ArmcalError, InputError, NotConvergedError
     from armcal.hooks import hookimpl
+    from armcal.measure.contact import Contact as Contact
+    from armcal.measure.instrument import Instrument as Instrument
+    from armcal.measure.instrument import InstrumentSettings as InstrumentSettings
+    from armcal.measure.measurement import Channel as Channel
     from armcal.plugin_files import use_plugins as use_plugins
     from armcal.run.pipeline import calibrate
     from armcal.run.result import RunResult
@@ -81,6 +86,11 @@ _HOMES = {
     "hookimpl": "armcal.hooks",
 }
 _FOR_PLUGINS = {
+    "ArmState": "armcal.arm.assembly",
+    "Channel": "armcal.measure.measurement",
+    "Contact": "armcal.measure.contact",
+    "Instrument": "armcal.measure.instrument",
+    "InstrumentSettings": "armcal.measure.instrument",
     "Angle": "armcal.base.settings",
     "Condition": "armcal.arm.effects",
     "EffectSettings": "armcal.arm.effects",

@@ -176,6 +176,7 @@ COMPONENTS: Mapping[str, ComponentKind] = MappingProxyType(
             "Measurement(settings, arm_names)",
             f"{_MEASURE}:Measurement",
             (
+                "armcal.measure.instrument:Instrument",
                 f"{_MEASURE}:RecordNoise",
                 f"{_MEASURE}:DimensionedResidual",
                 f"{_MEASURE}:GroupedMeasurement",

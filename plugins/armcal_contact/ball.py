@@ -70,19 +70,18 @@ class BallInSocket(OneArmContact):
 
     def __init__(self, settings: BallInSocketSettings, arm_names: Sequence[str]) -> None:
         super().__init__(settings, arm_names)
-        self._settings = settings
         self.group_owner = settings.sockets_of
         self.mean_weight = _MEAN_WEIGHT if settings.socket == "mean" else 1.0
 
     def parameters(self) -> tuple[ParameterBlock, ...]:
         """The ball's centre on the tool (m)."""
         return tuple(
-            scalar(f"centre_{axis}", "m", x, 0.01) for axis, x in zip("xyz", self._settings.centre, strict=True)
+            scalar(f"centre_{axis}", "m", x, 0.01) for axis, x in zip("xyz", self.settings.centre, strict=True)
         )
 
     def group_parameters(self, group: str) -> tuple[ParameterBlock, ...]:
         """A socket's place in the base frame (m); fixed if it is known."""
-        known = self._settings.sockets.get(group)
+        known = self.settings.sockets.get(group)
         blocks = [scalar(axis, "m", x, 0.01) for axis, x in zip("xyz", known or (0.0, 0.0, 0.0), strict=True)]
         return tuple(ParameterBlock(b.name, b.unit, b.nominal, b.domain, b.scale, free=known is None) for b in blocks)
 
@@ -94,15 +93,15 @@ class BallInSocket(OneArmContact):
     def named_groups(self) -> tuple[str, ...]:
         """Sockets at known places, and those at known distances."""
         before = "*/" if len(self.group_labels) > 1 else ""
-        apart = [f"{before}{name}" for known in self._settings.distances for name in known.between]
-        return (*self._settings.sockets, *apart)
+        apart = [f"{before}{name}" for known in self.settings.distances for name in known.between]
+        return (*self.settings.sockets, *apart)
 
     def ties(self, groups: Sequence[str]) -> tuple[Tie, ...]:
         """Known distances, within each tool position."""
-        if self._settings.sockets_of is not None:
+        if self.settings.sockets_of is not None:
             return ()
         found = []
-        for known in self._settings.distances:
+        for known in self.settings.distances:
             for first in groups:
                 position, slash, socket = first.rpartition("/")
                 second = f"{position}{slash}{known.between[1]}"
@@ -116,7 +115,7 @@ class BallInSocket(OneArmContact):
 
     def noise(self) -> tuple[float, ...]:
         """Of each coordinate (m)."""
-        return (self._settings.noise,) * 3
+        return (self.settings.noise,) * 3
 
     def noise_channels(self) -> tuple[tuple[Channel, ...], ...]:
         """One for all three."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, ClassVar
 
@@ -49,23 +49,19 @@ class ClampedTool(OneArmContact):
         "points": {"bench": {"position_mm": [300, 50, 120], "rpy_deg": [180, 0, 30]}},
     }
 
-    def __init__(self, settings: ClampedToolSettings, arm_names: Sequence[str]) -> None:
-        super().__init__(settings, arm_names)
-        self._settings = settings
-
     def parameters(self) -> tuple[ParameterBlock, ...]:
         """The fixture in the base frame (m, unit quaternion)."""
-        return self._settings.fixture.blocks("fixture")
+        return self.settings.fixture.blocks("fixture")
 
     def group_parameters(self, group: str) -> tuple[ParameterBlock, ...]:
         """The clamped tool's pose in the fixture (m, unit quaternion)."""
-        known = self._settings.points.get(group)
+        known = self.settings.points.get(group)
         blocks = pose_blocks("point") if known is None else known.blocks("point")
         return tuple(replace(block, free=known is None) for block in blocks)
 
     def named_groups(self) -> tuple[str, ...]:
         """The known points."""
-        return tuple(self._settings.points)
+        return tuple(self.settings.points)
 
     def told(self, arms: Mapping[str, ArmState], values: Mapping[str, Any]) -> dict[str, Any]:
         """The point is where the tool is."""
@@ -81,7 +77,7 @@ class ClampedTool(OneArmContact):
 
     def noise(self) -> tuple[float, ...]:
         """Of the position (m) and of the rotation (rad)."""
-        return (self._settings.noise,) * 3 + (self._settings.orientation_noise,) * 3
+        return (self.settings.noise,) * 3 + (self.settings.orientation_noise,) * 3
 
     def dimensions(self) -> tuple[str, ...]:
         """Position, then rotation."""

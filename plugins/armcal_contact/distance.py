@@ -8,21 +8,20 @@ from typing import Any, ClassVar
 import casadi as ca
 from armcal.arm.assembly import ArmState
 from armcal.base.parameters import ParameterBlock, scalar
-from armcal.base.settings import Length, Length3, Settings
-from armcal.measure.contact import named_arm
+from armcal.base.settings import Length, Length3
+from armcal.measure.instrument import Instrument, InstrumentSettings
 from armcal.measure.measurement import Channel
 from armcal.measure.partners import OTHER
 from pydantic import field_validator
 
 
-class TipDistanceSettings(Settings):
+class TipDistanceSettings(InstrumentSettings):
     """How well a distance is known (standard deviation), where the tip sits on the tool, which column names the pair.
 
     A record that has a ``distance`` names the other record by its id in the text column ``partner``.
     """
 
     noise: Length
-    arm: str | None = None
     tip: Length3 = (0.0, 0.0, 0.0)
     partner: str = "partner"
 
@@ -34,29 +33,24 @@ class TipDistanceSettings(Settings):
         return value
 
 
-class TipDistance:
+class TipDistance(Instrument):
     """The measurement ``tip_distance``: channel distance; parameters tip_x, tip_y, tip_z in the tool frame."""
 
-    Settings: ClassVar[type[TipDistanceSettings]] = TipDistanceSettings
+    Settings = TipDistanceSettings
     EXAMPLE: ClassVar[Mapping[str, Any]] = {"noise_mm": 0.05, "tip_mm": [0, 0, 60]}
 
     def __init__(self, settings: TipDistanceSettings, arm_names: Sequence[str]) -> None:
-        self._settings = settings
-        self._arm = named_arm(settings.arm, arm_names)
-
-    @property
-    def arms(self) -> tuple[str, ...]:
-        """The arm, in this record and in the other."""
-        return (self._arm, self._arm + OTHER)
+        super().__init__(settings, arm_names)
+        self.arms += (self.arms[0] + OTHER,)  # in the other record
 
     @property
     def partner_label(self) -> str:
         """What names the other record."""
-        return self._settings.partner
+        return str(self.settings.partner)
 
     def parameters(self) -> tuple[ParameterBlock, ...]:
         """The tip on the tool (m)."""
-        return tuple(scalar(f"tip_{axis}", "m", x, 0.01) for axis, x in zip("xyz", self._settings.tip, strict=True))
+        return tuple(scalar(f"tip_{axis}", "m", x, 0.01) for axis, x in zip("xyz", self.settings.tip, strict=True))
 
     def channels(self) -> tuple[Channel, ...]:
         """The distance of the two tips."""
@@ -68,10 +62,6 @@ class TipDistance:
         here, there = (arms[name].base_T_tool.apply(tip) for name in self.arms)
         return {"distance": ca.sqrt(ca.dot(here - there, here - there))}
 
-    def residual(self, arms: Mapping[str, ArmState], measured: Mapping[str, Any], values: Mapping[str, Any]) -> Any:
-        """Measured minus predicted (1x1, m)."""
-        return measured["distance"] - self.outputs(arms, values)["distance"]
-
     def noise(self) -> tuple[float, ...]:
         """Of a distance (m)."""
-        return (self._settings.noise,)
+        return (self.settings.noise,)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, ClassVar
 
@@ -51,13 +51,9 @@ class PlaneContact(OneArmContact):
     Settings: ClassVar[type[PlaneContactSettings]] = PlaneContactSettings
     EXAMPLE: ClassVar[Mapping[str, Any]] = {"noise_mm": 0.05, "tip_mm": [0, 0, 60]}
 
-    def __init__(self, settings: PlaneContactSettings, arm_names: Sequence[str]) -> None:
-        super().__init__(settings, arm_names)
-        self._settings = settings
-
     def parameters(self) -> tuple[ParameterBlock, ...]:
         """The tip on the tool (m)."""
-        return tuple(scalar(f"tip_{axis}", "m", x, 0.01) for axis, x in zip("xyz", self._settings.tip, strict=True))
+        return tuple(scalar(f"tip_{axis}", "m", x, 0.01) for axis, x in zip("xyz", self.settings.tip, strict=True))
 
     def group_parameters(self, group: str) -> tuple[ParameterBlock, ...]:
         """How a plane is tilted from the stated normal (rad), and how far it lies from the origin (m)."""
@@ -66,12 +62,12 @@ class PlaneContact(OneArmContact):
 
     def told(self, arms: Mapping[str, ArmState], values: Mapping[str, Any]) -> dict[str, Any]:
         """A plane of the stated normal goes through the tip."""
-        offset = ca.dot(ca.SX(list(self._settings.normal)), self._tip(arms, values))
+        offset = ca.dot(ca.SX(list(self.settings.normal)), self._tip(arms, values))
         return {"tilt_1": ca.SX(0), "tilt_2": ca.SX(0), "offset": offset}
 
     def residual(self, arms: Mapping[str, ArmState], measured: Mapping[str, Any], values: Mapping[str, Any]) -> Any:
         """How far the tip is beyond the plane (1x1, m)."""
-        normal = np.array(self._settings.normal)
+        normal = np.array(self.settings.normal)
         first = np.cross(normal, np.eye(3)[int(np.argmin(np.abs(normal)))])
         first = first / np.linalg.norm(first)
         second = np.cross(normal, first)
@@ -81,7 +77,7 @@ class PlaneContact(OneArmContact):
 
     def noise(self) -> tuple[float, ...]:
         """Across the plane (m)."""
-        return (self._settings.noise,)
+        return (self.settings.noise,)
 
     def _tip(self, arms: Mapping[str, ArmState], values: Mapping[str, Any]) -> Any:
         tip = ca.sparsify(ca.vertcat(*[values[f"tip_{axis}"] for axis in "xyz"]))

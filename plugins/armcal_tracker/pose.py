@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import casadi as ca
@@ -11,8 +11,8 @@ from armcal.arm.assembly import ArmState
 from armcal.base import se3
 from armcal.base.parameters import ParameterBlock
 from armcal.base.pose_blocks import NO_TURN, pose_blocks, pose_transform, quaternion_expression, rotation_of
-from armcal.base.settings import Angle, Angle3, Length, Length3, Settings
-from armcal.measure.contact import named_arm
+from armcal.base.settings import Angle, Angle3, Length, Length3
+from armcal.measure.instrument import Instrument, InstrumentSettings
 from armcal.measure.measurement import Channel
 from pydantic import field_validator
 
@@ -21,7 +21,7 @@ _TURNS = ("rx", "ry", "rz")
 _UNIT = 1e-3
 
 
-class TipPoseSettings(Settings):
+class TipPoseSettings(InstrumentSettings):
     """Which arm, how noisy the tracker is (standard deviations), how the body sits on the tool.
 
     ``noise`` is of each coordinate in the base frame, ``orientation_noise`` of the rotation vector about each axis of
@@ -32,7 +32,6 @@ class TipPoseSettings(Settings):
 
     noise: Length | Length3
     orientation_noise: Angle | Angle3
-    arm: str | None = None
     target: Length3 = (0.0, 0.0, 0.0)
     target_rotation: tuple[float, float, float, float] = NO_TURN
 
@@ -62,13 +61,13 @@ class TipPoseSettings(Settings):
         return tuple(float(x) / length for x in value)
 
 
-class TipPose:
+class TipPose(Instrument):
     """The measurement ``tip_pose``: channels x, y, z and qw, qx, qy, qz of base_T_body.
 
     Parameters target_x, target_y, target_z and target_rotation: tool_T_body.
     """
 
-    Settings: ClassVar[type[TipPoseSettings]] = TipPoseSettings
+    Settings = TipPoseSettings
     EXAMPLE: ClassVar[Mapping[str, Any]] = {
         "noise_mm": 0.5,
         "orientation_noise_deg": 0.1,
@@ -76,18 +75,9 @@ class TipPose:
         "target_rotation": [0.8, 0.0, 0.6, 0.0],
     }
 
-    def __init__(self, settings: TipPoseSettings, arm_names: Sequence[str]) -> None:
-        self._settings = settings
-        self._arm = named_arm(settings.arm, arm_names)
-
-    @property
-    def arms(self) -> tuple[str, ...]:
-        """The one arm that carries the body."""
-        return (self._arm,)
-
     def parameters(self) -> tuple[ParameterBlock, ...]:
         """The body on the tool (m, unit quaternion)."""
-        return pose_blocks("target", self._settings.target, self._settings.target_rotation)
+        return pose_blocks("target", self.settings.target, self.settings.target_rotation)
 
     def channels(self) -> tuple[Channel, ...]:
         """Three coordinates and a quaternion, of either sign."""
@@ -117,7 +107,7 @@ class TipPose:
 
     def noise(self) -> tuple[float, ...]:
         """Of each coordinate (m) and of each entry of the rotation vector (rad)."""
-        return _three(self._settings.noise) + _three(self._settings.orientation_noise)
+        return _three(self.settings.noise) + _three(self.settings.orientation_noise)
 
     def dimensions(self) -> tuple[str, ...]:
         """Position, then rotation."""
@@ -130,7 +120,7 @@ class TipPose:
         return lengths + angles
 
     def _pose(self, arms: Mapping[str, ArmState], values: Mapping[str, Any]) -> se3.Transform:
-        return arms[self._arm].base_T_tool @ pose_transform("target", values)
+        return self.base_T_tool(arms) @ pose_transform("target", values)
 
 
 def _three(value: float | tuple[float, ...]) -> tuple[float, ...]:

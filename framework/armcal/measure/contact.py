@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import casadi as ca
 
@@ -49,7 +50,8 @@ class ContactSettings(Settings):
 class OneArmContact(Contact):
     """A contact of one arm."""
 
-    def __init__(self, settings: ContactSettings, arm_names: Sequence[str]) -> None:
+    def __init__(self, settings: Any, arm_names: Sequence[str]) -> None:
+        self.settings = settings
         self.arms = (named_arm(settings.arm, arm_names),)
         self.group_labels = settings.group_labels
 
