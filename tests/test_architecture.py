@@ -526,4 +526,4 @@ def test_the_public_interface_is_small_and_light() -> None:
     import armcal
 
     assert len(armcal.__all__) <= 20
-    assert all(getattr(armcal, name) is not None for name in (*armcal.__all__, *armcal._FOR_PLUGINS))
+    assert all(getattr(armcal, name) is not None for name in (*armcal.__all__, *armcal._HOMES))

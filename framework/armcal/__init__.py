@@ -10,7 +10,8 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from armcal.api import Experiment, Run
+    from armcal.api import Experiment as Experiment
+    from armcal.api import Run as Run
     from armcal.arm.assembly import ArmState as ArmState
     from armcal.arm.effects import XYZ as XYZ
     from armcal.arm.effects import Condition as Condition
@@ -19,96 +20,77 @@ if TYPE_CHECKING:
     from armcal.arm.effects import JointEffect as JointEffect
     from armcal.arm.effects import Spring as Spring
     from armcal.arm.effects import chosen as chosen
-    from armcal.base.dataset import Dataset
+    from armcal.arm.model import Attachment as Attachment
+    from armcal.arm.model import Chain as Chain
+    from armcal.arm.model import Joint as Joint
+    from armcal.base.dataset import Dataset as Dataset
     from armcal.base.domains import Interval as Interval
-    from armcal.base.parameters import ParameterBlock, Parameters
+    from armcal.base.parameters import ParameterBlock as ParameterBlock
+    from armcal.base.parameters import Parameters as Parameters
     from armcal.base.parameters import scalar as scalar
     from armcal.base.settings import Angle as Angle
+    from armcal.base.settings import Compliance as Compliance
+    from armcal.base.settings import Force as Force
     from armcal.base.settings import Length as Length
     from armcal.base.settings import Length3 as Length3
-    from armcal.base.settings import Settings
-    from armcal.errors import ArmcalError, InputError, NotConvergedError
-    from armcal.hooks import hookimpl
+    from armcal.base.settings import Mass as Mass
+    from armcal.base.settings import Settings as Settings
+    from armcal.base.settings import Temperature as Temperature
+    from armcal.base.settings import Torque as Torque
+    from armcal.errors import ArmcalError as ArmcalError
+    from armcal.errors import InputError as InputError
+    from armcal.errors import NotConvergedError as NotConvergedError
+    from armcal.hooks import hookimpl as hookimpl
     from armcal.measure.contact import Contact as Contact
     from armcal.measure.instrument import Instrument as Instrument
     from armcal.measure.instrument import InstrumentSettings as InstrumentSettings
     from armcal.measure.measurement import Channel as Channel
     from armcal.plugin_files import use_plugins as use_plugins
-    from armcal.run.pipeline import calibrate
-    from armcal.run.result import RunResult
-    from armcal.solve.estimator import Estimate
-    from armcal.use.calibration import Calibration
-    from armcal.use.compensation.compensator import Compensator
-    from armcal.use.compensation.request import Commands, Options, Targets
+    from armcal.run.pipeline import calibrate as calibrate
+    from armcal.run.result import RunResult as RunResult
+    from armcal.solve.estimator import Estimate as Estimate
+    from armcal.use.calibration import Calibration as Calibration
+    from armcal.use.compensation.compensator import Compensator as Compensator
+    from armcal.use.compensation.request import Commands as Commands
+    from armcal.use.compensation.request import Options as Options
+    from armcal.use.compensation.request import Targets as Targets
 
 __version__ = "0.1.0"
 
-__all__ = [
-    "ArmcalError",
-    "Calibration",
-    "Commands",
-    "Compensator",
-    "Dataset",
-    "Estimate",
-    "Experiment",
-    "InputError",
-    "NotConvergedError",
-    "Options",
-    "ParameterBlock",
-    "Parameters",
-    "Run",
-    "RunResult",
-    "Settings",
-    "Targets",
-    "__version__",
-    "calibrate",
-    "hookimpl",
-]
-
-_HOMES = {
-    "ArmcalError": "armcal.errors",
-    "Calibration": "armcal.use.calibration",
-    "Commands": "armcal.use.compensation.request",
-    "Compensator": "armcal.use.compensation.compensator",
-    "Dataset": "armcal.base.dataset",
-    "Estimate": "armcal.solve.estimator",
-    "Experiment": "armcal.api",
-    "InputError": "armcal.errors",
-    "NotConvergedError": "armcal.errors",
-    "Options": "armcal.use.compensation.request",
-    "ParameterBlock": "armcal.base.parameters",
-    "Parameters": "armcal.base.parameters",
-    "Run": "armcal.api",
-    "RunResult": "armcal.run.result",
-    "Settings": "armcal.base.settings",
-    "Targets": "armcal.use.compensation.request",
-    "calibrate": "armcal.run.pipeline",
-    "hookimpl": "armcal.hooks",
+_FOR_USERS = {
+    "armcal.api": "Experiment Run",
+    "armcal.base.dataset": "Dataset",
+    "armcal.base.parameters": "ParameterBlock Parameters",
+    "armcal.base.settings": "Settings",
+    "armcal.errors": "ArmcalError InputError NotConvergedError",
+    "armcal.hooks": "hookimpl",
+    "armcal.run.pipeline": "calibrate",
+    "armcal.run.result": "RunResult",
+    "armcal.solve.estimator": "Estimate",
+    "armcal.use.calibration": "Calibration",
+    "armcal.use.compensation.compensator": "Compensator",
+    "armcal.use.compensation.request": "Commands Options Targets",
 }
+"""What runs and uses calibrations."""
 _FOR_PLUGINS = {
-    "ArmState": "armcal.arm.assembly",
-    "Channel": "armcal.measure.measurement",
-    "Contact": "armcal.measure.contact",
-    "Instrument": "armcal.measure.instrument",
-    "InstrumentSettings": "armcal.measure.instrument",
-    "Angle": "armcal.base.settings",
-    "Condition": "armcal.arm.effects",
-    "EffectSettings": "armcal.arm.effects",
-    "Interval": "armcal.base.domains",
-    "JointCommand": "armcal.arm.effects",
-    "JointEffect": "armcal.arm.effects",
-    "Length": "armcal.base.settings",
-    "Length3": "armcal.base.settings",
-    "Spring": "armcal.arm.effects",
-    "XYZ": "armcal.arm.effects",
-    "chosen": "armcal.arm.effects",
-    "scalar": "armcal.base.parameters",
-    "use_plugins": "armcal.plugin_files",
+    "armcal.arm.assembly": "ArmState",
+    "armcal.arm.effects": "Condition EffectSettings JointCommand JointEffect Spring XYZ chosen",
+    "armcal.arm.model": "Attachment Chain Joint",
+    "armcal.base.domains": "Interval",
+    "armcal.base.parameters": "scalar",
+    "armcal.base.settings": "Angle Compliance Force Length Length3 Mass Temperature Torque",
+    "armcal.measure.contact": "Contact",
+    "armcal.measure.instrument": "Instrument InstrumentSettings",
+    "armcal.measure.measurement": "Channel",
+    "armcal.plugin_files": "use_plugins",
 }
+"""What plugins are made of."""
+_HOMES = {name: home for homes in (_FOR_USERS, _FOR_PLUGINS) for home, names in homes.items() for name in names.split()}
+
+__all__ = ["__version__", *(name for names in _FOR_USERS.values() for name in names.split())]
 
 
 def __getattr__(name: str) -> Any:
-    home = _HOMES.get(name) or _FOR_PLUGINS.get(name)
-    if home:
-        return getattr(import_module(home), name)
+    if name in _HOMES:
+        return getattr(import_module(_HOMES[name]), name)
     raise AttributeError(f"module 'armcal' has no attribute {name!r}")

@@ -21,19 +21,21 @@ def new() -> None:
 @new.command("plugin")
 @click.argument("name")
 @click.option("--kind", required=True, type=click.Choice(KINDS), help="What it adds to armcal.")
+@click.option("--package", is_flag=True, help="To be installed by pip, in place of one file.")
 @click.option("--out", type=click.Path(path_type=Path), help="The folder to make [default: armcal-NAME].")
 @speaking
-def new_plugin(voice: Voice, name: str, kind: str, out: Path | None) -> None:
-    """Write a package that adds a component called NAME: it works, has tests, and is yours to change."""
+def new_plugin(voice: Voice, name: str, kind: str, package: bool, out: Path | None) -> None:
+    """Write one file that adds a component called NAME, and a test of it: they work, and are yours to change."""
     registry = discover()
     voice.plugin_faults(registry)
     chosen = plugin_name(name, registry)
     folder = out or Path(f"armcal-{chosen.replace('_', '-')}")
-    files = write_plugin(chosen, kind, folder)
+    files = write_plugin(chosen, kind, folder, package)
     voice.result({"plugin": chosen, "kind": kind, "out": str(folder), "files": list(files)})
     for file in files:
         voice.detail(str(folder / file))
-    after = ("pip install -e '.[test]'", f"armcal plugins check {chosen} -v", "pytest")
+    check = f"armcal plugins check {chosen} -v"
+    after = ("pip install -e '.[test]'", check, "pytest") if package else (f"{check} --plugin {chosen}.py", "pytest")
     told = (f"the {kind} {chosen}: {len(files)} files in {folder}", "next, in that folder:", *(f"  {c}" for c in after))
     for text in told:
         voice.out.print(text, markup=False, soft_wrap=True)

@@ -18,15 +18,18 @@ _DIGITS = 12
 
 
 def rendered(folder: str, context: Mapping[str, Any]) -> dict[str, str]:
-    """Every template below a folder, by the path of what it makes.
+    """Every template of a folder, by the path of what it makes."""
+    root = TEMPLATES / folder
+    names = [path.relative_to(root).as_posix() for path in sorted(root.rglob(f"*{SUFFIX}"))]
+    return {name.removesuffix(SUFFIX): rendered_file(f"{folder}/{name}", context) for name in names}
 
-    In paths ``PACKAGE`` stands for the context's package, and ``DOT`` for a dot, for hidden files may not be shipped.
-    """
+
+def rendered_file(template: str, context: Mapping[str, Any]) -> str:
+    """One template, by its path below all."""
     import jinja2
 
-    root = TEMPLATES / folder
     environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(root),
+        loader=jinja2.FileSystemLoader(TEMPLATES),
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
@@ -34,12 +37,7 @@ def rendered(folder: str, context: Mapping[str, Any]) -> dict[str, str]:
         autoescape=False,
     )
     environment.filters |= {"word": word, "number": number}
-    found = {}
-    for path in sorted(root.rglob(f"*{SUFFIX}")):
-        source = path.relative_to(root).as_posix()
-        target = source.removesuffix(SUFFIX).replace("PACKAGE", str(context.get("package"))).replace("DOT", ".")
-        found[target] = environment.get_template(source).render(context)
-    return found
+    return environment.get_template(template).render(context)
 
 
 def word(text: str) -> str:
