@@ -160,7 +160,7 @@ def discover(found: Iterable[EntryPoint] | None = None) -> PluginRegistry:
         outcome = registered(manager, point, trace)
         if isinstance(point, plugin_files.FilePoint) and (outcome.fault or not outcome.works):
             text = outcome.fault or "it registers nothing: write a function armcal_register_... after @hookimpl."
-            raise PluginError(text, where=None if outcome.fault else Location(str(point.file)))
+            raise PluginError(text, where=None if str(point.file) in text else Location(str(point.file)))
         plugins.append(PluginInfo(point.name, point.value, *_release(point), outcome.fault))
         components += [
             Component(each.kind, each.name, each.target, each.summary, point.name, point.value)

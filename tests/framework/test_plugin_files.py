@@ -143,7 +143,10 @@ def test_a_file_that_is_not_there_is_refused(tmp_path: Path) -> None:
 def test_a_file_that_registers_nothing_is_refused(tmp_path: Path) -> None:
     file = written(tmp_path / "wheel.py", GEAR.partition("@hookimpl")[0])
     assert refusal(file).startswith(f"{file}: it registers nothing: write a function armcal_register_")
-    assert "is not marked: put @hookimpl before it" in refusal(written(file, GEAR.replace("@hookimpl", "")))
+    unmarked = refusal(written(file, GEAR.replace("@hookimpl", "")))
+    assert unmarked.startswith(f"{file}: ") and "is not marked: put @hookimpl before it" in unmarked
+    misspelt = refusal(written(file, GEAR.replace("register_effects", "register_efects")))
+    assert str(file) in misspelt and "unknown hook 'armcal_register_efects'" in misspelt
 
 
 @pytest.mark.parametrize(
