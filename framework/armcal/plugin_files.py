@@ -90,18 +90,21 @@ class FilePoint(EntryPoint):
         if known is not None and (known.__file__, known.armcal_digest) != (str(file), digest(file)):
             del sys.modules[self.value]
         try:
-            module = importlib.import_module(self.value)
+            return importlib.import_module(self.value)
         except (Exception, SystemExit) as fault:  # whatever a user's file does, it is told where
             what = fault.msg if isinstance(fault, SyntaxError) else " ".join(str(fault).split())
             raise PluginError(
                 f"it does not import: {type(fault).__name__}: {what}.", where=Location(str(file), _line(fault, file))
             ) from fault
-        module.armcal_digest = digest(file)  # type: ignore[attr-defined]
-        return module
 
 
 class _Loader(SourceFileLoader):
     """Leaves no compiled file beside the source, whose age could not tell two edits of one second apart."""
+
+    def exec_module(self, module: ModuleType) -> None:
+        """The module also knows of which content it is."""
+        module.armcal_digest = digest(Path(self.path))  # type: ignore[attr-defined]
+        super().exec_module(module)
 
     def get_code(self, fullname: str) -> CodeType:
         """Compiled each time."""

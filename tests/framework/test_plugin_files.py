@@ -104,9 +104,12 @@ def test_a_folder_gives_all_its_files_but_tests_and_hidden_ones(tmp_path: Path) 
 
 def test_a_component_goes_to_another_process_and_back(tmp_path: Path) -> None:
     made = registry(written(tmp_path / "wheel.py")).find("effect", "gear").load()({}, ["q1"])
-    code = "import pickle, sys; made = pickle.load(sys.stdin.buffer); print(type(made).__name__, made.joints)"
+    code = (
+        "import pickle, sys; made = pickle.load(sys.stdin.buffer); print(type(made).__name__, made.joints)\n"
+        "from armcal.plugins import discover; assert discover().find('effect', 'gear').load() is type(made)"
+    )
     ran = subprocess.run([sys.executable, "-c", code], input=pickle.dumps(made), capture_output=True, check=False)
-    assert ran.stdout.decode() == "Gear (1,)\n", ran.stderr.decode()
+    assert (ran.returncode, ran.stdout.decode()) == (0, "Gear (1,)\n"), ran.stderr.decode()
 
 
 def test_only_the_command_line_loads_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
