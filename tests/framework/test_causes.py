@@ -126,6 +126,13 @@ def test_what_is_not_among_the_causes_is_not_given_the_name_of_one(lrm):
     assert "none of the" in said(found) or UNLISTED in said(found)
 
 
+def test_what_is_significant_but_less_likely_than_chance_is_no_finding(lrm):
+    """Of noise: the one recording in twenty or so of which the best of 200 causes has a family-wise p of 0.01."""
+    found = found_in(lrm, "none", 62)
+    assert found.more is False and not found.structures
+    assert "none explains the error left" in said(found)
+
+
 def test_noise_that_grows_is_noise_that_depends_on_the_order(lrm):
     found = found_in(lrm, "growing noise", 5)
     assert found.noise is not None and found.noise.words == "the recorded order"

@@ -59,9 +59,16 @@ class VirtualMachine:
     name = "virtual machine"
 
     def __init__(self, factor: Factor) -> None:
-        self._pass = Mapped(factor.pass_function())
-        self._linearise = Mapped(factor.linearise_function())
+        self._factor = factor
         self._has_state = factor.state.numel() > 0
+
+    @cached_property
+    def _pass(self) -> Mapped:
+        return Mapped(self._factor.pass_function())
+
+    @cached_property
+    def _linearise(self) -> Mapped:
+        return Mapped(self._factor.linearise_function())
 
     def residuals(self, values: Array, record: Array, state: Array, residual: Array, rest: float = REST_RAD) -> int:
         """As the protocol says."""

@@ -9,7 +9,7 @@ not among them: it is named alone only where it is clearly the likeliest.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -41,6 +41,8 @@ _FOLDS = 5
 _MM = 1000.0
 _NEGLIGIBLE = 0.1
 """Of what the causes found so far take up: less than this may be what is not linear in them. Model them first."""
+_LIKELIER = 0.5
+"""Where chance has more of the odds, a cause is none."""
 
 
 @dataclass(frozen=True)
@@ -217,7 +219,7 @@ class _Search:
 
 
 def _search(rows: FitRows, fit: Fit, contest: Contest, modelled: frozenset[str]) -> _Search:
-    """Causes one after another as long as one is significant, then each set against all others."""
+    """Causes one after another as long as one is significant, then each set against all others and chance."""
     left = [(i, own) for i, each in enumerate(contest.columns) if (own := own_basis(each, contest.basis)[0]).shape[1]]
     first = test = family_test(fit, [own for _, own in left])
     tested, chosen, p_values, whole = len(left), list[int](), list[float](), float(fit.residual @ fit.residual)
@@ -233,17 +235,20 @@ def _search(rows: FitRows, fit: Fit, contest: Contest, modelled: frozenset[str])
         left = [(i, own) for i, _ in left if (own := own_basis(contest.columns[i], basis)[0]).shape[1]]
         test = family_test(fit, [own for _, own in left])
     worth = (1 - max(test.lag_one, 0.0)) / (1 + max(test.lag_one, 0.0))
-    chosen, odds = _settled(contest, chosen, worth)
+    settled = _settled(contest, dict(zip(chosen, p_values, strict=True)), worth)
     structures = [
-        _structure(rows, contest, i, [j for j in chosen if j != i], modelled, p, own)
-        for i, p, own in zip(chosen, p_values, odds, strict=False)
+        _structure(rows, contest, i, [j for j in settled if j != i], modelled, p, odds)
+        for i, (p, odds) in settled.items()
     ]
-    return _Search(tuple(structures), tuple(chosen), bool(np.any(test.adjusted <= LEVEL)), first, test, tested)
+    return _Search(tuple(structures), tuple(settled), bool(np.any(test.adjusted <= LEVEL)), first, test, tested)
 
 
-def _settled(contest: Contest, chosen: Sequence[int], worth: float) -> tuple[list[int], list[Odds]]:
-    """Each cause beside the others: the likeliest in its place, and none that nothing speaks for any more."""
-    settled = list(chosen)
+def _settled(contest: Contest, found: Mapping[int, float], worth: float) -> dict[int, tuple[float, Odds]]:
+    """Causes with p-values and odds, each beside the others: the likeliest in its place, none that chance beats.
+
+    Something is significant in one of twenty recordings of nothing but noise; odds say which of them are chance.
+    """
+    settled, p_values = list(found), list(found.values())
     for _ in range(len(settled)):
         before = list(settled)
         for place in range(len(settled)):
@@ -251,7 +256,12 @@ def _settled(contest: Contest, chosen: Sequence[int], worth: float) -> tuple[lis
             settled[place] = contest.likeliest(others, worth)
         if settled == before:
             break
-    return settled, [contest.odds(each, [o for o in settled if o != each], worth) for each in settled]
+    odds = [contest.odds(each, [o for o in settled if o != each], worth) for each in settled]
+    whole = {i: (p, each) for i, p, each in zip(settled, p_values, odds, strict=True)}
+    least = max(whole, key=lambda i: whole[i][1].chance, default=None)
+    if least is None or whole[least][1].chance <= _LIKELIER:
+        return whole
+    return _settled(contest, {i: p for i, (p, _) in whole.items() if i != least}, worth)
 
 
 def _structure(

@@ -15,6 +15,8 @@ from armcal.base.domains import Array
 from armcal.solve.problem import FactorRecords, Problem
 
 ORDER_CHANNELS = ("sequence", "time")
+_STEP_M = 1e-3
+"""So small that a load that hangs there hardly stands elsewhere."""
 LOADS = ("turn_x", "turn_y", "turn_z", "gravity", "mass", "moment_x", "moment_y", "moment_z")
 """Gravity turned about base axes (rad) and multiplied; a mass at the payload's centre (kg), its moments (kg m)."""
 
@@ -42,8 +44,8 @@ class Motion:
         channels = tuple(f"{name}.{joint}" for name, arm in arms.items() for joint in arm.commanded)
         blocks = {b.name: values[problem.parameters.entries_of(b.name)] for b in problem.parameters.blocks}
         loads = {name: site_loads(arm, blocks, *_inputs(problem, arm, dataset)) for name, arm in arms.items()}
-        by_load = _by_load(problem, values, dataset) if any(len(each.state) for each in records) else ()
-        return cls(channels, problem.channel_slopes(values, records, channels), loads, by_load)
+        slopes, elastic = problem.channel_slopes(values, records, channels), any(len(each.state) for each in records)
+        return cls(channels, slopes, loads, _by_load(problem, values, records, dataset) if elastic else ())
 
     def subset(self, chosen: NDArray[np.intp]) -> Motion:
         """Some records of all."""
@@ -91,22 +93,25 @@ def _acting(problem: Problem, dataset: Dataset) -> dict[str, Array]:
     }
 
 
-def _by_load(problem: Problem, values: Array, dataset: Dataset) -> tuple[Array, ...]:
-    """Raw residual by ``LOADS`` in equilibrium, by a problem whose records all carry their loads."""
+def _by_load(problem: Problem, values: Array, records: Sequence[FactorRecords], dataset: Dataset) -> tuple[Array, ...]:
+    """Raw residual by ``LOADS``, by a problem whose records all carry their loads; ``records`` are in equilibrium."""
     plan, acting = problem.blueprint, _acting(problem, dataset)
     loaded = replace(dataset, channels={**dataset.channels, **acting})
     parts = (plan.arms, plan.measurements, problem.parameters, plan.environment, loaded)
     other = Problem.build(*parts, "interpreted", plan.groups)
 
-    def slopes(of: Dataset, names: Sequence[str]) -> tuple[Array, ...]:
-        return other.channel_slopes(values, other.records(of), names)
+    def slopes(of: Dataset) -> tuple[Array, ...]:
+        here = zip(other.records(of), records, strict=True)
+        at_rest = [replace(each, state=before.state.copy()) for each, before in here]
+        return other.channel_slopes(values, at_rest, LOAD_CHANNELS[:4])
 
     g = np.array([acting[f"gravity_{axis}"] for axis in "xyz"])
     ways = np.stack([np.cross(axis, g, axisb=0, axisc=0) for axis in np.eye(3)] + [g], axis=1)
-    pulled = [np.einsum("rgn,gkn->rkn", s, ways) for s in slopes(loaded, LOAD_CHANNELS[:3])]
-    hung = [slopes(loaded, ("payload",))]
+    bare = slopes(loaded)
+    pulled = [np.einsum("rgn,gkn->rkn", slope[:, :3], ways) for slope in bare]
+    hung = [[slope[:, 3:] for slope in bare]]
     for axis in "xyz":  # what a mass does is linear in its centre
-        moved = {**loaded.channels, f"payload_{axis}": acting[f"payload_{axis}"] + 1.0}
-        hung.append(slopes(replace(loaded, channels=moved), ("payload",)))
-    masses = [np.concatenate([own[0], *(each - own[0] for each in own[1:])], axis=1) for own in zip(*hung, strict=True)]
-    return tuple(np.concatenate([one, other_], axis=1) for one, other_ in zip(pulled, masses, strict=True))
+        moved = {**loaded.channels, f"payload_{axis}": acting[f"payload_{axis}"] + _STEP_M}
+        shifted = slopes(replace(loaded, channels=moved))
+        hung.append([(own[:, 3:] - at) / _STEP_M for own, at in zip(shifted, hung[0], strict=True)])
+    return tuple(np.concatenate(own, axis=1) for own in zip(pulled, *hung, strict=True))

@@ -32,12 +32,12 @@ class Odds:
     Attributes:
         share: of the odds of all causes, of what is not among them, and of chance, the cause's own.
         alternatives: in words, those that it does not beat 20 to 1, the most likely first.
-        gain: logarithm of its odds against noise alone.
+        chance: the share of nothing at all.
     """
 
     share: float
     alternatives: tuple[str, ...]
-    gain: float
+    chance: float
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ class Contest:
         close = [name for name, gain in shown.items() if gain > shown[mine] - CLEAR and name != mine]
         of_name = dict(zip(reversed(self.names), [c.words for c in reversed(self.causes)], strict=True))
         alternatives = tuple(of_name.get(name, name) for name in sorted(close, key=lambda name: -shown[name]))
-        return Odds(float(np.exp(shown[mine] - total)), alternatives, shown[mine])
+        return Odds(float(np.exp(shown[mine] - total)), alternatives, float(np.exp(shown[CHANCE] - total)))
 
     def _gains(self, residual: Array, basis: Array, others: Sequence[int], independence: float) -> Array:
         """Logarithm of each cause's odds against noise; that of a cause already in the model is no number."""

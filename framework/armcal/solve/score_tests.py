@@ -21,11 +21,15 @@ from armcal.base.domains import Array
 DRAWS = 999
 """Of noise, in the test that decides whether anything is found: the level of one design then scatters by 0.7 %."""
 FEWER_DRAWS = 299
-"""In the tests after it."""
+"""In the tests after it, and wherever they show enough."""
 SEEN = 0.05
 """A direction that the fit takes up but for so much of its length is the model's own."""
 _FEWEST_SPARE_BLOCKS = 8
 _SMALLEST_P = 1e-300
+_OUT_OF_QUESTION = 0.1
+"""A p-value by the fewer draws that all of them would bring to 0.05 once in ten thousand times."""
+_COLUMNS_AT_ONCE = 12
+"""Their products with the draws, block by block, stay in a processor's cache."""
 
 
 @dataclass(frozen=True)
@@ -103,51 +107,74 @@ class FamilyTest:
 
 
 def family_test(fit: Fit, bases: Sequence[Array]) -> FamilyTest:
-    """Test the residual against orthonormal bases (rows x k each), and against its neighbours."""
+    """Test the residual against orthonormal bases (rows x k each), and against its neighbours.
+
+    By fewer draws first: where those show that nothing is near significance, more would not change it.
+    """
+    few = _by_all_draws(fit.with_fewer_draws(), bases)
+    if min(few.adjusted.min(initial=1.0), few.lag_adjusted) > _OUT_OF_QUESTION:
+        return few
+    return _by_all_draws(fit, bases)
+
+
+def _by_all_draws(fit: Fit, bases: Sequence[Array]) -> FamilyTest:
     both = np.column_stack([fit.residual, fit.draws])
-    products = (_block_products(basis, both, fit.block, fit.blocks) for basis in bases)
-    small, share = [], []
-    for mine in products:
-        small.append(_p_values(mine))
-        share.append(float(np.sum(mine[:, :, 0].sum(axis=0) ** 2)))
     lag, lag_p = _neighbours(fit, both)
-    all_p = np.array([*small, lag_p])
-    least = np.sort(all_p[:, 1:].min(axis=0))
-    beaten = np.searchsorted(least, all_p[:, 0], side="right")
+    own, least, by_size = np.ones(len(bases)), lag_p[1:], dict[int, list[int]]()
+    for i, basis in enumerate(bases):
+        by_size.setdefault(basis.shape[1], []).append(i)
+    for size, members in by_size.items():
+        spare = fit.blocks - size  # where blocks are too few for the columns, nothing is known of them
+        if size and spare >= _FEWEST_SPARE_BLOCKS:
+            ratios = _ratios([bases[i] for i in members], both, fit)
+            own[members] = _p_value(size, spare, ratios[:, 0])
+            least = np.minimum(least, _p_value(size, spare, ratios[:, 1:].max(axis=0)))
+    beaten = np.searchsorted(np.sort(least), np.append(own, lag_p[0]), side="right")
     adjusted = (1 + beaten) / (1 + len(least))
     total = max(float(fit.residual @ fit.residual), _SMALLEST_P)
-    return FamilyTest(adjusted[:-1], np.array(share) / total, lag, float(adjusted[-1]))
+    share = np.array([np.sum((basis.T @ fit.residual) ** 2) for basis in bases]) / total
+    return FamilyTest(adjusted[:-1], share, lag, float(adjusted[-1]))
 
 
-def _block_products(stacked: Array, both: Array, block: NDArray[np.intp], count: int) -> Array:
-    """Inner products of columns and residuals block by block (blocks x k x draws)."""
-    order = np.argsort(block, kind="stable")
-    ends = np.searchsorted(block[order], np.arange(count + 1))
-    columns, rows = stacked[order].T, both[order]
-    found = np.empty((count, stacked.shape[1], both.shape[1]))
-    for i in range(count):
-        part = slice(ends[i], ends[i + 1])
-        np.matmul(columns[:, part], rows[part], out=found[i])
-    return found
-
-
-def _p_values(products: Array) -> Array:
-    """Of sums of block products (blocks x k x draws) by their own spread; 1 where blocks are too few for the columns.
+def _ratios(bases: Sequence[Array], both: Array, fit: Fit) -> Array:
+    """F of sums of block products by their own spread (bases x draws), of bases that have equally many columns.
 
     T = s' (sum of s_b s_b')^-1 s lies between 0 and the number of blocks B, and (B - k)/k T/(B - T) follows F(k, B - k)
     for independent normal blocks.
     """
-    blocks, size, draws = products.shape
-    spare = blocks - size
-    if not size or spare < _FEWEST_SPARE_BLOCKS:
-        return np.ones(draws)
-    by_draw = np.ascontiguousarray(products.transpose(2, 0, 1))
-    total = by_draw.sum(axis=1)
-    spread = by_draw.transpose(0, 2, 1) @ by_draw
-    floor = 1e-12 * np.trace(spread, axis1=1, axis2=2) + _SMALLEST_P
-    spread += floor[:, None, None] * np.eye(size)
-    statistic = np.einsum("di,di->d", total, np.linalg.solve(spread, total[:, :, None])[:, :, 0])
-    ratio = spare / size * statistic / np.maximum(blocks - statistic, 1e-9)
+    size, rows, found = bases[0].shape[1], _by_block(both, fit), np.empty((len(bases), both.shape[1]))
+    most = max(1, _COLUMNS_AT_ONCE // size)
+    for start in range(0, len(bases), most):
+        columns = _by_block(np.hstack(bases[start : start + most]), fit)
+        products = (columns.transpose(0, 2, 1) @ rows).reshape(fit.blocks, -1, size, both.shape[1])
+        found[start : start + most] = _statistic(products)
+    return np.asarray((fit.blocks - size) / size * found / np.maximum(fit.blocks - found, 1e-9))
+
+
+def _by_block(columns: Array, fit: Fit) -> Array:
+    """Rows (rows x n) block by block, zeros behind those of short blocks (blocks x most rows x n)."""
+    order, sizes = np.argsort(fit.block, kind="stable"), np.bincount(fit.block)
+    place = np.arange(len(order)) - np.repeat(np.cumsum(sizes) - sizes, sizes)
+    found = np.zeros((len(sizes), int(sizes.max()), columns.shape[1]))
+    found[fit.block[order], place] = columns[order]
+    return found
+
+
+def _statistic(products: Array) -> Array:
+    """T of block products (blocks x bases x k x draws), (bases x draws)."""
+    size, total = products.shape[2], products.sum(axis=0)
+    spread = np.empty((*total[:, 0].shape, size, size))
+    for i, j in zip(*np.tril_indices(size), strict=True):
+        spread[..., i, j] = spread[..., j, i] = np.einsum("bmd,bmd->md", products[:, :, i], products[:, :, j])
+    floor = 1e-12 * np.trace(spread, axis1=2, axis2=3) + _SMALLEST_P
+    if size == 1:
+        return np.asarray(total[:, 0] ** 2 / (spread[..., 0, 0] + floor))
+    sums = total.transpose(0, 2, 1)
+    solved = np.linalg.solve(spread + floor[..., None, None] * np.eye(size), sums[..., None])[..., 0]
+    return np.asarray(np.sum(sums * solved, axis=2))
+
+
+def _p_value(size: int, spare: int, ratio: Array) -> Array:
     return np.asarray(np.maximum(fdtrc(size, spare, ratio), _SMALLEST_P))
 
 
