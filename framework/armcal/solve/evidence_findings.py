@@ -165,7 +165,8 @@ def _scatter(found: Leftover) -> list[Finding]:
 
 def _test_of(found: Leftover) -> str:
     blocks = f", blocks of {found.block} records" if found.block > 1 else ""
-    return f"score test, {100 * found.level:g} % over all {found.tested} dependences{blocks}; and odds above those of chance"
+    level = f"{100 * found.level:g} % over all {found.tested} dependences{blocks}"
+    return f"score test, {level}, and likelier than chance"
 
 
 def neighbours_told(found: Leftover | None, estimate: Estimate, unit: str = _MM) -> list[Finding]:
