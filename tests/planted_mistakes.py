@@ -146,7 +146,7 @@ def arms(folder: Path) -> tuple[PlantedArm, ...]:
     return (
         PlantedArm("printed", DEMO, "arm.mdh.base_*", 0.42),
         PlantedArm("industrial", folder / "industrial" / "simulated.yaml", "arm.mdh.base_*", 1.4),
-        PlantedArm("seven", folder / "seven" / "simulated.yaml", "arm.urdf.j1_*", 1.2),
+        PlantedArm("seven", folder / "seven" / "simulated.yaml", "arm.placement_*", 1.2),
     )
 
 

@@ -11,9 +11,12 @@ import oracle
 import pytest
 from armcal.cli.main import cli
 from armcal.solve.evidence_findings import neighbours_told, structures_told
+from armcal.solve.fit_rows import FitRows
+from armcal.solve.gross import scale_deviation
 from armcal.solve.leftover import LEVEL, leftover
 from armcal.solve.motion import Motion, recorded_position
 from armcal.solve.odds import UNLISTED
+from armcal.solve.outside import predicted_positions
 from armcal.solve.smooth import CLEAR
 from armcal.solve.weighing import fit
 from armcal_ipopt.estimator import IpoptEstimator
@@ -131,6 +134,19 @@ def test_what_is_significant_but_less_likely_than_chance_is_no_finding(lrm):
     found = found_in(lrm, "none", 62)
     assert found.more is False and not found.structures
     assert "none explains the error left" in said(found)
+
+
+def test_how_large_an_unseen_scale_may_be_is_not_a_matter_of_chance(lrm):
+    """The noise of the positions, taken for a part of the scale, made its deviation half as large."""
+    q, _ = poses(1)
+    exact, found = oracle.tip(oracle.published(), q), []
+    for noise in (0.0, 4 * NOISE_M):
+        points = exact + noise * np.random.default_rng(2).normal(size=exact.shape)
+        problem, records, start = posed(lrm, q, points, oracle.OPTION_1)
+        estimate = fit(problem, records, IpoptEstimator(IpoptEstimator.Settings()), start).estimate
+        read = predicted_positions(problem, estimate.values, records, lrm.dataset(q, points))
+        found.append(scale_deviation(problem, FitRows.of(problem, records, estimate), read, 1.0))
+    assert found[1] == pytest.approx(found[0], rel=0.15)
 
 
 def test_noise_that_grows_is_noise_that_depends_on_the_order(lrm):

@@ -79,6 +79,19 @@ def test_what_data_cannot_show_is_stated(tmp_path: Path) -> None:
     assert "instrument's scale of up to" in found.notes
 
 
+def test_an_arm_that_shows_a_tenth_too_large_is_not_usable(tmp_path: Path) -> None:
+    """An instrument's scale 10 % off, where priors pull the arm a little back towards its nominal size."""
+    industrial = planted_mistakes.arms(tmp_path)[1]
+    found = planted("a tracker's scale off by 10 %", tmp_path, industrial)
+    assert found.grade == "bad" and "1.1 times as large" in found.said
+
+
+def test_a_base_that_nothing_holds_and_that_is_far_off_is_a_warning(tmp_path: Path) -> None:
+    found = planted("a base off by 1 m", tmp_path)
+    assert found.grade == "warning" and "base_x by 999 mm (100 times a typical correction)" in found.said
+    assert "cannot tell whether it is there" in found.said
+
+
 def test_a_clean_recording_is_not_graded_bad(tmp_path: Path) -> None:
     found = outcome(PRINTED, PRINTED.recording(5), tmp_path, ["validation.folds=0"])
     assert found.grade in ("good", "warning") and found.true < 0.5

@@ -26,6 +26,7 @@ from armcal.solve.misses import Judged, misses
 from armcal.solve.motion import Motion, recorded_position
 from armcal.solve.moved import Moved, moved_findings, moved_groups
 from armcal.solve.noise_findings import Finding
+from armcal.solve.outside import predicted_positions
 from armcal.solve.problem import FactorRecords, Problem
 from armcal.solve.suggestion import suggest
 from armcal.solve.validation import Split, error_unit
@@ -122,12 +123,13 @@ def _gross(run: FittedRecords, judged_mm: Array, evidence: Evidence) -> list[Fin
     rows = FitRows.of(problem, acting, found)
     dataset = run.dataset.subset(looked_at)
     position = recorded_position(run.dataset)[looked_at]
+    read = predicted_positions(problem, found.values, acting, dataset)
     return [
         *gross_error(judged_mm, figure, found, evidence.leftover, evidence.unit),
         *contradicting(minority(rows, found.noise_scale, position), dataset.ids),
         *size_told(figure),
         *displaced_told(figure),
-        *limits_told(figure, scale_deviation(problem, rows, dataset, found.noise_scale)),
+        *limits_told(figure, scale_deviation(problem, rows, read, found.noise_scale)),
     ]
 
 

@@ -9,7 +9,6 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.base.parameters import ParameterBlock
 from armcal.errors import NotConvergedError
@@ -121,25 +120,20 @@ def displaced(problem: Problem, estimate: Estimate, records: Sequence[FactorReco
     return tuple(sorted(found, key=lambda each: -each.times))
 
 
-def scale_deviation(problem: Problem, rows: FitRows, dataset: Dataset, noise_scale: float) -> float | None:
+def scale_deviation(problem: Problem, rows: FitRows, positions: Sequence[Array], noise_scale: float) -> float | None:
     """Standard deviation of an instrument's scale if it were free beside the parameters; None without positions.
 
     Args:
         problem: of the fit.
         rows: of the fit, priors among them.
-        dataset: the same records.
+        positions: what each factor should read (3 x N, or 0 x N; m), in the same records.
         noise_scale: residuals in units of the declared noise.
     """
-    raw, metric = [], False
-    for kernel in problem.kernels:
-        factor = kernel.factor
-        column = np.zeros((len(factor.noise), len(dataset), 1))
-        channels = factor.output_channels[:3]
-        if [c.rpartition(".")[2] for c in channels] == list("xyz") and all(map(dataset.has, channels)):
-            column[:3, :, 0], metric = np.nan_to_num(dataset.stacked(channels)), True
-        raw.append(column)
-    if not metric:
+    if not any(map(len, positions)):
         return None
+    raw = [np.zeros((len(k.factor.noise), len(rows.by_record), 1)) for k in problem.kernels]
+    for column, position in zip(raw, positions, strict=True):
+        column[: len(position), :, 0] = position
     left = float(np.linalg.norm(apart_from(rows.slopes, rows.columns(raw))))
     return noise_scale / left if left > 0 else float("inf")
 

@@ -20,7 +20,7 @@ UNEXPLAINED_OF_REACH, EXPLAINED_OF_REACH, TIMES_NOISE, EXPLAINED = 0.005, 0.02, 
 where no structure in the residuals makes up a third of it, as gravity does of a printed arm whose base is rigid."""
 _NO_EXCUSE = frozenset({"order", "step", "slip", "scale"})
 """Kinds of structure that explain no gross error: something may have moved, or a frame be wrong."""
-SIZE, GROSS_SIZE = 0.02, 0.1
+SIZE, GROSS_SIZE = 0.02, 0.05
 """How far the calibrated arm may be larger or smaller than the nominal one: worth a look, and gross."""
 UNSEEN_SCALE = 0.2
 MOST_NAMED = 3
@@ -89,18 +89,29 @@ def size_told(figure: Figure) -> list[Finding]:
 def displaced_told(figure: Figure) -> list[Finding]:
     """Parameters that contradict their priors, or are implausibly far from their nominal values."""
     geometry = [each for each in figure.displaced if each.by_prior or not each.placement]
+    gross = [each for each in geometry if each.times > FAR_BEYOND]
+    beyond = [each for each in geometry if each.times <= FAR_BEYOND]
+    elsewhere = [each for each in figure.displaced if each not in geometry and each.times > FAR_BEYOND]
+    test = f"limits {BEYOND:g} and {FAR_BEYOND:g} standard deviations of the prior, or typical corrections"
+    action = "If the arm is so, correct the nominal values; else look for a joint's zero, sign, or unit."
     findings = []
-    for grade, group in (
-        ("bad", [each for each in geometry if each.times > FAR_BEYOND]),
-        ("warning", [each for each in geometry if each.times <= FAR_BEYOND]),
-    ):
-        if group:
-            more = f" and {len(group) - MOST_NAMED} more" if len(group) > MOST_NAMED else ""
-            text = f"Far from the nominal values: {', '.join(map(_displacement, group[:MOST_NAMED]))}{more}."
-            test = f"limits {BEYOND:g} and {FAR_BEYOND:g} standard deviations of the prior, or typical corrections"
-            action = "If the arm is so, correct the nominal values; else look for a joint's zero, sign, or unit."
-            findings.append(Finding("bad" if grade == "bad" else "warning", text, test, action))
+    if gross:
+        findings.append(Finding("bad", f"Far from the nominal values: {_listed(gross)}.", test, action))
+    if beyond:
+        findings.append(Finding("warning", f"Far from the nominal values: {_listed(beyond)}.", test, action))
+    if elsewhere:
+        text = (
+            f"The base or the tool's point is far from where the configuration has it: {_listed(elsewhere)}. These "
+            "data cannot tell whether it is there, or the instrument's frame or target is elsewhere: no prior holds it."
+        )
+        action = "If the configuration's frame is meant, look for an offset or a unit; else correct the nominal values."
+        findings.append(Finding("warning", text, test, action))
     return findings
+
+
+def _listed(group: Sequence[Displaced]) -> str:
+    more = f" and {len(group) - MOST_NAMED} more" if len(group) > MOST_NAMED else ""
+    return f"{', '.join(map(_displacement, group[:MOST_NAMED]))}{more}"
 
 
 def _displacement(each: Displaced) -> str:

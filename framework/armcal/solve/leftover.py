@@ -26,7 +26,7 @@ from armcal.solve.fit_rows import FitRows
 from armcal.solve.motion import Motion
 from armcal.solve.noise_trend import NoiseTrend, noise_trend
 from armcal.solve.odds import Contest, Odds
-from armcal.solve.outside import measured_position, outside
+from armcal.solve.outside import outside, predicted_positions
 from armcal.solve.problem import FactorRecords, Problem
 from armcal.solve.score_tests import FamilyTest, Fit, family_test, linear_fit, own_basis
 from armcal.solve.smooth import TimeOrPose, left_out, pose_kernels, smooth, time_kernels
@@ -140,7 +140,8 @@ def leftover(
     block, consecutive = _blocks_of(rows, len(dataset)), np.diff(position) == 1
     fit, basis = _fit_of(rows, block, consecutive)
     motion = motion.subset(chosen)
-    causes = [*dependences(problem, motion, dataset), *outside(problem, motion, dataset)]
+    read = predicted_positions(problem, estimate.values, records, dataset)
+    causes = [*dependences(problem, motion, dataset), *outside(problem, motion, dataset, read)]
     columns = [rows.columns(one.columns) for one in causes]
     kernels = pose_kernels(problem, dataset), time_kernels(len(dataset))
     contest = Contest(causes, columns, fit.residual, basis, rows.by_record, fit.block * _FOLDS // fit.blocks, *kernels)
@@ -155,7 +156,7 @@ def leftover(
         found.last.lag_adjusted,
         _alike(residual, whole, rows, contest) if found.last.lag_adjusted <= LEVEL else None,
         smooth(residual, whole, rows.by_record, contest.pose).evidence,
-        noise_trend(residual, whole, rows.by_record, Records(dataset, motion), _read(problem, dataset)),
+        noise_trend(residual, whole, rows.by_record, Records(dataset, motion), _first(read, len(dataset))),
         rows.mean_error(fit.residual) * _MM,
         found.tested,
         len(dataset),
@@ -163,10 +164,9 @@ def leftover(
     )
 
 
-def _read(problem: Problem, dataset: Dataset) -> Array:
-    """The first position that is measured (3 x N; m), or nothing (0 x N)."""
-    read = [measured_position(problem, i, dataset) for i in range(len(problem.kernels))]
-    return next((each for each in read if len(each)), np.zeros((0, len(dataset))))
+def _first(read: Sequence[Array], count: int) -> Array:
+    """The first position that is read (3 x N; m), or nothing (0 x N)."""
+    return next((each for each in read if len(each)), np.zeros((0, count)))
 
 
 def _alike(residual: Array, basis: Array, rows: FitRows, contest: Contest) -> TimeOrPose:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -10,7 +10,7 @@ from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.solve.dependences import Dependence, Records
 from armcal.solve.motion import Motion, recorded_order
-from armcal.solve.problem import Problem
+from armcal.solve.problem import FactorRecords, Problem
 
 _AXES = ("x", "y", "z")
 _MOST_STEPS, _MOST_SLIPS = 40, 12
@@ -19,11 +19,11 @@ _FEWEST_APART = 4
 _STEP_MEASURE = "repeat some of the first poses now, and look at what was touched at that time"
 
 
-def outside(problem: Problem, motion: Motion, dataset: Dataset) -> Iterator[Dependence]:
-    """Everything of it that these records could show."""
+def outside(problem: Problem, motion: Motion, dataset: Dataset, positions: Sequence[Array]) -> Iterator[Dependence]:
+    """Everything of it that these records could show; ``positions`` are what instruments should read."""
     here = Records(dataset, motion)
     yield from _of_loads(motion)
-    yield from _of_instrument(problem, here)
+    yield from _of_instrument(here, positions)
     yield from _of_steps(here, problem)
 
 
@@ -44,9 +44,8 @@ def _of_loads(motion: Motion) -> Iterator[Dependence]:
     yield Dependence("load", "", "", words, "statics.payload_g", weigh, columns(4, 5, 6, 7))
 
 
-def _of_instrument(problem: Problem, here: Records) -> Iterator[Dependence]:
+def _of_instrument(here: Records, read: Sequence[Array]) -> Iterator[Dependence]:
     """Scale and axes of instruments that measure positions; all of them alike."""
-    read = [measured_position(problem, i, here.dataset) for i in range(len(problem.kernels))]
     if not any(np.any(each) for each in read):
         return
     zeros = [np.zeros((size, len(here.dataset), 1)) for size in here.sizes]
@@ -73,12 +72,19 @@ def _of_instrument(problem: Problem, here: Records) -> Iterator[Dependence]:
     yield Dependence("scale", "axes", "", words, "", known, columns((0, 1), (0, 2), (1, 2)), labels, "rad")
 
 
-def measured_position(problem: Problem, factor: int, dataset: Dataset) -> Array:
-    """What a factor reads (3 x N; m), 0 where it does not; none of one that does not read a position."""
-    channels = problem.kernels[factor].factor.output_channels
-    if [c.rpartition(".")[2] for c in channels] != list(_AXES) or not all(dataset.has(c) for c in channels):
-        return np.zeros((0, len(dataset)))
-    return np.nan_to_num(dataset.stacked(list(channels)))
+def predicted_positions(
+    problem: Problem, values: Array, records: Sequence[FactorRecords], dataset: Dataset
+) -> tuple[Array, ...]:
+    """What each factor should read of a position (3 x N; m), 0 where it reads none; nothing (0 x N) of other factors.
+
+    Not what it does read: the noise of that would be taken for a scale.
+    """
+    found = []
+    for kernel, off in zip(problem.kernels, problem.residuals(values, records), strict=True):
+        channels = kernel.factor.output_channels[:3]
+        read = [c.rpartition(".")[2] for c in channels] == list(_AXES) and all(map(dataset.has, channels))
+        found.append(np.nan_to_num(dataset.stacked(channels) - off[:3]) if read else np.zeros((0, len(dataset))))
+    return tuple(found)
 
 
 def _of_steps(here: Records, problem: Problem) -> Iterator[Dependence]:
