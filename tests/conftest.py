@@ -20,18 +20,44 @@ for _variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_variable, "1")
 
 
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Members of a parametrised test whose ids its ``quick`` mark does not name are slow."""
+    named: dict[str, set[str]] = {}
+    for item in items:
+        mark = item.get_closest_marker("quick")
+        if mark is None:
+            continue
+        family, _, member = item.nodeid.partition("[")
+        left = named.setdefault(family, set(mark.args))
+        if member[:-1] in mark.args:
+            left.discard(member[:-1])
+        else:
+            item.add_marker(pytest.mark.slow)
+    missing = [f"{family}[{member}]" for family, left in named.items() for member in left]
+    if missing and not any("::" in each for each in config.args):
+        raise pytest.UsageError(f"quick: found no {', '.join(missing)}; name members by their ids")
+
+
 @pytest.fixture(scope="session", autouse=True)
 def _own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """Compiled kernels go to a directory of this test run, never to the user's cache."""
-    kept = os.environ.get("ARMCAL_CACHE_DIR")
-    place = tmp_path_factory.mktemp("armcal-cache")
-    place.chmod(0o700)
-    os.environ["ARMCAL_CACHE_DIR"] = str(place)
-    yield
-    if kept is None:
-        os.environ.pop("ARMCAL_CACHE_DIR", None)
-    else:
-        os.environ["ARMCAL_CACHE_DIR"] = kept
+    """Compiled kernels go to a directory of this test run, never to the user's cache; its workers share it."""
+    base = tmp_path_factory.getbasetemp()
+    place = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "armcal-cache"
+    place.mkdir(mode=0o700, exist_ok=True)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("ARMCAL_CACHE_DIR", str(place))
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _no_compiling_for_later() -> Iterator[None]:
+    """Where a command goes on with the interpreter, none compiles for a next run that would have it by chance."""
+    from armcal.solve import compiler
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(compiler, "compile_in_background", lambda *given: None)
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -19,6 +19,7 @@ import io
 import json
 import os
 import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -27,9 +28,9 @@ import time
 import tomllib
 import traceback
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
 from multiprocessing import get_context
+from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +46,7 @@ DONE_BY_TESTS = {
 }
 """Pages that a test does word for word, so that doing them here again would only take time."""
 AT_ONCE = 2
+FORK = get_context("fork")
 LONGEST_S = 300
 _FENCE = re.compile(r"^(?P<indent> *)```(?P<kind>[^\s`]*)(?P<rest>[^`]*)$")
 _TITLE = re.compile(r'title="([^"]+)"')
@@ -149,7 +151,7 @@ def page_outcome(page: Path) -> Outcome:
             elif block.kind == "python":
                 _note(told, block, "python", lambda b=block: _execute(b, told.page, namespace))
             for command in commands(block) if not fault else ():
-                _note(told, block, command.text, lambda c=command: _bash(c))
+                _note(told, block, command.text, lambda c=command: _ran(c))
         os.chdir(ROOT)
     return told
 
@@ -165,20 +167,57 @@ def _note(told: Outcome, block: Block, what: str, act: Any) -> None:
         told.faults.append(f"{shown}\n{said}")
 
 
-def _bash(command: Command) -> str:
+def _ran(command: Command) -> str:
     """Run it; what it said, if it did not end as the page has it."""
+    words = _plain_words(command.text)
     try:
-        done = subprocess.run(
-            ["bash", "-ec", command.text], capture_output=True, text=True, timeout=LONGEST_S, check=False
-        )
+        code, out, err = _armcal(words) if words[:1] == ["armcal"] else _bash(command.text)
     except subprocess.TimeoutExpired:
         return f"it did not end within {LONGEST_S} s"
-    said = f"exit {done.returncode}\n{done.stdout}{done.stderr}"
+    said = f"exit {code}\n{out}{err}"
     if not command.refusal:
-        return said if done.returncode else ""
-    told = " ".join(done.stderr.split())
+        return said if code else ""
+    told = " ".join(err.split())
     pattern = ".*".join(re.escape(" ".join(part.split())) for part in command.refusal.split("..."))
-    return "" if done.returncode and re.search(pattern, told) else f"expected: {command.refusal}\n{said}"
+    return "" if code and re.search(pattern, told) else f"expected: {command.refusal}\n{said}"
+
+
+def _plain_words(text: str) -> list[str]:
+    """The words of a command in which a shell has nothing to do but to take off quotes; none of any other."""
+    bare = re.sub(r"'[^']*'|\"[^\"$`\\]*\"", "", text)
+    return [] if re.search(r"[^\w\s./:=,+@%-]", bare) or "\n" in text.strip() else shlex.split(text)
+
+
+def _bash(text: str) -> tuple[int, str, str]:
+    """Exit code, output and errors of a script, in processes of its own."""
+    done = subprocess.run(["bash", "-ec", text], capture_output=True, text=True, timeout=LONGEST_S, check=False)
+    return done.returncode, done.stdout, done.stderr
+
+
+def _armcal(words: list[str]) -> tuple[int, str, str]:
+    """The same of one command of armcal, in a fork of this process, which has loaded everything already."""
+    with tempfile.TemporaryDirectory(prefix="armcal-docs-") as place:
+        out, err = Path(place) / "out", Path(place) / "err"
+        process = FORK.Process(target=_main, args=(words, out, err))
+        process.start()
+        process.join(LONGEST_S)
+        if process.exitcode is None:
+            process.kill()
+            raise subprocess.TimeoutExpired(words, LONGEST_S)
+        return process.exitcode, out.read_text(encoding="utf-8"), err.read_text(encoding="utf-8")
+
+
+def _main(words: list[str], out: Path, err: Path) -> None:
+    from armcal.cli.main import main
+    from joblib.externals.loky import get_reusable_executor
+
+    for path, number in ((Path(os.devnull), 0), (out, 1), (err, 2)):
+        os.dup2(os.open(path, os.O_RDWR | os.O_CREAT), number)
+    sys.argv = words
+    try:
+        main()
+    finally:  # a fork does not wait for joblib's workers as the end of a program does
+        get_reusable_executor().shutdown(wait=True)
 
 
 def _execute(block: Block, page: str, namespace: dict[str, Any]) -> str:
@@ -201,13 +240,50 @@ def pages_of(places: list[str]) -> list[Path]:
     return [page.resolve() for page in found]
 
 
+def outcomes(pages: list[Path]) -> Iterator[Outcome]:
+    """What comes of each page, ``AT_ONCE`` at a time, each in a fork of this process."""
+    waiting, running = list(pages), {}
+    while waiting or running:
+        while waiting and len(running) < AT_ONCE:
+            ours, theirs = FORK.Pipe(duplex=False)
+            process = FORK.Process(target=_send_outcome, args=(waiting[0], theirs))
+            process.start()
+            theirs.close()
+            running[ours] = (process, waiting.pop(0))
+        for ours in wait(list(running)):
+            process, page = running.pop(ours)
+            try:
+                yield ours.recv()
+            except EOFError:
+                yield Outcome(str(page), faults=[f"{page}: its process ended"])
+            process.join()
+
+
+def _send_outcome(page: Path, pipe: Connection) -> None:
+    pipe.send(page_outcome(page))
+
+
+def load_everything() -> None:
+    """What each command would load anew; none compiles for a next run, which would be no page's."""
+    import matplotlib.pyplot  # noqa: F401
+    from armcal.plugins import discover
+    from armcal.report import page  # noqa: F401
+    from armcal.run import pipeline  # noqa: F401
+    from armcal.solve import compiler
+
+    discover()
+    compiler.compile_in_background = lambda *given: None
+
+
 def main(places: list[str]) -> int:
     """Run them all, two pages at once; the number of failures."""
     for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(variable, "1")
     began, done, faults = time.perf_counter(), 0, []
-    with ProcessPoolExecutor(AT_ONCE, mp_context=get_context("spawn"), max_tasks_per_child=1) as pool:
-        for outcome in pool.map(page_outcome, [page for page in pages_of(places) if page.name not in DONE_BY_TESTS]):
+    load_everything()
+    with tempfile.TemporaryDirectory(prefix="armcal-cache-") as cache:
+        os.environ["ARMCAL_CACHE_DIR"] = cache
+        for outcome in outcomes([page for page in pages_of(places) if page.name not in DONE_BY_TESTS]):
             for line in outcome.lines:
                 print(line, flush=True)
             done += outcome.done
