@@ -144,6 +144,7 @@ def judge(run: BenchRun, seed: int, undisturbed: dict[str, np.ndarray], kinds: t
 
 
 @pytest.mark.parametrize("seed", range(QUICK))
+@pytest.mark.quick("0")
 def test_random_troubles_never_make_the_arm_unsafe(
     run: BenchRun, undisturbed: dict[str, np.ndarray], seed: int
 ) -> None:

@@ -151,6 +151,7 @@ class TestJournalThatFails:
             (JournalFailedError("the disk fails"), "record", 14),
         ],
     )
+    @pytest.mark.quick("fault4-record-14")
     def test_the_arm_is_parked_and_the_run_can_go_on(
         self, holding: BenchRun, undisturbed: dict, fault: ArmcalError, call: str, after: int, monkeypatch: Any
     ) -> None:
@@ -503,6 +504,7 @@ class TestTracker:
         assert list(run.progress.left_out) == ["p3"] and "body lost" in run.progress.left_out["p3"]
 
     @pytest.mark.parametrize("motion", ["still", "moving"])
+    @pytest.mark.quick("moving")
     def test_a_base_body_that_stays_out_of_sight_makes_it_park_and_leaves_nothing_out(
         self, tmp_path: Path, motion: str
     ) -> None:

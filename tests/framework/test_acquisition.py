@@ -253,6 +253,7 @@ def test_where_parking_is_too_much_as_well_poses_are_left_out_and_none_is_lost()
 
 
 @pytest.mark.parametrize("dies_after", range(1, 34))
+@pytest.mark.quick("1", "5", "9", "14", "19", "24", "29", "33")
 def test_killed_after_any_entry_nothing_is_measured_twice_and_nothing_is_lost(dies_after: int) -> None:
     run = Run()
     run.log.dies_after = dies_after

@@ -156,6 +156,7 @@ def test_every_form_of_an_arm_stands_where_the_arm_stands_by_pinocchio_too(arm, 
 
 
 @pytest.mark.parametrize("arm", ARMS)
+@pytest.mark.quick("lrm", "degenerate")
 def test_round_and_round_again_comes_back(arm):
     first = chain = ARMS[arm]()
     for form in ("poe", "urdf", "mdh", "craig", "urdf", "poe", "mdh"):
@@ -197,9 +198,12 @@ def arms(draw):
     }
 
 
-@settings(max_examples=40, deadline=None)
-@given(arms())
-def test_any_arm_converts(section):
+@pytest.mark.parametrize("examples", [8, pytest.param(40, marks=pytest.mark.slow)])
+def test_any_arm_converts(examples):
+    settings(max_examples=examples, deadline=None)(given(arms())(converts))()
+
+
+def converts(section):
     chain = loaded(section)
     rigid = rigid_chain(chain)
     commands = random_commands(rigid, 100, 3)

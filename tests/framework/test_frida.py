@@ -59,6 +59,7 @@ CASES = {
 }
 WITH_TWISTS_AND_OFFSETS = (*CASES, "twists_and_offsets")
 QUICK = ("one_unknown_point", "several_points", "dual_known_clamp", "wrong_clamp")
+TELLING = ("one_unknown_point", "wrong_clamp")
 SLOW = pytest.mark.slow
 
 
@@ -95,11 +96,7 @@ def table(path):
 
 @pytest.mark.parametrize(
     "name",
-    [
-        pytest.param(n, marks=SLOW) if "dual_twists" in n else n
-        for n in WITH_TWISTS_AND_OFFSETS
-        if "tools_held" not in n
-    ],
+    [pytest.param(n, marks=SLOW) if "twists" in n else n for n in WITH_TWISTS_AND_OFFSETS if "tools_held" not in n],
 )
 def test_the_shipped_records_are_those_that_the_configuration_simulates(name, tmp_path):
     invoke("simulate", CONFIGS / f"{name}.yaml", "--out", tmp_path / "made.csv")
@@ -108,7 +105,7 @@ def test_the_shipped_records_are_those_that_the_configuration_simulates(name, tm
     np.testing.assert_allclose(shipped[2], made[2], atol=1e-9)
 
 
-@pytest.mark.parametrize("name", [n if n in QUICK else pytest.param(n, marks=SLOW) for n in WITH_TWISTS_AND_OFFSETS])
+@pytest.mark.parametrize("name", [n if n in TELLING else pytest.param(n, marks=SLOW) for n in WITH_TWISTS_AND_OFFSETS])
 def test_a_run_tells_what_is_determined_and_names_the_rest(name, tmp_path):
     out = tmp_path / "out"
     told = json.loads(
@@ -140,7 +137,8 @@ def test_a_run_tells_what_is_determined_and_names_the_rest(name, tmp_path):
 # ---------------------------------------------------------------- gauge dimensions
 
 
-@pytest.mark.parametrize("name", [pytest.param(n, marks=SLOW) if "dual_twists" in n else n for n in CASES])
+@pytest.mark.parametrize("name", CASES)
+@pytest.mark.quick("one_known_point", "one_unknown_point", "several_points", "dual_known_clamp")
 def test_ranks_with_priors_left_out(name):
     case, found = CASES[name], identified(name, "parameters.priors={}")
     assert (found["rank"], len(found["free"])) == (case.rank, case.free)
@@ -200,6 +198,13 @@ def test_ranks_of_other_sets_of_one_arm(settings, rank, free):
         ("wrong_clamp", "left right", "offsets clamp", 18),
     ],
 )
+@pytest.mark.quick(
+    "one_known_point-arm-offsets-7",
+    "one_unknown_point-arm-offsets point-11",
+    "dual_known_clamp-left right-offsets-14",
+    "dual_one_known_arm-right-axes-28",
+    "wrong_clamp-left right-offsets clamp-18",
+)
 def test_ranks_by_plain_numpy(name, arms, columns, rank):
     """At the truth, where the chain closes, by slopes of the pose's logarithm."""
     slopes = two_arms.oracle_slopes(Case.load(name), arms.split(), columns.split())
@@ -216,6 +221,7 @@ NAMES = [n for n in WITH_TWISTS_AND_OFFSETS if n not in ("dual_twists", "dual_tw
 
 
 @pytest.mark.parametrize("name", [pytest.param(n, marks=SLOW) if "twists" in n else n for n in NAMES])
+@pytest.mark.quick("one_known_point", "one_unknown_point", "dual_known_clamp", "wrong_clamp")
 def test_without_noise_what_is_determined_comes_back_exactly(name):
     """Joints that read exactly, and are believed; so believed, priors pull by less than 1e-8."""
     case = Case.load(name, joint_noise=0.0)

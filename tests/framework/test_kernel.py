@@ -469,6 +469,7 @@ def truly_settled(lrm, evaluator, soft, use):
 
 @soft_springs
 @pytest.mark.parametrize("evaluator", ["interpreted", pytest.param("compiled", marks=needs_compiler)])
+@pytest.mark.quick("interpreted-all-100.0", "interpreted-k5-100000.0", "compiled-all-10000.0", "compiled-k2-10.0")
 def test_residuals_with_springs_too_soft_for_repetition_are_true_or_refused(lrm, evaluator, which, compliance):
     def use(problem, values, records, dataset):
         measured = dataset.stacked([f"tracker.{a}" for a in "xyz"])
@@ -478,6 +479,7 @@ def test_residuals_with_springs_too_soft_for_repetition_are_true_or_refused(lrm,
 
 
 @soft_springs
+@pytest.mark.quick("all-100.0", "k2-1000.0")
 def test_predictions_with_springs_too_soft_for_repetition_are_true_or_refused(lrm, which, compliance):
     def use(problem, values, records, dataset):
         return problem.predict(values, records)[0][:3, 0]
@@ -487,6 +489,7 @@ def test_predictions_with_springs_too_soft_for_repetition_are_true_or_refused(lr
 
 @soft_springs
 @pytest.mark.parametrize("evaluator", ["interpreted", pytest.param("compiled", marks=needs_compiler)])
+@pytest.mark.quick("interpreted-all-100.0", "compiled-all-10000.0", "compiled-k2-10.0")
 def test_costs_with_springs_too_soft_for_repetition_are_one_number_or_refused(lrm, evaluator, which, compliance):
     """The cost and the normal equations' cost of each record alone, both from rest at zero.
 
@@ -645,6 +648,7 @@ def test_a_damaged_or_foreign_library_in_the_cache_is_replaced(repository, built
 
 
 @pytest.mark.parametrize("mode", [0o770, 0o1777], ids=oct)
+@pytest.mark.quick("0o770")
 def test_a_cache_that_others_may_write_to_is_not_trusted(repository, built, reference_cost, mode):
     built.parent.chmod(mode)
     backend, cost = finish(start(repository, built.parent))

@@ -234,6 +234,7 @@ def test_the_files_agree_with_the_terminal(place: Path) -> None:
     assert "66.3 g" in (out / "study.html").read_text()
 
 
+@pytest.mark.slow
 def test_the_shipped_study_runs(tmp_path: Path) -> None:
     done = armcal("study", str(CONFIGS / "load_transfer.yaml"), "--out", str(tmp_path / "o"), "--json")
     assert done.exit_code == 0, done.output

@@ -37,6 +37,7 @@ def lrm_data(shared_data: Path) -> Path:
 
 
 @pytest.mark.parametrize("option", [1, 2, 3, 4, 5])
+@pytest.mark.quick("1", "2")
 def test_mean_errors_over_all_poses_are_the_published_ones(
     repository: Path, lrm_data: Path, tmp_path: Path, option: int
 ) -> None:
@@ -48,6 +49,7 @@ def test_mean_errors_over_all_poses_are_the_published_ones(
 
 
 @pytest.mark.parametrize(("option", "usable"), [(1, True), (2, False)])
+@pytest.mark.slow
 def test_a_model_that_misses_more_than_3_percent_of_the_reach_is_not_to_be_used(
     repository: Path, lrm_data: Path, tmp_path: Path, option: int, usable: bool
 ) -> None:
@@ -78,7 +80,7 @@ def loaded(repository: Path, lrm_data: Path):
     return experiment, problem, problem.records(dataset)
 
 
-@pytest.mark.parametrize("sets", [50, pytest.param(200, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("sets", [15, pytest.param(200, marks=pytest.mark.slow)])
 def test_no_training_set_gives_a_negative_compliance(loaded, sets: int) -> None:
     """Random sets of 50 poses; many of them want one."""
     experiment, problem, records = loaded
@@ -94,12 +96,13 @@ def test_no_training_set_gives_a_negative_compliance(loaded, sets: int) -> None:
     assert held > sets / 10, "the bounds were hardly ever needed: this test shows nothing"
 
 
-def test_ipopt_and_cvxpy_agree_on_the_real_arm(repository: Path, loaded) -> None:
+@pytest.mark.parametrize("sets", [3, pytest.param(15, marks=pytest.mark.slow)])
+def test_ipopt_and_cvxpy_agree_on_the_real_arm(repository: Path, loaded, sets: int) -> None:
     experiment, problem, records = loaded
     other = Experiment.load(experiment.source.path, ["estimator.type=cvxpy"]).estimator
     start, free = experiment.parameters.nominal(), list(experiment.parameters.free_entries)
     rng = np.random.default_rng(1)
-    for chosen in [np.arange(313), *(np.sort(rng.choice(313, 50, replace=False)) for _ in range(15))]:
+    for chosen in [np.arange(313), *(np.sort(rng.choice(313, 50, replace=False)) for _ in range(sets))]:
         subset = problem.subset(records, chosen)
         one = experiment.estimator.solve(problem, subset, start)
         two = other.solve(problem, subset, start)

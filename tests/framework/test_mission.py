@@ -340,6 +340,7 @@ def test_the_recalibration_goes_on_after_power_cuts_and_sees_every_record(short:
     assert counts["ignored"] == 0
 
 
+@pytest.mark.slow
 def test_power_cuts_change_nothing(short: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
     """To the last digit of every error at every moment: the journal is all that a restart needs."""
     folder, _ = short

@@ -47,6 +47,7 @@ def test_a_socket_that_moved_is_named_with_where_and_how_far(before):
 
 
 @pytest.mark.parametrize("seed", range(6))
+@pytest.mark.quick("0", "3")
 def test_nothing_is_said_where_nothing_moved(seed):
     assert found(0.0, 10, seed=seed) == ()
 

@@ -232,6 +232,7 @@ class PublishedCost:
 @pytest.mark.parametrize(
     ("name", "trained"), [pytest.param(*k, marks=[] if k in POLISHED else SLOW) for k in PUBLISHED]
 )
+@pytest.mark.quick("kinova-left")
 def test_nothing_near_the_solution_has_a_lower_published_cost(run, name, trained):
     told, values = published(run, name, trained)
     urdf = Urdf.read(CONFIGS / ROBOTS[name].urdf, ROBOTS[name].root)
@@ -297,6 +298,7 @@ def test_joint_effects_do_better_on_positions_that_did_not_train_them(run, name,
     assert held["distance_mean_of_groups"] < (distance or 0.1), "better in one figure at the cost of the other"
 
 
+@pytest.mark.slow
 def test_a_socket_of_the_kinova_moved_while_it_was_recorded(run):
     """Of the position front: hole_0 after its seventh posture, hole_1 never, by an arm that other positions trained."""
     _, values = published(run, "kinova", "left", "lower_left", "raised_back")
@@ -355,6 +357,7 @@ def figures(told):
     return [*errors, *sorted(group["error_mm"] for group in told["groups"].values())]
 
 
+@pytest.mark.slow
 def test_the_order_of_records_and_of_folders_means_nothing(run, tmp_path):
     names = {"front": "zulu", "left_back": "alpha"}
     random = np.random.default_rng(5)
