@@ -3,6 +3,8 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
+# Many processes load armcal: each would compile its sources anew.
+export PYTHONDONTWRITEBYTECODE :=
 
 .PHONY: demo test test-all bench lint types docs docs-commands dist clean
 

@@ -75,6 +75,7 @@ def test_no_targets_have_no_answers() -> None:
 
 
 @pytest.mark.parametrize(("name", "turns"), [("three", False), ("rigid", False), ("lift", True), ("lrm", True)])
+@pytest.mark.quick("three-False", "rigid-False", "lift-True")
 def test_targets_in_reach(name: str, turns: bool) -> None:
     pair = Pair(name, turns)
     assert pair.alike(pair.goal(400), QUICK) > 0.3
@@ -86,7 +87,7 @@ def test_targets_out_of_reach_end_at_the_nearest() -> None:
 
 
 def test_wishes_and_joints_that_are_held() -> None:
-    pair = Pair("lrm", False)
+    pair = Pair("five", False)
     goal = pair.goal(200)
     wished = replace(goal, towards=drawn(pair.found, 200, seed=3).T)
     assert pair.alike(wished, WISHED) > 0.3
@@ -163,6 +164,7 @@ def test_several_threads_may_search_at_once() -> None:
 
 
 @pytest.mark.parametrize("kind", ["compiled", "arrays"])
+@pytest.mark.slow
 def test_what_counts_as_there_is_what_is_given(kind: str) -> None:
     """Not an earlier step that moved less but was not at rest, or was turned too far: a few of 1000 have such steps."""
     pair, near = Pair("lrm", True), Near(metres=1e-9, radians=1e-8, rest=1e-11)

@@ -163,6 +163,7 @@ def test_errors_that_resemble_their_neighbours_do_not_pass_for_dependence_on_the
     assert blamed <= 2
 
 
+@pytest.mark.slow
 def test_the_order_of_the_rows_does_not_matter_where_the_recording_is_numbered(lrm):
     problem, _, start, dataset = planted(lrm, "backlash", 5)
     numbered = replace(dataset, channels={**dataset.channels, "sequence": np.arange(150.0)})
@@ -173,6 +174,7 @@ def test_the_order_of_the_rows_does_not_matter_where_the_recording_is_numbered(l
     assert one.structures[0].falls_mm == pytest.approx(other.structures[0].falls_mm, abs=1e-6)
 
 
+@pytest.mark.slow
 def test_records_of_no_weight_tell_nothing(lrm):
     problem, _, start, dataset = planted(lrm, "wrong level", 6)
     spoilt = dict(dataset.channels)

@@ -98,6 +98,7 @@ def test_only_the_elastic_model_carries_over(place: Path) -> None:
     assert _mean(result, "kinematic", (), 250.0) == _mean(result, "elastic", (), 250.0) > 10
 
 
+@pytest.mark.slow
 def test_a_cell_at_another_load_is_a_run_at_one_judged_on_the_other(plain: Path) -> None:
     data = _measured(plain, {0: 40, 66.3: 30})
     result = _run(plain / "study.yaml", data=data)

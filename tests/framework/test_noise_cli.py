@@ -124,8 +124,10 @@ def test_robust_compliances_are_the_simulated_truths(repository, robust_run):
             assert sd < 0.2 * float(truth[name])
 
 
-def test_plugins_hear_of_records_that_were_set_aside(repository, spoilt, monkeypatch):
-    data, wrong = spoilt
+@pytest.fixture(scope="module")
+def rejected(repository, spoilt):
+    """What is found where wrong records are rejected and none is held out, and what plugins hear of it."""
+    data, _ = spoilt
     config = repository / "configs" / "lrm_arm" / "demo.yaml"
     given = ["noise.loss=reject", "validation.folds=0", "validation.holdout=0"]
     experiment = Experiment.load(config, given, data)
@@ -135,8 +137,13 @@ def test_plugins_hear_of_records_that_were_set_aside(repository, spoilt, monkeyp
         heard.append((event, told))
         return []
 
-    monkeypatch.setattr(type(experiment.registry), "notify", notify)
-    calibrate(experiment)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(type(experiment.registry), "notify", notify)
+        return calibrate(experiment), heard
+
+
+def test_plugins_hear_of_records_that_were_set_aside(spoilt, rejected):
+    wrong, heard = spoilt[1], rejected[1]
     assert {told["record_id"] for event, told in heard if event == "armcal_record_rejected"} == wrong
 
 
@@ -155,13 +162,10 @@ def test_components_reach_every_output(repository, tmp_path):
 
 def test_noise_for_each_axis_is_one_number_thrice_or_a_list(repository, tmp_path):
     data = repository / "configs" / "lrm_arm" / "demo.csv"
-    one, _ = run(repository, data, tmp_path / "one", "validation.folds=0")
-    same, _ = run(
-        repository, data, tmp_path / "same", "measurements.tracker.noise_mm=[0.5, 0.5, 0.5]", "validation.folds=0"
-    )
-    other, _ = run(
-        repository, data, tmp_path / "other", "measurements.tracker.noise_mm=[0.5, 0.5, 5]", "validation.folds=0"
-    )
+    few = "validation.folds=0"
+    one, _ = run(repository, data, tmp_path / "one", few)
+    same, _ = run(repository, data, tmp_path / "same", "measurements.tracker.noise_mm=[0.5, 0.5, 0.5]", few)
+    other, _ = run(repository, data, tmp_path / "other", "measurements.tracker.noise_mm=[0.5, 0.5, 5]", few)
     assert same["error_mm"] == one["error_mm"] and same["noise"] == one["noise"]
     assert other["error_mm"]["calibrated"]["train"]["rms"] > one["error_mm"]["calibrated"]["train"]["rms"]
 
@@ -186,11 +190,8 @@ def test_bad_settings_are_refused_at_their_place(repository, override, said):
     assert said in done.output and override.partition("=")[0] in done.output
 
 
-def test_the_report_escapes_what_a_suspicious_record_is_called(repository, spoilt):
-    data, _ = spoilt
-    config = repository / "configs" / "lrm_arm" / "demo.yaml"
-    experiment = Experiment.load(config, ["noise.loss=reject", "validation.folds=0", "validation.holdout=0"], data)
-    result = calibrate(experiment)
+def test_the_report_escapes_what_a_suspicious_record_is_called(rejected):
+    result = rejected[0]
     odd = replace(result.noise.suspicious[0], record_id="<b>x</b>")
     page = render(replace(result, noise=replace(result.noise, suspicious=(odd,))))
     assert "&lt;b&gt;x&lt;/b&gt;" in page and "<b>x</b>" not in page
@@ -212,6 +213,7 @@ def test_the_real_arm_under_every_loss(repository, shared_data, folds):
     assert errors["huber"] < errors["none"]
 
 
+@pytest.mark.slow
 def test_the_real_arm_is_noisier_in_its_joints_than_its_tracker(repository, shared_data):
     """The tracker is good to 0.5 mm along x and z; the servos step by 0.53 deg."""
     config, data = repository / "configs" / "lrm_arm" / "option1.yaml", shared_data / "lrm_arm" / "poses.csv"

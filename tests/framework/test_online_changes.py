@@ -154,6 +154,7 @@ LONG = pytest.mark.slow
         pytest.param(2.0, (1, 2, 3, 4, 5, 6), 25, marks=LONG),
     ],
 )
+@pytest.mark.quick("2.0-joints1-1")
 def test_a_small_step_is_decided_soon(degrees: float, joints: tuple[int, ...], seeds: int) -> None:
     """Half a degree of the wrist moves the tip by hardly more than the noise: see the test after this one."""
     soon = {joint: [] for joint in joints}
@@ -206,6 +207,7 @@ def _recoveries(seeds: range, outliers: float, joints: tuple[int, ...] = (1, 2, 
 
 @pytest.mark.parametrize("seeds", [1, pytest.param(25, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("outliers", [0.0, 0.05])
+@pytest.mark.quick("0.05-1")
 def test_a_slipped_joint_is_named_and_recovered(seeds: int, outliers: float) -> None:
     found = _recoveries(range(seeds), outliers)
     named, soon = np.mean([r.named for r in found]), np.mean([r.first <= 10 for r in found])

@@ -94,6 +94,9 @@ LIES = {
 
 
 @pytest.mark.parametrize("lie", LIES)
+@pytest.mark.quick(
+    "a quarter of the noise", "no process noise under drift", "half the prior's deviations", "1 mm bias, base free"
+)
 def test_a_planted_inconsistency_is_seen(lie: str) -> None:
     ground, world, by_nis, by_nees = LIES[lie]
     found = study(2, ground(), world)
@@ -120,6 +123,7 @@ NOTICED = {
 
 
 @pytest.mark.parametrize("lie", NOTICED)
+@pytest.mark.quick("1 mm bias")
 def test_the_recalibrator_notices(lie: str) -> None:
     of, changed, world = NOTICED[lie]
     recalibrator = begun(settings(**changed), **of)

@@ -102,6 +102,7 @@ def run(halves: Halves, settings: RecalibrateSettings, step_rad: float = 0.0) ->
 
 
 @pytest.mark.parametrize("halves", MODELS, indirect=True)
+@pytest.mark.slow
 def test_a_clean_run_raises_no_alarm_and_foretells_as_a_refit_would(halves: Halves) -> None:
     """A refit of option 1 before every other of the last 80 records errs by 5.7 mm on them in the mean; of the best
     model before every fifth by what docs/recalibrate.md states."""
@@ -115,6 +116,7 @@ def test_a_clean_run_raises_no_alarm_and_foretells_as_a_refit_would(halves: Halv
 
 @pytest.mark.parametrize("halves", MODELS, indirect=True)
 @pytest.mark.parametrize("step_deg", [5.0, 14.4])
+@pytest.mark.quick("5.0-option1")
 def test_a_step_of_joint_3_is_named_and_followed(halves: Halves, step_deg: float) -> None:
     """In the eight poses after the step joint 2 stands at zero and the axes of joints 1 and 3 coincide: no pose tells
     one from the other before the ninth record, so two joints are named at first, and one by the tenth."""

@@ -84,6 +84,7 @@ def test_a_problem_sent_elsewhere_gives_the_same_bits(lrm, evaluator: str) -> No
 @pytest.mark.parametrize(
     "executor", [Workers("loky", 2), Workers("loky", 3), Workers("threading", 2), Automatic(worth_s=0.0), Automatic()]
 )
+@pytest.mark.quick("executor0", "executor2", "executor3")
 def test_every_backend_gives_the_same_bits(lrm, executor: Executor) -> None:
     assert np.array_equal(_fold_errors(lrm, executor), _fold_errors(lrm, None))
 

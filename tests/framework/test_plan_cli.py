@@ -196,6 +196,7 @@ def test_a_plan_robust_to_priors_is_better_on_average_over_them(tmp_path: Path) 
     assert plain["log_det"] >= robust["log_det"]  # at the nominal values
 
 
+@pytest.mark.slow
 def test_the_same_command_gives_the_same_file(tmp_path: Path) -> None:
     for name in ("a", "b"):
         planned(

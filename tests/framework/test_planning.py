@@ -74,6 +74,7 @@ def test_updates_agree_with_decompositions_after_many_exchanges(goal: str, n_row
 
 @pytest.mark.parametrize("goal", GOALS)
 @pytest.mark.parametrize("draws", [1, 3])
+@pytest.mark.quick("1-D", "1-A", "1-E", "1-O1", "1-O2", "1-O3", "1-O4", "1-O5", "3-D")
 def test_no_single_swap_improves_a_plan(goal: str, draws: int) -> None:
     candidates = made(count=25, draws=draws, seed=3)
     plan = choose(Task(candidates, criterion(goal), 6), starts=2)
@@ -88,6 +89,7 @@ def test_no_single_swap_improves_a_plan(goal: str, draws: int) -> None:
 
 @pytest.mark.parametrize("goal", ["D", "A", "E"])
 @pytest.mark.parametrize("seed", range(4))
+@pytest.mark.quick("0-D", "1-A", "2-E")
 def test_of_few_candidates_the_very_best_plan_is_found(goal: str, seed: int) -> None:
     candidates = made(count=12, size=4, seed=seed)
     best = max(by_hand(candidates, goal, chosen) for chosen in combinations(range(12), 4))

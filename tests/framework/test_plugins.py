@@ -15,9 +15,11 @@ from typing import Any
 
 import pytest
 import yaml
+from armcal.cli.main import cli
 from armcal.errors import PluginError
 from armcal.plugins import Component, PluginRegistry, discover
 from armcal.testing.contract import CheckResult, check_component
+from click.testing import CliRunner
 
 ROOT = Path(__file__).parents[2]
 DATA = ROOT / "tests" / "data"
@@ -38,6 +40,10 @@ def python(*arguments: str, path: Path | None = None, cwd: Path | None = None, c
 
 
 def armcal(*arguments: str, path: Path | None = None, cwd: Path | None = None, columns: int = 1000) -> Ran:
+    """One command, in a process of its own where plugins are found on another path."""
+    if path is None and cwd is None:
+        done = CliRunner().invoke(cli, arguments, env={"COLUMNS": str(columns)})
+        return Ran(arguments, done.exit_code, done.stdout, done.stderr)
     return python("-m", "armcal.cli", *arguments, path=path, cwd=cwd, columns=columns)
 
 

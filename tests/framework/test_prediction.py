@@ -361,7 +361,12 @@ def test_python_gives_what_the_command_gives(recording: Path) -> None:
 
 @pytest.mark.parametrize(
     "extra",
-    [(), ("noise.estimate=true",), DRIFTING, pytest.param((*DRIFTING, "noise.loss=huber"), marks=pytest.mark.slow)],
+    [
+        pytest.param((), marks=pytest.mark.slow),
+        ("noise.estimate=true",),
+        DRIFTING,
+        pytest.param((*DRIFTING, "noise.loss=huber"), marks=pytest.mark.slow),
+    ],
 )
 def test_what_is_kept_predicts_as_the_fit_itself(extra: tuple[str, ...], tmp_path: Path) -> None:
     """Through the file: drift, estimated components, robust weights."""
