@@ -77,6 +77,7 @@ def touches_of_plane(normal, offset, tip, count, seed, scatter):
 
 @pytest.mark.parametrize("stated", [(0.0, 0.0, 1.0), (0.3, -1.0, 0.2), (-1.0, 0.0, 0.0)], ids=str)
 @pytest.mark.parametrize("tilt", [0.02, 0.6, 1.3])
+@pytest.mark.quick("0.02-(0.0, 0.0, 1.0)", "0.6-(0.3, -1.0, 0.2)", "1.3-(-1.0, 0.0, 0.0)")
 def test_the_plane_found_is_the_one_of_least_squares(stated, tilt):
     """With an exact arm nothing is left but the plane: that of the smallest singular value of the points."""
     mean = np.array(stated) / np.linalg.norm(stated)
