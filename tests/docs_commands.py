@@ -169,9 +169,9 @@ def _note(told: Outcome, block: Block, what: str, act: Any) -> None:
 
 def _ran(command: Command) -> str:
     """Run it; what it said, if it did not end as the page has it."""
-    words = _plain_words(command.text)
+    words = plain_words(command.text)
     try:
-        code, out, err = _armcal(words) if words[:1] == ["armcal"] else _bash(command.text)
+        code, out, err = run_armcal(words) if words[:1] == ["armcal"] else run_bash(command.text)
     except subprocess.TimeoutExpired:
         return f"it did not end within {LONGEST_S} s"
     said = f"exit {code}\n{out}{err}"
@@ -182,19 +182,19 @@ def _ran(command: Command) -> str:
     return "" if code and re.search(pattern, told) else f"expected: {command.refusal}\n{said}"
 
 
-def _plain_words(text: str) -> list[str]:
+def plain_words(text: str) -> list[str]:
     """The words of a command in which a shell has nothing to do but to take off quotes; none of any other."""
     bare = re.sub(r"'[^']*'|\"[^\"$`\\]*\"", "", text)
     return [] if re.search(r"[^\w\s./:=,+@%-]", bare) or "\n" in text.strip() else shlex.split(text)
 
 
-def _bash(text: str) -> tuple[int, str, str]:
+def run_bash(text: str) -> tuple[int, str, str]:
     """Exit code, output and errors of a script, in processes of its own."""
     done = subprocess.run(["bash", "-ec", text], capture_output=True, text=True, timeout=LONGEST_S, check=False)
     return done.returncode, done.stdout, done.stderr
 
 
-def _armcal(words: list[str]) -> tuple[int, str, str]:
+def run_armcal(words: list[str]) -> tuple[int, str, str]:
     """The same of one command of armcal, in a fork of this process, which has loaded everything already."""
     with tempfile.TemporaryDirectory(prefix="armcal-docs-") as place:
         out, err = Path(place) / "out", Path(place) / "err"
@@ -209,14 +209,23 @@ def _armcal(words: list[str]) -> tuple[int, str, str]:
 
 def _main(words: list[str], out: Path, err: Path) -> None:
     from armcal.cli.main import main
-    from joblib.externals.loky import get_reusable_executor
 
     for path, number in ((Path(os.devnull), 0), (out, 1), (err, 2)):
         os.dup2(os.open(path, os.O_RDWR | os.O_CREAT), number)
+    sys.stdin, sys.stdout, sys.stderr = open(0), open(1, "w"), open(2, "w")  # noqa: SIM115
     sys.argv = words
-    try:
+    with no_workers_left():
         main()
-    finally:  # a fork does not wait for joblib's workers as the end of a program does
+
+
+@contextlib.contextmanager
+def no_workers_left() -> Iterator[None]:
+    """A fork that ends waits for joblib's workers for ever, where the end of a program would end them."""
+    from joblib.externals.loky import get_reusable_executor
+
+    try:
+        yield
+    finally:
         get_reusable_executor().shutdown(wait=True)
 
 
@@ -260,7 +269,8 @@ def outcomes(pages: list[Path]) -> Iterator[Outcome]:
 
 
 def _send_outcome(page: Path, pipe: Connection) -> None:
-    pipe.send(page_outcome(page))
+    with no_workers_left():
+        pipe.send(page_outcome(page))
 
 
 def load_everything() -> None:

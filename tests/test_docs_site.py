@@ -16,7 +16,18 @@ import yaml
 from browser import CHROMIUM, Browser
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from tests.docs_commands import DONE_BY_TESTS, Block, blocks, commands, faults_of, page_outcome, pages_of
+from tests.docs_commands import (
+    DONE_BY_TESTS,
+    Block,
+    blocks,
+    commands,
+    faults_of,
+    page_outcome,
+    pages_of,
+    plain_words,
+    run_armcal,
+    run_bash,
+)
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
@@ -75,6 +86,17 @@ def test_what_is_wrong_with_a_block_is_told_with_its_line(
     monkeypatch.chdir(ROOT)
     told = page_outcome(page_of(tmp_path, "first line", text))
     assert len(told.faults) == 1 and "page.md:2" in told.faults[0]
+
+
+def test_what_needs_no_shell_runs_in_a_fork_and_says_the_same() -> None:
+    quoted = ["armcal", "check", "a.yaml", "--set", "parameters.free=[arm.*]"]
+    assert plain_words("armcal check a.yaml --set 'parameters.free=[arm.*]'") == quoted
+    for text in ("armcal a | b", "armcal a > b", "armcal a; b", "armcal $A", "armcal *.yaml", "armcal a\narmcal b"):
+        assert plain_words(text) == []
+    for words in (["--version"], ["check", "nowhere.yaml"]):
+        code, out, err = run_armcal(["armcal", *words])
+        done = run_bash(" ".join([sys.executable, "-m", "armcal.cli", *words]))
+        assert (code, out, err) == done and out + err
 
 
 def test_a_fence_that_is_never_closed_is_refused() -> None:
