@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
+import shutil
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -39,11 +41,17 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         raise pytest.UsageError(f"quick: found no {', '.join(missing)}; name members by their ids")
 
 
-@pytest.fixture(scope="session", autouse=True)
-def _own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """Compiled kernels go to a directory of this test run, never to the user's cache; its workers share it."""
+@pytest.fixture(scope="session")
+def of_this_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder that all workers of this test run share."""
     base = tmp_path_factory.getbasetemp()
-    place = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "armcal-cache"
+    return base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _own_cache(of_this_run: Path) -> Iterator[None]:
+    """Compiled kernels go to a directory of this test run, never to the user's cache."""
+    place = of_this_run / "armcal-cache"
     place.mkdir(mode=0o700, exist_ok=True)
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("ARMCAL_CACHE_DIR", str(place))
@@ -64,6 +72,29 @@ def _no_compiling_for_later() -> Iterator[None]:
 def repository() -> Path:
     """The root of the checkout."""
     return ROOT
+
+
+@pytest.fixture(scope="session")
+def demo_run(of_this_run: Path) -> Path:
+    """The folder of a run of the shipped demonstration without cross-validation, made by the worker that is first."""
+    from armcal.cli.main import cli
+    from click.testing import CliRunner
+
+    folder = of_this_run / "demo-run"
+    with (of_this_run / "demo-run.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not (folder / "calibration.yaml").is_file():
+            settings = ("--set", "validation.folds=0", "--set", "evaluator=interpreted")
+            demo = str(ROOT / "configs" / "lrm_arm" / "demo.yaml")
+            done = CliRunner().invoke(cli, ["run", demo, "--out", str(folder), "-q", *settings])
+            assert done.exit_code == 0, done.output
+    return folder
+
+
+@pytest.fixture(scope="module")
+def demo_calibration(demo_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The calibration of that run, in a copy of its folder that is the module's own."""
+    return Path(shutil.copytree(demo_run, tmp_path_factory.mktemp("demo") / "run")) / "calibration.yaml"
 
 
 @pytest.fixture(scope="session")

@@ -17,24 +17,13 @@ from pathlib import Path
 from typing import Any
 
 import yaml
-from armcal.cli.main import cli
 from armcal.serve.answering import Answerer
 from armcal.serve.client import Client
 from armcal.serve.loaded import Order, loaded
 from armcal.use.calibration_file import identity_of, sealed
-from click.testing import CliRunner
 
 ROOT = Path(__file__).resolve().parents[1]
-DEMO = ROOT / "configs" / "lrm_arm" / "demo.yaml"
-QUICK = ["--set", "validation.folds=0", "--set", "evaluator=interpreted"]
 LONG_S = 120.0
-
-
-def calibrated(folder: Path) -> Path:
-    """The calibration of the shipped demonstration."""
-    result = CliRunner().invoke(cli, ["run", str(DEMO), "--out", str(folder), "-q", *QUICK])
-    assert result.exit_code == 0, result.output
-    return folder / "calibration.yaml"
 
 
 def variant(text: str, number: int) -> str:

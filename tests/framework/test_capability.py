@@ -24,12 +24,10 @@ from armcal.capability.subject import Subject
 from armcal.capability.summary import design_summaries
 from armcal.capability.survey import Survey, outline, survey
 from armcal.capability.voxels import grouped, voxels_of
-from armcal.cli.main import cli
 from armcal.errors import ConfigError, ProblemError
 from armcal.measure.contact import ArmsAlone
 from armcal.solve.problem import Problem
 from armcal.use.calibration import Calibration
-from click.testing import CliRunner
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs" / "lrm_arm"
 LINKS = (0.3, 0.25)
@@ -86,12 +84,8 @@ def lrm() -> Task:
 
 
 @pytest.fixture(scope="module")
-def calibration(tmp_path_factory: pytest.TempPathFactory) -> Calibration:
-    folder = tmp_path_factory.mktemp("demo") / "run"
-    options = ("--set", "validation.folds=0", "--set", "evaluator=interpreted", "-q", "--out", str(folder))
-    done = CliRunner().invoke(cli, ["run", str(CONFIGS / "demo.yaml"), *options])
-    assert done.exit_code == 0, done.output
-    return Calibration.load(folder / "calibration.yaml")
+def calibration(demo_calibration: Path) -> Calibration:
+    return Calibration.load(demo_calibration)
 
 
 def test_two_links_reach_exactly_the_annulus(tmp_path: Path) -> None:

@@ -56,12 +56,9 @@ def told(*arguments: object) -> dict[str, Any]:
 
 
 @pytest.fixture(scope="module")
-def calibration(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def calibration(demo_calibration: Path) -> Path:
     """The demonstration's."""
-    folder = tmp_path_factory.mktemp("demo") / "run"
-    fast = ["--set", "validation.folds=0", "--set", "evaluator=interpreted"]
-    assert armcal("run", DEMO, "--out", folder, "-q", *fast).exit_code == 0
-    return folder / "calibration.yaml"
+    return demo_calibration
 
 
 def records() -> list[Incoming]:

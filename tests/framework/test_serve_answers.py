@@ -27,7 +27,7 @@ from armcal.use.calibration_file import sealed
 from armcal.use.compensation.request import Commands
 from pydantic import TypeAdapter
 from scipy.spatial.transform import Rotation
-from serving import ROOT, ask, calibrated, foreign, made, sha256, told, variant
+from serving import ROOT, ask, foreign, made, sha256, told, variant
 
 Q_DEG = [10.0, -20.0, 30.0, 40.0, -50.0, 60.0]
 NAMES = [f"q{i}" for i in range(1, 7)]
@@ -36,8 +36,8 @@ LOAD = {"payload_g": 150, "gravity_m_s2": [0.5, -0.3, -1.5]}
 
 
 @pytest.fixture(scope="module")
-def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return calibrated(tmp_path_factory.mktemp("serve"))
+def path(demo_calibration: Path) -> Path:
+    return demo_calibration
 
 
 @pytest.fixture(scope="module")

@@ -20,15 +20,15 @@ from armcal.cli.main import cli
 from armcal.serve.client import Client
 from armcal.use.calibration import Calibration
 from click.testing import CliRunner
-from serving import LONG_S, Running, calibrated, command, foreign, put, serving, sha256, variant
+from serving import LONG_S, Running, command, foreign, put, serving, sha256, variant
 
 HALF = "a: [\n"
 POSTURES = np.random.default_rng(0).uniform(-80, 80, (40, 6))
 
 
 @pytest.fixture(scope="module")
-def text(tmp_path_factory: pytest.TempPathFactory) -> str:
-    return calibrated(tmp_path_factory.mktemp("calibrated")).read_text()
+def text(demo_calibration: Path) -> str:
+    return demo_calibration.read_text()
 
 
 @pytest.fixture

@@ -34,17 +34,13 @@ from rich.console import Console
 from watching import SLIP, append, made_up, made_up_folder, written
 
 ROOT = Path(__file__).resolve().parents[2]
-DEMO = str(ROOT / "configs" / "lrm_arm" / "demo.yaml")
 HOSTILE = "</script><script>document.title='taken'</script><img src=x onerror=\"document.title='taken'\">"
 
 
 @pytest.fixture(scope="module")
-def calibration(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def calibration(demo_calibration: Path) -> Path:
     """A real one, of the shipped demonstration."""
-    folder = tmp_path_factory.mktemp("demo") / "run"
-    options = ["--set", "validation.folds=0", "--set", "evaluator=interpreted"]
-    assert CliRunner().invoke(cli, ["run", DEMO, "--out", str(folder), "-q", *options]).exit_code == 0
-    return folder / "calibration.yaml"
+    return demo_calibration
 
 
 # Files

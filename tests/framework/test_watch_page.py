@@ -11,25 +11,19 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 import pytest
-from armcal.cli.main import cli
 from armcal.online.watch.page import page
 from armcal.online.watch.shape import Shape
 from browser import CHROMIUM, Browser
-from click.testing import CliRunner
 from watching import Served, decision, made_up, made_up_folder
 
 ROOT = Path(__file__).resolve().parents[2]
-DEMO = str(ROOT / "configs" / "lrm_arm" / "demo.yaml")
 HOSTILE = "</script><script>document.title='taken'</script><img src=x onerror=\"document.title='taken'\">"
 
 
 @pytest.fixture(scope="module")
-def calibration(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def calibration(demo_calibration: Path) -> Path:
     """A real one, of the shipped demonstration."""
-    folder = tmp_path_factory.mktemp("demo") / "run"
-    options = ["--set", "validation.folds=0", "--set", "evaluator=interpreted"]
-    assert CliRunner().invoke(cli, ["run", DEMO, "--out", str(folder), "-q", *options]).exit_code == 0
-    return folder / "calibration.yaml"
+    return demo_calibration
 
 
 @pytest.fixture
