@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 from armcal.arm.assembly import Arm, prefixed
+from armcal.arm.environment import Environment
 from armcal.base.dataset import Dataset
 from armcal.base.parameters import Parameters
 from armcal.measure.groups import group_blocks, groups_of
-from armcal.solve.factor import Environment
 from armcal.solve.problem import Problem
 from armcal_contact.ball import BallInSocket
 from armcal_mdh.model import MdhModel

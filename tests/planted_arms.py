@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from armcal.arm.assembly import Arm, prefixed
 from armcal.arm.effects import JointEffect
+from armcal.arm.environment import Environment
 from armcal.base.dataset import Dataset
 from armcal.base.parameters import Parameters, scalar
-from armcal.solve.factor import Environment
 from armcal.solve.problem import Problem
 from armcal_mdh.model import MdhModel
 from armcal_tracker.position import TipPosition, TipPositionSettings

@@ -13,12 +13,14 @@ FRAMEWORK = ROOT / "framework" / "armcal"
 PLUGINS = ROOT / "plugins"
 
 ORDER = [
+    "armcal.version",
     "armcal.errors",
     "armcal.hooks",
     "armcal.hook_trace",
     "armcal.registration",
     "armcal.plugin_files",
     "armcal.plugins",
+    "armcal.io.udp",
     "armcal.base.shown",
     "armcal.base.plain_files",
     "armcal.base.units",
@@ -38,6 +40,7 @@ ORDER = [
     "armcal.arm.model",
     "armcal.arm.effects",
     "armcal.arm.statics",
+    "armcal.arm.environment",
     "armcal.arm.elastic",
     "armcal.arm.servo",
     "armcal.arm.assembly",

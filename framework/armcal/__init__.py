@@ -9,6 +9,8 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from armcal.version import __version__
+
 if TYPE_CHECKING:
     from armcal.api import Experiment as Experiment
     from armcal.api import Run as Run
@@ -54,8 +56,6 @@ if TYPE_CHECKING:
     from armcal.use.compensation.request import Commands as Commands
     from armcal.use.compensation.request import Options as Options
     from armcal.use.compensation.request import Targets as Targets
-
-__version__ = "0.1.0"
 
 _FOR_USERS = {
     "armcal.api": "Experiment Run",

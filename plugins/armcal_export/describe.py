@@ -7,10 +7,10 @@ from collections.abc import Mapping
 import casadi as ca
 import numpy as np
 from armcal.arm.assembly import scoped
+from armcal.arm.environment import STATICS, tilted
 from armcal.arm.model import Chain, forward
 from armcal.arm.statics import MOUNT_FRAME, TOOL_FRAME, Load, frame_names
 from armcal.base.domains import Array
-from armcal.solve.factor import STATICS, tilted
 from armcal.use.exporter import ExportRequest
 from armcal.use.rigid_chain import RigidJoint, rigid_chain
 

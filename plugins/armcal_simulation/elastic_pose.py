@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import casadi as ca
 import numpy as np
 from armcal.arm.assembly import Arm, ArmInputs, ArmState
+from armcal.arm.environment import STATICS, Environment
 from armcal.arm.statics import Load
 from armcal.base import se3
 from armcal.base.domains import Array
@@ -15,7 +16,6 @@ from armcal.base.parameters import Parameters
 from armcal.base.pose_blocks import rotation_of
 from armcal.errors import ConfigError, NotConvergedError
 from armcal.measure.measurement import Measurement
-from armcal.solve.factor import STATICS, Environment
 from armcal.solve.kernel import direct_access
 from armcal.solve.stability import MOST_PASSES
 

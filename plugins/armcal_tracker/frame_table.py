@@ -11,8 +11,7 @@ from typing import NoReturn
 from armcal.base.domains import Array
 from armcal.base.units import from_unit, split_suffix
 from armcal.errors import DataError, Location
-from armcal.measure.cells import read_cell
-from armcal.online.sources.row_parser import DELIMITERS, split
+from armcal.measure.cells import DELIMITERS, read_cell, split
 
 from armcal_tracker.body_pose import body_pose
 from armcal_tracker.unreadable import UnreadableError

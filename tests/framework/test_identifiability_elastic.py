@@ -10,9 +10,9 @@ import numpy as np
 import oracle
 import pytest
 from armcal.arm.assembly import Arm, MassSpec, prefixed
+from armcal.arm.environment import Environment
 from armcal.base.dataset import Dataset
 from armcal.base.parameters import Parameters
-from armcal.solve.factor import Environment
 from armcal.solve.problem import Problem
 from armcal.solve.structure import explain, identify
 from armcal_joints.springs import TorsionalSprings

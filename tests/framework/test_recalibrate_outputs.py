@@ -9,8 +9,9 @@ from io import BytesIO
 from pathlib import Path
 
 import pytest
+from armcal.base.config_text import as_line
 from armcal.online.running.event_file import EventFile
-from armcal.online.running.outputs import Outputs, as_line
+from armcal.online.running.outputs import Outputs
 from armcal.online.running.standard_output import StandardOutput
 from recalibrations import (
     FullFiles,

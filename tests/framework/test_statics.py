@@ -10,10 +10,10 @@ import oracle
 import pytest
 from armcal.arm.assembly import Arm, MassSpec
 from armcal.arm.effects import JointEffect, Spring
+from armcal.arm.environment import Environment
 from armcal.arm.model import forward
 from armcal.arm.statics import Load, Mass, wrenches
 from armcal.base.parameters import Parameters, scalar
-from armcal.solve.factor import Environment
 from armcal.solve.problem import Problem
 from armcal_joints.springs import TorsionalSprings, TorsionalSpringSettings
 from armcal_mdh.model import MdhModel, MdhSettings

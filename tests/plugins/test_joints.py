@@ -14,12 +14,12 @@ import oracle
 import pytest
 import yaml
 from armcal.arm.assembly import Arm, ArmInputs, MassSpec, prefixed
+from armcal.arm.environment import Environment
 from armcal.arm.statics import Load
 from armcal.base.dataset import Dataset
 from armcal.base.parameters import Parameters
 from armcal.cli.main import cli
 from armcal.run.experiment import Experiment
-from armcal.solve.factor import Environment
 from armcal.solve.problem import Problem
 from armcal_joints.backlash import ApproachBacklash, BearingPlay, TorqueBacklash
 from armcal_joints.compliance import Compliances

@@ -103,3 +103,11 @@ def resolve_path(text: ConfigText | str) -> Path:
             hint="Move the file below the root, or give its path on the command line.",
         )
     return found
+
+
+def as_line(content: Mapping[str, Any]) -> str:
+    """One line of JSON; numbers that are not finite become null."""
+    try:
+        return json.dumps(content, allow_nan=False)
+    except ValueError:
+        return as_json(content, indent=None)

@@ -11,10 +11,10 @@ from importlib import import_module
 import click
 from click.shell_completion import CompletionItem
 
-from armcal import __version__
 from armcal.cli.outlet import Outlet, say
 from armcal.errors import EXIT_DONE, EXIT_FAULT, EXIT_INTERRUPTED, ArmcalError
 from armcal.plugin_files import use_plugins
+from armcal.version import __version__
 
 COMMANDS = {
     "new": ("armcal.cli.new:new", "Begin a robot's files, or a plugin of your own."),

@@ -12,9 +12,9 @@ from typing import Any, get_args
 
 import click
 
+from armcal.base.config_text import as_line
 from armcal.cli.common import Voice, accept, point, speaking
 from armcal.errors import InputError
-from armcal.online.running.outputs import as_line
 from armcal.online.running.signals import Signals
 from armcal.online.running.standard_output import StandardOutput
 from armcal.serve.server import Opening, Server

@@ -11,6 +11,7 @@ from pydantic import Field, field_validator
 
 from armcal.arm.assembly import PLACEMENT, Arm, MassiveModel, MassSpec, prefixed
 from armcal.arm.effects import JointEffect
+from armcal.arm.environment import STATICS, Environment, gravity_tilt
 from armcal.arm.statics import frame_names
 from armcal.base.parameters import FIT_NAME, ParameterBlock, Parameters
 from armcal.base.pose_settings import PoseSettings
@@ -22,7 +23,6 @@ from armcal.measure.groups import Groups, group_blocks
 from armcal.measure.measurement import Measurement
 from armcal.measure.reader import surroundings
 from armcal.plugins import Component, PluginRegistry
-from armcal.solve.factor import STATICS, Environment, gravity_tilt
 
 T = TypeVar("T")
 Path = tuple[str | int, ...]

@@ -7,13 +7,12 @@ import sys
 from collections.abc import Callable, Iterator, Mapping
 from importlib import metadata
 from importlib.util import find_spec
-from pathlib import Path
 from typing import Any
 
-import armcal
 from armcal.doctor.finding import Finding, State
 from armcal.doctor.purposes import EXTRA_MODULES, EXTRAS, LIBRARIES, Purpose
 from armcal.doctor.requirements import DISTRIBUTION, Requirement, declared, installed
+from armcal.version import SOURCES, __version__
 
 Ask = Callable[..., Mapping[str, Any]]
 """``armcal.doctor.child.ask``, or what a test puts in its place."""
@@ -23,17 +22,17 @@ _ANEW = "Install it anew: pip install --force-reinstall"
 
 def itself() -> Iterator[Finding]:
     """Python and armcal."""
-    where = str(Path(armcal.__file__).parent)
+    where = str(SOURCES)
     version = platform.python_version()
     facts = {"version": version, "executable": sys.executable, "platform": platform.platform()}
     yield Finding("armcal", "Python", "ok", f"{version} ({sys.executable}), {platform.platform()}", detail=facts)
     told = installed(DISTRIBUTION)
-    facts = {"version": armcal.__version__, "metadata": told or "", "path": where}
+    facts = {"version": __version__, "metadata": told or "", "path": where}
     if told is None:
         text, hint = "it can be imported, but is not installed: no plugin is found", "Install it: pip install -e ."
-        yield Finding("armcal", "armcal", "fault", f"{armcal.__version__} in {where}: {text}", hint, facts)
-    elif told != armcal.__version__:
-        text = f"{armcal.__version__} in {where}, but it was installed as {told}: plugins may be missing"
+        yield Finding("armcal", "armcal", "fault", f"{__version__} in {where}: {text}", hint, facts)
+    elif told != __version__:
+        text = f"{__version__} in {where}, but it was installed as {told}: plugins may be missing"
         yield Finding("armcal", "armcal", "warning", text, "Install it anew: pip install -e .", facts)
     else:
         yield Finding("armcal", "armcal", "ok", f"{told}, in {where}", detail=facts)

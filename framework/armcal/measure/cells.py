@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import re
 from dataclasses import dataclass
 
@@ -9,6 +10,7 @@ from armcal.base.units import UNITS
 
 MISSING = frozenset({"", "na", "n/a", "nan", "null", "none"})
 """In small letters."""
+DELIMITERS = ",;\t|"
 DECIMAL_COMMA = re.compile(r"\s*[+-]?[0-9]+,[0-9]+(?:[eE][+-]?[0-9]+)?\s*")
 
 _UNIT_WORDS = frozenset({*UNITS, "°", "degree", "degrees", "radians", "meters", "metres", "m/s^2", "m/s2"} - {"1"})
@@ -60,3 +62,12 @@ def read_cell(cell: str) -> float | CellFault:
 def with_point(text: str) -> str:
     """A decimal comma as a point."""
     return text.strip().replace(",", ".")
+
+
+def split(line: str, delimiter: str) -> list[str]:
+    """The cells of one line; a quoted cell ends on the line on which it begins.
+
+    Raises:
+        csv.Error: quotes do not match, or a cell is too long.
+    """
+    return [cell.strip() for cell in next(csv.reader([line], delimiter=delimiter, strict=True), [])]

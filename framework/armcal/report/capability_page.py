@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import armcal
 from armcal.capability.tables import Table, number, share
 from armcal.report.numbers import count, plural, unbroken
+from armcal.version import __version__
 
 
 @dataclass(frozen=True)
@@ -75,5 +75,5 @@ def render_capability(
     environment.lstrip_blocks = True
     environment.filters.update(count=count, plural=plural, unbroken=unbroken)
     return environment.get_template("capability.html.j2").render(
-        title=title, sentences=sentences, tables=tables, pictures=pictures, facts=facts, version=armcal.__version__
+        title=title, sentences=sentences, tables=tables, pictures=pictures, facts=facts, version=__version__
     )

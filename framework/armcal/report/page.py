@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-import armcal
 from armcal.base.domains import Array
 from armcal.report import error_figures, interval_figures, parameter_figures, workspace
 from armcal.report.group_table import group_rows
@@ -29,6 +28,7 @@ from armcal.report.tables import (
 from armcal.run.result import RunResult
 from armcal.solve.estimator import Estimate
 from armcal.solve.identifiability import CORRELATED, POOR_CONDITION, bound_together, correlated_pairs, correlations
+from armcal.version import __version__
 
 MOST_LISTED = 50
 """Of records set aside and of correlated pairs; the rest is counted."""
@@ -54,7 +54,7 @@ def _content(result: RunResult) -> dict[str, Any]:
     return {
         "result": result,
         "unit": result.errors.unit,
-        "version": armcal.__version__,
+        "version": __version__,
         "words": _WORDS,
         "symbols": _SYMBOLS,
         "worst_grade": next((g for g in _WORDS if g in grades), "note"),

@@ -6,12 +6,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import armcal
 from armcal.report import study_figures
 from armcal.report.numbers import NONE, common_decimals, count, duration, fixed, plural, unbroken
 from armcal.report.svg import Figure
 from armcal.report.tables import provenance_facts
 from armcal.run.study_result import StudyResult, TransferCell, TransferResult, VariantResult
+from armcal.version import __version__
 
 _SAME_MM = 1e-6
 
@@ -62,7 +62,7 @@ def _render(
         table=table,
         figure=figure,
         changes=changes,
-        version=armcal.__version__,
+        version=__version__,
         facts=[f for f in facts if not f.long],
         seconds=[(name, duration(value)) for name, value in result.seconds.items()],
     )

@@ -11,10 +11,10 @@ from typing import Annotated, Any, Literal, NotRequired
 from pydantic import Field, field_validator
 from typing_extensions import TypedDict  # pydantic checks no other before Python 3.12
 
+from armcal.base.config_text import as_line
 from armcal.base.quantities import Kind
 from armcal.base.settings import Acceleration3, Angle, Angle3, Force3, Length3, Mass, Settings, Temperature, Torque3
 from armcal.errors import ArmcalError
-from armcal.online.running.outputs import as_line
 
 VERSION = 1
 MAX_LINE_BYTES = 256 * 1024

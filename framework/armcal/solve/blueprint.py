@@ -6,10 +6,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 from armcal.arm.assembly import Arm
+from armcal.arm.environment import Environment
 from armcal.base.parameters import Parameters
 from armcal.measure.groups import Groups
 from armcal.measure.measurement import Measurement
-from armcal.solve.factor import Environment, build_factor
+from armcal.solve.factor import build_factor
 from armcal.solve.kernel import EvaluatorChoice, Kernel, build_kernel
 
 

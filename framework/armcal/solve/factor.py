@@ -13,35 +13,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import casadi as ca
 
 from armcal.arm.assembly import Arm, ArmInputs, ArmState, scoped
+from armcal.arm.environment import STATICS, Environment, Vector3, tilted
 from armcal.arm.statics import Load
 from armcal.base import se3
-from armcal.base.parameters import ParameterBlock, Parameters, scalar
+from armcal.base.parameters import Parameters
 from armcal.base.se3 import Expression
 from armcal.errors import ProblemError
 from armcal.measure.measurement import GroupedMeasurement, Measurement, noise_channels, residual_dimensions
 from armcal.measure.partners import OTHER
-
-Vector3 = tuple[float, float, float]
-_ZERO: Vector3 = (0.0, 0.0, 0.0)
-STATICS = "statics"
-"""The instance name of what acts on all arms."""
-
-
-@dataclass(frozen=True)
-class Environment:
-    """What acts on the arms where a record does not say: gravity (m/s^2), payload (kg, m), wrench (N, N m)."""
-
-    gravity: Vector3
-    payload_mass: float = 0.0
-    payload_com: Vector3 = _ZERO
-    force: Vector3 = _ZERO
-    torque: Vector3 = _ZERO
 
 
 @dataclass(frozen=True)
@@ -306,19 +291,6 @@ def _load(records: _Records, environment: Environment) -> Load:
         force=records.vector("force", environment.force),
         torque=records.vector("torque", environment.torque),
     )
-
-
-def gravity_tilt() -> tuple[ParameterBlock, ...]:
-    """How the real gravity is turned from the stated one, about the base frame's x and y axes (rad)."""
-    return tuple(scalar(f"{STATICS}.gravity_{axis}", "rad", 0.0, 0.02) for axis in ("rx", "ry"))
-
-
-def tilted(load: Load, tilt: Mapping[str, Expression]) -> Load:
-    """A load under the real gravity; ``tilt`` has the values of ``gravity_tilt`` by local name, or nothing."""
-    if not tilt:
-        return load
-    about_x, about_y = (se3.rotation_about(axis, tilt[f"gravity_r{axis}"]).rotation for axis in "xy")
-    return replace(load, gravity=ca.mtimes(about_y, ca.mtimes(about_x, load.gravity)))
 
 
 def _value_expressions(parameters: Parameters) -> tuple[Expression, dict[str, Expression]]:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armcal.arm.assembly import Arm
+from armcal.arm.environment import Environment
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.base.parameters import Parameters
@@ -20,7 +21,6 @@ from armcal.measure.measurement import Measurement
 from armcal.measure.partners import with_partners
 from armcal.solve import factor_records, gather
 from armcal.solve.blueprint import Blueprint
-from armcal.solve.factor import Environment
 from armcal.solve.factor_records import FactorRecords, correlation_of
 from armcal.solve.gather import Slots
 from armcal.solve.kernel import EvaluatorChoice, Kernel

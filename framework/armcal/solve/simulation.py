@@ -9,11 +9,11 @@ from typing import Protocol
 import numpy as np
 
 from armcal.arm.assembly import Arm
+from armcal.arm.environment import Environment
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.base.parameters import Parameters
 from armcal.measure.measurement import Measurement
-from armcal.solve.factor import Environment
 from armcal.solve.problem import Problem
 from armcal.solve.readings import disturbed_records
 

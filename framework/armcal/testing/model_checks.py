@@ -9,12 +9,12 @@ import casadi as ca
 import numpy as np
 
 from armcal.arm.assembly import Arm, MassiveModel, MassSpec
+from armcal.arm.environment import Environment
 from armcal.arm.model import ArmModel, Chain, Joint, forward
 from armcal.arm.statics import MOUNT_FRAME, TOOL_FRAME, frame_names
 from armcal.base.domains import Array
 from armcal.base.parameters import ParameterBlock
 from armcal.base.se3 import Expression, Transform
-from armcal.solve.factor import Environment
 from armcal.solve.problem import Problem
 from armcal.testing.expressions import (
     check_parameters,

@@ -10,6 +10,7 @@ import numpy as np
 
 from armcal.arm.assembly import Arm, ArmState
 from armcal.arm.effects import JointCommand, JointEffect, Spring
+from armcal.arm.environment import Environment
 from armcal.arm.model import Attachment, Chain, Joint
 from armcal.base import se3
 from armcal.base.dataset import Dataset
@@ -19,7 +20,6 @@ from armcal.base.pose_blocks import quaternion_expression
 from armcal.base.se3 import Expression
 from armcal.measure.contact import Contact
 from armcal.measure.measurement import Channel
-from armcal.solve.factor import Environment
 
 ARM, TRACKER, WALLS = "arm", "tracker", "walls"
 GRAVITY = Environment((0.0, 0.0, -9.81))

@@ -13,6 +13,7 @@ import casadi as ca
 import numpy as np
 
 from armcal.arm.assembly import Arm, ArmState
+from armcal.arm.environment import STATICS, Environment
 from armcal.arm.model import forward
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
@@ -20,7 +21,6 @@ from armcal.base.parameters import ParameterBlock, Parameters
 from armcal.base.se3 import Expression
 from armcal.errors import NotConvergedError
 from armcal.measure.measurement import Channel
-from armcal.solve.factor import STATICS, Environment
 from armcal.use.calibration import Calibration, arm_named
 from armcal.use.calibration_file import ParameterRecord
 from armcal.use.tool_expression import ToolExpression, arm_expression

@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 
-import armcal
 from armcal import plugin_files
 from armcal.arm import assembly
 from armcal.base.dataset import Dataset
@@ -31,6 +30,7 @@ from armcal.plugins import PluginRegistry
 from armcal.solve.problem import Problem
 from armcal.solve.validation import Indices
 from armcal.use.intervals import PlusMinus
+from armcal.version import __version__
 
 SHARE = 0.05
 """Of a stated half width or radius: predictions that moved by more are not those of the calibration."""
@@ -121,7 +121,7 @@ def components(system: System, registry: PluginRegistry) -> tuple[ComponentRecor
         name="arm",
         plugin="armcal",
         distribution="armcal",
-        version=armcal.__version__,
+        version=__version__,
         source=_source(assembly.__name__),
     )
     records = {("core", "arm"): core}

@@ -14,6 +14,7 @@ import casadi as ca
 import numpy as np
 
 from armcal.arm.assembly import Arm, ArmInputs, scoped
+from armcal.arm.environment import STATICS, Environment, tilted
 from armcal.arm.loading import LOAD_CHANNELS
 from armcal.arm.servo import PulseClock, PulseTable, SteppedEffect
 from armcal.arm.statics import Load
@@ -21,7 +22,6 @@ from armcal.base import se3
 from armcal.base.domains import Array
 from armcal.base.parameters import Parameters
 from armcal.base.se3 import Expression, Transform
-from armcal.solve.factor import STATICS, Environment, tilted
 
 APPROACH = "approach."
 _VECTORS = ("gravity", "payload", "force", "torque")

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from armcal.arm.assembly import Arm
+from armcal.arm.environment import Environment
 from armcal.arm.holding import holding_function
 from armcal.base.domains import Array
 from armcal.bench.acquisition.settings import ServoHeatSettings
-from armcal.solve.factor import Environment
 
 NEVER = float("inf")
 _TIMES_OVER = 20.0

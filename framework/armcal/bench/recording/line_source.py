@@ -16,8 +16,8 @@ from pydantic import BeforeValidator
 from armcal.base.config_text import resolve_path
 from armcal.bench.faults import DeviceRefusedError
 from armcal.errors import ConfigError, InputError, Location
+from armcal.io.udp import UDP_KINDS, listening, parsed
 from armcal.online.sources.line_cutter import LineCutter
-from armcal.online.sources.udp import UDP_KINDS, listening, parsed
 
 STANDARD_INPUT = "-"
 KINDS = f"- (standard input), {UDP_KINDS}, or a file that another program writes"

@@ -12,12 +12,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from armcal.arm.assembly import Arm, ArmInputs, scoped
+from armcal.arm.environment import Environment
 from armcal.arm.model import forward
 from armcal.arm.statics import Load
 from armcal.base.domains import Array
 from armcal.base.parameters import Parameters
 from armcal.bench.servo.turning import twist_angles
-from armcal.solve.factor import Environment
 
 By = Literal["rotation", "position"]
 """What shows a turn about an axis."""

@@ -9,6 +9,7 @@ import casadi as ca
 import numpy as np
 
 from armcal.arm.assembly import ArmState
+from armcal.arm.environment import Environment
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.base.parameters import Parameters
@@ -16,7 +17,6 @@ from armcal.base.se3 import Expression
 from armcal.config.system import System
 from armcal.measure.contact import Contact
 from armcal.measure.measurement import Measurement
-from armcal.solve.factor import Environment
 from armcal.solve.factor_records import FactorRecords
 from armcal.solve.kernel import EvaluatorChoice
 from armcal.solve.problem import Problem

@@ -11,8 +11,8 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from armcal.base.config_text import as_line
 from armcal.errors import ArmcalError, InputError, Location
-from armcal.online.running.outputs import as_line
 from armcal.online.running.unix_socket import listening, short_address
 
 SOCKET = "control.sock"

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import math
 import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from armcal.base.config_text import as_json
+from armcal.base.config_text import as_line
 from armcal.online.journal.files import REAL_FILES, FileLayer, is_full, write_whole
 from armcal.online.running.event_file import EventFile
 from armcal.online.running.standard_output import StandardOutput
@@ -152,11 +151,3 @@ class Outputs:
             self._say(as_line({"event": "alarm", "at": time.time(), "sentence": sentence}))
         else:
             self.alarm(sentence)
-
-
-def as_line(content: Mapping[str, Any]) -> str:
-    """One line of JSON; numbers that are not finite become null."""
-    try:
-        return json.dumps(content, allow_nan=False)
-    except ValueError:
-        return as_json(content, indent=None)

@@ -13,10 +13,11 @@ from zlib import crc32
 from armcal.base.plain_files import input_file
 from armcal.errors import DataError, InputError, Location
 from armcal.online.sources.incoming import Incoming
+from armcal.online.sources.line_cutter import MAX_LINE_BYTES
 from armcal.online.sources.line_parser import Kind, LineParser
 from armcal.online.sources.reading import LineReading
 from armcal.online.sources.row_parser import RowParser
-from armcal.online.sources.source import MAX_LINE_BYTES, AtEnd, Clock, key_of, wait_until
+from armcal.online.sources.source import AtEnd, Clock, key_of, wait_until
 
 _LINE_END = b"\n"
 _TELLING: Mapping[Kind, int] = {"csv": 2, "json": 1}

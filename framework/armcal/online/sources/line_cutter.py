@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from armcal.online.sources.source import MAX_LINE_BYTES
+MAX_LINE_BYTES = 1024**2
 
 
 class LineCutter:

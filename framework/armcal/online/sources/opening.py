@@ -7,12 +7,13 @@ import time
 from pathlib import Path
 
 from armcal.errors import InputError, Location
+from armcal.io.udp import UDP_KINDS, parsed
 from armcal.online.sources.csv_file import CsvFile
 from armcal.online.sources.folder import Folder
 from armcal.online.sources.lines import Lines
 from armcal.online.sources.row_parser import RowParser
 from armcal.online.sources.source import AtEnd, Clock, Source
-from armcal.online.sources.udp import UDP_KINDS, Udp, parsed
+from armcal.online.sources.udp import Udp
 
 KINDS = f"- (standard input), {UDP_KINDS}, a directory, or a CSV file"
 

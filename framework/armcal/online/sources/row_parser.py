@@ -14,12 +14,11 @@ from typing import Any
 
 from armcal.base.units import from_unit
 from armcal.errors import DataError
-from armcal.measure.cells import CellFault, is_missing, read_cell
+from armcal.measure.cells import DELIMITERS, CellFault, is_missing, read_cell, split
 from armcal.measure.column_match import Header, Plan, header_of, match_columns, refuse_missing, renamed
 from armcal.measure.reader import ReadRequest, WantedChannel
 from armcal.online.sources.incoming import Incoming, Place
 
-DELIMITERS = ",;\t|"
 MAX_LABELS = 50
 MAX_LABEL = 500
 MAX_ID = 200
@@ -159,15 +158,6 @@ def faulty(place: Place, sentence: str) -> Incoming:
     return Incoming(
         str(place.row), {}, {}, place.arrived, place.source_key, place.row, _short(_clean(sentence), MAX_FAULT)
     )
-
-
-def split(line: str, delimiter: str) -> list[str]:
-    """The cells of one line; a quoted cell ends on the line on which it begins.
-
-    Raises:
-        csv.Error: quotes do not match, or a cell is too long.
-    """
-    return [cell.strip() for cell in next(csv.reader([line], delimiter=delimiter, strict=True), [])]
 
 
 def _number(value: Any) -> float | CellFault:

@@ -14,7 +14,6 @@ AtEnd = Literal["stop", "wait"]
 """What a file's end means: there is no more, or more may come."""
 POLL_S = 0.05
 """How often a file is looked at again."""
-MAX_LINE_BYTES = 1024**2
 THROUGH = "/"
 """Before a name among positions: all files up to that name were taken. No file's name begins so."""
 

@@ -10,10 +10,9 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-import armcal
-from armcal import __version__
 from armcal.solve import compiler
 from armcal.solve.problem import Problem
+from armcal.version import SOURCES, __version__
 
 _LIBRARIES = ("numpy", "scipy", "casadi", "filterpy", "cvxpy", "clarabel")
 """What adds numbers up, here or in the estimators that come with armcal."""
@@ -27,7 +26,7 @@ def identity(problem: Problem, estimator: object) -> dict[str, Any]:
     """
     return {
         "armcal": __version__,
-        "sources": _sources(Path(armcal.__file__).parent, Path(inspect.getfile(type(estimator))).parent),
+        "sources": _sources(SOURCES, Path(inspect.getfile(type(estimator))).parent),
         "python": platform.python_version(),
         "libraries": {name: _version(name) for name in _LIBRARIES},
         "backend": problem.backend,

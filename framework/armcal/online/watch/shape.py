@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from armcal.arm.assembly import Arm, ArmInputs
-    from armcal.solve.factor import Environment
+    from armcal.arm.environment import Environment
 
     Values = Mapping[str, ca.SX]
 

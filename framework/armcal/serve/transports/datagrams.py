@@ -8,7 +8,7 @@ from collections.abc import Callable
 from typing import Any
 
 from armcal.errors import ArmcalError, DataError
-from armcal.online.sources.udp import LOOPBACK, bound
+from armcal.io.udp import LOOPBACK, bound
 from armcal.serve.conversation import Conversation
 from armcal.serve.dispatcher import Dispatcher
 from armcal.serve.poller import Poller

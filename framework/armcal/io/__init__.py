@@ -1,0 +1,1 @@
+"""Files replaced whole, journals, line streams, sockets, signals, worker processes."""
