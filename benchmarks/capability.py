@@ -6,12 +6,12 @@ from collections.abc import Iterator
 
 import numpy as np
 from armcal.base.domains import Array
-from armcal.capability.loading import load_task
-from armcal.capability.mechanics import MechanicsFunction
-from armcal.capability.quantities import Postures, Weights, postures_at
-from armcal.capability.sampling import spread
-from armcal.capability.settings import LoadSettings
 from armcal.config.yaml_source import load_config
+from armcal_capability.loading import load_task
+from armcal_capability.mechanics import MechanicsFunction
+from armcal_capability.quantities import Postures, Weights, postures_at
+from armcal_capability.sampling import spread
+from armcal_capability.settings import LoadSettings
 
 from benchmarks import lrm, lrm_numpy
 from benchmarks.report import Row

@@ -16,12 +16,12 @@ import numpy as np
 import yaml
 from armcal.base.dataset import Dataset
 from armcal.base.parameters import Parameters
+from armcal.estimate.estimator import Estimate, estimate
+from armcal.estimate.nuisance import started
+from armcal.estimate.simulation import SimulationRequest
+from armcal.problem.joint_noise import with_joint_noise
+from armcal.problem.problem import Problem
 from armcal.run.experiment import Experiment
-from armcal.solve.estimator import Estimate, estimate
-from armcal.solve.joint_noise import with_joint_noise
-from armcal.solve.nuisance import started
-from armcal.solve.problem import Problem
-from armcal.solve.simulation import SimulationRequest
 from numpy.typing import NDArray
 
 CONFIGS = Path(__file__).resolve().parents[1] / "configs" / "frida"

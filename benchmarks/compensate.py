@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 from armcal.base.domains import Array
 from armcal.base.parameters import Parameters
+from armcal.calibration.compensation.compensator import Compensator
+from armcal.calibration.compensation.request import Commands, Options, Targets
+from armcal.calibration.tool_expression import arm_expression
 from armcal.config.selection import with_values
 from armcal.config.yaml_source import load_config
+from armcal.problem.kernel import EvaluatorChoice
 from armcal.run.experiment import Experiment
-from armcal.solve.kernel import EvaluatorChoice
-from armcal.use.compensation.compensator import Compensator
-from armcal.use.compensation.request import Commands, Options, Targets
-from armcal.use.tool_expression import arm_expression
 
 from benchmarks.lrm import CONFIGS
 from benchmarks.report import Row
@@ -140,7 +140,7 @@ def _toolbox(arm: TrueArm, targets: Targets) -> tuple[Callable[[], Any] | None, 
 
 def _as_transforms(rtb: Any, arm: TrueArm) -> Any:
     """The rigid arm as the toolbox has it."""
-    from armcal.use.rigid_chain import numeric_chain, rigid_chain
+    from armcal.calibration.rigid_chain import numeric_chain, rigid_chain
 
     model = arm.experiment.system.arms["arm"]
     chain = rigid_chain(numeric_chain(model.model, _local(arm)))

@@ -13,13 +13,13 @@ import casadi as ca
 import numpy as np
 from armcal.arm.assembly import Arm
 from armcal.base.domains import Array
+from armcal.calibration.exporter import ExportRequest, rigid_tools
+from armcal.calibration.rigid_chain import numeric_chain
 from armcal.config.selection import with_values
 from armcal.config.yaml_source import load_config
 from armcal.plugins import discover
+from armcal.problem.compiler import find_compiler
 from armcal.run.experiment import Experiment
-from armcal.solve.compiler import find_compiler
-from armcal.use.exporter import ExportRequest, rigid_tools
-from armcal.use.rigid_chain import numeric_chain
 
 from benchmarks.pinocchio_loop import compiled
 from benchmarks.report import Row

@@ -7,8 +7,8 @@ from functools import partial
 
 import numpy as np
 from armcal.base.domains import Array
-from armcal.solve.kernel import EvaluatorChoice
-from armcal.solve.problem import Problem
+from armcal.problem.kernel import EvaluatorChoice
+from armcal.problem.problem import Problem
 from scipy.optimize import least_squares
 
 from benchmarks import lrm, lrm_numpy

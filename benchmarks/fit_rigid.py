@@ -10,7 +10,7 @@ from importlib.util import find_spec
 
 import numpy as np
 from armcal.base.domains import Array
-from armcal.solve.problem import Problem
+from armcal.problem.problem import Problem
 
 from benchmarks import rigid_arm
 from benchmarks.report import Row

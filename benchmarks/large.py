@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 import numpy as np
 from armcal.base.domains import Array
-from armcal.solve.problem import Problem
+from armcal.problem.problem import Problem
 from scipy.optimize import least_squares
 
 from benchmarks import lrm

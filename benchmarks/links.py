@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
-from armcal.bench.framed.frames import Frame, FrameDecoder, encoded
+from armcal.devices.framed.frames import Frame, FrameDecoder, encoded
 from armcal_pca9685.firmata_messages import END, I2C_REPLY, SYSEX, FirmataDecoder, pairs
 
 from benchmarks.report import Row

@@ -11,11 +11,11 @@ from armcal.base.domains import Array
 from armcal.base.parameters import Parameters
 from armcal.config.selection import with_values
 from armcal.config.yaml_source import load_config
+from armcal.estimate.estimator import Solution
+from armcal.estimate.simulation import SimulationRequest
+from armcal.problem.kernel import EvaluatorChoice
+from armcal.problem.problem import Problem
 from armcal.run.experiment import Experiment
-from armcal.solve.estimator import Solution
-from armcal.solve.kernel import EvaluatorChoice
-from armcal.solve.problem import Problem
-from armcal.solve.simulation import SimulationRequest
 
 CONFIGS = Path(__file__).parents[1] / "configs" / "lrm_arm"
 

@@ -12,15 +12,15 @@ import numpy as np
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.base.parameters import Parameters
-from armcal.online.tracking.belief import Belief
-from armcal.online.tracking.chart import Chart
-from armcal.online.tracking.companions import Companions
-from armcal.online.tracking.observer import Observer, Reading, Seen
+from armcal.estimate.online import Gaussian
+from armcal.problem.kernel import NEAR_REST_RAD, EvaluatorChoice
+from armcal.problem.problem import Problem
 from armcal.run.experiment import Experiment
-from armcal.solve.kernel import NEAR_REST_RAD, EvaluatorChoice
-from armcal.solve.online import Gaussian
-from armcal.solve.problem import Problem
 from armcal_kalman.extended import ExtendedFilter, ExtendedSettings
+from armcal_online.tracking.belief import Belief
+from armcal_online.tracking.chart import Chart
+from armcal_online.tracking.companions import Companions
+from armcal_online.tracking.observer import Observer, Reading, Seen
 from filterpy.kalman import ExtendedKalmanFilter
 
 from benchmarks import lrm

@@ -12,14 +12,14 @@ from typing import Any
 import numpy as np
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
+from armcal.planning.bound import bounded
+from armcal.planning.candidates import Candidates, Indices, whitened_rows
+from armcal.planning.criterion import criterion
+from armcal.planning.planning import Plan, choose, detmax, value_of
+from armcal.planning.relaxation import Task
+from armcal.problem.kernel import EvaluatorChoice
+from armcal.problem.problem import Problem
 from armcal.run.experiment import Experiment
-from armcal.solve.bound import bounded
-from armcal.solve.candidates import Candidates, Indices, whitened_rows
-from armcal.solve.criterion import criterion
-from armcal.solve.kernel import EvaluatorChoice
-from armcal.solve.planning import Plan, choose, detmax, value_of
-from armcal.solve.problem import Problem
-from armcal.solve.relaxation import Task
 
 from benchmarks import lrm
 from benchmarks.large import _peak_mb

@@ -19,8 +19,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from armcal.serve.client import Client
-from armcal.use.calibration import Calibration
+from armcal.calibration.calibration import Calibration
+from armcal_serve.client import Client
 
 from benchmarks import lrm
 from benchmarks.report import Row

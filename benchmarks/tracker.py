@@ -6,7 +6,7 @@ import socket
 from collections.abc import Iterator
 
 import numpy as np
-from armcal.bench.clock import RealClock
+from armcal.devices.clock import RealClock
 from armcal_simulation.dtrack_text import datagram
 from armcal_tracker.dtrack import DTrackSettings, DTrackTracker
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from armcal.bench.device import DeviceIdentity, DeviceState
-from armcal.bench.faults import DeviceLostError
-from armcal.bench.settling import Settled
+from armcal.devices.device import DeviceIdentity, DeviceState
+from armcal.devices.faults import DeviceLostError
+from armcal_bench.settling import Settled
 
 COUNT_RAD = 0.0093
 

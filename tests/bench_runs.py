@@ -15,17 +15,17 @@ from typing import Any
 
 import numpy as np
 from armcal.base.dataset import Dataset
-from armcal.bench.acquisition.outputs import dataset_of
-from armcal.bench.acquisition.preparation import Prepared, prepare
-from armcal.bench.acquisition.progress import Progress, progress_of
-from armcal.bench.acquisition.rehearsal import overrides_for
-from armcal.bench.acquisition.session import Course, Outcome, acquire
-from armcal.bench.bench import Bench
-from armcal.bench.clock import SimulatedClock
-from armcal.bench.simulated import CLOCK, BenchRequest
+from armcal.devices.clock import SimulatedClock
+from armcal.devices.simulated import CLOCK, BenchRequest
 from armcal.errors import ArmcalError, InputError
-from armcal.online.journal.journal import Journal
+from armcal.io.journal.journal import Journal
 from armcal.run.experiment import Experiment
+from armcal_bench.acquisition.outputs import dataset_of
+from armcal_bench.acquisition.preparation import Prepared, prepare
+from armcal_bench.acquisition.progress import Progress, progress_of
+from armcal_bench.acquisition.rehearsal import overrides_for
+from armcal_bench.acquisition.session import Course, Outcome, acquire
+from armcal_bench.bench import Bench
 
 ROOT = Path(__file__).resolve().parents[1]
 CONFIG = ROOT / "configs" / "lrm_arm" / "bench.yaml"

@@ -10,9 +10,9 @@ import tty
 from pathlib import Path
 
 import numpy as np
-from armcal.bench.faults import DeviceError
-from armcal.bench.link import LinkIdentity
 from armcal.config.servo_file import BoardSettings, ServoFile, ServoSettings, servo_file_text
+from armcal.devices.faults import DeviceError
+from armcal.devices.link import LinkIdentity
 from armcal_simulation.firmata_board import FirmataBoard
 from armcal_simulation.framed_board import BoardIdentity, FramedBoard
 from armcal_simulation.i2c_bus import I2cBus

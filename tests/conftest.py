@@ -61,7 +61,7 @@ def _own_cache(of_this_run: Path) -> Iterator[None]:
 @pytest.fixture(scope="session", autouse=True)
 def _no_compiling_for_later() -> Iterator[None]:
     """Where a command goes on with the interpreter, none compiles for a next run that would have it by chance."""
-    from armcal.solve import compiler
+    from armcal.problem import compiler
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(compiler, "compile_in_background", lambda *given: None)
@@ -133,7 +133,7 @@ class LrmArm:
     @staticmethod
     def problem(experiment, dataset, evaluator="interpreted", parameters=None):
         """The compiled problem of an experiment, perhaps with other parameters."""
-        from armcal.solve.problem import Problem
+        from armcal.problem.problem import Problem
 
         system = experiment.system
         chosen = experiment.parameters if parameters is None else parameters

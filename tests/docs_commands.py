@@ -277,9 +277,9 @@ def load_everything() -> None:
     """What each command would load anew; none compiles for a next run, which would be no page's."""
     import matplotlib.pyplot  # noqa: F401
     from armcal.plugins import discover
+    from armcal.problem import compiler
     from armcal.report import page  # noqa: F401
     from armcal.run import pipeline  # noqa: F401
-    from armcal.solve import compiler
 
     discover()
     compiler.compile_in_background = lambda *given: None

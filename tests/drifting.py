@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from armcal.estimate.weighing import fit
+from armcal.problem.drift import with_drift
+from armcal.problem.problem import Problem
 from armcal.run.experiment import Experiment
-from armcal.solve.drift import with_drift
-from armcal.solve.problem import Problem
-from armcal.solve.weighing import fit
 
 DEMO = str(Path(__file__).resolve().parents[1] / "configs" / "lrm_arm" / "demo.yaml")
 DRIFTING = (

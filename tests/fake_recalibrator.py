@@ -8,11 +8,11 @@ import sys
 from pathlib import Path
 
 from armcal.errors import DataError
+from armcal.io.standard_output import StandardOutput
 from armcal.measure.reader import ReadRequest, WantedChannel
-from armcal.online.running.loop import Pace
-from armcal.online.running.session import Setup, opened
-from armcal.online.running.standard_output import StandardOutput
-from armcal.online.sources.opening import open_source
+from armcal_online.running.loop import Pace
+from armcal_online.running.session import Setup, opened
+from armcal_online.sources.opening import open_source
 
 HEADER = "pose_id,q1_deg,q2_deg,x_mm,y_mm,z_mm"
 CALIBRATION = "armcal_calibration: 0\n"

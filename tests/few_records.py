@@ -13,15 +13,15 @@ import board_camera
 import numpy as np
 import yaml
 from armcal.base.dataset import Dataset
-from armcal.online.sources.incoming import Incoming
-from armcal.online.tracking.recalibrator import Recalibrator
-from armcal.online.tracking.settings import RecalibrateSettings
+from armcal.calibration.calibration import Calibration
 from armcal.plugins import PluginRegistry, discover
+from armcal.problem.problem import Problem
 from armcal.run.experiment import Experiment
 from armcal.run.outputs import write
 from armcal.run.pipeline import calibrate
-from armcal.solve.problem import Problem
-from armcal.use.calibration import Calibration
+from armcal_online.sources.incoming import Incoming
+from armcal_online.tracking.recalibrator import Recalibrator
+from armcal_online.tracking.settings import RecalibrateSettings
 from scipy.spatial.transform import Rotation
 
 ARM = Path(__file__).resolve().parents[1] / "configs" / "lrm_arm" / "arm.yaml"

@@ -13,8 +13,8 @@ import sys
 import time
 from pathlib import Path
 
-from armcal.online.journal.journal import Journal, JournalLimits
-from armcal.online.journal.reader import read_entries, verify
+from armcal.io.journal.journal import Journal, JournalLimits
+from armcal.io.journal.reader import read_entries, verify
 
 LIMITS = JournalLimits(segment_bytes=4000, total_bytes=60_000)
 

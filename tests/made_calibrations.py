@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 from armcal.base.config_text import plain
+from armcal.calibration.calibration import Calibration
+from armcal.calibration.calibration_file import CalibrationFile, identity_of, sealed
 from armcal.config.system import System, build_system
 from armcal.config.yaml_source import load_config
 from armcal.plugins import discover
-from armcal.use.calibration import Calibration
-from armcal.use.calibration_file import CalibrationFile, identity_of, sealed
 
 _MOVES = {"m": 0.002, "rad": 0.02, "1": 0.02, "kg": 0.005, "rad_per_Nm3": 0.02, "per_K": 2e-5}
 _COMPLIANCE = 0.03

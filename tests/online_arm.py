@@ -15,18 +15,18 @@ from typing import Any
 import numpy as np
 from armcal.base.config_text import plain
 from armcal.base.dataset import Dataset
+from armcal.calibration.calibration import Calibration
 from armcal.config.system import build_system
 from armcal.config.yaml_source import load_config
-from armcal.online.sources.incoming import Incoming
-from armcal.online.tracking.belief import Belief
-from armcal.online.tracking.observer import Seen
-from armcal.online.tracking.recalibrator import Recalibrator
-from armcal.online.tracking.settings import RecalibrateSettings
-from armcal.online.tracking.start import Footing, footing
+from armcal.estimate.online import OnlineEstimator, Update
 from armcal.plugins import discover
-from armcal.solve.online import OnlineEstimator, Update
-from armcal.solve.problem import Problem
-from armcal.use.calibration import Calibration
+from armcal.problem.problem import Problem
+from armcal_online.sources.incoming import Incoming
+from armcal_online.tracking.belief import Belief
+from armcal_online.tracking.observer import Seen
+from armcal_online.tracking.recalibrator import Recalibrator
+from armcal_online.tracking.settings import RecalibrateSettings
+from armcal_online.tracking.start import Footing, footing
 from made_calibrations import made_record
 
 CONFIG = Path(__file__).resolve().parents[1] / "configs" / "lrm_arm" / "arm.yaml"

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import yaml
-from armcal.bench.acquisition.rehearsal import overrides_for
 from armcal.cli.main import cli
+from armcal_bench.acquisition.rehearsal import overrides_for
 from click.testing import CliRunner, Result
 
 from tests.bench_runs import BenchRun

@@ -12,7 +12,7 @@ from armcal.arm.effects import JointEffect
 from armcal.arm.environment import Environment
 from armcal.base.dataset import Dataset
 from armcal.base.parameters import Parameters, scalar
-from armcal.solve.problem import Problem
+from armcal.problem.problem import Problem
 from armcal_mdh.model import MdhModel
 from armcal_tracker.position import TipPosition, TipPositionSettings
 from chain_oracle import ChainSpec, Row, jacobian

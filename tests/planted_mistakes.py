@@ -14,11 +14,11 @@ import numpy as np
 from armcal.base.dataset import Dataset
 from armcal.cli.main import cli
 from armcal.errors import ArmcalError, NotConvergedError
+from armcal.estimate.simulation import SimulationRequest, measured_without_noise
 from armcal.measure.csv_writer import write_csv
 from armcal.measure.reader import wanted_channels
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import calibrate
-from armcal.solve.simulation import SimulationRequest, measured_without_noise
 from click.testing import CliRunner
 
 ROOT = Path(__file__).resolve().parents[1]

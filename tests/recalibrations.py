@@ -9,11 +9,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from armcal.online.journal.files import RealFiles
-from armcal.online.journal.reader import read_entries, read_until
-from armcal.online.running.course import Course
-from armcal.online.running.session import Open, opened
-from armcal.online.sources.incoming import Incoming
+from armcal.io.journal.files import RealFiles
+from armcal.io.journal.reader import read_entries, read_until
+from armcal_online.running.course import Course
+from armcal_online.running.session import Open, opened
+from armcal_online.sources.incoming import Incoming
 from fake_recalibrator import HEADER, FakeRecalibrator, row, setup
 
 

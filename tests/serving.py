@@ -17,10 +17,10 @@ from pathlib import Path
 from typing import Any
 
 import yaml
-from armcal.serve.answering import Answerer
-from armcal.serve.client import Client
-from armcal.serve.loaded import Order, loaded
-from armcal.use.calibration_file import identity_of, sealed
+from armcal.calibration.calibration_file import identity_of, sealed
+from armcal_serve.answering import Answerer
+from armcal_serve.client import Client
+from armcal_serve.loaded import Order, loaded
 
 ROOT = Path(__file__).resolve().parents[1]
 LONG_S = 120.0

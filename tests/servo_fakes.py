@@ -9,12 +9,12 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from armcal.bench.bench import Bench
-from armcal.bench.device import DeviceIdentity, DeviceState
-from armcal.bench.faults import DeviceLostError
-from armcal.bench.servo.setup import Setup
 from armcal.config.servo_file import load_servo_file
+from armcal.devices.device import DeviceIdentity, DeviceState
+from armcal.devices.faults import DeviceLostError
 from armcal.run.experiment import Experiment
+from armcal_bench.bench import Bench
+from armcal_bench.servo.setup import Setup
 
 from tests.bench_fakes import FakeClock
 

@@ -13,12 +13,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from armcal.bench.acquisition.rehearsal import overrides_for
-from armcal.bench.clock import SimulatedClock
-from armcal.bench.servo.record import NAME, Record
-from armcal.bench.servo.session import Conversation, evaluated, measure
-from armcal.bench.servo.setup import Setup
+from armcal.devices.clock import SimulatedClock
 from armcal.run.experiment import Experiment
+from armcal_bench.acquisition.rehearsal import overrides_for
+from armcal_bench.servo.record import NAME, Record
+from armcal_bench.servo.session import Conversation, evaluated, measure
+from armcal_bench.servo.setup import Setup
 
 from tests.bench_runs import BenchRun, _in_child, _wait, free_port
 from tests.servo_fakes import CONFIGS

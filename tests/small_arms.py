@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 from armcal.base.dataset import Dataset
-from armcal.use.calibration import Calibration
-from armcal.use.compensation.compensator import Compensator
-from armcal.use.compensation.request import Options
+from armcal.calibration.calibration import Calibration
+from armcal.calibration.compensation.compensator import Compensator
+from armcal.calibration.compensation.request import Options
 from made_calibrations import made_calibration
 
 CONFIGS = Path(__file__).resolve().parents[1] / "configs"

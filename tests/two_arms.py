@@ -15,12 +15,12 @@ import yaml
 from armcal.base.dataset import Dataset
 from armcal.config.selection import with_values
 from armcal.config.yaml_source import load_config
+from armcal.estimate.estimator import estimate, require_solvable
+from armcal.estimate.nuisance import started
+from armcal.estimate.simulation import SimulationRequest
+from armcal.problem.joint_noise import with_joint_noise
+from armcal.problem.problem import Problem
 from armcal.run.experiment import Experiment
-from armcal.solve.estimator import estimate, require_solvable
-from armcal.solve.joint_noise import with_joint_noise
-from armcal.solve.nuisance import started
-from armcal.solve.problem import Problem
-from armcal.solve.simulation import SimulationRequest
 
 ROOT = Path(__file__).resolve().parents[1]
 CONFIGS = ROOT / "configs" / "frida"

@@ -14,9 +14,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from armcal.online.watch.feed import Feed
-from armcal.online.watch.server import WatchServer
-from armcal.online.watch.shape import Shape, drawing_of
+from armcal_online.watch.feed import Feed
+from armcal_online.watch.server import WatchServer
+from armcal_online.watch.shape import Shape, drawing_of
 
 SLIP = 150
 

@@ -39,9 +39,15 @@ if TYPE_CHECKING:
     from armcal.base.settings import Settings as Settings
     from armcal.base.settings import Temperature as Temperature
     from armcal.base.settings import Torque as Torque
+    from armcal.calibration.calibration import Calibration as Calibration
+    from armcal.calibration.compensation.compensator import Compensator as Compensator
+    from armcal.calibration.compensation.request import Commands as Commands
+    from armcal.calibration.compensation.request import Options as Options
+    from armcal.calibration.compensation.request import Targets as Targets
     from armcal.errors import ArmcalError as ArmcalError
     from armcal.errors import InputError as InputError
     from armcal.errors import NotConvergedError as NotConvergedError
+    from armcal.estimate.estimator import Estimate as Estimate
     from armcal.hooks import hookimpl as hookimpl
     from armcal.measure.contact import Contact as Contact
     from armcal.measure.instrument import Instrument as Instrument
@@ -50,12 +56,6 @@ if TYPE_CHECKING:
     from armcal.plugin_files import use_plugins as use_plugins
     from armcal.run.pipeline import calibrate as calibrate
     from armcal.run.result import RunResult as RunResult
-    from armcal.solve.estimator import Estimate as Estimate
-    from armcal.use.calibration import Calibration as Calibration
-    from armcal.use.compensation.compensator import Compensator as Compensator
-    from armcal.use.compensation.request import Commands as Commands
-    from armcal.use.compensation.request import Options as Options
-    from armcal.use.compensation.request import Targets as Targets
 
 _FOR_USERS = {
     "armcal.api": "Experiment Run",
@@ -66,10 +66,10 @@ _FOR_USERS = {
     "armcal.hooks": "hookimpl",
     "armcal.run.pipeline": "calibrate",
     "armcal.run.result": "RunResult",
-    "armcal.solve.estimator": "Estimate",
-    "armcal.use.calibration": "Calibration",
-    "armcal.use.compensation.compensator": "Compensator",
-    "armcal.use.compensation.request": "Commands Options Targets",
+    "armcal.estimate.estimator": "Estimate",
+    "armcal.calibration.calibration": "Calibration",
+    "armcal.calibration.compensation.compensator": "Compensator",
+    "armcal.calibration.compensation.request": "Commands Options Targets",
 }
 """What runs and uses calibrations."""
 _FOR_PLUGINS = {

@@ -6,16 +6,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from armcal.calibration.calibration import Calibration
+from armcal.calibration.calibration_file import sealed
+from armcal.diagnose.verdict import Verdict
 from armcal.errors import NotConvergedError
+from armcal.estimate.estimator import CHECK_THE_DATA, Estimate
+from armcal.io.parallel import Executor
 from armcal.report import render
 from armcal.run import experiment, outputs
 from armcal.run.pipeline import calibrate
 from armcal.run.result import RunResult
-from armcal.solve.estimator import CHECK_THE_DATA, Estimate
-from armcal.solve.parallel import Executor
-from armcal.solve.verdict import Verdict
-from armcal.use.calibration import Calibration
-from armcal.use.calibration_file import sealed
 
 
 @dataclass(frozen=True)

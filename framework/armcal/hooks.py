@@ -33,6 +33,14 @@ class Register(Protocol):
         """
 
 
+class Command(Protocol):
+    """A ``click.Command``, made by ``@click.command()``.
+
+    What it raises as an ``ArmcalError`` becomes one message and an exit code. It imports what it needs when it runs, so
+    that ``armcal --help`` stays instant.
+    """
+
+
 @dataclass(frozen=True)
 class ComponentKind:
     """One kind of component.
@@ -116,6 +124,11 @@ def armcal_register_benches(register: Register) -> None:
 
 
 @hookspec
+def armcal_register_commands(register: Register) -> None:
+    """Commands: what ``armcal NAME`` runs, a click command that is imported when it is called."""
+
+
+@hookspec
 def armcal_run_started(name: str, records: int) -> None:
     """A calibration run begins.
 
@@ -141,7 +154,7 @@ def armcal_estimate_changed(estimate: Any) -> None:
     """An estimator came to a new estimate.
 
     Args:
-        estimate: an ``armcal.solve.estimator.Estimate``.
+        estimate: an ``armcal.estimate.estimator.Estimate``.
     """
 
 
@@ -188,33 +201,36 @@ COMPONENTS: Mapping[str, ComponentKind] = MappingProxyType(
         "estimator": ComponentKind(
             "armcal_register_estimators",
             "Estimator(settings)",
-            "armcal.solve.estimator:Estimator",
-            ("armcal.solve.estimator:SpreadableEstimator",),
+            "armcal.estimate.estimator:Estimator",
+            ("armcal.estimate.estimator:SpreadableEstimator",),
         ),
         "online": ComponentKind(
-            "armcal_register_online_estimators", "Estimator(settings)", "armcal.solve.online:OnlineEstimator"
+            "armcal_register_online_estimators", "Estimator(settings)", "armcal.estimate.online:OnlineEstimator"
         ),
         "simulator": ComponentKind(
-            "armcal_register_simulators", "Simulator(settings)", "armcal.solve.simulation:Simulator"
+            "armcal_register_simulators", "Simulator(settings)", "armcal.estimate.simulation:Simulator"
         ),
-        "exporter": ComponentKind("armcal_register_exporters", "Exporter(settings)", "armcal.use.exporter:Exporter"),
+        "exporter": ComponentKind(
+            "armcal_register_exporters", "Exporter(settings)", "armcal.calibration.exporter:Exporter"
+        ),
         "link": ComponentKind(
-            "armcal_register_links", "Link(settings)", "armcal.bench.link:Link", ("armcal.bench.link:GuardedLink",)
+            "armcal_register_links", "Link(settings)", "armcal.devices.link:Link", ("armcal.devices.link:GuardedLink",)
         ),
         "device": ComponentKind(
             "armcal_register_devices",
             "Device(settings, joint_names, link)",
-            "armcal.bench.device:JointDevice",
-            ("armcal.bench.device:PulseDevice",),
+            "armcal.devices.device:JointDevice",
+            ("armcal.devices.device:PulseDevice",),
         ),
-        "tracker": ComponentKind("armcal_register_trackers", "Tracker(settings)", "armcal.bench.tracker:Tracker"),
+        "tracker": ComponentKind("armcal_register_trackers", "Tracker(settings)", "armcal.devices.tracker:Tracker"),
         "joints": ComponentKind(
             "armcal_register_joint_streams",
             "Stream(settings)",
-            "armcal.bench.joint_stream:JointStream",
-            ("armcal.bench.recording.rest_stream:RestStream",),
+            "armcal.devices.joint_stream:JointStream",
+            ("armcal.devices.rest_stream:RestStream",),
         ),
-        "bench": ComponentKind("armcal_register_benches", "Bench(settings)", "armcal.bench.simulated:SimulatedBench"),
+        "bench": ComponentKind("armcal_register_benches", "Bench(settings)", "armcal.devices.simulated:SimulatedBench"),
+        "command": ComponentKind("armcal_register_commands", "Command", "armcal.hooks:Command"),
     }
 )
 """The kinds of component."""

@@ -8,9 +8,9 @@ from typing import Any, ClassVar, Literal
 
 from armcal.base.settings import Settings
 from armcal.base.units import split_suffix
-from armcal.bench.clock import Clock
-from armcal.bench.joint_stream import JointSample
-from armcal.bench.recording.line_source import Begin, LineSource, SourceName, open_lines
+from armcal.devices.clock import Clock
+from armcal.devices.joint_stream import JointSample
+from armcal.devices.line_source import Begin, LineSource, SourceName, open_lines
 from armcal.errors import ConfigError
 from pydantic import Field, field_validator
 
@@ -47,7 +47,7 @@ class JsonLinesJointSettings(Settings):
 
 
 class JsonLinesJoints:
-    """Joint readings as ``json_joint_message`` reads them. See ``armcal.bench.joint_stream.JointStream``."""
+    """Joint readings as ``json_joint_message`` reads them. See ``armcal.devices.joint_stream.JointStream``."""
 
     Settings: ClassVar[type[JsonLinesJointSettings]] = JsonLinesJointSettings
     EXAMPLE: ClassVar[Mapping[str, Any]] = {"source": "udp:0", "unit": "rad"}

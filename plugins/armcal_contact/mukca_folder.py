@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NoReturn
 
-from armcal.base.plain_files import input_bytes
 from armcal.errors import DataError, Location
+from armcal.io.plain_files import input_bytes
 
 POSITION, SOCKET = "position", "socket"
 MAX_BYTES = 64 * 1024**2

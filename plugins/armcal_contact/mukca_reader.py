@@ -19,7 +19,7 @@ from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.base.settings import InputPath, Settings
 from armcal.errors import DataError, Location
-from armcal.measure.cells import is_missing, is_number
+from armcal.io.cells import is_missing, is_number
 from armcal.measure.checks import check_dataset, layout_of
 from armcal.measure.contact import named_arm
 from armcal.measure.measurement import GroupedMeasurement, Measurement, noise_channels

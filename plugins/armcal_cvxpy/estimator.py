@@ -15,10 +15,10 @@ import cvxpy as cp
 import numpy as np
 from armcal.base.domains import Array, Semidefinite, symmetric
 from armcal.base.settings import Settings
-from armcal.solve.estimator import Progress, Solution, SolverVerdict, no_progress
-from armcal.solve.polish import polish
-from armcal.solve.posed import PosedProblem
-from armcal.solve.problem import FactorRecords, NormalEquations, Problem
+from armcal.estimate.estimator import Progress, Solution, SolverVerdict, no_progress
+from armcal.estimate.polish import polish
+from armcal.problem.posed import PosedProblem
+from armcal.problem.problem import FactorRecords, NormalEquations, Problem
 from pydantic import Field
 
 _LEAST_DAMPING, _FIRST_DAMPING, _MOST_DAMPING = 1e-12, 1e-6, 1e8

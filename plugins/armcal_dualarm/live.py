@@ -9,9 +9,9 @@ from typing import Any, ClassVar
 
 import numpy as np
 from armcal.base.units import from_unit
-from armcal.bench.clock import Clock
-from armcal.bench.joint_stream import JointSample
-from armcal.bench.recording.line_source import Begin, LineSource, SourceName, open_lines
+from armcal.devices.clock import Clock
+from armcal.devices.joint_stream import JointSample
+from armcal.devices.line_source import Begin, LineSource, SourceName, open_lines
 from armcal.errors import ConfigError, DataError
 
 from armcal_dualarm.live_still import LiveRests, Rows
@@ -33,7 +33,7 @@ class TwoArmStreamSettings(LogColumns):
 
 
 class TwoArmLogStream:
-    """Readings, or with ``still`` the means of rests. See ``armcal.bench.joint_stream.JointStream``."""
+    """Readings, or with ``still`` the means of rests. See ``armcal.devices.joint_stream.JointStream``."""
 
     Settings: ClassVar[type[TwoArmStreamSettings]] = TwoArmStreamSettings
     EXAMPLE: ClassVar[Mapping[str, Any]] = {
@@ -53,7 +53,7 @@ class TwoArmLogStream:
 
     @property
     def gives_rests(self) -> bool:
-        """See ``armcal.bench.recording.rest_stream.RestStream``."""
+        """See ``armcal.devices.rest_stream.RestStream``."""
         return self._settings.still is not None
 
     @property

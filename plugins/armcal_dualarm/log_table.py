@@ -13,9 +13,9 @@ from typing import NoReturn
 
 import numpy as np
 from armcal.base.domains import Array
-from armcal.base.plain_files import input_bytes
 from armcal.errors import DataError, Location
-from armcal.measure.cells import is_missing, is_number
+from armcal.io.cells import is_missing, is_number
+from armcal.io.plain_files import input_bytes
 
 MAX_BYTES = 2 * 1024**3
 _ROWS_AT_ONCE = 256

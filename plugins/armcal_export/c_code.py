@@ -10,9 +10,9 @@ from typing import Any, ClassVar
 
 from armcal.arm.loading import LOAD_CHANNELS
 from armcal.base.settings import Settings
+from armcal.calibration.exporter import Exported, ExportRequest, changed_numbers
+from armcal.calibration.tool_expression import ToolExpression
 from armcal.errors import ConfigError, InputError, Location
-from armcal.use.exporter import Exported, ExportRequest, changed_numbers
-from armcal.use.tool_expression import ToolExpression
 from pydantic import field_validator
 
 from armcal_export.c_check import FileNames, compiled_and_run

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import casadi as ca
 from armcal.base.se3 import Expression
-from armcal.use.tool_expression import ToolExpression
+from armcal.calibration.tool_expression import ToolExpression
 
 from armcal_export.c_template import filled
 from armcal_export.c_writer import c_function

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import casadi as ca
 import numpy as np
-from armcal.use.tool_expression import ToolExpression
+from armcal.calibration.tool_expression import ToolExpression
 
 from armcal_export.c_template import filled, with_prefix
 from armcal_export.c_writer import c_number

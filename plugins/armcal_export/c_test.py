@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from armcal.base.domains import Array
-from armcal.use.tool_expression import ToolExpression
+from armcal.calibration.tool_expression import ToolExpression
 
 from armcal_export.c_template import filled
 from armcal_export.c_writer import c_number

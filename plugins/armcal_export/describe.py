@@ -11,8 +11,8 @@ from armcal.arm.environment import STATICS, tilted
 from armcal.arm.model import Chain, forward
 from armcal.arm.statics import MOUNT_FRAME, TOOL_FRAME, Load, frame_names
 from armcal.base.domains import Array
-from armcal.use.exporter import ExportRequest
-from armcal.use.rigid_chain import RigidJoint, rigid_chain
+from armcal.calibration.exporter import ExportRequest
+from armcal.calibration.rigid_chain import RigidJoint, rigid_chain
 
 from armcal_export.description import (
     SCHEMA,

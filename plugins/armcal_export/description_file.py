@@ -10,8 +10,8 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 import yaml
 from armcal.base.settings import Settings
+from armcal.calibration.exporter import Exported, ExportRequest, changed_numbers, random_commands, rigid_tools
 from armcal.errors import ProblemError
-from armcal.use.exporter import Exported, ExportRequest, changed_numbers, random_commands, rigid_tools
 from pydantic import ValidationError
 
 from armcal_export.describe import describe, rebuilt_tools

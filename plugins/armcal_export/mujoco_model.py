@@ -13,9 +13,9 @@ from armcal.arm.assembly import scoped
 from armcal.arm.effects import JointCommand, reshapes
 from armcal.base.domains import Array
 from armcal.base.settings import Settings
+from armcal.calibration.exporter import POSES, Exported, ExportRequest, changed_numbers, random_commands, rigid_tools
+from armcal.calibration.rigid_chain import RigidChain, require_plain_axes, rigid_chain
 from armcal.errors import InputError, NotConvergedError, ProblemError
-from armcal.use.exporter import POSES, Exported, ExportRequest, changed_numbers, random_commands, rigid_tools
-from armcal.use.rigid_chain import RigidChain, require_plain_axes, rigid_chain
 from pydantic import Field
 
 from armcal_export.describe import chain_of, describe

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 from armcal.base.domains import Array
+from armcal.calibration.rigid_chain import RigidChain
 from armcal.errors import NotConvergedError
-from armcal.use.rigid_chain import RigidChain
 
 _TURNS, _AT_REST, _FARTHEST, _DIFFERENCE = 60, 1e-12, 1.5, 1e-6
 

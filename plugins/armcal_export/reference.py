@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 from armcal.base.domains import Array
+from armcal.calibration.exporter import random_commands
+from armcal.calibration.tool_expression import ToolExpression
 from armcal.errors import NotConvergedError
-from armcal.solve.stability import lowest
-from armcal.use.exporter import random_commands
-from armcal.use.tool_expression import ToolExpression
+from armcal.problem.stability import lowest
 
 AT_REST = 1e-14
 """rad or m; rounding leaves about as much."""

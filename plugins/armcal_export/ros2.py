@@ -10,9 +10,9 @@ import numpy as np
 from armcal.arm.servo import SteppedEffect
 from armcal.base.domains import Array
 from armcal.base.settings import Settings
+from armcal.calibration.exporter import Exported, ExportRequest, changed_numbers, random_commands, rigid_tools
+from armcal.calibration.rigid_chain import NEGLIGIBLE, RigidChain, rigid_chain, rpy_of
 from armcal.errors import ConfigError, ProblemError
-from armcal.use.exporter import Exported, ExportRequest, changed_numbers, random_commands, rigid_tools
-from armcal.use.rigid_chain import NEGLIGIBLE, RigidChain, rigid_chain, rpy_of
 from pydantic import field_validator
 
 from armcal_export.c_template import in_comment

@@ -10,7 +10,7 @@ from armcal.arm.assembly import scoped
 from armcal.arm.effects import MOUNT, JointCommand, Spring
 from armcal.arm.model import Chain
 from armcal.base.domains import Array
-from armcal.use.exporter import ExportRequest
+from armcal.calibration.exporter import ExportRequest
 
 _LOADS = (-3.0, -0.5, 0.1, 2.0)
 _COMMANDS = ((0.0, 0.0), (0.7, 1.0), (-1.1, -1.0))

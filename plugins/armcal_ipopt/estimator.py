@@ -17,11 +17,11 @@ from armcal.base.domains import Array, Semidefinite, symmetric
 from armcal.base.parameters import Parameters
 from armcal.base.settings import Settings
 from armcal.errors import NotConvergedError
-from armcal.solve.estimator import Progress, Solution, SolverVerdict, no_progress
-from armcal.solve.parallel import Executor, Sequential
-from armcal.solve.polish import polish
-from armcal.solve.posed import PosedProblem
-from armcal.solve.problem import FactorRecords, NormalEquations, Problem
+from armcal.estimate.estimator import Progress, Solution, SolverVerdict, no_progress
+from armcal.estimate.polish import polish
+from armcal.io.parallel import Executor, Sequential
+from armcal.problem.posed import PosedProblem
+from armcal.problem.problem import FactorRecords, NormalEquations, Problem
 from pydantic import Field
 
 T = TypeVar("T")

@@ -8,7 +8,7 @@ from typing import Annotated, Any, ClassVar
 import numpy as np
 from armcal.base.domains import Array
 from armcal.base.settings import Settings
-from armcal.solve.online import Gaussian, Linearised, Observation, Update, checked, weighed
+from armcal.estimate.online import Gaussian, Linearised, Observation, Update, checked, weighed
 from filterpy.kalman import ExtendedKalmanFilter
 from pydantic import Field
 

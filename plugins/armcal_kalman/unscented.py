@@ -8,7 +8,7 @@ from typing import Annotated, Any, ClassVar
 import numpy as np
 from armcal.base.domains import Array
 from armcal.base.settings import Settings
-from armcal.solve.online import Gaussian, Observation, Update, checked
+from armcal.estimate.online import Gaussian, Observation, Update, checked
 from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
 from pydantic import Field
 

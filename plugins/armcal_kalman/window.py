@@ -15,7 +15,7 @@ import numpy as np
 from armcal.base.domains import Array
 from armcal.base.settings import Settings
 from armcal.errors import NotConvergedError, ProblemError
-from armcal.solve.online import Gaussian, Observation, Update, checked
+from armcal.estimate.online import Gaussian, Observation, Update, checked
 from pydantic import Field
 
 _HALVINGS = 4

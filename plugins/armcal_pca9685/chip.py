@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Literal
 
-from armcal.bench.clock import Clock
-from armcal.bench.faults import DeviceError, DeviceRefusedError, DeviceResetError
-from armcal.bench.link import Link
+from armcal.devices.clock import Clock
+from armcal.devices.faults import DeviceError, DeviceRefusedError, DeviceResetError
+from armcal.devices.link import Link
 from armcal.errors import Location
 
 from armcal_pca9685.registers import (

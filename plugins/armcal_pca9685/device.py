@@ -9,11 +9,11 @@ from typing import Any, ClassVar
 
 from armcal.arm.servo import COUNTS
 from armcal.base.settings import InputPath, Settings
-from armcal.bench.clock import Clock
-from armcal.bench.device import DeviceIdentity, DeviceState
-from armcal.bench.faults import DeviceLostError, DeviceRefusedError
-from armcal.bench.link import GuardedLink, Link, LinkIdentity
 from armcal.config.servo_file import ServoFile, digest, load_servo_file
+from armcal.devices.clock import Clock
+from armcal.devices.device import DeviceIdentity, DeviceState
+from armcal.devices.faults import DeviceLostError, DeviceRefusedError
+from armcal.devices.link import GuardedLink, Link, LinkIdentity
 from armcal.errors import Location
 
 from armcal_pca9685.chip import Chip, ForeignPulses
@@ -30,7 +30,7 @@ class Pca9685Settings(Settings):
 
 
 class Pca9685Device:
-    """The device ``pca9685``; see ``JointDevice`` and ``PulseDevice`` in ``armcal.bench.device``."""
+    """The device ``pca9685``; see ``JointDevice`` and ``PulseDevice`` in ``armcal.devices.device``."""
 
     Settings: ClassVar[type[Pca9685Settings]] = Pca9685Settings
     EXAMPLE: ClassVar[Mapping[str, Any]] = {"servos": str(Path(__file__).with_name("example_servos.yaml"))}

@@ -11,10 +11,10 @@ from collections.abc import Mapping
 from typing import Any, ClassVar
 
 from armcal.base.settings import Duration
-from armcal.bench.clock import Clock
-from armcal.bench.faults import DeviceError, DeviceLostError, DeviceRefusedError, DeviceResetError
-from armcal.bench.link import LinkIdentity
-from armcal.bench.serial_port import SerialPort, SerialPortSettings
+from armcal.devices.clock import Clock
+from armcal.devices.faults import DeviceError, DeviceLostError, DeviceRefusedError, DeviceResetError
+from armcal.devices.link import LinkIdentity
+from armcal.devices.serial_port import SerialPort, SerialPortSettings
 from armcal.errors import Location
 
 from armcal_pca9685 import firmata_messages as firmata
@@ -48,7 +48,7 @@ class FirmataLink:
         self._reads = 0
 
     def open(self, clock: Clock) -> LinkIdentity:
-        """See ``armcal.bench.link.Link``. Many boards start anew when their port is opened; it waits for them."""
+        """See ``armcal.devices.link.Link``. Many boards start anew when their port is opened; it waits for them."""
         adapter = self._port.open()
         self._decoder.forget()
         try:

@@ -8,13 +8,13 @@ from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, NoReturn
 
 from armcal.base.settings import Duration
-from armcal.bench.clock import Clock
-from armcal.bench.faults import DeviceError, DeviceLostError, DeviceRefusedError, DeviceResetError
-from armcal.bench.framed import messages
-from armcal.bench.framed.frames import DELIMITER, MAX_PAYLOAD, Frame, FrameDecoder, encoded
-from armcal.bench.framed.messages import Code, Flag, Kind
-from armcal.bench.link import Counts, LinkIdentity
-from armcal.bench.serial_port import SerialPort, SerialPortSettings
+from armcal.devices.clock import Clock
+from armcal.devices.faults import DeviceError, DeviceLostError, DeviceRefusedError, DeviceResetError
+from armcal.devices.framed import messages
+from armcal.devices.framed.frames import DELIMITER, MAX_PAYLOAD, Frame, FrameDecoder, encoded
+from armcal.devices.framed.messages import Code, Flag, Kind
+from armcal.devices.link import Counts, LinkIdentity
+from armcal.devices.serial_port import SerialPort, SerialPortSettings
 from armcal.errors import Location
 
 _TRIES = 4
@@ -52,7 +52,7 @@ class FramedLink:
         return self._took_over
 
     def open(self, clock: Clock) -> LinkIdentity:
-        """See ``armcal.bench.link.Link``. A board that has taken over gives the arm back: it stops where it is."""
+        """See ``armcal.devices.link.Link``. A board that has taken over gives the arm back: it stops where it is."""
         adapter = self._port.open()
         self._decoder.forget()
         self._boots, self._took_over = None, False

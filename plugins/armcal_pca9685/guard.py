@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from armcal.bench.link import GuardedLink
+from armcal.devices.link import GuardedLink
 
 from armcal_pca9685.servo import Servo
 

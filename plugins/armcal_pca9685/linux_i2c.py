@@ -10,9 +10,9 @@ from types import ModuleType
 from typing import Annotated, Any, ClassVar, NoReturn, TypeVar
 
 from armcal.base.settings import Settings
-from armcal.bench.clock import Clock
-from armcal.bench.faults import DeviceError, DeviceLostError, DeviceRefusedError
-from armcal.bench.link import LinkIdentity
+from armcal.devices.clock import Clock
+from armcal.devices.faults import DeviceError, DeviceLostError, DeviceRefusedError
+from armcal.devices.link import LinkIdentity
 from armcal.errors import Location, PluginError
 from pydantic import Field
 
@@ -40,7 +40,7 @@ class LinuxI2cLink:
         self._smbus2: ModuleType | None = None
 
     def open(self, clock: Clock) -> LinkIdentity:
-        """See ``armcal.bench.link.Link``.
+        """See ``armcal.devices.link.Link``.
 
         Raises:
             PluginError: the library is not installed.

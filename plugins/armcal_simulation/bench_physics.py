@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 from armcal.base.domains import Array
 from armcal.errors import NotConvergedError
-from armcal.solve.kernel import direct_access
+from armcal.problem.kernel import direct_access
 
 from armcal_simulation.elastic_pose import ElasticPose
 from armcal_simulation.servo_heat import HeatPath, ServoHeat

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 from armcal.base.domains import Array
-from armcal.bench.simulated import LOG
 from armcal.config.servo_file import BoardSettings
+from armcal.devices.simulated import LOG
 from armcal.run.experiment import Experiment
 
 from armcal_simulation import bench_parts

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from armcal.bench.framed.messages import Guard, GuardedChannel
+from armcal.devices.framed.messages import Guard, GuardedChannel
 
 from armcal_simulation.board_firmware import NEVER
 from armcal_simulation.i2c_bus import BusStuckError, I2cBus

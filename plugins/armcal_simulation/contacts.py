@@ -14,11 +14,11 @@ from armcal.base.settings import Angle, InputPath, Length, Settings
 from armcal.config.selection import with_values
 from armcal.config.yaml_source import load_config
 from armcal.errors import ConfigError
+from armcal.estimate.simulation import SimulationRequest
 from armcal.measure.groups import ONLY, group_blocks, owner_of
 from armcal.measure.measurement import GroupedMeasurement
-from armcal.solve.problem import Problem
-from armcal.solve.projection import fits, joint_channels, projected
-from armcal.solve.simulation import SimulationRequest
+from armcal.problem.problem import Problem
+from armcal.problem.projection import fits, joint_channels, projected
 from armcal.testing import EXAMPLE_TRUTH
 from pydantic import Field
 

@@ -16,8 +16,8 @@ from armcal.base.parameters import Parameters
 from armcal.base.pose_blocks import rotation_of
 from armcal.errors import ConfigError, NotConvergedError
 from armcal.measure.measurement import Measurement
-from armcal.solve.kernel import direct_access
-from armcal.solve.stability import MOST_PASSES
+from armcal.problem.kernel import direct_access
+from armcal.problem.stability import MOST_PASSES
 
 REST_RAD = 1e-8
 """A spring that moves less in a pass is at rest: far below what a tracker sees."""

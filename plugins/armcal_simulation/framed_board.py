@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from armcal.bench.framed.frames import MAX_PAYLOAD, Frame, FrameDecoder, encoded
-from armcal.bench.framed.messages import (
+from armcal.devices.framed.frames import MAX_PAYLOAD, Frame, FrameDecoder, encoded
+from armcal.devices.framed.messages import (
     LATE,
     VERSION,
     ChannelTarget,

@@ -12,8 +12,8 @@ from armcal.base.domains import Array
 from armcal.config.selection import with_values
 from armcal.config.yaml_source import load_config
 from armcal.errors import ConfigError
-from armcal.online.mission.truth import DAY_S, Mission
-from armcal.solve.simulation import SimulationRequest, with_channels
+from armcal.estimate.mission_truth import DAY_S, Mission
+from armcal.estimate.simulation import SimulationRequest, with_channels
 from armcal.testing import EXAMPLE_TRUTH
 from numpy.typing import NDArray
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from armcal.base.domains import Array
-from armcal.online.mission.truth import DAY_S
+from armcal.estimate.mission_truth import DAY_S
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 

@@ -7,10 +7,10 @@ import numpy as np
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.errors import NotConvergedError
-from armcal.solve.factor import Factor
-from armcal.solve.problem import Problem
-from armcal.solve.simulation import SimulationRequest
-from armcal.solve.stability import MOST_PASSES, REST_RAD
+from armcal.estimate.simulation import SimulationRequest
+from armcal.problem.factor import Factor
+from armcal.problem.problem import Problem
+from armcal.problem.stability import MOST_PASSES, REST_RAD
 
 _BLOCK = 256
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
-from armcal.solve.simulation import SimulationRequest, measured_with_noise
+from armcal.estimate.simulation import SimulationRequest, measured_with_noise
 
 _QUATERNION = ("qw", "qx", "qy", "qz")
 

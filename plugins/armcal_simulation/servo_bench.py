@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, ClassVar
 
-from armcal.bench.simulated import BOARD, CLOCK, BenchRequest
-from armcal.online.running.signals import Signals
+from armcal.devices.simulated import BOARD, CLOCK, BenchRequest
+from armcal.io.signals import Signals
 from armcal.testing import EXAMPLE_TRUTH
 
 from armcal_simulation.bench_settings import ServoBenchSettings
@@ -38,7 +38,7 @@ class ServoBench:
         self._settings = settings
 
     def serve(self, request: BenchRequest) -> None:
-        """See ``armcal.bench.simulated.SimulatedBench``.
+        """See ``armcal.devices.simulated.SimulatedBench``.
 
         Raises:
             ConfigError: the settings do not fit the experiment.

@@ -16,7 +16,7 @@ from armcal.base.settings import Angle, InputPath, Length, Settings
 from armcal.config.selection import with_values
 from armcal.config.yaml_source import load_config
 from armcal.errors import ConfigError
-from armcal.solve.simulation import SimulationRequest, measured_without_noise, with_channels
+from armcal.estimate.simulation import SimulationRequest, measured_without_noise, with_channels
 from armcal.testing import EXAMPLE_TRUTH
 from pydantic import Field, model_validator
 

@@ -19,11 +19,11 @@ from typing import Any, BinaryIO, ClassVar, Literal, NoReturn
 import numpy as np
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
-from armcal.base.plain_files import input_file
 from armcal.base.settings import InputPath, Settings
 from armcal.base.units import from_unit
 from armcal.errors import DataError, Location
-from armcal.measure.cells import DECIMAL_COMMA, CellFault, read_cell, with_point
+from armcal.io.cells import DECIMAL_COMMA, CellFault, read_cell, with_point
+from armcal.io.plain_files import input_file
 from armcal.measure.checks import check_dataset, layout_of
 from armcal.measure.column_match import Column, Header, Plan, header_of, match_columns, renamed
 from armcal.measure.reader import ReadRequest

@@ -9,8 +9,8 @@ from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar
 
 from armcal.base.settings import Settings
-from armcal.bench.clock import Clock
-from armcal.bench.tracker import TrackerFrame
+from armcal.devices.clock import Clock
+from armcal.devices.tracker import TrackerFrame
 from pydantic import Field, field_validator
 
 from armcal_tracker.dtrack_message import Message, messages
@@ -52,7 +52,7 @@ class DTrackSettings(Settings):
 
 
 class DTrackTracker:
-    """Listens on a port; what DTrack is to send is set up in DTrack. See ``armcal.bench.tracker.Tracker``."""
+    """Listens on a port; what DTrack is to send is set up in DTrack. See ``armcal.devices.tracker.Tracker``."""
 
     Settings: ClassVar[type[DTrackSettings]] = DTrackSettings
     EXAMPLE: ClassVar[Mapping[str, Any]] = {"port": 0}

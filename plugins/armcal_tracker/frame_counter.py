@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from armcal.bench.tracker import REPEATED
+from armcal.devices.tracker import REPEATED
 
 LATE = "a frame that came too late, after a newer one"
 LATEST = 100

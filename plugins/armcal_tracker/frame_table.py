@@ -11,7 +11,7 @@ from typing import NoReturn
 from armcal.base.domains import Array
 from armcal.base.units import from_unit, split_suffix
 from armcal.errors import DataError, Location
-from armcal.measure.cells import DELIMITERS, read_cell, split
+from armcal.io.cells import DELIMITERS, read_cell, split
 
 from armcal_tracker.body_pose import body_pose
 from armcal_tracker.unreadable import UnreadableError

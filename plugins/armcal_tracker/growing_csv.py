@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from typing import Any, ClassVar, Literal
 
 from armcal.base.settings import InputPath, Settings
-from armcal.bench.clock import Clock
-from armcal.bench.tracker import TrackerFrame
+from armcal.devices.clock import Clock
+from armcal.devices.tracker import TrackerFrame
 from armcal.errors import DataError
 
 from armcal_tracker.frame_counter import FrameCounter
@@ -25,7 +25,7 @@ class GrowingCsvSettings(Settings):
 
 
 class GrowingCsvTracker:
-    """Rows as ``frame_table`` reads them. See ``armcal.bench.tracker.Tracker``."""
+    """Rows as ``frame_table`` reads them. See ``armcal.devices.tracker.Tracker``."""
 
     Settings: ClassVar[type[GrowingCsvSettings]] = GrowingCsvSettings
     EXAMPLE: ClassVar[Mapping[str, Any]] = {"path": "/no/such/folder/frames.csv"}

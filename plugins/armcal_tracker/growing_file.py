@@ -7,9 +7,9 @@ from pathlib import Path
 from stat import S_ISREG
 from typing import BinaryIO, Literal
 
-from armcal.bench.faults import DeviceRefusedError
+from armcal.devices.faults import DeviceRefusedError
 from armcal.errors import Location
-from armcal.online.sources.line_cutter import LineCutter
+from armcal.io.line_cutter import LineCutter
 
 MAX_LINE_BYTES = 64 * 1024
 _CHUNK = 64 * 1024

@@ -8,8 +8,8 @@ from collections.abc import Iterator, Mapping
 from typing import Annotated, Any, ClassVar, Literal
 
 from armcal.base.settings import InputPath, Settings
-from armcal.bench.clock import Clock
-from armcal.bench.tracker import TrackerFrame
+from armcal.devices.clock import Clock
+from armcal.devices.tracker import TrackerFrame
 from pydantic import Field, field_validator, model_validator
 
 from armcal_tracker.frame_counter import FrameCounter
@@ -44,7 +44,7 @@ class JsonLinesSettings(Settings):
 
 
 class JsonLinesTracker:
-    """Frames as ``json_message`` reads them. See ``armcal.bench.tracker.Tracker``."""
+    """Frames as ``json_message`` reads them. See ``armcal.devices.tracker.Tracker``."""
 
     Settings: ClassVar[type[JsonLinesSettings]] = JsonLinesSettings
     EXAMPLE: ClassVar[Mapping[str, Any]] = {"port": 0}

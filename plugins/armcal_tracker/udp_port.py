@@ -5,7 +5,7 @@ from __future__ import annotations
 import socket
 from collections.abc import Iterator
 
-from armcal.bench.faults import DeviceRefusedError
+from armcal.devices.faults import DeviceRefusedError
 from armcal.errors import Location
 
 MAX_DATAGRAM_BYTES = 65536

@@ -7,8 +7,8 @@ import re
 from pathlib import Path
 from typing import Literal, get_args
 
-from armcal.base.plain_files import input_bytes
 from armcal.errors import ConfigError, Location
+from armcal.io.plain_files import input_bytes
 
 Encoding = Literal["utf-8", "utf-16-le", "utf-16-be", "iso-8859-1", "us-ascii"]
 

@@ -13,9 +13,9 @@ from armcal.arm.model import forward
 from armcal.base.domains import Array
 from armcal.base.quaternions import rotation_matrix
 from armcal.base.settings import Settings
+from armcal.calibration.exporter import Exported, ExportRequest, random_commands
+from armcal.calibration.rigid_chain import numeric_chain, rigid_chain, rpy_of
 from armcal.errors import ConfigError, ProblemError
-from armcal.use.exporter import Exported, ExportRequest, random_commands
-from armcal.use.rigid_chain import numeric_chain, rigid_chain, rpy_of
 
 from armcal_urdf.edit import Placed, with_origins
 from armcal_urdf.encoding import encode

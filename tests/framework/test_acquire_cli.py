@@ -13,11 +13,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from armcal.bench.acquisition.rehearsal import overrides_for
-from armcal.bench.acquisition.session import Course, acquire
-from armcal.bench.faults import DeviceRefusedError
 from armcal.cli.main import cli
+from armcal.devices.faults import DeviceRefusedError
 from armcal.errors import InputError
+from armcal_bench.acquisition.rehearsal import overrides_for
+from armcal_bench.acquisition.session import Course, acquire
 from click.testing import CliRunner, Result
 
 from tests.bench_runs import CONFIG, BenchRun, free_port, positions, write_plan

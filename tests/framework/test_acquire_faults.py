@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from armcal.bench.clock import SimulatedClock
-from armcal.bench.faults import DeviceLostError, DeviceRefusedError
-from armcal.bench.serial_port import SerialPort, SerialPortSettings
+from armcal.devices.clock import SimulatedClock
+from armcal.devices.faults import DeviceLostError, DeviceRefusedError
+from armcal.devices.serial_port import SerialPort, SerialPortSettings
 
 from tests.bench_runs import BenchRun, positions
 

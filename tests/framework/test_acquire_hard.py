@@ -14,21 +14,21 @@ from typing import Any
 import numpy as np
 import pytest
 from armcal.arm.clearance import Checked
-from armcal.bench.acquisition.arrival import Arrival
-from armcal.bench.acquisition.eyes import TrackerEyes
-from armcal.bench.acquisition.schedule import Rest
-from armcal.bench.acquisition.session import Course, acquire
-from armcal.bench.acquisition.settings import AcquisitionSettings, ArrivalSettings, ServoHeatSettings
-from armcal.bench.acquisition.ways import Ways
-from armcal.bench.bench import Bench
-from armcal.bench.clock import SimulatedClock
-from armcal.bench.faults import DeviceError, DeviceRefusedError
-from armcal.bench.hazards import FirstMotion
 from armcal.cli.main import cli
 from armcal.config.servo_file import load_servo_file
+from armcal.devices.clock import SimulatedClock
+from armcal.devices.faults import DeviceError, DeviceRefusedError
 from armcal.errors import ArmcalError, InputError
-from armcal.online.journal.journal import Journal, JournalFailedError, JournalFullError
+from armcal.io.journal.journal import Journal, JournalFailedError, JournalFullError
 from armcal.run.experiment import Experiment
+from armcal_bench.acquisition.arrival import Arrival
+from armcal_bench.acquisition.eyes import TrackerEyes
+from armcal_bench.acquisition.schedule import Rest
+from armcal_bench.acquisition.session import Course, acquire
+from armcal_bench.acquisition.settings import AcquisitionSettings, ArrivalSettings, ServoHeatSettings
+from armcal_bench.acquisition.ways import Ways
+from armcal_bench.bench import Bench
+from armcal_bench.hazards import FirstMotion
 from armcal_pca9685.firmata_link import FirmataLink
 from click.testing import CliRunner
 from scipy.spatial.transform import Rotation
@@ -178,7 +178,7 @@ class TestJournalThatFails:
 
     @pytest.mark.slow
     def test_a_real_disk_that_is_full(self, run: BenchRun, monkeypatch: pytest.MonkeyPatch) -> None:
-        from armcal.online.journal.files import REAL_FILES
+        from armcal.io.journal.files import REAL_FILES
 
         write, calls = type(REAL_FILES).write, [0]
 
@@ -275,7 +275,7 @@ class TestBoard:
 
     @pytest.mark.parametrize("kind", [pytest.param("nack", marks=SLOW), "unplug", pytest.param("reset", marks=SLOW)])
     def test_joints_that_were_let_go_are_not_begun_again(self, run: BenchRun, kind: str, monkeypatch: Any) -> None:
-        from armcal.bench.acquisition.recovery import Recovery
+        from armcal_bench.acquisition.recovery import Recovery
 
         release = Recovery.release
         with run.simulated() as clock:

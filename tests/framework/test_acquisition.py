@@ -7,16 +7,16 @@ from functools import partial
 
 import numpy as np
 import pytest
-from armcal.bench.acquisition.conduct import Conduct, Parts
-from armcal.bench.acquisition.drive import Drive
-from armcal.bench.acquisition.heat import HeatModel
-from armcal.bench.acquisition.progress import Progress
-from armcal.bench.acquisition.recovery import Recovery
-from armcal.bench.acquisition.schedule import Scheduler
-from armcal.bench.acquisition.settings import AcquisitionSettings, ServoHeatSettings
-from armcal.bench.acquisition.watch import Patient, Watch
-from armcal.bench.acquisition.ways import Ways
-from armcal.bench.faults import DeviceError, DeviceLostError
+from armcal.devices.faults import DeviceError, DeviceLostError
+from armcal_bench.acquisition.conduct import Conduct, Parts
+from armcal_bench.acquisition.drive import Drive
+from armcal_bench.acquisition.heat import HeatModel
+from armcal_bench.acquisition.progress import Progress
+from armcal_bench.acquisition.recovery import Recovery
+from armcal_bench.acquisition.schedule import Scheduler
+from armcal_bench.acquisition.settings import AcquisitionSettings, ServoHeatSettings
+from armcal_bench.acquisition.watch import Patient, Watch
+from armcal_bench.acquisition.ways import Ways
 
 from tests.bench_fakes import COUNT_RAD, FakeClock, FakeDevice, FakeEyes, FakeLog, KilledError
 

@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from armcal.bench.acquisition.heat import NEVER, HeatModel
-from armcal.bench.acquisition.schedule import LeaveOut, Measure, Rest, Scheduler, foretell
-from armcal.bench.acquisition.settings import ServoHeatSettings
-from armcal.bench.acquisition.ways import Ways, travel
+from armcal_bench.acquisition.heat import NEVER, HeatModel
+from armcal_bench.acquisition.schedule import LeaveOut, Measure, Rest, Scheduler, foretell
+from armcal_bench.acquisition.settings import ServoHeatSettings
+from armcal_bench.acquisition.ways import Ways, travel
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp

@@ -15,12 +15,12 @@ import numpy as np
 import pytest
 import yaml
 from armcal.arm.servo import PulseClock, PulseTable
-from armcal.bench.acquisition.rehearsal import overrides_for, simulated_bench
 from armcal.config.selection import with_values
 from armcal.config.servo_file import load_servo_file
 from armcal.config.yaml_source import load_config
+from armcal.estimate.simulation import SimulationRequest, measured_without_noise
 from armcal.run.experiment import Experiment
-from armcal.solve.simulation import SimulationRequest, measured_without_noise
+from armcal_bench.acquisition.rehearsal import overrides_for, simulated_bench
 
 from tests.bench_runs import free_port, write_plan
 

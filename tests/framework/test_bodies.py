@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from armcal.bench.bodies import in_base, matrix_of, repeats
-from armcal.bench.body_settings import BodySettings
-from armcal.bench.rotations import mean_rotation, turns_from
-from armcal.bench.tracker import TrackerFrame
+from armcal.devices.tracker import TrackerFrame
+from armcal_bench.bodies import in_base, matrix_of, repeats
+from armcal_bench.body_settings import BodySettings
+from armcal_bench.rotations import mean_rotation, turns_from
 from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError

@@ -10,14 +10,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from armcal.cli.main import cli
+from armcal.diagnose.comparison import Change, change, simplest_good
 from armcal.errors import NotConvergedError, ProblemError
-from armcal.solve.blocks import automatic_block_length, draw_weights, standard_error_of_mean
-from armcal.solve.bootstrap import BootstrapSettings, bootstrap
-from armcal.solve.comparison import Change, change, simplest_good
-from armcal.solve.correlation import Correlation
-from armcal.solve.estimator import Solution, SolverVerdict, estimate
-from armcal.solve.parallel import Workers
-from armcal.solve.simulation import SimulationRequest, measured_without_noise, with_channels
+from armcal.estimate.blocks import automatic_block_length, draw_weights, standard_error_of_mean
+from armcal.estimate.bootstrap import BootstrapSettings, bootstrap
+from armcal.estimate.estimator import Solution, SolverVerdict, estimate
+from armcal.estimate.simulation import SimulationRequest, measured_without_noise, with_channels
+from armcal.io.parallel import Workers
+from armcal.problem.correlation import Correlation
 from click.testing import CliRunner
 
 DEMO = str(Path(__file__).resolve().parents[2] / "configs" / "lrm_arm" / "demo.yaml")

@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from armcal.cli.tables import _compliances, _matrices
+from armcal.diagnose.evidence_findings import shifted_told
+from armcal.estimate.estimator import Estimate, estimate
+from armcal.estimate.simulation import SimulationRequest, measured_without_noise, with_channels
+from armcal.problem.problem import Problem
 from armcal.run.experiment import Experiment
-from armcal.solve.estimator import Estimate, estimate
-from armcal.solve.evidence_findings import shifted_told
-from armcal.solve.problem import Problem
-from armcal.solve.simulation import SimulationRequest, measured_without_noise, with_channels
 from rich.console import Console
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs" / "lrm_arm"

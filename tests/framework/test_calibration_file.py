@@ -15,11 +15,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from armcal.calibration.calibration import Calibration
+from armcal.calibration.calibration_file import read_record, sealed
 from armcal.cli.main import cli
 from armcal.errors import ArmcalError, CalibrationWarning, ConfigError
 from armcal.plugins import PluginRegistry, discover
-from armcal.use.calibration import Calibration
-from armcal.use.calibration_file import read_record, sealed
 from armcal_joints.springs import TorsionalSprings
 from click.testing import CliRunner, Result
 
@@ -206,7 +206,7 @@ def upgraded(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[], None]]:
     def install() -> None:
         for module in ("predict", "export", "compensate", "recalibrate", "calibration"):
             monkeypatch.setattr(f"armcal.cli.{module}.discover", lambda: later)
-        monkeypatch.setattr("armcal.use.calibration.discover", lambda: later)
+        monkeypatch.setattr("armcal.calibration.calibration.discover", lambda: later)
 
     yield install
 

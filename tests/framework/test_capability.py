@@ -10,24 +10,24 @@ import pytest
 from armcal.arm.servo import PulseClock, PulseTable, quantised
 from armcal.base.dataset import Dataset
 from armcal.base.settings import Settings
-from armcal.capability.accuracy import steps_at, with_accuracy
-from armcal.capability.areas import AreaSearch, cells_of
-from armcal.capability.designs import load_designs
-from armcal.capability.inverse import Pointing
-from armcal.capability.loading import Task, load_task
-from armcal.capability.mechanics import MechanicsFunction
-from armcal.capability.nimbleness import moves, nimbleness, singular_values, weighted
-from armcal.capability.quantities import Weights, postures_at
-from armcal.capability.sampling import spread
-from armcal.capability.settings import AreaSettings, CapabilitySettings, LoadSettings, ToolDirectionSettings
-from armcal.capability.subject import Subject
-from armcal.capability.summary import design_summaries
-from armcal.capability.survey import Survey, outline, survey
-from armcal.capability.voxels import grouped, voxels_of
+from armcal.calibration.calibration import Calibration
 from armcal.errors import ConfigError, ProblemError
 from armcal.measure.contact import ArmsAlone
-from armcal.solve.problem import Problem
-from armcal.use.calibration import Calibration
+from armcal.problem.problem import Problem
+from armcal_capability.accuracy import steps_at, with_accuracy
+from armcal_capability.areas import AreaSearch, cells_of
+from armcal_capability.designs import load_designs
+from armcal_capability.inverse import Pointing
+from armcal_capability.loading import Task, load_task
+from armcal_capability.mechanics import MechanicsFunction
+from armcal_capability.nimbleness import moves, nimbleness, singular_values, weighted
+from armcal_capability.quantities import Weights, postures_at
+from armcal_capability.sampling import spread
+from armcal_capability.settings import AreaSettings, CapabilitySettings, LoadSettings, ToolDirectionSettings
+from armcal_capability.subject import Subject
+from armcal_capability.summary import design_summaries
+from armcal_capability.survey import Survey, outline, survey
+from armcal_capability.voxels import grouped, voxels_of
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs" / "lrm_arm"
 LINKS = (0.3, 0.25)
@@ -166,10 +166,10 @@ def test_a_beam_gives_its_compliance_times_the_square_of_its_lever(tmp_path: Pat
 def predicted(subject: Subject, parameters_of: str, commands: np.ndarray, acting: dict[str, float]) -> np.ndarray:
     """Tool poses (N x 4 x 4) by the code that fits, which shares no slopes with the maps."""
     task = load_task(Path(parameters_of))
-    from armcal.capability.subject import Corrections
     from armcal.config.system import build_system
     from armcal.config.yaml_source import load_config
     from armcal.plugins import discover
+    from armcal_capability.subject import Corrections
 
     registry, source = discover(), load_config(parameters_of)
     system = build_system(source, registry)
@@ -325,7 +325,7 @@ def test_areas_hold_every_sampled_posture_and_keep_limits_and_direction(lrm: Tas
 
 
 def test_found_postures_are_where_and_how_they_should_be(lrm: Task) -> None:
-    from armcal.capability.inverse import reach_for
+    from armcal_capability.inverse import reach_for
 
     subject, function = lrm.subject, mechanics(lrm.subject)
     targets = np.array([[0.3, 0.0, 0.05], [0.32, 0.1, 0.1], [2.0, 0.0, 0.0]]).T
@@ -365,8 +365,8 @@ def test_what_the_parameters_leave_open_is_what_predictions_say(calibration: Cal
 
 
 def of(calibration: Calibration) -> Subject:
-    from armcal.capability.subject import of_calibration
     from armcal.config.yaml_source import load_config
+    from armcal_capability.subject import of_calibration
 
     return of_calibration(calibration, load_config(CONFIGS / "plan.yaml"), "demo")
 

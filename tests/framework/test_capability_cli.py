@@ -169,8 +169,8 @@ def test_a_missing_or_broken_library_is_told_before_the_survey(
         assert name == "matplotlib"
         raise fault
 
-    monkeypatch.setattr("armcal.cli.capability.import_module", failing)
-    monkeypatch.setattr("armcal.cli.capability.survey", lambda *_: pytest.fail("it surveyed first"))
+    monkeypatch.setattr("armcal_capability.command.import_module", failing)
+    monkeypatch.setattr("armcal_capability.command.survey", lambda *_: pytest.fail("it surveyed first"))
     done = armcal("capability", CONFIGS / "plan.yaml", "--out", tmp_path / "out", *QUICK)
     assert done.exit_code == 1 and isinstance(done.exception, SystemExit)
     assert "Traceback" not in done.output and "armcal doctor" in done.output

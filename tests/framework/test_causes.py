@@ -10,15 +10,15 @@ import numpy as np
 import oracle
 import pytest
 from armcal.cli.main import cli
-from armcal.solve.evidence_findings import neighbours_told, structures_told
-from armcal.solve.fit_rows import FitRows
-from armcal.solve.gross import scale_deviation
-from armcal.solve.leftover import LEVEL, leftover
-from armcal.solve.motion import Motion, recorded_position
-from armcal.solve.odds import UNLISTED
-from armcal.solve.outside import predicted_positions
-from armcal.solve.smooth import CLEAR
-from armcal.solve.weighing import fit
+from armcal.diagnose.evidence_findings import neighbours_told, structures_told
+from armcal.diagnose.fit_rows import FitRows
+from armcal.diagnose.gross import scale_deviation
+from armcal.diagnose.leftover import LEVEL, leftover
+from armcal.diagnose.odds import UNLISTED
+from armcal.diagnose.outside import predicted_positions
+from armcal.diagnose.smooth import CLEAR
+from armcal.estimate.weighing import fit
+from armcal.problem.motion import Motion, recorded_position
 from armcal_ipopt.estimator import IpoptEstimator
 from click.testing import CliRunner
 from noise_cases import NOISE_M, posed

@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from armcal.base.dataset import Dataset
+from armcal.diagnose.clustered import widened
+from armcal.diagnose.evidence_findings import what_neighbours_cost
+from armcal.estimate.estimator import Estimate, estimate
+from armcal.estimate.simulation import SimulationRequest, measured_without_noise, with_channels
+from armcal.problem.problem import Problem
 from armcal.run.experiment import Experiment
-from armcal.solve.clustered import widened
-from armcal.solve.estimator import Estimate, estimate
-from armcal.solve.evidence_findings import what_neighbours_cost
-from armcal.solve.problem import Problem
-from armcal.solve.simulation import SimulationRequest, measured_without_noise, with_channels
 from scipy.special import stdtrit
 
 DEMO = Path(__file__).resolve().parents[2] / "configs" / "lrm_arm" / "demo.yaml"

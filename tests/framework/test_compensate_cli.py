@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 import yaml
 from armcal.base.dataset import Dataset
+from armcal.calibration.calibration import Calibration
+from armcal.calibration.compensation.compensator import Compensator
+from armcal.calibration.compensation.request import Options
 from armcal.cli.main import cli
 from armcal.plugins import discover
 from armcal.run import compensate as run_compensate
 from armcal.run.compensate import Bench
 from armcal.run.correction_table import correction_table, read_table_settings
-from armcal.use.calibration import Calibration
-from armcal.use.compensation.compensator import Compensator
-from armcal.use.compensation.request import Options
 from click.testing import CliRunner, Result
 from made_calibrations import made_calibration, written
 from scipy.interpolate import RegularGridInterpolator
@@ -32,7 +32,7 @@ NODES = (3, 3, 3)
 @pytest.fixture(autouse=True)
 def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing is compiled, not even behind the scenes."""
-    monkeypatch.setattr("armcal.solve.compiler.find_compiler", lambda: None)
+    monkeypatch.setattr("armcal.problem.compiler.find_compiler", lambda: None)
 
 
 def armcal(*arguments: object) -> Result:

@@ -9,14 +9,14 @@ import casadi as ca
 import numpy as np
 import pytest
 from armcal.base.dataset import Dataset
+from armcal.calibration.calibration import Calibration
+from armcal.calibration.calibration_file import sealed
+from armcal.calibration.compensation.request import Options
+from armcal.calibration.compensation.step import slope_function
+from armcal.estimate.prediction import quantile
 from armcal.run.experiment import Experiment
 from armcal.run.outputs import calibration_content
 from armcal.run.pipeline import calibrate
-from armcal.solve.prediction import quantile
-from armcal.use.calibration import Calibration
-from armcal.use.calibration_file import sealed
-from armcal.use.compensation.request import Options
-from armcal.use.compensation.step import slope_function
 
 pytestmark = [pytest.mark.shared, pytest.mark.slow]
 

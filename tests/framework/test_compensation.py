@@ -8,13 +8,13 @@ from itertools import product
 import numpy as np
 import pytest
 from armcal.arm.servo import quantised
-from armcal.solve.compiler import find_compiler
-from armcal.use.compensation.compensator import SEEDS, Compensator
-from armcal.use.compensation.equilibrium import Equilibrium
-from armcal.use.compensation.finder import Found
-from armcal.use.compensation.request import Commands, Options, Targets
-from armcal.use.compensation.seeds import Seeds
-from armcal.use.compensation.sides import with_sides
+from armcal.calibration.compensation.compensator import SEEDS, Compensator
+from armcal.calibration.compensation.equilibrium import Equilibrium
+from armcal.calibration.compensation.finder import Found
+from armcal.calibration.compensation.request import Commands, Options, Targets
+from armcal.calibration.compensation.seeds import Seeds
+from armcal.calibration.compensation.sides import with_sides
+from armcal.problem.compiler import find_compiler
 from scipy.optimize import least_squares, minimize
 from scipy.spatial.transform import Rotation
 from small_arms import LRM_LIMITS, calibration, compensator, drawn, predicted, with_options

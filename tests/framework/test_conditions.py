@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from armcal.calibration.calibration import Calibration
 from armcal.plugins import discover
 from armcal.testing.contract import check_component
-from armcal.use.calibration import Calibration
 from outside import armcal, installed, strict
 
 SWELLING = 0.012

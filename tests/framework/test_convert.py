@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 import yaml
 from armcal.arm.model import forward
+from armcal.calibration.convert_check import Difference, difference, load_source, reload
+from armcal.calibration.convert_mdh import mdh_section
+from armcal.calibration.convert_poe import poe_section
+from armcal.calibration.convert_urdf import urdf_text
+from armcal.calibration.rigid_chain import largest_difference, random_commands, rigid_chain, rpy_of, tool_poses
 from armcal.cli.main import cli
 from armcal.errors import ConfigError, ProblemError
 from armcal.plugins import discover
-from armcal.use.convert_check import Difference, difference, load_source, reload
-from armcal.use.convert_mdh import mdh_section
-from armcal.use.convert_poe import poe_section
-from armcal.use.convert_urdf import urdf_text
-from armcal.use.rigid_chain import largest_difference, random_commands, rigid_chain, rpy_of, tool_poses
 from click.testing import CliRunner
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -283,7 +283,7 @@ def test_loads_bend_the_converted_arm_as_they_bend_the_original(lrm):
 
 def full(*entries):
     """The Frida arm with six free numbers a joint, some of them other than nominal."""
-    from armcal.use.rigid_chain import numeric_chain
+    from armcal.calibration.rigid_chain import numeric_chain
     from armcal_poe.model import PoeModel, PoeSettings
 
     model = PoeModel(PoeSettings.model_validate(frida.model(parametrisation="full")))
@@ -414,7 +414,7 @@ def test_a_file_without_an_arm_is_refused(tmp_path, text):
 
 def test_a_calibration_gives_its_calibrated_arm(tmp_path):
     """The shipped demonstration, run and converted: not the nominal arm, and the one that predicts."""
-    from armcal.use.calibration import Calibration
+    from armcal.calibration.calibration import Calibration
 
     demo = str(ROOT / "configs" / "lrm_arm" / "demo.yaml")
     run = CliRunner().invoke(

@@ -11,13 +11,13 @@ import oracle
 import pytest
 from armcal.base.parameters import Drift
 from armcal.cli.main import cli
+from armcal.diagnose.evidence import Evidence
+from armcal.diagnose.verdict import LEVEL, _good_for, _size
 from armcal.errors import DataError
-from armcal.solve.drift import residuals, with_drift
-from armcal.solve.estimator import estimate
-from armcal.solve.evidence import Evidence
-from armcal.solve.validation import cross_validate, folds, record_errors
-from armcal.solve.verdict import LEVEL, _good_for, _size
-from armcal.solve.weighing import NoiseSettings, Weighing
+from armcal.estimate.estimator import estimate
+from armcal.estimate.validation import cross_validate, folds, record_errors
+from armcal.estimate.weighing import NoiseSettings, Weighing
+from armcal.problem.drift import residuals, with_drift
 from armcal_cvxpy.estimator import CvxpyEstimator
 from armcal_ipopt.estimator import IpoptEstimator
 from click.testing import CliRunner

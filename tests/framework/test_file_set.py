@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 from armcal.errors import InputError
-from armcal.use.file_set import write_new, write_over
+from armcal.io.file_set import write_new, write_over
 
 NAMES = ("arm.h", "arm.c", "check.c")
 

@@ -11,9 +11,9 @@ import contact_oracle as co
 import numpy as np
 import pytest
 from armcal.errors import DataError, InputError, ProblemError
-from armcal.solve import compiler
-from armcal.solve.estimator import Solution, SolverVerdict, estimate, require_solvable
-from armcal.solve.nuisance import restricted, started
+from armcal.estimate.estimator import Solution, SolverVerdict, estimate, require_solvable
+from armcal.estimate.nuisance import restricted, started
+from armcal.problem import compiler
 from armcal_tracker.position import TipPosition, TipPositionSettings
 from contact_oracle import (
     BALL,

@@ -8,9 +8,9 @@ import contact_oracle as co
 import numpy as np
 import pytest
 from armcal.errors import InputError
-from armcal.solve.joint_noise import with_joint_noise
-from armcal.solve.nuisance import restricted, settled, started, untrained
-from armcal.solve.validation import record_errors
+from armcal.estimate.nuisance import restricted, settled, started, untrained
+from armcal.estimate.validation import record_errors
+from armcal.problem.joint_noise import with_joint_noise
 from armcal_ipopt.estimator import IpoptEstimator
 from armcal_tracker.position import TipPosition, TipPositionSettings
 from contact_oracle import (

@@ -13,12 +13,12 @@ import yaml
 from armcal.base.domains import Array
 from armcal.cli.main import cli
 from armcal.errors import NotConvergedError
+from armcal.estimate.estimator import Estimate, estimate
+from armcal.estimate.simulation import SimulationRequest, measured_without_noise, with_channels
+from armcal.estimate.validation import cross_validate, folds
+from armcal.estimate.weighing import NoiseSettings, WeighedFit, fit, weighed
+from armcal.problem.problem import Problem
 from armcal.run.experiment import Experiment
-from armcal.solve.estimator import Estimate, estimate
-from armcal.solve.problem import Problem
-from armcal.solve.simulation import SimulationRequest, measured_without_noise, with_channels
-from armcal.solve.validation import cross_validate, folds
-from armcal.solve.weighing import NoiseSettings, WeighedFit, fit, weighed
 from click.testing import CliRunner, Result
 from scipy.special import chdtri, stdtrit
 

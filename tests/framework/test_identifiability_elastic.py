@@ -13,8 +13,8 @@ from armcal.arm.assembly import Arm, MassSpec, prefixed
 from armcal.arm.environment import Environment
 from armcal.base.dataset import Dataset
 from armcal.base.parameters import Parameters
-from armcal.solve.problem import Problem
-from armcal.solve.structure import explain, identify
+from armcal.estimate.structure import explain, identify
+from armcal.problem.problem import Problem
 from armcal_joints.springs import TorsionalSprings
 from armcal_mdh.model import MdhModel
 from armcal_tracker.position import TipPosition, TipPositionSettings

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from armcal.base.dataset import Dataset
 from armcal.base.parameters import Parameters, scalar
+from armcal.estimate.estimator import Solution, SolverVerdict, estimate, require_solvable
+from armcal.estimate.identifiability import analyse
+from armcal.estimate.structure import explain, identify
 from armcal.measure.measurement import Channel
-from armcal.solve.estimator import Solution, SolverVerdict, estimate, require_solvable
-from armcal.solve.identifiability import analyse
-from armcal.solve.problem import Problem
-from armcal.solve.projection import projected
-from armcal.solve.structure import explain, identify
+from armcal.problem.problem import Problem
+from armcal.problem.projection import projected
 from armcal.testing.planar import GRAVITY, Tip, planar_arms
 
 COUNT = 30

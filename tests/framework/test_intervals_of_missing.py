@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from armcal.diagnose.coverage import Scores, coverage, missed, predictor, score, stretch
+from armcal.estimate.simulation import with_channels
+from armcal.estimate.weighing import fit
 from armcal.run.experiment import Experiment
-from armcal.solve.coverage import Scores, coverage, missed, predictor, score, stretch
-from armcal.solve.simulation import with_channels
-from armcal.solve.weighing import fit
 from drifting import DEMO, FREE, problem_of
 
 SECOND = "measurements.second={type: tip_position, noise_mm: 0.5}"

@@ -8,9 +8,9 @@ import contact_oracle as co
 import numpy as np
 import oracle
 import pytest
-from armcal.solve.estimator import estimate
-from armcal.solve.joint_noise import with_joint_noise
-from armcal.solve.nuisance import started
+from armcal.estimate.estimator import estimate
+from armcal.estimate.nuisance import started
+from armcal.problem.joint_noise import with_joint_noise
 from armcal_contact.distance import TipDistance
 from armcal_ipopt.estimator import IpoptEstimator
 from armcal_tracker.position import TipPosition, TipPositionSettings

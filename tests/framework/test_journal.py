@@ -13,10 +13,10 @@ from pathlib import Path
 
 import pytest
 from armcal.errors import DataError, InputError
-from armcal.online.journal.files import RealFiles, write_whole
-from armcal.online.journal.journal import Journal, JournalLimits
-from armcal.online.journal.reader import read_entries, read_newest, read_segments, read_until, verify
-from armcal.online.journal.room import BALLAST, BALLAST_BYTES
+from armcal.io.journal.files import RealFiles, write_whole
+from armcal.io.journal.journal import Journal, JournalLimits
+from armcal.io.journal.reader import read_entries, read_newest, read_segments, read_until, verify
+from armcal.io.journal.room import BALLAST, BALLAST_BYTES
 
 HEADER = {"software": "1.2.3", "evaluator": {"kernel": "abc"}}
 SMALL = JournalLimits(segment_bytes=600, total_bytes=4000)
@@ -261,7 +261,7 @@ def test_a_segment_that_is_gone_is_damage(tmp_path: Path) -> None:
 
 
 def test_another_format_is_refused(tmp_path: Path) -> None:
-    from armcal.online.journal.frames import encode_frame, payload_of
+    from armcal.io.journal.frames import encode_frame, payload_of
 
     header = {"kind": "header", "format": 2, "segment": 1, "previous": "00000000", "content": {}}
     (tmp_path / "journal-00000001.log").write_bytes(encode_frame(1, payload_of(header), 0)[0])

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from armcal.cli.main import cli
-from armcal.online.journal.frames import decode_frame, encode_frame
+from armcal.io.journal.frames import decode_frame, encode_frame
 from click.testing import CliRunner, Result
 from small_arms import TEXTS, calibration, predicted
 

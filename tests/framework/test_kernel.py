@@ -18,10 +18,10 @@ import numpy as np
 import oracle
 import pytest
 from armcal.errors import NotConvergedError
-from armcal.solve import c_source, compiler, kernel
-from armcal.solve.factor import Factor
-from armcal.solve.kernel import build_kernel, kernel_source
-from armcal.solve.problem import BLOCK_RECORDS
+from armcal.problem import c_source, compiler, kernel
+from armcal.problem.factor import Factor
+from armcal.problem.kernel import build_kernel, kernel_source
+from armcal.problem.problem import BLOCK_RECORDS
 
 AGREEMENT = 1e-12
 needs_compiler = pytest.mark.skipif(compiler.find_compiler() is None, reason="no C compiler on this machine")
@@ -547,7 +547,7 @@ SCRIPT = """
     import oracle
     from armcal.base.dataset import Dataset
     from armcal.run.experiment import Experiment
-    from armcal.solve.problem import Problem
+    from armcal.problem.problem import Problem
 
     experiment = Experiment.load({config!r})
     q = oracle.random_poses(20, 0)

@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from armcal.diagnose.coverage import predictor
+from armcal.estimate.weighing import fit
 from armcal.run.experiment import Experiment
-from armcal.solve.coverage import predictor
-from armcal.solve.weighing import fit
 from drifting import DEMO, FREE, dense_drift, dense_slopes, drifting_problem, problem_of
 
 NOISE = 5e-4

@@ -11,12 +11,12 @@ import pytest
 from armcal.arm.holding import holding_efforts
 from armcal.arm.loading import LOAD_CHANNELS, site_loads
 from armcal.base.dataset import Dataset
-from armcal.solve.evidence import priors_alone, unseen_poses
-from armcal.solve.leftover import LEVEL, MOST_RECORDS, leftover
-from armcal.solve.misses import Judged, misses
-from armcal.solve.motion import Motion, recorded_position
-from armcal.solve.score_tests import DRAWS, family_test, linear_fit, own_basis
-from armcal.solve.weighing import fit
+from armcal.diagnose.evidence import priors_alone, unseen_poses
+from armcal.diagnose.leftover import LEVEL, MOST_RECORDS, leftover
+from armcal.diagnose.misses import Judged, misses
+from armcal.diagnose.score_tests import DRAWS, family_test, linear_fit, own_basis
+from armcal.estimate.weighing import fit
+from armcal.problem.motion import Motion, recorded_position
 from armcal_ipopt.estimator import IpoptEstimator
 from noise_cases import FEW, NOISE_M, posed
 from planted_arms import SLIDE, Case
@@ -196,7 +196,7 @@ def test_what_the_model_has_is_told_to_be_loosened_not_added(lrm):
 
 @pytest.mark.parametrize("most", [200, pytest.param(MOST_RECORDS, marks=pytest.mark.slow)])
 def test_very_many_records_are_looked_at_in_part_and_few_not_at_all(lrm, monkeypatch, most):
-    monkeypatch.setattr("armcal.solve.leftover.MOST_RECORDS", most)
+    monkeypatch.setattr("armcal.diagnose.leftover.MOST_RECORDS", most)
     problem, records, start, dataset = recording(
         lrm, 8 * most // 5, 8, lambda q, came: on_joint(4, -0.6 * DEG * came[:, 3])
     )

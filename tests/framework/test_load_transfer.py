@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from armcal.cli.main import cli
+from armcal.io.parallel import Sequential, Workers
 from armcal.run.experiment import Experiment
 from armcal.run.load_transfer import transfer
 from armcal.run.pipeline import calibrate
 from armcal.run.study import Study
 from armcal.run.study_result import TransferResult
-from armcal.solve.parallel import Sequential, Workers
 from click.testing import CliRunner, Result
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs" / "lrm_arm"

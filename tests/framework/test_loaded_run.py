@@ -8,12 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from armcal.bench.acquisition.heat import HeatModel
-from armcal.bench.acquisition.preparation import prepare
-from armcal.bench.acquisition.schedule import LeaveOut, Measure, Outlook, Rest, Scheduler, foretell
-from armcal.bench.acquisition.settings import ServoHeatSettings
-from armcal.bench.acquisition.ways import travel
 from armcal.run.experiment import Experiment
+from armcal_bench.acquisition.heat import HeatModel
+from armcal_bench.acquisition.preparation import prepare
+from armcal_bench.acquisition.schedule import LeaveOut, Measure, Outlook, Rest, Scheduler, foretell
+from armcal_bench.acquisition.settings import ServoHeatSettings
+from armcal_bench.acquisition.ways import travel
 from armcal_simulation.servo_heat import HeatPath, ServoHeat
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs" / "lrm_arm"

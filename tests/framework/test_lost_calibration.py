@@ -5,11 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from armcal.calibration.calibration import Calibration
 from armcal.cli.main import cli
 from armcal.errors import ConfigError
-from armcal.online.tracking.updated import calibration_text
-from armcal.serve.loaded import Order, loaded
-from armcal.use.calibration import Calibration
+from armcal_online.tracking.updated import calibration_text
+from armcal_serve.loaded import Order, loaded
 from click.testing import CliRunner, Result
 from online_arm import CONFIG, begun, calibration, settings
 from serving import ask, sha256

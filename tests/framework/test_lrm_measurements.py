@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 import yaml
 from armcal.cli.main import cli
+from armcal.estimate.estimator import estimate
+from armcal.estimate.validation import record_errors
+from armcal.problem.problem import Problem
 from armcal.run.experiment import Experiment
-from armcal.solve.estimator import estimate
-from armcal.solve.problem import Problem
-from armcal.solve.validation import record_errors
 from click.testing import CliRunner
 
 pytestmark = pytest.mark.shared

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 import yaml
 from armcal.base.dataset import Dataset
+from armcal.calibration.compensation.grid import over_grid
+from armcal.calibration.measured_point import measured_point
 from armcal.cli.main import cli
 from armcal.plugins import discover
 from armcal.run.compensate import Bench, commanded
-from armcal.serve.loaded import Order, loaded
-from armcal.use.compensation.grid import over_grid
-from armcal.use.measured_point import measured_point
+from armcal_serve.loaded import Order, loaded
 from click.testing import CliRunner, Result
 from made_calibrations import written
 from scipy.spatial.transform import Rotation
@@ -33,7 +33,7 @@ BODY = (
 
 @pytest.fixture(autouse=True)
 def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("armcal.solve.compiler.find_compiler", lambda: None)
+    monkeypatch.setattr("armcal.problem.compiler.find_compiler", lambda: None)
 
 
 def armcal(*arguments: object) -> Result:

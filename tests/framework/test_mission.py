@@ -14,22 +14,22 @@ import numpy as np
 import pytest
 import yaml
 from armcal.base.dataset import Dataset
+from armcal.calibration.calibration import Calibration
 from armcal.cli.main import cli
-from armcal.cli.mission import _write
 from armcal.errors import ConfigError, InputError
-from armcal.online.mission.errors import error_curve
-from armcal.online.mission.files import curve_text, figures, schedule, truth_text
-from armcal.online.mission.judge import Judgement, judge
-from armcal.online.mission.mission import MissionResult, before_launch, recalibrated, simulated
-from armcal.online.mission.settings import MissionPlan
-from armcal.online.mission.source import MissionSource, PowerCutError
-from armcal.online.mission.story import Story
-from armcal.online.mission.tips import random_poses
-from armcal.online.mission.truth import DAY_S, Mission
-from armcal.online.tracking.settings import RecalibrateSettings
-from armcal.report.mission_figure import mission_figure
-from armcal.solve.simulation import SimulationRequest, measured_without_noise
-from armcal.use.calibration import Calibration
+from armcal.estimate.mission_truth import DAY_S, Mission
+from armcal.estimate.simulation import SimulationRequest, measured_without_noise
+from armcal_online.commands.mission import _write
+from armcal_online.mission.errors import error_curve
+from armcal_online.mission.files import curve_text, figures, schedule, truth_text
+from armcal_online.mission.judge import Judgement, judge
+from armcal_online.mission.mission import MissionResult, before_launch, recalibrated, simulated
+from armcal_online.mission.settings import MissionPlan
+from armcal_online.mission.source import MissionSource, PowerCutError
+from armcal_online.mission.story import Story
+from armcal_online.mission.tips import random_poses
+from armcal_online.mission_figure import mission_figure
+from armcal_online.tracking.settings import RecalibrateSettings
 from click.testing import CliRunner, Result
 
 CONFIG = Path(__file__).resolve().parents[2] / "configs" / "lrm_arm" / "mission.yaml"

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from armcal.base.dataset import Dataset
 from armcal.cli.main import cli
+from armcal.diagnose.mixups import _within, find_mixup
 from armcal.errors import NotConvergedError
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import Prepared, Stopwatch, assemble, calibrate
-from armcal.solve.mixups import _within, find_mixup
 from click.testing import CliRunner
 from scipy.optimize import minimize
 
@@ -163,7 +163,7 @@ def test_a_lost_fit_whose_residuals_cannot_be_taken_says_what_to_look_at(monkeyp
     def nowhere(*parts: object) -> None:
         raise NotConvergedError("the elastic equilibrium of a record did not settle.")
 
-    monkeypatch.setattr("armcal.solve.weighing.estimate", nowhere)
+    monkeypatch.setattr("armcal.estimate.weighing.estimate", nowhere)
     with pytest.raises(NotConvergedError, match=r"ipopt did not converge \(Maximum.*axes, units and frame"):
         calibrate(Experiment.load(DEMO, ["estimator.max_iterations=2"]))
     with pytest.raises(NotConvergedError, match="did not settle"):

@@ -6,9 +6,9 @@ import contact_oracle as co
 import numpy as np
 import pytest
 from armcal.base.dataset import Dataset
-from armcal.solve.evidence_findings import worse_than_nominal
-from armcal.solve.moved import FEWEST, moved_findings, moved_groups
-from armcal.solve.nuisance import settled, started, untrained
+from armcal.diagnose.evidence_findings import worse_than_nominal
+from armcal.diagnose.moved import FEWEST, moved_findings, moved_groups
+from armcal.estimate.nuisance import settled, started, untrained
 from armcal_contact.ball import BallInSocket, BallInSocketSettings
 
 NOISE = 2e-4

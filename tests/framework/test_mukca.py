@@ -15,10 +15,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from armcal.calibration.convert_check import load_source
+from armcal.calibration.rigid_chain import tool_poses
 from armcal.cli.main import cli
 from armcal.plugins import discover
-from armcal.use.convert_check import load_source
-from armcal.use.rigid_chain import tool_poses
 from click.testing import CliRunner
 from scipy.optimize import minimize
 

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from armcal.calibration.calibration import Calibration
 from armcal.cli.main import cli
 from armcal.cli.robot_questions import direction, place
 from armcal.errors import InputError
@@ -24,7 +25,6 @@ from armcal.scaffold.dh_table import read_rows
 from armcal.scaffold.rendering import number, word
 from armcal.scaffold.robot import Row, robot_of_rows
 from armcal.scaffold.robot_files import RECORDS, SIMULATED, RobotFolder, write_robot
-from armcal.use.calibration import Calibration
 from click.testing import CliRunner, Result
 from scaffolds import ROOT, commands_of, files_of, page
 
@@ -78,7 +78,7 @@ def test_the_calibration_is_nearer_to_the_truth_everywhere_than_the_drawing(here
     rows = table(here, files_of(PAGE)["arm5.csv"])
     assert new_robot("arm5", "--dh", rows, "--convention", "standard").exit_code == 0
     experiment = Experiment.load(here / "arm5" / "simulated.yaml", ["simulation.noise=0 mm", "simulation.seed=99"])
-    from armcal.solve.simulation import SimulationRequest
+    from armcal.estimate.simulation import SimulationRequest
 
     system = experiment.system
     request = SimulationRequest(system.arms, system.measurements, experiment.parameters, system.environment)

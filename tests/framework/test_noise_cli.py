@@ -10,12 +10,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import yaml
+from armcal.calibration.calibration import Calibration
 from armcal.cli.main import cli
 from armcal.report import render
 from armcal.run import outputs
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import calibrate
-from armcal.use.calibration import Calibration
 from click.testing import CliRunner
 
 OFF_MM = 20.0

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from armcal.base.domains import Array
 from armcal.errors import NotConvergedError
-from armcal.online.tracking.chart import nearest_semidefinite
+from armcal.estimate.online import surprise, weighed
+from armcal.problem.compiler import find_compiler
+from armcal.problem.kernel import EvaluatorChoice
+from armcal.problem.one_record import OneRecord
+from armcal.problem.problem import Problem
 from armcal.run.experiment import Experiment
-from armcal.solve.compiler import find_compiler
-from armcal.solve.kernel import EvaluatorChoice
-from armcal.solve.one_record import OneRecord
-from armcal.solve.online import surprise, weighed
-from armcal.solve.problem import Problem
+from armcal_online.tracking.chart import nearest_semidefinite
 
 DEMO = Path(__file__).resolve().parents[2] / "configs" / "lrm_arm" / "demo.yaml"
 COMPLIANCE = 0.05

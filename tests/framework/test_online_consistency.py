@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from armcal.online.tracking.start import Footing
-from armcal.solve.online import surprise
+from armcal.estimate.online import surprise
 from armcal_kalman.extended import ExtendedFilter, ExtendedSettings
+from armcal_online.tracking.start import Footing
 from online_arm import STATES, Filtered, World, begun, ground_of, nees, settings, told, walk_of
 from scipy.stats import chi2
 

@@ -11,15 +11,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from armcal.base.parameters import Parameters
-from armcal.online.sources.incoming import Incoming
-from armcal.online.tracking.belief import Belief
-from armcal.online.tracking.chart import Chart
-from armcal.online.tracking.observer import Observer
-from armcal.online.tracking.recalibrator import Recalibrator
-from armcal.online.tracking.settings import DAY
-from armcal.online.tracking.start import Footing
-from armcal.solve.online import Gaussian
+from armcal.estimate.online import Gaussian
 from armcal_kalman.extended import ExtendedFilter, ExtendedSettings
+from armcal_online.sources.incoming import Incoming
+from armcal_online.tracking.belief import Belief
+from armcal_online.tracking.chart import Chart
+from armcal_online.tracking.observer import Observer
+from armcal_online.tracking.recalibrator import Recalibrator
+from armcal_online.tracking.settings import DAY
+from armcal_online.tracking.start import Footing
 from online_arm import (
     AXES,
     JOINTS,

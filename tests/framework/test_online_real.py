@@ -10,17 +10,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 from armcal.base.dataset import Dataset
+from armcal.calibration.calibration import Calibration
+from armcal.calibration.calibration_file import sealed
 from armcal.errors import ConfigError
-from armcal.online.sources.incoming import Incoming
-from armcal.online.tracking.belief import Belief
-from armcal.online.tracking.recalibrator import Recalibrator
-from armcal.online.tracking.settings import RecalibrateSettings
+from armcal.estimate.online import Gaussian
 from armcal.run.experiment import Experiment
 from armcal.run.outputs import calibration_content
 from armcal.run.pipeline import calibrate
-from armcal.solve.online import Gaussian
-from armcal.use.calibration import Calibration
-from armcal.use.calibration_file import sealed
+from armcal_online.sources.incoming import Incoming
+from armcal_online.tracking.belief import Belief
+from armcal_online.tracking.recalibrator import Recalibrator
+from armcal_online.tracking.settings import RecalibrateSettings
 
 ROOT = Path(__file__).resolve().parents[2]
 pytestmark = pytest.mark.shared

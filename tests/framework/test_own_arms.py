@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from armcal.bench.clock import SimulatedClock
-from armcal.bench.waiting import Waits
+from armcal.devices.clock import SimulatedClock
+from armcal_bench.waiting import Waits
 from click.testing import Result
 
 from tests.own_arms import POST, POST_SERVOS, TOWER, TOWER_SERVOS, OwnArm

@@ -16,11 +16,11 @@ import numpy as np
 import pytest
 from armcal.cli.main import cli, main
 from armcal.errors import ArmcalError, ConfigError, InputError, Location
-from armcal.solve import parallel
-from armcal.solve.estimator import spread
-from armcal.solve.parallel import Automatic, Executor, Sequential, Workers, parse_executor
-from armcal.solve.problem import Problem
-from armcal.solve.validation import FitTask, cross_validate, fit_and_judge, folds
+from armcal.estimate.estimator import spread
+from armcal.estimate.validation import FitTask, cross_validate, fit_and_judge, folds
+from armcal.io import parallel
+from armcal.io.parallel import Automatic, Executor, Sequential, Workers, parse_executor
+from armcal.problem.problem import Problem
 from click.testing import CliRunner
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs" / "lrm_arm"

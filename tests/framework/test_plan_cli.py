@@ -12,9 +12,9 @@ import yaml
 from armcal.arm.clearance import ClearanceCheck
 from armcal.base.dataset import Dataset
 from armcal.cli.main import cli
+from armcal.problem.problem import Problem
 from armcal.run.experiment import Experiment
 from armcal.run.plan_clearance import clearance_check
-from armcal.solve.problem import Problem
 from click.testing import CliRunner, Result
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs" / "lrm_arm"

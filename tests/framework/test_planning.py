@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from armcal.base.domains import Interval
 from armcal.base.parameters import ParameterBlock, Parameters
-from armcal.solve.candidates import Candidates, deviations, parameter_draws, whitened_rows
-from armcal.solve.criterion import GOALS, criterion
-from armcal.solve.planning import built_up, choose, detmax, in_order, value_of
-from armcal.solve.relaxation import Task
-from armcal.solve.tally import SHORTLIST, tally
+from armcal.planning.candidates import Candidates, deviations, parameter_draws, whitened_rows
+from armcal.planning.criterion import GOALS, criterion
+from armcal.planning.planning import built_up, choose, detmax, in_order, value_of
+from armcal.planning.relaxation import Task
+from armcal.planning.tally import SHORTLIST, tally
 
 
 def made(count=30, n_rows=3, size=5, draws=1, known=2, seed=0) -> Candidates:

@@ -10,12 +10,12 @@ import numpy as np
 import planted_mistakes
 import pytest
 from armcal.base.dataset import Dataset
+from armcal.calibration.calibration import Calibration
 from armcal.cli.main import cli
 from armcal.errors import ConfigError
+from armcal.estimate.validation import folds, hold_out
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import calibrate
-from armcal.solve.validation import folds, hold_out
-from armcal.use.calibration import Calibration
 from click.testing import CliRunner
 from planted_mistakes import DEMO, MISTAKES, Mistake, PlantedArm, outcome
 

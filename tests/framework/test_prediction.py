@@ -10,13 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from armcal.calibration.calibration import Calibration
+from armcal.calibration.calibration_file import sealed
 from armcal.cli.main import cli
-from armcal.errors import DataError
-from armcal.measure.reader import ReadRequest, wanted_channels
-from armcal.run.experiment import Experiment
-from armcal.run.pipeline import Stopwatch, calibrate, prepare
-from armcal.solve.clustered import widened
-from armcal.solve.coverage import (
+from armcal.diagnose.clustered import widened
+from armcal.diagnose.coverage import (
     FEWEST,
     Coverage,
     Scores,
@@ -29,14 +27,16 @@ from armcal.solve.coverage import (
     told,
     whitened_like,
 )
-from armcal.solve.drift import with_drift
-from armcal.solve.motion import recorded_position
-from armcal.solve.prediction import LEVELS, Spread
-from armcal.solve.simulation import SimulationRequest, measured_without_noise, with_channels
-from armcal.solve.validation import folds
-from armcal.solve.weighing import fit
-from armcal.use.calibration import Calibration
-from armcal.use.calibration_file import sealed
+from armcal.errors import DataError
+from armcal.estimate.prediction import LEVELS, Spread
+from armcal.estimate.simulation import SimulationRequest, measured_without_noise, with_channels
+from armcal.estimate.validation import folds
+from armcal.estimate.weighing import fit
+from armcal.measure.reader import ReadRequest, wanted_channels
+from armcal.problem.drift import with_drift
+from armcal.problem.motion import recorded_position
+from armcal.run.experiment import Experiment
+from armcal.run.pipeline import Stopwatch, calibrate, prepare
 from click.testing import CliRunner, Result
 from drifting import DEMO, DRIFTING, FREE, dense_drift, dense_slopes, drifting_problem, problem_of
 
@@ -262,7 +262,7 @@ def test_the_stretch_that_judges_a_record_does_not_know_its_score() -> None:
 
 
 def test_folds_err_as_they_did_before_they_were_asked_for_intervals() -> None:
-    from armcal.solve.validation import cross_validate
+    from armcal.estimate.validation import cross_validate
 
     loaded = Experiment.load(DEMO, [FREE])
     dataset = loaded.read().subset(np.arange(80))

@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 from armcal.cli.main import cli
 from armcal.errors import ConfigError, NotConvergedError
+from armcal.estimate.estimator import Solution, SolverVerdict
+from armcal.estimate.polish import bounded_step, polish
+from armcal.estimate.profile import profiled, profiles
+from armcal.estimate.simulation import SimulationRequest, measured_without_noise, with_channels
+from armcal.estimate.weighing import NoiseSettings, Weighing, fit
+from armcal.problem.posed import PosedProblem
+from armcal.problem.problem import Problem
 from armcal.run.experiment import Experiment
-from armcal.solve.estimator import Solution, SolverVerdict
-from armcal.solve.polish import bounded_step, polish
-from armcal.solve.posed import PosedProblem
-from armcal.solve.problem import Problem
-from armcal.solve.profile import profiled, profiles
-from armcal.solve.simulation import SimulationRequest, measured_without_noise, with_channels
-from armcal.solve.weighing import NoiseSettings, Weighing, fit
 from click.testing import CliRunner
 
 DEMO = str(Path(__file__).resolve().parents[2] / "configs" / "lrm_arm" / "demo.yaml")

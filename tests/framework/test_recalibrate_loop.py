@@ -10,13 +10,13 @@ from typing import Any
 
 import pytest
 from armcal.errors import InputError
-from armcal.online.journal.journal import JournalFullError
-from armcal.online.journal.reader import read_entries
-from armcal.online.running.course import ReplayDiffersError
-from armcal.online.running.loop import Pace, Recalibration
-from armcal.online.running.session import opened
-from armcal.online.sources.incoming import Incoming
-from armcal.online.sources.opening import open_source
+from armcal.io.journal.journal import JournalFullError
+from armcal.io.journal.reader import read_entries
+from armcal_online.running.course import ReplayDiffersError
+from armcal_online.running.loop import Pace, Recalibration
+from armcal_online.running.session import opened
+from armcal_online.sources.incoming import Incoming
+from armcal_online.sources.opening import open_source
 from fake_recalibrator import FakeRecalibrator, setup
 from recalibrations import (
     FullFiles,
@@ -243,7 +243,7 @@ def test_a_rollback_that_no_checkpoint_followed_is_made_again_after_a_restart(
 
 
 def test_records_wait_unacknowledged_while_the_journal_is_full(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("armcal.online.running.loop.FULL_WAIT_S", 0.0)
+    monkeypatch.setattr("armcal_online.running.loop.FULL_WAIT_S", 0.0)
     files, fake, source, out = FullFiles(), FakeRecalibrator(), Listed(made(1, 9)), BytesIO()
     with opened(setup(tmp_path / "out", files=files, stream=out), fake, lambda rows: source) as going:
         steps(going, 3)

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 from armcal.base.config_text import as_line
-from armcal.online.running.event_file import EventFile
-from armcal.online.running.outputs import Outputs
-from armcal.online.running.standard_output import StandardOutput
+from armcal.io.event_file import EventFile
+from armcal.io.standard_output import StandardOutput
+from armcal_online.running.outputs import Outputs
 from recalibrations import (
     FullFiles,
 )
@@ -21,7 +21,7 @@ from recalibrations import (
 def test_a_full_disk_costs_events_first_and_the_calibration_stays_whole(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("armcal.online.running.outputs.RETRY_S", 0.0)
+    monkeypatch.setattr("armcal_online.running.outputs.RETRY_S", 0.0)
     files, out = FullFiles(), BytesIO()
     outputs = Outputs(tmp_path, StandardOutput(out), EventFile(tmp_path), files)
     assert outputs.calibration("one")

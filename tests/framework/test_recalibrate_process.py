@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from armcal.online.running.control import ask
+from armcal_online.running.control import ask
 from fake_recalibrator import row
 from recalibrations import (
     events,

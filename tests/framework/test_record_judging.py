@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from armcal.bench.recording.agreement import AgreementJudge
-from armcal.bench.recording.quick_fit import QuickFitter
 from armcal.run.experiment import Experiment
+from armcal_bench.recording.agreement import AgreementJudge
+from armcal_bench.recording.quick_fit import QuickFitter
 from recordings import DEMO, command, postures, recorded, still_lines
 
 

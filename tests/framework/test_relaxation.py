@@ -7,12 +7,12 @@ from itertools import combinations
 
 import numpy as np
 import pytest
-from armcal.solve import relaxation
-from armcal.solve.bound import bounded, by_cvxpy
-from armcal.solve.candidates import Candidates
-from armcal.solve.criterion import criterion, spread
-from armcal.solve.planning import choose, value_of
-from armcal.solve.relaxation import Task, certified, interior_point, relax, tangent
+from armcal.planning import relaxation
+from armcal.planning.bound import bounded, by_cvxpy
+from armcal.planning.candidates import Candidates
+from armcal.planning.criterion import criterion, spread
+from armcal.planning.planning import choose, value_of
+from armcal.planning.relaxation import Task, certified, interior_point, relax, tangent
 
 SMOOTH = ["D", "A", "O5"]
 

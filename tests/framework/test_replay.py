@@ -13,27 +13,27 @@ import numpy as np
 import pytest
 import yaml
 from armcal.base.settings import Settings
+from armcal.calibration.calibration import Calibration
 from armcal.cli.main import cli
-from armcal.cli.recalibrate import setup_of
 from armcal.errors import DataError
-from armcal.online.journal.journal import JournalLimits
-from armcal.online.journal.reader import read_entries, read_segments, read_until
-from armcal.online.replaying.replay import kept, replay
-from armcal.online.replaying.state_distance import BOUND, distance
-from armcal.online.replaying.walk import NoWitness
-from armcal.online.replaying.witness import Comparer, DiffersError
-from armcal.online.running.loop import Pace
-from armcal.online.running.session import Open, opened
-from armcal.online.running.standard_output import StandardOutput
-from armcal.online.sources.incoming import Incoming
-from armcal.online.tracking.recalibrator import Recalibrator
-from armcal.online.tracking.settings import RecalibrateSettings
-from armcal.online.tracking.state import State
+from armcal.estimate.estimator import no_progress
+from armcal.io.journal.journal import JournalLimits
+from armcal.io.journal.reader import read_entries, read_segments, read_until
+from armcal.io.standard_output import StandardOutput
 from armcal.plugins import discover
+from armcal.problem.compiler import find_compiler
 from armcal.run.experiment import Experiment
-from armcal.solve.compiler import find_compiler
-from armcal.solve.estimator import no_progress
-from armcal.use.calibration import Calibration
+from armcal_online.commands.recalibrate import setup_of
+from armcal_online.replaying.replay import kept, replay
+from armcal_online.replaying.state_distance import BOUND, distance
+from armcal_online.replaying.walk import NoWitness
+from armcal_online.replaying.witness import Comparer, DiffersError
+from armcal_online.running.loop import Pace
+from armcal_online.running.session import Open, opened
+from armcal_online.sources.incoming import Incoming
+from armcal_online.tracking.recalibrator import Recalibrator
+from armcal_online.tracking.settings import RecalibrateSettings
+from armcal_online.tracking.state import State
 from click.testing import CliRunner, Result
 from fake_recalibrator import FakeRecalibrator
 from recalibrations import Listed, PowerCutError, made, run, stepping, steps
@@ -291,7 +291,7 @@ def sequence_of_first(done: Any) -> int:
 
 
 def test_a_journal_without_its_calibration_is_refused(whole: Path) -> None:
-    from armcal.online.replaying.begin import kept_calibration
+    from armcal_online.replaying.begin import kept_calibration
 
     header = next(read_segments(whole / "journal")).header
     for changed in ({"text": None}, {"text": header["text"] + " "}):

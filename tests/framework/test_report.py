@@ -17,12 +17,12 @@ import pytest
 from armcal.base.dataset import Dataset, SetAside
 from armcal.base.domains import Interval, Pose, Semidefinite
 from armcal.base.parameters import ParameterBlock, Parameters, scalar
+from armcal.diagnose.verdict import Verdict, judge
+from armcal.estimate.estimator import Estimate, SolverVerdict
+from armcal.estimate.identifiability import analyse
+from armcal.estimate.validation import Split, hold_out, summarise
 from armcal.report import render
 from armcal.run.result import ErrorTable, RecordErrors, RunResult
-from armcal.solve.estimator import Estimate, SolverVerdict
-from armcal.solve.identifiability import analyse
-from armcal.solve.validation import Split, hold_out, summarise
-from armcal.solve.verdict import Verdict, judge
 
 SECTIONS = ("verdict", "accuracy", "distribution", "records", "parameters")
 SECTIONS += ("compliances", "correlations", "determined", "data", "reproduce")

@@ -9,11 +9,11 @@ import numpy as np
 import oracle
 import pytest
 from armcal.errors import DataError
-from armcal.solve import robust
-from armcal.solve.estimator import SolverVerdict
-from armcal.solve.loss import median_norm, tuned
-from armcal.solve.redundancy import studentised_distances
-from armcal.solve.weighing import NoiseSettings, Weighing, fit, weighed
+from armcal.estimate import robust
+from armcal.estimate.estimator import SolverVerdict
+from armcal.estimate.loss import median_norm, tuned
+from armcal.estimate.redundancy import studentised_distances
+from armcal.estimate.weighing import NoiseSettings, Weighing, fit, weighed
 from armcal_cvxpy.estimator import CvxpyEstimator
 from armcal_ipopt.estimator import IpoptEstimator
 from noise_cases import FEW, NOISE_M, deviations_off, measured, posed

@@ -15,8 +15,8 @@ from pathlib import Path
 import pytest
 from armcal.cli.main import cli
 from armcal.errors import InputError
-from armcal.run import folder as folders
-from armcal.run.folder import place, reserved
+from armcal.io import folder as folders
+from armcal.io.folder import place, reserved
 from click.testing import CliRunner
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -13,16 +13,16 @@ import yaml
 from armcal.arm.model import Chain
 from armcal.base.dataset import Dataset
 from armcal.base.domains import ScrewAxis
+from armcal.calibration.convert_check import load_source, nominal_values, reload
+from armcal.calibration.convert_mdh import mdh_section
+from armcal.calibration.convert_poe import poe_section
+from armcal.calibration.convert_urdf import urdf_text
+from armcal.calibration.rigid_chain import numeric_chain, random_commands, rigid_chain, tool_poses
+from armcal.estimate.estimator import estimate
+from armcal.estimate.structure import identify
 from armcal.plugins import discover
+from armcal.problem.problem import Problem
 from armcal.run.experiment import Experiment
-from armcal.solve.estimator import estimate
-from armcal.solve.problem import Problem
-from armcal.solve.structure import identify
-from armcal.use.convert_check import load_source, nominal_values, reload
-from armcal.use.convert_mdh import mdh_section
-from armcal.use.convert_poe import poe_section
-from armcal.use.convert_urdf import urdf_text
-from armcal.use.rigid_chain import numeric_chain, random_commands, rigid_chain, tool_poses
 
 LRM = Path(__file__).resolve().parents[2] / "configs" / "lrm_arm" / "arm.yaml"
 REGISTRY = discover()

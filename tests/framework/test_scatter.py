@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from armcal.base.dataset import Dataset
-from armcal.solve.scatter import Scatter, scatter_of
+from armcal.estimate.scatter import Scatter, scatter_of
 
 
 def told(residual: np.ndarray, places: np.ndarray | None = None, weight: np.ndarray | None = None) -> Scatter:

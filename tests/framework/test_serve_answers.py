@@ -15,16 +15,16 @@ import pytest
 import yaml
 from armcal.arm.servo import PulseClock, PulseTable
 from armcal.base.dataset import Dataset
+from armcal.calibration.calibration import Calibration
+from armcal.calibration.calibration_file import sealed
+from armcal.calibration.compensation.request import Commands
 from armcal.errors import ConfigError, DataError
-from armcal.serve.answering import Answerer
-from armcal.serve.calibration_watch import CalibrationWatch
-from armcal.serve.loaded import Order, loaded
-from armcal.serve.protocol import Acting, CompensateAnswer, ForwardAnswer, Refusal
-from armcal.serve.rows import command_rows
-from armcal.serve.served_arm import ServedArm
-from armcal.use.calibration import Calibration
-from armcal.use.calibration_file import sealed
-from armcal.use.compensation.request import Commands
+from armcal_serve.answering import Answerer
+from armcal_serve.calibration_watch import CalibrationWatch
+from armcal_serve.loaded import Order, loaded
+from armcal_serve.protocol import Acting, CompensateAnswer, ForwardAnswer, Refusal
+from armcal_serve.rows import command_rows
+from armcal_serve.served_arm import ServedArm
 from pydantic import TypeAdapter
 from scipy.spatial.transform import Rotation
 from serving import ROOT, ask, foreign, made, sha256, told, variant

@@ -16,9 +16,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from armcal.calibration.calibration import Calibration
 from armcal.cli.main import cli
-from armcal.serve.client import Client
-from armcal.use.calibration import Calibration
+from armcal_serve.client import Client
 from click.testing import CliRunner
 from serving import LONG_S, Running, command, foreign, put, serving, sha256, variant
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from armcal.cli.main import cli
-from armcal.serve.answering import Answerer
+from armcal_serve.answering import Answerer
 from click.testing import CliRunner
 from made_calibrations import written
 from serving import ask, made, told
@@ -32,7 +32,7 @@ def warm_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def quickly_made(text: str) -> Answerer:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("armcal.serve.loaded._TRIES", 1)
+        patch.setattr("armcal_serve.loaded._TRIES", 1)
         return made(text)
 
 

@@ -15,14 +15,14 @@ from typing import Any
 
 import pytest
 from armcal.errors import ArmcalError, InputError
-from armcal.serve.conversation import MOST_WAITING, Ticket
-from armcal.serve.dispatcher import Dispatcher
-from armcal.serve.frames import Message, Unpacker
-from armcal.serve.poller import Poller
-from armcal.serve.protocol import MAX_LINE_BYTES
-from armcal.serve.transports.datagrams import Datagrams
-from armcal.serve.transports.standard import StandardStreams
-from armcal.serve.transports.unix import MOST_CLIENTS, UnixSocket
+from armcal_serve.conversation import MOST_WAITING, Ticket
+from armcal_serve.dispatcher import Dispatcher
+from armcal_serve.frames import Message, Unpacker
+from armcal_serve.poller import Poller
+from armcal_serve.protocol import MAX_LINE_BYTES
+from armcal_serve.transports.datagrams import Datagrams
+from armcal_serve.transports.standard import StandardStreams
+from armcal_serve.transports.unix import MOST_CLIENTS, UnixSocket
 
 
 class Worker:
@@ -423,5 +423,5 @@ def _clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     now = [1000.0]
     for module in ("stream", "unix"):
         clock = SimpleNamespace(monotonic=lambda: now[0])
-        monkeypatch.setattr(f"armcal.serve.transports.{module}.time", clock)
+        monkeypatch.setattr(f"armcal_serve.transports.{module}.time", clock)
     return now

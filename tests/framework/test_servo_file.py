@@ -7,7 +7,6 @@ import struct
 
 import pytest
 from armcal.arm.servo import PulseClock, PulseTable
-from armcal.bench.servo.outputs import write_servo_file
 from armcal.config.servo_file import (
     BoardSettings,
     ServoFile,
@@ -18,6 +17,7 @@ from armcal.config.servo_file import (
     servo_file_text,
 )
 from armcal.errors import ConfigError
+from armcal_bench.servo.outputs import write_servo_file
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 

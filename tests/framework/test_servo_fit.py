@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from armcal.arm.servo import PulseClock, PulseTable
-from armcal.bench.servo.fit import fit_servos
-from armcal.bench.servo.known import KnownBoard, KnownServo, MeasuredPulse, Observation
-from armcal.bench.servo.unknowns import FitTask
+from armcal_bench.servo.fit import fit_servos
+from armcal_bench.servo.known import KnownBoard, KnownServo, MeasuredPulse, Observation
+from armcal_bench.servo.unknowns import FitTask
 
 US = 1e-6
 KNOTS = tuple(math.radians(a) for a in (-100, 0, 100))

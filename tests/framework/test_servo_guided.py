@@ -11,12 +11,12 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from armcal.bench.servo.keys import QUIT, Keys, Lines, wishes_from
-from armcal.bench.servo.mover import StoppedError
-from armcal.bench.servo.outputs import improved
-from armcal.bench.servo.record import NAME, Record
-from armcal.bench.servo.session import Conversation, evaluated, measure
 from armcal.errors import DataError, InputError
+from armcal_bench.servo.keys import QUIT, Keys, Lines, wishes_from
+from armcal_bench.servo.mover import StoppedError
+from armcal_bench.servo.outputs import improved
+from armcal_bench.servo.record import NAME, Record
+from armcal_bench.servo.session import Conversation, evaluated, measure
 
 from tests.servo_fakes import config_in, setup_on
 

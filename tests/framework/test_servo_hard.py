@@ -11,17 +11,17 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from armcal.bench.acquisition.heat import HeatModel
-from armcal.bench.device import DeviceIdentity
-from armcal.bench.faults import DeviceError
-from armcal.bench.servo.mover import Motion, Mover, StoppedError
-from armcal.bench.servo.outputs import improved, write_servo_file
-from armcal.bench.servo.record import NAME, Record
-from armcal.bench.servo.session import Conversation, evaluated, measure
-from armcal.bench.servo.setup import Setup
-from armcal.bench.servo.warmth import Warmth
 from armcal.config.servo_file import BoardSettings, ServoFile, load_servo_file
+from armcal.devices.device import DeviceIdentity
+from armcal.devices.faults import DeviceError
 from armcal.errors import ArmcalError, DataError, InputError
+from armcal_bench.acquisition.heat import HeatModel
+from armcal_bench.servo.mover import Motion, Mover, StoppedError
+from armcal_bench.servo.outputs import improved, write_servo_file
+from armcal_bench.servo.record import NAME, Record
+from armcal_bench.servo.session import Conversation, evaluated, measure
+from armcal_bench.servo.setup import Setup
+from armcal_bench.servo.warmth import Warmth
 
 from tests.bench_fakes import FakeClock
 from tests.framework.test_acquire_faults import faults

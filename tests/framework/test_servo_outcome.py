@@ -8,15 +8,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from armcal.arm.servo import PulseClock, PulseTable
-from armcal.bench.servo.findings import findings
-from armcal.bench.servo.known import KnownBoard, KnownServo, MeasuredPulse
-from armcal.bench.servo.nominal import NominalArm
-from armcal.bench.servo.outcome import outcome_of
-from armcal.bench.servo.outputs import improved, results, write_servo_file
-from armcal.bench.servo.settings import ServoCalibrationSettings
 from armcal.config.servo_file import load_servo_file
 from armcal.config.yaml_source import load_config
 from armcal.run.experiment import Experiment
+from armcal_bench.servo.findings import findings
+from armcal_bench.servo.known import KnownBoard, KnownServo, MeasuredPulse
+from armcal_bench.servo.nominal import NominalArm
+from armcal_bench.servo.outcome import outcome_of
+from armcal_bench.servo.outputs import improved, results, write_servo_file
+from armcal_bench.servo.settings import ServoCalibrationSettings
 from scipy.spatial.transform import Rotation
 
 from tests.servo_fakes import CONFIGS

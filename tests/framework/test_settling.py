@@ -6,12 +6,12 @@ from collections.abc import Callable, Iterable
 
 import numpy as np
 import pytest
-from armcal.bench.acquisition.settings import SettleSettings
-from armcal.bench.body_settings import BodySettings
-from armcal.bench.settling import Settled, Settling, Unsettled
-from armcal.bench.stillness import deviations_of_mean, mean_pose
-from armcal.bench.tracker import REPEATED, TrackerFrame
-from armcal.bench.tracker_health import TrackerHealth
+from armcal.devices.tracker import REPEATED, TrackerFrame
+from armcal_bench.acquisition.settings import SettleSettings
+from armcal_bench.body_settings import BodySettings
+from armcal_bench.settling import Settled, Settling, Unsettled
+from armcal_bench.stillness import deviations_of_mean, mean_pose
+from armcal_bench.tracker_health import TrackerHealth
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation

@@ -14,16 +14,16 @@ from pathlib import Path
 import pytest
 from armcal.base.dataset import Dataset
 from armcal.errors import DataError, InputError
-from armcal.online.running.progress import MAX_FILES, Progress
-from armcal.online.sources.csv_file import CsvFile
-from armcal.online.sources.folder import Folder
-from armcal.online.sources.incoming import Incoming, Place
-from armcal.online.sources.line_cutter import LineCutter
-from armcal.online.sources.lines import Lines
-from armcal.online.sources.opening import open_source
-from armcal.online.sources.row_parser import RowParser
-from armcal.online.sources.source import Source
-from armcal.online.sources.udp import Udp
+from armcal.io.line_cutter import LineCutter
+from armcal_online.running.progress import MAX_FILES, Progress
+from armcal_online.sources.csv_file import CsvFile
+from armcal_online.sources.folder import Folder
+from armcal_online.sources.incoming import Incoming, Place
+from armcal_online.sources.lines import Lines
+from armcal_online.sources.opening import open_source
+from armcal_online.sources.row_parser import RowParser
+from armcal_online.sources.source import Source
+from armcal_online.sources.udp import Udp
 from armcal_tracker.csv_reader import CsvReader, CsvSettings
 from fake_recalibrator import HEADER, request, row
 

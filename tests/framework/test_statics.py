@@ -14,7 +14,7 @@ from armcal.arm.environment import Environment
 from armcal.arm.model import forward
 from armcal.arm.statics import Load, Mass, wrenches
 from armcal.base.parameters import Parameters, scalar
-from armcal.solve.problem import Problem
+from armcal.problem.problem import Problem
 from armcal_joints.springs import TorsionalSprings, TorsionalSpringSettings
 from armcal_mdh.model import MdhModel, MdhSettings
 from armcal_tracker.position import TipPosition, TipPositionSettings

@@ -14,12 +14,12 @@ import pytest
 from armcal.cli.main import cli
 from armcal.config.variants import load_variants
 from armcal.errors import ConfigError, NotConvergedError, ProblemError
+from armcal.estimate.validation import FitTask, fit_and_judge, folds
+from armcal.io.parallel import Sequential, Workers
 from armcal.report.study_page import conclusions
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import calibrate
 from armcal.run.study import Study, compare
-from armcal.solve.parallel import Sequential, Workers
-from armcal.solve.validation import FitTask, fit_and_judge, folds
 from click.testing import CliRunner, Result
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs" / "lrm_arm"
@@ -301,7 +301,7 @@ def test_a_nested_choice_is_that_of_a_plain_loop(place: Path, close_choices) -> 
 
 
 def _problem(experiment: Experiment, system, dataset):
-    from armcal.solve.problem import Problem
+    from armcal.problem.problem import Problem
 
     return Problem.build(
         system.arms, system.measurements, experiment.parameters, system.environment, dataset, "compiled"

@@ -8,10 +8,10 @@ import casadi as ca
 import numpy as np
 import pytest
 from armcal.arm.loading import LOAD_CHANNELS
+from armcal.calibration.compensation.compensator import Compensator
+from armcal.calibration.compensation.request import Options
+from armcal.calibration.compensation.step import slope_function
 from armcal.errors import NotConvergedError
-from armcal.use.compensation.compensator import Compensator
-from armcal.use.compensation.request import Options
-from armcal.use.compensation.step import slope_function
 from made_calibrations import made_calibration
 from scipy.spatial.transform import Rotation
 from small_arms import CONFIGS, calibration, compensator, drawn, predicted, with_options

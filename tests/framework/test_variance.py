@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import oracle
 import pytest
+from armcal.diagnose.noise_findings import components_told
 from armcal.errors import ProblemError
-from armcal.solve.likelihood import Term, _evaluate, maximise
-from armcal.solve.noise_findings import components_told
-from armcal.solve.variance import apply_components, estimate_components
-from armcal.solve.weighing import NoiseSettings, fit, weighed
-from armcal.solve.whitening import by_covariance, transformed
+from armcal.estimate.likelihood import Term, _evaluate, maximise
+from armcal.estimate.variance import apply_components, estimate_components
+from armcal.estimate.weighing import NoiseSettings, fit, weighed
+from armcal.problem.whitening import by_covariance, transformed
 from armcal_ipopt.estimator import IpoptEstimator
 from noise_cases import NOISE_M, deviations_off, measured, posed
 

@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from armcal.cli.main import cli
+from armcal.diagnose.verdict import _good_for
+from armcal.estimate.estimator import estimate
+from armcal.estimate.identifiability import POOR_CONDITION, analyse
+from armcal.planning.suggestion import suggest
+from armcal.problem.problem import Problem
 from armcal.run.experiment import Experiment
-from armcal.solve.estimator import estimate
-from armcal.solve.identifiability import POOR_CONDITION, analyse
-from armcal.solve.problem import Problem
-from armcal.solve.suggestion import suggest
-from armcal.solve.verdict import _good_for
 from click.testing import CliRunner
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs" / "lrm_arm"

@@ -18,17 +18,17 @@ from urllib.parse import urlsplit
 import numpy as np
 import pytest
 import yaml
+from armcal.calibration.calibration import Calibration
 from armcal.cli.main import cli
-from armcal.online.running.event_file import EventFile
-from armcal.online.watch.events import record_of, told_of
-from armcal.online.watch.feed import Feed
-from armcal.online.watch.history import OLDER_ACCEPTED, OLDER_OTHERS, RECENT_RECORDS, History
-from armcal.online.watch.lenient import LONGEST_TEXT, number, parsed, text
-from armcal.online.watch.shape import Shape, drawing_of
-from armcal.online.watch.tail import LONGEST_LINE, Tail
-from armcal.online.watch.terminal import line, picture
-from armcal.online.watch.thinned import Thinned
-from armcal.use.calibration import Calibration
+from armcal.io.event_file import EventFile
+from armcal_online.watch.events import record_of, told_of
+from armcal_online.watch.feed import Feed
+from armcal_online.watch.history import OLDER_ACCEPTED, OLDER_OTHERS, RECENT_RECORDS, History
+from armcal_online.watch.lenient import LONGEST_TEXT, number, parsed, text
+from armcal_online.watch.shape import Shape, drawing_of
+from armcal_online.watch.tail import LONGEST_LINE, Tail
+from armcal_online.watch.terminal import line, picture
+from armcal_online.watch.thinned import Thinned
 from click.testing import CliRunner
 from rich.console import Console
 from watching import SLIP, append, made_up, made_up_folder, written
@@ -342,7 +342,7 @@ def test_a_calibration_that_is_nested_deeply_does_not_end_the_watcher(tmp_path: 
 
 def test_a_watcher_that_draws_nothing_stays_light() -> None:
     heavy = ("numpy", "casadi", "yaml", "pydantic")
-    script = f"import sys, armcal.cli.watch; print([m for m in {heavy} if m in sys.modules])"
+    script = f"import sys, armcal_online.commands.watch; print([m for m in {heavy} if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
 

@@ -11,8 +11,8 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 import pytest
-from armcal.online.watch.page import page
-from armcal.online.watch.shape import Shape
+from armcal_online.watch.page import page
+from armcal_online.watch.shape import Shape
 from browser import CHROMIUM, Browser
 from watching import Served, decision, made_up, made_up_folder
 
@@ -54,8 +54,8 @@ def test_the_wheel_holds_the_page(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(tmp_path)]
     subprocess.run(command, cwd=ROOT, check=True, capture_output=True, timeout=120)
     with zipfile.ZipFile(next(tmp_path.glob("*.whl"))) as wheel:
-        held = {Path(name).name for name in wheel.namelist() if name.startswith("armcal/online/watch/")}
-    files = {path.name for path in (ROOT / "framework/armcal/online/watch").iterdir() if path.is_file()}
+        held = {Path(name).name for name in wheel.namelist() if name.startswith("armcal_online/watch/")}
+    files = {path.name for path in (ROOT / "framework/armcal_online/watch").iterdir() if path.is_file()}
     assert files <= held and "page.html" in held
 
 

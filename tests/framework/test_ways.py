@@ -5,7 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from armcal.bench.acquisition.ways import Ways, travel
+from armcal_bench.acquisition.ways import Ways, travel
 
 LIMITS = np.array([[-2.0, 2.0], [-2.0, 2.0]])
 

@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from armcal.calibration.calibration import Calibration
 from armcal.cli.main import cli
 from armcal.run.experiment import Experiment
-from armcal.use.calibration import Calibration
 from click.testing import CliRunner, Result
 
 ROOT = Path(__file__).resolve().parents[2]

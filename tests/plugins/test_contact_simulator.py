@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from armcal.base.dataset import Dataset
 from armcal.errors import ConfigError
+from armcal.estimate.estimator import estimate
+from armcal.estimate.nuisance import started
+from armcal.estimate.simulation import SimulationRequest
 from armcal.measure.csv_writer import write_csv
 from armcal.measure.reader import ReadRequest, wanted_channels
-from armcal.solve.estimator import estimate
-from armcal.solve.joint_noise import with_joint_noise
-from armcal.solve.nuisance import started
-from armcal.solve.simulation import SimulationRequest
+from armcal.problem.joint_noise import with_joint_noise
 from armcal_contact.clamp import ClampedTool
 from armcal_contact.plane import PlaneContact
 from armcal_dualarm.closure import ClosedChain

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from armcal.base import se3
 from armcal.errors import InputError
-from armcal.solve.estimator import require_solvable
-from armcal.solve.joint_noise import with_joint_noise
-from armcal.solve.nuisance import restricted, settled, started, untrained
+from armcal.estimate.estimator import require_solvable
+from armcal.estimate.nuisance import restricted, settled, started, untrained
+from armcal.problem.joint_noise import with_joint_noise
 from armcal_contact.ball import BallInSocket
 from armcal_contact.clamp import ClampedTool
 from armcal_contact.plane import PlaneContact

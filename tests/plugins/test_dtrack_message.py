@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from armcal.bench.tracker import REPEATED
+from armcal.devices.tracker import REPEATED
 from armcal_tracker.dtrack_message import messages
 from armcal_tracker.frame_counter import LATE, FrameCounter
 from armcal_tracker.unreadable import UnreadableError

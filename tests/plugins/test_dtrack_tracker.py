@@ -8,8 +8,8 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from armcal.bench.faults import DeviceRefusedError
-from armcal.bench.tracker import REPEATED, TrackerFrame
+from armcal.devices.faults import DeviceRefusedError
+from armcal.devices.tracker import REPEATED, TrackerFrame
 from armcal_simulation.dtrack_sender import DTrackSender
 from armcal_simulation.dtrack_sender_settings import DTrackSenderSettings
 from armcal_simulation.dtrack_text import angles_deg, datagram

@@ -9,9 +9,9 @@ import oracle
 import pytest
 from armcal.base.domains import Interval
 from armcal.errors import ProblemError
-from armcal.solve.estimator import estimate, require_solvable
-from armcal.solve.identifiability import analyse
-from armcal.solve.problem import Problem
+from armcal.estimate.estimator import estimate, require_solvable
+from armcal.estimate.identifiability import analyse
+from armcal.problem.problem import Problem
 from armcal_cvxpy.estimator import CvxpyEstimator
 from armcal_ipopt.estimator import IpoptEstimator
 from armcal_tracker.position import TipPosition, TipPositionSettings

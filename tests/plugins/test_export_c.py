@@ -11,9 +11,9 @@ import casadi as ca
 import numpy as np
 import pytest
 from armcal.base.dataset import Dataset
+from armcal.calibration.exporter import Origin, random_commands, request_of
 from armcal.errors import ConfigError, InputError, ProblemError
-from armcal.solve.compiler import find_compiler
-from armcal.use.exporter import Origin, random_commands, request_of
+from armcal.problem.compiler import find_compiler
 from armcal_export import c_code, c_expressions
 from armcal_export.c_code import CExporter, CExportSettings
 from scipy.spatial.transform import Rotation

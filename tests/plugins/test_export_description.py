@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from armcal.calibration.exporter import ExportRequest, Origin, random_commands, request_of, rigid_tools
 from armcal.errors import ProblemError
 from armcal.testing.planar import planar_arms
-from armcal.use.exporter import ExportRequest, Origin, random_commands, request_of, rigid_tools
 from armcal_export import description_file
 from armcal_export.describe import rebuilt_tools
 from armcal_export.description import SCHEMA_FILE, ArmDescription

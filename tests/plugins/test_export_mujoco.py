@@ -10,9 +10,9 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from armcal.calibration.exporter import random_commands, request_of, rigid_tools
+from armcal.calibration.rigid_chain import rigid_chain
 from armcal.errors import InputError, ProblemError
-from armcal.use.exporter import random_commands, request_of, rigid_tools
-from armcal.use.rigid_chain import rigid_chain
 from armcal_export import mujoco_model
 from armcal_export.describe import chain_of, describe
 from armcal_export.mjcf import Drive, Hinge, mjcf

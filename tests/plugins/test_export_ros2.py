@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from armcal.calibration.exporter import random_commands, request_of, rigid_tools
 from armcal.errors import ConfigError, ProblemError
-from armcal.use.exporter import random_commands, request_of, rigid_tools
 from armcal_export import ros2
 from armcal_export.ros2 import Ros2Exporter, Ros2Settings, rebuilt_tools
 from armcal_export.ros2_text import read_ros2, ros2_text

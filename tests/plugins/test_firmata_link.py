@@ -6,8 +6,8 @@ import math
 import os
 
 import pytest
-from armcal.bench.faults import DeviceError, DeviceLostError, DeviceRefusedError, DeviceResetError
-from armcal.bench.link import GuardedLink
+from armcal.devices.faults import DeviceError, DeviceLostError, DeviceRefusedError, DeviceResetError
+from armcal.devices.link import GuardedLink
 from armcal_pca9685 import firmata_link
 from armcal_pca9685.device import Pca9685Device
 from armcal_pca9685.firmata_link import FirmataLink

@@ -6,9 +6,9 @@ import binascii
 
 import numpy as np
 import pytest
-from armcal.bench.framed import messages
-from armcal.bench.framed.cobs import cobs_decoded, cobs_encoded
-from armcal.bench.framed.frames import MAX_PAYLOAD, Frame, FrameDecoder, encoded
+from armcal.devices.framed import messages
+from armcal.devices.framed.cobs import cobs_decoded, cobs_encoded
+from armcal.devices.framed.frames import MAX_PAYLOAD, Frame, FrameDecoder, encoded
 from hypothesis import given
 from hypothesis import strategies as st
 

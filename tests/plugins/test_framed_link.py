@@ -6,10 +6,10 @@ import math
 import os
 
 import pytest
-from armcal.bench.faults import DeviceError, DeviceLostError, DeviceRefusedError, DeviceResetError
-from armcal.bench.framed import messages
-from armcal.bench.framed.frames import Frame, FrameDecoder, encoded
-from armcal.bench.link import GuardedLink
+from armcal.devices.faults import DeviceError, DeviceLostError, DeviceRefusedError, DeviceResetError
+from armcal.devices.framed import messages
+from armcal.devices.framed.frames import Frame, FrameDecoder, encoded
+from armcal.devices.link import GuardedLink
 from armcal_pca9685.device import Pca9685Device
 from armcal_pca9685.framed_link import FramedLink
 from armcal_simulation.i2c_bus import ADDRESS_ONLY

@@ -19,8 +19,8 @@ from armcal.arm.statics import Load
 from armcal.base.dataset import Dataset
 from armcal.base.parameters import Parameters
 from armcal.cli.main import cli
+from armcal.problem.problem import Problem
 from armcal.run.experiment import Experiment
-from armcal.solve.problem import Problem
 from armcal_joints.backlash import ApproachBacklash, BearingPlay, TorqueBacklash
 from armcal_joints.compliance import Compliances
 from armcal_joints.gear import GearError

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from armcal.bench.clock import RealClock
-from armcal.bench.faults import DeviceRefusedError
+from armcal.devices.clock import RealClock
+from armcal.devices.faults import DeviceRefusedError
 from armcal.errors import DataError
 from armcal_tracker.frame_table import frame_table, row_of
 from armcal_tracker.growing_csv import GrowingCsvSettings, GrowingCsvTracker

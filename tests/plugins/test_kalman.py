@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 from armcal.errors import ProblemError
+from armcal.estimate.online import Gaussian, Linearised, OnlineEstimator, Update, absorbed, checked
 from armcal.plugins import Component, discover
-from armcal.solve.online import Gaussian, Linearised, OnlineEstimator, Update, absorbed, checked
 from armcal.testing.contract import check_component, check_plugin
 from armcal_kalman.extended import ExtendedFilter, ExtendedSettings
 from armcal_kalman.unscented import UnscentedFilter, UnscentedSettings

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from armcal.errors import ConfigError
-from armcal.online.mission.truth import DAY_S, Mission, MissionSimulator
+from armcal.estimate.mission_truth import DAY_S, Mission, MissionSimulator
+from armcal.estimate.simulation import SimulationRequest, measured_without_noise
 from armcal.run.experiment import Experiment
-from armcal.solve.simulation import SimulationRequest, measured_without_noise
 from armcal_simulation.mission_schedule import Stands
 from armcal_simulation.mission_settings import MissionSettings, TiltSettings, parsed_creep
 from armcal_simulation.motions import approach_of
@@ -38,7 +38,7 @@ QUIET = {
 @lru_cache
 def experiment() -> Experiment:
     """The shipped mission's, without the sections that are not an experiment's."""
-    from armcal.online.mission.settings import MissionPlan
+    from armcal_online.mission.settings import MissionPlan
 
     return MissionPlan.load(CONFIG).experiment
 

@@ -7,9 +7,9 @@ import math
 import numpy as np
 import pytest
 from armcal.arm.servo import PulseClock, PulseTable, quantised
-from armcal.bench.device import JointDevice, PulseDevice
-from armcal.bench.faults import DeviceError, DeviceLostError, DeviceRefusedError, DeviceResetError
 from armcal.config.servo_file import ServoFile
+from armcal.devices.device import JointDevice, PulseDevice
+from armcal.devices.faults import DeviceError, DeviceLostError, DeviceRefusedError, DeviceResetError
 from armcal.errors import ConfigError
 from armcal_pca9685.device import Pca9685Device
 from board_bench import JOINTS, LRM_PULSES_US, Clock, ModelLink, servo_file, written

@@ -11,8 +11,8 @@ import armcal_pca9685.chip
 import armcal_pca9685.device
 import pytest
 from armcal.arm.servo import PulseClock
-from armcal.bench.faults import DeviceError
 from armcal.config.servo_file import CalibratedServo
+from armcal.devices.faults import DeviceError
 from armcal_pca9685.chip import Chip
 from armcal_pca9685.device import Pca9685Device
 from armcal_pca9685.registers import Channel, channel_register

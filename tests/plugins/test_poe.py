@@ -389,8 +389,8 @@ def test_axes_are_found_by_calibration(tmp_path):
     """Offsets that are wrong in truth turn every axis beyond them; the axes that are found make up for it."""
     import json
 
+    from armcal.calibration.calibration import Calibration
     from armcal.cli.main import cli
-    from armcal.use.calibration import Calibration
     from click.testing import CliRunner
 
     path = tmp_path / "experiment.yaml"

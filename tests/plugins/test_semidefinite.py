@@ -13,9 +13,9 @@ import oracle
 import pytest
 import yaml
 from armcal.base.domains import Semidefinite, symmetric
+from armcal.estimate.estimator import estimate
+from armcal.problem.posed import PosedProblem
 from armcal.run.experiment import Experiment
-from armcal.solve.estimator import estimate
-from armcal.solve.posed import PosedProblem
 from armcal_cvxpy.estimator import CvxpyEstimator
 from armcal_ipopt.estimator import IpoptEstimator
 

@@ -18,10 +18,10 @@ from typing import Any
 import numpy as np
 import pytest
 from armcal.arm.servo import PulseClock
-from armcal.bench.framed.frames import Frame, FrameDecoder, encoded
-from armcal.bench.simulated import BenchRequest
 from armcal.cli.main import cli
 from armcal.config.servo_file import load_servo_file
+from armcal.devices.framed.frames import Frame, FrameDecoder, encoded
+from armcal.devices.simulated import BenchRequest
 from armcal.run.experiment import Experiment
 from armcal.run.plan_clearance import clearance_check
 from armcal_simulation.bench_settings import ServoBenchSettings

@@ -13,8 +13,8 @@ from armcal.base.dataset import Dataset
 from armcal.config.selection import with_values
 from armcal.config.yaml_source import load_config
 from armcal.errors import ConfigError
+from armcal.estimate.simulation import SimulationRequest, measured_without_noise
 from armcal.run.experiment import Experiment
-from armcal.solve.simulation import SimulationRequest, measured_without_noise
 from armcal_simulation.bench_parts import tracked_arm
 from armcal_simulation.bench_settings import ServoBenchSettings
 from armcal_simulation.elastic_pose import ElasticPose

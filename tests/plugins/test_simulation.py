@@ -9,10 +9,10 @@ import pytest
 from armcal.config.selection import with_values
 from armcal.config.yaml_source import load_config
 from armcal.errors import ConfigError
+from armcal.estimate.estimator import estimate
+from armcal.estimate.simulation import SimulationRequest
+from armcal.problem.problem import Problem
 from armcal.run.experiment import Experiment
-from armcal.solve.estimator import estimate
-from armcal.solve.problem import Problem
-from armcal.solve.simulation import SimulationRequest
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs" / "lrm_arm"
 SEEDS = 200

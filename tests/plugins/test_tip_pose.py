@@ -9,12 +9,12 @@ from armcal.arm.assembly import ArmState
 from armcal.base import se3
 from armcal.base.dataset import Dataset
 from armcal.base.parameters import Parameters
+from armcal.estimate.simulation import SimulationRequest, measured_without_noise
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import calibrate
 from armcal.run.plan_ground import ground_of
 from armcal.run.plan_poses import JointSpace
 from armcal.run.plan_settings import PlanSettings
-from armcal.solve.simulation import SimulationRequest, measured_without_noise
 from armcal_tracker.pose import TipPose, TipPoseSettings
 from pydantic import ValidationError
 from scipy.spatial.transform import Rotation

@@ -10,6 +10,7 @@ from armcal.arm.assembly import Arm
 from armcal.arm.holding import holding_efforts
 from armcal.arm.model import forward
 from armcal.base.dataset import Dataset
+from armcal.calibration.calibration_file import dump
 from armcal.config.system import build_system
 from armcal.config.yaml_source import load_config
 from armcal.errors import ConfigError, DataError
@@ -19,7 +20,6 @@ from armcal.measure.limits import warn_beyond_limits
 from armcal.measure.reader import wanted_channels
 from armcal.plugins import discover
 from armcal.run.experiment import Experiment
-from armcal.use.calibration_file import dump
 from armcal_urdf.encoding import MAX_BYTES, decode, encode
 from armcal_urdf.model import UrdfModel, UrdfSettings
 from pydantic import ValidationError
@@ -215,7 +215,7 @@ def test_springs_bend_the_arm_by_compliance_times_pinocchios_torque(tmp_path):
     (tmp_path / "arm.urdf").write_text(ODD)
     (tmp_path / "a.yaml").write_text(CONFIG.replace("LINKS", "{}"))
     experiment = Experiment.load(tmp_path / "a.yaml")
-    from armcal.solve.problem import Problem
+    from armcal.problem.problem import Problem
 
     q = np.array([0.4, 0.3, 0.02])
     channels = {f"arm.{name}": np.array([x]) for name, x in zip(("turn", "bend", "slide"), q, strict=True)}

@@ -9,11 +9,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from armcal.arm.assembly import Arm
+from armcal.calibration.calibration import Calibration
+from armcal.calibration.exporter import ExportRequest, effects_reach, random_commands, request_of, rigid_tools
 from armcal.cli.main import cli
 from armcal.errors import ConfigError, ProblemError
 from armcal.testing.planar import planar_arms
-from armcal.use.calibration import Calibration
-from armcal.use.exporter import ExportRequest, effects_reach, random_commands, request_of, rigid_tools
 from armcal_urdf import edit, export
 from armcal_urdf.encoding import decode
 from armcal_urdf.export import UrdfExporter, UrdfExportSettings

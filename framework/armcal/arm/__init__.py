@@ -1,1 +1,1 @@
-"""First floor: arm models, joint effects, statics."""
+"""Arm models, joint effects, statics, joint limits, clearance."""

@@ -1,1 +1,1 @@
-"""Ground floor: units, rigid motions, parameters, datasets."""
+"""Units, arrays, rigid motions, parameter blocks and their domains, datasets, settings."""

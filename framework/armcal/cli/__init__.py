@@ -1,1 +1,1 @@
-"""Top floor: the command line, one file a command."""
+"""The command line: one file a command, thin."""

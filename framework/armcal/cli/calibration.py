@@ -7,11 +7,11 @@ from pathlib import Path
 
 import click
 
+from armcal.calibration.acceptance import accept as accepted
+from armcal.calibration.calibration_file import sealed
 from armcal.cli.common import Voice, speaking
+from armcal.io.file_set import write_over
 from armcal.plugins import discover
-from armcal.use.acceptance import accept as accepted
-from armcal.use.calibration_file import sealed
-from armcal.use.file_set import write_over
 
 
 @click.group()

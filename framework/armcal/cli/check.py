@@ -14,13 +14,13 @@ from rich.table import Table
 from armcal.cli.common import Voice, overrides, speaking
 from armcal.cli.outlet import say
 from armcal.errors import ProblemError
+from armcal.estimate.estimator import require_solvable
+from armcal.estimate.identifiability import Identifiability
+from armcal.estimate.structure import identify
 from armcal.plugins import discover
 from armcal.run.experiment import Experiment
 from armcal.run.gravity import gravity_findings
 from armcal.run.pipeline import Prepared, Stopwatch, assemble
-from armcal.solve.estimator import require_solvable
-from armcal.solve.identifiability import Identifiability
-from armcal.solve.structure import identify
 
 
 @click.command()

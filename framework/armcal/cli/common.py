@@ -14,12 +14,12 @@ from typing import Any, TypeVar, get_args
 import click
 
 from armcal.base.config_text import as_json
+from armcal.calibration.measured_point import MeasuredPoint, Point
 from armcal.cli.console import Screen
 from armcal.errors import CalibrationWarning, DataError, Location
+from armcal.estimate.estimator import Progress, no_progress
+from armcal.io.parallel import parse_executor
 from armcal.plugins import PluginRegistry
-from armcal.solve.estimator import Progress, no_progress
-from armcal.solve.parallel import parse_executor
-from armcal.use.measured_point import MeasuredPoint, Point
 
 F = TypeVar("F", bound=Callable[..., Any])
 _SAME_POINT_M = 1e-5

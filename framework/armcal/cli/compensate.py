@@ -11,15 +11,15 @@ import numpy as np
 
 from armcal.base.domains import Array
 from armcal.base.units import parse_quantity
+from armcal.calibration.calibration import Calibration
+from armcal.calibration.compensation.compensator import Compensator
+from armcal.calibration.compensation.request import Redundancy
 from armcal.cli.common import Voice, accept, point, spare_inputs, speaking, warn_of_target
 from armcal.errors import InputError, Location
 from armcal.plugins import discover
 from armcal.run.command_file import write_commands
 from armcal.run.compensate import Assessed, Bench, assess, summary
 from armcal.run.target_file import TargetFile, check_units
-from armcal.use.calibration import Calibration
-from armcal.use.compensation.compensator import Compensator
-from armcal.use.compensation.request import Redundancy
 
 _SHOWN = 5
 _ARRIVES = {"tool": "by the tool frame's origin", "target": "by the measured target"}

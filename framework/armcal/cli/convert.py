@@ -9,15 +9,15 @@ from typing import Any
 import click
 import yaml
 
-from armcal.base.plain_files import check_output
+from armcal.calibration.convert_check import ConvertSource, Difference, difference, load_source, reload
+from armcal.calibration.convert_mdh import Convention, mdh_section
+from armcal.calibration.convert_poe import poe_section
+from armcal.calibration.convert_urdf import urdf_text
+from armcal.calibration.rigid_chain import rigid_chain
 from armcal.cli.common import Voice, speaking
 from armcal.errors import ArmcalError, InputError, Location, PluginError
+from armcal.io.plain_files import check_output
 from armcal.plugins import PluginRegistry, discover
-from armcal.use.convert_check import ConvertSource, Difference, difference, load_source, reload
-from armcal.use.convert_mdh import Convention, mdh_section
-from armcal.use.convert_poe import poe_section
-from armcal.use.convert_urdf import urdf_text
-from armcal.use.rigid_chain import rigid_chain
 
 LARGEST = 1e-9
 """m and rad: a conversion that is further off is not written."""

@@ -7,13 +7,13 @@ from pathlib import Path
 import click
 import numpy as np
 
+from armcal.calibration.calibration import Calibration
+from armcal.calibration.measured_point import Point
 from armcal.cli.common import Voice, accept, point, spare_inputs, speaking, warn_of_target
 from armcal.plugins import discover
 from armcal.run.compensate import Bench
 from armcal.run.correction_table import correction_table as made_table
 from armcal.run.correction_table import read_table_settings, write_table
-from armcal.use.calibration import Calibration
-from armcal.use.measured_point import Point
 
 
 @click.command("correction-table")

@@ -6,14 +6,14 @@ from pathlib import Path
 
 import click
 
-from armcal.base.plain_files import check_output
+from armcal.calibration.calibration import Calibration
+from armcal.calibration.exporter import POSES, Exported, Exporter, ExportRequest, effects_reach, request_of
 from armcal.cli.common import Voice, accept, speaking
 from armcal.config.options import settings_from
 from armcal.errors import InputError, Location, PluginError
+from armcal.io.file_set import require_new, write_new, write_over
+from armcal.io.plain_files import check_output
 from armcal.plugins import PluginRegistry, discover
-from armcal.use.calibration import Calibration
-from armcal.use.exporter import POSES, Exported, Exporter, ExportRequest, effects_reach, request_of
-from armcal.use.file_set import require_new, write_new, write_over
 
 _NOTHING_MM = 1e-6
 

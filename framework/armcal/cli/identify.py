@@ -11,16 +11,16 @@ import numpy as np
 from armcal.base.domains import Array
 from armcal.base.parameters import Parameters
 from armcal.cli.common import Voice, overrides, speaking
+from armcal.diagnose.minimal import Dropped, MinimalSet, minimal_set
 from armcal.errors import ConfigError, Location
+from armcal.estimate.combination import Combination
+from armcal.estimate.identifiability import CORRELATED, Identifiability, correlated_pairs, expected_covariance
+from armcal.estimate.structure import SAID, explain, held_by_nothing, identify_from
+from armcal.planning.observability import observability
 from armcal.plugins import discover
+from armcal.problem.projection import factor_at_zero
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import Prepared, Stopwatch, assemble
-from armcal.solve.combination import Combination
-from armcal.solve.identifiability import CORRELATED, Identifiability, correlated_pairs, expected_covariance
-from armcal.solve.minimal import Dropped, MinimalSet, minimal_set
-from armcal.solve.observability import observability
-from armcal.solve.projection import factor_at_zero
-from armcal.solve.structure import SAID, explain, held_by_nothing, identify_from
 
 
 @click.command()

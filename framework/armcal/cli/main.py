@@ -14,6 +14,7 @@ from click.shell_completion import CompletionItem
 from armcal.cli.outlet import Outlet, say
 from armcal.errors import EXIT_DONE, EXIT_FAULT, EXIT_INTERRUPTED, ArmcalError
 from armcal.plugin_files import use_plugins
+from armcal.plugins import discover
 from armcal.version import __version__
 
 COMMANDS = {
@@ -30,22 +31,9 @@ COMMANDS = {
     ),
     "export": ("armcal.cli.export:export", "Write a calibrated arm in another program's format, such as URDF."),
     "calibration": ("armcal.cli.calibration:calibration", "Accept a calibration that was edited by hand."),
-    "capability": ("armcal.cli.capability:capability", "What an arm can do where, and which design does it best."),
     "plan": ("armcal.cli.plan:plan", "Which poses to measure: the best few, and how good any could be."),
     "convert": ("armcal.cli.convert:convert", "The geometry of an arm in another form: mdh, poe, urdf."),
-    "servo": ("armcal.cli.servo:servo", "Which pulse makes which angle: servo tables, by tracker or by eye."),
-    "acquire": ("armcal.cli.acquire:acquire_command", "Drive a plan with servo board and tracker, and measure it."),
-    "rehearse": ("armcal.cli.rehearse:rehearse", "Do what acquire does, against a simulated bench."),
-    "record": ("armcal.cli.record:record_command", "Record postures of an arm that is guided by hand, judged at once."),
-    "simulated-bench": ("armcal.cli.simulated_bench:simulated_bench", "Stand in for a servo board, arm and tracker."),
     "simulate": ("armcal.cli.simulate:simulate", "Make measurements up from a stated truth."),
-    "recalibrate": ("armcal.cli.recalibrate:recalibrate", "Keep a calibration true, record by record, as they come."),
-    "control": ("armcal.cli.control:control", "Ask a running recalibration, or tell it what to do."),
-    "replay": ("armcal.cli.replay:replay_command", "Make every state of a recalibration again from its journal."),
-    "what-if": ("armcal.cli.what_if:what_if", "How much one more record would tell, by pose."),
-    "serve": ("armcal.cli.serve:serve", "Answer forward, compensate and status requests of other programs."),
-    "watch": ("armcal.cli.watch:watch", "Show a recalibration live, in the browser or the terminal."),
-    "mission": ("armcal.cli.mission:mission", "Simulate a mission, recalibrate over it, judge it by its truth."),
     "plugins": ("armcal.cli.plugins:plugins", "List plugins, or check one."),
     "doctor": ("armcal.cli.doctor:doctor", "What is installed, what works, and what is missing."),
 }
@@ -54,17 +42,22 @@ _GLOBAL = ("--plugin", "--disable-plugin")
 
 
 class LazyGroup(click.Group):
-    """A group that knows its commands by name and imports one only to run it."""
+    """A group that knows its commands by name and imports one only to run it; plugins add theirs."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        """In a fixed order."""
-        return list(COMMANDS)
+        """Our own in a fixed order, then those of plugins."""
+        return [*COMMANDS, *_plugin_commands()]
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        """Import a command."""
-        if cmd_name not in COMMANDS:
+        """Import a command.
+
+        Raises:
+            PluginError: two plugins offer it.
+        """
+        target, _ = COMMANDS.get(cmd_name) or _plugin_commands().get(cmd_name, ("", ""))
+        if not target:
             return None
-        module, _, attribute = COMMANDS[cmd_name][0].partition(":")
+        module, _, attribute = target.partition(":")
         try:
             command: click.Command = getattr(import_module(module), attribute)
         except ImportError as fault:
@@ -79,9 +72,11 @@ class LazyGroup(click.Group):
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
         """A name that is none is refused with the nearest that is."""
-        near = difflib.get_close_matches(args[0], COMMANDS, n=1, cutoff=0.6)
-        if args[0] not in COMMANDS and near and not args[0].startswith("-"):
-            ctx.fail(f"No such command {args[0]!r}. Did you mean {near[0]!r}?")
+        if args[0] not in COMMANDS and not args[0].startswith("-"):
+            known = self.list_commands(ctx)
+            near = difflib.get_close_matches(args[0], known, n=1, cutoff=0.6)
+            if args[0] not in known and near:
+                ctx.fail(f"No such command {args[0]!r}. Did you mean {near[0]!r}?")
         return super().resolve_command(ctx, args)
 
     def invoke(self, ctx: click.Context) -> object:
@@ -97,13 +92,28 @@ class LazyGroup(click.Group):
 
     def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
         """Names and summaries from the table: to import every command for them takes seconds."""
-        named = [CompletionItem(name, help=text) for name, (_, text) in COMMANDS.items() if name.startswith(incomplete)]
+        commands = {**COMMANDS, **_plugin_commands()}
+        named = [CompletionItem(name, help=text) for name, (_, text) in commands.items() if name.startswith(incomplete)]
         return [*named, *click.Command.shell_complete(self, ctx, incomplete)]
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Help from the table, without importing anything."""
-        with formatter.section("Commands"):
-            formatter.write_dl([(name, summary) for name, (_, summary) in COMMANDS.items()])
+        for title, commands in (("Commands", COMMANDS), ("Commands of plugins", _plugin_commands())):
+            if commands:
+                with formatter.section(title):
+                    formatter.write_dl([(name, summary) for name, (_, summary) in commands.items()])
+
+
+def _plugin_commands() -> dict[str, tuple[str, str]]:
+    """By name: where a plugin's command is, and what it does.
+
+    Raises:
+        PluginError: two plugins offer the same.
+    """
+    registry = discover()
+    names = dict.fromkeys(c.name for c in registry.components if c.kind == "command" and c.name not in COMMANDS)
+    found = [registry.find("command", name) for name in names]
+    return {command.name: (command.target, command.summary) for command in found}
 
 
 @click.command(cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})

@@ -16,12 +16,12 @@ from armcal.cli.common import Voice, overrides, speaking
 from armcal.config.selection import DIMENSION_OF_UNIT
 from armcal.errors import ConfigError
 from armcal.measure.csv_writer import write_csv
+from armcal.planning.criterion import GOALS
 from armcal.plugins import discover
 from armcal.run.experiment import Experiment
 from armcal.run.plan import PlanRequest, PlanResult, make_plan
 from armcal.run.plan_poses import told
 from armcal.run.plan_settings import PlanSettings
-from armcal.solve.criterion import GOALS
 
 _SHOWN = 8
 _FILE = click.Path(path_type=Path)

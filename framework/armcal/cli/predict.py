@@ -14,17 +14,17 @@ import numpy as np
 from armcal.base.config_text import ConfigText
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
-from armcal.base.plain_files import input_file
 from armcal.base.pose_settings import quaternion_of
 from armcal.base.units import DIMENSIONLESS, split_suffix, to_unit
+from armcal.calibration.calibration import Calibration
+from armcal.calibration.intervals import PlusMinus
 from armcal.cli.common import Voice, accept, speaking
 from armcal.errors import DataError, InputError, Location
+from armcal.io.plain_files import input_file
 from armcal.measure.csv_writer import column_names, write_csv
 from armcal.measure.environment import noticed
 from armcal.measure.reader import ReadRequest, WantedChannel, wanted_channels
 from armcal.plugins import PluginRegistry, discover
-from armcal.use.calibration import Calibration
-from armcal.use.intervals import PlusMinus
 
 _MOST_BYTES, _LONGEST_HEADER = 1 << 31, 1 << 20
 _RECORDINGS: Mapping[str, Literal["same", "new"]] = {"calibrated": "same", "new": "new"}

@@ -10,7 +10,7 @@ import click
 
 from armcal.base.units import from_unit, parse_quantity
 from armcal.errors import ConfigError
-from armcal.measure.cells import is_number
+from armcal.io.cells import is_number
 from armcal.scaffold.robot import (
     ASSUMED_TRAVEL,
     ASSUMED_TURN,

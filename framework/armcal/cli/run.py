@@ -11,14 +11,14 @@ from armcal.cli.common import Voice, command_line, overrides, parallel, speaking
 from armcal.cli.outlet import say
 from armcal.cli.tables import show_run
 from armcal.errors import EXIT_DO_NOT_USE, EXIT_NOT_CONVERGED
+from armcal.estimate.estimator import CHECK_THE_DATA
+from armcal.io.parallel import Executor
 from armcal.plugins import discover
 from armcal.report import render
 from armcal.run import outputs
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import Stopwatch, calibrate
 from armcal.run.result import RunResult
-from armcal.solve.estimator import CHECK_THE_DATA
-from armcal.solve.parallel import Executor
 
 
 @click.command()

@@ -7,10 +7,10 @@ from pathlib import Path
 import click
 
 from armcal.cli.common import Voice, overrides, speaking
+from armcal.estimate.simulation import SimulationRequest
 from armcal.measure.csv_writer import write_csv
 from armcal.plugins import discover
 from armcal.run.experiment import Experiment
-from armcal.solve.simulation import SimulationRequest
 
 
 @click.command()

@@ -9,16 +9,16 @@ import click
 from rich.table import Table
 
 from armcal.cli.common import Voice, command_line, overrides, parallel, speaking
+from armcal.io.folder import reserved
+from armcal.io.parallel import Executor
 from armcal.plugins import discover
 from armcal.report.study_page import conclusions, render_study, render_transfer, transfer_conclusions, transfer_table
 from armcal.run import study_outputs
-from armcal.run.folder import reserved
 from armcal.run.load_transfer import transfer
 from armcal.run.pipeline import Stopwatch
 from armcal.run.study import Study, compare
 from armcal.run.study_result import StudyResult, TransferResult
 from armcal.run.study_settings import LoadTransferSettings
-from armcal.solve.parallel import Executor
 
 
 @click.command()

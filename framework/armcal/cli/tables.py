@@ -11,13 +11,13 @@ from rich.text import Text
 
 from armcal.base.domains import Semidefinite, symmetric
 from armcal.cli.common import Voice
+from armcal.estimate.bootstrap import Bootstrap
+from armcal.estimate.estimator import Estimate
+from armcal.estimate.validation import ErrorSummary
 from armcal.report.group_table import part_of
 from armcal.report.numbers import MINUS, NONE, decimals_for, shown_unit, significant
 from armcal.report.tables import parameter_rows
 from armcal.run.result import RunResult
-from armcal.solve.bootstrap import Bootstrap
-from armcal.solve.estimator import Estimate
-from armcal.solve.validation import ErrorSummary
 
 _SETS = {"train": "training", "holdout": "held out", "cross_validated": "cross-validated"}
 _STYLES = {"bad": "bold red", "warning": "yellow", "note": "", "good": "green"}

@@ -1,1 +1,1 @@
-"""Fourth floor: from text to checked settings and built components."""
+"""From YAML to checked settings and built components."""

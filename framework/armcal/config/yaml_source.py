@@ -11,11 +11,11 @@ from typing import Any, NoReturn
 import yaml
 
 from armcal.base.config_text import ConfigText, resolve_path
-from armcal.base.plain_files import size_text
 from armcal.base.units import split_suffix
 from armcal.config.yaml_nodes import Node, Origin, Step, dotted, read_nodes
 from armcal.config.yaml_tree import entries_of, merge, override
 from armcal.errors import ConfigError, Location
+from armcal.io.plain_files import size_text
 
 __all__ = ["ConfigSource", "ConfigText", "find_key", "load_config", "resolve_path"]
 

@@ -43,7 +43,7 @@ def _evaluated(choice: Any) -> _Evaluated:
     import numpy as np
 
     from armcal.arm.assembly import Arm, MassSpec
-    from armcal.solve.problem import Problem
+    from armcal.problem.problem import Problem
     from armcal.testing import planar
 
     masses = (MassSpec("tip", 0.2, (0.0, 0.01, 0.0), "tool"),)
@@ -65,7 +65,7 @@ def _evaluated(choice: Any) -> _Evaluated:
 
 def _explain() -> None:
     """Compile a file of one line to hear what the compiler says."""
-    from armcal.solve import compiler
+    from armcal.problem import compiler
 
     with tempfile.TemporaryDirectory(prefix="armcal-doctor-") as place:
         (Path(place) / "one.c").write_text("int armcal_doctor(void) { return 0; }\n", encoding="utf-8")

@@ -138,12 +138,12 @@ def calibration() -> dict[str, Any]:
 
     The measured positions come from the cosine rule written here, not from armcal's kinematics.
     """
+    from armcal.calibration.calibration import Calibration
     from armcal.plugins import discover
     from armcal.report import render
     from armcal.run import outputs
     from armcal.run.experiment import Experiment
     from armcal.run.pipeline import calibrate
-    from armcal.use.calibration import Calibration
 
     with tempfile.TemporaryDirectory(prefix="armcal-doctor-") as text:
         place = Path(text)

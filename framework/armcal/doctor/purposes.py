@@ -33,6 +33,9 @@ LIBRARIES: Mapping[str, Purpose] = MappingProxyType(
         "matplotlib": Purpose("matplotlib.figure", "no figure of a mission"),
         "pyserial": Purpose("serial", "no servo board on a serial port"),
         "filterpy": Purpose("filterpy.kalman", "armcal recalibrate cannot use its Kalman filters"),
+        "typing-extensions": Purpose(
+            "typing_extensions", "no application of armcal runs, and some devices do not", needed=True
+        ),
         "joblib": Purpose("joblib", "folds, starts and studies run in one process only"),
     }
 )

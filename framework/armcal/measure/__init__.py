@@ -1,1 +1,1 @@
-"""Second floor: what a record measures, and how records are read."""
+"""Measurements, groups and readers: what one record constrains, and how records are read."""

@@ -12,7 +12,7 @@ from typing import NoReturn
 
 from armcal.base.units import DIMENSIONLESS, UNITS, units_of
 from armcal.errors import DataError, Location
-from armcal.measure.cells import is_number
+from armcal.io.cells import is_number
 from armcal.measure.checks import refuse_joint_count
 from armcal.measure.reader import ID_NAMES, WantedChannel
 

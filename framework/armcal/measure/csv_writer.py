@@ -14,9 +14,9 @@ from typing import TextIO
 
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
-from armcal.base.plain_files import check_output
 from armcal.base.units import DIMENSIONLESS, display_unit, to_unit, units_of
 from armcal.errors import DataError, Location
+from armcal.io.plain_files import check_output
 from armcal.measure.reader import WantedChannel
 
 ID_COLUMN = "pose_id"

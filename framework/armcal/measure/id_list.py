@@ -5,8 +5,8 @@ from __future__ import annotations
 import csv
 from pathlib import Path
 
-from armcal.base.plain_files import input_bytes
 from armcal.errors import DataError, Location
+from armcal.io.plain_files import input_bytes
 
 MAX_BYTES = 1 << 26
 

@@ -6,11 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armcal.base.domains import Array
+from armcal.estimate.validation import FEWEST_FOR_P95
 from armcal.report import svg
 from armcal.report.numbers import count, plural, significant
 from armcal.report.svg import Axis, Box, Figure
 from armcal.run.result import RunResult
-from armcal.solve.validation import FEWEST_FOR_P95
 
 PLAIN_POINTS = 3000
 """More records than this are drawn as bands, not one by one."""

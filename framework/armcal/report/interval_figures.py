@@ -8,15 +8,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from armcal.base.domains import Array
+from armcal.diagnose.coverage import Coverage
+from armcal.estimate.prediction import LEVELS
+from armcal.estimate.profile import Profile
 from armcal.report import svg
 from armcal.report.error_figures import roles
 from armcal.report.numbers import NONE, count, fixed, plural, shown_unit, significant
 from armcal.report.svg import Axis, Box, Figure
 from armcal.run.intervals import IntervalResult
 from armcal.run.result import RunResult
-from armcal.solve.coverage import Coverage
-from armcal.solve.prediction import LEVELS
-from armcal.solve.profile import Profile
 
 _DIAMOND = "m-3.6 0l3.6-3.6l3.6 3.6l-3.6 3.6z"
 _RECORDINGS = {"same": "calibrated recording", "new": "new recording"}

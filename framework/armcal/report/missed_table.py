@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from armcal.diagnose.misses import Misses
 from armcal.report.numbers import NONE, fixed
-from armcal.solve.misses import Misses
 
 
 @dataclass(frozen=True)

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from armcal.estimate.variance import Component
 from armcal.report.numbers import NONE, fixed
 from armcal.run.noise import NoiseResult
-from armcal.solve.variance import Component
 
 _MM = 1000.0
 

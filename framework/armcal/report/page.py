@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 
 from armcal.base.domains import Array
+from armcal.estimate.estimator import Estimate
+from armcal.estimate.identifiability import CORRELATED, POOR_CONDITION, bound_together, correlated_pairs, correlations
 from armcal.report import error_figures, interval_figures, parameter_figures, workspace
 from armcal.report.group_table import group_rows
 from armcal.report.missed_table import missed_records
@@ -26,8 +28,6 @@ from armcal.report.tables import (
     worst_rows,
 )
 from armcal.run.result import RunResult
-from armcal.solve.estimator import Estimate
-from armcal.solve.identifiability import CORRELATED, POOR_CONDITION, bound_together, correlated_pairs, correlations
 from armcal.version import __version__
 
 MOST_LISTED = 50

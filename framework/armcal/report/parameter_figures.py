@@ -8,11 +8,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from armcal.base.domains import Array
+from armcal.estimate.identifiability import Identifiability
 from armcal.report import svg
 from armcal.report.numbers import fixed, plural, significant
 from armcal.report.svg import MONO, Axis, Box, Figure
 from armcal.report.tables import ParameterRow
-from armcal.solve.identifiability import Identifiability
 
 MOST_WHISKERS = 40
 MOST_MAPPED = 40

@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from armcal.estimate.estimator import Estimate, Interval95
+from armcal.estimate.validation import ErrorSummary
 from armcal.report.numbers import (
     MINUS,
     NONE,
@@ -21,8 +23,6 @@ from armcal.report.numbers import (
     shown_unit,
 )
 from armcal.run.result import RunResult
-from armcal.solve.estimator import Estimate, Interval95
-from armcal.solve.validation import ErrorSummary
 
 _SETS = (("train", "Train"), ("holdout", "Holdout"), ("cross_validated", "Cross-validated"))
 _STATISTICS = ("mean", "rms", "p95", "max")

@@ -1,1 +1,1 @@
-"""Sixth floor: from a configuration to a finished run."""
+"""One call: load, check, fit, validate, judge, write; studies, plans and compensation of files."""

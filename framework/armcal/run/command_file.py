@@ -15,12 +15,12 @@ from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.base.pose_settings import quaternion_of
 from armcal.base.units import UNITS
+from armcal.calibration.compensation.compensator import Compensator
+from armcal.calibration.compensation.request import Targets
+from armcal.calibration.tool_expression import APPROACH
 from armcal.measure.csv_writer import write_csv
 from armcal.measure.reader import WantedChannel, wanted_channels
 from armcal.run.compensate import Assessed, commanded
-from armcal.use.compensation.compensator import Compensator
-from armcal.use.compensation.request import Targets
-from armcal.use.tool_expression import APPROACH
 
 _ENGLISH = {False: "no", True: "yes"}
 

@@ -12,16 +12,16 @@ import numpy as np
 from armcal.arm.loading import LOAD_CHANNELS
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
+from armcal.calibration.calibration import Calibration, arm_named
+from armcal.calibration.compensation.compensator import Compensator
+from armcal.calibration.compensation.request import Commands, Options, Redundancy, Targets
+from armcal.calibration.measured_point import MeasuredPoint, Point, measured_point, pointed
+from armcal.calibration.tool_expression import APPROACH, arm_expression
 from armcal.errors import ArmcalError, ConfigError
 from armcal.plugins import PluginRegistry
+from armcal.problem.kernel import EvaluatorChoice
 from armcal.run.target_file import TargetFile, read_targets
 from armcal.run.workspace import Workspace, workspace_of
-from armcal.solve.kernel import EvaluatorChoice
-from armcal.use.calibration import Calibration, arm_named
-from armcal.use.compensation.compensator import Compensator
-from armcal.use.compensation.request import Commands, Options, Redundancy, Targets
-from armcal.use.measured_point import MeasuredPoint, Point, measured_point, pointed
-from armcal.use.tool_expression import APPROACH, arm_expression
 
 _WORTH_COMPILING = 5000
 """From this many targets on, waiting for the compiler costs less than doing without it."""

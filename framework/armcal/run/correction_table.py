@@ -19,15 +19,15 @@ from scipy.spatial.transform import Rotation
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.base.settings import Angle3, Length3, Mass, Settings
+from armcal.calibration.compensation.compensator import Compensator
+from armcal.calibration.compensation.grid import over_grid
+from armcal.calibration.compensation.request import FARTHEST_M, Mask, Targets
+from armcal.calibration.compensation.turning import turn_between
 from armcal.config.validate import validate
 from armcal.config.yaml_source import load_config
 from armcal.errors import ConfigError, Location, ProblemError
 from armcal.measure.csv_writer import write_csv
 from armcal.measure.reader import WantedChannel
-from armcal.use.compensation.compensator import Compensator
-from armcal.use.compensation.grid import over_grid
-from armcal.use.compensation.request import FARTHEST_M, Mask, Targets
-from armcal.use.compensation.turning import turn_between
 
 _MOST_NODES = 200_000
 

@@ -19,6 +19,9 @@ from armcal.config.system import System, build_component, build_system
 from armcal.config.validate import validate
 from armcal.config.yaml_source import ConfigSource, load_config
 from armcal.errors import ConfigError
+from armcal.estimate.estimator import Estimator
+from armcal.estimate.simulation import Simulator
+from armcal.estimate.weighing import weighed
 from armcal.measure.environment import noticed, require_conditions
 from armcal.measure.groups import grouped_instances, groups_of, unmatched
 from armcal.measure.limits import warn_beyond_limits
@@ -26,9 +29,6 @@ from armcal.measure.poses import pose_numbers
 from armcal.measure.reader import Reader, ReadRequest, wanted_channels
 from armcal.plugins import PluginRegistry, discover
 from armcal.run.settings import ExperimentSettings
-from armcal.solve.estimator import Estimator
-from armcal.solve.simulation import Simulator
-from armcal.solve.weighing import weighed
 
 STANDARD_GRAVITY = {"earth": 9.80665, "moon": 1.62, "mars": 3.71}
 """m/s^2; [Williams2024]"""

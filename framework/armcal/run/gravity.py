@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from armcal.base.dataset import Dataset
 from armcal.config.system import System
-from armcal.solve.noise_findings import Finding
+from armcal.diagnose.noise_findings import Finding
 
 
 def gravity_findings(system: System, dataset: Dataset) -> list[Finding]:

@@ -10,12 +10,12 @@ import numpy as np
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.errors import ConfigError
+from armcal.estimate.nuisance import settled, untrained
+from armcal.estimate.validation import Split
 from armcal.measure.groups import Groups
 from armcal.measure.measurement import GroupedMeasurement
+from armcal.problem.problem import FactorRecords, Problem
 from armcal.run.experiment import Experiment
-from armcal.solve.nuisance import settled, untrained
-from armcal.solve.problem import FactorRecords, Problem
-from armcal.solve.validation import Split
 
 _MM = 1000.0
 

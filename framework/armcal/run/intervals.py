@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from armcal.solve.coverage import (
+from armcal.diagnose.coverage import (
     Coverage,
     PredictedFit,
     Recording,
@@ -24,12 +24,12 @@ from armcal.solve.coverage import (
     told,
     whitened_like,
 )
-from armcal.solve.estimator import Estimator
-from armcal.solve.noise_findings import Finding
-from armcal.solve.prediction import LEVELS, STATED, Predictor, Spread, is_position
-from armcal.solve.problem import FactorRecords, Problem
-from armcal.solve.validation import CrossValidation, Indices, Split
-from armcal.solve.weighing import WeighedFit
+from armcal.diagnose.noise_findings import Finding
+from armcal.estimate.estimator import Estimator
+from armcal.estimate.prediction import LEVELS, STATED, Predictor, Spread, is_position
+from armcal.estimate.validation import CrossValidation, Indices, Split
+from armcal.estimate.weighing import WeighedFit
+from armcal.problem.problem import FactorRecords, Problem
 
 _MM = 1000.0
 _NAMED: Mapping[Recording, str] = {"same": "same_recording", "new": "new_recording"}

@@ -11,27 +11,27 @@ import numpy as np
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.config.system import System
+from armcal.diagnose.evidence import Evidence, priors_alone, unseen_poses
+from armcal.diagnose.evidence_findings import worse_than_nominal
+from armcal.diagnose.fit_rows import FitRows
+from armcal.diagnose.gross import MOST_RECORDS, figure_of, scale_deviation, thinned
+from armcal.diagnose.gross_findings import contradicting, displaced_told, gross_error, limits_told, size_told
+from armcal.diagnose.leftover import leftover
+from armcal.diagnose.majority import minority
+from armcal.diagnose.misses import Judged, misses
+from armcal.diagnose.moved import Moved, moved_findings, moved_groups
+from armcal.diagnose.noise_findings import Finding
+from armcal.diagnose.outside import predicted_positions
+from armcal.diagnose.verdict import Verdict, judge
+from armcal.estimate.validation import Split, error_unit
+from armcal.estimate.weighing import WeighedFit
+from armcal.planning.suggestion import suggest
+from armcal.problem.drift import residuals
+from armcal.problem.motion import Motion, recorded_position
+from armcal.problem.problem import FactorRecords, Problem
 from armcal.run.gravity import gravity_findings
 from armcal.run.intervals import IntervalResult
 from armcal.run.result import RecordErrors
-from armcal.solve.drift import residuals
-from armcal.solve.evidence import Evidence, priors_alone, unseen_poses
-from armcal.solve.evidence_findings import worse_than_nominal
-from armcal.solve.fit_rows import FitRows
-from armcal.solve.gross import MOST_RECORDS, figure_of, scale_deviation, thinned
-from armcal.solve.gross_findings import contradicting, displaced_told, gross_error, limits_told, size_told
-from armcal.solve.leftover import leftover
-from armcal.solve.majority import minority
-from armcal.solve.misses import Judged, misses
-from armcal.solve.motion import Motion, recorded_position
-from armcal.solve.moved import Moved, moved_findings, moved_groups
-from armcal.solve.noise_findings import Finding
-from armcal.solve.outside import predicted_positions
-from armcal.solve.problem import FactorRecords, Problem
-from armcal.solve.suggestion import suggest
-from armcal.solve.validation import Split, error_unit
-from armcal.solve.verdict import Verdict, judge
-from armcal.solve.weighing import WeighedFit
 
 _MM = 1000.0
 _AT_REST = ", as in a new recording (its drift not known)"

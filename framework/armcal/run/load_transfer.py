@@ -12,18 +12,9 @@ from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.config.yaml_source import ConfigSource
 from armcal.errors import ConfigError, DataError, Location
-from armcal.run.experiment import Experiment
-from armcal.run.pipeline import Stopwatch
-from armcal.run.provenance import provenance
-from armcal.run.study import Study, Trainable, compiled, interpreted_first, naming
-from armcal.run.study_result import TransferCell, TransferResult
-from armcal.run.study_settings import LoadTransferSettings
-from armcal.solve.drift import with_drift
-from armcal.solve.estimator import Progress, no_progress, require_solvable
-from armcal.solve.parallel import Executor
-from armcal.solve.problem import Problem
-from armcal.solve.simulation import SimulationRequest, with_channels
-from armcal.solve.validation import (
+from armcal.estimate.estimator import Progress, no_progress, require_solvable
+from armcal.estimate.simulation import SimulationRequest, with_channels
+from armcal.estimate.validation import (
     FitTask,
     Indices,
     JudgedFit,
@@ -34,6 +25,15 @@ from armcal.solve.validation import (
     record_errors,
     summarise,
 )
+from armcal.io.parallel import Executor
+from armcal.problem.drift import with_drift
+from armcal.problem.problem import Problem
+from armcal.run.experiment import Experiment
+from armcal.run.pipeline import Stopwatch
+from armcal.run.provenance import provenance
+from armcal.run.study import Study, Trainable, compiled, interpreted_first, naming
+from armcal.run.study_result import TransferCell, TransferResult
+from armcal.run.study_settings import LoadTransferSettings
 
 _MM = 1000.0
 _GRAMS = 1000.0

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from armcal.base.dataset import Dataset
+from armcal.diagnose.mixups import find_mixup
 from armcal.errors import DataError, Location
-from armcal.solve.mixups import find_mixup
-from armcal.solve.problem import FactorRecords, Problem
+from armcal.problem.problem import FactorRecords, Problem
 
 _MEND = {
     True: "the order or the directions of the joints in the model",

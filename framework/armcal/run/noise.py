@@ -10,11 +10,11 @@ import numpy as np
 
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
-from armcal.solve.problem import Problem
-from armcal.solve.scatter import Scatter, scatter_of
-from armcal.solve.validation import Split
-from armcal.solve.variance import VarianceComponents
-from armcal.solve.weighing import WeighedFit
+from armcal.estimate.scatter import Scatter, scatter_of
+from armcal.estimate.validation import Split
+from armcal.estimate.variance import VarianceComponents
+from armcal.estimate.weighing import WeighedFit
+from armcal.problem.problem import Problem
 
 
 @dataclass(frozen=True)

@@ -17,20 +17,27 @@ import numpy as np
 
 from armcal.base.config_text import as_json, finite
 from armcal.base.shown import shown
+from armcal.calibration.calibration import Calibration
+from armcal.calibration.calibration_file import (
+    SCHEMA,
+    CalibrationFile,
+    InformationRecord,
+    dump,
+    parameter_records,
+    sealed,
+)
+from armcal.calibration.physics import check_poses
 from armcal.config.yaml_source import ConfigSource
 from armcal.errors import ArmcalError, CalibrationWarning, NotConvergedError
+from armcal.estimate.bootstrap import Bootstrap
+from armcal.estimate.profile import Profile
+from armcal.estimate.validation import in_unit
+from armcal.io import folder as folders
 from armcal.measure.reader import surroundings
 from armcal.plugins import PluginRegistry
-from armcal.run import folder as folders
 from armcal.run.experiment import Experiment
 from armcal.run.groups import GroupError
 from armcal.run.result import RunResult
-from armcal.solve.bootstrap import Bootstrap
-from armcal.solve.profile import Profile
-from armcal.solve.validation import in_unit
-from armcal.use.calibration import Calibration
-from armcal.use.calibration_file import SCHEMA, CalibrationFile, InformationRecord, dump, parameter_records, sealed
-from armcal.use.physics import check_poses
 
 FILES = ("experiment.yaml", "residuals.csv", "metrics.json", "report.html", "log.txt", "calibration.yaml")
 """In the order in which they are put in place: the calibration last."""

@@ -11,32 +11,18 @@ import numpy as np
 
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
+from armcal.calibration.intervals import PredictionRecord, covariance_rows, recording_record, stretch_records
+from armcal.diagnose.clustered import widened
+from armcal.diagnose.coverage import fit_and_predict
+from armcal.diagnose.evidence import Evidence
+from armcal.diagnose.verdict import Verdict
 from armcal.errors import ConfigError, NotConvergedError, ProblemError
-from armcal.measure.id_list import read_ids
-from armcal.plugins import PluginRegistry
-from armcal.run.experiment import Experiment
-from armcal.run.groups import RunGroups, group_errors, labels_of
-from armcal.run.intervals import IntervalResult, interval_result
-from armcal.run.judging import FittedRecords, verdict_of
-from armcal.run.mixup import check_mixups
-from armcal.run.noise import noise_result
-from armcal.run.provenance import provenance
-from armcal.run.reach import check_reach
-from armcal.run.result import ErrorTable, RecordErrors, RunResult
-from armcal.solve.bootstrap import Bootstrap, bootstrap
-from armcal.solve.clustered import widened
-from armcal.solve.coverage import fit_and_predict
-from armcal.solve.drift import residuals, with_drift
-from armcal.solve.estimator import Progress, gave_up, no_progress, require_solvable, spread
-from armcal.solve.evidence import Evidence
-from armcal.solve.joint_noise import with_joint_noise
-from armcal.solve.motion import recorded_position
-from armcal.solve.nuisance import restricted, settled, started, untrained
-from armcal.solve.parallel import Executor
-from armcal.solve.problem import FactorRecords, Problem
-from armcal.solve.profile import Profile, profiled, profiles
-from armcal.solve.screening import hopeless
-from armcal.solve.validation import (
+from armcal.estimate.bootstrap import Bootstrap, bootstrap
+from armcal.estimate.estimator import Progress, gave_up, no_progress, require_solvable, spread
+from armcal.estimate.nuisance import restricted, settled, started, untrained
+from armcal.estimate.profile import Profile, profiled, profiles
+from armcal.estimate.screening import hopeless
+from armcal.estimate.validation import (
     CrossValidation,
     ErrorSummary,
     Split,
@@ -49,9 +35,23 @@ from armcal.solve.validation import (
     split_by_label,
     summarise,
 )
-from armcal.solve.verdict import Verdict
-from armcal.solve.weighing import WeighedFit, fit, plain_fit
-from armcal.use.intervals import PredictionRecord, covariance_rows, recording_record, stretch_records
+from armcal.estimate.weighing import WeighedFit, fit, plain_fit
+from armcal.io.parallel import Executor
+from armcal.measure.id_list import read_ids
+from armcal.plugins import PluginRegistry
+from armcal.problem.drift import residuals, with_drift
+from armcal.problem.joint_noise import with_joint_noise
+from armcal.problem.motion import recorded_position
+from armcal.problem.problem import FactorRecords, Problem
+from armcal.run.experiment import Experiment
+from armcal.run.groups import RunGroups, group_errors, labels_of
+from armcal.run.intervals import IntervalResult, interval_result
+from armcal.run.judging import FittedRecords, verdict_of
+from armcal.run.mixup import check_mixups
+from armcal.run.noise import noise_result
+from armcal.run.provenance import provenance
+from armcal.run.reach import check_reach
+from armcal.run.result import ErrorTable, RecordErrors, RunResult
 
 _MM = 1000.0
 """Thousandths of m; of rad where errors are angles."""

@@ -11,21 +11,21 @@ from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.base.parameters import Parameters
 from armcal.errors import ProblemError
+from armcal.estimate.estimator import Progress, no_progress
+from armcal.estimate.identifiability import Identifiability, analyse, measures_of
+from armcal.planning.bound import bounded
+from armcal.planning.candidates import Candidates, Indices, deviations, over_draws
+from armcal.planning.criterion import criterion
+from armcal.planning.observability import Observability, observability
+from armcal.planning.planning import Plan, choose, value_of
+from armcal.planning.refinement import Allowed, refine
+from armcal.planning.relaxation import Relaxation, Task
 from armcal.run.experiment import Experiment
 from armcal.run.plan_clearance import clearance_check
 from armcal.run.plan_ground import Ground, as_if_measured, draws_of, ground_of, parameters_of, problem_of
 from armcal.run.plan_poses import JointSpace, Pool, dataset_of, given_records, pool_of, same_poses, told
 from armcal.run.plan_settings import PlanSettings
 from armcal.run.plan_visit import visit
-from armcal.solve.bound import bounded
-from armcal.solve.candidates import Candidates, Indices, deviations, over_draws
-from armcal.solve.criterion import criterion
-from armcal.solve.estimator import Progress, no_progress
-from armcal.solve.identifiability import Identifiability, analyse, measures_of
-from armcal.solve.observability import Observability, observability
-from armcal.solve.planning import Plan, choose, value_of
-from armcal.solve.refinement import Allowed, refine
-from armcal.solve.relaxation import Relaxation, Task
 
 _MORE = "Plan more poses, give the records that are there already (--given), or give priors."
 

@@ -10,15 +10,15 @@ import numpy as np
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.base.parameters import Parameters
+from armcal.calibration.calibration import Calibration
 from armcal.errors import ConfigError, ProblemError
+from armcal.estimate.simulation import with_channels
 from armcal.measure.groups import grouped_instances
+from armcal.planning.candidates import over_draws, parameter_draws
+from armcal.problem.problem import Problem, triangular
 from armcal.run.experiment import Experiment
 from armcal.run.plan_poses import JointSpace
 from armcal.run.plan_settings import PlanSettings, RobustSettings
-from armcal.solve.candidates import over_draws, parameter_draws
-from armcal.solve.problem import Problem, triangular
-from armcal.solve.simulation import with_channels
-from armcal.use.calibration import Calibration
 
 
 @dataclass(frozen=True)

@@ -12,9 +12,9 @@ import numpy as np
 from armcal.arm.clearance import ClearanceCheck, Mask
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
-from armcal.base.plain_files import input_file
 from armcal.config.system import build_component
 from armcal.errors import ConfigError, DataError, Location, ProblemError
+from armcal.io.plain_files import input_file
 from armcal.measure.id_list import MAX_BYTES, read_ids
 from armcal.measure.reader import Reader
 from armcal.run.experiment import Experiment, with_data

@@ -7,8 +7,8 @@ from typing import Annotated, Literal, TypeAlias
 from pydantic import Field, model_validator
 
 from armcal.base.settings import Angle, InputPath, Length, Length3, Settings
-from armcal.solve.bound import BoundSolver
-from armcal.solve.criterion import Goal
+from armcal.planning.bound import BoundSolver
+from armcal.planning.criterion import Goal
 
 Levels: TypeAlias = dict[str, Annotated[tuple[Angle, ...], Field(min_length=1)]]
 Travel: TypeAlias = dict[str, Annotated[tuple[Length, ...], Field(min_length=1)]]

@@ -10,9 +10,9 @@ import numpy as np
 from armcal.arm.holding import holding_efforts
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
+from armcal.planning.candidates import Indices
 from armcal.run.plan_ground import Ground
 from armcal.run.visit import cool_order, heat, path_time, peak, quick_order, travel_times
-from armcal.solve.candidates import Indices
 
 _SPEEDS = {"angle": np.deg2rad(60.0), "length": 0.05}
 

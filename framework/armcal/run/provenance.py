@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from armcal.base.dataset import Dataset
+from armcal.calibration.calibration_file import identity_of
 from armcal.run.experiment import Experiment
-from armcal.use.calibration_file import identity_of
 
 
 def provenance(experiment: Experiment, dataset: Dataset) -> dict[str, Any]:

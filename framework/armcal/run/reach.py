@@ -9,7 +9,7 @@ import numpy as np
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.errors import DataError, Location
-from armcal.solve.problem import FactorRecords, Problem
+from armcal.problem.problem import FactorRecords, Problem
 
 _REACH_RATIO = 10.0
 _ALIKE = 0.35

@@ -7,16 +7,16 @@ from typing import Any
 
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
+from armcal.calibration.intervals import PredictionRecord
+from armcal.diagnose.evidence import Evidence
+from armcal.diagnose.verdict import Verdict
+from armcal.estimate.bootstrap import Bootstrap
+from armcal.estimate.estimator import Estimate
+from armcal.estimate.profile import Profile
+from armcal.estimate.validation import ErrorSummary, Indices, Split
 from armcal.run.groups import RunGroups
 from armcal.run.intervals import IntervalResult
 from armcal.run.noise import NoiseResult
-from armcal.solve.bootstrap import Bootstrap
-from armcal.solve.estimator import Estimate
-from armcal.solve.evidence import Evidence
-from armcal.solve.profile import Profile
-from armcal.solve.validation import ErrorSummary, Indices, Split
-from armcal.solve.verdict import Verdict
-from armcal.use.intervals import PredictionRecord
 
 
 @dataclass(frozen=True)

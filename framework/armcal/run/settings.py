@@ -9,9 +9,9 @@ from pydantic import Field, model_validator
 from armcal.base.settings import InputPath, Length, Settings
 from armcal.config.selection import ParameterSettings
 from armcal.config.system import StaticsSettings
+from armcal.estimate.bootstrap import BootstrapSettings
+from armcal.estimate.weighing import NoiseSettings
 from armcal.run.plan_settings import PlanSettings
-from armcal.solve.bootstrap import BootstrapSettings
-from armcal.solve.weighing import NoiseSettings
 
 
 class ValidationSettings(Settings):

@@ -12,19 +12,10 @@ import numpy as np
 
 from armcal.config.variants import load_variants
 from armcal.config.yaml_source import ConfigSource
+from armcal.diagnose.comparison import change, simplest_good
 from armcal.errors import InputError, NotConvergedError, ProblemError
-from armcal.plugins import PluginRegistry, discover
-from armcal.run.experiment import Experiment
-from armcal.run.pipeline import Prepared, Stopwatch, prepare
-from armcal.run.provenance import provenance
-from armcal.run.settings import ExperimentSettings, ValidationSettings
-from armcal.run.study_result import NestedResult, StudyResult, VariantResult
-from armcal.run.study_settings import PREVIOUS, LoadTransferSettings, ModelStudySettings, study_settings
-from armcal.solve.comparison import change, simplest_good
-from armcal.solve.estimator import Progress, no_progress
-from armcal.solve.parallel import Executor
-from armcal.solve.problem import FactorRecords, Problem
-from armcal.solve.validation import (
+from armcal.estimate.estimator import Progress, no_progress
+from armcal.estimate.validation import (
     ErrorSummary,
     FitTask,
     Indices,
@@ -36,6 +27,15 @@ from armcal.solve.validation import (
     record_errors,
     summarise,
 )
+from armcal.io.parallel import Executor
+from armcal.plugins import PluginRegistry, discover
+from armcal.problem.problem import FactorRecords, Problem
+from armcal.run.experiment import Experiment
+from armcal.run.pipeline import Prepared, Stopwatch, prepare
+from armcal.run.provenance import provenance
+from armcal.run.settings import ExperimentSettings, ValidationSettings
+from armcal.run.study_result import NestedResult, StudyResult, VariantResult
+from armcal.run.study_settings import PREVIOUS, LoadTransferSettings, ModelStudySettings, study_settings
 
 R = TypeVar("R")
 K = TypeVar("K", ModelStudySettings, LoadTransferSettings)

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 
 from armcal.base.config_text import as_json
+from armcal.calibration.calibration_file import dump
 from armcal.config.variants import SECTION
 from armcal.run.study import Study
 from armcal.run.study_result import StudyResult, TransferResult
-from armcal.use.calibration_file import dump
 
 FILES = ("experiment.yaml", "study.csv", "study.json", "study.html")
 

@@ -7,8 +7,8 @@ from typing import Any
 
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
-from armcal.solve.comparison import Change
-from armcal.solve.validation import ErrorSummary, in_unit
+from armcal.diagnose.comparison import Change
+from armcal.estimate.validation import ErrorSummary, in_unit
 
 
 @dataclass(frozen=True)

@@ -14,13 +14,13 @@ from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.base.quaternions import rotation_matrix
 from armcal.base.units import DIMENSIONLESS, split_suffix
+from armcal.calibration.compensation.reach import Reach
+from armcal.calibration.compensation.request import FARTHEST_M, Targets
+from armcal.calibration.tool_expression import APPROACH, ToolExpression
 from armcal.errors import DataError, Location
 from armcal.measure.environment import noticed
 from armcal.measure.reader import ReadRequest, WantedChannel, surroundings
 from armcal.plugins import PluginRegistry
-from armcal.use.compensation.reach import Reach
-from armcal.use.compensation.request import FARTHEST_M, Targets
-from armcal.use.tool_expression import APPROACH, ToolExpression
 
 QUATERNION = ("qw", "qx", "qy", "qz")
 RPY = ("roll", "pitch", "yaw")

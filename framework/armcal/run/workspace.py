@@ -8,12 +8,12 @@ from pathlib import Path
 
 import numpy as np
 
+from armcal.calibration.compensation.finder import Allowed
 from armcal.errors import ConfigError, Location
 from armcal.plugins import PluginRegistry
 from armcal.run.experiment import Experiment
 from armcal.run.plan_clearance import clearance_check
 from armcal.run.plan_poses import JointSpace
-from armcal.use.compensation.finder import Allowed
 
 
 @dataclass(frozen=True)

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NoReturn
 
-from armcal.base.plain_files import input_bytes
 from armcal.base.units import Unit, display_unit, from_unit, split_suffix, units_of
 from armcal.errors import DataError, Location
-from armcal.measure.cells import CellFault, read_cell
+from armcal.io.cells import CellFault, read_cell
+from armcal.io.plain_files import input_bytes
 from armcal.scaffold.joint_names import check_joint_names
 from armcal.scaffold.robot import (
     ASSUMED_TRAVEL,

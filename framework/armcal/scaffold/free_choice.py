@@ -5,11 +5,11 @@ from __future__ import annotations
 import fnmatch
 from dataclasses import dataclass
 
+from armcal.diagnose.minimal import minimal_set
+from armcal.problem.projection import factor_at_zero
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import Stopwatch, assemble
 from armcal.scaffold.robot import Robot
-from armcal.solve.minimal import minimal_set
-from armcal.solve.projection import factor_at_zero
 
 MOST_UNCERTAIN = 0.5
 """In ordinary sizes: what the declared noise leaves less certain than this is held."""

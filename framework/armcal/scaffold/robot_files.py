@@ -14,6 +14,7 @@ import numpy as np
 from armcal.base.dataset import Dataset
 from armcal.base.units import display_unit, to_unit
 from armcal.errors import InputError
+from armcal.estimate.simulation import SimulationRequest, measured_without_noise
 from armcal.measure.csv_writer import write_csv
 from armcal.plugins import PluginRegistry
 from armcal.run.experiment import Experiment
@@ -22,7 +23,6 @@ from armcal.scaffold.folder import staged, write_texts
 from armcal.scaffold.free_choice import FreeChoice, choose_free
 from armcal.scaffold.rendering import number, rendered
 from armcal.scaffold.robot import Robot, RobotJoint
-from armcal.solve.simulation import SimulationRequest, measured_without_noise
 
 SIMULATED, RECORDS = "simulated.yaml", "simulated.csv"
 NOISE_MM, NOISE_SEED = 0.1, 4

@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 from pathlib import Path
 
+from armcal.estimate.estimator import Progress, no_progress
 from armcal.plugins import PluginRegistry
 from armcal.report import render
 from armcal.run import outputs
@@ -13,7 +14,6 @@ from armcal.run.experiment import Experiment
 from armcal.run.pipeline import Stopwatch, calibrate
 from armcal.run.result import RunResult
 from armcal.scaffold.robot_files import SIMULATED, RobotFolder
-from armcal.solve.estimator import Progress, no_progress
 
 RESULTS = "runs/simulated"
 MOST_ERROR = 1.5

@@ -9,12 +9,12 @@ from pydantic import ValidationError
 
 from armcal.arm.assembly import PLACEMENT, MassiveModel
 from armcal.arm.model import Joint
+from armcal.calibration.convert_check import nominal_values
+from armcal.calibration.rigid_chain import numeric_chain
 from armcal.errors import ConfigError, DataError, Location
 from armcal.plugins import PluginRegistry
 from armcal.scaffold.joint_names import check_joint_names
 from armcal.scaffold.robot import ASSUMED_TRAVEL, ASSUMED_TURN, FEWEST_JOINTS, MOST_JOINTS, Robot, RobotJoint
-from armcal.use.convert_check import nominal_values
-from armcal.use.rigid_chain import numeric_chain
 
 _MOST_TRAVEL_RAD = 3.2
 """A turning joint need not be measured over more than one turn."""

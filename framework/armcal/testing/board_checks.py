@@ -6,10 +6,10 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from armcal.bench.clock import RealClock
-from armcal.bench.device import JointDevice
-from armcal.bench.faults import DeviceError
-from armcal.bench.link import GuardedLink
+from armcal.devices.clock import RealClock
+from armcal.devices.device import JointDevice
+from armcal.devices.faults import DeviceError
+from armcal.devices.link import GuardedLink
 from armcal.errors import InputError
 from armcal.testing.memory_link import MemoryLink, NoLink
 from armcal.testing.results import ContractError, NotRun, Recorder, expect
@@ -139,11 +139,11 @@ def _refused(device: Any, angle: float) -> None:
         found = device.standing({JOINTS[0]: angle})
     except InputError:
         return
-    raise ContractError(f"found {found}, expected armcal.bench.faults.DeviceRefusedError")
+    raise ContractError(f"found {found}, expected armcal.devices.faults.DeviceRefusedError")
 
 
 def _callable(made: Any, name: str) -> None:
-    expect(callable(getattr(made, name, None)), f"found no {name}(), see armcal.bench")
+    expect(callable(getattr(made, name, None)), f"found no {name}(), see armcal_bench")
 
 
 def _lost(call: Callable[[], Any]) -> None:
@@ -153,9 +153,9 @@ def _lost(call: Callable[[], Any]) -> None:
         return
     except Exception as fault:
         raise ContractError(
-            f"found {type(fault).__name__} ({fault}), expected armcal.bench.faults.DeviceError"
+            f"found {type(fault).__name__} ({fault}), expected armcal.devices.faults.DeviceError"
         ) from fault
-    expect(False, "found no error, expected armcal.bench.faults.DeviceError")
+    expect(False, "found no error, expected armcal.devices.faults.DeviceError")
 
 
 def _stands(device: Any) -> None:

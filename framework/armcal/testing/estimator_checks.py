@@ -10,9 +10,9 @@ import numpy as np
 
 from armcal.base.domains import Array, Interval
 from armcal.base.parameters import Parameters
-from armcal.solve.estimator import Estimator, Solution
-from armcal.solve.problem import FactorRecords, Problem
-from armcal.solve.simulation import SimulationRequest, measured_without_noise
+from armcal.estimate.estimator import Estimator, Solution
+from armcal.estimate.simulation import SimulationRequest, measured_without_noise
+from armcal.problem.problem import FactorRecords, Problem
 from armcal.testing.planar import ARM, GRAVITY, NOISE_M, TRACKER, Tip, all_parameters, commands, dataset, planar_arms
 from armcal.testing.results import NotRun, Recorder, expect
 from armcal.testing.settings_checks import Subject

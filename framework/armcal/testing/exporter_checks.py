@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
+from armcal.calibration.exporter import Exported, ExportRequest
 from armcal.errors import InputError
 from armcal.testing.planar import ARM, planar_arms
 from armcal.testing.results import ContractError, NotRun, Recorder, expect
 from armcal.testing.settings_checks import Subject
-from armcal.use.exporter import Exported, ExportRequest
 
 
 def check_exporter(record: Recorder, subject: Subject) -> None:
@@ -37,7 +37,7 @@ def _written(exporter: Any, request: ExportRequest) -> Exported | str:
         return str(refusal)
     except Exception as fault:
         raise ContractError(f"found {type(fault).__name__} ({fault}), expected armcal.errors.InputError") from fault
-    expect(isinstance(found, Exported), f"found {type(found).__name__}, expected armcal.use.exporter.Exported")
+    expect(isinstance(found, Exported), f"found {type(found).__name__}, expected armcal.calibration.exporter.Exported")
     for name, content in {"content": found.content, **found.companions}.items():
         expect(isinstance(content, bytes), f"found {name} of type {type(content).__name__}, expected bytes")
     for name in found.companions:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from armcal.bench.clock import RealClock
-from armcal.bench.joint_stream import JointSample
+from armcal.devices.clock import RealClock
+from armcal.devices.joint_stream import JointSample
 from armcal.errors import InputError
 from armcal.testing.live_checks import check_counts, opens, survives_damage, within
 from armcal.testing.results import Recorder, expect

@@ -15,8 +15,8 @@ from armcal.base.se3 import Expression
 from armcal.base.units import units_of
 from armcal.measure.measurement import Channel, GroupedMeasurement, Measurement
 from armcal.measure.partners import OTHER
-from armcal.solve.factor import Factor, build_factor
-from armcal.solve.readings import readings_by_residual
+from armcal.problem.factor import Factor, build_factor
+from armcal.problem.readings import readings_by_residual
 from armcal.testing.expressions import (
     check_parameters,
     expect_all_used,

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from armcal.bench.clock import Clock
-from armcal.bench.faults import DeviceLostError
-from armcal.bench.link import LinkIdentity
+from armcal.devices.clock import Clock
+from armcal.devices.faults import DeviceLostError
+from armcal.devices.link import LinkIdentity
 
 _REGISTERS = 256
 

@@ -15,7 +15,7 @@ from armcal.arm.statics import MOUNT_FRAME, TOOL_FRAME, frame_names
 from armcal.base.domains import Array
 from armcal.base.parameters import ParameterBlock
 from armcal.base.se3 import Expression, Transform
-from armcal.solve.problem import Problem
+from armcal.problem.problem import Problem
 from armcal.testing.expressions import (
     check_parameters,
     entry_names,

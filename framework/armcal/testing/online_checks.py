@@ -10,7 +10,7 @@ import numpy as np
 
 from armcal.base.domains import Array
 from armcal.errors import ProblemError
-from armcal.solve.online import Gaussian, Linearised, OnlineEstimator, Update
+from armcal.estimate.online import Gaussian, Linearised, OnlineEstimator, Update
 from armcal.testing.results import ContractError, Recorder, expect
 from armcal.testing.settings_checks import Subject
 

@@ -10,9 +10,9 @@ import numpy as np
 from armcal.arm.assembly import Arm
 from armcal.base.dataset import Dataset
 from armcal.errors import InputError
+from armcal.estimate.simulation import SimulationRequest, Simulator
 from armcal.measure.measurement import Measurement
 from armcal.measure.reader import wanted_channels
-from armcal.solve.simulation import SimulationRequest, Simulator
 from armcal.testing.planar import ARM, GRAVITY, TRACKER, WALLS, Tip, Walls, all_parameters, planar_arms
 from armcal.testing.results import NotRun, Recorder, expect
 from armcal.testing.settings_checks import Subject

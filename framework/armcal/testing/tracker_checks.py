@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from armcal.bench.clock import RealClock
-from armcal.bench.tracker import TrackerFrame
+from armcal.devices.clock import RealClock
+from armcal.devices.tracker import TrackerFrame
 from armcal.errors import InputError
 from armcal.testing.live_checks import check_counts, opens, survives_damage, within
 from armcal.testing.results import Recorder, expect
@@ -40,7 +40,8 @@ def _frames(tracker: Any) -> None:
     expect(isinstance(found, list), f"found {type(found).__name__}, expected a list")
     for frame in found:
         expect(
-            isinstance(frame, TrackerFrame), f"found {type(frame).__name__}, expected armcal.bench.tracker.TrackerFrame"
+            isinstance(frame, TrackerFrame),
+            f"found {type(frame).__name__}, expected armcal.devices.tracker.TrackerFrame",
         )
 
 

@@ -15,8 +15,8 @@ from armcal.base.dataset import Dataset
 from armcal.base.domains import Interval, Semidefinite
 from armcal.base.parameters import ParameterBlock, scalar
 from armcal.base.settings import Length, Settings
+from armcal.estimate.estimator import Solution, SolverVerdict
 from armcal.measure.measurement import Channel
-from armcal.solve.estimator import Solution, SolverVerdict
 from pydantic import ConfigDict, Field
 
 

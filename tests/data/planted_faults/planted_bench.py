@@ -13,10 +13,10 @@ from typing import Any, ClassVar
 
 import numpy as np
 from armcal.base.settings import InputPath, Settings
-from armcal.bench.device import DeviceIdentity, DeviceState
-from armcal.bench.faults import DeviceError, DeviceLostError, DeviceRefusedError
-from armcal.bench.joint_stream import JointSample
-from armcal.bench.tracker import TrackerFrame
+from armcal.devices.device import DeviceIdentity, DeviceState
+from armcal.devices.faults import DeviceError, DeviceLostError, DeviceRefusedError
+from armcal.devices.joint_stream import JointSample
+from armcal.devices.tracker import TrackerFrame
 
 _BOARD, _LIMIT = 0x20, 3.0
 

@@ -12,11 +12,11 @@ import numpy as np
 from armcal.base.dataset import Dataset
 from armcal.base.settings import InputPath, Settings
 from armcal.base.units import from_unit, split_suffix
+from armcal.calibration.exporter import Exported
 from armcal.errors import ConfigError, DataError, Location
-from armcal.solve.estimator import Solution, SolverVerdict, no_progress
-from armcal.solve.online import Gaussian, Update, absorbed, checked
-from armcal.solve.posed import PosedProblem
-from armcal.use.exporter import Exported
+from armcal.estimate.estimator import Solution, SolverVerdict, no_progress
+from armcal.estimate.online import Gaussian, Update, absorbed, checked
+from armcal.problem.posed import PosedProblem
 
 COUNTER = itertools.count()
 

@@ -1,0 +1,1 @@
+"""What a run leaves behind: load, predict, intervals, compensate, convert, export."""

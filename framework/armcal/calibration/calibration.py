@@ -1,0 +1,393 @@
+"""A calibration as a file: everything needed to use it, check it and go on from it."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from armcal.base.config_text import plain
+from armcal.base.dataset import Dataset
+from armcal.base.domains import Array
+from armcal.base.parameters import Parameters
+from armcal.calibration.calibration_file import CalibrationFile, identity_of, lost_calibration, read_record
+from armcal.calibration.compensation.compensator import Compensator
+from armcal.calibration.compensation.request import Commands, Options
+from armcal.calibration.intervals import PlusMinus, Uncertainty
+from armcal.calibration.measured_point import Point, pointed
+from armcal.calibration.physics import (
+    SHARE,
+    UNSTATED_M,
+    ComponentRecord,
+    absent,
+    check_record,
+    components,
+    differences,
+    movement,
+    predict,
+    readable,
+)
+from armcal.calibration.tool_expression import ToolExpression, arm_expression
+from armcal.config.system import System, build_system
+from armcal.config.validate import validate
+from armcal.config.yaml_source import ConfigSource
+from armcal.diagnose.coverage import Recording
+from armcal.errors import ArmcalError, CalibrationWarning, ConfigError, DataError, Location, PluginError
+from armcal.estimate.variance import Component
+from armcal.measure.measurement import Measurement
+from armcal.plugins import PluginRegistry, discover
+
+_OTHER_PHYSICS = (
+    "Install the versions that it names, or run the calibration again; to use its values with today's physics in "
+    "spite of that: armcal calibration accept FILE."
+)
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """A calibrated arm.
+
+    Attributes:
+        system: arms, measurements and statics.
+        parameters: all blocks; their nominal values are the calibrated ones.
+        record: the file's content.
+    """
+
+    system: System
+    parameters: Parameters
+    record: CalibrationFile
+
+    @classmethod
+    def load(cls, path: str | Path, registry: PluginRegistry | None = None, accept: bool = False) -> Calibration:
+        """Read a calibration; a ``CalibrationWarning`` for what its user should know of it.
+
+        ``accept``: even one whose recalibration found that it no longer holds.
+
+        Raises:
+            ConfigError: not a calibration, of another schema, damaged, changed since it was written, lost, of a bad
+                verdict that nobody accepted, or made with other physics than that of the plugins that are there now.
+            PluginError: it needs a plugin that is not there.
+        """
+        registry = registry or discover()
+        loaded = cls.built(read_record(path)[0], path, registry)
+        if loaded.record.level == "lost" and not accept:
+            raise lost_calibration(loaded.record, path)
+        for notice in loaded.notices(path, registry):
+            warnings.warn(f"the calibration {notice}", CalibrationWarning, stacklevel=2)
+        return loaded
+
+    @classmethod
+    def built(cls, source: ConfigSource, path: str | Path, registry: PluginRegistry) -> Calibration:
+        """The calibration in a file that was read, whatever its predictions were when it was written.
+
+        Raises:
+            ConfigError: its parts do not fit one another.
+            PluginError: it needs a plugin that is not there.
+        """
+        record = validate(CalibrationFile, source)
+        if not record.converged:
+            raise ConfigError(
+                "the solver did not converge: these values are no calibration.",
+                where=Location(str(path)),
+                hint="Run the calibration again with better start values or more data.",
+            )
+        if not (record.verdict.get("usable", True) or record.verdict.get("accepted", False)):
+            raise ConfigError(
+                f"its verdict is bad: {record.verdict['findings'][0]}",
+                where=Location(str(path)),
+                hint="Correct the data or the configuration; or, if you know better, run again with --accept.",
+            )
+        rows = record.information.square_root
+        if [len(row) for row in rows] != [len(record.information.increments)] * len(record.information.increments):
+            raise ConfigError(
+                "its information does not fit its parameters: the file was cut or damaged.",
+                where=Location(str(path)),
+                hint="Take a whole copy, or run the calibration again.",
+            )
+        description = {key: plain(source.data[key]) for key in ("arms", "measurements", "statics")}
+        if identity_of(description) != record.identity.get("arm"):
+            raise ConfigError(
+                "the description of the arm does not match its identity: the file was edited or damaged.",
+                where=Location(str(path)),
+                hint="Change the experiment's configuration and run it again.",
+            )
+        missing = absent(record.components, registry)
+        if missing is not None:
+            raise _absent(missing, path)
+        system = build_system(source, registry)
+        parameters = system.parameters(record.groups)
+        changed = differences(record.components, components(system, registry))
+        return cls(system, parameters.with_nominal(_values(parameters, record, path, changed)), record)
+
+    def checked(self, commands: Dataset | None, registry: PluginRegistry) -> Calibration:
+        """The same with what its components are now and predictions at check poses (no poses: none).
+
+        Raises:
+            NotConvergedError: a pose has no equilibrium.
+        """
+        checks = None
+        if commands is not None:
+            stated = self.plus_minus(commands) if self.record.prediction and self.readable else None
+            checks = check_record(self.system, self.parameters, commands, stated)
+        physics = {"checks": checks, "components": components(self.system, registry)}
+        return replace(self, record=self.record.model_copy(update=physics))
+
+    def notices(self, path: str | Path, registry: PluginRegistry) -> list[str]:
+        """What its user should know, the rest of a sentence each: what was accepted, versions whose predictions agree.
+
+        Raises:
+            ConfigError: the physics is not that which it was made with: its check poses are predicted elsewhere.
+        """
+        found, record = [], self.record
+        if record.level == "lost":
+            found.append(f"is lost: {(record.recalibrated or {}).get('why')}")
+        if not record.verdict.get("usable", True):
+            found.append(f"is used although its verdict is bad: {record.verdict['findings'][0]}")
+        if record.accepted:
+            found.append(f"was {record.accepted}: no records stand behind what it predicts now.")
+        changed = differences(record.components, components(self.system, registry))
+        made_with = f" It was made with {'; '.join(changed)}." if changed else ""
+        if record.checks is None:
+            return [*found, f"keeps no check poses.{made_with}"] if changed else found
+        try:
+            moved = movement(self.system, self.parameters, record.checks)
+        except (ArmcalError, ValueError) as fault:
+            text = f"its check poses cannot be predicted any more ({fault})."
+            raise ConfigError(f"{text}{made_with}", where=Location(str(path)), hint=_OTHER_PHYSICS) from fault
+        if moved.share > SHARE:
+            stated = f"{moved.name} by {moved.share:.2g} times its stated accuracy (limit {SHARE:g})"
+            if moved.name in record.checks.tools and record.checks.radius is None:
+                stated = f"no accuracy is stated for them (limit {UNSTATED_M * 1000:g} mm)"
+            raise ConfigError(
+                f"the physics is another than when it was written: at its {len(record.checks.records)} check poses "
+                f"tools moved by up to {moved.tool_m * 1000:.3g} mm; {stated}.{made_with}",
+                where=Location(str(path)),
+                hint=_OTHER_PHYSICS,
+            )
+        if changed:
+            agree = f"predictions at its {len(record.checks.records)} check poses agree to {moved.tool_m * 1000:.1g} mm"
+            found.append(f"was made with {'; '.join(changed)}; {agree}.")
+        return found
+
+    @property
+    def readable(self) -> Mapping[str, Measurement]:
+        """The measurements whose readings a single pose has: a contact reads nothing."""
+        return readable(self.system)
+
+    def predict(self, commands: Dataset) -> tuple[dict[str, Array], Array]:
+        """What instruments would read and where the first measurement's arms' tools are, in elastic equilibrium.
+
+        Args:
+            commands: records with joint angles; load and gravity where they differ from the configured ones.
+
+        Returns:
+            values (N) by channel (SI), and base_T_tool (arms x N x 4 x 4).
+
+        Raises:
+            DataError: the arm is elastic and neither records nor calibration say what hangs on the tool.
+            NotConvergedError: a record has no equilibrium.
+        """
+        self.require_payload(commands.has("payload"), commands.source)
+        return predict(self.system, self.parameters, commands)
+
+    def require_payload(self, told: bool, source: str | None = None) -> None:
+        """An elastic arm needs to know what hangs on its tool, if not from the calibration then from the records.
+
+        Raises:
+            DataError: neither says.
+        """
+        elastic = any(arm.deflection_size for arm in self.system.arms.values())
+        if elastic and self.system.statics.payload is None and not told:
+            raise DataError(
+                "the arm is elastic and its payload is not stated.",
+                where=Location(source or None),
+                hint="Add a column payload_g; the calibration was made with one.",
+            )
+
+    @property
+    def uncertainty(self) -> Uncertainty:
+        """How far its predictions may be off.
+
+        Raises:
+            ConfigError: the file does not say, or what it says does not fit its parameters.
+        """
+        kept, noise = self.record.prediction, self.record.noise
+        if kept is None:
+            raise ConfigError(
+                "the calibration keeps nothing about the errors of its predictions.",
+                hint="It was written by an earlier version; run the calibration again.",
+            )
+        entries = self.record.parameters
+        free = {entry.name.partition("[")[0] for entry in entries if entry.free}
+        names = tuple(entry.name for entry in entries if entry.free)
+        if kept.entries != names or [len(row) for row in kept.covariance] != [*range(1, len(names) + 1)]:
+            raise ConfigError(
+                "the covariance in the calibration does not fit its free parameters.",
+                hint="The file was edited or damaged; run the calibration again.",
+            )
+        fitted = self.parameters.with_nominal(np.array([entry.nominal for entry in entries])).with_free(free)
+        try:
+            components = tuple(_component(each) for each in noise.get("components", ()))
+            measure = (float(noise["scale"]), float(noise["degrees_of_freedom"]))
+        except (KeyError, TypeError, ValueError) as fault:
+            text = f"the noise in the calibration cannot be read ({type(fault).__name__}: {fault})."
+            raise ConfigError(text, hint="The file was edited or damaged; run the calibration again.") from fault
+        return Uncertainty(
+            replace(self.system, measurements=self.readable),
+            fitted,
+            self.parameters.nominal(),
+            kept,
+            *measure,
+            components,
+        )
+
+    def plus_minus(self, commands: Dataset, recording: Recording = "new") -> PlusMinus:
+        """How far measurements at these commands may lie from ``predict``.
+
+        In the ``same`` recording as the calibration's, with the drift that it tells of, which ``shift`` adds to the
+        predicted channels.
+
+        Raises:
+            ConfigError: the calibration does not say, or was recalibrated since.
+            DataError: in the same recording, and the records do not say their place in it.
+            NotConvergedError: a record has no equilibrium.
+        """
+        if recording == "same" and self.record.recalibrated is not None:
+            raise ConfigError(
+                "the calibration was kept true since its recording, which no longer tells of its drift.",
+                hint="Predict for a new recording.",
+            )
+        return self.uncertainty.plus_minus(commands, recording)
+
+    def expression(
+        self, arm: str | None = None, conditions: Sequence[str] = (), point: Point = "tool"
+    ) -> ToolExpression:
+        """One arm (the first if no name is given) as expressions of commands, load and elastic state.
+
+        ``point`` says what is where the tool's frame is: that frame itself, or the ``target`` that was measured.
+
+        Raises:
+            ValueError: no such arm.
+            ConfigError: no measurement reads the target.
+        """
+        system, name = self.system, self._named(arm)
+        found = arm_expression(system.arms[name], self.parameters, system.environment, conditions)
+        return pointed(found, point, system, self.parameters)
+
+    def compensator(
+        self,
+        arm: str | None = None,
+        options: Options | None = None,
+        conditions: Sequence[str] = (),
+        point: Point = "tool",
+        **parts: Any,
+    ) -> Compensator:
+        """What finds commands for one arm (the first if no name is given); build it once and ask it often.
+
+        ``conditions`` of the surroundings are those that targets will tell, ``point`` is what arrives at them (see
+        ``expression``); ``parts`` are further ones of ``Compensator``.
+
+        Raises:
+            ValueError: no such arm, or limits of a joint that it does not have.
+            ConfigError: no measurement reads the target that shall arrive.
+        """
+        return Compensator(self.expression(arm, conditions, point), self.parameters, options, **parts)
+
+    def compensate(
+        self,
+        positions: Array,
+        rotations: Array | None = None,
+        start: Array | None = None,
+        arm: str | None = None,
+        options: Options | None = None,
+        point: Point = "tool",
+        **told: Any,
+    ) -> Commands:
+        """What to command so that the tool is at positions (N x 3; m; base frame), turned as base_R_tool (N x 3 x 3).
+
+        With the ``point`` ``target`` the target that was measured arrives there, in place of the tool frame's origin.
+
+        ``start`` (n or N x n; rad or m) is where the arm comes from, ``told`` the rest of ``Compensator.targets``:
+        payload, gravity, approach, conditions of the surroundings. Who asks often keeps a ``compensator``.
+
+        Raises:
+            ValueError: no such arm, limits of a joint that it does not have, or arrays of other shapes.
+            DataError: the arm is elastic and nothing says what hangs on the tool.
+            ConfigError: no measurement reads the target that shall arrive.
+        """
+        self.require_payload(told.get("payload") is not None)
+        compensator = self.compensator(arm, options, tuple(told.get("conditions") or ()), point)
+        return compensator.solve(compensator.targets(positions, rotations, **told), start)
+
+    def _named(self, arm: str | None) -> str:
+        name = arm or next(iter(self.system.arms))
+        if name not in self.system.arms:
+            raise ValueError(f"no arm is called {name!r}; the arms are {', '.join(self.system.arms)}")
+        return name
+
+    def forward(self, joint_angles: Array, arm: str | None = None) -> Array:
+        """base_T_tool (N x 4 x 4) at commanded joint angles (N x n; rad, or m on sliding joints).
+
+        Raises:
+            ValueError: no such arm, or the number of joints differs.
+            NotConvergedError: a record has no equilibrium.
+        """
+        name = self._named(arm)
+        joints = tuple(self.system.arms[name].commanded)
+        angles = np.atleast_2d(np.asarray(joint_angles, dtype=float))
+        if angles.shape[1] != len(joints):
+            raise ValueError(f"found {angles.shape[1]} joint angles a row, the arm {name} has {len(joints)} joints")
+        channels = {f"{name}.{joint}": angles[:, i] for i, joint in enumerate(joints)}
+        commands = Dataset(tuple(str(i) for i in range(len(angles))), channels)
+        alone = replace(self.system, arms={name: self.system.arms[name]}, measurements={})
+        poses = replace(self, system=alone).predict(commands)[1]
+        return np.asarray(poses[0])
+
+
+def arm_named(calibration: Calibration, arm: str | None) -> str:
+    """The arm of this name, or the only one if there is no name.
+
+    Raises:
+        ConfigError: no such arm, or several and no name.
+    """
+    arms = calibration.system.arms
+    if arm is None and len(arms) > 1:
+        raise ConfigError(f"the calibration has {len(arms)} arms, {', '.join(arms)}.", hint="Choose: --arm NAME.")
+    name = next(iter(arms)) if arm is None else arm
+    if name not in arms:
+        raise ConfigError(f"no arm is called {name!r}.", hint=f"The arms are {', '.join(arms)}.")
+    return name
+
+
+def _component(kept: Mapping[str, Any]) -> Component:
+    """One estimated variance; not a number where null is kept."""
+    known: dict[str, Any] = {key: float("nan") if value is None else value for key, value in kept.items()}
+    return Component(**known)
+
+
+def _absent(missing: ComponentRecord, path: str | Path) -> PluginError:
+    """What is wrong with a calibration whose plugin is not there."""
+    given = f"{missing.distribution or missing.plugin} {missing.version}".strip()
+    is_file = missing.distribution.endswith(".py")
+    return PluginError(
+        f"it was made with the {missing.kind} {missing.name!r} of the plugin{' file' if is_file else ''} {given}, "
+        "which is not loaded.",
+        where=Location(str(path)),
+        hint=f"Give that file: --plugin {missing.distribution}." if is_file else "Install that plugin.",
+    )
+
+
+def _values(parameters: Parameters, record: CalibrationFile, path: str | Path, changed: Sequence[str]) -> Array:
+    kept = {entry.name: entry.value for entry in record.parameters}
+    if tuple(kept) != parameters.entry_names:
+        differing: Sequence[str] = sorted(set(kept) ^ set(parameters.entry_names))
+        raise ConfigError(
+            f"its parameters are not those of its arm: {', '.join(differing[:5]) or 'their order differs'}.",
+            where=Location(str(path)),
+            hint=f"It was made with {'; '.join(changed) or 'another version of a plugin'}; run the calibration again.",
+        )
+    return np.array(list(kept.values()))

@@ -1,0 +1,221 @@
+"""The content of calibration.yaml: what it keeps, and how it is written."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import yaml
+from pydantic import Field
+
+from armcal.base.config_text import plain
+from armcal.base.settings import Settings
+from armcal.calibration.intervals import PredictionRecord
+from armcal.calibration.physics import CheckRecord, ComponentRecord
+from armcal.config.yaml_source import ConfigSource, load_config
+from armcal.errors import ConfigError, Location
+from armcal.estimate.estimator import Estimate
+
+SCHEMA = 1
+UNMOVED_SD = 1e-4
+"""In standard deviations: a step that ignores the bounds and is shorter than this is the solver's own tolerance."""
+_Seal = Literal["whole", "broken", "absent"]
+_LAST_LINE = "# sha256 of the lines above: "
+_CHANGED_HINT = (
+    "Take a whole copy, or run the calibration again; if it was edited on purpose: armcal calibration accept FILE."
+)
+_LINE_END = re.compile("[\n\r\x85\u2028\u2029]")
+
+
+class ParameterRecord(Settings):
+    """One canonical entry as it is kept; ``sd``, ``lower`` and ``upper`` are null where they are not known.
+
+    ``determined`` is by the records alone; what they do not determine may be held by a prior, and is no finding.
+    ``unconstrained`` is where the records would have it if no bound held any parameter, where that differs: who goes on
+    from the calibration needs it, for a bound is no evidence.
+    """
+
+    name: str
+    unit: str
+    nominal: float
+    value: float
+    free: bool
+    sd: float | None = None
+    lower: float | None = None
+    upper: float | None = None
+    determined: bool | None = None
+    held_by_prior: bool = False
+    at_bound: bool = False
+    unconstrained: float | None = None
+
+
+class InformationRecord(Settings):
+    """Square-root information of the increments of the free parameters about their values."""
+
+    increments: tuple[str, ...]
+    square_root: tuple[tuple[float, ...], ...]
+
+
+class CalibrationFile(Settings):
+    """The schema of calibration.yaml.
+
+    ``accepted`` says why and when it was last accepted by hand; errors are ``quality_mrad`` where nothing measured is a
+    length.
+    """
+
+    armcal_calibration: int
+    created: str
+    experiment: str
+    converged: bool
+    software: dict[str, str]
+    identity: dict[str, str]
+    environment_columns: tuple[str, ...] = ()
+    noise: dict[str, Any]
+    quality_mm: dict[str, Any] = Field(default_factory=dict)
+    quality_mrad: dict[str, Any] = Field(default_factory=dict)
+    verdict: dict[str, Any]
+    arms: dict[str, Any]
+    measurements: dict[str, Any]
+    statics: dict[str, Any]
+    groups: dict[str, tuple[str, ...]] = Field(default_factory=dict)
+    parameters: tuple[ParameterRecord, ...]
+    prediction: PredictionRecord | None = None
+    components: tuple[ComponentRecord, ...] = ()
+    checks: CheckRecord | None = None
+    accepted: str | None = None
+    information: InformationRecord
+    recalibrated: dict[str, Any] | None = None
+
+    @property
+    def level(self) -> str | None:
+        """How far the recalibration that wrote it trusts it; None where a run wrote it."""
+        level = (self.recalibrated or {}).get("level")
+        return None if level is None else str(level)
+
+
+def identity_of(description: Mapping[str, Any]) -> str:
+    """A hash of an arm's whole description."""
+    return hashlib.sha256(json.dumps(plain(description), sort_keys=True).encode()).hexdigest()
+
+
+def parameter_records(estimate: Estimate) -> tuple[ParameterRecord, ...]:
+    """Every canonical entry of an estimate."""
+    parameters, nominal = estimate.parameters, estimate.parameters.nominal()
+    units = [block.entry_unit for block in parameters.blocks for _ in block.entry_names]
+    place = {name: i for i, name in enumerate(estimate.names)}
+    records = []
+    for position, name in enumerate(parameters.entry_names):
+        i = place.get(name)
+        known = {} if i is None else _uncertainty(estimate, i)
+        records.append(
+            ParameterRecord(
+                name=name,
+                unit=units[position],
+                nominal=float(nominal[position]),
+                value=float(estimate.values[position]),
+                free=i is not None,
+                at_bound=name in estimate.at_bound,
+                **known,
+            )
+        )
+    return tuple(records)
+
+
+def dump(content: Mapping[str, Any]) -> str:
+    """YAML text, keys in order, numbers to their last digit."""
+    return yaml.dump(plain(dict(content)), Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=110)
+
+
+def sealed(content: Mapping[str, Any]) -> str:
+    """The text of a calibration: YAML that ends in a hash of all that is above it."""
+    text = dump(content)
+    return f"{text}{_LAST_LINE}{_hash(text)}\n"
+
+
+def read_record(path: str | Path, changed: bool = False) -> tuple[ConfigSource, bool]:
+    """A calibration's content, and whether it is as armcal wrote it; if it must be, ``changed`` is false.
+
+    Raises:
+        ConfigError: it cannot be read, is not a calibration of this schema, or was changed since it was written.
+    """
+    states: list[_Seal] = []
+
+    def look(text: str) -> None:
+        states.append(_seal(text))
+        if states == ["broken"] and not changed:
+            found = "its content is not what armcal wrote: it was edited or damaged."
+            raise ConfigError(found, where=Location(str(path)), hint=_CHANGED_HINT)
+
+    source = load_config(path, check=look)
+    schema = source.data.get("armcal_calibration")
+    if schema != SCHEMA:
+        raise ConfigError(
+            f"found calibration schema {schema!r}, expected {SCHEMA}.",
+            where=Location(str(path)),
+            hint="Give the calibration.yaml of a run, or run the calibration again with this version.",
+        )
+    if states == ["absent"] and not changed:
+        raise ConfigError(
+            "it does not end in the hash of its content: it was cut, damaged, or written by an earlier version.",
+            where=Location(str(path)),
+            hint=_CHANGED_HINT,
+        )
+    return source, states == ["whole"]
+
+
+def _seal(text: str) -> _Seal:
+    """What a text's last line is; line ends may have become those of another system."""
+    above, found, kept = text.replace("\r\n", "\n").rpartition(_LAST_LINE)
+    if not found:
+        return "absent"
+    return "whole" if kept == f"{_hash(above)}\n" else "broken"
+
+
+def _hash(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+class _Dumper(getattr(yaml, "CSafeDumper", yaml.SafeDumper)):  # type: ignore[misc]
+    """Puts text of several lines in double quotes, the only style that keeps every kind of line end."""
+
+
+def _quoted(dumper: yaml.SafeDumper, text: str) -> yaml.ScalarNode:
+    style = '"' if _LINE_END.search(text) else None
+    return dumper.represent_scalar("tag:yaml.org,2002:str", text, style=style)
+
+
+_Dumper.add_representer(str, _quoted)
+
+
+def _uncertainty(estimate: Estimate, index: int) -> dict[str, Any]:
+    interval, free = estimate.intervals[index], float(estimate.unconstrained[index])
+    moved = abs(free - estimate.values[estimate.free_entries[index]])
+    return {
+        "unconstrained": free if moved > UNMOVED_SD * estimate.deviations[index] else None,
+        "sd": _finite(estimate.deviations[index]),
+        "lower": _finite(interval.lower),
+        "upper": _finite(interval.upper),
+        "determined": estimate.told_by_data[index],
+        "held_by_prior": estimate.determined[index] and not estimate.told_by_data[index],
+    }
+
+
+def _finite(number: float) -> float | None:
+    return float(number) if np.isfinite(number) else None
+
+
+def lost_calibration(record: CalibrationFile, path: str | Path) -> ConfigError:
+    """What is wrong with a calibration whose recalibration ended at the level lost."""
+    recalibrated = record.recalibrated or {}
+    reason = str(recalibrated.get("why", "")).rstrip(".")
+    return ConfigError(
+        f"its level is lost since record {recalibrated.get('sequence')}: {reason}.",
+        where=Location(str(path)),
+        hint="Calibrate on the bench again. To use it all the same: --accept of predict, compensate, "
+        "correction-table, export and serve.",
+    )

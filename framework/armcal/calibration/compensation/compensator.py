@@ -1,0 +1,319 @@
+"""The compensator of one arm: from targets to commands."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import cached_property
+
+import numpy as np
+
+from armcal.arm.loading import LOAD_CHANNELS
+from armcal.base.domains import Array
+from armcal.base.parameters import Parameters
+from armcal.calibration.compensation.counts import Counts, ServoCounts
+from armcal.calibration.compensation.equilibrium import Equilibrium, Standing
+from armcal.calibration.compensation.finder import Allowed, Found, Rows
+from armcal.calibration.compensation.limits import check_held, held_joints, joint_limits
+from armcal.calibration.compensation.path import PathFinder
+from armcal.calibration.compensation.reach import Reach, reach_of
+from armcal.calibration.compensation.reasons import why_not
+from armcal.calibration.compensation.request import Commands, Mask, Options, Targets
+from armcal.calibration.compensation.seeds import Seeds
+from armcal.calibration.compensation.sides import with_sides
+from armcal.calibration.compensation.target_kind import TargetKind
+from armcal.calibration.compensation.turning import turn_between
+from armcal.calibration.tool_expression import APPROACH, ToolExpression
+from armcal.problem.kernel import EvaluatorChoice
+
+SEEDS = 512
+
+
+class Compensator:
+    """From targets to commands for one calibrated arm; built once, asked often.
+
+    Attributes:
+        expression: the arm's.
+        options: how commands are chosen.
+        limits: lowest and highest command by joint (n x 2; rad or m).
+        reach: how far it reaches at all.
+    """
+
+    def __init__(
+        self,
+        expression: ToolExpression,
+        parameters: Parameters,
+        options: Options | None = None,
+        allowed: Allowed | None = None,
+        choice: EvaluatorChoice = "auto",
+    ) -> None:
+        """Build it.
+
+        Args:
+            expression: the calibrated arm's.
+            parameters: its calibrated values.
+            options: how commands are chosen.
+            allowed: from commands (n x N) to whether the arm may be there (N).
+            choice: of evaluator: compiled C, or CasADi's virtual machine.
+
+        Raises:
+            ValueError: limits of a joint that is not there, or in falling order.
+        """
+        self.expression, self.options = expression, options or Options()
+        self._allowed = allowed
+        self._held = held_joints(expression, self.options.held)
+        self.limits = joint_limits(expression, self.options.limits)
+        self.reach: Reach = reach_of(expression.arm, parameters, self.limits, expression.tool_T_point)
+        self._equilibrium = Equilibrium(expression, choice)
+        self._counts = ServoCounts(expression.joints, expression.servos) if expression.servos else None
+        self._positions = TargetKind(
+            expression=expression,
+            options=self.options,
+            limits=self.limits,
+            held=self._held,
+            seeds=Seeds(expression, self._equilibrium, self.limits, SEEDS, self.options.seed),
+            equilibrium=self._equilibrium,
+            counts=self._counts,
+            allowed=allowed,
+            choice=choice,
+            turns=False,
+        )
+        self._poses = replace(self._positions, turns=True)
+
+    @property
+    def joints(self) -> tuple[str, ...]:
+        """The commanded ones."""
+        return self.expression.joints
+
+    def targets(
+        self,
+        positions: Array,
+        rotations: Array | None = None,
+        payload: Array | float | None = None,
+        gravity: Array | None = None,
+        approach: Array | None = None,
+        conditions: Mapping[str, Array | float] | None = None,
+    ) -> Targets:
+        """Targets from arrays.
+
+        Args:
+            positions: N x 3 (m; base frame).
+            rotations: base_R_tool (N x 3 x 3); None where only positions count.
+            payload: kg (one number or N); the calibration's where it is None.
+            gravity: m/s^2 (3 or N x 3; base frame).
+            approach: from where each joint comes (N x n; -1, 0, 1).
+            conditions: of the surroundings, by name (one number or N; SI, temperatures in degrees Celsius): all that
+                the compensator was built for.
+
+        Raises:
+            ValueError: arrays of other shapes, numbers that are none, or matrices that are no rotations.
+        """
+        positions = np.atleast_2d(np.asarray(positions, dtype=float))
+        count, joints = len(positions), len(self.joints)
+        acting = np.repeat(self.expression.defaults[2 * joints : 2 * joints + len(LOAD_CHANNELS), None], count, axis=1)
+        if payload is not None:
+            acting[LOAD_CHANNELS.index("payload")] = payload
+        if gravity is not None:
+            acting[:3] = np.broadcast_to(np.asarray(gravity, dtype=float), (count, 3)).T
+        sides = np.zeros((joints, count)) if approach is None else self._commanded(approach, count)
+        turned = None if rotations is None else np.asarray(rotations, dtype=float).reshape(-1, 3, 3)
+        told = {name: np.broadcast_to(value, count) for name, value in (conditions or {}).items()}
+        return Targets(positions, turned, acting, sides, told)
+
+    def solve(self, targets: Targets, start: Array | None = None) -> Commands:
+        """Commands for each target by itself.
+
+        Args:
+            targets: where the tool shall be.
+            start: commands from which the arm comes (n or N x n). ``nearest`` is near to them; without any the first
+                commands that are found are taken.
+
+        Raises:
+            ValueError: joints are to be held, and nothing says where or it is beyond their limits; or another number of
+                commands.
+        """
+        check_held(self.joints, self._held, self.limits, start)
+        record = self._record(targets)
+        towards = None if start is None else self._commanded(start, len(targets))
+        if towards is None or not self._tells_approach or targets.approach.any():
+            found = self._found(record, targets, towards)
+        else:
+            found = with_sides(record, towards, targets.approach, lambda told: self._found(told, targets, towards))
+        return self._commands(record, targets, found)
+
+    def follow(self, targets: Targets, start: Array | None = None) -> Commands:
+        """Commands along a path: one target after another, without jumps where that can be.
+
+        ``start`` (n) is where the arm stands; without it the best of several postures for the first target. The sides
+        from which joints come follow from the path.
+
+        Raises:
+            ValueError: as of ``solve``.
+        """
+        check_held(self.joints, self._held, self.limits, start)
+        if not len(targets):
+            return replace(self.solve(targets, start), moves=np.zeros((0, len(self.joints))))
+        record = self._record(targets)
+        finder = PathFinder(self._kind(targets).finder, len(self.joints), self._tells_approach)
+        at = None if start is None else self._commanded(start, 1)[:, 0]
+        path = finder(record, _goal(targets), at)
+        record[len(self.joints) : 2 * len(self.joints)] = path.approach
+        return replace(self._commands(record, targets, path.found), moves=path.moves.T)
+
+    def postures(self, target: Targets) -> Array:
+        """Different commands (n x ways) that have a target (one), in the postures that are found.
+
+        Raises:
+            ValueError: joints are to be held, and nothing can say where.
+        """
+        check_held(self.joints, self._held, self.limits, None)
+        finder = PathFinder(self._kind(target).finder, len(self.joints), self._tells_approach)
+        return finder.beginnings(self._record(target), _goal(target))
+
+    def onward(self, targets: Targets, at: Array) -> Commands:
+        """Commands for targets straight on from others (N x n): no other posture is looked for."""
+        record = self._record(targets)
+        found = self._kind(targets).finder.straight(record, _goal(targets), self._commanded(at, len(targets)))
+        return self._commands(record, targets, found)
+
+    def forward(
+        self,
+        joint_angles: Array,
+        acting: Array | None = None,
+        approach: Array | None = None,
+        conditions: Mapping[str, Array | float] | None = None,
+    ) -> Array:
+        """base_T_tool (N x 4 x 4) at commands (N x n) as they are, in elastic equilibrium.
+
+        ``acting`` is LOAD_CHANNELS x N, the calibration's without it; ``approach`` N x n; ``conditions`` as of targets.
+
+        Raises:
+            ValueError: another number of commands, or of conditions.
+            NotConvergedError: one has no equilibrium.
+        """
+        count = len(np.atleast_2d(joint_angles))
+        commands = self._commanded(joint_angles, count)
+        record = self._record(self.targets(np.zeros((count, 3)), conditions=conditions))
+        record[: len(commands)] = self._set(commands)
+        if approach is not None:
+            record[len(commands) : 2 * len(commands)] = np.asarray(approach, dtype=float).T
+        if acting is not None:
+            record[2 * len(commands) : 2 * len(commands) + len(LOAD_CHANNELS)] = acting
+        return self._equilibrium.required(record).base_T_tool
+
+    def exact(self, joint_angles: Array, acting: Array) -> Array:
+        """base_T_tool (N x 4 x 4) where joints stand at commands (N x n) to the last digit, as no board sets them.
+
+        ``acting`` is LOAD_CHANNELS x N.
+
+        Raises:
+            NotConvergedError: one has no equilibrium.
+        """
+        nowhere = self.targets(np.zeros((len(joint_angles), 3)))
+        record = self._record(replace(nowhere, acting=acting))
+        record[: len(self.joints)] = joint_angles.T
+        return self._equilibrium.required(record).base_T_tool
+
+    def stand(self, joint_angles: Array, targets: Targets, approach: Array) -> Standing:
+        """Where the arm stands at commands (N x n), rounded to counts, under what acts on it at targets."""
+        record = self._record(replace(targets, approach=approach.T))
+        record[: len(self.joints)] = self._set(joint_angles.T)
+        return self._equilibrium(record)
+
+    def _commanded(self, given: Array, count: int) -> Array:
+        """One row for all, or a row for each, as the searches take it (n x N)."""
+        numbers = np.asarray(given, dtype=float)
+        if numbers.shape not in {(len(self.joints),), (1, len(self.joints)), (count, len(self.joints))}:
+            raise ValueError(f"found numbers of the shape {numbers.shape}, expected {count} x {len(self.joints)}")
+        if not np.isfinite(numbers).all():
+            raise ValueError("found commands that are not finite numbers")
+        return np.broadcast_to(numbers, (count, len(self.joints))).T.copy()
+
+    def _set(self, commands: Array) -> Array:
+        if self._counts is None:
+            return commands
+        return self._counts.angles(self._counts.counts(commands), commands)
+
+    def _found(self, record: Array, targets: Targets, start: Array | None) -> Found:
+        """Exact commands, as redundancy asks."""
+        goal, kind = _goal(targets), self._kind(targets)
+        choice = len(self.joints) - len(self._held) > (3 if targets.rotations is None else 6)
+        if self.options.redundancy == "nearest":
+            return kind.finder(record, goal) if start is None else kind.finder.onward(record, goal, start)
+
+        def score(commands: Array, states: Array, rows: Rows) -> Array:
+            return kind.descent.score(record[:, rows], commands, states)
+
+        found = kind.finder(record, goal, start, score)
+        if choice:
+            kind.descent.improve(record, goal, found, self._allowed)
+        return found
+
+    def _commands(self, record: Array, targets: Targets, found: Found) -> Commands:
+        """What is commanded: exact, or the best counts; and where that leads."""
+        joints, counts = len(self.joints), None
+        record[:joints] = found.commands
+        rounding = self._kind(targets).rounding
+        if rounding is not None:
+            counts, record[:joints] = rounding(record, found, targets, self._allowed)
+            if self._allowed is not None:
+                barred = found.there & ~self._allowed(record[:joints])
+                found.there[barred], found.forbidden[barred] = False, True
+        standing = self._equilibrium(record, None if counts is not None else found.states)
+        return self._answer(record, targets, found, standing, counts)
+
+    def _answer(
+        self, record: Array, targets: Targets, found: Found, standing: Standing, counts: Counts | None
+    ) -> Commands:
+        tools, had = standing.base_T_tool, found.there & standing.settled
+        bounds = self.reach.bounds(targets.positions)
+        turns = np.zeros(len(tools))
+        if targets.rotations is not None:
+            turns = np.linalg.norm(turn_between(tools[:, :3, :3], targets.rotations), axis=1)
+        commands = record[: len(self.joints)]
+
+        def position_can_be_had(rows: Rows) -> Mask:
+            return self._positions.finder(record[:, rows], targets.positions[rows].T, commands[:, rows]).there
+
+        reasons = why_not(self.joints, self.limits, commands, targets, found, had, bounds, position_can_be_had)
+        return Commands(
+            joints=self.joints,
+            joint_angles=commands.T.copy(),
+            counts=None if counts is None else counts.T.copy(),
+            base_T_tool=tools,
+            distances=np.linalg.norm(tools[:, :3, 3] - targets.positions, axis=1),
+            turns=turns,
+            found=had,
+            reasons=reasons,
+            bounds=np.where(had, 0.0, bounds),
+            approach=record[len(self.joints) : 2 * len(self.joints)].T.copy(),
+        )
+
+    def _record(self, targets: Targets) -> Array:
+        joints, count = len(self.joints), len(targets)
+        record = np.repeat(self.expression.defaults[:, None], count, axis=1)
+        record[joints : 2 * joints] = targets.approach
+        record[2 * joints : 2 * joints + len(LOAD_CHANNELS)] = targets.acting
+        conditions = self.expression.channels[2 * joints + len(LOAD_CHANNELS) :]
+        if set(targets.conditions) != set(conditions):
+            found, expected = (", ".join(names) or "nothing" for names in (targets.conditions, conditions))
+            raise ValueError(f"found targets that tell {found} of the surroundings, expected {expected}")
+        for name, values in targets.conditions.items():
+            record[self.expression.channels.index(name)] = values
+        return record
+
+    def _kind(self, targets: Targets) -> TargetKind:
+        return self._positions if targets.rotations is None else self._poses
+
+    @cached_property
+    def _tells_approach(self) -> bool:
+        """Whether it matters from where a joint comes."""
+        names = [f"{APPROACH}{joint}" for joint in self.joints]
+        return self.expression.uses(names)
+
+
+def _goal(targets: Targets) -> Array:
+    """As the solver takes it (3 or 12 x N)."""
+    if targets.rotations is None:
+        return targets.positions.T
+    return np.concatenate([targets.positions.T, targets.rotations.transpose(0, 2, 1).reshape(-1, 9).T])

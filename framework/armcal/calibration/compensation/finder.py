@@ -1,0 +1,288 @@
+"""Many starts: searches from the likeliest seeds first, and from more at once the fewer targets are left."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armcal.base.domains import Array
+from armcal.calibration.compensation.goal import NEAREST, WISHED, Attempt, Goal, chosen_of
+from armcal.calibration.compensation.request import Mask
+from armcal.calibration.compensation.seeds import Seeds
+from armcal.calibration.compensation.solver import Solver
+
+Rows = NDArray[np.intp]
+Allowed = Callable[[Array], Mask]
+"""From commands (n x N) to whether the arm may be there."""
+Score = Callable[[Array, Array, Rows], Array]
+"""From commands (n x R), states and the targets they are for, to what is to be small (R)."""
+
+_ROUNDS = (1, 1, 2, 4, 8, 16, 32, 64)
+_CANDIDATES = (12, 16, 32, 64)
+"""Where the best of several is wanted."""
+_AT_ONCE = 4096
+PARTS = ("commands", "states", "distances", "turns", "there", "forbidden")
+_BESIDE = 0.6
+"""Commands that moved no joint farther (rad or m) are taken for the nearest without a look at other postures."""
+_POSTURES, _MOVED = 24, 0.2
+"""Starts from which the nearest of all commands is sought; what their distance from where the arm is counts beside
+that of their tool from the target."""
+_NEAREST_STARTS = 4
+
+
+@dataclass(frozen=True)
+class Found:
+    """What was found of targets (N).
+
+    Attributes:
+        commands: n x N (rad or m); of those that are not had, the nearest.
+        states: n_d x N.
+        distances: what is left (m).
+        turns: what is left (rad).
+        there: whether it is had.
+        forbidden: of those that are not had, whether only clearance forbids it.
+    """
+
+    commands: Array
+    states: Array
+    distances: Array
+    turns: Array
+    there: Mask
+    forbidden: Mask
+
+    @classmethod
+    def nothing(cls, joints: int, state: int, count: int) -> Found:
+        """Nothing found yet."""
+        far = np.full((2, count), np.inf)
+        no = np.zeros((2, count), dtype=bool)
+        return cls(np.zeros((joints, count)), np.zeros((state, count)), far[0], far[1], no[0], no[1])
+
+    def put(self, at: Rows, attempt: Attempt, chosen: Rows) -> None:
+        """Candidates of an attempt at their targets' places."""
+        self.commands[:, at], self.states[:, at] = attempt.commands[:, chosen], attempt.states[:, chosen]
+        self.distances[at], self.turns[at] = attempt.distances[chosen], attempt.turns[chosen]
+
+    def subset(self, chosen: Mask | Rows) -> Found:
+        """Some of them."""
+        return Found(*(getattr(self, name)[..., chosen] for name in PARTS))
+
+    def replace(self, at: Rows, other: Found) -> None:
+        """Others' findings at their places."""
+        for name in PARTS:
+            getattr(self, name)[..., at] = getattr(other, name)
+
+
+class Finder:
+    """Searches of one solver from many starts."""
+
+    def __init__(self, solver: Solver, seeds: Seeds, allowed: Allowed | None, held: tuple[int, ...] = ()) -> None:
+        """``held`` joints stay where searches start; every search then needs a start."""
+        self._solver, self._seeds, self._allowed, self._held = solver, seeds, allowed, held
+
+    def __call__(self, record: Array, target: Array, start: Array | None = None, score: Score | None = None) -> Found:
+        """Commands for targets (3 or 12 x N) under records (channels x N).
+
+        Args:
+            record: what acts; its commands are not used.
+            target: as the solver's.
+            start: commands to come from (n x N); the first search starts there.
+            score: to choose by among several commands; without one the first that is found is taken.
+        """
+        count = record.shape[1]
+        found = Found.nothing(len(self._solver.limits), len(self._seeds.states), count)
+        lost: Rows = np.arange(count)
+        if start is not None and score is None:
+            lost = self._from(record, target, start, found)
+        used = 0
+        for wide in _ROUNDS if score is None else _CANDIDATES:
+            if not lost.size or used >= self._seeds.commands.shape[1]:
+                break
+            wide = min(wide, self._seeds.commands.shape[1] - used)
+            for todo in _chunks(lost, wide):
+                picks = self._picked(target[:, todo], used, wide)
+                self._round(record, target, todo, picks, found, score, start)
+            lost = lost[~found.there[lost]]
+            used += wide
+        self._nearest(record, target, lost, found, start)
+        return found
+
+    @property
+    def states(self) -> int:
+        """How many numbers an elastic state has."""
+        return len(self._seeds.states)
+
+    def spread(self, record: Array, target: Array) -> Found:
+        """Commands for the same target (columns alike), each from another seed, in whatever posture it leads to."""
+        found = Found.nothing(len(self._solver.limits), self.states, record.shape[1])
+        apart = self._seeds.apart(target[:, :1], self._solver.length)[0]
+        picks = np.argsort(apart)[: record.shape[1]]
+        rows = np.arange(len(picks))
+        self._round(record, target, rows, picks[:, None], found, None, None)
+        return found
+
+    def straight(self, record: Array, target: Array, at: Array) -> Found:
+        """Commands from others (n x N) straight on: no other posture is looked for."""
+        found = Found.nothing(len(self._solver.limits), self.states, record.shape[1])
+        found.commands[:] = at
+        self._from(record, target, at, found)
+        return found
+
+    def onward(self, record: Array, target: Array, at: Array) -> Found:
+        """The commands nearest to others (n x N): beside them, else in whatever posture is nearest of many."""
+        found = self._beside(record, target, at)
+        far = np.flatnonzero(~found.there | (np.abs(found.commands - at).max(axis=0) > _BESIDE))
+        if not far.size:
+            return found
+        other = self._of_many(record[:, far], target[:, far], at[:, far])
+        nearer = _apart(other.commands, at[:, far]) < _apart(found.commands[:, far], at[:, far])
+        better = ~found.there[far] | (other.there & nearer)
+        found.replace(far[better], other.subset(better))
+        return found
+
+    def _of_many(self, record: Array, target: Array, at: Array) -> Found:
+        """From many starts, each brought as near to commands (n x N) as its target allows: the nearest of them."""
+        found = Found.nothing(len(self._solver.limits), self.states, record.shape[1])
+        wide = min(_POSTURES, self._seeds.commands.shape[1])
+        for todo in _chunks(np.arange(record.shape[1]), wide):
+            rows, first = np.repeat(todo, wide), np.arange(len(todo)) * wide
+            attempts = Found.nothing(len(self._solver.limits), self.states, len(rows))
+            picks = self._picked_for(target[:, todo], at[:, todo], wide).ravel()[:, None]
+            records, targets, wished = (chosen_of(each, rows) for each in (record, target, at))
+            self._round(records, targets, np.arange(len(rows)), picks, attempts, None, wished)
+            self.towards(records, targets, wished, attempts)
+            apart = np.where(attempts.there, _apart(attempts.commands, wished), np.inf)
+            found.replace(todo, attempts.subset(apart.reshape(-1, wide).argmin(axis=1) + first))
+        lost = np.flatnonzero(~found.there)
+        if lost.size:
+            parts = (record[:, lost], target[:, lost], at[:, lost])
+            more = self(*parts)
+            self.towards(*parts, more)
+            found.replace(lost, more)
+        return found
+
+    def _beside(self, record: Array, target: Array, at: Array) -> Found:
+        """Searches from commands that wish to stay there; what is not found so is sought without the wish."""
+        found = Found.nothing(len(self._solver.limits), self.states, record.shape[1])
+        goal = Goal(_at(record, at), np.zeros((self.states, record.shape[1])), target, at, self._held)
+        attempt = self._solver(goal, WISHED)
+        good = np.flatnonzero(attempt.there & self._may(attempt.commands))
+        found.put(good, attempt, good)
+        found.there[good] = True
+        lost = np.flatnonzero(~found.there)
+        if lost.size:
+            found.replace(lost, self.straight(record[:, lost], target[:, lost], at[:, lost]))
+        return found
+
+    def towards(self, record: Array, target: Array, wished: Array, found: Found) -> None:
+        """As near to wished commands (n x N) as the targets allow, in place; only those that are had."""
+        at = np.flatnonzero(found.there)
+        goal = Goal(_at(record, found.commands)[:, at], found.states[:, at], target[:, at], wished[:, at], self._held)
+        attempt = self._solver(goal, WISHED)
+        nearer = _apart(attempt.commands, wished[:, at]) < _apart(found.commands[:, at], wished[:, at])
+        good = np.flatnonzero(attempt.there & nearer & self._may(attempt.commands))
+        found.put(at[good], attempt, good)
+
+    def _from(self, record: Array, target: Array, start: Array, found: Found) -> Rows:
+        goal = Goal(_at(record, start), np.zeros((len(found.states), record.shape[1])), target, None, self._held)
+        attempt = self._solver(goal)
+        good = attempt.there & self._may(attempt.commands)
+        at = np.flatnonzero(good)
+        found.put(at, attempt, at)
+        found.there[at] = True
+        return np.flatnonzero(~good)
+
+    def _picked(self, target: Array, used: int, wide: int) -> NDArray[np.intp]:
+        """The next seeds of each target (N x wide)."""
+        apart = self._seeds.apart(target, self._solver.length)
+        if used == 0 and wide == 1:
+            return np.asarray(apart.argmin(axis=1)[:, None])
+        last = min(used + wide, apart.shape[1] - 1)
+        near = np.argpartition(apart, last, axis=1)[:, : used + wide]
+        order = np.argsort(np.take_along_axis(apart, near, axis=1), axis=1)
+        return np.asarray(np.take_along_axis(near, order, axis=1)[:, used:])
+
+    def _picked_for(self, target: Array, at: Array, wide: int) -> NDArray[np.intp]:
+        """Seeds near to targets, and near to commands too (N x wide)."""
+        apart = self._seeds.apart(target, self._solver.length)
+        moved = _apart(self._seeds.commands[:, None, :], at[:, :, None])
+        cost = apart + _MOVED * self._solver.length**2 * moved
+        return np.asarray(np.argpartition(cost, wide - 1, axis=1)[:, :wide])
+
+    def _round(
+        self,
+        record: Array,
+        target: Array,
+        todo: Rows,
+        picks: NDArray[np.intp],
+        found: Found,
+        score: Score | None,
+        start: Array | None,
+    ) -> None:
+        wide = picks.shape[1]
+        rows, chosen = np.repeat(todo, wide), picks.ravel()
+        commands, states = chosen_of(self._seeds.commands, chosen), chosen_of(self._seeds.states, chosen)
+        if start is not None and score is not None:
+            first = np.arange(0, len(rows), wide)
+            commands[:, first], states[:, first] = start[:, todo], 0.0
+        attempt = self._solver(self._goal(record, target, rows, commands, states, start))
+        good = attempt.there & self._may(attempt.commands)
+        left = attempt.distances + self._solver.length * attempt.turns
+        value = left if score is None else score(attempt.commands, attempt.states, rows)
+        best = np.where(good, value, np.inf).reshape(-1, wide).argmin(axis=1) + np.arange(len(todo)) * wide
+        had = good[best]
+        found.put(todo[had], attempt, best[had])
+        found.there[todo[had]] = True
+        found.forbidden[todo] |= (attempt.there & ~good).reshape(-1, wide).any(axis=1)
+        near = np.where(attempt.there, np.inf, left).reshape(-1, wide).argmin(axis=1) + np.arange(len(todo)) * wide
+        closer = ~had & (left[near] < found.distances[todo] + self._solver.length * found.turns[todo])
+        found.put(todo[closer], attempt, near[closer])
+
+    def _nearest(self, record: Array, target: Array, lost: Rows, found: Found, start: Array | None) -> None:
+        """Of targets that cannot be had, the commands that come nearest."""
+        wide = min(_NEAREST_STARTS, self._seeds.commands.shape[1] - 1)
+        for todo in _chunks(lost, wide + 1):
+            picks = self._picked(target[:, todo], 0, wide)
+            rows = np.repeat(todo, wide + 1)
+            commands = np.concatenate([found.commands[:, todo, None], self._seeds.commands[:, picks]], axis=2)
+            states = np.concatenate([found.states[:, todo, None], self._seeds.states[:, picks]], axis=2)
+            commands, states = (each.reshape(len(each), len(rows)) for each in (commands, states))
+            attempt = self._solver(self._goal(record, target, rows, commands, states, start), NEAREST)
+            left = attempt.distances + self._solver.length * attempt.turns
+            left = np.where(self._may(attempt.commands), left, np.inf)
+            best = left.reshape(-1, wide + 1).argmin(axis=1) + np.arange(len(todo)) * (wide + 1)
+            found.put(todo, attempt, best)
+
+    def _goal(
+        self, record: Array, target: Array, rows: Rows, commands: Array, states: Array, start: Array | None
+    ) -> Goal:
+        """Searches for targets (rows) from commands, but for joints that are held."""
+        if self._held and start is not None:
+            held = list(self._held)
+            commands[held] = start[held][:, rows]
+        return Goal(_at(chosen_of(record, rows), commands), states, chosen_of(target, rows), None, self._held)
+
+    def _may(self, commands: Array) -> Mask:
+        if self._allowed is None or not commands.shape[1]:
+            return np.ones(commands.shape[1], dtype=bool)
+        return self._allowed(commands)
+
+
+def _apart(commands: Array, others: Array) -> Array:
+    """The squared distance of commands (n x N each) from others (N)."""
+    return np.asarray(((commands - others) ** 2).sum(axis=0))
+
+
+def _at(record: Array, commands: Array) -> Array:
+    """Records with other commands."""
+    moved = record.copy()
+    moved[: len(commands)] = commands
+    return moved
+
+
+def _chunks(rows: Rows, wide: int) -> Iterator[Rows]:
+    size = max(1, _AT_ONCE // wide)
+    for start in range(0, len(rows), size):
+        yield rows[start : start + size]

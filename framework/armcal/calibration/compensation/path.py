@@ -1,0 +1,103 @@
+"""Commands along a path: each target from the commands before it, several ways at once, and the best way of them.
+
+An arm reaches a target in several postures. Each way keeps to its own as long as it can; where it cannot, it jumps to
+another, and a way with fewer and shorter jumps is the better one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from armcal.base.domains import Array
+from armcal.calibration.compensation.finder import PARTS, Finder, Found
+from armcal.calibration.compensation.request import Mask
+from armcal.calibration.compensation.sides import sides_of, with_sides
+
+WAYS = 12
+_SAME = 1e-3
+"""Commands nearer than this (rad or m) are the same posture."""
+_JUMP = 0.5
+"""A longer move (rad or m) between neighbouring targets is a jump."""
+
+
+@dataclass(frozen=True)
+class Path:
+    """Commands along a path.
+
+    Attributes:
+        found: what was found for each target.
+        approach: from where each joint came (n x N).
+        moves: of each joint to each target from the one before it (n x N; rad or m; 0 for the first without a start).
+    """
+
+    found: Found
+    approach: Array
+    moves: Array
+
+
+class PathFinder:
+    """Follows targets, one after another."""
+
+    def __init__(self, finder: Finder, joints: int, tells_approach: bool) -> None:
+        """``tells_approach``: whether it matters from where a joint comes."""
+        self._finder, self._joints, self._tells_approach = finder, joints, tells_approach
+
+    def __call__(self, record: Array, target: Array, start: Array | None) -> Path:
+        """Follow targets (3 or 12 x N) under records (channels x N) from commands (n), or from wherever is best."""
+        ways = self.beginnings(record, target) if start is None else start[:, None]
+        count, wide = target.shape[1], ways.shape[1]
+        found: list[Found] = []
+        sides = np.zeros((count, self._joints, wide))
+        moves = np.zeros((count, self._joints, wide))
+        at, side = ways, np.zeros_like(ways)
+        for i in range(count):
+            rows = np.full(wide, i)
+            if i == 0 and start is None:
+                following = self._finder.onward(record[:, rows], target[:, rows], at)
+            else:
+                following, side = self._next(record[:, rows], target[:, rows], at, side)
+                moves[i], sides[i] = following.commands - at, side
+            found.append(following)
+            at = following.commands
+            kept = self._as_good_as_any([each.there for each in found], moves[: i + 1])
+            if not kept.all():
+                found = [each.subset(kept) for each in found]
+                sides, moves, at, side = sides[:, :, kept], moves[:, :, kept], at[:, kept], side[:, kept]
+                wide = int(kept.sum())
+        longest = np.abs(moves).max(axis=1)
+        best = int((longest.max(axis=0) + longest.mean(axis=0)).argmin())
+        return Path(_joined(found, best), sides[:, :, best].T, moves[:, :, best].T)
+
+    def beginnings(self, record: Array, target: Array) -> Array:
+        """Commands in different postures that have the first target (n x ways); the nearest if there are none."""
+        many = np.zeros(4 * WAYS, dtype=int)
+        found = self._finder.spread(record[:, many], target[:, many])
+        kept: list[Array] = []
+        for commands in found.commands[:, found.there].T:
+            if len(kept) < WAYS and all(np.abs(commands - other).max() > _SAME for other in kept):
+                kept.append(commands)
+        return np.stack(kept, axis=1) if kept else found.commands[:, :1]
+
+    def _next(self, record: Array, target: Array, at: Array, side: Array) -> tuple[Found, Array]:
+        """The next target from each way's commands; the side from which joints come is told as they move."""
+        if not self._tells_approach:
+            found = self._finder.onward(record, target, at)
+            return found, sides_of(found.commands - at, side)
+        record = record.copy()
+        found = with_sides(record, at, side, lambda told: self._finder.onward(told, target, at))
+        return found, record[self._joints : 2 * self._joints]
+
+    @staticmethod
+    def _as_good_as_any(there: list[Mask], moves: Array) -> Mask:
+        """Which ways have missed no more targets, and jumped no more often, than any other."""
+        jumps = (np.abs(moves).max(axis=1) > _JUMP).sum(axis=0)
+        spoilt = (~np.array(there)).sum(axis=0) + jumps
+        return np.asarray(spoilt == spoilt.min())
+
+
+def _joined(found: list[Found], way: int) -> Found:
+    """One way's findings, target by target."""
+    parts = {name: np.stack([getattr(each, name)[..., way] for each in found], axis=-1) for name in PARTS}
+    return Found(**parts)

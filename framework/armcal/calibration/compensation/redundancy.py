@@ -1,0 +1,148 @@
+"""Which of many commands: what is to be small beside reaching the target, and the way down to it.
+
+The way is sought along commands that keep the target to first order; the solver then brings the arm back to it, and the
+step counts only if what is to be small became smaller. [Nocedal2006]
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+from armcal.base.domains import Array
+from armcal.base.se3 import Expression
+from armcal.calibration.compensation.finder import Allowed, Found
+from armcal.calibration.compensation.goal import Goal
+from armcal.calibration.compensation.request import Redundancy
+from armcal.calibration.compensation.solver import Solver
+from armcal.calibration.compensation.step import sample_inputs, slopes, tool_error
+from armcal.calibration.tool_expression import ToolExpression
+from armcal.problem.batch_function import BatchFunction
+from armcal.problem.kernel import EvaluatorChoice
+
+_STEPS = 25
+_FIRST, _LEAST = 0.3, 1e-4
+"""Lengths of steps (rad or m): the first, and the one below which the way ends."""
+_MOST = 0.6
+_SOFTENED = 1e-6
+
+
+def wanted_small(expression: ToolExpression, redundancy: Redundancy) -> Expression:
+    """What is to be small, as numbers whose squares count.
+
+    ``stiffest``: how the tool gives way to a force (9; m/N). ``least_sag``: how far it hangs below where it would be
+    without springs (3; m). ``coolest``: what the joints hold (N m, or N), as a servo's heat goes with its square.
+    """
+    if redundancy == "coolest":
+        return expression.efforts
+    pose, state = expression.base_T_tool.translation, expression.state
+    if not state.numel():
+        return ca.SX.zeros(3)
+    if redundancy == "least_sag":
+        return pose - ca.substitute(pose, state, ca.SX.zeros(state.numel()))
+    places = [expression.channels.index(f"force_{axis}") for axis in "xyz"]
+    by_force = ca.jacobian(expression.next_state, expression.record)[:, places]
+    return ca.vec(ca.mtimes(ca.jacobian(pose, state), expression.to_equilibrium(by_force)[0]))
+
+
+@dataclass(frozen=True)
+class _Local:
+    """What is to be small (k x N), its slope (N x k x n) and that of what is held (N x 3 or 6 x n)."""
+
+    small: Array
+    slope: Array
+    held: Array
+
+
+class Descent:
+    """From commands that reach a target to better ones that reach it too."""
+
+    def __init__(
+        self,
+        expression: ToolExpression,
+        redundancy: Redundancy,
+        solver: Solver,
+        still: tuple[int, ...] = (),
+        choice: EvaluatorChoice = "auto",
+    ) -> None:
+        """``still`` joints do not move."""
+        small = ca.densify(wanted_small(expression, redundancy))
+        found, count = slopes(expression), len(expression.joints)
+        by_commands = ca.jacobian(small, expression.record)[:, :count]
+        slope = by_commands + ca.mtimes(ca.jacobian(small, expression.state), found.state)
+        self._shape = (small.numel(), count)
+        here = ca.reshape(found.corrected[:9], 3, 3) if solver.turns else None
+        held = tool_error(found, found.corrected[9:], here)[1]
+        self._held = held.size1()
+        outputs = [small, ca.vec(ca.densify(slope)), ca.vec(ca.densify(held))]
+        function = ca.Function("redundancy", [expression.record, expression.state], outputs, {"cse": True})
+        self._function = BatchFunction(function, sample_inputs(expression), choice)
+        self._solver, self._still = solver, still
+
+    def score(self, record: Array, commands: Array, states: Array) -> Array:
+        """Half of the squares of what is to be small (N), for commands (n x N) in equilibrium."""
+        moved = record.copy()
+        moved[: len(commands)] = commands
+        small = self._function(moved, states)[0]
+        return np.asarray(0.5 * np.einsum("kn,kn->n", small, small))
+
+    def improve(self, record: Array, target: Array, found: Found, allowed: Allowed | None) -> None:
+        """Walk down from what was found, in place; only those that reach their target."""
+        at = np.flatnonzero(found.there)
+        record, target = record[:, at], target[:, at]
+        commands, states = found.commands[:, at], found.states[:, at]
+        left = np.stack([found.distances[at], found.turns[at]])
+        value, trust = self.score(record, commands, states), np.full(len(at), _FIRST)
+        for _ in range(_STEPS):
+            if not (trust > _LEAST).any():
+                break
+            step = self._step(record, commands, states, trust)
+            attempt = self._solver(Goal(_moved(record, commands + step), states, target, None, self._still))
+            new = self.score(record, attempt.commands, attempt.states)
+            good = attempt.there & (new < value * (1 - 1e-9))
+            if allowed is not None:
+                good &= allowed(attempt.commands)
+            commands, states = np.where(good, attempt.commands, commands), np.where(good, attempt.states, states)
+            left = np.where(good, np.stack([attempt.distances, attempt.turns]), left)
+            flat = good & (value - new < 1e-7 * value)
+            value = np.where(good, new, value)
+            trust = np.where(flat, 0.0, np.where(good, np.minimum(1.5 * trust, _MOST), 0.3 * trust))
+        found.commands[:, at], found.states[:, at] = commands, states
+        found.distances[at], found.turns[at] = left
+
+    def _step(self, record: Array, commands: Array, states: Array, trust: Array) -> Array:
+        """Least squares of what is to be small along commands that keep the target; joints at limits stay (n x N)."""
+        local = self._local(_moved(record, commands), states)
+        pull = -np.einsum("nki,kn->ni", local.slope, local.small)
+        low, high = self._solver.limits[:, 0], self._solver.limits[:, 1]
+        at = commands.T
+        stuck = ((at <= low) & (pull < 0)) | ((at >= high) & (pull > 0))
+        free = np.where(stuck, 0.0, 1.0)
+        free[:, list(self._still)] = 0.0
+        n, k = len(commands), self._held
+        square = np.einsum("nki,nkj->nij", local.slope, local.slope) * free[:, :, None] * free[:, None, :]
+        size = np.maximum(np.trace(square, axis1=1, axis2=2), 1e-300)[:, None, None]
+        whole = np.zeros((len(at), n + k, n + k))
+        whole[:, :n, :n] = square / size + _SOFTENED * np.eye(n)
+        held = local.held * free[:, None, :]
+        whole[:, :n, n:], whole[:, n:, :n] = held.transpose(0, 2, 1), held
+        whole[:, n:, n:] = -1e-12 * np.eye(k)
+        right = np.concatenate([pull * free / size[:, :, 0], np.zeros((len(at), k))], axis=1)
+        step = np.linalg.solve(whole, right[:, :, None])[:, :n, 0] * free
+        length = np.abs(step).max(axis=1, keepdims=True)
+        step *= np.minimum(1.0, trust[:, None] / np.maximum(length, 1e-300))
+        return np.asarray(np.clip(at + step, low, high) - at).T
+
+    def _local(self, record: Array, states: Array) -> _Local:
+        small, slope, held = self._function(record, states)
+        rows, count = self._shape
+        slope = slope.reshape(count, rows, -1).transpose(2, 1, 0)
+        return _Local(small, slope, held.reshape(count, self._held, -1).transpose(2, 1, 0))
+
+
+def _moved(record: Array, commands: Array) -> Array:
+    moved = record.copy()
+    moved[: len(commands)] = commands
+    return moved

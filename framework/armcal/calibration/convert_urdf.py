@@ -1,0 +1,88 @@
+"""A chain as a small URDF: one link a joint, no shapes, no masses."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+
+from armcal.base.domains import Array
+from armcal.base.shown import shown
+from armcal.calibration.convert_poe import numbers
+from armcal.calibration.rigid_chain import RigidChain, RigidJoint, require_plain_axes, rpy_of
+
+BASE, TIP = "base_link", "tip_link"
+UNKNOWN = "0"
+"""What a URDF has to state and nobody knows: effort, velocity, and the travel of a sliding joint."""
+
+
+def urdf_text(chain: RigidChain, name: str) -> str:
+    """The text: links ``base_link``, ``link1``, ..., ``tip_link``; joints by their names. Lengths in m, angles in rad.
+
+    Raises:
+        ProblemError: a joint has pitch or scale.
+    """
+    require_plain_axes(chain, "a URDF")
+    return "\n".join([f"<robot name={_attribute(name)}>", *_elements(chain), "</robot>", ""])
+
+
+def _elements(chain: RigidChain) -> Iterator[str]:
+    yield f'  <link name="{BASE}"/>'
+    parent, here = BASE, np.eye(4)
+    for number, joint in enumerate(chain.joints, start=1):
+        child = f"link{number}"
+        yield f"  <joint name={_attribute(joint.name)} type={_attribute(_kind(joint))}>"
+        yield from _placed(here, joint.base_T_joint, parent, child)
+        yield f'    <axis xyz="{_words(numbers(joint.axis))}"/>'
+        yield from _bounds(joint)
+        yield "  </joint>"
+        yield f'  <link name="{child}"/>'
+        parent, here = child, joint.base_T_joint
+    yield f'  <joint name={_attribute(_unused("tip", chain))} type="fixed">'
+    yield from _placed(here, chain.base_T_tool, parent, TIP)
+    yield "  </joint>"
+    yield f'  <link name="{TIP}"/>'
+
+
+def _placed(base_T_parent: Array, base_T_child: Array, parent: str, child: str) -> Iterator[str]:
+    rotation = base_T_parent[:3, :3].T
+    xyz = numbers(rotation @ (base_T_child[:3, 3] - base_T_parent[:3, 3]))
+    rpy = numbers(np.array(rpy_of(rotation @ base_T_child[:3, :3])))
+    yield f'    <origin xyz="{_words(xyz)}" rpy="{_words(rpy)}"/>'
+    yield f'    <parent link="{parent}"/>'
+    yield f'    <child link="{child}"/>'
+
+
+def _kind(joint: RigidJoint) -> str:
+    """A turning joint without known limits is written as one that has none."""
+    if joint.slides:
+        return "prismatic"
+    return "revolute" if joint.limits and not joint.endless else "continuous"
+
+
+def _bounds(joint: RigidJoint) -> Iterator[str]:
+    if joint.limits and not joint.endless:
+        lower, upper = (repr(float(end)) for end in joint.limits)
+        yield f'    <limit lower="{lower}" upper="{upper}" effort="{UNKNOWN}" velocity="{UNKNOWN}"/>'
+    elif joint.slides:
+        yield f'    <limit effort="{UNKNOWN}" velocity="{UNKNOWN}"/>'
+    if joint.mimic is not None:
+        told = (f'{key}="{getattr(joint.mimic, key)!r}"' for key in ("multiplier", "offset"))
+        yield f"    <mimic joint={_attribute(joint.mimic.master)} {' '.join(told)}/>"
+
+
+def _unused(name: str, chain: RigidChain) -> str:
+    taken = {joint.name for joint in chain.joints}
+    while name in taken:
+        name += "_"
+    return name
+
+
+def _words(values: list[float]) -> str:
+    return " ".join(repr(value) for value in values)
+
+
+def _attribute(text: str) -> str:
+    """A text as the value of an XML attribute, in quotes; XML has no control characters. [URDF]"""
+    return quoteattr(shown(text, keep=""))

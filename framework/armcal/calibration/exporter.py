@@ -1,0 +1,237 @@
+"""Exporters: calibrated arms in the formats of other programs, and how far what a format leaves out matters."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Protocol
+
+import casadi as ca
+import numpy as np
+
+from armcal.arm.assembly import Arm, ArmState
+from armcal.arm.environment import STATICS, Environment
+from armcal.arm.model import forward
+from armcal.base.dataset import Dataset
+from armcal.base.domains import Array
+from armcal.base.parameters import ParameterBlock, Parameters
+from armcal.base.se3 import Expression
+from armcal.calibration.calibration import Calibration, arm_named
+from armcal.calibration.calibration_file import ParameterRecord
+from armcal.calibration.tool_expression import ToolExpression, arm_expression
+from armcal.errors import NotConvergedError
+from armcal.measure.measurement import Channel
+
+POSES = 1000
+"""So many random poses, within the joints' limits, are compared."""
+_LONGEST_M = 1.0
+_FARTHEST = {"angle": math.pi, "length": _LONGEST_M}
+_WIDEST = {"angle": 4 * math.pi, "length": 100.0}
+_NOTHING = Environment((0.0, 0.0, 0.0))
+
+
+@dataclass(frozen=True)
+class Origin:
+    """Where the numbers of an export come from.
+
+    Attributes:
+        experiment: the calibration's name.
+        created: when it was made (ISO 8601).
+        software: versions by name.
+        identity: hashes of what it was made from, by name (``arm``, ``data``).
+    """
+
+    experiment: str = ""
+    created: str = ""
+    software: Mapping[str, str] = field(default_factory=dict)
+    identity: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class ExportRequest:
+    """What is to be written: an arm, its instance name, and its calibrated parameters by full name.
+
+    Attributes:
+        name: the arm's instance name.
+        arm: the arm.
+        values: its own calibrated parameters by full name (SI).
+        tilt: how the real gravity is turned from the stated one, by full name (``statics.gravity_rx``; rad).
+        environment: what acts where nothing is said.
+        payload_stated: whether the calibration says what hangs on the tool.
+        entries: what the calibration says of each number: unit, nominal value, value, standard deviation.
+        description: the arm as a configuration in SI units: ``model``, ``effects``, ``links``.
+        origin: where the numbers come from.
+        out: the name of the file that is written, for formats whose files name one another.
+    """
+
+    name: str
+    arm: Arm
+    values: Mapping[str, Array]
+    tilt: Mapping[str, Array] = field(default_factory=dict)
+    environment: Environment = _NOTHING
+    payload_stated: bool = True
+    entries: tuple[ParameterRecord, ...] = ()
+    description: Mapping[str, Any] = field(default_factory=dict)
+    origin: Origin = field(default_factory=Origin)
+    out: str = ""
+
+    def expression(self, conditions: Sequence[str] = ()) -> ToolExpression:
+        """The arm as expressions of commands, load and elastic state; ``conditions`` are told, not taken as known."""
+        blocks = [replace(b, nominal=tuple(map(float, self.values[b.name]))) for b in self.arm.parameters()]
+        tilt = [ParameterBlock(name, "rad", tuple(map(float, value))) for name, value in self.tilt.items()]
+        return arm_expression(self.arm, Parameters((*blocks, *tilt)), self.environment, conditions)
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of the arm's description and of its calibrated values, by which an export is known again."""
+        numbers = {name: [float(x) for x in value] for name, value in {**self.values, **self.tilt}.items()}
+        told = {"arm": self.origin.identity.get("arm", ""), "name": self.name, "values": numbers}
+        return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()
+
+
+@dataclass(frozen=True)
+class Exported:
+    """A file's content, how many of the arm's numbers changed in it, and what of the arm it cannot hold.
+
+    Attributes:
+        content: of the file that was asked for.
+        changed: how many numbers are not the nominal ones.
+        left_out: what the format cannot hold.
+        companions: further files by name, which are written beside it.
+        remarks: what whoever uses the files should know, a sentence each.
+        reach: how far what is left out moves the tool, at most over random poses (m), where the exporter measured it;
+            None for all effects together, which armcal measures.
+    """
+
+    content: bytes
+    changed: int
+    left_out: tuple[str, ...] = ()
+    companions: Mapping[str, bytes] = field(default_factory=dict)
+    remarks: tuple[str, ...] = ()
+    reach: float | None = None
+
+
+class Exporter(Protocol):
+    """What a plugin provides to write a calibrated arm in a format of its own."""
+
+    def export(self, request: ExportRequest) -> Exported:
+        """The arm in the format, read again and compared before it is handed out.
+
+        Raises:
+            InputError: the format cannot hold this arm, or what it needs is not installed.
+        """
+
+
+def changed_numbers(request: ExportRequest) -> int:
+    """How many of the arm's calibrated numbers are not the nominal ones."""
+    nominal = {block.name: block.nominal for block in request.arm.parameters()}
+    return sum(float(a) != b for n, value in request.values.items() for a, b in zip(value, nominal[n], strict=True))
+
+
+def request_of(calibration: Calibration, arm: str | None, out: str = "") -> ExportRequest:
+    """What a calibration says of one arm, of its only one if no name is given; ``out`` names the file to be written.
+
+    Raises:
+        ConfigError: no such arm, or several and no name.
+    """
+    arms, name = calibration.system.arms, arm_named(calibration, arm)
+    values = {block.name: np.array(block.nominal) for block in calibration.parameters.blocks}
+    own = {block.name for block in arms[name].parameters()}
+    record = calibration.record
+    return ExportRequest(
+        name,
+        arms[name],
+        {key: value for key, value in values.items() if key in own},
+        tilt={key: value for key, value in values.items() if key.startswith(f"{STATICS}.")},
+        environment=calibration.system.environment,
+        payload_stated=calibration.system.statics.payload is not None,
+        description=record.arms[name],
+        entries=tuple(e for e in record.parameters if e.name.partition("[")[0] in own),
+        origin=Origin(record.experiment, record.created, record.software, record.identity),
+        out=out,
+    )
+
+
+def random_commands(arm: Arm, count: int = POSES, seed: int = 1) -> Array:
+    """Commands of the commanded joints within their limits (joints x N; rad or m), up to a half turn without any."""
+    random = np.random.default_rng(seed)
+    rows = []
+    for joint in arm.nominal_chain.joints:
+        if joint.mimic is None:
+            kind = arm.commanded[joint.name]
+            low, high = joint.limits or (-_FARTHEST[kind], _FARTHEST[kind])
+            widest = _WIDEST[kind]
+            rows.append(random.uniform(max(low, -widest), min(high, widest), count))
+    return np.array(rows)
+
+
+def rigid_tools(arm: Arm, values: Mapping[str, Array], commands: Array) -> Array:
+    """base_T_tool (N x 4 x 4) without effects, at commands (joints x N) and parameters by full name."""
+    chain = arm.chain({name: ca.SX(list(value)) for name, value in values.items()})
+    told = ca.SX.sym("commands", commands.shape[0])
+    moved = arm.joint_commands(ca.vertsplit(told))
+    frames = forward(chain, [joint.offset + moved[i] for i, joint in enumerate(chain.joints)], {})
+    function = ca.Function("tool", [told], [ca.vec(ca.densify(frames.base_T_tool.matrix()))], {"cse": True})
+    found = np.asarray(function.map(commands.shape[1])(commands).full())
+    return found.T.reshape(-1, 4, 4).transpose(0, 2, 1)
+
+
+def effects_reach(calibration: Calibration, request: ExportRequest) -> float | None:
+    """How far the calibrated arm is from the same one without effects, at most over random poses (m).
+
+    Under the configured gravity and load, no load where none is configured. None where an elastic arm does not
+    settle in all poses.
+
+    Raises:
+        DataError: the arm cannot be predicted.
+    """
+    commands = random_commands(request.arm)
+    statics = calibration.system.statics
+    if statics.payload is None:
+        statics = statics.model_copy(update={"payload": 0.0})
+    alone = replace(calibration.system, measurements={"tool": _ToolOf(request.name)}, statics=statics)
+    channels = {f"{request.name}.{joint}": row for joint, row in zip(request.arm.commanded, commands, strict=True)}
+    poses = Dataset(tuple(str(i) for i in range(commands.shape[1])), channels)
+    try:
+        _, tools = replace(calibration, system=alone).predict(poses)
+    except NotConvergedError:
+        return None
+    apart = tools[0][:, :3, 3] - rigid_tools(request.arm, request.values, commands)[:, :3, 3]
+    return float(np.linalg.norm(apart, axis=1).max())
+
+
+@dataclass(frozen=True)
+class _ToolOf:
+    """A measurement without an instrument, to have an arm's tool."""
+
+    arm: str
+
+    @property
+    def arms(self) -> tuple[str, ...]:
+        """One."""
+        return (self.arm,)
+
+    def parameters(self) -> tuple[ParameterBlock, ...]:
+        """None."""
+        return ()
+
+    def channels(self) -> tuple[Channel, ...]:
+        """None."""
+        return ()
+
+    def outputs(self, arms: Mapping[str, ArmState], values: Mapping[str, Expression]) -> Mapping[str, Expression]:
+        """Nothing."""
+        return {}
+
+    def residual(
+        self, arms: Mapping[str, ArmState], measured: Mapping[str, Expression], values: Mapping[str, Expression]
+    ) -> Expression:
+        """The tool's position (m)."""
+        return arms[self.arm].base_T_tool.translation
+
+    def noise(self) -> Sequence[float]:
+        """One metre."""
+        return (1.0, 1.0, 1.0)

@@ -1,0 +1,326 @@
+"""How far a calibrated arm may be off its predictions: what a calibration keeps for that, and its use.
+
+A drift is not kept as its states: with their covariance, and with how both hang on every parameter, they are many
+times larger than the records that tell of it. Those are kept instead, and the drift is told again from them, exactly.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+from pydantic import Field
+
+from armcal.base.dataset import Dataset
+from armcal.base.domains import Array
+from armcal.base.parameters import Drift, Parameters
+from armcal.base.settings import Settings
+from armcal.config.system import System
+from armcal.diagnose.coverage import Recording, Stretch, level_name
+from armcal.errors import DataError, Location
+from armcal.estimate.prediction import LEVELS, STATED, Predictor, Spread, ToldDrift, is_position
+from armcal.estimate.validation import Indices
+from armcal.estimate.variance import Axes, Component, VarianceComponents, apply_components
+from armcal.problem.drift import Chain, chain, with_drift
+from armcal.problem.problem import FactorRecords, Problem
+from armcal.problem.readings import reading_slopes
+
+_AT_ONCE = 1000
+"""Records whose slopes are in memory together."""
+_FORGOTTEN = 5.0
+"""So many correlation distances beyond the recording nothing is known of its drift."""
+_DIGITS = 12
+
+
+class DriftRecord(Settings):
+    """How a parameter drifts: standard deviation in its SI unit, distance in units of the channel."""
+
+    sd: float
+    over: float
+    channel: str
+
+
+class RecordingRecord(Settings):
+    """The records that tell of a drift (SI, a row a record), and their weights (a row a measurement; none for ones)."""
+
+    drifts: dict[str, DriftRecord]
+    channels: tuple[str, ...]
+    records: tuple[tuple[float, ...], ...]
+    weights: tuple[tuple[float, ...], ...] = ()
+
+
+class StretchRecord(Settings):
+    """What half widths and radii are multiplied by: one number a level, one for 95 % radii."""
+
+    coordinates: dict[str, float]
+    radius: float | None = None
+
+
+class PredictionRecord(Settings):
+    """What predictions need beyond values: covariance of the free entries (lower triangle), stretches, a recording.
+
+    ``columns`` are what the calibration's data called its columns.
+    """
+
+    entries: tuple[str, ...]
+    covariance: tuple[tuple[float, ...], ...]
+    stretches: dict[Literal["same", "new"], StretchRecord] = Field(default_factory=dict)
+    columns: dict[str, str] = Field(default_factory=dict)
+    recording: RecordingRecord | None = None
+
+
+@dataclass(frozen=True)
+class PlusMinus:
+    """How far measurements may lie from predictions.
+
+    Attributes:
+        shift: what the drift of the recording adds to each predicted channel (N each; zero in a new recording).
+        deviations: standard deviation of each channel (N each; SI), not stretched; none of a measurement whose residual
+            does not follow from its readings.
+        half_widths: of 90 % intervals, stretched as cross-validation found (N each).
+        radii: of each position measurement by name: of a ball about the prediction that holds 95 % (N each; m).
+        covariances: of each position measurement by name, stretched as half widths are (N x 3 x 3 each; m^2).
+    """
+
+    shift: dict[str, Array]
+    deviations: dict[str, Array]
+    half_widths: dict[str, Array]
+    radii: dict[str, Array]
+    covariances: dict[str, Array] = field(default_factory=dict)
+
+
+def stretch_records(stretches: Mapping[Recording, Stretch]) -> dict[Literal["same", "new"], StretchRecord]:
+    """As they are kept."""
+    return {
+        name: StretchRecord(
+            coordinates={level_name(p): x for p, x in zip(LEVELS, each.coordinates, strict=True)}, radius=each.radius
+        )
+        for name, each in stretches.items()
+    }
+
+
+def covariance_rows(covariance: Array) -> tuple[tuple[float, ...], ...]:
+    """The lower triangle, to twelve digits."""
+    return tuple(tuple(float(f"{x:.{_DIGITS}g}") for x in row[: i + 1]) for i, row in enumerate(covariance))
+
+
+def recording_record(problem: Problem, dataset: Dataset, fitted: Sequence[FactorRecords]) -> RecordingRecord | None:
+    """The training records (a dataset in the order of ``fitted``); None where nothing drifts."""
+    drifts = {b.name: b.drift for b in problem.parameters.free if b.drift is not None}
+    if not drifts:
+        return None
+    weights = [each.weight[: each.count] for each in fitted]
+    weighed = any(np.any(weight != 1) for weight in weights)
+    return RecordingRecord(
+        drifts={name: DriftRecord(sd=d.sd, over=d.over, channel=d.channel) for name, d in drifts.items()},
+        channels=tuple(dataset.channels),
+        records=tuple(tuple(row) for row in dataset.stacked(tuple(dataset.channels)).T.tolist()),
+        weights=tuple(tuple(w.tolist()) for w in weights) if weighed else (),
+    )
+
+
+@dataclass(frozen=True)
+class Uncertainty:
+    """What a calibration knows of its own errors.
+
+    Attributes:
+        system: arms and measurements.
+        parameters: as fitted: free ones free, about the nominal values of the fit.
+        values: found.
+        record: as kept.
+        noise_scale: residuals in units of the declared noise.
+        freedom: degrees of freedom.
+        components: estimated variances, if there were any.
+    """
+
+    system: System
+    parameters: Parameters
+    values: Array
+    record: PredictionRecord
+    noise_scale: float
+    freedom: float
+    components: tuple[Component, ...] = ()
+
+    def plus_minus(self, commands: Dataset, recording: Recording = "new") -> PlusMinus:
+        """How far measurements at these commands may lie from predictions.
+
+        Args:
+            commands: records with joint angles, load, gravity; in the same recording with their place in it.
+            recording: ``same`` as the calibration's, whose drift is told as far as records lie near; or a ``new`` one.
+
+        Raises:
+            DataError: in the same recording, and the records do not say their place in it.
+            NotConvergedError: a record has no equilibrium.
+        """
+        told, commands = self.record.recording, self._with_predictions(commands)
+        problem = self._problem(commands)
+        near = np.zeros(len(commands), dtype=bool)
+        if recording == "same" and told is not None:
+            near = self._near(told, commands)
+        parts = [self._apart(problem, commands.subset(chunk), chunk) for chunk in _chunks(np.flatnonzero(~near))]
+        if told is not None and near.any():
+            recorded = _dataset(told)
+            along = chain(problem, recorded, commands.subset(np.flatnonzero(near)))
+            drift = self._told(told, recorded, along)
+            for chunk in _chunks(np.flatnonzero(near)):
+                parts.append(self._within(problem, commands.subset(chunk), chunk, drift, along))
+        return _joined(problem, parts, len(commands), self.record.stretches)
+
+    def _apart(self, problem: Problem, commands: Dataset, places: Indices) -> _Part:
+        """Where nothing is told of a drift."""
+        records = problem.records(commands)
+        spreads = self._predictor(problem, None).in_new_recording(self._whitened(problem, records))
+        recording: Recording = "same" if self.record.recording is None else "new"
+        still = tuple(np.zeros_like(spread.deviations) for spread in spreads)
+        return _Part(places, recording, still, spreads, reading_slopes(problem, self.values, records))
+
+    def _within(
+        self, problem: Problem, commands: Dataset, places: Indices, drift: ToldDrift, along: Chain | None
+    ) -> _Part:
+        """In the recording, which tells of a drift."""
+        records = self._drifted(problem, commands, along)
+        spreads = self._predictor(problem, drift).in_recording(records)
+        moved = [each.correlation.shift(i, drift.states) for i, each in enumerate(records) if each.correlation]
+        off = tuple(m[:, : len(places), 0] for m in moved)
+        return _Part(places, "same", off, spreads, reading_slopes(problem, self.values, records))
+
+    def _predictor(self, problem: Problem, drift: ToldDrift | None) -> Predictor:
+        return Predictor(problem, self.values, self._covariance, self.noise_scale, self.freedom, drift)
+
+    def _told(self, told: RecordingRecord, dataset: Dataset, along: Chain | None) -> ToldDrift:
+        """The drift of the recording, told by its records, along a chain of places."""
+        problem = self._problem(dataset)
+        records = self._drifted(problem, dataset, along)
+        if told.weights:
+            records = problem.weighted(records, [np.array(row) for row in told.weights])
+        found = ToldDrift.by(problem, self.values, records)
+        if found is None:
+            raise TypeError("a recording is kept only where something drifts")
+        return found
+
+    def _drifted(self, problem: Problem, dataset: Dataset, along: Chain | None) -> tuple[FactorRecords, ...]:
+        return with_drift(problem, problem.records(dataset), dataset, self.parameters.nominal(), along)
+
+    def _with_predictions(self, commands: Dataset) -> Dataset:
+        """The commands with what instruments read there: residuals may depend on readings in any way."""
+        problem = self._problem(commands)
+        shown = problem.predict(self.values, problem.records(commands))
+        read = {
+            channel: values[row]
+            for kernel, values in zip(problem.kernels, shown, strict=True)
+            for row, channel in enumerate(kernel.factor.output_channels)
+        }
+        return replace(commands, channels={**commands.channels, **read})
+
+    def _problem(self, dataset: Dataset) -> Problem:
+        system = self.system
+        parts = (system.arms, system.measurements, self._drifting, system.environment, dataset)
+        return Problem.build(*parts, "interpreted", groups={})
+
+    @cached_property
+    def _drifting(self) -> Parameters:
+        told = self.record.recording
+        drifts = {} if told is None else told.drifts
+        return self.parameters.replaced(
+            {n: replace(self.parameters[n], drift=Drift(d.sd, d.over, d.channel)) for n, d in drifts.items()}
+        )
+
+    @cached_property
+    def _covariance(self) -> Array:
+        rows = self.record.covariance
+        lower = np.zeros((len(rows), len(rows)))
+        for i, row in enumerate(rows):
+            lower[i, : i + 1] = row
+        return lower + np.tril(lower, -1).T
+
+    def _whitened(self, problem: Problem, records: tuple[FactorRecords, ...]) -> tuple[FactorRecords, ...]:
+        """With the noise that the calibration estimated, if it did."""
+        if not self.components:
+            return records
+        instruments = [c.name for c in self.components if c.kind == "instrument"]
+        axes: Axes = "together" if set(instruments) <= set(self.system.measurements) else "apart"
+        found = VarianceComponents(self.components, (), (), 0.0)
+        return apply_components(problem, self.values, records, found, axes)
+
+    def _near(self, told: RecordingRecord, commands: Dataset) -> Array:
+        """Whether the recording says anything of each record's drift (N)."""
+        near = np.ones(len(commands), dtype=bool)
+        recorded = _dataset(told)
+        for name, drift in told.drifts.items():
+            if not commands.has(drift.channel):
+                raise DataError(
+                    f"{name} drifts over {drift.channel}, and the poses do not say theirs.",
+                    where=Location(commands.source or None),
+                    hint=f"Add a column {drift.channel}, name the one that is, or predict in a new recording.",
+                )
+            at, known = commands.column(drift.channel), recorded.column(drift.channel)
+            reach = _FORGOTTEN * drift.over
+            near &= (at > known.min() - reach) & (at < known.max() + reach)
+        return near
+
+
+@dataclass(frozen=True)
+class _Part:
+    """Some records: their places, what is known of their drift, and by factor what that says of their residuals.
+
+    Shifts (n_r x N) and spreads are of residuals, ``slopes`` (N x outputs x n_r) those of the readings by them.
+    """
+
+    places: Indices
+    recording: Recording
+    shifts: tuple[Array, ...]
+    spreads: tuple[Spread, ...]
+    slopes: tuple[Array | None, ...]
+
+    def of_readings(self, place: int) -> tuple[Array, Spread] | None:
+        """Shift (outputs x N) and spread of the readings of one factor; None where they do not follow from residuals.
+
+        A reading that no residual depends on is not known to any extent: not a number.
+        """
+        slope, spread = self.slopes[place], self.spreads[place]
+        if slope is None:
+            return None
+        covariance = slope @ spread.covariance @ slope.transpose(0, 2, 1)
+        idle = ~np.any(slope != 0, axis=2)
+        covariance[idle[:, :, None] | idle[:, None, :]] = np.nan
+        return np.einsum("nor,rn->on", slope, self.shifts[place]), Spread(covariance, spread.freedom)
+
+
+def _joined(
+    problem: Problem, parts: Sequence[_Part], count: int, stretches: Mapping[Literal["same", "new"], StretchRecord]
+) -> PlusMinus:
+    found = PlusMinus({}, {}, {}, {})
+    for place, kernel in enumerate(problem.kernels):
+        channels, name = kernel.factor.output_channels, kernel.factor.name
+        known = [part.of_readings(place) for part in parts]
+        if not channels or any(own is None for own in known):
+            continue
+        rows, radius = np.full((3, len(channels), count), np.nan), np.full(count, np.nan)
+        covariance = np.full((count, len(channels), len(channels)), np.nan)
+        for part, (shift, spread) in zip(parts, filter(None, known), strict=True):
+            own = stretches.get(part.recording)
+            stretch = own.coordinates[level_name(STATED)] if own else 1.0
+            rows[:, :, part.places] = shift, spread.deviations, stretch * spread.half_widths(STATED)
+            covariance[part.places] = stretch**2 * spread.covariance
+            radius[part.places] = spread.radius() * (own.radius if own and own.radius is not None else 1.0)
+        for i, channel in enumerate(channels):
+            found.shift[channel], found.deviations[channel], found.half_widths[channel] = rows[:, i]
+        if is_position(kernel):
+            found.radii[name], found.covariances[name] = radius, covariance
+    return found
+
+
+def _chunks(places: Indices) -> list[Indices]:
+    return [places[start : start + _AT_ONCE] for start in range(0, len(places), _AT_ONCE)]
+
+
+def _dataset(told: RecordingRecord) -> Dataset:
+    rows = np.array(told.records, dtype=float).reshape(len(told.records), len(told.channels))
+    return Dataset(
+        tuple(str(i) for i in range(1, len(rows) + 1)),
+        {name: np.ascontiguousarray(column) for name, column in zip(told.channels, rows.T, strict=True)},
+        source="the recording that the calibration keeps",
+    )

@@ -1,0 +1,100 @@
+"""The point of a tool that instruments read: a ball, a reflector or a marker, seldom at the tool's origin."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import casadi as ca
+import numpy as np
+
+from armcal.arm.assembly import Arm, ArmState, scoped
+from armcal.arm.model import forward
+from armcal.base.domains import Array
+from armcal.base.parameters import Parameters
+from armcal.base.quaternions import rotation_matrix
+from armcal.base.se3 import Transform
+from armcal.calibration.tool_expression import ToolExpression
+from armcal.config.system import System
+from armcal.errors import ConfigError
+from armcal.measure.measurement import Measurement
+
+Point = Literal["tool", "target"]
+"""What arrives: the origin of the tool's frame, or the target that was measured."""
+
+_QUATERNION = ("qw", "qx", "qy", "qz")
+_SAME_M = 1e-9
+
+
+@dataclass(frozen=True)
+class MeasuredPoint:
+    """What a measurement reads of a tool: its instance name, and the pose of the target (tool_T_target, 4 x 4)."""
+
+    measurement: str
+    tool_T_target: Array
+
+    @property
+    def distance(self) -> float:
+        """From the tool's origin (m)."""
+        return float(np.linalg.norm(self.tool_T_target[:3, 3]))
+
+    @property
+    def transform(self) -> Transform:
+        """As an expression of constants."""
+        pose = ca.DM(self.tool_T_target)
+        return Transform(ca.sparsify(ca.SX(pose[:3, :3])), ca.sparsify(ca.SX(pose[:3, 3])))
+
+
+def measured_point(system: System, name: str, parameters: Parameters) -> MeasuredPoint | None:
+    """The target of an arm's first measurement that reads a place in the base frame; None if no measurement does.
+
+    It stands on the tool if it has the same place there in two postures: an instrument with a frame of its own, or a
+    point of another link, has not.
+    """
+    arm, values = system.arms[name], {b.name: ca.SX(list(b.nominal)) for b in parameters.blocks if not b.nuisance}
+    for instance, measurement in system.measurements.items():
+        channels = {channel.name for channel in measurement.channels()}
+        if tuple(measurement.arms) != (name,) or not channels.issuperset("xyz"):
+            continue
+        own = scoped(values, f"{instance}.")
+        first, second = (_on_tool(measurement, arm, values, own, angle) for angle in (0.0, 0.3))
+        if np.abs(first - second).max() <= _SAME_M:
+            return MeasuredPoint(instance, first)
+    return None
+
+
+def pointed(expression: ToolExpression, point: Point, system: System, parameters: Parameters) -> ToolExpression:
+    """The arm with the measured target where the tool's frame is, if that is the point that arrives.
+
+    Raises:
+        ConfigError: no measurement reads it.
+    """
+    if point == "tool":
+        return expression
+    target = measured_point(system, expression.name, parameters)
+    if target is None:
+        raise ConfigError(
+            f"no measurement reads the place of a target on the tool of {expression.name!r} in the base frame.",
+            hint="Leave the point target out: then the tool frame's origin arrives.",
+        )
+    return expression.at(target.transform)
+
+
+def _on_tool(
+    measurement: Measurement, arm: Arm, values: Mapping[str, ca.SX], own: Mapping[str, ca.SX], angle: float
+) -> Array:
+    """tool_T_target (4 x 4) as the measurement has it where every command is ``angle`` (rad or m)."""
+    chain = arm.chain(values)
+    moved = arm.joint_commands([ca.SX(angle)] * len(arm.commanded))
+    frames = forward(chain, [joint.offset + moved[i] for i, joint in enumerate(chain.joints)], {})
+    state = ArmState(frames.base_T_tool, frames.named, ca.SX(0, 1), ca.SX.zeros(len(chain.joints)))
+    read = measurement.outputs({arm.name: state}, own)
+    names = ("x", "y", "z", *(_QUATERNION if set(_QUATERNION) <= set(read) else ()))
+    numbers = np.array([float(ca.evalf(ca.SX(read[each]))) for each in names])
+    base_T_tool = np.asarray(ca.evalf(ca.densify(frames.base_T_tool.matrix())).full())
+    base_T_target = base_T_tool.copy()
+    base_T_target[:3, 3] = numbers[:3]
+    if len(numbers) > len("xyz"):
+        base_T_target[:3, :3] = rotation_matrix(numbers[3:])
+    return np.asarray(np.linalg.inv(base_T_tool) @ base_T_target)

@@ -1,0 +1,107 @@
+"""What moves a bench's joints."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+from armcal.devices.clock import Clock
+
+
+@dataclass(frozen=True)
+class DeviceIdentity:
+    """Which device a dataset was measured with.
+
+    Attributes:
+        name: for people, one line.
+        digest: of everything that a calibration hangs on (board identity, oscillator, prescale, pulse tables), hex.
+        boots: how often it has started, where it counts that.
+        adapter: what tells its adapter from all others, as ``LinkIdentity`` has it; empty if nothing does.
+    """
+
+    name: str
+    digest: str
+    boots: int | None = None
+    adapter: str = ""
+
+
+@dataclass(frozen=True)
+class DeviceState:
+    """What a device is doing, read from it and not remembered.
+
+    Attributes:
+        angles: by joint, of those that get pulses: the angle its pulse asks for (rad). The others hang free.
+        took_over: the device has driven by itself, since its host was silent.
+    """
+
+    angles: Mapping[str, float]
+    took_over: bool = False
+
+
+class JointDevice(Protocol):
+    """Servos by joint name. Angles are commanded ones (rad), as in ``joint_angles`` of a dataset.
+
+    Calls may raise ``DeviceError``, ``DeviceLostError`` or ``DeviceResetError``. After a loss or reset, ``open`` is
+    called again; it moves nothing.
+    """
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Those it moves."""
+
+    def open(self, clock: Clock) -> DeviceIdentity:
+        """Open, identify and prepare it. Pulses that run go on unchanged, and none begins.
+
+        Raises:
+            DeviceRefusedError: it is not the calibrated one, or its set-up does not read back.
+        """
+
+    def state(self) -> DeviceState:
+        """Which joints get which pulses."""
+
+    def standing(self, angles: Mapping[str, float]) -> dict[str, float]:
+        """The angles that its pulses can set nearest to these (rad). Asks nothing of the device.
+
+        Raises:
+            DeviceRefusedError: an angle is outside a joint's pulse table.
+        """
+
+    def energise(self, joint: str, angle: float) -> None:
+        """Begin a joint's pulses. A servo tells nobody where it stands, so it may jump: one joint at a time."""
+
+    def command(self, angles: Mapping[str, float]) -> None:
+        """Move joints that are energised, all at once, to absolute angles. Verified as far as the link allows.
+
+        Raises:
+            DeviceRefusedError: an angle is outside a joint's pulse table, or a joint is not energised.
+        """
+
+    def keep_alive(self) -> None:
+        """Say that the host lives; to be called at least every 0.2 s.
+
+        Raises:
+            DeviceLostError: it has begun to drive by itself; ``open`` takes over again.
+        """
+
+    def guard(self, waypoints: Sequence[Mapping[str, float]], rate: float, after_s: float) -> bool:
+        """Where to go after a silence of the host: through waypoints, no joint faster than ``rate`` (rad/s).
+
+        False: this device cannot, and its pulses go on as they are.
+        """
+
+    def release(self, joint: str) -> None:
+        """End a joint's pulses; a loaded joint drops."""
+
+    def close(self) -> None:
+        """Let go of it; pulses go on as they are. May be called twice."""
+
+
+class PulseDevice(Protocol):
+    """A device whose pulses can be set in seconds, before anybody knows which angles they make."""
+
+    def set_pulse(self, joint: str, pulse: float) -> float:
+        """Set a joint's pulse (s), beginning it if need be; gives the one that was set, by the stated oscillator."""
+
+    def release(self, joint: str) -> None:
+        """End a joint's pulses."""

@@ -1,0 +1,232 @@
+"""Lines of text as they come: standard input, datagrams, or a file that another program writes. Nothing waits."""
+
+from __future__ import annotations
+
+import os
+import select
+import socket
+import stat
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Literal, Protocol
+
+from pydantic import BeforeValidator
+
+from armcal.base.config_text import resolve_path
+from armcal.devices.faults import DeviceRefusedError
+from armcal.errors import ConfigError, InputError, Location
+from armcal.io.line_cutter import LineCutter
+from armcal.io.udp import UDP_KINDS, listening, parsed
+
+STANDARD_INPUT = "-"
+KINDS = f"- (standard input), {UDP_KINDS}, or a file that another program writes"
+Begin = Literal["start", "end"]
+"""From where a file is read: ``end`` passes over what was in it before."""
+
+_LONGEST_LINE = 64 * 1024
+_CHUNK = 1 << 20
+_MOST_AT_ONCE = 16
+"""Chunks, or thousands of datagrams, that are taken at once; the rest waits."""
+_BUFFER_BYTES = 4 << 20
+
+
+def _named(value: object) -> object:
+    """A source's name; a file's becomes a whole path."""
+    if not isinstance(value, str) or value == STANDARD_INPUT:
+        return value
+    if value.startswith("udp:"):
+        if parsed(value) is None:
+            raise ValueError(f"found {value!r}, expected {KINDS}")
+        return str(value)
+    try:
+        return str(resolve_path(value))
+    except ConfigError as fault:
+        raise ValueError(f"{fault.message} {fault.hint}") from fault
+
+
+SourceName = Annotated[str, BeforeValidator(_named)]
+"""``-``, ``udp:PORT``, ``udp:HOST:PORT?from=SENDER``, or the path of a file."""
+
+
+class LineSource(Protocol):
+    """Where lines come from."""
+
+    def lines(self) -> list[bytes | None]:
+        """All that are complete since the last call, without their ends; None for one that was too long."""
+
+    @property
+    def ended(self) -> bool:
+        """Whether nothing more will come."""
+
+    def close(self) -> None:
+        """Let go. May be called twice."""
+
+
+def open_lines(name: str, begin: Begin) -> LineSource:
+    """A source by its name.
+
+    Raises:
+        DeviceRefusedError: it is not there, or is taken.
+    """
+    if name == STANDARD_INPUT:
+        return PipeLines(sys.stdin.fileno(), owned=False)
+    if name.startswith("udp:"):
+        return UdpLines(name)
+    path = Path(name)
+    try:
+        kind = path.stat().st_mode
+        if stat.S_ISREG(kind):
+            return FileLines(path, begin)
+        if stat.S_ISFIFO(kind) or stat.S_ISCHR(kind):
+            return PipeLines(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | os.O_NOCTTY), owned=True)
+    except OSError as fault:
+        raise _refusal(name, f"it cannot be read ({fault.strerror or fault})") from fault
+    raise _refusal(name, "it is no file that can be read line by line")
+
+
+def told_refused(refused: Mapping[str, int]) -> str:
+    """Why lines were passed over, the commonest reasons in words; empty if none was."""
+    if not refused:
+        return ""
+    common = sorted(refused.items(), key=lambda entry: -entry[1])[:3]
+    listed = "; ".join(f"{reason} ({count})" for reason, count in common)
+    return f"{sum(refused.values())} lines were passed over: {listed}"
+
+
+class PipeLines:
+    """Lines of a pipe. A last line without an end is not trusted."""
+
+    def __init__(self, descriptor: int, *, owned: bool) -> None:
+        self._descriptor, self._owned = descriptor, owned
+        self._cutter = LineCutter(_LONGEST_LINE)
+        self._open = True
+
+    @property
+    def ended(self) -> bool:
+        """See ``LineSource``."""
+        return not self._open
+
+    def lines(self) -> list[bytes | None]:
+        """See ``LineSource``."""
+        found: list[bytes | None] = []
+        for _ in range(_MOST_AT_ONCE):
+            if not self._open or not select.select([self._descriptor], [], [], 0)[0]:
+                break
+            try:
+                data = os.read(self._descriptor, _CHUNK)
+            except BlockingIOError:
+                break
+            except OSError:
+                data = b""
+            # A pipe with a name has an end whenever nobody writes; the next writer may come.
+            self._open = bool(data) or self._owned
+            found += self._cutter.feed(data)
+            if not data:
+                break
+        return found
+
+    def close(self) -> None:
+        """See ``LineSource``."""
+        if self._owned and self._open:
+            os.close(self._descriptor)
+        self._open = False
+
+
+class UdpLines:
+    """Lines of datagrams on a port of this machine; what comes while nobody looks waits in the system's queue."""
+
+    def __init__(self, name: str) -> None:
+        address = parsed(name)
+        if address is None:
+            raise _refusal(name, "it is no address")
+        try:
+            self._socket, self._is_ours = listening(*address)
+        except InputError as fault:
+            raise DeviceRefusedError(fault.message, where=Location(name), hint=fault.hint) from fault
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER_BYTES)
+        self._open = True
+
+    @property
+    def port(self) -> int:
+        """Its number."""
+        return int(self._socket.getsockname()[1])
+
+    @property
+    def ended(self) -> bool:
+        """See ``LineSource``."""
+        return not self._open
+
+    def lines(self) -> list[bytes | None]:
+        """See ``LineSource``."""
+        found: list[bytes | None] = []
+        for _ in range(1000 * _MOST_AT_ONCE if self._open else 0):
+            try:
+                data, _, flags, sender = self._socket.recvmsg(_LONGEST_LINE)
+            except OSError:  # nothing is left, or the network is gone for now: both are silence
+                break
+            if not self._is_ours(sender[0]):
+                continue
+            found += [None] if flags & socket.MSG_TRUNC else data.split(b"\n")
+        return found
+
+    def close(self) -> None:
+        """See ``LineSource``."""
+        self._open = False
+        self._socket.close()
+
+
+class FileLines:
+    """Lines of a file that grows; one that was cut or replaced is read from its start."""
+
+    ended = False
+
+    def __init__(self, path: Path, begin: Begin) -> None:
+        self._path = path
+        self._cutter = LineCutter(_LONGEST_LINE)
+        self._file = path.open("rb", buffering=0)
+        self._position = self._after_last_line() if begin == "end" else 0
+
+    def lines(self) -> list[bytes | None]:
+        """See ``LineSource``."""
+        found: list[bytes | None] = []
+        try:
+            self._look()
+            for _ in range(_MOST_AT_ONCE):
+                data = os.pread(self._file.fileno(), _CHUNK, self._position)
+                self._position += len(data)
+                found += self._cutter.feed(data)
+                if not data:
+                    break
+        except (OSError, ValueError):  # gone for now, or closed
+            return found
+        return found
+
+    def close(self) -> None:
+        """See ``LineSource``."""
+        self._file.close()
+
+    def _look(self) -> None:
+        """Begin anew if the file is another one, or shorter than it was."""
+        known = os.fstat(self._file.fileno())
+        try:
+            there = self._path.stat()
+        except OSError:
+            there = known
+        is_another = (there.st_dev, there.st_ino) != (known.st_dev, known.st_ino)
+        if is_another:
+            self._file.close()
+            self._file = self._path.open("rb", buffering=0)
+        if is_another or there.st_size < self._position:
+            self._position, self._cutter = 0, LineCutter(_LONGEST_LINE)
+
+    def _after_last_line(self) -> int:
+        size = os.fstat(self._file.fileno()).st_size
+        start = max(0, size - _LONGEST_LINE)
+        return start + os.pread(self._file.fileno(), size - start, start).rfind(b"\n") + 1
+
+
+def _refusal(name: str, why: str) -> DeviceRefusedError:
+    return DeviceRefusedError(
+        f"{why}, so no joint readings come.", where=Location(name), hint=f"Give {KINDS}, that nothing else uses."
+    )

@@ -1,0 +1,175 @@
+"""A serial port that may be unplugged at any moment: opened by path or USB serial number, alone, never blocking."""
+
+from __future__ import annotations
+
+import errno
+import os
+import select
+import termios
+import time
+from pathlib import Path
+from typing import Annotated, Any, NoReturn
+
+from pydantic import BeforeValidator, Field, model_validator
+
+from armcal.base.config_text import ConfigText
+from armcal.base.settings import Settings
+from armcal.devices.faults import DeviceLostError, DeviceRefusedError
+from armcal.errors import Location
+
+_AT_ONCE = 1 << 16
+_LONGEST_WRITE_S = 1.0
+_TAKEN = (errno.EBUSY, errno.EAGAIN, errno.EWOULDBLOCK)
+
+
+def _placed(value: Any) -> Any:
+    """A relative path is the config file's; symbolic links stay, since they are followed at each opening."""
+    if not isinstance(value, str):
+        return value
+    if not value.strip() or "\0" in value or "://" in value:
+        raise ValueError(f"found {str(value)!r}, expected the path of a serial port")
+    base = value.base_dir if isinstance(value, ConfigText) else Path.cwd()
+    return Path(os.path.normpath(base / value))
+
+
+PortPath = Annotated[Path, BeforeValidator(_placed)]
+
+
+class SerialPortSettings(Settings):
+    """Which port: its path (``/dev/ttyACM0``), or the serial number of its USB adapter, wherever that is plugged in."""
+
+    port: PortPath | None = None
+    serial_number: str | None = None
+    baud: Annotated[int, Field(ge=300, le=4_000_000)] = 115_200
+
+    @model_validator(mode="after")
+    def _one(self) -> SerialPortSettings:
+        if self.port is None and self.serial_number is None:
+            raise ValueError("found neither port nor serial_number, expected one of them: which serial port is meant?")
+        if self.port is not None and self.serial_number is not None:
+            raise ValueError("found both port and serial_number, expected one of them: set the other one to null")
+        return self
+
+    @property
+    def meant(self) -> str:
+        """The port, for people."""
+        return str(self.port) if self.port is not None else f"the adapter {self.serial_number}"
+
+
+class SerialPort:
+    """One port. Every call but ``open`` and ``close`` raises ``DeviceLostError`` once it is gone."""
+
+    def __init__(self, settings: SerialPortSettings) -> None:
+        self._settings = settings
+        self._port: Any = None
+        self._was_open = False
+
+    def open(self) -> str:
+        """Open it, or open it anew, wherever it is now; gives the adapter's serial number, empty if it has none.
+
+        Raises:
+            DeviceRefusedError: there is none, several could be meant, or another program has it.
+            DeviceLostError: it was open before, and is not there now.
+        """
+        import serial
+
+        self.close()
+        path, serial_number = self._found()
+        try:
+            self._port = serial.Serial(path, self._settings.baud, timeout=0, write_timeout=0, exclusive=True)
+        except (OSError, termios.error) as fault:  # pyserial's own errors are OSErrors
+            self._refuse(path, fault)
+        self._was_open = True
+        return serial_number
+
+    def read(self, longest_s: float) -> bytes:
+        """What has come, as soon as something has; empty if nothing does in this time (the machine's, not the bench's).
+
+        Zero seconds gives what is there and does not wait.
+        """
+        try:
+            ready, _, _ = select.select([self._handle()], [], [], longest_s)
+            if not ready:
+                return b""
+            data = os.read(self._handle(), _AT_ONCE)
+        except BlockingIOError:
+            return b""
+        except (OSError, ValueError) as fault:
+            self._lose(fault)
+        if not data:
+            self._lose("it hung up")
+        return data
+
+    def write(self, data: bytes) -> None:
+        """Send all of it, or lose the port: a port that takes nothing for a second is as good as gone."""
+        rest, until = memoryview(data), time.monotonic() + _LONGEST_WRITE_S
+        while rest:
+            try:
+                _, ready, _ = select.select([], [self._handle()], [], max(0.0, until - time.monotonic()))
+                if not ready:
+                    self._lose("it takes no more bytes")
+                rest = rest[os.write(self._handle(), rest) :]
+            except BlockingIOError:
+                continue
+            except (OSError, ValueError) as fault:
+                self._lose(fault)
+
+    def close(self) -> None:
+        """Let go of it. May be called twice."""
+        port, self._port = self._port, None
+        if port is not None:
+            port.close()
+
+    def _handle(self) -> int:
+        if self._port is None:
+            self._lose("it is not open")
+        handle: int = self._port.fileno()
+        return handle
+
+    def _lose(self, why: object) -> NoReturn:
+        self.close()
+        raise DeviceLostError(
+            f"the serial port is gone ({why}).",
+            where=Location(self._settings.meant),
+            hint="Look at its plug, cable and power.",
+        )
+
+    def _found(self) -> tuple[str, str]:
+        """The port's path now, and the adapter's serial number."""
+        from serial.tools import list_ports
+
+        wanted = self._settings.serial_number
+        if self._settings.port is not None:
+            path = str(self._settings.port)
+            actual = os.path.realpath(path)
+            numbers = [port.serial_number for port in list_ports.comports() if os.path.realpath(port.device) == actual]
+            return path, (numbers[0] or "") if numbers else ""
+        ports = list_ports.comports()
+        found = [port.device for port in ports if port.serial_number == wanted]
+        if len(found) == 1:
+            return str(found[0]), str(wanted)
+        if not found and self._was_open:
+            self._lose("no adapter with this serial number is plugged in")
+        seen = ", ".join(f"{port.device} ({port.serial_number})" for port in ports if port.serial_number)
+        raise DeviceRefusedError(
+            f"found {len(found)} adapters with this serial number, expected one.",
+            where=Location(self._settings.meant),
+            hint=f"Plugged in are: {seen or 'none that tell a serial number'}.",
+        )
+
+    def _refuse(self, path: str, fault: Exception) -> NoReturn:
+        number = fault.errno if isinstance(fault, OSError) else None
+        if number in _TAKEN:
+            message, hint = "another program has this serial port.", f"Close it; fuser {path} says which one it is."
+        elif self._was_open:
+            self._lose(fault)
+        elif number == errno.ENOENT:
+            message, hint = "there is no such serial port.", "Plug the board in; python -m serial.tools.list_ports."
+        elif number in (errno.EACCES, errno.EPERM):
+            message, hint = (
+                "this serial port may not be opened.",
+                "Join its group (dialout) and log in anew.",
+            )
+        else:
+            message, hint = f"this serial port cannot be opened ({fault}).", "Check that the path is a serial port."
+        raise DeviceRefusedError(message, where=Location(path), hint=hint) from fault

@@ -1,0 +1,126 @@
+"""Covariances that hold where records which follow one another err alike.
+
+Errors of neighbours are taken for an independent part beside one that falls by e over some records, both by restricted
+maximum likelihood [Patterson1971], which counts what the fit took out of the residuals. An estimate is a weighted sum
+of the records' errors, and so its covariance is the sandwich of the weights and those of all pairs [Liang1986]. In
+random order poses weigh correlated errors with changing signs, and little is wider; along a path it is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
+
+from armcal.base.domains import Array
+from armcal.diagnose.fit_rows import FitRows
+from armcal.diagnose.score_tests import family_test, linear_fit
+from armcal.estimate.estimator import Estimate
+from armcal.problem.problem import FactorRecords, Problem
+
+LEVEL = 0.05
+MATTERS = 1.1
+"""Standard deviations that grow by less are left as they are."""
+FEWEST_RECORDS = 30
+_MOST_RECORDS, _MOST_FITTED = 1000, 300
+_SHARES = (0.1, 0.25, 0.5, 0.75, 0.9, 0.98)
+_DISTANCES = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0)
+
+
+def widened(
+    problem: Problem, records: Sequence[FactorRecords], estimate: Estimate, position: NDArray[np.intp]
+) -> Estimate:
+    """The estimate with the wider covariance where neighbouring residuals correlate (5 %), and it is wider by a tenth.
+
+    Args:
+        problem: of the fit.
+        records: it was fitted to, with the weights they had.
+        estimate: what it found.
+        position: how many of all records were recorded before each (N).
+    """
+    taking_part = np.any([each.weight[: each.count] > 0 for each in records], axis=0)
+    chosen = np.flatnonzero(taking_part)
+    chosen = chosen[np.argsort(position[chosen], kind="stable")][:_MOST_RECORDS]
+    if len(chosen) < FEWEST_RECORDS or not estimate.names or not estimate.verdict.converged:
+        return estimate
+    rows, place = FitRows.of(problem, problem.subset(records, chosen), estimate), position[chosen]
+    block = np.zeros(len(rows.residual), dtype=np.intp)
+    fit, _ = linear_fit(rows.slopes, rows.residual, block, rows.by_record, np.diff(place) == 1)
+    if family_test(fit, []).lag_adjusted > LEVEL:
+        return estimate
+    shared = _shared(rows, place, estimate.noise_scale, problem.increments)
+    chain = problem.parameters.entries_jacobian(estimate.values) * problem.parameters.scales()
+    weights = np.vstack([np.eye(problem.increments), chain]) @ np.linalg.pinv(rows.slopes)[: problem.increments]
+    factors = _factors(weights, rows, shared, estimate.noise_scale)
+    by_coordinate, by_entry = factors[: problem.increments], factors[problem.increments :]
+    if by_entry.max() < MATTERS:
+        return replace(estimate, widened=())
+    return replace(
+        estimate,
+        covariance=estimate.covariance * np.outer(by_entry, by_entry),
+        square_root_information=estimate.square_root_information / by_coordinate,
+        widened=tuple(float(x) for x in by_entry),
+    )
+
+
+def _correlation(place: NDArray[np.intp], share: float, distance: float) -> Array:
+    """Of the errors of records (N x N)."""
+    apart = np.abs(place[:, None] - place[None, :])
+    return np.asarray((1 - share) * (apart == 0) + share * np.exp(-apart / distance))
+
+
+def _shared(rows: FitRows, place: NDArray[np.intp], noise_scale: float, parameters: int) -> Array:
+    """The likeliest covariance of the errors of records (N x N), in squares of the noise scale, of a grid of shares.
+
+    Of the columns the first ones are the parameters', the others a drift's.
+    """
+    first, drifts = rows.by_record[:_MOST_FITTED], rows.slopes.shape[1] - parameters
+    slopes, residual = rows.slopes[first] / noise_scale, rows.residual[first] / noise_scale
+    residual = residual - slopes[:, :, parameters:] @ rows.residual[len(rows.residual) - drifts :]
+    priors = slice(len(rows.record_of), len(rows.residual) - drifts)
+    held, below = rows.slopes[priors, :parameters], rows.residual[priors]
+    count, size, columns = slopes.shape
+    spare = max(count * size + len(held) - parameters, 1)
+
+    def fitted(share: float, distance: float) -> tuple[float, float, float, float]:
+        root = np.linalg.cholesky(_correlation(place[:count], share, distance) + 1e-9 * np.eye(count))
+        both = np.concatenate([slopes, residual[:, :, None]], axis=2).reshape(count, -1)
+        white = np.asarray(solve_triangular(root, both, lower=True)).reshape(-1, columns + 1)
+        white, drifted = _without_drift(white, parameters, drifts)
+        part = np.vstack([white[:, :parameters], held])
+        target = np.concatenate([white[:, -1], below])
+        lengths = np.maximum(np.linalg.norm(part, axis=0), 1e-300)
+        basis, triangle = np.linalg.qr(part / lengths)
+        left = float(target @ target - np.sum((basis.T @ target) ** 2))
+        spread = np.log(np.maximum(np.abs(np.diag(triangle)), 1e-12) * lengths)
+        determinant = size * float(np.sum(np.log(np.diag(root)))) + drifted + float(np.sum(spread))
+        return 2 * determinant + spare * float(np.log(max(left, 1e-300))), share, distance, left / spare
+
+    _, share, distance, variance = min(fitted(s, d) for s in _SHARES for d in _DISTANCES)
+    return variance * _correlation(place, share, distance)
+
+
+def _without_drift(white: Array, parameters: int, drifts: int) -> tuple[Array, float]:
+    """Rows by parameters, drifts' innovations and the residual, made independent of these; half their log covariance.
+
+    The innovations have unit covariance: the rows' own is I + A A', whose factor takes them out.
+    """
+    if not drifts:
+        return white, 0.0
+    drifting = white[:, parameters : parameters + drifts]
+    root = np.linalg.cholesky(np.eye(len(white)) + drifting @ drifting.T)
+    kept = np.delete(white, np.s_[parameters : parameters + drifts], axis=1)
+    return np.asarray(solve_triangular(root, kept, lower=True)), float(np.sum(np.log(np.diag(root))))
+
+
+def _factors(weights: Array, rows: FitRows, shared: Array, noise_scale: float) -> Array:
+    """By what standard deviations of sums of rows by weights (sums x rows) grow; the part of priors does not."""
+    own = weights[:, rows.by_record]
+    apart = np.sum(own**2, axis=(1, 2))
+    together = np.einsum("jir,ik,jkr->j", own, shared, own, optimize=True)
+    of_priors = np.sum(weights[:, len(rows.record_of) :] ** 2, axis=1)
+    whole = np.maximum(noise_scale**2 * apart + of_priors, 1e-300)
+    return np.asarray(np.sqrt(1 + noise_scale**2 * np.maximum(together - apart, 0.0) / whole))

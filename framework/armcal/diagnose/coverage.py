@@ -1,0 +1,307 @@
+"""Whether prediction intervals hold what they claim, and by how much to widen them where they do not.
+
+Residuals of records that took no part in a fit are put in units of what was predicted for them. If the model's own
+error is not Gaussian, or larger in some poses than in others, the shares held differ from the levels claimed. The
+intervals are then stretched by the quantile of these scores, level by level, as conformal prediction does with scores
+in units of the predicted spread [Lei2018]. Its guarantee is not had: scores are those of folds, set against what the
+whole fit predicts, so that they are not exchangeable with those of new records, and all rests on poses alike. A
+stretch is never judged by the records it comes from: each fold of a cross-validation is judged by the stretch that the
+scores of the other folds give (cross-conformal [Vovk2015]).
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from scipy.special import ndtri
+
+from armcal.base.domains import Array
+from armcal.diagnose.noise_findings import Finding
+from armcal.errors import NotConvergedError
+from armcal.estimate.blocks import automatic_block_length, standard_error_of_mean
+from armcal.estimate.estimator import Estimator
+from armcal.estimate.prediction import LEVELS, RADIUS_LEVEL, STATED, Predictor, Spread, ToldDrift, is_position, quantile
+from armcal.estimate.validation import FitTask, Indices, JudgedFit, Split, failed_fit, fit_and_judge, judged_fit
+from armcal.estimate.variance import apply_components
+from armcal.estimate.weighing import WeighedFit, Weighing, fit
+from armcal.problem.problem import FactorRecords, Problem
+
+Recording = Literal["same", "new"]
+"""Whether what is predicted lies within the recording of the fit, whose drift is told, or in another one."""
+Misses = tuple[Array, ...]
+"""Raw residuals, one (n_r x N) a factor."""
+FEWEST = 40
+"""Judged records for a stretch to be found."""
+LEVEL = 0.05
+_MEANT = {"same": "", "new": " without what is told of the drift, as in a new recording,"}
+
+
+@dataclass(frozen=True)
+class Scores:
+    """Residuals of judged records in units of what was predicted; nan where there was no fit to judge, or no residual.
+
+    Attributes:
+        errors: residual numbers over their standard deviations, all factors stacked (n_r x N).
+        reaches: lengths of position residuals over their 95 % radii, one row a position factor (n_p x N).
+        freedom: degrees of freedom of the fit that judged each record (N).
+    """
+
+    errors: Array
+    reaches: Array
+    freedom: Array
+
+    def of_level(self, level: float) -> Array:
+        """Sizes of residuals over half the widths of their intervals (n_r x N)."""
+        return np.asarray(np.abs(self.errors) / quantile(level, self.freedom))
+
+    @property
+    def judged(self) -> Array:
+        """Whether each record was judged (N), by any of its measurements."""
+        return np.asarray(np.isfinite(self.errors).any(axis=0))
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """What half widths are multiplied by, one number a level, and what 95 % radii are (None without positions)."""
+
+    coordinates: tuple[float, ...]
+    radius: float | None
+
+    def as_dict(self) -> dict[str, float | None]:
+        """For YAML and JSON."""
+        named: dict[str, float | None] = {level_name(p): x for p, x in zip(LEVELS, self.coordinates, strict=True)}
+        return {**named, "radius_95": self.radius}
+
+
+@dataclass(frozen=True)
+class PredictedFit(JudgedFit):
+    """A fit that also tells how its predictions missed.
+
+    Attributes:
+        misses: raw residuals of the records that judge, by recording (``new`` only where something drifts).
+    """
+
+    misses: Mapping[Recording, Misses]
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """Shares held.
+
+    Attributes:
+        records, coordinates: how many records and numbers were judged.
+        raw: share within the intervals as computed, one a level of ``LEVELS``.
+        raw_radius: share of positions within 95 % radii; None without positions.
+        stretched, stretched_radius: the same by stretches of other records; None where there were too few.
+        independent: how many independent numbers the judged ones are worth.
+    """
+
+    records: int
+    coordinates: int
+    raw: tuple[float, ...]
+    raw_radius: float | None
+    stretched: tuple[float, ...] | None
+    stretched_radius: float | None
+    independent: float
+
+    @property
+    def stated(self) -> tuple[float, ...]:
+        """Of the intervals that predictions give."""
+        return self.stretched or self.raw
+
+    def as_dict(self) -> dict[str, object]:
+        """For JSON."""
+
+        def named(shares: tuple[float, ...] | None, radius: float | None) -> dict[str, float | None] | None:
+            if shares is None:
+                return None
+            return {**{level_name(p): x for p, x in zip(LEVELS, shares, strict=True)}, "radius_95": radius}
+
+        return {
+            "records": self.records,
+            "coordinates": self.coordinates,
+            "worth_independent": self.independent,
+            "share": named(self.stated, self.stretched_radius if self.stretched else self.raw_radius),
+            "share_without_stretch": named(self.raw, self.raw_radius),
+            "stretched": self.stretched is not None,
+        }
+
+
+def level_name(level: float) -> str:
+    """Of a level or a share as a key: ``90``."""
+    return f"{100 * level:g}"
+
+
+def predictor(problem: Problem, fitted: WeighedFit) -> Predictor:
+    """What a fit predicts."""
+    found = fitted.estimate
+    drift = ToldDrift.by(problem, found.values, fitted.records)
+    return Predictor(problem, found.values, found.covariance, found.noise_scale, found.degrees_of_freedom, drift)
+
+
+def missed(by: Predictor, held: Sequence[FactorRecords]) -> dict[Recording, Misses]:
+    """Residuals of records that a fit did not see; nan where a measurement was not made."""
+    found: dict[Recording, Misses] = {"same": by.residuals(held)}
+    if by.drifts:
+        found["new"] = by.problem.residuals(by.values, held)
+    return {
+        name: tuple(np.where(each.measured, own, np.nan) for each, own in zip(held, misses, strict=True))
+        for name, misses in found.items()
+    }
+
+
+def score(by: Predictor, held: Sequence[FactorRecords]) -> dict[Recording, Scores]:
+    """Residuals of records that a fit did not see, in units of what it predicts for them."""
+    ways = {"same": by.in_recording, "new": by.in_new_recording}
+    return {name: scored(by.problem, found, ways[name](held)) for name, found in missed(by, held).items()}
+
+
+def scored(problem: Problem, found: Misses, spreads: Sequence[Spread]) -> Scores:
+    """Residuals in units of what is predicted for them; nan where there are none."""
+    errors = [residual / spread.deviations for residual, spread in zip(found, spreads, strict=True)]
+    reaches = [
+        np.linalg.norm(residual, axis=0) / spread.radius()
+        for kernel, residual, spread in zip(problem.kernels, found, spreads, strict=True)
+        if is_position(kernel)
+    ]
+    count = found[0].shape[1]
+    freedom = np.full(count, max(spreads[0].freedom, 1))
+    return Scores(np.vstack(errors), np.array(reaches).reshape(-1, count), freedom)
+
+
+def whitened_like(
+    problem: Problem, fitted: WeighedFit, held: Sequence[FactorRecords], estimator: Estimator
+) -> tuple[FactorRecords, ...]:
+    """Records with the noise that the fit estimated, if it did."""
+    if fitted.components is None or not isinstance(estimator, Weighing):
+        return tuple(held)
+    return apply_components(problem, fitted.solution.values, held, fitted.components, estimator.settings.axes)
+
+
+def fit_and_predict(task: FitTask) -> JudgedFit:
+    """Fit, judge and tell how it missed; see ``fit_and_judge``."""
+    if task.problem.blueprint.groups:
+        return fit_and_judge(task)  # a socket that is found anew from the records that judge it has no interval
+    began = time.perf_counter()
+    try:
+        train, held = task.parts()
+        fitted = fit(task.problem, train, task.estimator, task.start)
+        judged = judged_fit(task, fitted.solution, train, held, began)
+        if not judged.converged:
+            return judged
+        misses = missed(predictor(task.problem, fitted), whitened_like(task.problem, fitted, held, task.estimator))
+    except NotConvergedError:
+        return failed_fit(task, began)
+    return PredictedFit(judged.errors, judged.at_rest, True, time.perf_counter() - began, misses)
+
+
+def besides(scores: Scores, places: Indices) -> Scores:
+    """The scores of all records but some."""
+    errors = scores.errors.copy()
+    errors[:, places] = np.nan
+    return replace(scores, errors=errors)
+
+
+def collected(
+    splits: Sequence[Split], found: Sequence[Mapping[Recording, Misses]], count: int
+) -> dict[Recording, Misses]:
+    """The residuals of all folds in the order of the records; nan where a fold has none."""
+    result: dict[Recording, Misses] = {}
+    for split, misses in zip(splits, found, strict=True):
+        for name, own in misses.items():
+            whole = result.setdefault(name, tuple(np.full((len(each), count), np.nan) for each in own))
+            for mine, each in zip(whole, own, strict=True):
+                mine[:, split.holdout] = each
+    return result
+
+
+def stretch(scores: Scores) -> Stretch | None:
+    """From the scores of records that no other stretch comes from; None if there are too few.
+
+    Of n scores the ceil((n + 1) p)-th smallest: the finite-sample quantile of [Lei2018].
+    """
+    judged = scores.judged
+    if judged.sum() < FEWEST:
+        return None
+    rank = [_ranked(scores.of_level(level)[:, judged].ravel(), level) for level in LEVELS]
+    reaches = scores.reaches[:, judged].ravel()
+    radius = _ranked(reaches, RADIUS_LEVEL) if np.isfinite(reaches).any() else None
+    return Stretch(tuple(rank), radius)
+
+
+def coverage(scores: Scores, stretches: Sequence[Stretch | None] | None = None) -> Coverage | None:
+    """Shares held by the intervals of judged records (None if there are none), widened by each record's stretch."""
+    judged = np.flatnonzero(scores.judged)
+    if not len(judged):
+        return None
+    none = [Stretch((1.0,) * len(LEVELS), 1.0)] * len(scores.freedom)
+    raw, raw_radius = _shares(scores, none, judged)
+    own = list(stretches or ())
+    known = bool(own) and all(own[i] is not None for i in judged)
+    shares, radius = _shares(scores, own, judged) if known else (None, None)
+    held = _held(scores, own if known else none, STATED)[:, judged]
+    return Coverage(len(judged), int(np.isfinite(held).sum()), raw, raw_radius, shares, radius, _worth(held))
+
+
+def told(found: Coverage, of: str, recording: Recording = "same") -> Finding:
+    """Do intervals hold their share? Two-sided, at 5 %, against so many independent numbers as they are worth."""
+    share, raw = found.stated[LEVELS.index(STATED)], found.raw[LEVELS.index(STATED)]
+    error = np.sqrt(STATED * (1 - STATED) / found.independent)
+    off = abs(share - STATED) > ndtri(1 - LEVEL / 2) * error
+    before = f"; {100 * raw:.1f} % before they were stretched" if found.stretched else ""
+    text = (
+        f"90 % prediction intervals{_MEANT[recording]} hold {100 * share:.1f} % of {found.coordinates} coordinates "
+        f"of {of}{before}"
+    )
+    test = f"two-sided, 5 %, as of {found.independent:.0f} independent numbers"
+    if not off:
+        return Finding("good", f"{text}.", test)
+    if share > STATED:
+        return Finding("note", f"{text}: wider than need be.", test)
+    return Finding("warning", f"{text}: too narrow.", test, "Take the shares found for what a +- is worth.")
+
+
+def _ranked(scores: Array, level: float) -> float:
+    """The ceil((n + 1) p)-th smallest of those that there are, or the largest."""
+    ordered = np.sort(scores[np.isfinite(scores)])
+    return float(ordered[min(int(np.ceil((len(ordered) + 1) * level)), len(ordered)) - 1])
+
+
+def _held(scores: Scores, stretches: Sequence[Stretch | None], level: float) -> Array:
+    """Whether each number lies within its interval (n_r x N): one, zero, or nan where there is none."""
+    place = LEVELS.index(level)
+    factors = np.array([np.nan if s is None else s.coordinates[place] for s in stretches])
+    return _within(scores.of_level(level), factors)
+
+
+def _shares(
+    scores: Scores, stretches: Sequence[Stretch | None], judged: Indices
+) -> tuple[tuple[float, ...], float | None]:
+    shares = tuple(float(np.nanmean(_held(scores, stretches, level)[:, judged])) for level in LEVELS)
+    if not np.isfinite(scores.reaches[:, judged]).any():
+        return shares, None
+    radii = np.array([np.nan if s is None or s.radius is None else s.radius for s in stretches])
+    return shares, float(np.nanmean(_within(scores.reaches, radii)[:, judged]))
+
+
+def _within(scores: Array, limits: Array) -> Array:
+    return np.where(np.isfinite(scores), scores <= limits, np.nan)
+
+
+def _worth(held: Array) -> float:
+    """How many independent numbers (n_r x N, in recorded order) would have a share as uncertain as theirs.
+
+    The standard error of a record's share over circular blocks of neighbours [Politis1992] against that of
+    independent numbers; no more than there are, and where all or none were held no more than the records.
+    """
+    share, by_record = float(np.nanmean(held)), np.nanmean(held, axis=0)
+    if share in (0.0, 1.0):
+        return float(held.shape[1])
+    error = standard_error_of_mean(by_record, automatic_block_length(by_record))
+    if not np.isfinite(error) or error == 0:
+        return float(held.shape[1])
+    return float(np.clip(share * (1 - share) / error**2, 1.0, np.isfinite(held).sum()))

@@ -1,0 +1,290 @@
+"""What residuals might still depend on: order, joint levels, approach, torques, payload, temperature.
+
+Each dependence is a set of columns: how residuals would move with it, to first order, along the motion of one joint,
+along the residual's own entries (base axes for a position), or along the turning of one site.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.polynomial import legendre
+
+from armcal.arm.assembly import Arm
+from armcal.arm.loading import SiteLoads
+from armcal.base.dataset import Dataset
+from armcal.base.domains import Array
+from armcal.base.units import display_unit, to_unit
+from armcal.problem.motion import Motion, recorded_order
+from armcal.problem.problem import Problem
+
+MOST_LEVELS = 12
+"""Levels of a joint are told apart one by one up to so many; beyond, by a cubic."""
+_SLOW = 3
+_CUBIC = 3
+_AXES = ("x", "y", "z")
+_SYMMETRIC = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+_BOTH_SIDES = "visit the same poses from both sides of {joint}"
+_SECOND_LOAD = "repeat some poses with a second payload"
+_REPEATS = "repeat one pose at the start, in the middle and at the end"
+
+
+@dataclass(frozen=True)
+class Dependence:
+    """One thing that residuals might depend on.
+
+    Attributes:
+        kind: ``offset``, ``order``, ``level``, ``approach``, ``coupling``, ``torque``, ``moment``, ``payload``,
+            ``temperature``; of what is outside of the arm ``step``, ``slip``, ``gravity``, ``load``, ``scale``.
+        subject: the joint or site, as a user names it; empty where it is none.
+        arm: the arm's name; empty where it is none.
+        words: what residuals depend on, as the end of a sentence.
+        effect: the effect that would model it, and on what; empty if there is none.
+        measure: which measurement would tell.
+        columns: raw residual by coefficient, one (n_r x N x k) array a factor.
+        labels: what each coefficient is (k), for those that have a unit.
+        unit: of the coefficients in SI (``rad``, ``m``, ``rad_per_Nm``; ``1`` for shares); empty if they have none.
+    """
+
+    kind: str
+    subject: str
+    arm: str
+    words: str
+    effect: str
+    measure: str
+    columns: tuple[Array, ...]
+    labels: tuple[str, ...] = ()
+    unit: str = ""
+
+
+@dataclass(frozen=True)
+class Records:
+    """Records that dependences are made from."""
+
+    dataset: Dataset
+    motion: Motion
+
+    @property
+    def sizes(self) -> tuple[int, ...]:
+        """Residual numbers of each factor."""
+        return tuple(slope.shape[0] for slope in self.motion.slopes)
+
+    def along(self, joint: str, features: Array) -> tuple[Array, ...]:
+        """Features (N x k) along the motion of a joint."""
+        return tuple(slope[:, :, None] * features[None] for slope in self.motion.along(joint))
+
+    def axes(self, features: Array) -> tuple[Array, ...]:
+        """Features (N x k) along each entry of each factor's residual."""
+        whole, place, parts = sum(self.sizes) * features.shape[1], 0, []
+        for size in self.sizes:
+            part = np.zeros((size, len(features), whole))
+            for entry in range(size):
+                part[entry, :, place : place + features.shape[1]] = features
+                place += features.shape[1]
+            parts.append(part)
+        return tuple(parts)
+
+
+def dependences(problem: Problem, motion: Motion, dataset: Dataset) -> Iterator[Dependence]:
+    """Everything that could be told of these records; what does not vary is left out."""
+    arms, here = problem.blueprint.arms, Records(dataset, motion)
+    yield from _of_offset(here)
+    yield from _of_order(here)
+    for name, arm in arms.items():
+        loads = motion.loads[name]
+        for joint, dimension in arm.commanded.items():
+            index = arm.joint_names.index(joint)
+            shown = joint if len(arms) == 1 else f"{name}.{joint}"
+            angle = dimension == "angle"
+            yield from _of_level(here, name, f"{name}.{joint}", shown, dimension)
+            yield from _of_approach(here, name, joint, shown, "rad" if angle else "m")
+            yield from _of_coupling(here, name, arm, joint, shown)
+            yield from _of_torque(here, name, f"{name}.{joint}", shown, loads.efforts[index], angle)
+        yield from _of_moments(problem, here, arm, loads, len(arms) == 1)
+    yield from _of_surroundings(here)
+
+
+def _of_offset(here: Records) -> Iterator[Dependence]:
+    """What does not change from record to record, and the model still cannot take up."""
+    ones, measure = np.ones((len(here.dataset), 1)), "any poses tell this: free the parameter"
+    words = "a constant shift of what is measured"
+    yield Dependence("offset", "", "", words, "the base's position, if it is free", measure, here.axes(ones))
+    for channel in here.motion.channels:
+        arm, _, joint = channel.partition(".")
+        effect = f"the zero of {joint}, if it is free"
+        yield Dependence("offset", joint, arm, f"the zero of {joint}", effect, measure, here.along(channel, ones))
+
+
+def _of_order(here: Records) -> Iterator[Dependence]:
+    order = recorded_order(here.dataset)
+    if np.ptp(order) <= 0:
+        return
+    place = (order - order.min()) / np.ptp(order)
+    slow = legendre.legvander(2 * place - 1, _SLOW)  # with its mean, which a drift has
+    yield Dependence(
+        "order",
+        "",
+        "",
+        "the recorded order: what is measured drifts slowly as a whole",
+        "parameters.drift on the base's position",
+        _REPEATS,
+        here.axes(slow),
+    )
+    for channel in here.motion.channels:
+        arm, _, joint = channel.partition(".")
+        words = f"the recorded order: {joint} drifts slowly along its own motion"
+        effect = f"parameters.drift on the zero of {joint}"
+        yield Dependence("order", joint, arm, words, effect, _REPEATS, here.along(channel, slow))
+
+
+def _of_level(here: Records, arm: str, channel: str, shown: str, dimension: str) -> Iterator[Dependence]:
+    command = here.dataset.column(channel)
+    levels = np.unique(np.round(_stated(command), 9))
+    if len(levels) < 2:
+        return
+    unit = display_unit(dimension)
+    if len(levels) <= MOST_LEVELS:
+        features = _centred((np.abs(command[:, None] - levels[None]) < 1e-8).astype(float), command)
+        labels = tuple(f"{to_unit(level, unit.name):.4g} {unit.name}" for level in levels)
+        effect = f"servo_map on {shown}" if len(levels) <= _CUBIC else f"gear_error or servo_map on {shown}"
+    else:
+        middle, half = (levels[0] + levels[-1]) / 2, (levels[-1] - levels[0]) / 2
+        features = _centred(legendre.legvander((command - middle) / half, _CUBIC)[:, 1:], command)
+        labels, effect = (), f"gear_error or servo_map on {shown}"
+    between = f"command {shown} to levels in between, from both sides"
+    si = "rad" if dimension == "angle" else "m"
+    along = f"the angle of {shown}, along its own motion" if si == "rad" else f"the travel of {shown}, along itself"
+    yield Dependence("level", shown, arm, along, effect, between, here.along(channel, features), labels, si)
+    yield Dependence(
+        "level",
+        shown,
+        arm,
+        f"the {'angle' if si == 'rad' else 'travel'} of {shown}, in directions that {shown} does not move",
+        f"more free geometry about {shown}, or compliance there",
+        f"repeat some poses with a second payload: what moves is compliance, the rest geometry of {shown}",
+        here.axes(features),
+    )
+
+
+def _of_approach(here: Records, arm: str, joint: str, shown: str, si: str) -> Iterator[Dependence]:
+    channel, command = f"{arm}.approach.{joint}", here.dataset.column(f"{arm}.{joint}")
+    effect, side = f"approach_backlash on {shown}", f"the side {shown} was approached from"
+    if here.dataset.has(channel):
+        came = here.dataset.column(channel)
+    else:
+        came = _came_from(command, recorded_order(here.dataset))
+        effect += ", with a column for the approach"
+        side += ", if it went from pose to pose in the recorded order"
+    if _spread(came) <= 0:
+        return
+    sign, measure = np.nan_to_num(-came[:, None]), _BOTH_SIDES.format(joint=shown)
+    along = here.along(f"{arm}.{joint}", sign)
+    yield Dependence(
+        "approach", shown, arm, f"{side}, along its own motion", effect, measure, along, ("half of its play",), si
+    )
+    words = f"{side}, in directions that {shown} does not move"
+    yield Dependence("approach", shown, arm, words, "", measure, here.axes(sign))
+
+
+def _came_from(command: Array, order: Array) -> Array:
+    """The sign of each joint's last move before each record (N), 0 before its first."""
+    place = np.argsort(order, kind="stable")
+    moved = np.sign(np.diff(np.nan_to_num(command[place]), prepend=np.nan_to_num(command[place[:1]])))
+    last = np.maximum.accumulate(np.where(moved != 0, np.arange(len(moved)), 0))
+    came = np.empty(len(command))
+    came[place] = moved[last]
+    return came
+
+
+def _of_coupling(here: Records, name: str, arm: Arm, joint: str, shown: str) -> Iterator[Dependence]:
+    """A share of another joint's command on this one, as a belt or a gear that runs through it would add."""
+    for other, dimension in arm.commanded.items():
+        command = here.dataset.column(f"{name}.{other}")
+        if other == joint or dimension != arm.commanded[joint] or _spread(command) <= 0:
+            continue
+        feature = _centred(np.nan_to_num(command)[:, None], command)
+        words = f"the command of {other}, along {shown}'s own motion: {other} moves {shown} with it"
+        measure = f"move {other} alone from end to end, and watch {shown}"
+        columns = here.along(f"{name}.{joint}", feature)
+        yield Dependence("coupling", f"{other} on {shown}", name, words, "", measure, columns, ("share",), "1")
+
+
+def _of_torque(
+    here: Records, arm: str, channel: str, shown: str, effort: Array, revolute: bool
+) -> Iterator[Dependence]:
+    if _spread(effort) <= 1e-9 * max(1.0, float(np.abs(_stated(effort)).max(initial=0.0))):
+        return
+    effort = np.nan_to_num(effort)
+    load, per = ("torque about", "rad_per_Nm") if revolute else ("force along", "")
+    si, cubic = ("rad", "rad_per_Nm3") if revolute else ("m", "")
+    both = f"poses on both sides of zero {load.split()[0]} at {shown}, some with a second payload"
+    laws = (
+        (f"the {load} {shown}", f"torsional_spring on {shown}", _SECOND_LOAD, effort, "compliance", per),
+        (f"the sign of the {load} {shown}", f"torque_backlash on {shown}", both, np.sign(effort), "half its play", si),
+        (f"the size of the {load} {shown}, whatever its sign", "", both, np.abs(effort), "slope", per),
+        (f"the cube of the {load} {shown}", f"cubic_spring on {shown}", _SECOND_LOAD, effort**3, "cubic term", cubic),
+    )
+    for words, effect, measure, feature, label, unit in laws:
+        if np.ptp(feature) > 0:
+            columns = here.along(channel, feature[:, None])
+            yield Dependence("torque", shown, arm, words, effect, measure, columns, (label,), unit)
+
+
+def _of_moments(problem: Problem, here: Records, arm: Arm, loads: SiteLoads, alone: bool) -> Iterator[Dependence]:
+    """A symmetric compliance at each site, seen by the factors that measure this arm's tip in its base frame."""
+    seen = [_is_position_of(problem, i, arm.name) for i in range(len(problem.kernels))]
+    if not any(seen):
+        return
+    for site, (moment, lever) in enumerate(zip(loads.moments, loads.levers, strict=True)):
+        moved = []
+        for j, k in _SYMMETRIC:
+            one = lever[:, j] * moment[k]
+            moved.append(one if j == k else one + lever[:, k] * moment[j])
+        tip = np.nan_to_num(np.stack(moved, axis=2))
+        if not np.any(tip):
+            continue
+        zeros = (np.zeros((size, tip.shape[1], tip.shape[2])) for size in here.sizes)
+        columns = tuple(tip if yes else none for yes, none in zip(seen, zeros, strict=True))
+        name = arm.joint_names[site - 1] if site else "the mount"
+        shown = name if alone else (f"{arm.name}.{name}" if site else f"the mount of {arm.name}")
+        words = f"the moment that {shown} carries, in all directions"
+        yield Dependence("moment", shown, arm.name, words, f"compliance on {shown}", _SECOND_LOAD, columns)
+
+
+def _stated(feature: Array) -> Array:
+    """Without the records that do not have it: those of another arm."""
+    return feature[np.isfinite(feature)]
+
+
+def _spread(feature: Array) -> float:
+    """From the smallest to the largest; 0 where no record has it."""
+    stated = _stated(feature)
+    return float(np.ptp(stated)) if len(stated) else 0.0
+
+
+def _centred(features: Array, command: Array) -> Array:
+    """About their mean (N x k) in the records that state the command, none in the others."""
+    known = np.isfinite(command)
+    centred = np.zeros_like(features)
+    centred[known] = features[known] - features[known].mean(axis=0)
+    return centred
+
+
+def _is_position_of(problem: Problem, factor: int, arm: str) -> bool:
+    one = problem.kernels[factor].factor
+    axes = [channel.rpartition(".")[2] for channel in one.output_channels]
+    return axes == list(_AXES) and tuple(problem.blueprint.measurements[one.name].arms) == (arm,)
+
+
+def _of_surroundings(here: Records) -> Iterator[Dependence]:
+    asked = (
+        ("payload", "the payload", "torsional_spring or compliance; the payload's centre", _SECOND_LOAD),
+        ("temperature", "the temperature", "thermal_length", "repeat some poses cold and warm"),
+    )
+    for channel, words, effect, measure in asked:
+        if here.dataset.has(channel) and np.ptp(here.dataset.column(channel)) > 0:
+            feature = here.dataset.column(channel)
+            centred = (feature - feature.mean())[:, None] / feature.std()
+            yield Dependence(channel, "", "", words, effect, measure, here.axes(centred))

@@ -1,0 +1,116 @@
+"""What a verdict rests on beside the estimate: structure left in residuals, misses, and what priors alone hold."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from armcal.base.dataset import Dataset
+from armcal.base.domains import Array
+from armcal.diagnose.leftover import Leftover
+from armcal.diagnose.misses import Misses
+from armcal.estimate.estimator import Estimate
+from armcal.planning.candidates import whitened_rows
+from armcal.problem.problem import Problem
+from armcal.problem.tool_motion import along, apart_from, tools, unseen_motions
+
+UNSEEN = 400
+UP_TO_FRAMES = "where the base stands and which point of the tool is meant"
+_AXES = ["x", "y", "z"]
+_MM = 1000.0
+
+
+@dataclass(frozen=True)
+class PriorsAlone:
+    """What combinations that only priors hold do to the tip.
+
+    Attributes:
+        worst_mm: the largest standard deviation of the tip that they leave, over the poses looked at.
+        poses: how many unseen poses were looked at.
+        up_to: motions that were left out, because nothing that was measured sees them; empty where none were.
+    """
+
+    worst_mm: float
+    poses: int
+    up_to: str = ""
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """All of it; what was not looked at, or is not known, is None. ``unit`` is that of all errors, mm or mrad."""
+
+    leftover: Leftover | None = None
+    misses: Misses | None = None
+    priors_alone: PriorsAlone | None = None
+    unit: str = "mm"
+
+    def as_dict(self) -> dict[str, Any]:
+        """For metrics.json."""
+        alone = self.priors_alone
+        return {
+            "leftover": None if self.leftover is None else self.leftover.as_dict(),
+            "misses": None if self.misses is None else self.misses.as_dict(),
+            "priors_alone": None if alone is None else {"worst_mm": alone.worst_mm, "poses": alone.poses},
+        }
+
+
+def unseen_poses(dataset: Dataset, channels: Sequence[str]) -> Dataset:
+    """Poses that combine what single joints did in the records: a joint's command and approach are of one of them."""
+    random = np.random.default_rng(0)
+    together = random.integers(0, len(dataset), UNSEEN)
+    values = {name: column[together] for name, column in dataset.channels.items()}
+    for channel in channels:
+        arm, _, joint = channel.partition(".")
+        drawn = random.integers(0, len(dataset), UNSEEN)
+        for own in (channel, f"{arm}.approach.{joint}"):
+            if dataset.has(own):
+                values[own] = dataset.column(own)[drawn]
+    return Dataset(tuple(str(i) for i in range(UNSEEN)), values)
+
+
+def priors_alone(problem: Problem, estimate: Estimate, poses: Dataset) -> PriorsAlone | None:
+    """How far the tip at these poses depends on combinations that the data does not determine.
+
+    Their covariance is what the priors give them, V (V'PV)^-1 V' over the undetermined directions V.
+
+    Returns:
+        None if there are none, or if no prior holds one of them.
+    """
+    null = estimate.identifiability.null
+    rows = _position_rows(problem)
+    scales = estimate.parameters.scales()
+    information = null * (scales**2 * estimate.parameters.prior_information()) @ null.T
+    if not len(null) or not len(poses) or np.linalg.cond(information) > 1 / np.finfo(float).eps:
+        return None
+    if not len(rows):
+        return _of_tools(problem, estimate, poses, np.asarray(np.linalg.inv(information), dtype=float))
+    noise = np.concatenate([kernel.factor.noise for kernel in problem.kernels])
+    seen = whitened_rows(problem, estimate.values, poses)[rows] * noise[rows, None, None] @ null.T
+    covariance: Array = np.asarray(np.linalg.inv(information), dtype=float)
+    variance = np.einsum("rnk,kl,rnl->n", seen, covariance, seen)
+    return PriorsAlone(float(np.sqrt(np.max(np.maximum(variance, 0.0)))) * _MM, len(poses))
+
+
+def _of_tools(problem: Problem, estimate: Estimate, poses: Dataset, covariance: Array) -> PriorsAlone:
+    """Where nothing reads a position in the base frame: of the tools themselves, up to what no contact could see."""
+    records, values = problem.records(poses), estimate.values
+    at, axes = tools(problem, values, records)
+    moves = np.array([along(problem, values, records, way).ravel() for way in estimate.identifiability.null]).T
+    left = apart_from(np.array(unseen_motions(at, axes)).T, moves).reshape(len(at), 3, -1, moves.shape[1])
+    variance = np.einsum("trnk,kl,trnl->tn", left, covariance, left)
+    return PriorsAlone(float(np.sqrt(np.max(np.maximum(variance, 0.0)))) * _MM, len(poses), UP_TO_FRAMES)
+
+
+def _position_rows(problem: Problem) -> list[int]:
+    """Which residual numbers, all factors stacked, are those of the first position in a base frame."""
+    start = 0
+    for kernel in problem.kernels:
+        factor = kernel.factor
+        own = [channel.rpartition(".")[2] for channel in factor.output_channels[:3]]
+        if own == _AXES and factor.dimensions[:3] == ("length",) * 3:
+            return list(range(start, start + 3))
+        start += len(factor.noise)
+    return []

@@ -1,0 +1,251 @@
+"""What is left in residuals, which records are missed, and what priors alone hold, in sentences of the verdict."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.special import stdtrit
+
+from armcal.base.domains import Array, Semidefinite, symmetric
+from armcal.base.parameters import ParameterBlock
+from armcal.diagnose.evidence import PriorsAlone
+from armcal.diagnose.leftover import Leftover, Structure
+from armcal.diagnose.misses import MEDIANS, Misses
+from armcal.diagnose.noise_findings import Finding
+from armcal.diagnose.odds import UNLISTED
+from armcal.diagnose.smooth import CLEAR, IMITATED, TimeOrPose
+from armcal.estimate.estimator import AT_BOUND, Estimate
+
+MOST_TOLD = 5
+FEW_NAMED = 2
+"""So many combinations that only priors hold are named in the verdict; of more, armcal identify tells."""
+_LIKELY = 0.05
+"""A cause with less of the odds is not named first."""
+NEGLIGIBLE_SHARE = 0.1
+"""Of the typical error: what moves the tip by less than this does not matter to it."""
+NOTICEABLE_SD = 0.3
+"""A shift by less than so many standard deviations is not reported."""
+_MM = "mm"
+
+
+def determined_told(estimate: Estimate, alone: PriorsAlone | None, typical_mm: float | None) -> Finding:
+    """What the data determines, and whether what it does not matters to the tip."""
+    known = estimate.identifiability
+    test = "rank of the Jacobian in ordinary sizes"
+    if not len(known):
+        text = "No parameter was free: the nominal model was judged, nothing was calibrated."
+        return Finding("warning", text, test, "Free parameters: parameters.free.")
+    count = len(known.undetermined)
+    if not count:
+        return Finding("good", f"The data determines all {known.rank} free parameters.", test)
+    listed = "; ".join(str(combination) for combination in known.undetermined[:MOST_TOLD])
+    more = f"; and {count - MOST_TOLD} more" if count > MOST_TOLD else ""
+    if alone is None:
+        text = f"Not determined by the data, held by priors alone: {listed}{more}."
+        return Finding("bad", text, test, "Free fewer parameters, or measure what armcal identify asks for.")
+    held = f"{_plural(count, 'combination is', 'combinations are')} held by priors alone"
+    held += f" ({listed})" if count <= FEW_NAMED else ""
+    test = f"{test}; the tip at {alone.poses} unseen poses, joints approached as in the records"
+    test += f"; positions, not orientations, up to {alone.up_to}, which nothing measured shows" if alone.up_to else ""
+    if typical_mm is None or alone.worst_mm <= NEGLIGIBLE_SHARE * typical_mm:
+        most = f"{alone.worst_mm:.2g}" if alone.worst_mm >= 0.001 else "0.001"
+        text = f"{held}; the tip at unseen poses does not depend on them (at most {most} {_MM}, 1 sd)."
+        return Finding("note", text, test, "Nothing for the tip; armcal identify names them.")
+    text = f"{held}, and the tip at unseen poses depends on them, by up to {alone.worst_mm:.2g} {_MM} (1 sd)."
+    return Finding("warning", text, test, "armcal identify names them, and armcal plan the poses that would tell.")
+
+
+def shifted_told(estimate: Estimate) -> list[Finding]:
+    """Which estimates are moved by bounds and cones that hold others, and by how many standard deviations."""
+    blocks = {block.name for block in estimate.parameters.free if _at_its_edge(estimate, block)}
+    sd = np.where(estimate.deviations > 0, estimate.deviations, np.inf)
+    moved = np.nan_to_num((estimate.free_values - estimate.unconstrained) / sd)
+    seen = [i for i, name in enumerate(estimate.names) if name.partition("[")[0] not in blocks]
+    seen = [i for i in seen if abs(moved[i]) > NOTICEABLE_SD] if blocks else []
+    if not seen:
+        return []
+    worst = sorted(seen, key=lambda i: -abs(moved[i]))
+    listed = ", ".join(f"{estimate.names[i]} ({moved[i]:+.1f} sd)" for i in worst[:MOST_TOLD])
+    more = f" and {len(worst) - MOST_TOLD} more" if len(worst) > MOST_TOLD else ""
+    held = ", ".join(sorted(blocks)[:MOST_TOLD]) + (" and others" if len(blocks) > MOST_TOLD else "")
+    text = f"Bounds that hold {held} shift other estimates: {listed}{more}. Their intervals do not count this shift."
+    return [Finding("note", text, f"step without bounds, more than {NOTICEABLE_SD:g} sd")]
+
+
+def _at_its_edge(estimate: Estimate, block: ParameterBlock) -> bool:
+    """Whether a block lies on a bound, or a matrix on its cone."""
+    if isinstance(block.domain, Semidefinite):
+        sizes = np.linalg.eigvalsh(symmetric(estimate.values[estimate.parameters.entries_of(block.name)]))
+        return bool(sizes.min() <= AT_BOUND * block.scale)
+    return not set(block.entry_names).isdisjoint(estimate.at_bound)
+
+
+def worse_than_nominal(judged_mm: Array, nominal_mm: Array, unit: str = _MM) -> list[Finding]:
+    """Where records that did not train are missed by more than before calibration (N each; nan where not judged)."""
+    seen = np.isfinite(judged_mm) & np.isfinite(nominal_mm)
+    if not seen.any():
+        return []
+    after, before = float(np.mean(judged_mm[seen])), float(np.mean(nominal_mm[seen]))
+    if after <= before:
+        return []
+    which = f"on records that did not train it: {after:.2f} {unit} on average, {before:.2f} before."
+    more = judged_mm[seen] - nominal_mm[seen]
+    test = "paired differences, one-sided, 5 %"
+    if len(more) > 1 and after - before <= stdtrit(len(more) - 1, 0.95) * np.std(more, ddof=1) / np.sqrt(len(more)):
+        action = "Nothing is gained by it on poses like these: keep the nominal arm, or look at what trained."
+        return [Finding("warning", f"No better than the nominal arm {which}", test, action)]
+    action = "Do not use it. Look at what trained: too few postures, too much alike, or some of them wrong."
+    return [Finding("bad", f"Worse than the nominal arm {which}", test, action)]
+
+
+def structures_told(found: Leftover | None, unit: str = _MM) -> list[Finding]:
+    """What residuals still depend on."""
+    if found is None:
+        return []
+    test = _test_of(found)
+    kept = found.worthwhile
+    findings = [_structure_told(s, found, unit, test) for s in kept] + _unlisted(found)
+    if not findings:
+        slight = f" {_plural(len(found.structures), 'dependence', 'dependences')} found would not lower it by 1 %."
+        text = f"Of {found.tested} things that residuals might depend on none explains the error left."
+        findings.append(Finding("good", text + (slight if found.structures else ""), test))
+    if kept and found.more:
+        text = "Residuals depend on more than these; model them first, then look again."
+        findings.append(Finding("note", text, test))
+    return [*findings, *_scatter(found)]
+
+
+def _structure_told(s: Structure, found: Leftover, unit: str, test: str) -> Finding:
+    """One cause if it is clearly the likeliest, else all that it does not beat."""
+    falls = f"the mean training residual of {found.mean_mm:.2f} {unit} would fall by {s.falls_mm:.2f} {unit}"
+    what = s.words + (f" ({s.size})" if s.size else "")
+    test = f"p {_p(s.p_value)}, {test}; odds among all of them and what is none of them"
+    if not s.alternatives:
+        model = f"Model it: {s.effect}. " if s.effect else "No effect of armcal says this. "
+        text = f"Residuals still depend on {what}: modelled, {falls}. It has {_share(s.odds)} of the odds."
+        return Finding("warning", text, test, f"{model}To be sure: {s.measure}.")
+    named = [what, *s.alternatives] if s.odds >= _LIKELY else [s.alternatives[0], what, *s.alternatives[1:]]
+    more = len(named) - MOST_TOLD
+    text = f"Residuals still depend on {'; or on '.join(named[:MOST_TOLD])}"
+    text += f"; or on {more} more (metrics.json). " if more > 0 else ". "
+    text += f"These data cannot tell which. Modelled as {s.words}, which has {_share(s.odds)} of the odds, {falls}."
+    model = f" Then model it: {s.effect}." if s.effect else ""
+    return Finding("warning", text, test, f"To tell: {s.measure}.{model}")
+
+
+def _share(odds: float) -> str:
+    return "over 99 %" if odds > 0.99 else "less than 1 %" if odds < 0.01 else f"{100 * odds:.0f} %"
+
+
+def _unlisted(found: Leftover) -> list[Finding]:
+    """What follows the pose, and is none of the causes; those that may stand for it say so themselves."""
+    if found.unlisted <= CLEAR or any(UNLISTED in s.alternatives for s in found.worthwhile):
+        return []
+    text = f"Residuals follow the pose smoothly in a way that none of the {found.tested} causes tried explains: the "
+    text += "model lacks something that is not among them."
+    test = f"marginal likelihood of a Gaussian process over the poses, odds of {np.exp(CLEAR):.0f} to 1"
+    return [Finding("warning", text, test, "Free more of the geometry; repeat some poses with a second payload.")]
+
+
+def _scatter(found: Leftover) -> list[Finding]:
+    """What the size of residuals depends on."""
+    noise = found.noise
+    if noise is None:
+        return []
+    text = f"The scatter of the residuals depends on {'; or on '.join([noise.words, *noise.alternatives[:MOST_TOLD]])}:"
+    text += f" from {noise.low:.1f} to {noise.high:.1f} times the declared noise, in the thirds of the records with the"
+    text += " least and the most of it. Either the noise varies, or the model errs more there."
+    test = f"regression of squared residuals, p {_p(noise.p_value)} over everything looked at"
+    action = (
+        "Repeat a pose at both ends of it: where repeats scatter alike, it is the model; else state noise by record."
+    )
+    return [Finding("warning", text, test, action)]
+
+
+def _test_of(found: Leftover) -> str:
+    blocks = f", blocks of {found.block} records" if found.block > 1 else ""
+    level = f"{100 * found.level:g} % over all {found.tested} dependences{blocks}"
+    return f"score test, {level}, and likelier than chance"
+
+
+def neighbours_told(found: Leftover | None, estimate: Estimate, unit: str = _MM) -> list[Finding]:
+    """Whether records that follow one another miss alike, why, and whether that made intervals wider."""
+    if found is None:
+        return []
+    test = f"lag-one correlation, {100 * found.level:g} % over all dependences and this"
+    if found.lag_p > found.level:
+        return [Finding("good", "Residuals of neighbouring records do not correlate.", test)]
+    text = f"Residuals of neighbouring records correlate by {found.lag_one:.2f}"
+    if found.lag_after_p > found.level:
+        return [Finding("note", f"{text}; what was found above explains it.", test)]
+    after = f", by {found.lag_after:.2f} still beside what was found" if found.structures else ""
+    why, cause = ("", "open") if found.alike is None else (f" {_why(found.alike, unit)}", found.alike.cause)
+    text += f"{after}: they are no noise. {what_neighbours_cost(estimate)}{why}"
+    return [Finding("warning", text, test, _TELL_APART[cause])]
+
+
+def what_neighbours_cost(estimate: Estimate) -> str:
+    """What correlated neighbours do to the intervals of the parameters."""
+    factors = estimate.widened
+    if not factors:
+        return "Intervals of the parameters hold all the same, in the order in which these poses were measured."
+    widest = int(np.argmax(factors))
+    return (
+        "By independent errors the intervals of the parameters would be too narrow; they are wider by a factor of "
+        f"{float(np.median(factors)):.1f} (median), at most {max(factors):.1f} ({estimate.names[widest]})."
+    )
+
+
+_WHY = {
+    "time": "It goes with time, not with the pose: ",
+    "pose": "It goes with the pose, not with time: ",
+    "open": "Whether time or the pose is the cause is not known: ",
+}
+_TELL_APART = {
+    "time": "Let the base drift (parameters.drift); repeat one pose at the start, in the middle and at the end.",
+    "pose": "The model lacks an effect of pose; visiting the poses in random order would show it plainly.",
+    "open": "Repeat one pose at the start, in the middle and at the end; visit the others in random order.",
+}
+
+
+def _why(alike: TimeOrPose, unit: str) -> str:
+    """Smooth functions of both, compared."""
+    text = f"{_WHY[alike.cause]}predicted from the others, a record misses a smooth function of time by "
+    text += f"{alike.time_mm:.2f} {unit} and one of the pose by {alike.pose_mm:.2f} {unit} (log odds against "
+    text += f"noise {alike.time:.0f} and {alike.pose:.0f})"
+    if max(alike.time_imitated, alike.pose_imitated) > IMITATED:
+        shares = f"the pose predicts {_share(alike.time_imitated)} of the one, time {_share(alike.pose_imitated)} of "
+        text += f"; {shares}the other, as the poses were visited in an order"
+    return text + "."
+
+
+def misses_told(found: Misses | None, unit: str = _MM) -> list[Finding]:
+    """Records beyond the limit, each with what is unusual about it."""
+    if found is None:
+        return []
+    limit = "validation.limit_mm" if found.configured else f"{MEDIANS:g} times the median"
+    test = f"errors of {found.judged} records by fits that did not see them, limit {limit}"
+    if not found.beyond:
+        return [Finding("good", f"No judged record is missed by more than {found.limit_mm:.2f} {unit}.", test)]
+    listed = "; ".join(
+        f"{miss.record_id} ({miss.error_mm:.2f} {unit}: {', '.join(miss.reasons)})"
+        for miss in found.explained[:MOST_TOLD]
+    )
+    more = f"; and {found.beyond - MOST_TOLD} more, in the report" if found.beyond > MOST_TOLD else ""
+    text = f"{_plural(found.beyond, 'record is', 'records are')} missed by more than {found.limit_mm:.2f} {unit}: "
+    advice = _shared_advice([miss.advice for miss in found.explained[:MOST_TOLD]])
+    return [Finding("warning", f"{text}{listed}{more}.", test, advice)]
+
+
+def _shared_advice(advice: Sequence[str]) -> str:
+    different = list(dict.fromkeys(advice))
+    return "; or ".join(different).capitalize() + "."
+
+
+def _plural(count: int, one: str, many: str) -> str:
+    return f"{count} {one if count == 1 else many}"
+
+
+def _p(p: float) -> str:
+    return f"{p:.3f}" if p >= 0.01 else f"below {0.005 if p < 0.005 else 0.01:g}"

@@ -1,0 +1,121 @@
+"""A fit as the rows of one linear least-squares problem: data, priors, and the innovations of a drift."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armcal.base.domains import Array
+from armcal.estimate.estimator import Estimate
+from armcal.problem.problem import FactorRecords, Problem
+
+
+@dataclass(frozen=True)
+class FitRows:
+    """A fit as rows: whitened data factor by factor, then priors, then innovations of a drift.
+
+    Attributes:
+        slopes: by coordinates, and by innovations (rows x n).
+        residual: at the solution (rows).
+        record_of: of the data's rows, which record each belongs to.
+        by_record: the data's rows as (records x rows a record).
+        whitening: of each factor (n_r x n_r x N), weights counted.
+    """
+
+    slopes: Array
+    residual: Array
+    record_of: NDArray[np.intp]
+    by_record: NDArray[np.intp]
+    whitening: tuple[Array, ...]
+
+    @classmethod
+    def of(cls, problem: Problem, records: Sequence[FactorRecords], estimate: Estimate) -> FitRows:
+        """The rows at an estimate; ``records`` with the weights they had."""
+        values, parameters = estimate.values, problem.parameters
+        count, scales = records[0].count, parameters.scales()
+        chain = parameters.entries_jacobian(values) * scales
+        parts = [np.einsum("rvn,vc->rnc", block, chain) for block in _by_factor(problem, values, records)]
+        weighted = problem.weighted_residuals(values, records)
+        shared = records[0].correlation
+        drifted = [np.zeros((*r.shape, 0)) for r in weighted] if shared is None else shared.shared()
+        drifted = [slope[:, :count] for slope in drifted]
+        drift = np.zeros(0) if shared is None else _innovations(weighted, drifted)
+        data, slopes = [], []
+        for residual, part, slope in zip(weighted, parts, drifted, strict=True):
+            data.append((residual + slope @ drift).ravel())
+            slopes.append(np.concatenate([part, slope], axis=2).reshape(residual.size, -1))
+        prior = np.sqrt(parameters.prior_information())
+        moved = prior * parameters.coordinates(parameters.local(values))
+        held, kept = np.flatnonzero(prior), len(scales)
+        below = np.zeros((len(held) + len(drift), kept + len(drift)))
+        below[np.arange(len(held)), held] = (prior * scales)[held]
+        below[len(held) :, kept:] = np.eye(len(drift))
+        sizes = [len(residual) for residual in weighted]
+        numbers = np.arange(sum(sizes) * count).reshape(sum(sizes), count)
+        return cls(
+            np.vstack([*slopes, below]),
+            np.concatenate([*data, moved[held], drift]),
+            np.tile(np.arange(count), sum(sizes)),
+            numbers.T,
+            tuple(_whitening(k.factor.noise, each) for k, each in zip(problem.kernels, records, strict=True)),
+        )
+
+    def columns(self, raw: Sequence[Array]) -> Array:
+        """Raw residuals by coefficient (n_r x N x k a factor) as rows."""
+        parts = [
+            np.einsum("rsn,snk->rnk", whitening, part).reshape(-1, part.shape[2])
+            for whitening, part in zip(self.whitening, raw, strict=True)
+        ]
+        below = np.zeros((len(self.residual) - len(self.record_of), parts[0].shape[1]))
+        return np.vstack([*parts, below])
+
+    def stance(self, count: int) -> Array:
+        """How the arm stands in each record, by how its parameters move the residual (records x features)."""
+        return np.asarray(self.slopes[self.by_record][:, :, :count].reshape(len(self.by_record), -1))
+
+    def mean_error(self, residual: Array) -> float:
+        """Mean length of the raw residuals that rows stand for (m); root mean square over several factors."""
+        return float(np.mean(self.errors(residual)))
+
+    def errors(self, residual: Array) -> Array:
+        """The length of each record's (N, m)."""
+        squares, place, count = [], 0, len(self.by_record)
+        for whitening in self.whitening:
+            size = len(whitening)
+            own = residual[place : place + size * count].reshape(size, count)
+            counted = np.flatnonzero(np.abs(np.linalg.det(np.moveaxis(whitening, 2, 0))) > 0)
+            raw = np.zeros_like(own)
+            inverse = np.linalg.inv(np.moveaxis(whitening[:, :, counted], 2, 0))
+            raw[:, counted] = np.einsum("nrs,sn->rn", inverse, own[:, counted])
+            squares.append(np.sum(raw**2, axis=0))
+            place += size * count
+        return np.asarray(np.sqrt(np.mean(squares, axis=0)))
+
+
+def _by_factor(problem: Problem, values: Array, records: Sequence[FactorRecords]) -> list[Array]:
+    """Whitened, weighted Jacobians by free entries, one (n_r x n_v x N) a factor."""
+    blocks, whole = problem.jacobians(values, records), []
+    for each in records:
+        parts: list[Array] = []
+        while sum(part.shape[2] for part in parts) < each.record.shape[1]:
+            parts.append(next(blocks))
+        whole.append(np.concatenate(parts, axis=2)[:, :, : each.count])
+    return whole
+
+
+def _innovations(residuals: Sequence[Array], slopes: Sequence[Array]) -> Array:
+    """The most likely ones of a drift (n_z), by whitened residuals (n_r x N a factor) and their slopes by them."""
+    residual = np.concatenate([each.ravel() for each in residuals])
+    slope = np.vstack([each.reshape(-1, each.shape[2]) for each in slopes])
+    return -np.linalg.solve(np.eye(slope.shape[1]) + slope.T @ slope, slope.T @ residual)
+
+
+def _whitening(noise: Sequence[float], records: FactorRecords) -> Array:
+    """What makes raw residuals rows (n_r x n_r x N)."""
+    root = np.sqrt(records.weight[: records.count])
+    if records.whitening is not None:
+        return np.asarray(records.whitening[:, :, : records.count] * root)
+    return np.asarray(np.diag(1 / np.array(noise))[:, :, None] * root)

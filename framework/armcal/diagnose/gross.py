@@ -1,0 +1,154 @@
+"""How a calibrated arm differs from the nominal one as a whole, and what of it contradicts what was known before."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from armcal.base.domains import Array
+from armcal.base.parameters import ParameterBlock
+from armcal.diagnose.fit_rows import FitRows
+from armcal.errors import NotConvergedError
+from armcal.estimate.combination import Measure
+from armcal.estimate.estimator import Estimate
+from armcal.estimate.structure import random_records
+from armcal.problem.problem import FactorRecords, Problem
+from armcal.problem.rigid import rigid_fit, spread_of
+from armcal.problem.tool_motion import along, apart_from, tools, unseen_motions
+
+BEYOND, FAR_BEYOND = 4.0, 20.0
+"""Standard deviations of a prior, or typical corrections where there is none: what is worth a look, what is gross."""
+MOST_RECORDS = 300
+_POSES = 60
+_SAME_MOTION = 0.02
+"""Of a parameter's motion of the tool: what may differ from that of the base or of the tool's point."""
+
+
+@dataclass(frozen=True)
+class Displaced:
+    """A parameter far from its nominal value.
+
+    Attributes:
+        name: of its coordinate.
+        amount: how far, in ``unit``.
+        unit: that people are shown.
+        times: how many standard deviations of its prior, or typical corrections.
+        by_prior: whether it has a prior.
+        placement: whether it only says where the base stands or which point of the tool is meant.
+    """
+
+    name: str
+    amount: float
+    unit: str
+    times: float
+    by_prior: bool
+    placement: bool
+
+
+@dataclass(frozen=True)
+class Figure:
+    """The calibrated arm beside the nominal one.
+
+    Attributes:
+        reach_mm: largest distance of the nominal tool from the first joint, over the poses.
+        size: extent of the calibrated tool positions by that of the nominal ones; nan where they do not move.
+        moved_mm, turned_deg: how the calibrated arm as a whole stands away from the nominal one.
+        displaced: parameters beyond what their priors say, the farthest first.
+    """
+
+    reach_mm: float
+    size: float
+    moved_mm: float
+    turned_deg: float
+    displaced: tuple[Displaced, ...]
+
+
+def thinned(chosen: NDArray[np.intp], most: int) -> NDArray[np.intp]:
+    """At most so many of some records, evenly."""
+    return chosen[:: max(1, -(-len(chosen) // most))]
+
+
+def figure_of(problem: Problem, estimate: Estimate, records: Sequence[FactorRecords]) -> Figure:
+    """Of the first tool of all, at random poses about the recorded ones: what touches a socket hardly moves in them.
+
+    Raises:
+        NotConvergedError: a record has no elastic equilibrium.
+    """
+    poses = problem.subset(random_records(problem, records), np.arange(_POSES, dtype=np.intp))
+    try:
+        nominal, calibrated = _both(problem, estimate, poses)
+    except NotConvergedError:
+        poses = tuple(records)
+        nominal, calibrated = _both(problem, estimate, poses)
+    arm = problem.blueprint.arms[problem.blueprint.measurements[problem.kernels[0].factor.name].arms[0]]
+    chain = arm.nominal_chain
+    first = np.array(ca.evalf((chain.base_T_mount @ chain.joints[0].parent_T_joint).translation)).ravel()
+    extent, turn, shift = spread_of(nominal), *rigid_fit(nominal, calibrated)
+    return Figure(
+        reach_mm=float(np.max(np.linalg.norm(nominal - first[:, None], axis=0))) * 1000.0,
+        size=spread_of(calibrated) / extent if extent > 0 else float("nan"),
+        moved_mm=float(np.linalg.norm(turn @ first + shift - first)) * 1000.0,
+        turned_deg=float(np.degrees(np.arccos(np.clip((np.trace(turn) - 1) / 2, -1.0, 1.0)))),
+        displaced=displaced(problem, estimate, poses),
+    )
+
+
+def _both(problem: Problem, estimate: Estimate, poses: Sequence[FactorRecords]) -> tuple[Array, Array]:
+    """Places of the first tool, nominal and calibrated (3 x N, m)."""
+    at_nominal, at_estimate = (tools(problem, v, poses)[0] for v in (problem.parameters.nominal(), estimate.values))
+    return at_nominal[0], at_estimate[0]
+
+
+def displaced(problem: Problem, estimate: Estimate, records: Sequence[FactorRecords]) -> tuple[Displaced, ...]:
+    """Coordinates of geometry that are more than ``BEYOND`` prior standard deviations from their nominal values."""
+    parameters = problem.parameters
+    moved = parameters.coordinates(parameters.local(estimate.values))
+    blocks = [block for block in parameters.free for _ in range(block.domain.dof)]
+    sizes = np.array([_plausible(block) for block in blocks])
+    found = []
+    for i in np.flatnonzero(np.abs(moved) > BEYOND * sizes):
+        block, direction = blocks[i], np.zeros(len(moved))
+        direction[i] = 1.0
+        amount, unit = Measure(block.unit, 1.0).shown(float(moved[i]))
+        placement = _is_placement(problem, estimate.values, records, direction)
+        times, name = abs(float(moved[i])) / sizes[i], parameters.coordinate_names[i]
+        found.append(Displaced(name, amount, unit, float(times), block.prior_sd is not None, placement))
+    return tuple(sorted(found, key=lambda each: -each.times))
+
+
+def scale_deviation(problem: Problem, rows: FitRows, positions: Sequence[Array], noise_scale: float) -> float | None:
+    """Standard deviation of an instrument's scale if it were free beside the parameters; None without positions.
+
+    Args:
+        problem: of the fit.
+        rows: of the fit, priors among them.
+        positions: what each factor should read (3 x N, or 0 x N; m), in the same records.
+        noise_scale: residuals in units of the declared noise.
+    """
+    if not any(map(len, positions)):
+        return None
+    raw = [np.zeros((len(k.factor.noise), len(rows.by_record), 1)) for k in problem.kernels]
+    for column, position in zip(raw, positions, strict=True):
+        column[: len(position), :, 0] = position
+    left = float(np.linalg.norm(apart_from(rows.slopes, rows.columns(raw))))
+    return noise_scale / left if left > 0 else float("inf")
+
+
+def _plausible(block: ParameterBlock) -> float:
+    """What its prior says, else a typical correction of a length or angle; of others nothing is known."""
+    if block.prior_sd is not None:
+        return block.prior_sd
+    return block.scale if block.unit in ("m", "rad") and not block.nuisance else float("inf")
+
+
+def _is_placement(problem: Problem, values: Array, records: Sequence[FactorRecords], direction: Array) -> bool:
+    """Whether a direction moves all tools as the base would, or as another point of the tool would."""
+    at, axes = tools(problem, values, records)
+    moves = along(problem, values, records, direction).reshape(-1, 1)
+    size = float(np.linalg.norm(moves))
+    left = apart_from(np.array(unseen_motions(at, axes)).T, moves)
+    return size == 0 or float(np.linalg.norm(left)) <= _SAME_MOTION * size

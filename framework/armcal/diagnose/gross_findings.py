@@ -1,0 +1,139 @@
+"""What is grossly wrong with a calibration, and what no data can show, in sentences of the verdict."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from armcal.base.domains import Array
+from armcal.diagnose.gross import BEYOND, FAR_BEYOND, Displaced, Figure
+from armcal.diagnose.leftover import Leftover
+from armcal.diagnose.majority import Minority
+from armcal.diagnose.noise_findings import Finding
+from armcal.estimate.estimator import CHECK_THE_DATA, Estimate
+
+OF_REACH = 0.03
+"""An error beyond this share of the arm's reach is gross, whatever the arm."""
+UNEXPLAINED_OF_REACH, EXPLAINED_OF_REACH, TIMES_NOISE, EXPLAINED = 0.005, 0.02, 5.0, 1 / 3
+"""An error beyond the second share of the reach and so many times the declared noise is gross; beyond the first one
+where no structure in the residuals makes up a third of it, as gravity does of a printed arm whose base is rigid."""
+_NO_EXCUSE = frozenset({"order", "step", "slip", "scale"})
+"""Kinds of structure that explain no gross error: something may have moved, or a frame be wrong."""
+SIZE, GROSS_SIZE = 0.02, 0.05
+"""How far the calibrated arm may be larger or smaller than the nominal one: worth a look, and gross."""
+UNSEEN_SCALE = 0.2
+MOST_NAMED = 3
+
+
+def gross_error(
+    judged_mm: Array, figure: Figure, estimate: Estimate, left: Leftover | None, unit: str = "mm"
+) -> list[Finding]:
+    """Errors of records that did not train (N; nan where not judged) beside the reach and the noise.
+
+    Where nothing measured is a length, errors are in ``mrad`` and stand beside a radian: what the reach is at the
+    distance of the reach.
+    """
+    seen = judged_mm[np.isfinite(judged_mm)]
+    if not len(seen) or figure.reach_mm <= 0:
+        return []
+    mean, scale = float(np.mean(seen)), estimate.noise_scale
+    whole, name = (figure.reach_mm, "the arm's reach") if unit == "mm" else (1000.0, "a radian")
+    share = mean / whole
+    error = f"Records that did not train are missed by {mean:.3g} {unit} on average, {100 * share:.2g} % of {name}"
+    if share > OF_REACH:
+        test = f"mean, limit {100 * OF_REACH:g} % of {whole:.0f} {unit}"
+        return [Finding("bad", f"{error}: the values do not describe this arm.", test, CHECK_THE_DATA)]
+    found = 0.0
+    if left is not None:
+        causes = [s.falls_mm for s in left.worthwhile if s.kind not in _NO_EXCUSE]
+        found = max(causes, default=0.0) / max(left.mean_mm, 1e-12)
+    limit = UNEXPLAINED_OF_REACH if found < EXPLAINED else EXPLAINED_OF_REACH
+    if share <= limit or scale <= TIMES_NOISE:
+        return []
+    text = f"{error} and {scale:.0f} times the declared noise; what was found in the residuals does not explain it."
+    test = f"limits {100 * limit:g} % and {TIMES_NOISE:g} times; one cause explains at most {100 * found:.0f} %"
+    return [Finding("bad", text, test, f"The cause is not known. {CHECK_THE_DATA}")]
+
+
+def contradicting(found: Minority | None, ids: Sequence[str]) -> list[Finding]:
+    """Records that contradict the others; ``ids`` are those of the records looked at, in the order of the fit."""
+    if found is None:
+        return []
+    count, total = len(found.far), len(ids)
+    text = (
+        f"{count} of {total} training records ({100 * count / total:.0f} %) contradict the others: a fit to the "
+        f"majority is off by {found.typical_mm:.2g} mm there, and by {found.far_mm:.3g} mm in these"
+    )
+    listed = f"{', '.join(ids[i] for i in found.far[:MOST_NAMED])}{', ...' if count > MOST_NAMED else ''}"
+    test = "sum of residual lengths minimised; far is beyond 8 times the lower quartile"
+    if found.since is None:
+        action = f"Find out what is different about them ({listed}): units, joints, the target, reflections."
+        return [Finding("bad", f"{text}.", test, action)]
+    text += f": nearly all from record {ids[found.far[0]]} on"
+    action = "Something moved there, or slipped: the base, the tracker, the target or a joint. Measure again, or split."
+    return [Finding("bad", f"{text}.", test, action)]
+
+
+def size_told(figure: Figure) -> list[Finding]:
+    """Is the calibrated arm as large as the nominal one?"""
+    off = abs(figure.size - 1)
+    if not off > SIZE:
+        return []
+    text = f"The calibrated arm is {figure.size:.3g} times as large as the nominal one."
+    test = f"extent of the tool's positions, limits {100 * SIZE:g} and {100 * GROSS_SIZE:g} %"
+    action = "Check the units and values of known distances and positions, and the tracker's scale."
+    return [Finding("bad" if off > GROSS_SIZE else "warning", text, test, action)]
+
+
+def displaced_told(figure: Figure) -> list[Finding]:
+    """Parameters that contradict their priors, or are implausibly far from their nominal values."""
+    geometry = [each for each in figure.displaced if each.by_prior or not each.placement]
+    gross = [each for each in geometry if each.times > FAR_BEYOND]
+    beyond = [each for each in geometry if each.times <= FAR_BEYOND]
+    elsewhere = [each for each in figure.displaced if each not in geometry and each.times > FAR_BEYOND]
+    test = f"limits {BEYOND:g} and {FAR_BEYOND:g} standard deviations of the prior, or typical corrections"
+    action = "If the arm is so, correct the nominal values; else look for a joint's zero, sign, or unit."
+    findings = []
+    if gross:
+        findings.append(Finding("bad", f"Far from the nominal values: {_listed(gross)}.", test, action))
+    if beyond:
+        findings.append(Finding("warning", f"Far from the nominal values: {_listed(beyond)}.", test, action))
+    if elsewhere:
+        text = (
+            f"The base or the tool's point is far from where the configuration has it: {_listed(elsewhere)}. These "
+            "data cannot tell whether it is there, or the instrument's frame or target is elsewhere: no prior holds it."
+        )
+        action = "If the configuration's frame is meant, look for an offset or a unit; else correct the nominal values."
+        findings.append(Finding("warning", text, test, action))
+    return findings
+
+
+def _listed(group: Sequence[Displaced]) -> str:
+    more = f" and {len(group) - MOST_NAMED} more" if len(group) > MOST_NAMED else ""
+    return f"{', '.join(map(_displacement, group[:MOST_NAMED]))}{more}"
+
+
+def _displacement(each: Displaced) -> str:
+    measure = "its prior" if each.by_prior else "a typical correction"
+    return f"{each.name} by {each.amount:.3g} {each.unit} ({each.times:.0f} times {measure})"
+
+
+def limits_told(figure: Figure, scale_sd: float | None) -> list[Finding]:
+    """What no residual shows: in which frame the answer is, and how large an error of the instrument's scale may be."""
+    if scale_sd is None:
+        return []
+    text = (
+        f"The answer is in the instrument's frame: in it the arm stands {figure.moved_mm:.3g} mm and "
+        f"{figure.turned_deg:.2g} deg from where the configuration has it."
+    )
+    most = 2 * scale_sd
+    if most > UNSEEN_SCALE:
+        text += " An error of the instrument's scale would not show in these data at all."
+    else:
+        text += (
+            f" An error of the instrument's scale of up to {100 * most:.2g} % would not show"
+            f" ({most * figure.reach_mm:.2g} mm at the arm's reach)."
+        )
+    action = "Measure a known length with the instrument, if the scale matters."
+    return [Finding("note", text, "two standard deviations of a scale beside the parameters", action)]

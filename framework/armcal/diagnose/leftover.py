@@ -1,0 +1,326 @@
+"""What structure is left in the residuals of a calibration, how much of the error it is, and what would tell.
+
+Dependences are tested all at once (family-wise 5 %). The one that says most for its size [Schwarz1978] is taken into
+the model, to first order, and the others are tested again on what is left: so each is named for what the ones before
+it do not say. Residuals are those of training, less the drift that was found; what the parameters can take up, each
+dependence is freed of first. Of those that were found, each is then set against all the others and against what is
+not among them: it is named alone only where it is clearly the likeliest.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armcal.base.dataset import Dataset
+from armcal.base.domains import Array
+from armcal.base.units import display_unit, to_unit
+from armcal.diagnose.dependences import Dependence, Records, dependences
+from armcal.diagnose.fit_rows import FitRows
+from armcal.diagnose.noise_trend import NoiseTrend, noise_trend
+from armcal.diagnose.odds import Contest, Odds
+from armcal.diagnose.outside import outside, predicted_positions
+from armcal.diagnose.score_tests import FamilyTest, Fit, family_test, linear_fit, own_basis
+from armcal.diagnose.smooth import TimeOrPose, left_out, pose_kernels, smooth, time_kernels
+from armcal.estimate.blocks import automatic_block_length
+from armcal.estimate.estimator import Estimate
+from armcal.problem.motion import Motion
+from armcal.problem.problem import FactorRecords, Problem
+
+LEVEL = 0.05
+MOST_FOUND = 5
+WORTHWHILE = 0.01
+MOST_RECORDS = 1000
+FEWEST_RECORDS = 30
+_MOST_BLOCKS, _FEWEST_BLOCKS = 60, 30
+_FOLDS = 5
+_MM = 1000.0
+_NEGLIGIBLE = 0.1
+"""Of what the causes found so far take up: less than this may be what is not linear in them. Model them first."""
+_LIKELIER = 0.5
+"""Where chance has more of the odds, a cause is none."""
+
+
+@dataclass(frozen=True)
+class Structure:
+    """A dependence that was found.
+
+    Attributes:
+        kind, subject, words, effect, measure: as in ``Dependence``.
+        p_value: that the residuals do not depend on it, family-wise.
+        share: of the squared residuals left by the ones before it.
+        falls_mm: by how much the mean error would fall if it were modelled, judged on records left out.
+        size: how large it is, in words; empty if its coefficients have no unit.
+        odds: its share of the odds of everything that was tried, and of what was not.
+        alternatives: what it does not beat 20 to 1, the most likely first; only a measurement can tell.
+    """
+
+    kind: str
+    subject: str
+    words: str
+    effect: str
+    measure: str
+    p_value: float
+    share: float
+    falls_mm: float
+    size: str
+    odds: float
+    alternatives: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Leftover:
+    """What the residuals of a fit still depend on.
+
+    Attributes:
+        structures: in the order in which they were taken into the model.
+        more: whether something was significant still when the search ended.
+        lag_one: correlation of neighbouring residuals, less what the fit itself makes of it.
+        lag_p: its p-value, in the same family.
+        lag_after, lag_after_p: the same once the structures found are modelled.
+        alike: why neighbours resemble each other even then; None if they do not.
+        unlisted: logarithm of the odds that residuals follow the pose beside what was found, against noise.
+        noise: what their scatter depends on; None if on nothing.
+        mean_mm: mean residual of the training records.
+        tested: how many dependences were tested.
+        records: how many records were looked at.
+        block: how many neighbours count as one observation.
+        level: family-wise.
+    """
+
+    structures: tuple[Structure, ...]
+    more: bool
+    lag_one: float
+    lag_p: float
+    lag_after: float
+    lag_after_p: float
+    alike: TimeOrPose | None
+    unlisted: float
+    noise: NoiseTrend | None
+    mean_mm: float
+    tested: int
+    records: int
+    block: int
+    level: float = LEVEL
+
+    @property
+    def worthwhile(self) -> tuple[Structure, ...]:
+        """Those that would lower the mean error by a hundredth of it."""
+        return tuple(s for s in self.structures if s.falls_mm >= WORTHWHILE * self.mean_mm)
+
+    def as_dict(self) -> dict[str, Any]:
+        """For metrics.json."""
+        return asdict(self)
+
+
+def leftover(
+    problem: Problem,
+    records: Sequence[FactorRecords],
+    estimate: Estimate,
+    dataset: Dataset,
+    motion: Motion,
+    position: NDArray[np.intp],
+    modelled: frozenset[str] = frozenset(),
+) -> Leftover | None:
+    """Test the residuals of a fit to records, with the weights they had; None where there are too few to tell.
+
+    ``motion`` is how the arm stands in them, ``position`` how many of all records were recorded before each (N),
+    ``modelled`` the types of the effects that the model has.
+    """
+    taking_part = np.any([each.weight[: each.count] > 0 for each in records], axis=0)
+    chosen = _looked_at(np.flatnonzero(taking_part), position)
+    if len(chosen) < FEWEST_RECORDS:
+        return None
+    records, dataset, position = problem.subset(records, chosen), dataset.subset(chosen), position[chosen]
+    rows = FitRows.of(problem, records, estimate)
+    block, consecutive = _blocks_of(rows, len(dataset)), np.diff(position) == 1
+    fit, basis = _fit_of(rows, block, consecutive)
+    motion = motion.subset(chosen)
+    read = predicted_positions(problem, estimate.values, records, dataset)
+    causes = [*dependences(problem, motion, dataset), *outside(problem, motion, dataset, read)]
+    columns = [rows.columns(one.columns) for one in causes]
+    kernels = pose_kernels(problem, dataset), time_kernels(len(dataset))
+    contest = Contest(causes, columns, fit.residual, basis, rows.by_record, fit.block * _FOLDS // fit.blocks, *kernels)
+    found = _search(rows, fit, contest, modelled)
+    residual, whole = contest.beside(found.chosen)
+    return Leftover(
+        found.structures,
+        found.more,
+        found.first.lag_one,
+        found.first.lag_adjusted,
+        found.last.lag_one,
+        found.last.lag_adjusted,
+        _alike(residual, whole, rows, contest) if found.last.lag_adjusted <= LEVEL else None,
+        smooth(residual, whole, rows.by_record, contest.pose).evidence,
+        noise_trend(residual, whole, rows.by_record, Records(dataset, motion), _first(read, len(dataset))),
+        rows.mean_error(fit.residual) * _MM,
+        found.tested,
+        len(dataset),
+        int(np.bincount(block).max()),
+    )
+
+
+def _first(read: Sequence[Array], count: int) -> Array:
+    """The first position that is read (3 x N; m), or nothing (0 x N)."""
+    return next((each for each in read if len(each)), np.zeros((0, count)))
+
+
+def _alike(residual: Array, basis: Array, rows: FitRows, contest: Contest) -> TimeOrPose:
+    time, pose = (smooth(residual, basis, rows.by_record, k) for k in (contest.time, contest.pose))
+    left = (left_out(each, residual, basis, rows.by_record) for each in (time, pose))
+    time_mm, pose_mm = (rows.mean_error(each) * _MM for each in left)
+    return TimeOrPose(
+        time.evidence,
+        pose.evidence,
+        time_mm,
+        pose_mm,
+        contest.pose.imitate(time.function[rows.by_record]),
+        contest.time.imitate(pose.function[rows.by_record]),
+    )
+
+
+def _fit_of(rows: FitRows, block: NDArray[np.intp], consecutive: NDArray[np.bool_]) -> tuple[Fit, Array]:
+    """The rows of priors and drifts are dealt out to the blocks in turn."""
+    extra = np.arange(len(rows.residual) - len(rows.record_of)) % (block.max() + 1)
+    row_block = np.concatenate([block[rows.record_of], extra]).astype(np.intp)
+    return linear_fit(rows.slopes, rows.residual, row_block, rows.by_record, consecutive)
+
+
+def _looked_at(candidates: NDArray[np.intp], position: NDArray[np.intp]) -> NDArray[np.intp]:
+    """In recorded order; of very many, runs of neighbours spread over the recording."""
+    order = candidates[np.argsort(position[candidates], kind="stable")]
+    if len(order) <= MOST_RECORDS:
+        return order
+    runs = np.array_split(order, 2 * len(order) // MOST_RECORDS)
+    most = MOST_RECORDS // len(runs)
+    return np.concatenate([run[:most] for run in runs])
+
+
+def _blocks_of(rows: FitRows, count: int) -> NDArray[np.intp]:
+    """Of each record: as long as errors resemble their neighbours', and neither too many nor too few."""
+    series = rows.residual[rows.by_record].T
+    length = min(automatic_block_length(series), max(1, count // _FEWEST_BLOCKS))
+    length = max(length, -(-count // _MOST_BLOCKS))
+    return (np.arange(count) // length).astype(np.intp)
+
+
+@dataclass(frozen=True)
+class _Search:
+    structures: tuple[Structure, ...]
+    chosen: tuple[int, ...]
+    more: bool
+    first: FamilyTest
+    last: FamilyTest
+    tested: int
+
+
+def _search(rows: FitRows, fit: Fit, contest: Contest, modelled: frozenset[str]) -> _Search:
+    """Causes one after another as long as one is significant, then each set against all others and chance."""
+    left = [(i, own) for i, each in enumerate(contest.columns) if (own := own_basis(each, contest.basis)[0]).shape[1]]
+    first = test = family_test(fit, [own for _, own in left])
+    tested, chosen, p_values, whole = len(left), list[int](), list[float](), float(fit.residual @ fit.residual)
+    while len(chosen) < MOST_FOUND:
+        best = _best(test, [own.shape[1] for _, own in left], fit)
+        now = float(fit.residual @ fit.residual)
+        if best is None or test.share[best] * now < _NEGLIGIBLE * (whole - now):
+            break
+        chosen.append(left[best][0])
+        p_values.append(float(test.adjusted[best]))
+        fit = fit.with_fewer_draws().without(left[best][1])
+        basis = contest.beside(chosen)[1]
+        left = [(i, own) for i, _ in left if (own := own_basis(contest.columns[i], basis)[0]).shape[1]]
+        test = family_test(fit, [own for _, own in left])
+    worth = (1 - max(test.lag_one, 0.0)) / (1 + max(test.lag_one, 0.0))
+    settled = _settled(contest, dict(zip(chosen, p_values, strict=True)), worth)
+    structures = [
+        _structure(rows, contest, i, [j for j in settled if j != i], modelled, p, odds)
+        for i, (p, odds) in settled.items()
+    ]
+    return _Search(tuple(structures), tuple(settled), bool(np.any(test.adjusted <= LEVEL)), first, test, tested)
+
+
+def _settled(contest: Contest, found: Mapping[int, float], worth: float) -> dict[int, tuple[float, Odds]]:
+    """Causes with p-values and odds, each beside the others: the likeliest in its place, none that chance beats.
+
+    Something is significant in one of twenty recordings of nothing but noise; odds say which of them are chance.
+    """
+    settled, p_values = list(found), list(found.values())
+    for _ in range(len(settled)):
+        before = list(settled)
+        for place in range(len(settled)):
+            others = settled[:place] + settled[place + 1 :]
+            settled[place] = contest.likeliest(others, worth)
+        if settled == before:
+            break
+    odds = [contest.odds(each, [o for o in settled if o != each], worth) for each in settled]
+    whole = {i: (p, each) for i, p, each in zip(settled, p_values, odds, strict=True)}
+    least = max(whole, key=lambda i: whole[i][1].chance, default=None)
+    if least is None or whole[least][1].chance <= _LIKELIER:
+        return whole
+    return _settled(contest, {i: p for i, (p, _) in whole.items() if i != least}, worth)
+
+
+def _structure(
+    rows: FitRows,
+    contest: Contest,
+    cause: int,
+    others: Sequence[int],
+    modelled: frozenset[str],
+    p_value: float,
+    odds: Odds,
+) -> Structure:
+    """What a cause takes up beside the others."""
+    one, (residual, basis) = contest.causes[cause], contest.beside(others)
+    own, coefficients = own_basis(contest.columns[cause], basis)
+    present = one.effect.split(" ")[0] in modelled
+    effect = f"{one.effect} (it is in the model: free it, or loosen its prior)" if present else one.effect
+    share = float(np.sum((own.T @ residual) ** 2) / max(float(residual @ residual), 1e-300))
+    falls = rows.mean_error(residual) - rows.mean_error(_left_out(residual, own, contest.fold))
+    size = _size(one, -coefficients @ (own.T @ residual))
+    named = (one.kind, one.subject, one.words, effect, one.measure)
+    return Structure(*named, p_value, share, max(0.0, falls) * _MM, size, odds.share, odds.alternatives)
+
+
+def _best(test: FamilyTest, sizes: Sequence[int], fit: Fit) -> int | None:
+    """Among the significant ones the one with the least Bayesian information criterion, blocks counting as one."""
+    significant = np.flatnonzero(test.adjusted <= LEVEL)
+    if not len(significant):
+        return None
+    count = fit.blocks * fit.records.shape[1]
+    size = np.array(sizes)[significant]
+    left = np.maximum(1 - test.share[significant], 1e-12)
+    return int(significant[np.argmin(count * np.log(left) + size * np.log(count))])
+
+
+def _left_out(residual: Array, own: Array, fold: NDArray[np.intp]) -> Array:
+    """The residual less what a dependence takes up, its coefficients found without the records that are judged."""
+    left = residual.copy()
+    for number in range(_FOLDS):
+        judged = fold == number
+        gram = own[~judged].T @ own[~judged]
+        ridge = 1e-9 * max(float(np.trace(gram)), 1e-300) * np.eye(len(gram))
+        coefficients = np.linalg.solve(gram + ridge, own[~judged].T @ residual[~judged])
+        left[judged] -= own[judged] @ coefficients
+    return left
+
+
+def _size(one: Dependence, coefficients: Array) -> str:
+    """Its coefficients in a customary unit, of levels the largest."""
+    if not one.labels or not one.unit:
+        return ""
+    unit = {"rad": display_unit("angle"), "m": display_unit("length")}.get(one.unit)
+    numbers = coefficients[: len(one.labels)]
+
+    def shown(number: float) -> str:
+        if one.unit == "1":
+            return f"{100 * number:.2g} %"
+        return f"{to_unit(number, unit.name):.2g} {unit.name}" if unit else f"{number:.2g} {one.unit}"
+
+    if one.kind == "level":
+        largest = int(np.argmax(np.abs(numbers)))
+        return f"{shown(float(numbers[largest]))} off at {one.labels[largest]}, beside its other levels"
+    return ", ".join(f"{label}: {shown(float(n))}" for label, n in zip(one.labels, numbers, strict=True))

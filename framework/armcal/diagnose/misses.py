@@ -1,0 +1,215 @@
+"""Records that the model misses by more than a limit, and what is unusual about each."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import betainc
+
+from armcal.base.dataset import Dataset
+from armcal.base.domains import Array
+from armcal.base.units import display_unit, to_unit
+from armcal.estimate.estimator import Estimate
+from armcal.problem.motion import Motion
+from armcal.problem.problem import FactorRecords, Problem
+
+MEDIANS = 3.0
+"""The limit where none is configured, in medians of the judged errors: of three equal normal coordinates one record
+in several thousand lies beyond it."""
+UNUSUAL = 0.95
+"""What is above this share of all records is unusual."""
+MOST_EXPLAINED = 50
+_ALIKE = 0.5
+_CHANCE = 0.05
+
+
+@dataclass(frozen=True)
+class Miss:
+    """One record beyond the limit.
+
+    Attributes:
+        record_id, row: which it is.
+        error_mm: its error, by a fit that did not see it.
+        reasons: what is unusual about it, in words.
+        advice: what to do about it.
+    """
+
+    record_id: str
+    row: int
+    error_mm: float
+    reasons: tuple[str, ...]
+    advice: str
+
+
+@dataclass(frozen=True)
+class Misses:
+    """All records beyond the limit, the farthest first; at most ``MOST_EXPLAINED`` of them are explained.
+
+    Attributes:
+        limit_mm: the limit.
+        configured: whether it was asked for; else it is ``MEDIANS`` medians.
+        judged: how many records were judged.
+        beyond: how many lie beyond.
+        explained: these, with reasons.
+    """
+
+    limit_mm: float
+    configured: bool
+    judged: int
+    beyond: int
+    explained: tuple[Miss, ...]
+
+    def as_dict(self) -> dict[str, Any]:
+        """For metrics.json."""
+        return asdict(self)
+
+
+@dataclass(frozen=True)
+class Judged:
+    """What is known of every record of a dataset once it was judged.
+
+    Attributes:
+        errors_mm: by fits that did not see the record (N; nan where there is none).
+        residuals: raw, of each factor (n_r x N), in one sign convention.
+        position: how many records were recorded before each (N).
+    """
+
+    errors_mm: Array
+    residuals: tuple[Array, ...]
+    position: NDArray[np.intp]
+
+
+def misses(
+    problem: Problem,
+    records: Sequence[FactorRecords],
+    estimate: Estimate,
+    dataset: Dataset,
+    motion: Motion,
+    judged: Judged,
+    limit_mm: float | None = None,
+) -> Misses | None:
+    """Which judged records lie beyond the limit, and what is unusual about them; None if none was judged."""
+    errors = judged.errors_mm
+    known = np.isfinite(errors)
+    if not known.any():
+        return None
+    limit = MEDIANS * float(np.median(errors[known])) if limit_mm is None else limit_mm
+    beyond = np.flatnonzero(known & (errors > limit))
+    beyond = beyond[np.argsort(-errors[beyond], kind="stable")]
+    explained: tuple[Miss, ...] = ()
+    if len(beyond):
+        leverage = _above(_leverage(problem, records, estimate))
+        efforts = {name: _above(np.abs(loads.efforts)) for name, loads in motion.loads.items()}
+        explained = tuple(
+            _miss(int(i), problem, dataset, motion, judged, leverage, efforts) for i in beyond[:MOST_EXPLAINED]
+        )
+    return Misses(limit, limit_mm is not None, int(known.sum()), len(beyond), explained)
+
+
+def _miss(
+    record: int,
+    problem: Problem,
+    dataset: Dataset,
+    motion: Motion,
+    judged: Judged,
+    leverage: Array,
+    efforts: Mapping[str, Array],
+) -> Miss:
+    around = _neighbours(record, judged)
+    far = bool(leverage[record] > UNUSUAL)
+    reasons = []
+    if far:
+        reasons.append("hardest to predict: what it asks of the parameters is among the top 5 %")
+    heavy = _heaviest(record, problem, motion, efforts)
+    if heavy:
+        reasons.append(heavy)
+    if around == "alike":
+        reasons.append("its neighbours in the recording miss in the same direction")
+    along = _along(record, problem, motion, judged)
+    if along:
+        reasons.append(along)
+    if not reasons:
+        reasons.append("nothing is unusual about the pose")
+    row = dataset.rows[record] if dataset.rows else 0
+    advice = _advice(far or bool(heavy), around)
+    return Miss(dataset.ids[record], row, float(judged.errors_mm[record]), tuple(reasons), advice)
+
+
+def _advice(unusual: bool, around: str) -> str:
+    if around == "alike":
+        return "measure this pose again, at another time and coming from elsewhere"
+    if unusual:
+        return "measure more poses like it"
+    return "measure it again: it may be a single wrong measurement"
+
+
+def _leverage(problem: Problem, records: Sequence[FactorRecords], estimate: Estimate) -> Array:
+    """Variance of what the model predicts of each record, in units of the declared noise (N)."""
+    count = records[0].count
+    if not len(estimate.covariance):
+        return np.zeros(count)
+    values, vectors = np.linalg.eigh(estimate.covariance)
+    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    total, place, width = np.zeros(count), 0, records[0].record.shape[1]
+    for block in problem.jacobians(estimate.values, records):
+        spread = np.sum((np.swapaxes(block, 1, 2) @ root) ** 2, axis=(0, 2))
+        here = slice(place, min(place + block.shape[2], count))
+        total[here] += spread[: max(0, here.stop - here.start)]
+        place = (place + block.shape[2]) % width
+    return total
+
+
+def _above(numbers: Array) -> Array:
+    """Which share of all records each is not below, along the last axis."""
+    ranks = np.argsort(np.argsort(numbers, axis=-1, kind="stable"), axis=-1)
+    return np.asarray((ranks + 1) / numbers.shape[-1])
+
+
+def _heaviest(record: int, problem: Problem, motion: Motion, efforts: Mapping[str, Array]) -> str:
+    arms = problem.blueprint.arms
+    for name, arm in arms.items():
+        joint = int(np.argmax(efforts[name][:, record]))
+        effort = float(motion.loads[name].efforts[joint, record])
+        if efforts[name][joint, record] > UNUSUAL and abs(effort) > 1e-9:
+            shown = arm.joint_names[joint] if len(arms) == 1 else f"{name}.{arm.joint_names[joint]}"
+            unit = "N m" if arm.joint_dimensions[joint] == "angle" else "N"
+            return f"{shown} holds {abs(effort):.2g} {unit}, among the top 5 %"
+    return ""
+
+
+def _neighbours(record: int, judged: Judged) -> str:
+    """``alike`` if those before and after it (that there are) miss in its direction, and not by little."""
+    whole = np.vstack(judged.residuals)
+    own, size = whole[:, record], float(np.linalg.norm(whole[:, record]))
+    middle = float(np.median(np.linalg.norm(whole, axis=0)))
+    found = []
+    for step in (-1, 1):
+        for other in np.flatnonzero(judged.position == judged.position[record] + step):
+            length = float(np.linalg.norm(whole[:, other]))
+            found.append(length >= middle and float(own @ whole[:, other]) > _ALIKE * size * length)
+    return "alike" if found and all(found) else "not alike"
+
+
+def _along(record: int, problem: Problem, motion: Motion, judged: Judged) -> str:
+    """The joint whose own motion the residual follows, and how far off it would be; only what chance rarely does."""
+    own = np.concatenate([r[:, record] for r in judged.residuals])
+    slopes = np.concatenate([s[:, :, record] for s in motion.slopes])
+    lengths = np.linalg.norm(slopes, axis=0) * np.linalg.norm(own)
+    if len(own) < 2 or not np.any(lengths > 0):
+        return ""
+    cosine = np.abs(own @ slopes) / np.where(lengths > 0, lengths, np.inf)
+    best = int(np.argmax(cosine))
+    chance = float(betainc((len(own) - 1) / 2, 0.5, max(0.0, 1 - float(cosine[best]) ** 2)))
+    chance = 1 - (1 - chance) ** int(np.sum(lengths > 0))
+    if chance > _CHANCE:
+        return ""
+    name, _, joint = motion.channels[best].partition(".")
+    arm = problem.blueprint.arms[name]
+    unit = display_unit(arm.commanded[joint])
+    off = abs(float(own @ slopes[:, best] / (slopes[:, best] @ slopes[:, best])))
+    shown = joint if len(problem.blueprint.arms) == 1 else motion.channels[best]
+    return f"it misses along {shown}'s own motion, as if {to_unit(off, unit.name):.1f} {unit.name} off"

@@ -1,0 +1,84 @@
+"""What a fit says of noise, in sentences of the verdict."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from armcal.estimate.variance import Component, VarianceComponents
+from armcal.estimate.weighing import Suspect, WeighedFit
+
+Grade = Literal["good", "note", "warning", "bad"]
+MOST_LISTED = 10
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One row of the verdict: how much it matters, what it is, how it was tested at which level, what to do."""
+
+    grade: Grade
+    text: str
+    test: str = ""
+    action: str = ""
+
+    @property
+    def whole(self) -> str:
+        """All of it in one line."""
+        return self.text + (f" [{self.test}]" if self.test else "") + (f" {self.action}" if self.action else "")
+
+
+def suspects_told(fitted: WeighedFit, ids: Sequence[str]) -> list[Finding]:
+    """Which training records lie beyond what noise does, at 1 % over all of them; ``ids`` are theirs."""
+    if not fitted.suspects:
+        return [Finding("good", "No training record lies farther from the fit than noise allows (1 % over all).")]
+    left = "Left in the fit" if fitted.loss == "reject" else f"Weighed less by the loss {fitted.loss}"
+    groups = [
+        ("Set aside", fitted.set_aside),
+        (left, tuple(suspect for suspect in fitted.suspects if suspect.weight > 0)),
+    ]
+    return [Finding("warning", _listed(fate, group, ids)) for fate, group in groups if group]
+
+
+def _listed(fate: str, group: Sequence[Suspect], ids: Sequence[str]) -> str:
+    listed = ", ".join(f"{ids[s.record]} ({_distance(s)})" for s in group[:MOST_LISTED])
+    more = f" and {len(group) - MOST_LISTED} more" if len(group) > MOST_LISTED else ""
+    limit = f"{group[0].limit:.1f} sd, 1 % over all records"
+    return (
+        f"{fate}, and farther from the fit than noise allows ({limit}): {len(group)} records: {listed}{more}. "
+        "Their errors are counted all the same; residuals.csv has them."
+    )
+
+
+def _distance(suspect: Suspect) -> str:
+    weight = f", weight {suspect.weight:.2g}" if 0 < suspect.weight < 1 else ""
+    return f"{suspect.distance:.1f} sd{weight}"
+
+
+def components_told(found: VarianceComponents) -> list[Finding]:
+    """Is it the tracker or the model?"""
+    joints = found.share("joint")
+    parts = sorted(found.components, key=lambda c: -c.share)
+    listed = "; ".join(f"{c.name} {100 * c.share:.0f} % ({_size(c)})" for c in parts)
+    whose = "the joints'" if joints > 0.5 else "the instruments'"
+    share = joints if joints > 0.5 else 1 - joints
+    meaning = (
+        " A joint's part is what acts like an angle that is off, repeatable or not: an effect that the model lacks "
+        "looks the same. Poses measured twice would tell the two apart."
+    )
+    text = f"The scatter is mostly {whose} ({100 * share:.0f} % of the variance): {listed}."
+    findings = [Finding("note", text + (meaning if joints > 0.5 else ""))]
+    if found.inseparable:
+        pairs = ", ".join(f"{a} and {b} ({r:+.2f})" for a, b, r in found.inseparable)
+        findings.append(Finding("warning", f"These poses hardly tell apart whose the scatter is: {pairs}."))
+    if found.unseen:
+        findings.append(Finding("note", f"No residual shows what these joints do: {', '.join(found.unseen)}."))
+    return findings
+
+
+def _size(c: Component) -> str:
+    """A standard deviation and its interval in a customary unit."""
+    factor, unit = {"rad": (180 / np.pi, " deg"), "m": (1000.0, " mm")}.get(c.unit, (1.0, " times the declared noise"))
+    return f"{factor * c.sd:.2g}{unit}, 95 % {factor * c.lower:.2g} to {factor * c.upper:.2g}"

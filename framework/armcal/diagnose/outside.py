@@ -1,0 +1,116 @@
+"""What residuals might depend on outside of the arm: gravity, load, the instrument's scale and axes, sudden jumps."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from armcal.base.dataset import Dataset
+from armcal.base.domains import Array
+from armcal.diagnose.dependences import Dependence, Records
+from armcal.problem.motion import Motion, recorded_order
+from armcal.problem.problem import FactorRecords, Problem
+
+_AXES = ("x", "y", "z")
+_MOST_STEPS, _MOST_SLIPS = 40, 12
+"""Places at which something may have jumped are looked at: of all that is measured, and of each joint."""
+_FEWEST_APART = 4
+_STEP_MEASURE = "repeat some of the first poses now, and look at what was touched at that time"
+
+
+def outside(problem: Problem, motion: Motion, dataset: Dataset, positions: Sequence[Array]) -> Iterator[Dependence]:
+    """Everything of it that these records could show; ``positions`` are what instruments should read."""
+    here = Records(dataset, motion)
+    yield from _of_loads(motion)
+    yield from _of_instrument(here, positions)
+    yield from _of_steps(here, problem)
+
+
+def _of_loads(motion: Motion) -> Iterator[Dependence]:
+    if not motion.by_load:
+        return
+
+    def columns(*places: int) -> tuple[Array, ...]:
+        return tuple(slope[:, list(places)].transpose(0, 2, 1) for slope in motion.by_load)
+
+    level, weigh = "level the base, or measure its tilt with a spirit level", "weigh what hangs on the tool"
+    turns = tuple(f"turned about {axis}" for axis in _AXES)
+    words, effect = "the direction of gravity in the base frame", "statics.gravity_r?, freed"
+    yield Dependence("gravity", "", "", words, effect, level, columns(0, 1, 2), turns, "rad")
+    words = "the size of gravity, or of all masses together"
+    yield Dependence("gravity", "size", "", words, "statics.gravity_m_s2", weigh, columns(3), ("share",), "1")
+    words = "a load at the tool that is not stated"
+    yield Dependence("load", "", "", words, "statics.payload_g", weigh, columns(4, 5, 6, 7))
+
+
+def _of_instrument(here: Records, read: Sequence[Array]) -> Iterator[Dependence]:
+    """Scale and axes of instruments that measure positions; all of them alike."""
+    if not any(np.any(each) for each in read):
+        return
+    zeros = [np.zeros((size, len(here.dataset), 1)) for size in here.sizes]
+
+    def columns(*entries: tuple[int, int]) -> tuple[Array, ...]:
+        """What is read along one axis grows with the coordinate on another: one column for each such pair."""
+        parts = []
+        for own, zero in zip(read, zeros, strict=True):
+            part = np.repeat(zero, len(entries), axis=2)
+            for k, (row, other) in enumerate(entries if len(own) else ()):
+                part[row, :, k] = -own[other]
+            parts.append(part)
+        return tuple(parts)
+
+    known = "measure a known length along each axis with the instrument"
+    together = tuple(np.sum(part, axis=2, keepdims=True) for part in columns((0, 0), (1, 1), (2, 2)))
+    words = "the instrument's scale, along all axes alike"
+    yield Dependence("scale", "", "", words, "", known, together, ("share",), "1")
+    for i, axis in enumerate(_AXES):
+        words = f"the instrument's scale along {axis}"
+        yield Dependence("scale", axis, "", words, "", known, columns((i, i)), ("share",), "1")
+    words = "the instrument's axes, which are not at right angles"
+    labels = tuple(f"between {_AXES[i]} and {_AXES[j]}" for i, j in ((0, 1), (0, 2), (1, 2)))
+    yield Dependence("scale", "axes", "", words, "", known, columns((0, 1), (0, 2), (1, 2)), labels, "rad")
+
+
+def predicted_positions(
+    problem: Problem, values: Array, records: Sequence[FactorRecords], dataset: Dataset
+) -> tuple[Array, ...]:
+    """What each factor should read of a position (3 x N; m), 0 where it reads none; nothing (0 x N) of other factors.
+
+    Not what it does read: the noise of that would be taken for a scale.
+    """
+    found = []
+    for kernel, off in zip(problem.kernels, problem.residuals(values, records), strict=True):
+        channels = kernel.factor.output_channels[:3]
+        read = [c.rpartition(".")[2] for c in channels] == list(_AXES) and all(map(dataset.has, channels))
+        found.append(np.nan_to_num(dataset.stacked(channels) - off[:3]) if read else np.zeros((0, len(dataset))))
+    return tuple(found)
+
+
+def _of_steps(here: Records, problem: Problem) -> Iterator[Dependence]:
+    """Something that moved once, between two records."""
+    order = recorded_order(here.dataset)
+    if np.ptp(order) <= 0:
+        return
+    ids = [here.dataset.ids[i] for i in np.argsort(order, kind="stable")]
+    rank = np.argsort(np.argsort(order, kind="stable"), kind="stable")
+    for place in _places(len(rank), _MOST_STEPS):
+        after = (rank >= place).astype(float)[:, None]
+        words = f"whether a record was measured before or after {ids[place]}: what is measured jumps there as a whole"
+        effect = "the records before and after as groups of their own"
+        yield Dependence("step", "", "", words, effect, _STEP_MEASURE, here.axes(after))
+    for channel in here.motion.channels:
+        arm, _, joint = channel.partition(".")
+        shown = joint if len(problem.blueprint.arms) == 1 else channel
+        si = "rad" if problem.blueprint.arms[arm].commanded[joint] == "angle" else "m"
+        for place in _places(len(rank), _MOST_SLIPS):
+            along = here.along(channel, (rank >= place).astype(float)[:, None])
+            words = f"whether a record was measured before or after {ids[place]}: {shown} slips there"
+            yield Dependence("slip", shown, arm, words, "", _STEP_MEASURE, along, ("slip",), si)
+
+
+def _places(count: int, most: int) -> list[int]:
+    """Spread over a recording, so many at most, none within the first or last few records."""
+    inner = np.arange(_FEWEST_APART, count - _FEWEST_APART + 1)
+    step = max(_FEWEST_APART, -(-len(inner) // most))
+    return [int(i) for i in inner[step // 2 :: step]]

@@ -1,0 +1,298 @@
+"""The verdict: what a person should conclude, each sentence from a test with a stated level."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import bdtr, chdtri, ndtri
+
+from armcal.base.domains import Array
+from armcal.diagnose.evidence import Evidence
+from armcal.diagnose.evidence_findings import (
+    MOST_TOLD,
+    determined_told,
+    misses_told,
+    neighbours_told,
+    shifted_told,
+    structures_told,
+    what_neighbours_cost,
+)
+from armcal.diagnose.noise_findings import Finding, components_told, suspects_told
+from armcal.estimate.estimator import CHECK_THE_DATA, Estimate
+from armcal.estimate.identifiability import POOR_CONDITION, bound_together, correlated_pairs
+from armcal.estimate.validation import summarise
+from armcal.estimate.weighing import WeighedFit
+from armcal.planning.suggestion import CANDIDATES, Suggestion
+
+LEVEL = 0.05
+SHARE = 0.95
+DEVIATIONS = 5.0
+DO_NOT_USE = "Do not use this calibration"
+_ORDER = {"bad": 0, "warning": 1, "note": 2, "good": 3}
+_SMALLEST_SPREAD_MM = 1e-6
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """The findings, the worst first, one line that sums them up, and a paragraph that a technician can act on."""
+
+    headline: str
+    findings: tuple[Finding, ...]
+    paragraph: str = ""
+
+    @property
+    def bad(self) -> tuple[Finding, ...]:
+        """Why the values are not to be used; empty if they may be."""
+        return tuple(finding for finding in self.findings if finding.grade == "bad")
+
+
+def judge(
+    estimate: Estimate,
+    whitened: Array,
+    errors_mm: Array,
+    train: NDArray[np.intp],
+    judged_mm: Array,
+    judged_on: str,
+    ids: Sequence[str],
+    suggestions: Sequence[Suggestion] = (),
+    fitted: WeighedFit | None = None,
+    predicted: Sequence[Finding] = (),
+    evidence: Evidence | None = None,
+) -> Verdict:
+    """Judge a calibration.
+
+    Args:
+        estimate: what was found.
+        whitened: residuals in units of the declared noise, in recorded order (n_r x N).
+        errors_mm: calibrated error of each record (N).
+        train: which records trained.
+        judged_mm: errors of the records that did not train, or of cross-validation; empty if there are none.
+        judged_on: what these are, in words.
+        ids: of all records (N).
+        suggestions: poses that would tell most next.
+        fitted: how the training records weighed; None for plain least squares.
+        predicted: whether prediction intervals hold their share.
+        evidence: what residuals still depend on, which records are missed, what priors alone hold.
+    """
+    seen = evidence or Evidence()
+    typical = float(np.median(judged_mm)) if len(judged_mm) else None
+    determined = determined_told(estimate, seen.priors_alone, typical)
+    own, kept = [ids[i] for i in train], train if fitted is None else train[fitted.kept]
+    suspicious = _suspicious(errors_mm[train], own, fitted)
+    findings = [_convergence(estimate), determined, *_condition(estimate), *_bounds(estimate)]
+    findings += [*shifted_told(estimate), *_noise(estimate, fitted, seen), *structures_told(seen.leftover, seen.unit)]
+    findings += neighbours_told(seen.leftover, estimate, seen.unit) or _neighbours(whitened, kept, estimate)
+    findings += [*_correlated(estimate), *predicted, *misses_told(seen.misses, seen.unit)]
+    findings += [*_outliers(suspicious, own, fitted), *_next(estimate, suggestions)]
+    ranked = tuple(sorted(findings, key=lambda finding: _ORDER[finding.grade]))
+    first = _first(judged_mm, judged_on, ranked[0], seen.unit)
+    sentences = [first, *_in_short(estimate, determined, seen, suspicious, suggestions)]
+    if not estimate.verdict.converged:
+        sentences = ["The solver did not converge: these values are no calibration."]
+    return Verdict(_headline(judged_mm, judged_on, ranked[0], seen.unit), ranked, " ".join(sentences))
+
+
+def _first(judged_mm: Array, judged_on: str, worst: Finding, unit: str) -> str:
+    return f"{DO_NOT_USE}: {worst.text}" if worst.grade == "bad" else _good_for(judged_mm, judged_on, unit)
+
+
+def _headline(judged_mm: Array, judged_on: str, worst: Finding, unit: str) -> str:
+    if worst.grade == "bad":
+        return f"{DO_NOT_USE}. {_errors_told(judged_mm, judged_on, unit)}"
+    return _errors_told(judged_mm, judged_on, unit)
+
+
+def _errors_told(judged_mm: Array, judged_on: str, unit: str) -> str:
+    if not len(judged_mm):
+        return "No record was held out: how good the model is on new poses is not known."
+    errors = summarise(judged_mm)
+    most = "all of them" if errors.p95 is None else "95 % of poses"
+    return (
+        f"{'Tip' if unit == 'mm' else 'Angle'} error {errors.mean:.2f} {unit} on average, {most} below "
+        f"{errors.max if errors.p95 is None else errors.p95:.2f} {unit}, judged on {judged_on}."
+    )
+
+
+def _good_for(judged_mm: Array, judged_on: str, unit: str = "mm") -> str:
+    """Below what 95 % of unseen poses lie, with 95 % confidence, by order statistics. [Wilks1941]"""
+    if not len(judged_mm):
+        return "How good the model is on unseen poses is not known: hold records out, or cross-validate."
+    below = np.arange(len(judged_mm))
+    enough = np.flatnonzero(bdtr(below, len(judged_mm), SHARE) >= 1 - LEVEL)
+    if not len(enough):
+        largest = float(np.max(judged_mm))
+        return f"The largest error on {judged_on} is {largest:.2f} {unit}; {len(judged_mm)} are too few to say more."
+    limit = float(np.sort(judged_mm)[enough[0]])
+    return (
+        f"Good for +- {limit:.2f} {unit} on unseen poses like these: 95 % of them, with 95 % confidence ({judged_on})."
+    )
+
+
+def _in_short(
+    estimate: Estimate,
+    determined: Finding,
+    seen: Evidence,
+    suspicious: Sequence[str],
+    suggestions: Sequence[Suggestion],
+) -> list[str]:
+    """What is not determined, suspicious, left over, and to be measured next; a sentence each."""
+    sentences = []
+    if estimate.identifiability.undetermined:
+        sentences.append(f"Not determined: {determined.text[:1].lower()}{determined.text[1:]}")
+    missed = seen.misses
+    if missed is not None and missed.beyond:
+        ids = ", ".join(miss.record_id for miss in missed.explained[:MOST_TOLD])
+        more = f" and {missed.beyond - MOST_TOLD} more" if missed.beyond > MOST_TOLD else ""
+        sentences.append(f"Missed by more than {missed.limit_mm:.2f} {seen.unit}: {ids}{more}.")
+    sentences.append(f"Suspicious records: {_few(suspicious)}." if suspicious else "No training record is suspicious.")
+    if seen.leftover is not None and seen.leftover.worthwhile:
+        listed = "; ".join(
+            f"{s.words}{', or on another cause' if s.alternatives else ''} ({s.falls_mm:.2f} {seen.unit})"
+            for s in seen.leftover.worthwhile
+        )
+        sentences.append(f"Residuals still depend on {listed}.")
+    elif seen.leftover is not None and seen.leftover.lag_after_p <= seen.leftover.level:
+        after = f"{seen.leftover.lag_after:.2f}"
+        sentences.append(f"No cause that was looked for is left in the residuals, yet neighbours correlate by {after}.")
+    elif seen.leftover is not None:
+        sentences.append("Nothing that was looked for is left in the residuals.")
+    if suggestions:
+        sentences.append(f"Measure these poses next: {'; '.join(suggestion.text for suggestion in suggestions)}.")
+    return sentences
+
+
+def _convergence(estimate: Estimate) -> Finding:
+    told = estimate.verdict
+    if not told.converged:
+        text = f"{told.name} did not converge ({told.status}): these values are no calibration."
+        return Finding("bad", text, "the solver's own", CHECK_THE_DATA)
+    text = f"{told.name} converged in {told.iterations} iterations"
+    if told.starts > 1:
+        text += f"; {told.agreeing_starts} of {told.starts} starts came to the same answer"
+    return Finding("good", text + ".", "the solver's own")
+
+
+def _condition(estimate: Estimate) -> list[Finding]:
+    known = estimate.identifiability
+    if known.condition <= POOR_CONDITION:
+        return []
+    held = bool(np.all(estimate.parameters.prior_information() > 0))
+    test = f"scaled condition {known.condition:.1e}, limit {POOR_CONDITION:.0e}"
+    action = "Their priors hold them." if held else "Measure what armcal plan asks for, or give them priors."
+    return [Finding("note" if held else "warning", f"Hardly determined: {known.weakest}.", test, action)]
+
+
+def _bounds(estimate: Estimate) -> list[Finding]:
+    """Is a bound that holds compatible with the data? One-sided, at 5 %, by the step that ignores bounds."""
+    agreeing: list[str] = []
+    pushing: list[str] = []
+    for i, name in enumerate(estimate.names):
+        if name not in estimate.at_bound:
+            continue
+        value, sd = estimate.values[estimate.free_entries[i]], estimate.deviations[i]
+        beyond = abs(float(estimate.unconstrained[i] - value)) / sd if sd > 0 else 0.0
+        (pushing if beyond > ndtri(1 - LEVEL) else agreeing).append(f"{name} ({beyond:.1f} sd beyond)")
+    findings, test = [], "step without bounds, one-sided, 5 %"
+    if pushing:
+        text = f"The data pushes against a bound: {_few(pushing)}. Something else in the model is missing."
+        findings.append(Finding("warning", text, test, "Check loads, masses and signs; look for a missing effect."))
+    if agreeing:
+        text = f"At a bound, and the data agrees: {_few(agreeing)}. Its upper limit is what was learned."
+        findings.append(Finding("note", text, test))
+    return findings
+
+
+def _few(listed: Sequence[str], separator: str = ", ") -> str:
+    more = f" and {len(listed) - MOST_TOLD} more" if len(listed) > MOST_TOLD else ""
+    return separator.join(listed[:MOST_TOLD]) + more
+
+
+def _noise(estimate: Estimate, fitted: WeighedFit | None, seen: Evidence) -> list[Finding]:
+    """Whose the scatter is if that was estimated, else whether it is as large as declared."""
+    if fitted is not None and fitted.components is not None:
+        return components_told(fitted.components)
+    return [_size(estimate, seen)]
+
+
+def _size(estimate: Estimate, seen: Evidence) -> Finding:
+    """Are the residuals as large as the declared noise? Chi-square, two-sided, at 5 %."""
+    freedom, ratio = max(1, estimate.degrees_of_freedom), estimate.noise_scale
+    total, test = ratio**2 * freedom, "chi-square, 5 %"
+    if total > chdtri(freedom, LEVEL / 2):
+        found = seen.leftover
+        why = "the model's error or the instrument's, which this test cannot tell apart"
+        if found is not None:
+            known = "some of it is the model's: what residuals depend on is named below"
+            why += f"; {known if found.structures else 'no cause that was looked for is in it'}"
+        text = f"Residuals are {ratio:.1f} times the declared noise: {why}. Intervals are widened to the residuals."
+        action = "Repeat some poses, each from elsewhere: what scatters there is noise, the rest the model's error."
+        return Finding("warning", text, test, action)
+    if ratio < 0.5:
+        text = f"Residuals are only {ratio:.2f} times the declared noise: was it stated too large?"
+        return Finding("note", text, "ratio below 0.5", "State the noise as the instrument's data sheet does.")
+    return Finding("good", "Residuals are as large as the declared noise: the model explains the data.", test)
+
+
+def _neighbours(whitened: Array, train: NDArray[np.intp], estimate: Estimate) -> list[Finding]:
+    """Do training records that follow one another correlate? Against independence, two-sided, at 5 %."""
+    first = train[:-1][np.diff(train) == 1]
+    spread = float(np.mean(whitened[:, train] ** 2))
+    if len(first) < 10 or not spread:
+        return []
+    products = whitened[:, first] * whitened[:, first + 1]
+    lag_one, test = float(np.mean(products)) / spread, "lag-one correlation, 5 %"
+    if abs(lag_one) < ndtri(1 - LEVEL / 2) / np.sqrt(products.size):
+        return [Finding("good", "Residuals of neighbouring records do not correlate.", test)]
+    text = f"Residuals of neighbouring records correlate by {lag_one:.2f}: they are no noise."
+    text += f" {what_neighbours_cost(estimate)}" if estimate.widened is not None else ""
+    return [Finding("warning", text, test, "Repeat one pose at the start, in the middle and at the end.")]
+
+
+def _correlated(estimate: Estimate) -> list[Finding]:
+    pairs = correlated_pairs(estimate.covariance, estimate.names, bound=bound_together(estimate.parameters))
+    if not pairs:
+        return []
+    listed = _few([f"{a} with {b} ({value:+.3f})" for a, b, value in pairs])
+    return [Finding("note", f"Hard to tell apart: {listed}.", "correlation of estimates above 0.95")]
+
+
+def _suspicious(errors_mm: Array, ids: Sequence[str], fitted: WeighedFit | None) -> list[str]:
+    """Ids of training records beyond their limit, the farthest first."""
+    if fitted is not None and fitted.loss != "none":
+        return list(dict.fromkeys(ids[suspect.record] for suspect in fitted.suspects))
+    middle = float(np.median(errors_mm))
+    spread = 1.4826 * float(np.median(np.abs(errors_mm - middle)))
+    beyond = np.flatnonzero(errors_mm > middle + DEVIATIONS * max(spread, _SMALLEST_SPREAD_MM))
+    return [ids[i] for i in beyond[np.argsort(-errors_mm[beyond], kind="stable")]]
+
+
+def _outliers(suspicious: Sequence[str], ids: Sequence[str], fitted: WeighedFit | None) -> list[Finding]:
+    """Records beyond their limits if the loss sought them, else beyond five robust deviations of the errors."""
+    if fitted is not None and fitted.loss != "none":
+        action = "Look at them in residuals.csv, and measure them again."
+        return [replace(f, action=action) if f.grade == "warning" else f for f in suspects_told(fitted, ids)]
+    if not suspicious:
+        return []
+    listed = ", ".join(suspicious[:MOST_TOLD])
+    text = f"Beyond five robust deviations of the training errors: {len(suspicious)} records, the worst {listed}."
+    test = "median and median absolute deviation"
+    return [Finding("warning", text, test, "Measure them again, or set noise.loss: reject; residuals.csv has all.")]
+
+
+def _next(estimate: Estimate, suggestions: Sequence[Suggestion]) -> list[Finding]:
+    """The parameter whose uncertainty is largest in its own ordinary size, and the poses that would tell most."""
+    if not estimate.names:
+        return []
+    scales = [b.scale for b in estimate.parameters.free for _ in range(b.size)]
+    relative = np.nan_to_num(estimate.deviations / np.array(scales), nan=np.inf)
+    text = f"Least certain, in its ordinary size: {estimate.names[int(np.argmax(relative))]}."
+    if not suggestions:
+        return [Finding("note", text)]
+    shrink = 100 * (1 - suggestions[-1].shrink)
+    text += f" Three poses more would shrink standard deviations by {shrink:.1f} % on average."
+    test = f"determinant of the information, {CANDIDATES} poses like the recorded ones; clearance was not checked"
+    poses = "; ".join(suggestion.text for suggestion in suggestions)
+    return [Finding("note", text, test, f"Measure next: {poses}.")]

@@ -1,0 +1,1 @@
+"""Estimators, weights and robust losses, covariance, intervals, folds, bootstrap."""

@@ -1,0 +1,177 @@
+"""Intervals from refits to resampled records. [Efron1993]
+
+``blocks`` draws records with replacement, in circular blocks of neighbours whose errors resemble one another
+[Politis1992]; blocks of one record draw independent ones. What is wrong with the model stays in the records, so that
+the spread counts it. ``parametric`` makes the measured values up from the fitted model and its noise: the spread if
+the model were true.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from armcal.base.domains import Array
+from armcal.base.settings import Settings
+from armcal.errors import NotConvergedError, ProblemError
+from armcal.estimate.blocks import BlockLength, automatic_block_length, draw_weights
+from armcal.estimate.estimator import CONFIDENCE, Estimate, Estimator, Progress, no_progress
+from armcal.io.parallel import Executor, Sequential
+from armcal.problem.problem import FactorRecords, Problem
+from armcal.problem.projection import predicted_records
+from armcal.problem.readings import disturbed_records, reading_slopes
+
+_FEWEST = 20
+"""Refits that have to converge for an interval to be stated."""
+
+
+class BootstrapSettings(Settings):
+    """How often records are resampled, and how; ``blocks`` is how many neighbours are drawn together."""
+
+    bootstrap: Annotated[int, Field(ge=0, le=1_000_000)] = 0
+    method: Literal["blocks", "parametric"] = "blocks"
+    blocks: Annotated[int, Field(ge=1)] | Literal["auto"] = "auto"
+    seed: Annotated[int, Field(ge=0)] = 0
+
+
+@dataclass(frozen=True)
+class Bootstrap:
+    """Refits to resampled records.
+
+    Attributes:
+        names: of the free canonical entries.
+        values: of each refit that converged (B x n).
+        method: ``blocks`` or ``parametric``.
+        block: how many neighbours were drawn together (1 in a parametric one).
+        failed: how many refits did not converge; they are left out.
+    """
+
+    names: tuple[str, ...]
+    values: Array
+    method: str
+    block: int
+    failed: int
+
+    @property
+    def deviations(self) -> Array:
+        """Standard deviations over the refits (n); not a number with too few of them."""
+        return self.values.std(axis=0, ddof=1) if self._enough else np.full(len(self.names), np.nan)
+
+    @property
+    def intervals(self) -> Array:
+        """95 % percentile intervals (n x 2); not a number with too few refits."""
+        if not self._enough:
+            return np.full((len(self.names), 2), np.nan)
+        tail = 50 * (1 - CONFIDENCE)
+        return np.asarray(np.percentile(self.values, [tail, 100 - tail], axis=0).T)
+
+    @property
+    def _enough(self) -> bool:
+        return len(self.values) >= _FEWEST
+
+
+@dataclass(frozen=True)
+class _Refit:
+    """One resample: which records, how often each, and perhaps other measured values."""
+
+    problem: Problem
+    estimator: Estimator
+    start: Array
+    records: tuple[FactorRecords, ...]
+    chosen: NDArray[np.intp]
+    weights: Array
+    seed: int | None
+    noise_scale: float
+
+
+def bootstrap(
+    problem: Problem,
+    records: Sequence[FactorRecords],
+    estimator: Estimator,
+    found: Estimate,
+    settings: BootstrapSettings,
+    executor: Executor | None = None,
+    progress: Progress = no_progress,
+    poses: NDArray[np.intp] | None = None,
+) -> Bootstrap:
+    """Refit to resamples of the records (in recorded order) of an estimate; the same seed gives the same refits.
+
+    Records of one pose (``poses``, numbers from 0) are drawn together.
+
+    Raises:
+        ProblemError: a parametric one of measurements that measure nothing, or of drifting parameters.
+    """
+    count, random = records[0].count, np.random.default_rng(settings.seed)
+    poses = np.arange(count) if poses is None else poses
+    parametric = settings.method == "parametric"
+    block = 1 if parametric else _block(problem, records, found, settings.blocks)
+    if parametric:
+        _require_measured(problem, records, found.values)
+    tasks = []
+    for _ in range(settings.bootstrap):
+        weights = np.ones(count) if parametric else draw_weights(int(poses.max()) + 1, block, random)[poses]
+        chosen = np.flatnonzero(weights).astype(np.intp)
+        seed = int(random.integers(2**63)) if parametric else None
+        part = (tuple(records), chosen, weights[chosen], seed, found.noise_scale)
+        tasks.append(_Refit(problem, estimator, found.values, *part))
+    refits = (executor or Sequential()).map(_refit, tasks, lambda done: progress("bootstrap", done))
+    free = list(found.free_entries)
+    values = np.array([values[free] for values in refits if values is not None]).reshape(-1, len(free))
+    return Bootstrap(found.names, values, settings.method, block, sum(values is None for values in refits))
+
+
+def _block(problem: Problem, records: Sequence[FactorRecords], found: Estimate, asked: BlockLength) -> int:
+    """The longest block that any residual component asks for."""
+    if asked != "auto":
+        return min(asked, records[0].count)
+    whitened = problem.whitened_residuals(found.values, records)
+    return max(automatic_block_length(each) for each in whitened)
+
+
+def _refit(task: _Refit) -> Array | None:
+    """The values of one refit; None if it did not converge."""
+    problem = task.problem
+    records = problem.subset(task.records, task.chosen)
+    if task.seed is not None:
+        records = _made_up(problem, task.start, records, task.noise_scale, np.random.default_rng(task.seed))
+    records = problem.weighted(records, [task.weights] * len(records))
+    try:
+        solution = task.estimator.solve(problem, records, task.start)
+    except NotConvergedError:
+        return None
+    return solution.values if solution.verdict.converged else None
+
+
+def _made_up(
+    problem: Problem,
+    values: Array,
+    records: Sequence[FactorRecords],
+    noise_scale: float,
+    random: np.random.Generator,
+) -> tuple[FactorRecords, ...]:
+    """The records with measured values of the model, and noise as it was declared and found."""
+    predicted = predicted_records(problem, values, records)
+    noise = []
+    for kernel, each in zip(problem.kernels, records, strict=True):
+        white = noise_scale * random.normal(size=(len(kernel.factor.noise), each.count))
+        if each.whitening is None:
+            noise.append(white * np.array(kernel.factor.noise)[:, None])
+        else:
+            inverse = np.linalg.inv(np.moveaxis(each.whitening[:, :, : each.count], 2, 0))
+            noise.append(np.einsum("wrs,sw->rw", inverse, white))
+    return disturbed_records(problem, values, predicted, noise)
+
+
+def _require_measured(problem: Problem, records: Sequence[FactorRecords], values: Array) -> None:
+    slopes = reading_slopes(problem, values, predicted_records(problem, values, records))
+    for kernel, each, slope in zip(problem.kernels, records, slopes, strict=True):
+        if slope is None or each.correlation is not None:
+            raise ProblemError(
+                f"{kernel.factor.name} has no measured values of its own noise to make up.",
+                hint="Use uncertainty.method: blocks.",
+            )

@@ -1,0 +1,375 @@
+"""Estimators and estimates: from a problem and records to values, and how sure they are."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from scipy.special import stdtrit
+
+from armcal.base.domains import Array
+from armcal.base.parameters import Parameters
+from armcal.errors import NotConvergedError, ProblemError
+from armcal.estimate.identifiability import POOR_CONDITION, Identifiability, InverseInformation
+from armcal.estimate.scale import GIVE_A_LENGTH, UNSEEN_SCALE, scale_is_unseen
+from armcal.estimate.structure import Undetermined, explain, held_by_nothing, identify, identify_from
+from armcal.io.parallel import Executor
+from armcal.problem.problem import FactorRecords, Problem, triangular
+from armcal.problem.projection import factor_at_zero
+
+CONFIDENCE = 0.95
+NEAR_A_BOUND_SD = 3.0
+"""Within so many standard deviations of a bound an interval is one-sided."""
+MOST_TOLD = 5
+"""So many undetermined combinations are listed in one message."""
+FEW_HELD = 2
+"""Combinations under priors that are told in full: they do no harm, and more of them bury the rest."""
+SMALLEST_SPREAD = 1e-12
+AT_BOUND = 1e-6
+"""In ordinary sizes of the parameter: closer than this, a parameter lies on its bound."""
+
+CHECK_THE_DATA = (
+    "Check the axes, units and frame of the measurements, the order and signs of the joints, and the start values; "
+    "or allow more iterations."
+)
+"""What to do about a fit that leads nowhere."""
+
+Progress = Callable[[str, float], None]
+"""Told what is being done, and which fraction of it is."""
+
+
+def no_progress(what: str, fraction: float) -> None:
+    """Says nothing."""
+
+
+@dataclass(frozen=True)
+class SolverVerdict:
+    """What a solver says of its own work; ``status`` in its own words."""
+
+    name: str
+    status: str
+    converged: bool
+    iterations: int
+    seconds: float
+    starts: int = 1
+    agreeing_starts: int = 1
+
+
+def gave_up(verdict: SolverVerdict) -> NotConvergedError:
+    """What to say of a fit that ended where not even its residuals can be taken."""
+    return NotConvergedError(
+        f"{verdict.name} did not converge ({verdict.status}): the fit was driven to where springs do not hold the arm.",
+        hint=f"{CHECK_THE_DATA} If all is right, bound the compliances.",
+    )
+
+
+@dataclass(frozen=True)
+class Solution:
+    """A value vector (all canonical entries) and the solver's verdict on it."""
+
+    values: Array
+    verdict: SolverVerdict
+
+
+class Estimator(Protocol):
+    """What a plugin provides to solve a problem on all records at once."""
+
+    def solve(
+        self,
+        problem: Problem,
+        records: Sequence[FactorRecords],
+        start: Array,
+        progress: Progress = no_progress,
+    ) -> Solution:
+        """Minimise half the squared whitened residuals plus priors, within bounds, from ``start``.
+
+        A solver that does not converge says so in its verdict; it does not raise.
+        """
+
+
+@runtime_checkable
+class SpreadableEstimator(Protocol):
+    """An estimator whose own work falls into independent pieces, such as starts."""
+
+    def spread(self, executor: Executor) -> Estimator:
+        """The same estimator, with the same answers, its pieces done by an executor."""
+
+
+def spread(estimator: Estimator, executor: Executor | None) -> Estimator:
+    """An estimator on an executor, if it has pieces to spread."""
+    return estimator.spread(executor) if executor and isinstance(estimator, SpreadableEstimator) else estimator
+
+
+@dataclass(frozen=True)
+class Interval95:
+    """A 95 % interval of one canonical entry; ``one_sided`` near a bound, where the bound itself is the other end."""
+
+    lower: float
+    upper: float
+    one_sided: bool
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What a calibration found.
+
+    Attributes:
+        parameters: the blocks, with their nominal values.
+        values: all canonical entries.
+        free_entries: positions of the free ones.
+        covariance: of the free canonical entries; directions that neither data nor priors determine are left out.
+        unconstrained: free canonical entries after a step that ignores the bounds; equals the values where no
+            bound holds.
+        square_root_information: R (n x n) with R'R the information of data and priors on the coordinates, at the
+            values; undetermined directions included, as its null space.
+        noise_scale: residuals in units of the declared noise (standard deviation).
+        degrees_of_freedom: residual numbers less what the fit takes up of them, see ``degrees_of_freedom``.
+        identifiability: what the data alone determines.
+        determined: per free entry, whether data and priors together determine it.
+        told_by_data: per free entry, whether the data alone does; else only a prior holds it, if anything does.
+        verdict: the solver's.
+        widened: by what the standard deviations of free entries grew because neighbouring records err alike; empty
+            where they do and nothing grew by it, None where no such correlation was found.
+    """
+
+    parameters: Parameters
+    values: Array
+    free_entries: tuple[int, ...]
+    covariance: Array
+    unconstrained: Array
+    square_root_information: Array
+    noise_scale: float
+    degrees_of_freedom: float
+    identifiability: Identifiability
+    determined: tuple[bool, ...]
+    told_by_data: tuple[bool, ...]
+    verdict: SolverVerdict
+    widened: tuple[float, ...] | None = None
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Names of the free canonical entries."""
+        return tuple(self.parameters.entry_names[i] for i in self.free_entries)
+
+    @cached_property
+    def free_values(self) -> Array:
+        """Values of the free canonical entries, in the order of ``names``, ``deviations`` and ``intervals``."""
+        return self.values[list(self.free_entries)]
+
+    @cached_property
+    def deviations(self) -> Array:
+        """Standard deviations of the free canonical entries; not a number where undetermined."""
+        deviation = np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
+        return np.where(np.array(self.determined, dtype=bool), deviation, np.nan)
+
+    @cached_property
+    def at_bound(self) -> tuple[str, ...]:
+        """Free entries that ended on a bound."""
+        lower, upper = _entry_bounds(self.parameters)
+        scale = _entry_scales(self.parameters)
+        value = self.values[list(self.free_entries)]
+        on = (value - lower <= AT_BOUND * scale) | (upper - value <= AT_BOUND * scale)
+        return tuple(name for name, flag in zip(self.names, on, strict=True) if flag)
+
+    @cached_property
+    def intervals(self) -> tuple[Interval95, ...]:
+        """95 % intervals of the free entries, by Student's t.
+
+        Within 3 deviations of a bound, or beyond it, an interval reaches from the bound to the other end of the
+        two-sided one about the estimate without bounds, or about the bound where that lies beyond it. A
+        one-sided quantile there would be shorter, but choosing between the two kinds by the estimate itself
+        would then hold the truth in less than 95 % of cases [Feldman1998].
+        """
+        lower, upper = _entry_bounds(self.parameters)
+        freedom = max(self.degrees_of_freedom, 1.0)
+        quantile = float(stdtrit(freedom, 0.5 + CONFIDENCE / 2))
+        value = self.values[list(self.free_entries)]
+        rows = zip(value, self.unconstrained, self.deviations, lower, upper, strict=True)
+        return tuple(_interval(*row, quantile) for row in rows)
+
+
+@dataclass(frozen=True)
+class Influence:
+    """How residuals act on an estimate: all alike in least squares, less when large under a robust loss [Huber1981].
+
+    Attributes:
+        weights: of each record, factor by factor (N each); None for ones.
+        spread: root mean square of what a residual number contributes, in units of the declared noise.
+        slope: mean derivative of that by the residual.
+        noise_scale: residuals in units of the declared noise, outliers discounted.
+    """
+
+    weights: tuple[Array, ...] | None
+    spread: float
+    slope: float
+    noise_scale: float
+
+
+def estimate(
+    problem: Problem, records: Sequence[FactorRecords], solution: Solution, influence: Influence | None = None
+) -> Estimate:
+    """Covariance, intervals and identifiability at a solution; without ``influence``, one of least squares.
+
+    The declared noise is scaled to the residuals found (the a posteriori variance factor [Mikhail1976]): with a
+    model that is wrong by more than the noise the intervals widen accordingly. Priors weigh in the estimate as they
+    were stated against the declared noise, so its covariance is the sandwich H^-1 (s^2 J'J + P) H^-1 with
+    H = b J'J + P; s is the influence's spread and b its slope, 1 in least squares.
+    A parameter at a bound keeps its full covariance: the bound is not evidence.
+
+    Raises:
+        NotConvergedError: springs do not hold the arm in a record.
+    """
+    problem.require_held(solution.values, records)
+    parameters = problem.parameters
+    scales, prior = parameters.scales(), parameters.prior_information()
+    slope = 1.0 if influence is None else influence.slope
+    moved = parameters.coordinates(parameters.local(solution.values))
+    chain = parameters.entries_jacobian(solution.values)
+    equations = problem.normal_equations(solution.values, _acting(problem, records, influence)).chained(chain)
+    triangle = factor_at_zero(problem, solution.values, records)
+    known = identify_from(triangle, parameters)
+    inverse = InverseInformation.of(np.sqrt(slope) * triangle, parameters)
+    half, freedom = inverse.root, problem.equations(records) - inverse.spent
+    influence = influence or _of_least_squares(equations.cost, freedom)
+    by_data = influence.spread * half @ (half.T @ triangle.T)
+    by_both = np.hstack([by_data, half @ (half.T * np.sqrt(prior))])
+    step = -(half @ (half.T @ (equations.gradient + prior * moved)))
+    unseen = np.linalg.norm(inverse.null, axis=0)
+    return Estimate(
+        parameters=parameters,
+        values=solution.values,
+        free_entries=parameters.free_entries,
+        covariance=chain @ (by_both @ by_both.T) @ chain.T,
+        unconstrained=solution.values[list(parameters.free_entries)] + chain @ step,
+        square_root_information=_square_root(triangle, prior, influence),
+        noise_scale=influence.noise_scale,
+        degrees_of_freedom=freedom,
+        identifiability=known,
+        determined=tuple(bool(x) for x in ~(np.abs(chain) @ unseen > 1e-6)),
+        told_by_data=_told_by_data(chain, scales, known),
+        verdict=solution.verdict,
+    )
+
+
+def _told_by_data(chain: Array, scales: Array, known: Identifiability) -> tuple[bool, ...]:
+    """Of each entry, whether it takes part in no undetermined combination (by more than 1e-6 of its ordinary size)."""
+    if not len(known.null):
+        return (True,) * len(chain)
+    moves = np.linalg.norm(chain @ (known.null * scales).T, axis=1)
+    ordinary = np.linalg.norm(chain * scales, axis=1)
+    return tuple(bool(x) for x in moves <= 1e-6 * np.where(ordinary > 0, ordinary, 1.0))
+
+
+def _acting(problem: Problem, records: Sequence[FactorRecords], influence: Influence | None) -> Sequence[FactorRecords]:
+    """The records with the weights that a loss gave them."""
+    return records if influence is None or influence.weights is None else problem.weighted(records, influence.weights)
+
+
+def _square_root(triangle: Array, prior: Array, influence: Influence) -> Array:
+    by_data = triangle * (influence.slope / max(influence.spread, SMALLEST_SPREAD))
+    return triangular(np.vstack([by_data, np.diag(np.sqrt(prior))]))
+
+
+def _of_least_squares(cost: float, freedom: float) -> Influence:
+    """With less than one degree of freedom the declared noise is believed."""
+    noise_scale = float(np.sqrt(2 * cost / freedom)) if freedom >= 1 else 1.0
+    return Influence(None, noise_scale, 1.0, noise_scale)
+
+
+def degrees_of_freedom(problem: Problem, values: Array, records: Sequence[FactorRecords], slope: float = 1.0) -> float:
+    """Residual numbers less what a fit takes up of them, the trace of its hat matrix.
+
+    A parameter that its prior holds takes up nothing, so that it is not counted as spent. ``slope`` is that of an
+    influence.
+
+    Raises:
+        NotConvergedError: a record has no elastic equilibrium there.
+    """
+    triangle = np.sqrt(slope) * factor_at_zero(problem, values, records)
+    return problem.equations(records) - InverseInformation.of(triangle, problem.parameters).spent
+
+
+def require_solvable(problem: Problem, records: Sequence[FactorRecords], start: Array) -> tuple[str, ...]:
+    """Refuse a problem whose answer would be made up.
+
+    Returns:
+        warnings: what priors alone hold, and a poor condition.
+
+    Raises:
+        ProblemError: fewer equations than parameters, or undetermined combinations, without priors on them.
+    """
+    parameters = problem.parameters
+    count = problem.equations(records)
+    unknown = problem.increments
+    has_prior = parameters.prior_information() > 0
+    warnings = []
+    if count < unknown:
+        text = f"{count} equations ({_poses(records)} records) for {unknown} free parameters"
+        if not has_prior.all():
+            raise ProblemError(f"{text}.", hint="Measure more poses, fix parameters, or give every one a prior.")
+        warnings.append(f"{text}: what the data does not say comes from the priors.")
+    known = identify(problem, start, records)
+    if known.undetermined:
+        explained = explain(problem, start, records, known)
+        listed = "; ".join(str(each) for each in explained[:MOST_TOLD])
+        more = len(explained) - MOST_TOLD
+        listed += f"; and {more} more, which armcal identify lists" if more > 0 else ""
+        text = f"the data does not determine {len(explained)} combinations"
+        unseen_scale = scale_is_unseen(problem, start, records, known)
+        if held_by_nothing(parameters, known):
+            first, mend = (f"{UNSEEN_SCALE}; ", f"{GIVE_A_LENGTH}. ") if unseen_scale else ("", "")
+            raise ProblemError(f"{first}{text}: {listed}.", hint=_sentence(f"{mend}{_mend(explained)}"))
+        if unseen_scale:
+            warnings.append(f"{UNSEEN_SCALE}; its priors hold it. To know it, {GIVE_A_LENGTH}.")
+        told = listed if len(explained) <= FEW_HELD else "armcal identify lists them"
+        warnings.append(
+            f"at the nominal values {text}; their priors hold them: {told}. The verdict counts at the answer."
+        )
+    if known.condition > POOR_CONDITION and not has_prior.all():
+        warnings.append(f"the scaled condition is {known.condition:.1e}: {known.weakest} is hardly determined.")
+    return tuple(warnings)
+
+
+def _sentence(text: str) -> str:
+    return text[:1].upper() + text[1:]
+
+
+def _mend(undetermined: Sequence[Undetermined]) -> str:
+    causes = {each.cause for each in undetermined}
+    ways = ["fix one parameter of each", "give it a prior"]
+    if "values" in causes:
+        ways.append("start from other values")
+    if causes & {"poses", "unknown"}:
+        ways.append("measure poses that tell them apart")
+    return _sentence(f"{', '.join(ways[:-1])}, or {ways[-1]}.")
+
+
+def _poses(records: Sequence[FactorRecords]) -> int:
+    return max((each.count for each in records), default=0)
+
+
+def _interval(value: float, unconstrained: float, sd: float, lower: float, upper: float, quantile: float) -> Interval95:
+    if not np.isfinite(sd):
+        return Interval95(lower, upper, False)
+    # Beyond a bound the interval starts there: an estimate that noise pushed far out is no surer than one at the bound.
+    low, high = min(unconstrained, upper) - quantile * sd, max(unconstrained, lower) + quantile * sd
+    if unconstrained - lower < NEAR_A_BOUND_SD * sd and unconstrained - lower <= upper - unconstrained:
+        return Interval95(lower, float(np.clip(high, lower, upper)), True)
+    if upper - unconstrained < NEAR_A_BOUND_SD * sd:
+        return Interval95(float(np.clip(low, lower, upper)), upper, True)
+    return Interval95(float(value - quantile * sd), float(value + quantile * sd), False)
+
+
+def _entry_bounds(parameters: Parameters) -> tuple[Array, Array]:
+    lower, upper = [], []
+    for block in parameters.free:
+        lower += [getattr(block.domain, "lower", -np.inf)] * block.size
+        upper += [getattr(block.domain, "upper", np.inf)] * block.size
+    return np.array(lower), np.array(upper)
+
+
+def _entry_scales(parameters: Parameters) -> Array:
+    return np.array([block.scale for block in parameters.free for _ in range(block.size)])

@@ -1,0 +1,178 @@
+"""Restricted likelihood of variance components in a linear model whose residuals are correlated within records only.
+
+Targets y = J d + e, cov(e_i) = S_i = sum_c theta_c V_ci, and a Gaussian prior on d. With D = S^-1 and
+P = D - D J (J' D J + prior)^-1 J' D [Patterson1971]:
+
+    log L = -1/2 (log|S| + log|J' D J + prior| + y' P y)
+    slope_c = 1/2 (y' P V_c P y - tr P V_c),    average information_cd = 1/2 y' P V_c P V_d P y    [Gilmour1995]
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from armcal.base.domains import Array
+from armcal.estimate.polish import bounded_step
+from armcal.problem.problem import NormalEquations
+
+MOST_STEPS = 100
+AT_REST = 1e-3
+"""A step this many standard deviations long ends the search."""
+INSTRUMENT_FLOOR = 1e-4
+"""Of the whole variance: an instrument without any noise would make records exact that are not."""
+_MOST_HALVINGS = 30
+
+
+@dataclass(frozen=True)
+class Term:
+    """Records of one factor: targets (N x n_r), Jacobians (N x n_r x n), bases (components x N x n_r x n_r)."""
+
+    target: Array
+    jacobian: Array
+    bases: Array
+
+
+@dataclass(frozen=True)
+class LikelihoodMaximum:
+    """Thetas, the covariance of their estimate, and the log likelihood there."""
+
+    theta: Array
+    covariance: Array
+    log_likelihood: float
+
+
+@dataclass(frozen=True)
+class _Local:
+    """Log likelihood, its slope and the average information at some thetas."""
+
+    value: float
+    slope: Array
+    information: Array
+
+
+def maximise(terms: Sequence[Term], prior: Array, floored: Array) -> LikelihoodMaximum:
+    """The thetas of largest restricted likelihood.
+
+    Args:
+        terms: with bases of mean variance one.
+        prior: information of the prior of each parameter (n).
+        floored: which thetas may not fall to zero (components).
+    """
+    count = len(floored)
+    # A parameter with a prior takes nothing away: its part of the target is in the sum of squares.
+    freedom = max(1, sum(term.target.size for term in terms) - int(np.count_nonzero(prior == 0)))
+    total = _least_squares(terms, prior) / freedom
+    lower = np.where(floored, INSTRUMENT_FLOOR * total, 0.0)
+    theta = np.full(count, max(total, 1e-300) / count)
+    here = _evaluate(terms, prior, theta)
+    for _ in range(MOST_STEPS):
+        step = _step(here, theta, lower)
+        length = max(float(step @ here.information @ step), 0.0) ** 0.5
+        moved = _raised(terms, prior, theta, step, here)
+        if moved is None:
+            break
+        theta, here = moved
+        if length < AT_REST:
+            break
+    scale = np.sqrt(np.maximum(np.diag(here.information), 1e-300))
+    covariance = np.linalg.pinv(here.information / np.outer(scale, scale), rcond=1e-10, hermitian=True)
+    return LikelihoodMaximum(theta, covariance / np.outer(scale, scale), here.value)
+
+
+def _step(here: _Local, theta: Array, lower: Array) -> Array:
+    """Towards the maximum of the local model, above the floors."""
+    size = np.diag(here.information)
+    ridge = 1e-9 * np.diag(size) + (1e-12 * float(np.max(size, initial=1e-300))) * np.eye(len(theta))
+    model = NormalEquations(0.0, -here.slope, here.information + ridge)
+    step = bounded_step(model, lower - theta, np.full(len(theta), np.inf))
+    return np.zeros(len(theta)) if step is None else step
+
+
+def _raised(
+    terms: Sequence[Term], prior: Array, theta: Array, step: Array, here: _Local
+) -> tuple[Array, _Local] | None:
+    """Along a step as far as the likelihood does not fall; None if it falls everywhere."""
+    for halving in range(_MOST_HALVINGS):
+        there = theta + step * 0.5**halving
+        try:
+            found = _evaluate(terms, prior, there)
+        except np.linalg.LinAlgError:
+            continue
+        if found.value >= here.value:
+            return there, found
+    return None
+
+
+def _evaluate(terms: Sequence[Term], prior: Array, theta: Array) -> _Local:
+    inverses: list[Array] = [np.asarray(np.linalg.inv(_covariances(t, theta)), dtype=float) for t in terms]
+    information = np.diag(prior).astype(float)
+    pull = np.zeros(len(prior))
+    logarithm = 0.0
+    for term, inverse in zip(terms, inverses, strict=True):
+        logarithm -= float(np.linalg.slogdet(inverse)[1].sum())
+        weighed = np.einsum("nab,nbc->nac", inverse, term.jacobian, optimize=True)
+        information += np.einsum("nac,nad->cd", term.jacobian, weighed, optimize=True)
+        pull += np.einsum("nac,na->c", weighed, term.target, optimize=True)
+    scale = np.sqrt(np.maximum(np.diag(information), 1e-300))
+    scaled = information / np.outer(scale, scale) + 1e-14 * np.eye(len(scale))
+    root = np.linalg.cholesky(scaled) if len(scale) else np.zeros((0, 0))
+    covariance = np.linalg.inv(scaled) / np.outer(scale, scale) if len(scale) else np.zeros((0, 0))
+    logarithm += 2 * float(np.log(np.diag(root) * scale).sum())
+    fit = covariance @ pull
+    projected = [
+        np.einsum("nab,nb->na", inverse, term.target - term.jacobian @ fit)
+        for term, inverse in zip(terms, inverses, strict=True)
+    ]
+    energy = sum(float(np.sum(t.target * p)) for t, p in zip(terms, projected, strict=True))
+    slope = _slope(terms, inverses, projected, covariance, len(theta))
+    return _Local(
+        -0.5 * (logarithm + energy), slope, _average_information(terms, inverses, projected, covariance, len(theta))
+    )
+
+
+def _slope(
+    terms: Sequence[Term], inverses: Sequence[Array], projected: Sequence[Array], covariance: Array, count: int
+) -> Array:
+    slope = np.zeros(count)
+    for term, inverse, p in zip(terms, inverses, projected, strict=True):
+        weighed = np.einsum("nab,nbc->nac", inverse, term.jacobian, optimize=True)
+        reduced = inverse - np.einsum("nac,cd,nbd->nab", weighed, covariance, weighed, optimize=True)
+        slope += 0.5 * np.einsum("cnab,nab->c", term.bases, p[:, :, None] * p[:, None, :] - reduced, optimize=True)
+    return slope
+
+
+def _average_information(
+    terms: Sequence[Term], inverses: Sequence[Array], projected: Sequence[Array], covariance: Array, count: int
+) -> Array:
+    """1/2 u_c' P u_d with u_c = V_c P y."""
+    total, reached = np.zeros((count, count)), np.zeros((count, len(covariance)))
+    for term, inverse, p in zip(terms, inverses, projected, strict=True):
+        u = np.einsum("cnab,nb->cna", term.bases, p, optimize=True)
+        weighed = np.einsum("nab,cnb->cna", inverse, u, optimize=True)
+        total += np.einsum("cna,dna->cd", u, weighed, optimize=True)
+        reached += np.einsum("cna,nav->cv", weighed, term.jacobian, optimize=True)
+    return 0.5 * (total - reached @ covariance @ reached.T)
+
+
+def _covariances(term: Term, theta: Array) -> Array:
+    """S of each record (N x n_r x n_r).
+
+    Raises:
+        numpy.linalg.LinAlgError: one is not positive definite.
+    """
+    found = np.einsum("c,cnab->nab", theta, term.bases, optimize=True)
+    np.linalg.cholesky(found)
+    return np.asarray(found)
+
+
+def _least_squares(terms: Sequence[Term], prior: Array) -> float:
+    """y' P y with all noise declared."""
+    rows = [term.jacobian.reshape(-1, len(prior)) for term in terms]
+    stacked = np.vstack([*rows, np.diag(np.sqrt(prior))])
+    target = np.concatenate([*[term.target.ravel() for term in terms], np.zeros(len(prior))])
+    scale = np.maximum(np.linalg.norm(stacked, axis=0), 1e-300)
+    found = np.linalg.lstsq(stacked / scale, target, rcond=None)[0]
+    return float(np.sum((target - stacked / scale @ found) ** 2))

@@ -1,0 +1,333 @@
+"""Intervals by profile likelihood: how much worse the best fit becomes when one parameter is held away from its value.
+
+A parameter is pinned along a grid that grows outward, everything else is fitted again from the nearest fit before,
+and the interval ends where twice the rise of the cost passes the quantile of F(1, degrees of freedom). The rise is
+divided by the factor that makes it agree with the estimate's standard deviation for small moves: the square of the
+noise found, less where priors hold the parameter, since they weigh as they were stated (the vertical adjustment of
+[Chandler2007]). Nothing is assumed of how residuals bend, so an interval may be lopsided, end at a bound, or not end.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+from scipy.special import fdtri
+
+from armcal.base.domains import Array, Interval
+from armcal.errors import ConfigError, NotConvergedError
+from armcal.estimate.estimator import CONFIDENCE, Estimate, Estimator, Progress, no_progress
+from armcal.estimate.weighing import WeighedFit, Weighing
+from armcal.io.parallel import Executor, Sequential
+from armcal.problem.posed import PosedProblem
+from armcal.problem.problem import FactorRecords, Problem
+from armcal.problem.projection import factor_at_zero
+
+End = Literal["crossed", "bound", "open"]
+"""How an interval ends: where the rise passes the quantile, at the parameter's bound, or not as far as was looked."""
+SETTLED = 2e-3
+"""Of a standard deviation: an end is known so well."""
+_MOST_STEPS = 24
+_FARTHEST = 50.0
+_BISECTIONS = 40
+_BETTER = 1e-3
+_MOST_RISE = 1e12
+
+
+@dataclass(frozen=True)
+class Profile:
+    """One parameter's profile.
+
+    Attributes:
+        name: of the parameter.
+        value: found (SI).
+        deviation: its standard deviation by the curvature at the estimate.
+        lower, upper: ends of the interval; the last place looked at where it is open.
+        lower_end, upper_end: how it ends there.
+        curve: places and twice the adjusted rise of the cost (2 x K), in order.
+        quantile: what the rise must not pass.
+        better: whether a fit was found that is better than the estimate: it was not the best one.
+        failed: fits that did not converge; the search ends at them.
+    """
+
+    name: str
+    value: float
+    deviation: float
+    lower: float
+    upper: float
+    lower_end: End
+    upper_end: End
+    curve: Array
+    quantile: float
+    better: bool
+    failed: int
+
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {
+            "value": self.value,
+            "sd": self.deviation if np.isfinite(self.deviation) else None,
+            "level": CONFIDENCE,
+            "lower": self.lower,
+            "upper": self.upper,
+            "lower_end": self.lower_end,
+            "upper_end": self.upper_end,
+            "quantile": self.quantile,
+            "better_fit_found": self.better,
+            "failed_fits": self.failed,
+            "curve": {"value": self.curve[0].tolist(), "rise": self.curve[1].tolist()},
+        }
+
+
+@dataclass(frozen=True)
+class ProfileTask:
+    """One parameter of a fit; small enough to send to another process."""
+
+    problem: Problem
+    estimator: Estimator
+    records: tuple[FactorRecords, ...]
+    found: Estimate
+    name: str
+
+
+def profiles(
+    problem: Problem,
+    fitted: WeighedFit,
+    estimator: Estimator,
+    patterns: Sequence[str],
+    executor: Executor | None = None,
+    progress: Progress = no_progress,
+) -> tuple[Profile, ...]:
+    """The profiles of free numbers by glob; records weigh as they did in the fit.
+
+    Raises:
+        ConfigError: a glob matches no free number.
+    """
+    records = fitted.records
+    if isinstance(estimator, Weighing):
+        estimator, records = estimator.inner, problem.weighted(records, fitted.weights)
+    names = profiled(problem, patterns)
+    tasks = [ProfileTask(problem, estimator, records, fitted.estimate, name) for name in names]
+    done = (executor or Sequential()).map(profile, tasks, lambda share: progress("profile likelihood", share))
+    return tuple(done)
+
+
+def profiled(problem: Problem, patterns: Sequence[str]) -> tuple[str, ...]:
+    """The free numbers that globs name.
+
+    Raises:
+        ConfigError: one matches no free number.
+    """
+    parameters = problem.parameters
+    numbers = {b.name for b in parameters.free if isinstance(b.domain, Interval)}
+    for pattern in patterns:
+        matched = parameters.select([pattern])
+        if not numbers & set(matched):
+            what = "a matrix or a rotation" if any(parameters[name].free for name in matched) else "not free"
+            raise ConfigError(
+                f"{pattern} has no profile: it is {what}.",
+                hint="Name free numbers under uncertainty.profile; armcal check -v lists them.",
+            )
+    return tuple(name for name in parameters.select(patterns) if name in numbers)
+
+
+def profile(task: ProfileTask) -> Profile:
+    """Pin, fit again, look outward on both sides."""
+    search = _Search(task)
+    lower, lower_end = search.end(-1.0)
+    upper, upper_end = search.end(1.0)
+    places = np.array(sorted(search.rises))
+    rises = np.array([search.rises[place] for place in places])
+    return Profile(
+        task.name,
+        search.value,
+        search.deviation,
+        lower,
+        upper,
+        lower_end,
+        upper_end,
+        np.vstack([places, rises]),
+        search.quantile,
+        bool(rises.min() < -_BETTER * search.quantile),
+        search.failed,
+    )
+
+
+class _Search:
+    """Pinned fits of one parameter, and where their cost passes the quantile."""
+
+    def __init__(self, task: ProfileTask) -> None:
+        self._task, parameters = task, task.problem.parameters
+        self._place = parameters.entries_of(task.name).start
+        own = task.found.names.index(task.name)
+        self.value = float(task.found.values[self._place])
+        self.deviation = float(task.found.deviations[own])
+        self.quantile = float(fdtri(1, max(task.found.degrees_of_freedom, 1), CONFIDENCE))
+        block = parameters[task.name]
+        known = np.isfinite(self.deviation) and self.deviation > 0
+        self._step = self.deviation if known else block.scale
+        domain = block.domain
+        self._bounds = (domain.lower, domain.upper) if isinstance(domain, Interval) else (-np.inf, np.inf)
+        self._cost = _cost(task.problem, task.records, task.found.values)
+        self._unit = _unit(task, own) if known else max(task.found.noise_scale**2, 1e-30)
+        self._fits = {self.value: task.found.values}
+        self.rises = {self.value: 0.0}
+        self.failed = 0
+
+    def end(self, sign: float) -> tuple[float, End]:
+        """The lower (-1) or upper (+1) end."""
+        bound = self._bounds[0 if sign < 0 else 1]
+        inside, width = self.value, 0.5 * self._step
+        for _ in range(_MOST_STEPS):
+            outside = inside + sign * width
+            at_bound = sign * (outside - bound) >= 0
+            outside = bound if at_bound else outside
+            if outside == inside:
+                return bound, "bound"
+            rise = self._rise(outside)
+            if rise is None:
+                return inside, "open"
+            if rise > self.quantile:
+                return self._crossing(inside, outside), "crossed"
+            if at_bound:
+                return bound, "bound"
+            if abs(outside - self.value) > _FARTHEST * self._step:
+                return outside, "open"
+            width = self._next_width(abs(outside - self.value), rise, width)
+            inside = outside
+        return inside, "open"
+
+    def _next_width(self, reached: float, rise: float, width: float) -> float:
+        """To where a parabola would pass the quantile, and somewhat beyond; at most twice as far as before."""
+        ahead = reached * (np.sqrt(self.quantile / rise) - 1) if rise > 0 else np.inf
+        return float(np.clip(1.1 * ahead, 0.2 * self._step, max(2 * width, reached)))
+
+    def _crossing(self, inside: float, outside: float) -> float:
+        """Between a place below the quantile and one above: by secants of the root of the rise, kept between."""
+        low, high = (float(np.sqrt(max(self.rises[p], 0.0)) - np.sqrt(self.quantile)) for p in (inside, outside))
+        for number in range(_BISECTIONS):
+            if abs(outside - inside) <= SETTLED * self._step or high - low <= 0:
+                break
+            share = float(np.clip(-low / (high - low), 0.02, 0.98)) if number % 3 < 2 else 0.5
+            middle = inside + share * (outside - inside)
+            rise = self._rise(middle)
+            if rise is None:
+                break
+            at = float(np.sqrt(max(rise, 0.0)) - np.sqrt(self.quantile))
+            if abs(at) < SETTLED / 2:
+                return middle
+            if at > 0:
+                outside, high = middle, at
+            else:
+                inside, low = middle, at
+        return 0.5 * (inside + outside)
+
+    def _rise(self, place: float) -> float | None:
+        """Twice the adjusted rise of the cost with the parameter pinned; None if the fit failed."""
+        if place not in self.rises:
+            task = self._task
+            nearest = min(self._fits, key=lambda known: abs(known - place))
+            start = self._fits[nearest].copy()
+            start[self._place] = place
+            problem = _pinned(task.problem, task.name, place)
+            try:
+                solution = task.estimator.solve(problem, task.records, start)
+                converged = solution.verdict.converged
+            except NotConvergedError:
+                converged = False
+            if not converged:
+                self.failed += 1
+                return None
+            cost = _cost(task.problem, task.records, solution.values)
+            self._fits[place] = solution.values
+            self.rises[place] = min(2 * (cost - self._cost) / self._unit, _MOST_RISE)
+        return self.rises[place]
+
+
+@dataclass(frozen=True)
+class Pinned:
+    """The domain of a number that is held at a place: it has no increments, so that no solver sees it."""
+
+    place: float
+
+    @property
+    def entries(self) -> tuple[str, ...]:
+        """One entry, without a suffix."""
+        return ("",)
+
+    @property
+    def dof(self) -> int:
+        """None."""
+        return 0
+
+    def check(self, value: Array) -> str:
+        """Nothing is wrong with any."""
+        return ""
+
+    def retract(self, base: Array, delta: Array) -> Array:
+        """The place."""
+        return np.array([self.place])
+
+    def local(self, base: Array, value: Array) -> Array:
+        """Nothing moves."""
+        return np.zeros(0)
+
+    def retract_jacobian(self, base: Array, delta: Array) -> Array:
+        """Nothing moves."""
+        return np.zeros((1, 0))
+
+    def increment_scale(self, scale: float) -> float:
+        """Of no increment."""
+        return scale
+
+    @property
+    def increments(self) -> tuple[str, ...]:
+        """None."""
+        return ()
+
+    def coordinates(self, base: Array, delta: Array) -> Array:
+        """None."""
+        return np.zeros(0)
+
+    def from_coordinates(self, base: Array, coordinates: Array) -> Array:
+        """None."""
+        return np.zeros(0)
+
+    def coordinates_jacobian(self, base: Array, delta: Array) -> Array:
+        """None by none."""
+        return np.zeros((0, 0))
+
+    def entries_jacobian(self, base: Array, delta: Array) -> Array:
+        """Nothing moves."""
+        return np.zeros((1, 0))
+
+    def curvature(self, gradient: Array) -> Array | None:
+        """None."""
+        return None
+
+
+def _pinned(problem: Problem, name: str, place: float) -> Problem:
+    """The same compiled functions, one parameter held; its own prior is a constant, which ``_cost`` counts."""
+    block = replace(problem.parameters[name], domain=Pinned(place))
+    return replace(problem, parameters=problem.parameters.replaced({name: block}))
+
+
+def _cost(problem: Problem, records: Sequence[FactorRecords], values: Array) -> float:
+    """Of residuals and priors."""
+    posed = PosedProblem(problem, records)
+    return posed.cost(posed.x(values))
+
+
+def _unit(task: ProfileTask, own: int) -> float:
+    """What the rise is divided by: variance of the estimate over that by the curvature of the cost alone."""
+    parameters = task.problem.parameters
+    triangle = factor_at_zero(task.problem, task.found.values, task.records)
+    chain = parameters.entries_jacobian(task.found.values)
+    scales = parameters.scales()
+    prior = np.sqrt(parameters.prior_information())
+    stacked = np.vstack([triangle * scales, np.diag(prior * scales)])
+    row = chain[own] * scales
+    by_curvature = float(np.sum((np.linalg.pinv(stacked).T @ row) ** 2))
+    return float(task.found.covariance[own, own]) / by_curvature

@@ -1,0 +1,110 @@
+"""How far each record lies from a fit, in units of what its own residual should scatter by.
+
+A record that pulls the fit towards itself has a small residual even if it is wrong. With H = J C J' (C the inverse
+of the information of records and priors, J whitened) and w the record's weight in the fit, the covariance of its
+residual is s^2 (I - (2 w - 1) H): I - H for one that took part, I + H for one that was set aside [Rousseeuw1987].
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import fdtri
+
+from armcal.base.domains import Array
+from armcal.estimate.identifiability import InverseInformation
+from armcal.estimate.loss import median_norm
+from armcal.problem.problem import FactorRecords, Problem
+
+LEVEL = 0.01
+"""Of calling any record an outlier though all noise is Gaussian."""
+SMALLEST_SCALE = 1e-3
+"""In units of the declared noise: residuals smaller than this are none, and no measure of what is large."""
+UNCONTROLLED = 1e-3
+"""Of a residual's variance: below this it would hardly show an error of its own record."""
+
+
+@dataclass(frozen=True)
+class Distances:
+    """Of all records, factor by factor.
+
+    Attributes:
+        studentised: length of each residual in its own standard deviations (N each); 0 where nothing controls it.
+        limits: the length that the largest of all stays below in 99 % of experiments without outliers.
+        scales: residuals in units of their noise, by their median, so that a minority of outliers hardly matters.
+    """
+
+    studentised: tuple[Array, ...]
+    limits: tuple[float, ...]
+    scales: tuple[float, ...]
+
+    def beyond(self) -> tuple[Array, ...]:
+        """How many limits away each record lies (N each)."""
+        return tuple(length / limit for length, limit in zip(self.studentised, self.limits, strict=True))
+
+
+def studentised_distances(
+    problem: Problem, values: Array, records: Sequence[FactorRecords], weights: Sequence[Array]
+) -> Distances:
+    """Distances of all records from a fit that gave them these weights (N each, 0 to 1).
+
+    The limit is Fisher's quantile at 1 % over the number of records (Bonferroni).
+    """
+    counted = problem.weighted(records, weights)
+    inverse = InverseInformation.of(problem.triangular_factor(values, counted), problem.parameters)
+    residuals = remaining(problem, values, records, weights)
+    lengths = [np.zeros(each.count) for each in records]
+    for factor, part, reached in _reached(problem, values, records, inverse.root):
+        hat = np.einsum("avn,bvn->nab", reached, reached)
+        spread = np.eye(len(reached)) - (2 * weights[factor][part, None, None] - 1) * hat
+        lengths[factor][part] = _lengths(residuals[factor][:, part], spread)
+    freedom = max(1.0, problem.equations(counted) - inverse.spent)
+    tests = sum(len(length) for length in lengths)
+    sizes = [len(residual) for residual in residuals]
+    scales = [
+        max(float(np.median(length)) / median_norm(m), SMALLEST_SCALE) for length, m in zip(lengths, sizes, strict=True)
+    ]
+    limits = [float(np.sqrt(m * fdtri(m, freedom, 1 - LEVEL / max(1, tests)))) for m in sizes]
+    studentised = [length / scale for length, scale in zip(lengths, scales, strict=True)]
+    return Distances(tuple(studentised), tuple(limits), tuple(scales))
+
+
+def remaining(
+    problem: Problem, values: Array, records: Sequence[FactorRecords], weights: Sequence[Array]
+) -> tuple[Array, ...]:
+    """Whitened residuals (n_r x N) times the roots of the records' own weights.
+
+    Of drifting records less the drift that they tell of with these further weights (N each).
+    """
+    found, shared = problem.weighted_residuals(values, records), records[0].correlation
+    told_by = problem.weighted(records, weights) if shared is not None else records
+    told = told_by[0].correlation
+    if shared is None or told is None:
+        return found
+    states = told.states([r[:, :, None] for r in problem.weighted_residuals(values, told_by)])
+    return tuple(r - shared.taken_up(i, states)[:, : r.shape[1], 0] for i, r in enumerate(found))
+
+
+def _reached(
+    problem: Problem, values: Array, records: Sequence[FactorRecords], half: Array
+) -> Iterator[tuple[int, slice, Array]]:
+    """J B of each block of records (n_r x k x B), with its factor and place; records are those of weight one."""
+    to_directions = problem.parameters.entries_jacobian(values) @ half
+    blocks = problem.jacobians(values, records)
+    for factor, each in enumerate(records):
+        start = 0
+        while start < each.record.shape[1]:
+            jacobian = next(blocks)
+            stop = min(start + jacobian.shape[2], each.count)
+            yield factor, slice(start, stop), np.einsum("avn,vk->akn", jacobian[:, :, : stop - start], to_directions)
+            start += jacobian.shape[2]
+
+
+def _lengths(residuals: Array, spread: Array) -> Array:
+    """sqrt(r' S^-1 r) of each record; directions that nothing controls are left out."""
+    sizes, axes = np.linalg.eigh(spread)
+    along = np.einsum("nab,an->nb", axes, residuals)
+    controlled = sizes > UNCONTROLLED
+    return np.asarray(np.sqrt(np.sum(np.where(controlled, along**2 / np.where(controlled, sizes, 1.0), 0.0), axis=1)))

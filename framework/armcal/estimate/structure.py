@@ -1,0 +1,175 @@
+"""Why a combination is undetermined: no poses could tell, these poses do not, or only not at these values.
+
+A model is analytic, so its rank is the same almost everywhere; random poses at a point near the values at hand show
+it with probability one, and what is undetermined there is a gauge.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from armcal.base.domains import Array
+from armcal.base.parameters import Parameters
+from armcal.errors import NotConvergedError
+from armcal.estimate.combination import Combination, named
+from armcal.estimate.identifiability import RANK_TOLERANCE, Identifiability, analyse, measures_of
+from armcal.estimate.null_space import null_rows, sparse_basis
+from armcal.problem.factor import Factor
+from armcal.problem.problem import FactorRecords, Problem
+from armcal.problem.projection import approach_channels, factor_at_zero, fits, joint_channels, projected
+
+Cause = Literal["gauge", "values", "poses", "unknown"]
+SAID: dict[Cause, str] = {
+    "gauge": "a gauge: no poses would tell",
+    "values": "not seen at these values, only away from them",
+    "poses": "these poses do not tell, others would",
+    "unknown": "whether other poses would tell could not be found out",
+}
+_AWAY = 0.1
+"""How far from the values at hand a point lies where the rank is taken, in ordinary sizes."""
+_HARDLY_AWAY = 1e-3
+"""And one where undetermined directions are taken: they turn along with the values."""
+_BEYOND = 0.7
+"""rad, or m: how far random poses go beyond the recorded ones."""
+_WITHIN = 1e-2
+"""Sine of the angle within which a direction is the one that is undetermined there."""
+_NAMED = 1e-4
+
+
+@dataclass(frozen=True)
+class Undetermined:
+    """A combination that the records do not determine, why, and the priors that take part in it."""
+
+    combination: Combination
+    cause: Cause
+    priors: tuple[str, ...]
+
+    def __str__(self) -> str:
+        return f"{self.combination}: {SAID[self.cause]}"
+
+
+def identify(problem: Problem, values: Array, records: Sequence[FactorRecords]) -> Identifiability:
+    """What records determine at a value vector, judged at zero residual.
+
+    Raises:
+        NotConvergedError: a record has no elastic equilibrium at these values.
+    """
+    return identify_from(factor_at_zero(problem, values, records), problem.parameters)
+
+
+def identify_from(triangle: Array, parameters: Parameters) -> Identifiability:
+    """The same from R (m x n) with R'R the information by coordinates."""
+    return analyse(triangle, parameters.scales(), parameters.coordinate_names, measures_of(parameters))
+
+
+def explain(
+    problem: Problem, values: Array, records: Sequence[FactorRecords], known: Identifiability
+) -> tuple[Undetermined, ...]:
+    """Every undetermined combination with its cause: gauges first, as few parameters in each as possible."""
+    null = known.null
+    if not len(null):
+        return ()
+    held = problem.parameters.prior_information() > 0
+    priors = {name for name, has in zip(known.names, held, strict=True) if has}
+    vectors, causes = _by_cause(problem, values, records, null)
+    told = [named(vector, known.names, known.measures, _NAMED) for vector in vectors]
+    return tuple(
+        Undetermined(combination, cause, tuple(name for name in combination.names if name in priors))
+        for combination, cause in zip(told, causes, strict=True)
+    )
+
+
+def held_by_nothing(parameters: Parameters, known: Identifiability) -> tuple[Combination, ...]:
+    """Undetermined combinations that priors do not hold either."""
+    null = known.null
+    if not len(null):
+        return ()
+    strength = np.sqrt(parameters.prior_information()) * parameters.scales()
+    free = null_rows((null * strength).T, RANK_TOLERANCE * max(float(strength.max()), 1e-300)) @ null
+    return tuple(named(vector, known.names, known.measures, _NAMED) for vector in sparse_basis(free))
+
+
+def nearby(parameters: Parameters, values: Array, away: float = _AWAY, seed: int = 0) -> Array:
+    """A value vector so many ordinary sizes away, within bounds."""
+    random = np.random.default_rng(seed)
+    at, scale = parameters.local(values), parameters.increment_scales()
+    lower, upper = parameters.increment_bounds()
+    step = away * scale * random.uniform(0.5, 1.0, len(scale)) * random.choice([-1.0, 1.0], len(scale))
+    step = np.where((at + step < lower) | (at + step > upper), -step, step)
+    return parameters.retract(np.clip(at + step, lower, upper))
+
+
+def random_records(problem: Problem, records: Sequence[FactorRecords], seed: int = 0) -> tuple[FactorRecords, ...]:
+    """Random poses about the recorded ones and beyond them, under the recorded loads, from either side."""
+    count = int(np.clip(3 * problem.increments, 60, 600))
+    result = []
+    for kernel, each in zip(problem.kernels, records, strict=True):
+        random = np.random.default_rng(seed)
+        rows = np.flatnonzero(each.weight[: each.count])
+        chosen = random.choice(rows if len(rows) else np.arange(each.count), count)
+        (drawn,) = Problem.subset([each], chosen.astype(np.intp))
+        record = _spread(kernel.factor, each, drawn.record.copy(), random)
+        weight = (np.arange(record.shape[1]) < count).astype(float)
+        result.append(replace(drawn, record=record, weight=weight, state=np.zeros_like(drawn.state)))
+    return tuple(result)
+
+
+def _spread(factor: Factor, each: FactorRecords, record: Array, random: np.random.Generator) -> Array:
+    joints, approaches = list(joint_channels(factor)), list(approach_channels(factor))
+    seen = each.record[joints, : each.count]
+    lowest, highest = seen.min(axis=1) - _BEYOND, seen.max(axis=1) + _BEYOND
+    record[joints] = random.uniform(lowest[:, None], highest[:, None], (len(joints), record.shape[1]))
+    record[approaches] = random.choice([-1.0, 1.0], (len(approaches), record.shape[1]))
+    return record
+
+
+def _by_cause(
+    problem: Problem, values: Array, records: Sequence[FactorRecords], null: Array
+) -> tuple[Array, list[Cause]]:
+    causes: list[Cause] = ["unknown"] * len(null)
+    if not all(each.count for each in records):
+        return sparse_basis(null), causes
+    try:
+        gauge, here = _nested(problem, values, records, null)
+    except NotConvergedError:
+        return sparse_basis(null), causes
+    counts: dict[Cause, int] = {
+        "gauge": len(gauge),
+        "values": len(here) - len(gauge),
+        "poses": len(null) - len(here),
+    }
+    causes = [cause for cause, count in counts.items() for _ in range(count)]
+    return sparse_basis(null, (gauge, here), _WITHIN), causes
+
+
+def _nested(problem: Problem, values: Array, records: Sequence[FactorRecords], null: Array) -> tuple[Array, Array]:
+    """Of the undetermined directions, those no poses show near these values, and those no poses show at them."""
+    poses, parameters = random_records(problem, records), problem.parameters
+    at = _scaled(problem, values, poses)
+    here = null_rows(at @ null.T, 1e3 * RANK_TOLERANCE * _largest(at)) @ null
+    away = _scaled(problem, nearby(parameters, values), poses)
+    count = len(null_rows(away, RANK_TOLERANCE * _largest(away)))
+    near = _scaled(problem, nearby(parameters, values, _HARDLY_AWAY), poses)
+    anywhere = np.linalg.svd(near)[2][len(near.T) - count :]
+    turn, cosines, _ = np.linalg.svd(here @ anywhere.T)
+    return turn.T[: int(np.sum(cosines > np.sqrt(1 - _WITHIN**2)))] @ here, here
+
+
+def _scaled(problem: Problem, values: Array, poses: Sequence[FactorRecords]) -> Array:
+    """R by coordinates in ordinary sizes, at zero residual, of the poses that can be taken up."""
+    fitting = projected(problem, values, poses)
+    can = fits(problem, values, fitting)
+    weighed = []
+    for each, mask in zip(fitting, can, strict=True):
+        weight = each.weight.copy()
+        weight[: each.count] *= mask
+        weighed.append(replace(each, weight=weight))
+    return problem.triangular_factor(values, weighed) * problem.parameters.scales()
+
+
+def _largest(matrix: Array) -> float:
+    return float(np.linalg.norm(matrix, 2)) if matrix.size else 0.0

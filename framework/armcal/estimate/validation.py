@@ -1,0 +1,265 @@
+"""Validation: which records train, which judge, and how wrong the model is on each."""
+
+from __future__ import annotations
+
+import re
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armcal.base.domains import Array
+from armcal.errors import NotConvergedError, ProblemError
+from armcal.estimate.estimator import Estimator, Progress, Solution, no_progress
+from armcal.estimate.nuisance import restricted, settled
+from armcal.io.parallel import Executor, Sequential
+from armcal.problem.drift import residuals
+from armcal.problem.problem import FactorRecords, Problem
+
+Indices = NDArray[np.intp]
+FEWEST_FOR_P95 = 20
+
+
+@dataclass(frozen=True)
+class ErrorSummary:
+    """Errors over some records, all in the unit of the errors given; None where there are no, or too few, records."""
+
+    mean: float | None
+    rms: float | None
+    p95: float | None
+    max: float | None
+    count: int
+
+    def as_dict(self) -> dict[str, float | int | None]:
+        """For JSON."""
+        return asdict(self)
+
+
+@dataclass(frozen=True)
+class Split:
+    """Which records train and which judge."""
+
+    train: Indices
+    holdout: Indices
+
+
+def summarise(errors: Array) -> ErrorSummary:
+    """Mean, root mean square, maximum, and the 95th percentile where a record in twenty lies beyond it."""
+    errors = errors[~np.isnan(errors)]
+    if not len(errors):
+        return ErrorSummary(None, None, None, None, 0)
+    return ErrorSummary(
+        float(np.mean(errors)),
+        float(np.sqrt(np.mean(errors**2))),
+        float(np.percentile(errors, 95)) if len(errors) >= FEWEST_FOR_P95 else None,
+        float(np.max(errors)),
+        len(errors),
+    )
+
+
+def record_errors(
+    problem: Problem, values: Array, records: Sequence[FactorRecords], told_by: Sequence[FactorRecords] | None = None
+) -> Array:
+    """How far each record's measurement lies from the prediction; root mean square over several measurements (N).
+
+    In m, angles left out; in rad where nothing measured is a length (``error_unit``). Groups that the problem holds,
+    as those that no training record touched, are fitted to these records first: what is left is how far the records
+    of a group disagree. ``told_by`` are the records that tell how far drifting parameters had drifted; without them
+    they are at rest.
+    """
+    values = settled(problem, values, records)
+    found = problem.residuals(values, records) if told_by is None else residuals(problem, values, records, told_by)
+    squares, count = np.zeros((2, records[0].count))
+    counted = error_dimension(problem)
+    for kernel, each, residual in zip(problem.kernels, records, found, strict=True):
+        rows = np.array([dimension == counted for dimension in kernel.factor.dimensions], dtype=bool)
+        if rows.any():
+            squares += np.where(each.measured, np.sum(residual[rows] ** 2, axis=0), 0.0)
+            count += each.measured
+    with np.errstate(invalid="ignore"):
+        return np.asarray(np.sqrt(squares / count))
+
+
+def error_unit(problem: Problem) -> str:
+    """The unit in which errors are shown: mm, or mrad where nothing measured is a length; a thousandth of SI each."""
+    return {"length": "mm", "angle": "mrad"}[error_dimension(problem)]
+
+
+def in_unit(content: Any, unit: str) -> Any:
+    """Content for JSON or YAML whose keys that end in ``_mm`` name the unit of its errors (``error_unit``)."""
+    if unit == "mm":
+        return content
+    if isinstance(content, Mapping):
+        return {re.sub("_mm$", f"_{unit}", str(key)): in_unit(value, unit) for key, value in content.items()}
+    return [in_unit(each, unit) for each in content] if isinstance(content, list | tuple) else content
+
+
+def error_dimension(problem: Problem) -> str:
+    """``length``, or ``angle`` where nothing measured is a length."""
+    lengths = any("length" in kernel.factor.dimensions for kernel in problem.kernels)
+    return "length" if lengths else "angle"
+
+
+def hold_out(count: int, fraction: float, seed: int, poses: Indices | None = None) -> Split:
+    """A random split; the same for the same count and seed. Records of one pose (numbers, N) stay together."""
+    poses, number = _poses(count, poses)
+    order = np.random.default_rng(seed).permutation(number)
+    held = np.isin(poses, order[: round(fraction * number)])
+    return Split(np.flatnonzero(~held).astype(np.intp), np.flatnonzero(held).astype(np.intp))
+
+
+def _poses(count: int, poses: Indices | None) -> tuple[Indices, int]:
+    """The number of each record's pose, and how many there are; each record its own where nothing is known."""
+    poses = np.arange(count, dtype=np.intp) if poses is None else np.unique(poses, return_inverse=True)[1]
+    return poses, int(poses.max(initial=-1)) + 1
+
+
+def split_by_id(ids: Sequence[str], train_ids: Sequence[str]) -> Split:
+    """Records with these ids train, the others judge.
+
+    Raises:
+        ProblemError: an id is not among the records, or none is left to train on.
+    """
+    wanted = set(train_ids)
+    missing = sorted(wanted - set(ids))
+    if missing:
+        raise ProblemError(
+            f"{len(missing)} of {len(wanted)} training ids are not in the data, the first: {missing[0]}.",
+            hint="Check that the list belongs to this dataset; records set aside on reading cannot train.",
+        )
+    inside = np.array([record in wanted for record in ids], dtype=bool)
+    return Split(np.flatnonzero(inside), np.flatnonzero(~inside))
+
+
+def split_by_label(labels: Sequence[str], train: Sequence[str]) -> Split:
+    """Records with one of these labels train, the others judge.
+
+    Raises:
+        ProblemError: no record has one of the labels.
+    """
+    missing = sorted(set(train) - set(labels))
+    if missing:
+        raise ProblemError(
+            f"no record belongs to {missing[0]!r}; there are {', '.join(sorted(set(labels)))}.",
+            hint="Correct validation.train_groups.",
+        )
+    inside = np.array([label in set(train) for label in labels], dtype=bool)
+    return Split(np.flatnonzero(inside), np.flatnonzero(~inside))
+
+
+def folds(count: int, number: int, seed: int, poses: Indices | None = None) -> tuple[Split, ...]:
+    """Random folds of nearly equal size; every record judges once. Records of one pose (numbers, N) stay together."""
+    poses, different = _poses(count, poses)
+    if not 2 <= number <= different:
+        raise ProblemError(
+            f"{number} folds of {different} {'records' if different == count else f'poses ({count} records)'}.",
+            hint="Take at least 2 folds, and no more than there are records of different poses.",
+        )
+    order = np.random.default_rng(seed).permutation(different)
+    judging = [np.isin(poses, part) for part in np.array_split(order, number)]
+    return tuple(Split(np.flatnonzero(~held).astype(np.intp), np.flatnonzero(held).astype(np.intp)) for held in judging)
+
+
+@dataclass(frozen=True)
+class FitTask:
+    """A fit on some records, judged on others; small enough to send to another process."""
+
+    problem: Problem
+    estimator: Estimator
+    start: Array
+    records: tuple[FactorRecords, ...]
+    split: Split
+
+    def parts(self) -> tuple[tuple[FactorRecords, ...], tuple[FactorRecords, ...]]:
+        """The records that train, and those that judge."""
+        train, held = (self.problem.subset(self.records, part) for part in (self.split.train, self.split.holdout))
+        return train, held
+
+    def trained(self) -> FitTask:
+        """The task with what its training records can tell of groups."""
+        train, _ = self.parts()
+        return replace(self, problem=restricted(self.problem, train))
+
+
+@dataclass(frozen=True)
+class JudgedFit:
+    """Errors (m) of the records that judge, by a fit on those that train; nan if it did not converge.
+
+    ``at_rest`` are the errors if nothing is known of a drift.
+    """
+
+    errors: Array
+    at_rest: Array
+    converged: bool
+    seconds: float
+
+
+@dataclass(frozen=True)
+class CrossValidation:
+    """Errors of each record, judged by the fold that did not train on it (nan if that fold did not converge).
+
+    ``at_rest`` are the errors if nothing is known of a drift; ``fits`` those of the folds, in order.
+    """
+
+    errors: Array
+    at_rest: Array
+    failed_folds: int
+    fits: tuple[JudgedFit, ...] = ()
+
+
+def fit_and_judge(task: FitTask) -> JudgedFit:
+    """Fit on the training records of a task, judge on its others."""
+    began, task = time.perf_counter(), task.trained()
+    try:
+        train, held = task.parts()
+        solution = task.estimator.solve(task.problem, train, task.start)
+        return judged_fit(task, solution, train, held, began)
+    except NotConvergedError:
+        return failed_fit(task, began)
+
+
+def judged_fit(
+    task: FitTask,
+    solution: Solution,
+    train: Sequence[FactorRecords],
+    held: Sequence[FactorRecords],
+    began: float,
+) -> JudgedFit:
+    """What a solution on the training records says of the others.
+
+    Raises:
+        NotConvergedError: a record has no elastic equilibrium there.
+    """
+    judged = record_errors(task.problem, solution.values, held, train)
+    at_rest = record_errors(task.problem, solution.values, held)
+    if not solution.verdict.converged:
+        return failed_fit(task, began)
+    return JudgedFit(judged, at_rest, True, time.perf_counter() - began)
+
+
+def failed_fit(task: FitTask, began: float) -> JudgedFit:
+    """Nothing is known."""
+    nothing = np.full(len(task.split.holdout), np.nan)
+    return JudgedFit(nothing, nothing, False, time.perf_counter() - began)
+
+
+def cross_validate(
+    problem: Problem,
+    records: Sequence[FactorRecords],
+    splits: Sequence[Split],
+    estimator: Estimator,
+    start: Array,
+    progress: Progress = no_progress,
+    executor: Executor | None = None,
+    judge: Callable[[FitTask], JudgedFit] = fit_and_judge,
+) -> CrossValidation:
+    """Fit on each fold's training records, judge on its others; the same compiled functions throughout."""
+    tasks = [FitTask(problem, estimator, start, tuple(records), split) for split in splits]
+    fits = (executor or Sequential()).map(judge, tasks, lambda done: progress("cross-validation", done))
+    errors, at_rest = np.full((2, records[0].count), np.nan)
+    for split, fit in zip(splits, fits, strict=True):
+        errors[split.holdout], at_rest[split.holdout] = fit.errors, fit.at_rest
+    return CrossValidation(errors, at_rest, sum(not fit.converged for fit in fits), tuple(fits))

@@ -1,0 +1,245 @@
+"""How records weigh in a fit: robust losses, setting aside, estimated variances; around any estimator."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import Field
+
+from armcal.base.domains import Array
+from armcal.base.settings import Settings
+from armcal.errors import NotConvergedError
+from armcal.estimate.estimator import (
+    Estimate,
+    Estimator,
+    Influence,
+    Progress,
+    Solution,
+    estimate,
+    gave_up,
+    no_progress,
+    spread,
+)
+from armcal.estimate.redundancy import studentised_distances
+from armcal.estimate.robust import RobustFit, Round, influence, ones, reweighted, selected
+from armcal.estimate.variance import Axes, VarianceComponents, apply_components, estimate_components
+from armcal.io.parallel import Executor
+from armcal.problem.problem import FactorRecords, Problem
+
+MOST_ESTIMATES = 10
+
+
+class NoiseSettings(Settings):
+    """What is believed of the noise.
+
+    ``loss``: ``none`` is least squares; ``huber`` and ``cauchy`` weigh large residuals less; ``reject`` sets records
+    aside and fits the rest, at most the fraction ``most_rejected``. ``estimate`` finds variance components, of each
+    instrument as a whole or of its axes apart, and of each joint, and fits with them.
+    """
+
+    loss: Literal["none", "huber", "cauchy", "reject"] = "none"
+    estimate: bool = False
+    axes: Axes = "together"
+    most_rejected: Annotated[float, Field(gt=0, lt=0.5)] = 0.1
+
+
+@dataclass(frozen=True)
+class Suspect:
+    """A record that lies farther from the fit than noise alone takes one record in a hundred experiments.
+
+    Attributes:
+        record: its place among the records of the fit.
+        measurement: whose residual it is.
+        distance: length of its residual in its own standard deviations, robustly scaled.
+        limit: what was allowed.
+        weight: in the fit: 0 if it was set aside.
+    """
+
+    record: int
+    measurement: str
+    distance: float
+    limit: float
+    weight: float
+
+
+@dataclass(frozen=True)
+class WeighedFit:
+    """A fit, and how its records weighed.
+
+    Attributes:
+        solution: the solver's.
+        estimate: values and how sure they are.
+        records: those of the fit, with the whitening used; set-aside ones have weight zero.
+        weights: of each record, factor by factor (N each).
+        suspects: the farthest first; empty without a loss.
+        components: estimated variances, or None.
+        loss: which one; ``none`` for least squares.
+        rounds: of reweighting and selecting.
+        warnings: what a user should know.
+    """
+
+    solution: Solution
+    estimate: Estimate
+    records: tuple[FactorRecords, ...]
+    weights: tuple[Array, ...]
+    suspects: tuple[Suspect, ...] = ()
+    components: VarianceComponents | None = None
+    loss: str = "none"
+    rounds: tuple[Round, ...] = ()
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def set_aside(self) -> tuple[Suspect, ...]:
+        """Those that took no part."""
+        return tuple(s for s in self.suspects if s.weight == 0)
+
+    @property
+    def kept(self) -> Array:
+        """Whether each record took part with some measurement (N)."""
+        return np.asarray(np.any(np.array(self.weights) > 0, axis=0))
+
+
+@dataclass(frozen=True)
+class Weighing:
+    """An estimator that weighs records as the settings say; it is an estimator itself, for folds and studies."""
+
+    inner: Estimator
+    settings: NoiseSettings
+
+    def spread(self, executor: Executor) -> Weighing:
+        """The same, with the inner estimator's own pieces done by an executor."""
+        return Weighing(spread(self.inner, executor), self.settings)
+
+    def solve(
+        self,
+        problem: Problem,
+        records: Sequence[FactorRecords],
+        start: Array,
+        progress: Progress = no_progress,
+    ) -> Solution:
+        """The values alone."""
+        return self._weighed(problem, tuple(records), start, progress)[0].solution
+
+    def fit(
+        self, problem: Problem, records: Sequence[FactorRecords], start: Array, progress: Progress = no_progress
+    ) -> WeighedFit:
+        """Values, and everything that is known of how records weighed."""
+        robust, whitened, components = self._weighed(problem, tuple(records), start, progress)
+        loss, acting = self.settings.loss, None
+        suspects = () if loss == "none" else _suspects(problem, robust, whitened)
+        if loss == "huber" or loss == "cauchy":
+            acting = influence(problem, whitened, robust, loss, self._trusted(problem, whitened, robust))
+        elif loss == "reject":
+            whitened = problem.weighted(whitened, robust.weights)
+        found = _estimate(problem, whitened, robust.solution, acting)
+        return WeighedFit(
+            robust.solution,
+            found,
+            whitened,
+            robust.weights,
+            suspects,
+            components,
+            loss,
+            robust.rounds,
+            robust.warnings,
+        )
+
+    def _weighed(
+        self, problem: Problem, records: tuple[FactorRecords, ...], start: Array, progress: Progress
+    ) -> tuple[RobustFit, tuple[FactorRecords, ...], VarianceComponents | None]:
+        first = self.inner.solve(problem, records, start, progress)
+        robust = self._robust(problem, records, first, progress)
+        if not self.settings.estimate:
+            return robust, records, None
+        return self._with_components(problem, records, robust, progress)
+
+    def _robust(
+        self, problem: Problem, records: tuple[FactorRecords, ...], first: Solution, progress: Progress
+    ) -> RobustFit:
+        """From a least-squares solution; Cauchy's loss and the selection start from Huber's, which has one minimum."""
+        loss = self.settings.loss
+        if loss == "none" or not first.verdict.converged or not problem.increments:
+            return RobustFit(first, ones(records), (1.0,) * len(records), ())
+        huber = reweighted(problem, records, self.inner, first, "huber", progress)
+        if loss == "huber" or not huber.solution.verdict.converged:
+            return huber
+        if loss == "cauchy":
+            return reweighted(problem, records, self.inner, huber.solution, "cauchy", progress)
+        return selected(problem, records, self.inner, huber, self.settings.most_rejected, progress)
+
+    def _with_components(
+        self, problem: Problem, records: tuple[FactorRecords, ...], robust: RobustFit, progress: Progress
+    ) -> tuple[RobustFit, tuple[FactorRecords, ...], VarianceComponents | None]:
+        """Components and values in turn, until the components rest; suspects tell nothing of the variances."""
+        axes, whitened, before = self.settings.axes, records, None
+        for number in range(MOST_ESTIMATES):
+            if not robust.solution.verdict.converged:
+                return robust, whitened, before
+            progress("variance components", number / MOST_ESTIMATES)
+            counted = problem.weighted(records, self._trusted(problem, whitened, robust))
+            found = estimate_components(problem, robust.solution.values, counted, axes)
+            found = VarianceComponents(
+                found.components, found.inseparable, found.unseen, found.log_likelihood, number + 1
+            )
+            if before is not None and found.close_to(before):
+                return robust, whitened, found
+            before = found
+            whitened = apply_components(problem, robust.solution.values, records, found, axes)
+            again = self.inner.solve(problem, whitened, robust.solution.values)
+            robust = self._robust(problem, whitened, again, progress)
+        return robust, whitened, before
+
+    def _trusted(self, problem: Problem, records: tuple[FactorRecords, ...], robust: RobustFit) -> tuple[Array, ...]:
+        """1 for records that may tell of the variances, 0 for suspects of a robust fit."""
+        if self.settings.loss == "none":
+            return robust.weights
+        distances = studentised_distances(problem, robust.solution.values, records, robust.weights)
+        return tuple(np.where(beyond > 1, 0.0, 1.0) for beyond in distances.beyond())
+
+
+def weighed(estimator: Estimator, settings: NoiseSettings) -> Estimator:
+    """The estimator as it is where plain least squares is asked for, else one that weighs records."""
+    return estimator if settings.loss == "none" and not settings.estimate else Weighing(estimator, settings)
+
+
+def fit(
+    problem: Problem,
+    records: Sequence[FactorRecords],
+    estimator: Estimator,
+    start: Array,
+    progress: Progress = no_progress,
+) -> WeighedFit:
+    """The fit of any estimator, weighing or not."""
+    if isinstance(estimator, Weighing):
+        return estimator.fit(problem, records, start, progress)
+    return plain_fit(problem, records, estimator.solve(problem, records, start, progress))
+
+
+def plain_fit(problem: Problem, records: Sequence[FactorRecords], solution: Solution) -> WeighedFit:
+    """A solution of least squares as a fit."""
+    return WeighedFit(solution, _estimate(problem, records, solution), tuple(records), ones(records))
+
+
+def _estimate(
+    problem: Problem, records: Sequence[FactorRecords], solution: Solution, acting: Influence | None = None
+) -> Estimate:
+    """The estimate at a solution; where a solver gave up on the edge of what springs hold, there may be none."""
+    try:
+        return estimate(problem, records, solution, acting)
+    except NotConvergedError as fault:
+        raise fault if solution.verdict.converged else gave_up(solution.verdict) from fault
+
+
+def _suspects(problem: Problem, robust: RobustFit, records: tuple[FactorRecords, ...]) -> tuple[Suspect, ...]:
+    """All records beyond their limit, and all that were set aside."""
+    distances = studentised_distances(problem, robust.solution.values, records, robust.weights)
+    found = []
+    rows = zip(problem.kernels, distances.studentised, distances.limits, robust.weights, strict=True)
+    for kernel, lengths, limit, weights in rows:
+        for i in np.flatnonzero((lengths > limit) | (weights == 0)):
+            suspect = Suspect(int(i), kernel.factor.name, float(lengths[i]), limit, float(weights[i]))
+            found.append(suspect)
+    return tuple(sorted(found, key=lambda s: -s.distance))

@@ -1,0 +1,137 @@
+"""How far from the best a plan can be: the relaxation posed in cvxpy, certified by its tangent."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Literal
+
+import numpy as np
+
+from armcal.base.domains import Array
+from armcal.planning.candidates import Candidates
+from armcal.planning.relaxation import (
+    AT_ONCE,
+    INTERIOR_POINT,
+    Relaxation,
+    Tangent,
+    Task,
+    interior_point,
+    relax,
+    tangent,
+)
+
+BoundSolver = Literal["auto", "cvxpy", "interior_point", "none"]
+_MOST_COORDINATES = 60
+"""A determinant is a cone of twice its size to cvxpy: beyond this the interior-point method is used."""
+_AT_ONCE_E = 600
+
+
+def bounded(task: Task, solver: BoundSolver = "auto", found: Relaxation | None = None) -> Relaxation | None:
+    """A certified upper bound on the criterion of any plan; None where there is none.
+
+    ``auto``: cvxpy for up to 2000 candidates and 60 coordinates, beyond them an interior-point method on the
+    candidates that matter, certified on all by the equivalence theorem. E is always cvxpy's. O2 and O4 are not
+    concave; E over several draws is not posed. ``found`` is the interior-point answer, where it is known already.
+    """
+    name = task.criterion.name
+    if solver == "none" or name in ("O2", "O4") or (name == "E" and task.candidates.draws > 1):
+        return None
+    small = task.candidates.count <= AT_ONCE and task.candidates.size <= _MOST_COORDINATES
+    can = name in ("D", "A", "E") and task.candidates.draws == 1
+    wanted = name == "E" or solver == "cvxpy" or (solver == "auto" and small)
+    if can and wanted and task.count < task.candidates.count * task.limit:
+        try:
+            return relax(task, by_cvxpy, "cvxpy", max(_AT_ONCE_E if name == "E" else AT_ONCE, 4 * task.count))
+        except (ArithmeticError, ValueError):
+            if name == "E":
+                return None
+    if name == "E":
+        return None
+    return found or relax(task, interior_point, INTERIOR_POINT)
+
+
+def by_cvxpy(task: Task) -> tuple[Array, Tangent]:
+    """The relaxation in cvxpy, in the basis in which an even mixture has the information I.
+
+    Raises:
+        ArithmeticError: no solver found an answer.
+    """
+    import cvxpy as cp
+
+    candidates = task.candidates
+    even = np.full(candidates.count, task.count / candidates.count)
+    mixed = candidates.information(even)[0] + candidates.ridge() * np.eye(candidates.size)
+    values, vectors = np.linalg.eigh(mixed)
+    basis = vectors / np.sqrt(np.maximum(values, 1e-300))
+    weights = cp.Variable(candidates.count)
+    information = _information(cp, candidates, basis, weights)
+    constraints = [weights >= 0, weights <= task.limit, cp.sum(weights) == task.count]
+    if task.criterion.name == "E":
+        return _smallest(cp, task, (weights, information, constraints), basis)
+    objective = -cp.log_det(information) if task.criterion.name == "D" else cp.matrix_frac(basis.T, information)
+    _solve(cp, cp.Problem(cp.Minimize(objective), constraints), ("SCS", "CLARABEL"))
+    found = _feasible(task, weights.value)
+    return found, tangent(task, found)
+
+
+def _information(cp: Any, candidates: Candidates, basis: Array, weights: Any) -> Any:
+    """The information in the basis, affine in the weights."""
+    size = candidates.size
+    rows = candidates.rows[0] @ basis
+    each = np.einsum("rni,rnj->ijn", rows, rows, optimize=True).reshape(size * size, -1)
+    known = basis.T @ (candidates.known()[0] + candidates.ridge() * np.eye(size)) @ basis
+    whole = cp.reshape(each @ weights, (size, size), order="C") + known
+    return (whole + whole.T) / 2
+
+
+def _smallest(cp: Any, task: Task, posed: tuple[Any, Any, list[Any]], basis: Array) -> tuple[Array, Tangent]:
+    """E: the largest t with information - t I positive semidefinite; the dual matrix of that is the tangent."""
+    weights, information, constraints = posed
+    metric = basis.T @ basis
+    unit = float(np.trace(metric)) / len(metric)
+    level = cp.Variable()
+    cone = information >> level * (metric / unit)
+    _solve(cp, cp.Problem(cp.Maximize(level), [*constraints, cone]), ("CLARABEL", "SCS"))
+    dual = np.asarray(cone.dual_value)
+    values, vectors = np.linalg.eigh(basis @ ((dual + dual.T) / 2) @ basis.T)
+    values = np.maximum(values, 0.0)
+    if not values.sum() > 0:
+        raise ArithmeticError("no dual answer")
+    gradient = (vectors * (values / values.sum())) @ vectors.T
+    constant = float(np.sum(gradient * task.candidates.known()[0]))
+    return _feasible(task, weights.value), Tangent(constant, gradient[None])
+
+
+def _solve(cp: Any, problem: Any, solvers: tuple[str, ...]) -> None:
+    """By the first solver that gives any answer: what it is worth is certified afterwards."""
+    import warnings
+
+    for solver in solvers:
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                problem.solve(solver=solver)
+        except (cp.error.SolverError, cp.error.DCPError):
+            continue
+        if problem.status in ("optimal", "optimal_inaccurate"):
+            return
+    raise ArithmeticError(f"cvxpy found no answer ({problem.status})")
+
+
+def _feasible(task: Task, weights: Array | None) -> Array:
+    """A solver's weights, put between their limits and on their sum by a shift."""
+    if weights is None or not np.isfinite(weights).all():
+        raise ArithmeticError("cvxpy gave no weights")
+    upper = float(task.limit)
+
+    def excess(shift: float) -> float:
+        return float(np.clip(weights + shift, 0.0, upper).sum()) - task.count
+
+    return np.clip(weights + _root(excess, -upper - float(np.abs(weights).max()), upper + 1.0), 0.0, upper)
+
+
+def _root(function: Callable[[float], float], low: float, high: float) -> float:
+    for _ in range(80):
+        middle = (low + high) / 2
+        low, high = (middle, high) if function(middle) < 0 else (low, middle)
+    return (low + high) / 2

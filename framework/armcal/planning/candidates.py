@@ -1,0 +1,142 @@
+"""Candidate poses as information: what each would add to what is known already."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armcal.base.dataset import Dataset
+from armcal.base.domains import Array
+from armcal.base.parameters import Parameters
+from armcal.problem.linearised import BLOCK_RECORDS
+from armcal.problem.problem import Problem, triangular
+from armcal.problem.projection import as_predicted
+
+Indices = NDArray[np.intp]
+RIDGE = 1e-9
+"""Information in ordinary sizes that stands in for what nothing determines yet, relative to the candidates' mean:
+below what any real measurement tells, far above rounding."""
+_ROWS_AT_ONCE = 8192
+_SEEN = 1e-9
+_TAKES_PART = 1e-6
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """Candidates by coordinates in ordinary sizes, at one value vector or at several draws of it.
+
+    Attributes:
+        base: what is known before, as R with R'R the information (draws x rows x n).
+        rows: whitened Jacobians (draws x n_r x N x n); the n_r rows of a candidate enter together.
+    """
+
+    base: Array
+    rows: Array
+
+    @property
+    def draws(self) -> int:
+        """Of the parameters."""
+        return len(self.rows)
+
+    @property
+    def count(self) -> int:
+        """How many candidates there are."""
+        return int(self.rows.shape[2])
+
+    @property
+    def size(self) -> int:
+        """How many coordinates there are."""
+        return int(self.rows.shape[3])
+
+    def subset(self, chosen: Indices) -> Candidates:
+        """Some of the candidates."""
+        return Candidates(self.base, np.take(self.rows, chosen, axis=2))
+
+    def known(self) -> Array:
+        """Information before (draws x n x n)."""
+        return np.asarray(np.swapaxes(self.base, 1, 2) @ self.base)
+
+    def ridge(self) -> float:
+        """A little information on everything, for matrices that have to be inverted before they are full."""
+        mean = float(np.mean(np.einsum("krij,krij->kr", self.rows, self.rows))) * self.rows.shape[1] / self.size
+        known = float(np.mean(np.einsum("kij,kij->k", self.base, self.base))) / self.size
+        return float(RIDGE * max(mean, known, 1e-300))
+
+    def information(self, weights: Array) -> Array:
+        """Of what is known before and the candidates by weight (N), one matrix a draw."""
+        used = np.flatnonzero(weights)
+        rows = self.rows[:, :, used, :] * np.sqrt(np.maximum(weights[used], 0.0))[:, None]
+        flat = rows.reshape(self.draws, -1, self.size)
+        return np.asarray(self.known() + np.swapaxes(flat, 1, 2) @ flat)
+
+    def triangles(self, chosen: Indices) -> list[Array]:
+        """R with R'R the information of what is known and the chosen ones, one a draw: keeps small singular values."""
+        found = list(self.base)
+        for start in range(0, len(chosen), _ROWS_AT_ONCE):
+            few = self.rows[:, :, chosen[start : start + _ROWS_AT_ONCE], :].reshape(self.draws, -1, self.size)
+            found = [triangular(np.vstack([above, part])) for above, part in zip(found, few, strict=True)]
+        return found
+
+    def scores(self, gradients: Array) -> Array:
+        """<gradient, J'J> of every candidate, averaged over draws (N); ``gradients`` (draws x n x n) symmetric."""
+        total = np.zeros(self.count)
+        for rows, gradient in zip(self.rows, gradients, strict=True):
+            for part in rows:
+                for start in range(0, self.count, _ROWS_AT_ONCE):
+                    few = part[start : start + _ROWS_AT_ONCE]
+                    total[start : start + _ROWS_AT_ONCE] += np.einsum("ij,ij->i", few @ gradient, few)
+        return total / self.draws
+
+
+def deviations(triangle: Array) -> Array:
+    """Standard deviations (n) from R (rows x n) with R'R the information; infinite where something is undetermined."""
+    size = triangle.shape[1]
+    _, values, directions = np.linalg.svd(np.vstack([triangle, np.zeros((size, size))]), full_matrices=False)
+    seen = values > _SEEN * max(float(values[0]), 1e-300)
+    spread = np.linalg.norm(directions[seen].T / values[seen], axis=1)
+    undetermined = np.linalg.norm(directions[~seen], axis=0) > _TAKES_PART
+    return np.where(undetermined, np.inf, spread)
+
+
+def whitened_rows(problem: Problem, values: Array, dataset: Dataset) -> Array:
+    """Whitened Jacobians by coordinates in ordinary sizes, all factors stacked (n_r x N x n).
+
+    Of poses that are only thought of nothing was measured: what the model predicts stands in for it.
+    """
+    scales = problem.parameters.scales()
+    chain = problem.parameters.entries_jacobian(values) * scales
+    records = as_predicted(problem, values, problem.records(dataset))
+    blocks = problem.jacobians(values, records)
+    parts: list[Array] = []
+    for each in records:
+        width = each.record.shape[1]
+        whole: Array | None = None
+        for start in range(0, width, BLOCK_RECORDS):
+            block = next(blocks)
+            if whole is None:
+                whole = np.empty((block.shape[0], each.count, len(scales)))
+            end = min(start + block.shape[2], each.count)
+            for row, jacobian in zip(whole, block, strict=True):
+                row[start:end] = jacobian[:, : max(0, end - start)].T @ chain
+        if whole is not None:
+            parts.append(whole)
+    return np.concatenate(parts) if len(parts) > 1 else parts[0]
+
+
+def over_draws(problem: Problem, draws: Sequence[Array], dataset: Dataset) -> Array:
+    """The same at several value vectors (draws x n_r x N x n)."""
+    return np.stack([whitened_rows(problem, values, dataset) for values in draws])
+
+
+def parameter_draws(parameters: Parameters, count: int, seed: int) -> Iterator[Array]:
+    """Value vectors from the parameters' priors, within bounds; those without a prior stay nominal."""
+    prior = parameters.prior_information()
+    deviation = np.where(prior > 0, 1 / np.sqrt(np.where(prior > 0, prior, 1.0)), 0.0)
+    lower, upper = parameters.increment_bounds()
+    random = np.random.default_rng(seed)
+    for _ in range(count):
+        moved = parameters.from_coordinates(random.normal(size=len(prior)) * deviation)
+        yield parameters.retract(np.clip(moved, lower, upper))

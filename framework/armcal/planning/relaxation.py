@@ -1,0 +1,241 @@
+"""The convex relaxation of choosing poses, and what it certifies.
+
+Poses get weights between 0 and 1 that sum to their number. The criterion f is concave in the information M, so for
+any M at hand, and any plan v, with X the gradient of f at M,
+
+    f(M_v) <= f(M) + <X, M_v - M>,
+
+whose right side is largest for the poses with the largest <X, J'J>: a bound on every plan, whichever way M was
+found. At the optimum of the relaxation it is tight, the equivalence theorem [Kiefer1974] [Boyd2004]. A solver's own
+word is never taken.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+
+from armcal.base.domains import Array
+from armcal.planning.candidates import Candidates, Indices
+from armcal.planning.criterion import Criterion, spread
+
+AT_ONCE = 2000
+"""Above so many candidates the relaxation is solved on those that matter, and certified on all."""
+INTERIOR_POINT = "interior point, equivalence theorem"
+_MANY_COORDINATES = 64
+_FEW = 600
+_GAP = 1e-7
+_ITERATIONS = 60
+_ROUNDS = 30
+_TO_THE_WALL = 0.98
+_CENTRING = 0.15
+
+
+@dataclass(frozen=True)
+class Task:
+    """How many poses to choose from which candidates, each at most ``limit`` times, by which criterion."""
+
+    candidates: Candidates
+    criterion: Criterion
+    count: int
+    limit: int = 1
+
+    def most(self, scores: Array) -> float:
+        """The largest sum of scores that a plan can have."""
+        whole, left = divmod(self.count, self.limit)
+        best = -np.sort(-scores)
+        rest = best[whole] * left if left else 0.0
+        return float(np.sum(best[:whole]) * self.limit + rest)
+
+    def threshold(self, scores: Array) -> float:
+        """The score of the last pose of the plan whose scores have the largest sum."""
+        last = -(-self.count // self.limit) - 1
+        return float(-np.partition(-scores, last)[last])
+
+    def subset(self, chosen: Indices) -> Task:
+        """The same with fewer candidates."""
+        return Task(self.candidates.subset(chosen), self.criterion, self.count, self.limit)
+
+
+@dataclass(frozen=True)
+class Tangent:
+    """An affine function above the criterion: ``constant`` plus <gradients, J'J> (draws x n x n) of the chosen."""
+
+    constant: float
+    gradients: Array
+
+
+@dataclass(frozen=True)
+class Relaxation:
+    """What the relaxation says.
+
+    Attributes:
+        weights: of the candidates (N).
+        bound: no plan has a larger value.
+        scores: what each candidate adds to the bound at most (N).
+        how: which solver gave the weights.
+    """
+
+    weights: Array
+    bound: float
+    scores: Array
+    how: str
+
+
+Solver = Callable[[Task], tuple[Array, Tangent]]
+
+
+def tangent(task: Task, weights: Array) -> Tangent:
+    """The tangent at weights (N) of a criterion that is a sum over eigenvalues."""
+    slope, _ = _trace(task)
+    candidates = task.candidates
+    known = candidates.known()
+    information = candidates.information(weights) + candidates.ridge() * np.eye(candidates.size)
+    values, vectors = np.linalg.eigh(information)
+    values = np.maximum(values, 1e-300)
+    gradients = (vectors * slope(values)[:, None, :]) @ np.swapaxes(vectors, 1, 2)
+    inside = np.einsum("kij,kij->", gradients, known - information) / candidates.draws
+    return Tangent(float(np.mean(task.criterion.value(values)) + inside), gradients)
+
+
+def certified(task: Task, weights: Array, upper: Tangent, how: str) -> Relaxation:
+    """The bound that a tangent gives on all candidates."""
+    scores = task.candidates.scores(upper.gradients)
+    return Relaxation(weights, upper.constant + task.most(scores), scores, how)
+
+
+def relax(task: Task, solver: Solver, how: str, at_once: int | None = None) -> Relaxation:
+    """Solve the relaxation; above ``at_once`` candidates on those that matter, until the bound holds for all."""
+    if at_once is None:
+        at_once = max(AT_ONCE if task.candidates.size <= _MANY_COORDINATES else _FEW, 4 * task.count)
+    if task.candidates.count <= at_once:
+        return certified(task, *solver(task), how)
+    active = _spread_out(task, at_once // 4)
+    best: Relaxation | None = None
+    for _ in range(_ROUNDS):
+        found, upper = solver(task.subset(active))
+        weights = np.zeros(task.candidates.count)
+        weights[active] = found
+        made = certified(task, weights, upper, how)
+        reached = upper.constant + task.subset(active).most(made.scores[active])
+        best = made if best is None or made.bound < best.bound else best
+        if made.bound - reached <= _GAP * max(1.0, abs(made.bound)):
+            break
+        active = _next_active(task, made, active, at_once)
+    assert best is not None
+    return best
+
+
+def _spread_out(task: Task, count: int) -> Indices:
+    """To begin with: those that add most to an even mixture, and a few of all kinds."""
+    candidates, number = task.candidates, task.candidates.count
+    even = np.full(number, task.count / number)
+    information = candidates.information(even) + candidates.ridge() * np.eye(candidates.size)
+    scores = candidates.scores(np.asarray(np.linalg.inv(information), dtype=float))
+    step = max(1, number // count)
+    return np.union1d(np.argpartition(-scores, count)[:count], np.arange(0, number, step)).astype(np.intp)
+
+
+def _next_active(task: Task, made: Relaxation, active: Indices, most: int) -> Indices:
+    """Those in use, and those outside that could do better than the least useful one in use."""
+    used = np.flatnonzero(made.weights > 1e-7 * task.limit)
+    floor = task.threshold(made.scores[active])
+    outside = np.ones(task.candidates.count, dtype=bool)
+    outside[active] = False
+    better = np.flatnonzero(outside & (made.scores > floor))
+    room = max(most - len(used), task.count)
+    better = better[np.argsort(-made.scores[better])[:room]]
+    near = active[np.argsort(-made.scores[active])[: max(0, room - len(better))]]
+    return np.unique(np.concatenate([used, better, near])).astype(np.intp)
+
+
+def interior_point(task: Task) -> tuple[Array, Tangent]:
+    """A primal-dual interior-point method in the weights [Nocedal2006], for sums over eigenvalues.
+
+    Its Newton matrix is the criterion's Hessian, K K', plus a diagonal; it is solved in whichever of the two sizes
+    is smaller.
+    """
+    number, upper = task.candidates.count, float(task.limit)
+    weights = np.full(number, task.count / number)
+    if task.count >= number * task.limit:
+        return weights, tangent(task, weights)
+    gradient, curved = _derivatives(task, weights)
+    scale = float(np.abs(gradient).max()) or 1.0
+    low = high = np.full(number, 0.1)
+    price = float(np.median(gradient)) / scale
+    best_weights, best, best_bound = weights, tangent(task, weights), np.inf
+    for _ in range(_ITERATIONS):
+        here = tangent(task, weights)
+        bound = here.constant + task.most(gradient)
+        if bound < best_bound:
+            best_weights, best, best_bound = weights, here, bound
+        gap = task.most(gradient) - float(gradient @ weights)
+        if gap <= _GAP * max(1.0, abs(bound)) * 0.1:
+            break
+        room = upper - weights
+        barrier = _CENTRING * float(low @ weights + high @ room) / (2 * number)
+        diagonal = low / weights + high / room
+        right = gradient / scale - price + barrier / weights - barrier / room
+        step, price_step = _newton_step(curved / np.sqrt(scale), diagonal, right)
+        low_step = barrier / weights - low - low / weights * step
+        high_step = barrier / room - high + high / room * step
+        length = min(_reach(weights, step), _reach(room, -step))
+        dual = min(_reach(low, low_step), _reach(high, high_step))
+        weights = weights + length * step
+        low, high, price = low + dual * low_step, high + dual * high_step, price + dual * price_step
+        gradient, curved = _derivatives(task, weights)
+    return best_weights, best
+
+
+def _trace(task: Task) -> tuple[Callable[[Array], Array], Callable[[Array], Array]]:
+    if task.criterion.trace is None:
+        raise ValueError(f"the criterion {task.criterion.name} is no sum over eigenvalues")
+    return task.criterion.trace
+
+
+def _derivatives(task: Task, weights: Array) -> tuple[Array, Array]:
+    """The gradient by weights (N), and K (N x columns) with K K' minus the Hessian."""
+    slope, curvature = _trace(task)
+    candidates = task.candidates
+    information = candidates.information(weights) + candidates.ridge() * np.eye(candidates.size)
+    left, right = np.triu_indices(candidates.size)
+    double = np.where(left == right, 1.0, np.sqrt(2.0))
+    gradient, parts = np.zeros(candidates.count), []
+    for matrix, rows in zip(information, candidates.rows, strict=True):
+        values, vectors = np.linalg.eigh(matrix)
+        values = np.maximum(values, 1e-300)
+        turned = rows @ vectors
+        gradient += np.einsum("rni,rni,i->n", turned, turned, slope(values), optimize=True) / candidates.draws
+        factor = np.sqrt(np.maximum(-spread(slope, curvature, values), 0.0) / candidates.draws)
+        part = np.zeros((candidates.count, len(left)))
+        for row in turned:
+            part += row[:, left] * row[:, right]
+        part *= factor[left, right] * double
+        parts.append(part)
+    return gradient, parts[0] if len(parts) == 1 else np.hstack(parts)
+
+
+def _newton_step(curved: Array, diagonal: Array, right: Array) -> tuple[Array, float]:
+    """Solve (diag + K K') x + 1 y = right with sum(x) = 0."""
+    number, columns = curved.shape
+    both = np.column_stack([right, np.ones(number)])
+    if number <= columns:
+        solved = cho_solve(cho_factor(curved @ curved.T + np.diag(diagonal)), both)
+    else:
+        scaled = curved / diagonal[:, None]
+        inner = cho_factor(np.eye(columns) + curved.T @ scaled)
+        flat = both / diagonal[:, None]
+        solved = flat - scaled @ cho_solve(inner, curved.T @ flat)
+    multiplier = float(solved[:, 0].sum() / solved[:, 1].sum())
+    return solved[:, 0] - multiplier * solved[:, 1], multiplier
+
+
+def _reach(values: Array, step: Array) -> float:
+    """How far along a step the values stay positive, at most 1."""
+    falling = step < 0
+    if not falling.any():
+        return 1.0
+    return min(1.0, _TO_THE_WALL * float(np.min(-values[falling] / step[falling])))

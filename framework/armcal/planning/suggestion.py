@@ -1,0 +1,78 @@
+"""Which few poses would tell most next: D-optimal choice among poses like the recorded ones."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from armcal.base.dataset import Dataset
+from armcal.base.units import display_unit, to_unit
+from armcal.estimate.estimator import Estimate
+from armcal.planning.candidates import Candidates, deviations, whitened_rows
+from armcal.planning.criterion import criterion
+from armcal.planning.planning import built_up
+from armcal.planning.relaxation import Task
+from armcal.problem.problem import Problem
+
+CANDIDATES = 400
+MOST_LEVELS = 12
+
+
+@dataclass(frozen=True)
+class Suggestion:
+    """A pose (channel to rad or m), its text, and the mean ratio of standard deviations once it has been measured."""
+
+    commands: dict[str, float]
+    text: str
+    shrink: float
+
+
+def suggest(
+    problem: Problem, dataset: Dataset, estimate: Estimate, joints: Mapping[str, str], count: int = 3, seed: int = 0
+) -> tuple[Suggestion, ...]:
+    """The poses that together shrink the estimate's uncertainty most, each adding most to those before it.
+
+    Candidates combine recorded levels of each joint (``joints`` names their channels and dimensions), or lie between
+    its recorded ends where there are many; load and gravity are those of the middle record. Clearance is not
+    considered.
+    """
+    poses = _candidates(dataset, tuple(joints), seed)
+    rows = whitened_rows(problem, estimate.values, poses) / (estimate.noise_scale or 1.0)
+    base = estimate.square_root_information * estimate.parameters.scales()
+    candidates = Candidates(base[None], rows[None])
+    chosen = built_up(Task(candidates, criterion("D"), min(count, len(poses))))
+    before = deviations(base)
+    known = np.isfinite(before) & (before > 0)
+    suggestions = []
+    for number in range(1, len(chosen) + 1):
+        after = deviations(candidates.triangles(chosen[:number])[0])
+        commands = {channel: float(poses.column(channel)[chosen[number - 1]]) for channel in joints}
+        shrink = float(np.mean(after[known] / before[known])) if known.any() else 1.0
+        suggestions.append(Suggestion(commands, _text(commands, joints), shrink))
+    return tuple(suggestions)
+
+
+def _text(commands: Mapping[str, float], joints: Mapping[str, str]) -> str:
+    units = {channel: display_unit(dimension).name for channel, dimension in joints.items()}
+    parts = [f"{to_unit(value, units[channel]):.0f}" for channel, value in commands.items()]
+    if len(set(units.values())) > 1:
+        parts = [f"{part} {unit}" for part, unit in zip(parts, units.values(), strict=True)]
+        return f"({', '.join(parts)})"
+    return f"({', '.join(parts)}) {next(iter(units.values()))}"
+
+
+def _candidates(dataset: Dataset, joints: tuple[str, ...], seed: int) -> Dataset:
+    """Distinct poses."""
+    random = np.random.default_rng(seed)
+    middle = len(dataset) // 2
+    drawn = []
+    for channel in joints:
+        levels = np.unique(dataset.column(channel))
+        few = len(levels) <= MOST_LEVELS
+        drawn.append(random.choice(levels, CANDIDATES) if few else random.uniform(levels[0], levels[-1], CANDIDATES))
+    poses = np.unique(np.array(drawn), axis=1)
+    count = poses.shape[1]
+    channels = {name: np.full(count, values[middle]) for name, values in dataset.channels.items()}
+    return Dataset(tuple(str(i) for i in range(count)), {**channels, **dict(zip(joints, poses, strict=True))})

@@ -1,0 +1,1 @@
+"""Factors and parameters become a compiled least-squares problem."""

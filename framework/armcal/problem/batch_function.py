@@ -1,0 +1,235 @@
+"""A CasADi function over many records at once: generated C where a compiler is found, the virtual machine elsewhere.
+
+Arrays are stored channel by channel, (entries x records).
+"""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property, partial
+from itertools import accumulate
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from armcal.base.domains import Array
+from armcal.problem import c_source, compiler
+from armcal.problem.kernel import EvaluatorChoice, Mapped, quietly
+
+_ENTRY, _VECTOR = "armcal_evaluate", "armcal_evaluate_vector"
+_AGREEMENT = 1e-9
+_WORTH_COMPILING = 100_000
+"""Records that the virtual machine takes longer for than the compiler takes to make a library."""
+_BLOCK = 16
+"""Records that the virtual machine evaluates together; what is left of them one by one."""
+
+
+@dataclass(frozen=True)
+class Loop:
+    """More C that is compiled together with a function, which it knows as ``evaluate``.
+
+    Attributes:
+        entry: the C function to be called.
+        inputs: names of the sizes of inputs, by the inputs' places.
+        outputs: names of the sizes of outputs, by their places.
+        text: the source.
+    """
+
+    entry: str
+    inputs: Mapping[str, int]
+    outputs: Mapping[str, int]
+    text: str
+
+    def source(self, function: ca.Function) -> str:
+        """For one function."""
+        sizes = {name: function.numel_in(place) for name, place in self.inputs.items()}
+        sizes |= {name: function.numel_out(place) for name, place in self.outputs.items()}
+        return "".join(f"#define {name} {size}\n" for name, size in sizes.items()) + self.text
+
+
+class BatchFunction:
+    """A function of column vectors, to be called for many records.
+
+    Attributes:
+        function: the CasADi function (SX, dense inputs and outputs).
+        compiled: whether C serves it.
+    """
+
+    def __init__(
+        self,
+        function: ca.Function,
+        sample: Sequence[Array],
+        choice: EvaluatorChoice = "auto",
+        loop: Loop | None = None,
+    ) -> None:
+        """Build it; ``sample`` are inputs (entries x 8 each) on which C must agree with the virtual machine.
+
+        ``auto`` takes what was compiled before, and else lets the compiler work for the next time once so many records
+        were asked for that it would have paid; ``compiled`` waits for it; ``interpreted`` does without. A ``loop`` is
+        compiled with the function.
+        """
+        self.function = function
+        self._sizes_out = [function.numel_out(i) for i in range(function.n_out())]
+        self.places = list(zip(self._sizes_out, accumulate(self._sizes_out), strict=True))
+        self._all_in = sum(function.numel_in(i) for i in range(function.n_in()))
+        self._library: Any = None
+        self._asked = 0
+        self._compile_later: Callable[[], None] | None = None
+        if choice != "interpreted" and compiler.find_compiler() is not None:
+            trial = partial(_trial, self, sample)
+            library, self._compile_later = _library(function, choice, loop, trial)
+            self._library = _agreeing(self, library, sample)
+
+    @property
+    def compiled(self) -> bool:
+        """Whether C serves it."""
+        return self._library is not None
+
+    def entry(self, name: str) -> Any:
+        """A C function of its library, where it is compiled."""
+        return getattr(self._library, name)
+
+    def __call__(self, *inputs: Array) -> list[Array]:
+        """The outputs (entries x N each) for inputs (entries x N each)."""
+        count = inputs[0].shape[1]
+        if self._library is None:
+            self._count(count)
+            return self.interpreted(inputs, count)
+        whole = count - count % c_source.LANES
+        if not whole and count:
+            return self._rest(inputs, 0)
+        outputs = [np.empty((size, count)) for size in self._sizes_out]
+        _evaluate(self._library.armcal_evaluate, [_rows(each) for each in inputs], outputs, whole)
+        if whole < count:
+            for target, source in zip(outputs, self._rest(inputs, whole), strict=True):
+                target[:, whole:] = source
+        return outputs
+
+    def interpreted(self, inputs: Sequence[Array], count: int) -> list[Array]:
+        """The outputs by the virtual machine."""
+        outputs = [np.empty((size, count)) for size in self._sizes_out]
+        whole = count - count % _BLOCK
+        if whole:
+            self._mapped(np.zeros(0), [each[:, :whole] for each in inputs], [each[:, :whole] for each in outputs])
+        if whole < count:
+            self._single(np.zeros(0), [each[:, whole:] for each in inputs], [each[:, whole:] for each in outputs])
+        return outputs
+
+    def _count(self, records: int) -> None:
+        self._asked += records
+        if self._asked > _WORTH_COMPILING and self._compile_later is not None:
+            later, self._compile_later = self._compile_later, None
+            quietly(lambda: later())
+
+    def _rest(self, inputs: Sequence[Array], start: int) -> list[Array]:
+        """Records from ``start`` on, fewer than one vector of them: the last one fills it up."""
+        count, row = inputs[0].shape[1] - start, 0
+        given = np.empty((self._all_in, c_source.LANES))
+        for each in inputs:
+            given[row : row + len(each), :count] = each[:, start:]
+            row += len(each)
+        given[:, count:] = given[:, count - 1 : count]
+        taken = np.empty((sum(self._sizes_out), c_source.LANES))
+        self._library.armcal_evaluate_vector(given.ctypes.data, taken.ctypes.data)
+        return [taken[end - size : end, :count] for size, end in self.places]
+
+    @cached_property
+    def _shared(self) -> ca.Function:
+        """With a first input that all records share, which is empty."""
+        symbols = [ca.SX.sym(f"in{i}", self.function.numel_in(i)) for i in range(self.function.n_in())]
+        return ca.Function("batch", [ca.SX(0, 1), *symbols], self.function.call(symbols), {"cse": True})
+
+    @cached_property
+    def _mapped(self) -> Mapped:
+        return Mapped(self._shared, _BLOCK)
+
+    @cached_property
+    def _single(self) -> Mapped:
+        return Mapped(self._shared, 1)
+
+
+def _library(
+    function: ca.Function, choice: EvaluatorChoice, loop: Loop | None, trial: Callable[[], compiler.Trial]
+) -> tuple[ctypes.CDLL | None, Callable[[], None]]:
+    """The library if there is one by now, and what has it compiled for the next time."""
+    driver = _driver(function) + (loop.source(function) if loop else "")
+    entries = (_ENTRY, _VECTOR, *([loop.entry] if loop else []))
+    text = function.serialize() + c_source.support_source() + c_source.generator_source() + driver
+    key = compiler.library_key(f"{_ENTRY} {c_source.LANES} lanes {text}")
+
+    def source() -> str:
+        written = c_source.write_function(function, "evaluate", 0)
+        defines = f"#define LANES {c_source.LANES}\n#define HOISTED {written.hoisted}\n"
+        return defines + c_source.support_source() + written.source + driver
+
+    library = compiler.load_cached(key, entries)
+    if library is None and choice == "compiled":
+        library = quietly(partial(compiler.compile_now, key, source, entries, trial))
+    return library, partial(compiler.compile_in_background, key, source, trial)
+
+
+def _driver(function: ca.Function) -> str:
+    """The loop over vectors of records."""
+    ins = [function.numel_in(i) for i in range(function.n_in())]
+    outs = [function.numel_out(i) for i in range(function.n_out())]
+    vectors = [f"V in{i}[{max(1, n)}];" for i, n in enumerate(ins)]
+    vectors += [f"V out{i}[{max(1, n)}];" for i, n in enumerate(outs)]
+    gathered = [f"gather(in{i}, in[{i}] + r, in_stride[{i}], {n});" for i, n in enumerate(ins)]
+    scattered = [f"scatter(out[{i}] + r, out{i}, out_stride[{i}], {n});" for i, n in enumerate(outs)]
+    names = [*(f"in{i}" for i in range(len(ins))), *(f"out{i}" for i in range(len(outs)))]
+    lines = [*vectors, *gathered, f"evaluate(c, {', '.join(names)});", *scattered]
+    body = "\n    ".join(lines)
+    return (
+        f"void {_ENTRY}(long n, const double **in, const long *in_stride, double **out, const long *out_stride) {{\n"
+        "  double c[HOISTED];\n  evaluate_hoist(c);\n"
+        f"  for (long r = 0; r < n; r += LANES) {{\n    {body}\n  }}\n}}\n"
+        f"void {_VECTOR}(const double *in, double *out) {{\n"
+        f"  const double *from[] = {{{', '.join(_addresses('in', ins))}}};\n"
+        f"  double *onto[] = {{{', '.join(_addresses('out', outs))}}};\n"
+        f"  long step[{max(len(ins), len(outs))}];\n"
+        f"  for (int i = 0; i < {max(len(ins), len(outs))}; ++i) step[i] = LANES;\n"
+        f"  {_ENTRY}(LANES, from, step, onto, step);\n}}\n"
+    )
+
+
+def _addresses(name: str, sizes: Sequence[int]) -> list[str]:
+    """Where each array begins in one piece of memory."""
+    return [f"{name} + {start} * LANES" for start in accumulate([0, *sizes[:-1]])]
+
+
+def _trial(batch: BatchFunction, sample: Sequence[Array]) -> compiler.Trial:
+    """What a new library has to give for the sample, all inputs in one piece of memory and so all outputs."""
+    given = [np.ascontiguousarray(each[:, : c_source.LANES], dtype=float) for each in sample]
+    expected = np.concatenate(batch.interpreted(given, c_source.LANES))
+    return compiler.Trial(_VECTOR, (np.concatenate(given), np.zeros_like(expected)), {1: expected}, _AGREEMENT)
+
+
+def _agreeing(batch: BatchFunction, library: ctypes.CDLL | None, sample: Sequence[Array]) -> Any:
+    """The library, if it gives the virtual machine's numbers; a miscompiled one is not used."""
+    if library is None:
+        return None
+    library.armcal_evaluate_vector.argtypes = [ctypes.c_void_p, ctypes.c_void_p]
+    given = [np.ascontiguousarray(each[:, : c_source.LANES]) for each in sample]
+    mine = [np.empty((size, c_source.LANES)) for size, _ in batch.places]
+    _evaluate(library.armcal_evaluate, given, mine, c_source.LANES)
+    for one, two in zip(batch(*given), mine, strict=True):
+        scale = max(1.0, float(np.abs(one).max(initial=0.0)))
+        if not np.allclose(one, two, rtol=0.0, atol=_AGREEMENT * scale, equal_nan=True):
+            return None
+    return library
+
+
+def _evaluate(function: Any, inputs: Sequence[Array], outputs: Sequence[Array], count: int) -> None:
+    pointers, strides = zip(*[(a.ctypes.data, a.strides[0] // 8) for a in inputs], strict=True)
+    targets, steps = zip(*[(a.ctypes.data, a.strides[0] // 8) for a in outputs], strict=True)
+    place, stride = ctypes.c_void_p * len(pointers), ctypes.c_long * len(strides)
+    onto, step = ctypes.c_void_p * len(targets), ctypes.c_long * len(steps)
+    function(ctypes.c_long(count), place(*pointers), stride(*strides), onto(*targets), step(*steps))
+
+
+def _rows(array: Array) -> Array:
+    """As it is if each channel lies in one piece, a copy otherwise."""
+    return array if array.dtype == np.float64 and array.strides[-1] == 8 else np.array(array, dtype=float, order="C")

@@ -1,0 +1,198 @@
+"""Generated C, compiled by whatever compiler is there and cached on disk; never required.
+
+A library's key covers the expression, the generator, the compiler, its flags and the processor, so that a
+stale or foreign one is never loaded. Its name ends in a digest of its content, so that a torn one is not loaded
+either; see ``library_build`` for what a library passes before it is there. ``ARMCAL_CACHE_DIR`` moves the cache;
+``ARMCAL_CC=none`` turns compiling off, any other value names the compiler.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import hashlib
+import json
+import os
+import platform
+import shutil
+import stat
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+
+from armcal.base.domains import Array
+from armcal.problem import library_build
+
+FLAGS = ("-O1", "-march=native", "-ffp-contract=off", "-fPIC", "-shared", "-w")
+ENTRY_POINTS = ("armcal_residuals", "armcal_linearise")
+KEPT_LIBRARIES = 64
+_COMPILE_LIMIT_S = 120
+_BUILD = ".build-"
+
+
+@cache
+def find_compiler() -> str | None:
+    """The C compiler's path, or None."""
+    asked = os.environ.get("ARMCAL_CC", "")
+    if asked == "none":
+        return None
+    for name in [asked] if asked else [os.environ.get("CC", ""), "cc", "gcc", "clang"]:
+        found = shutil.which(name) if name else None
+        if found:
+            return found
+    return None
+
+
+def cache_directory() -> Path:
+    """Where compiled kernels are kept."""
+    asked = os.environ.get("ARMCAL_CACHE_DIR")
+    if asked:
+        return Path(asked).absolute()
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "armcal"
+
+
+def library_key(text: str) -> str:
+    """A key for an expression's serialised text on this machine with this compiler."""
+    parts = (text, " ".join(FLAGS), _compiler_identity(), processor())
+    return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:40]
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A call of a new library, made in a process of its own, and what it has to give.
+
+    Attributes:
+        entry: the C function.
+        arguments: integers (long), floats (double) and arrays, handed over by their address.
+        expected: by the places of arguments, what these arrays have to hold afterwards.
+        tolerance: in units of the largest number of an array, or of 1.
+    """
+
+    entry: str
+    arguments: Sequence[int | float | Array]
+    expected: Mapping[int, Array]
+    tolerance: float
+
+
+def load_cached(key: str, entry_points: Sequence[str] = ENTRY_POINTS) -> ctypes.CDLL | None:
+    """A compiled library from the cache, or None.
+
+    Files that others could have written are not loaded; one that is not whole is removed.
+    """
+    directory = cache_directory()
+    with suppress(OSError):
+        for path in sorted(directory.glob(library_build.library_name(key, "*"))):
+            if not (_is_ours(path) and _is_ours(directory)):
+                continue
+            if path.name != library_build.library_name(key, library_build.digest_of(path.read_bytes())):
+                path.unlink()
+                continue
+            os.utime(path)
+            library = ctypes.CDLL(str(path))
+            if all(hasattr(library, name) for name in entry_points):
+                return library
+    return None
+
+
+def _is_ours(path: Path) -> bool:
+    seen = path.stat()
+    return not hasattr(os, "getuid") or (
+        seen.st_uid == os.getuid() and not seen.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
+    )
+
+
+def compile_now(
+    key: str,
+    source: Callable[[], str],
+    entry_points: Sequence[str] = ENTRY_POINTS,
+    trial: Callable[[], Trial] | None = None,
+) -> ctypes.CDLL | None:
+    """Compile, try, cache and load; None when that fails."""
+    command = _prepare(key, source, trial)
+    if command is None:
+        return None
+    with suppress(OSError, subprocess.SubprocessError):
+        subprocess.run(command, check=True, capture_output=True, timeout=_COMPILE_LIMIT_S)
+    return load_cached(key, entry_points)
+
+
+def compile_in_background(key: str, source: Callable[[], str], trial: Callable[[], Trial] | None = None) -> None:
+    """Start compiling for the next run; this one goes on, and may end first without stopping the compiler."""
+    command = _prepare(key, source, trial)
+    if command is None:
+        return
+
+    def wait() -> None:
+        with suppress(OSError, subprocess.SubprocessError):
+            silent = subprocess.DEVNULL
+            subprocess.run(command, start_new_session=True, stdin=silent, stdout=silent, stderr=silent, check=False)
+
+    threading.Thread(target=wait, name="armcal-compile", daemon=True).start()
+
+
+def _prepare(key: str, source: Callable[[], str], trial: Callable[[], Trial] | None) -> list[str] | None:
+    """Write the source and give the command that compiles and tries it, and puts the result in place."""
+    compiler = find_compiler()
+    if compiler is None:
+        return None
+    directory = cache_directory()
+    # -I and -S: nothing but Python's own library is found, whatever lies in the working directory.
+    python = [sys.executable, "-I", "-S"]
+    try:
+        directory.mkdir(parents=True, exist_ok=True, mode=0o700)
+        _forget_old(directory)
+        text, tried = source(), None if trial is None else _as_json(trial())
+        job = {"compile": [compiler, *FLAGS], "python": python, "place": str(directory), "key": key, "trial": tried}
+        build = Path(tempfile.mkdtemp(prefix=_BUILD, dir=directory))
+        (build / "kernel.c").write_text(text, encoding="utf-8")
+        (build / "job.json").write_text(json.dumps(job), encoding="utf-8")
+    except OSError:
+        return None
+    return [*python, library_build.__file__, "build", str(build)]
+
+
+def _as_json(trial: Trial) -> dict[str, object]:
+    arguments = [each.ravel().tolist() if isinstance(each, np.ndarray) else each for each in trial.arguments]
+    expected = {str(place): numbers.ravel().tolist() for place, numbers in trial.expected.items()}
+    return {"entry": trial.entry, "arguments": arguments, "expected": expected, "tolerance": trial.tolerance}
+
+
+def _forget_old(directory: Path) -> None:
+    """Keep the libraries that were used last, and no folder of a build that was killed."""
+    libraries = sorted(directory.glob("*.so"), key=lambda path: path.stat().st_mtime, reverse=True)
+    for path in libraries[KEPT_LIBRARIES:]:
+        with suppress(OSError):
+            path.unlink()
+    for build in directory.glob(f"{_BUILD}*"):
+        with suppress(OSError):
+            if time.time() - build.stat().st_mtime > 10 * _COMPILE_LIMIT_S:
+                shutil.rmtree(build)
+
+
+@cache
+def _compiler_identity() -> str:
+    compiler = find_compiler()
+    if compiler is None:
+        return ""
+    real = Path(compiler).resolve()
+    with suppress(OSError):
+        seen = real.stat()
+        return f"{real} {seen.st_size} {seen.st_mtime_ns}"
+    return str(real)
+
+
+@cache
+def processor() -> str:
+    """What ``-march=native`` depends on."""
+    with suppress(OSError):
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
+        return "\n".join(sorted({line for line in lines if line.startswith(("flags", "Features", "model name"))}))
+    return f"{platform.machine()} {platform.processor()} {platform.node()}"

@@ -1,0 +1,387 @@
+"""Compiled functions of one factor: residuals and Jacobians of many records in elastic equilibrium.
+
+Two backends give the same numbers: CasADi's virtual machine, always there, and generated C, where a
+compiler is found. Arrays are stored channel by channel, (channels x records).
+"""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property, partial
+from typing import Any, Literal, NoReturn, Protocol
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from armcal.base.domains import Array
+from armcal.problem import c_source, compiler, kernel_trial
+from armcal.problem.factor import Factor
+from armcal.problem.stability import (
+    MOST_DEFLECTION,
+    MOST_PASSES,
+    NEAR_REST_RAD,
+    REST_RAD,
+    Evaluate,
+    lowest,
+    refusal,
+    settle,
+)
+
+EvaluatorChoice = Literal["auto", "compiled", "interpreted"]
+
+AS_IT_STANDS = 1e300
+"""Any state is at rest: take the one given, to which repeated passes might not lead."""
+WORTH_COMPILING_RECORDS = 5000
+"""From this many records on, waiting for the compiler costs less than the virtual machine does."""
+_BLOCK, _FEW = 64, 8
+
+
+class Backend(Protocol):
+    """Evaluates blocks of records; ``state`` is read as the start and left in equilibrium."""
+
+    name: str
+
+    def residuals(self, values: Array, record: Array, state: Array, residual: Array, rest: float = REST_RAD) -> int:
+        """Fill ``residual`` once no deflection moves more than ``rest``; give how many records did not settle."""
+
+    def linearise(
+        self, values: Array, record: Array, state: Array, residual: Array, jacobian: Array, rest: float = NEAR_REST_RAD
+    ) -> int:
+        """Fill ``residual``, and ``jacobian`` (n_r * n_v x records, residual entry by residual entry)."""
+
+
+class VirtualMachine:
+    """CasADi's interpreter over blocks of records."""
+
+    name = "virtual machine"
+
+    def __init__(self, factor: Factor) -> None:
+        self._factor = factor
+        self._has_state = factor.state.numel() > 0
+
+    @cached_property
+    def _pass(self) -> Mapped:
+        return Mapped(self._factor.pass_function())
+
+    @cached_property
+    def _linearise(self) -> Mapped:
+        return Mapped(self._factor.linearise_function())
+
+    def residuals(self, values: Array, record: Array, state: Array, residual: Array, rest: float = REST_RAD) -> int:
+        """As the protocol says."""
+        return self._settle(values, record, state, residual, rest)
+
+    def linearise(
+        self, values: Array, record: Array, state: Array, residual: Array, jacobian: Array, rest: float = NEAR_REST_RAD
+    ) -> int:
+        """As the protocol says."""
+        unsettled = 0
+        if self._has_state:
+            unsettled = self._settle(values, record, state, residual, rest)
+        following = np.empty_like(state)
+        self._linearise(values, (record, state), (following, residual, jacobian))
+        state[:] = following
+        return unsettled
+
+    def _settle(self, values: Array, record: Array, state: Array, residual: Array, tolerance: float) -> int:
+        following = np.empty_like(state)
+        moving = np.ones(record.shape[1], dtype=bool)
+        for _ in range(MOST_PASSES):
+            self._pass(values, (record, state), (following, residual))
+            moving = ~(np.abs(following - state).max(axis=0, initial=0.0) <= tolerance)
+            state[:] = following
+            if not moving.any():
+                return 0
+        return int(moving.sum())
+
+
+class Mapped:
+    """A CasADi function over many records, without a conversion for each number."""
+
+    def __init__(self, function: ca.Function, block: int = _BLOCK) -> None:
+        self._block, self._function = block, function.map(f"{function.name()}_block", "serial", block, [0], [])
+        self._out_sizes = [function.numel_out(i) for i in range(function.n_out())]
+        self._in_sizes = [function.numel_in(i) for i in range(1, function.n_in())]
+
+    def __call__(self, values: Array, inputs: Sequence[Array], outputs: Sequence[Array]) -> None:
+        """Fill the outputs (entries x N each) for inputs (entries x N each) and ``values``, the same for all."""
+        count = inputs[0].shape[1]
+        buffer, evaluate = direct_access(self._function)
+        given = [np.zeros((self._block, size)) for size in self._in_sizes]
+        taken = [np.zeros((self._block, size)) for size in self._out_sizes]
+        shared = np.ascontiguousarray(values)
+        for position, array in enumerate([shared, *given]):
+            if array.size:
+                buffer.set_arg(position, array.data)
+        for position, array in enumerate(taken):
+            if array.size:
+                buffer.set_res(position, array.data)
+        for start in range(0, count, self._block):
+            stop = min(start + self._block, count)
+            for block, source in zip(given, inputs, strict=True):
+                block[: stop - start] = source[:, start:stop].T
+            evaluate()
+            for block, target in zip(taken, outputs, strict=True):
+                target[:, start:stop] = self._by_rows(block[: stop - start], target.shape[0])
+
+    @staticmethod
+    def _by_rows(block: Array, rows: int) -> Array:
+        return block.reshape(len(block), rows).T
+
+
+def direct_access(function: ca.Function) -> tuple[Any, Callable[[], None]]:
+    """Direct access to a function's memory."""
+    buffer, evaluate = function.buffer()
+    return buffer, evaluate
+
+
+class Compiled:
+    """The same functions in C, several records at once."""
+
+    name = "compiled"
+
+    def __init__(self, library: ctypes.CDLL) -> None:
+        self._residuals = _signature(library.armcal_residuals, outputs=1)
+        self._linearise = _signature(library.armcal_linearise, outputs=2)
+
+    def residuals(self, values: Array, record: Array, state: Array, residual: Array, rest: float = REST_RAD) -> int:
+        """As the protocol says."""
+        pointers = [*_pointers(values, record, state), residual.ctypes.data, _stride(residual)]
+        return int(self._residuals(record.shape[1], _stride(record), *pointers, rest, MOST_PASSES))
+
+    def linearise(
+        self, values: Array, record: Array, state: Array, residual: Array, jacobian: Array, rest: float = NEAR_REST_RAD
+    ) -> int:
+        """As the protocol says."""
+        return self.prepared(values, record, state, residual, jacobian, rest)()
+
+    def prepared(
+        self, values: Array, record: Array, state: Array, residual: Array, jacobian: Array, rest: float = NEAR_REST_RAD
+    ) -> Callable[[], int]:
+        """``linearise`` again and again, of arrays that the caller keeps: their addresses are taken once."""
+        pointers = [*_pointers(values, record, state), residual.ctypes.data, _stride(residual)]
+        pointers += [jacobian.ctypes.data, _stride(jacobian)]
+        return partial(self._linearise, record.shape[1], _stride(record), *pointers, rest, MOST_PASSES)
+
+
+@dataclass(frozen=True)
+class Kernel:
+    """A factor with the backend that evaluates it; ``identity`` names the library (its key) or the interpreter."""
+
+    factor: Factor
+    backend: Backend
+    identity: str = f"casadi {ca.CasadiMeta.version()}"
+
+    @cached_property
+    def _slope(self) -> Mapped:
+        """How the next state follows the state."""
+        return Mapped(self.factor.slope_function(), _FEW)
+
+    @cached_property
+    def _by_channels(self) -> dict[tuple[str, ...], Mapped]:
+        """Slopes by channels, once they were asked for."""
+        return {}
+
+    @cached_property
+    def outputs(self) -> ca.Function:
+        """What the instrument would read, and where the tools are."""
+        return self.factor.output_function()
+
+    @cached_property
+    def hessian(self) -> ca.Function:
+        """The exact Hessian of one record."""
+        return self.factor.hessian_function()
+
+    def channel_slopes(
+        self, values: Array, record: Array, state: Array, slopes: Array, channels: Sequence[str]
+    ) -> None:
+        """d residual / d channels (n_r * channels x records) at states in equilibrium."""
+        if slopes.size:
+            chosen = tuple(channels)
+            if chosen not in self._by_channels:
+                self._by_channels[chosen] = Mapped(self.factor.channel_slope_function(chosen))
+            self._by_channels[chosen](values, (record, state), (slopes,))
+
+    def residuals(self, values: Array, record: Array, state: Array, residual: Array) -> None:
+        """Residuals in equilibrium.
+
+        Raises:
+            NotConvergedError: a record has none.
+        """
+        before = state.copy()
+        if self.backend.residuals(values, record, state, residual, REST_RAD) or _out_of_hand(state):
+            self._settle_by_newton(values, record, state, before)
+            self.backend.residuals(values, record, state, residual, AS_IT_STANDS)
+
+    def linearise(self, values: Array, record: Array, state: Array, residual: Array, jacobian: Array) -> None:
+        """Residuals and Jacobian in equilibrium.
+
+        Raises:
+            NotConvergedError: a record has none.
+        """
+        before = state.copy()
+        if self.backend.linearise(values, record, state, residual, jacobian, NEAR_REST_RAD) or _out_of_hand(state):
+            self._settle_by_newton(values, record, state, before)
+            self.backend.linearise(values, record, state, residual, jacobian, AS_IT_STANDS)
+
+    def _settle_by_newton(self, values: Array, record: Array, state: Array, before: Array) -> None:
+        """Bring every record to an equilibrium that the springs hold in place, where passes lead away from it.
+
+        ``state`` is where the passes ended. Records that they brought to rest stay there; the others start anew from
+        ``before``, or from no deflection if that is too much. If one has none, all are left at ``before``.
+        """
+        at_rest = np.abs(state).max(axis=0, initial=0.0) <= MOST_DEFLECTION
+        state[:, ~at_rest] = 0.0
+        following, slopes = self._slopes(values, record, state)(np.arange(state.shape[1]))
+        at_rest &= (np.abs(following - state).max(axis=0, initial=0.0) < NEAR_REST_RAD) & (lowest(slopes) > 0)
+        within = np.abs(before).max(axis=0, initial=0.0) <= MOST_DEFLECTION
+        moving = np.flatnonzero(~at_rest)
+        moved = np.where(within, before, 0.0)[:, moving]
+        settled = settle(self._slopes(values, record[:, moving], moved), moved)
+        state[:, moving] = moved
+        if not settled.sound.all():
+            bad = int(np.argmin(settled.sound))
+            self._refuse(values, record[:, moving[bad]], moved[:, bad], not settled.at_rest[bad], state, before)
+
+    def require_held(self, values: Array, record: Array, state: Array) -> None:
+        """Refuse states in equilibrium that springs do not hold, such as a load balanced upright on a soft joint.
+
+        Raises:
+            NotConvergedError: of a record.
+        """
+        if len(state):
+            low = lowest(self._slopes(values, record, state)(np.arange(state.shape[1]))[1])
+            bad = int(np.argmin(low))
+            if not low[bad] > 0:
+                self._refuse(values, record[:, bad], state[:, bad], False, state, np.zeros_like(state))
+
+    def _refuse(self, values: Array, record: Array, at: Array, far: bool, state: Array, before: Array) -> NoReturn:
+        """Of one record at a state; all states are left at ``before``."""
+        _, slopes = self._slopes(values, record[:, None], at[:, None].copy())(np.arange(1))
+        state[:] = before
+        raise refusal(f"a record ({self.factor.pose_of(record)})", self.factor.springs, at, slopes[0], far)
+
+    def _slopes(self, values: Array, record: Array, state: Array) -> Evaluate:
+        """What ``settle`` asks for, of these records at their states."""
+
+        def evaluate(places: NDArray[np.intp]) -> tuple[Array, Array]:
+            following, slopes = (np.empty((size, len(places))) for size in (len(state), len(state) ** 2))
+            self._slope(values, (record[:, places], state[:, places]), (following, slopes))
+            return following, slopes.reshape(len(state), len(state), -1).transpose(2, 1, 0)
+
+        return evaluate
+
+    def predict(self, values: Array, record: Array, state: Array, shown: Array) -> None:
+        """Outputs and tool poses in equilibrium (n_o + 12 an arm x records).
+
+        Raises:
+            NotConvergedError: a record has no equilibrium.
+        """
+        self._in_equilibrium(self.outputs, values, record, state, shown)
+
+    def tell(self, values: Array, record: Array, state: Array, said: Array) -> None:
+        """What each record says of its group's parameters, in equilibrium (entries x records)."""
+        self._in_equilibrium(self.factor.told_function(), values, record, state, said)
+
+    def _in_equilibrium(self, function: ca.Function, values: Array, record: Array, state: Array, shown: Array) -> None:
+        mapped, following, before = Mapped(function), np.empty_like(state), state.copy()
+        for _ in range(MOST_PASSES):
+            mapped(values, (record, state), (following, shown))
+            moved = np.abs(following - state).max(initial=0.0)
+            state[:] = following
+            if moved <= REST_RAD and not _out_of_hand(state):
+                self.require_held(values, record, state)
+                return
+        self._settle_by_newton(values, record, state, before)
+        mapped(values, (record, state), (following, shown))
+
+
+def _out_of_hand(state: Array) -> bool:
+    return bool(np.abs(state).max(initial=0.0) > MOST_DEFLECTION)
+
+
+def build_kernel(factor: Factor, records: int, choice: EvaluatorChoice = "auto") -> Kernel:
+    """A kernel for about so many records.
+
+    ``auto`` takes a cached library, else waits for the compiler only where that pays, else interprets and lets
+    the compiler work for the next run. ``compiled`` waits; without a compiler it interprets.
+    """
+    machine = VirtualMachine(factor)
+    if choice == "interpreted" or compiler.find_compiler() is None:
+        return Kernel(factor, machine)
+    functions = (factor.pass_function(), factor.linearise_function())
+    text = "".join(f.serialize() for f in functions) + c_source.support_source() + c_source.driver_source()
+    text += f"{c_source.LANES} lanes" + c_source.generator_source()
+    key = compiler.library_key(text)
+
+    def source() -> str:
+        return kernel_source(factor, *functions)
+
+    def trial() -> compiler.Trial:
+        return kernel_trial.trial(factor, machine.linearise, (NEAR_REST_RAD, MOST_PASSES))
+
+    library = compiler.load_cached(key)
+    if library is None:
+        if choice == "auto" and records < WORTH_COMPILING_RECORDS:
+            quietly(lambda: compiler.compile_in_background(key, source, trial))
+            return Kernel(factor, machine)
+        library = quietly(lambda: compiler.compile_now(key, source, trial=trial))
+    if library is None:
+        return Kernel(factor, machine)
+    compiled = Compiled(library)
+    return (
+        Kernel(factor, compiled, key)
+        if kernel_trial.agree(factor, machine.linearise, compiled.linearise)
+        else Kernel(factor, machine)
+    )
+
+
+def kernel_source(factor: Factor, single_pass: ca.Function, linearise: ca.Function) -> str:
+    """The whole C file of a factor."""
+    one = c_source.write_function(single_pass, "pass", 1)
+    two = c_source.write_function(linearise, "linearise", 1)
+    sizes = {
+        "LANES": c_source.LANES,
+        "N_RECORD": factor.record.numel(),
+        "N_STATE": factor.state.numel(),
+        "N_RESIDUAL": factor.residual.numel(),
+        "N_VALUES": factor.values.numel(),
+        "PASS_HOISTED": one.hoisted,
+        "LINEARISE_HOISTED": two.hoisted,
+    }
+    defines = "".join(f"#define {name} {number}\n" for name, number in sizes.items())
+    return defines + c_source.support_source() + one.source + two.source + c_source.driver_source()
+
+
+def quietly(build: Callable[[], ctypes.CDLL | None]) -> ctypes.CDLL | None:
+    """What was built, or None: an expression without a C form is no fault, the virtual machine serves."""
+    try:
+        return build()
+    except c_source.UnsupportedExpressionError:
+        return None
+
+
+def _stride(array: Array) -> int:
+    """Numbers from one channel to the next."""
+    if array.size and array.strides[1] != array.itemsize:
+        raise ValueError("the records of a channel must lie side by side")
+    return array.strides[0] // array.itemsize
+
+
+def _pointers(values: Array, *channels: Array) -> list[int]:
+    """Addresses; the C side takes contiguous values, and one stride for record and state."""
+    if not values.flags.c_contiguous or len({_stride(array) for array in channels if array.size}) > 1:
+        raise ValueError("values must be contiguous, record and state slices of arrays of one width")
+    return [values.ctypes.data, *(array.ctypes.data for array in channels)]
+
+
+def _signature(function: Any, outputs: int) -> Any:
+    """Count and stride, three inputs, then each output with its own stride, tolerance, most passes."""
+    integer, pointer = ctypes.c_long, ctypes.c_void_p
+    shared = [integer, integer, pointer, pointer, pointer]
+    function.argtypes = [*shared, *[pointer, integer] * outputs, ctypes.c_double, ctypes.c_int]
+    function.restype = integer
+    return function

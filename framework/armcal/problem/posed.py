@@ -1,0 +1,104 @@
+"""A problem as solvers see it: residuals and priors over scaled increments from the nominal values.
+
+A solver of smooth problems moves ``x`` (n), increments in their ordinary sizes. A cone solver moves ``c`` (n),
+coordinates in their ordinary sizes, in which priors are quadratic and a semidefinite block is a cone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from armcal.base.domains import Array
+from armcal.errors import NotConvergedError
+from armcal.problem.problem import FactorRecords, NormalEquations, Problem
+
+
+class PosedProblem:
+    """Half the squared whitened residuals of some records plus priors."""
+
+    def __init__(self, problem: Problem, records: Sequence[FactorRecords]) -> None:
+        self.problem, self.records = problem, records
+        self.scales = problem.parameters.increment_scales()
+        self.coordinate_scales = problem.parameters.scales()
+        self._prior = problem.parameters.prior_information() * self.coordinate_scales**2
+
+    def bounds(self) -> tuple[Array, Array]:
+        """Lower and upper bounds of ``x``, and of ``c``: only numbers have them, and theirs are the same."""
+        lower, upper = self.problem.parameters.increment_bounds()
+        return lower / self.scales, upper / self.scales
+
+    def x(self, values: Array) -> Array:
+        """Where a value vector lies."""
+        return self.problem.parameters.local(values) / self.scales
+
+    def values(self, x: Array) -> Array:
+        """The value vector there."""
+        return self.problem.parameters.retract(x * self.scales)
+
+    def coordinates(self, x: Array) -> Array:
+        """The same place for a cone solver."""
+        return self.problem.parameters.coordinates(x * self.scales) / self.coordinate_scales
+
+    def from_coordinates(self, c: Array) -> Array:
+        """The place a cone solver means, or the nearest one that the domains allow."""
+        return self.problem.parameters.from_coordinates(c * self.coordinate_scales) / self.scales
+
+    def cost(self, x: Array) -> float:
+        """Residuals and priors; infinite where a record has no elastic equilibrium."""
+        try:
+            return self.problem.cost(self.values(x), self.records) + self._prior_cost(x)
+        except NotConvergedError:
+            return float("inf")
+
+    def model(self, x: Array) -> NormalEquations:
+        """Cost, gradient and Gauss-Newton Hessian by ``x``.
+
+        Raises:
+            NotConvergedError: a record has no elastic equilibrium there.
+        """
+        data = self._data(x)
+        gradient, hessian = self._chained(x, data)
+        curvature = self.problem.parameters.curvature(self._entry_gradient(x, data.gradient))
+        return NormalEquations(data.cost + self._prior_cost(x), gradient, hessian + curvature * self._products())
+
+    def convex_model(self, x: Array) -> NormalEquations:
+        """Cost, gradient and Gauss-Newton Hessian by ``c``.
+
+        Raises:
+            NotConvergedError: a record has no elastic equilibrium there.
+        """
+        chain = self.problem.parameters.entries_jacobian(self.values(x)) * self.coordinate_scales
+        data = self._data(x).chained(chain)
+        gradient = data.gradient + self._prior * self.coordinates(x)
+        return NormalEquations(data.cost + self._prior_cost(x), gradient, data.hessian + np.diag(self._prior))
+
+    def exact_hessian(self, x: Array) -> Array:
+        """The Hessian by ``x`` with the curvature of the residuals."""
+        data = self._data(x)
+        exact = NormalEquations(0.0, data.gradient, self.problem.exact_hessian(self.values(x), self.records))
+        curvature = self.problem.parameters.curvature(self._entry_gradient(x, data.gradient))
+        return self._chained(x, exact)[1] + curvature * self._products()
+
+    def _data(self, x: Array) -> NormalEquations:
+        return self.problem.normal_equations(self.values(x), self.records)
+
+    def _chained(self, x: Array, data: NormalEquations) -> tuple[Array, Array]:
+        """Gradient and Hessian by ``x`` of data, by canonical entries, and priors, by coordinates."""
+        parameters, delta = self.problem.parameters, x * self.scales
+        by_data = data.chained(parameters.retract_jacobian(delta) * self.scales)
+        by_prior = parameters.coordinates_jacobian(delta) * self.scales / self.coordinate_scales[:, None]
+        weighted = by_prior.T * self._prior
+        return by_data.gradient + weighted @ self.coordinates(x), by_data.hessian + weighted @ by_prior
+
+    def _entry_gradient(self, x: Array, data: Array) -> Array:
+        """The gradient by canonical entries, with that of the priors where entries are coordinates."""
+        by_prior = self._prior * self.coordinates(x) / self.coordinate_scales
+        return data + self.problem.parameters.entries_jacobian(self.values(x)) @ by_prior
+
+    def _prior_cost(self, x: Array) -> float:
+        return 0.5 * float(self._prior @ self.coordinates(x) ** 2) if self._prior.any() else 0.0
+
+    def _products(self) -> Array:
+        return np.outer(self.scales, self.scales)

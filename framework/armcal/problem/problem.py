@@ -1,0 +1,360 @@
+"""A problem: arms, measurements and parameters, compiled once; records, weights and subsets are arguments."""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache, partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armcal.arm.assembly import Arm
+from armcal.arm.environment import Environment
+from armcal.base.dataset import Dataset
+from armcal.base.domains import Array
+from armcal.base.parameters import Parameters
+from armcal.measure.groups import NO_GROUP, Groups, group_numbers, groups_of, refuse_lost, ties_of
+from armcal.measure.measurement import Measurement
+from armcal.measure.partners import with_partners
+from armcal.problem import factor_records, gather
+from armcal.problem.blueprint import Blueprint
+from armcal.problem.factor_records import FactorRecords, correlation_of
+from armcal.problem.gather import Slots
+from armcal.problem.kernel import EvaluatorChoice, Kernel
+from armcal.problem.linearised import linearised, linearised_means, mean_shares
+from armcal.problem.normal_equations import ExtraRows, NormalEquations, TieFunction, stacked
+from armcal.problem.whitening import declared, transformed
+
+__all__ = ["FactorRecords", "NormalEquations", "Problem", "triangular"]
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Kernels over one set of parameters; ``known_ties`` are what is known between groups beside the records.
+
+    Value vectors hold all canonical entries. Those that the blueprint fixes are compiled in and must be the nominal
+    ones; ``parameters`` may hold more. In another process a problem is compiled anew, once, from its blueprint and by
+    the same evaluators.
+    """
+
+    parameters: Parameters
+    kernels: tuple[Kernel, ...]
+    environment: Environment
+    blueprint: Blueprint
+    known_ties: tuple[TieFunction, ...] = ()
+
+    @classmethod
+    def build(
+        cls,
+        arms: Mapping[str, Arm],
+        measurements: Mapping[str, Measurement],
+        parameters: Parameters,
+        environment: Environment,
+        dataset: Dataset,
+        evaluator: EvaluatorChoice = "auto",
+        groups: Groups | None = None,
+    ) -> Problem:
+        """Compile for datasets with the channels of this one, and its groups where none are given."""
+        dataset = with_partners(dataset, measurements)
+        if groups is None:
+            groups = groups_of(dataset, measurements) if parameters.nuisances else {}
+        blueprint = Blueprint(arms, measurements, parameters, environment, frozenset(dataset.channels), groups)
+        choices = dict.fromkeys(measurements, evaluator)
+        kernels, ties = blueprint.kernels(len(dataset), choices), _ties(blueprint)
+        return cls(parameters, kernels, environment, blueprint, ties)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _from_bytes, (self._bytes,)
+
+    @cached_property
+    def _bytes(self) -> bytes:
+        """The blueprint, and what evaluates each measurement."""
+        choices = {k.factor.name: "compiled" if k.backend.name == "compiled" else "interpreted" for k in self.kernels}
+        return pickle.dumps((self.blueprint.bare(), choices, self.parameters))
+
+    def evaluated_by(self, evaluator: EvaluatorChoice) -> Problem:
+        """The same problem by another evaluator; ``compiled`` waits for the compiler. Records serve both."""
+        choices = dict.fromkeys(self.blueprint.measurements, evaluator)
+        return replace(self, kernels=self.blueprint.kernels(0, choices))
+
+    @property
+    def backend(self) -> str:
+        """What evaluates it: ``compiled``, ``virtual machine`` or both."""
+        return ", ".join(sorted({kernel.backend.name for kernel in self.kernels}))
+
+    @property
+    def increments(self) -> int:
+        """How many numbers an increment has."""
+        return len(self.parameters.coordinate_names)
+
+    @property
+    def free_names(self) -> tuple[str, ...]:
+        """Names of the free canonical entries."""
+        return tuple(self.parameters.entry_names[i] for i in self.parameters.free_entries)
+
+    @cached_property
+    def slots(self) -> tuple[Slots, ...]:
+        """Where each kernel's values come from, and where its Jacobian goes."""
+        plan = self.blueprint
+        return tuple(
+            gather.slots_of(name, measurement, plan.parameters, self.parameters, plan.groups)
+            for name, measurement in plan.measurements.items()
+        )
+
+    @cached_property
+    def ties(self) -> tuple[TieFunction, ...]:
+        """What is known between groups that are free, or free and known.
+
+        A group held because no record belongs to it is not known: a tie to where it starts would be made up.
+        """
+        free, could = set(self.parameters.free_entries), set(self.blueprint.parameters.free_entries)
+        sides = [[set(side.tolist()) for side in tie.sides] for tie in self.known_ties]
+        return tuple(
+            tie
+            for tie, both in zip(self.known_ties, sides, strict=True)
+            if any(side & free for side in both) and all(side & free or not side & could for side in both)
+        )
+
+    def records(self, dataset: Dataset, weights: Array | None = None) -> tuple[FactorRecords, ...]:
+        """A dataset as the kernels read it; ``weights`` (N) multiply each record's squared residual."""
+        plan = self.blueprint
+        dataset = with_partners(dataset, plan.measurements)
+        factors = [kernel.factor for kernel in self.kernels]
+        numbers = [group_numbers(dataset, name, m, plan.groups) for name, m in plan.measurements.items()]
+        masks = [factor_records.applicable(f, dataset, n) for f, n in zip(factors, numbers, strict=True)]
+        # A record that is nobody's stays with all that read it, so that it is found out.
+        nobodys = ~np.any(masks, axis=0)
+        readers = [nobodys if number is None else nobodys & (number != NO_GROUP) for number in numbers]
+        refuse_lost(dataset, plan.measurements, nobodys & ~np.any(readers, axis=0))
+        return tuple(
+            factor_records.factor_records(factor, dataset, number, mask | reader, weights)
+            for factor, number, mask, reader in zip(factors, numbers, masks, readers, strict=True)
+        )
+
+    @staticmethod
+    def subset(records: Sequence[FactorRecords], chosen: NDArray[np.intp]) -> tuple[FactorRecords, ...]:
+        """Some records of all."""
+        return factor_records.subset(records, chosen)
+
+    @staticmethod
+    def weighted(records: Sequence[FactorRecords], weights: Sequence[Array]) -> tuple[FactorRecords, ...]:
+        """The same records with their weights multiplied, factor by factor (N each); equilibria stay shared."""
+        return factor_records.weighted(records, weights)
+
+    def equations(self, records: Sequence[FactorRecords]) -> int:
+        """How many residual numbers the records give; those of weight zero are no evidence."""
+        return sum(
+            int(np.count_nonzero(each.weight)) * len(kernel.factor.noise)
+            for kernel, each in zip(self.kernels, records, strict=True)
+        ) + sum(len(tie.noise) for tie in self.ties)
+
+    def residuals(self, values: Array, records: Sequence[FactorRecords]) -> tuple[Array, ...]:
+        """Raw residuals in equilibrium, one (n_r x N) matrix a factor.
+
+        Raises:
+            NotConvergedError: a record has no elastic equilibrium at these values.
+        """
+        self._check_fixed(values)
+        result = []
+        for kernel, slots, each in zip(self.kernels, self.slots, records, strict=True):
+            residual = np.empty((kernel.factor.residual.numel(), each.record.shape[1]))
+            gather.evaluated(slots, values, each.group, kernel.residuals, each.record, each.state, residual)
+            result.append(residual[:, : each.count])
+        return tuple(result)
+
+    def require_held(self, values: Array, records: Sequence[FactorRecords]) -> None:
+        """Refuse values at which springs do not hold the arm in every record.
+
+        Raises:
+            NotConvergedError: a record has no elastic equilibrium, or one that is not stable.
+        """
+        self.residuals(values, records)
+        for kernel, slots, each in zip(self.kernels, self.slots, records, strict=True):
+            gather.evaluated(slots, values, each.group, kernel.require_held, each.record, each.state)
+
+    def cost(self, values: Array, records: Sequence[FactorRecords]) -> float:
+        """Half the weighted squared whitened residuals."""
+        raw = self.residuals(values, records)
+        whitened = zip(records, self.whitened(raw, records), strict=True)
+        weighted = tuple(residual * np.sqrt(each.weight[: each.count]) for each, residual in whitened)
+        shared = correlation_of(records)
+        if shared is not None:
+            weighted = shared.independent([residual[:, :, None] for residual in weighted])
+        total = sum(0.5 * float(np.sum(residual**2)) for residual in weighted)
+        for kernel, each, residual in zip(self.kernels, records, raw, strict=True):
+            declared_ones = residual / np.array(kernel.factor.noise)[:, None]
+            for share in mean_shares(kernel.factor, each):
+                total += 0.5 * float(np.sum((declared_ones @ share[: each.count]) ** 2))
+        return total + sum(0.5 * float(np.sum((tie.residual(values) / tie.noise) ** 2)) for tie in self.ties)
+
+    def weighted_residuals(self, values: Array, records: Sequence[FactorRecords]) -> tuple[Array, ...]:
+        """Residuals in units of their noise, times the roots of their weights, one (n_r x N) matrix a factor."""
+        whitened = self.whitened_residuals(values, records)
+        return tuple(w * np.sqrt(each.weight[: each.count]) for each, w in zip(records, whitened, strict=True))
+
+    def whitened_residuals(self, values: Array, records: Sequence[FactorRecords]) -> tuple[Array, ...]:
+        """Residuals in units of their noise, weights left out, one (n_r x N) matrix a factor."""
+        return self.whitened(self.residuals(values, records), records)
+
+    def whitened(self, residuals: Sequence[Array], records: Sequence[FactorRecords]) -> tuple[Array, ...]:
+        """Raw residuals in units of their noise, one (n_r x N) matrix a factor."""
+        return tuple(
+            transformed(each.whitening[:, :, : each.count], residual)
+            if each.whitening is not None
+            else residual / np.array(kernel.factor.noise)[:, None]
+            for kernel, each, residual in zip(self.kernels, records, residuals, strict=True)
+        )
+
+    def normal_equations(self, values: Array, records: Sequence[FactorRecords]) -> NormalEquations:
+        """Cost, gradient and Gauss-Newton Hessian, accumulated in blocks: memory does not grow with the records.
+
+        But where they hang together, all are made independent at once.
+        """
+        blocks = [_block_sums(*block) for block in self._independent_blocks(values, records)]
+        entries = len(self.parameters.free_entries)
+        cost = sum((b[0] for b in blocks), 0.0)
+        gradient = sum((b[1] for b in blocks), np.zeros(entries))
+        hessian = sum((b[2] for b in blocks), np.zeros((entries, entries)))
+        return self._extra(values, records).added_to(NormalEquations(cost, gradient, hessian))
+
+    def triangular_factor(self, values: Array, records: Sequence[FactorRecords]) -> Array:
+        """R with R'R = J'J of the whitened residuals by coordinates: singular values keep their condition."""
+        chain = self.parameters.entries_jacobian(values)
+        triangle = np.zeros((0, self.increments))
+        for jacobian, _ in self._independent_blocks(values, records):
+            rows = np.concatenate([chain.T @ part for part in jacobian], axis=1).T
+            triangle = triangular(np.vstack([triangle, rows]))
+        return triangular(np.vstack([triangle, self._extra(values, records).jacobian @ chain]))
+
+    def jacobians(self, values: Array, records: Sequence[FactorRecords]) -> Iterator[Array]:
+        """Whitened Jacobians by free canonical entries, in blocks of records (n_r x n_v x B), factor by factor."""
+        return (jacobian for jacobian, _ in self._blocks(values, records))
+
+    def exact_hessian(self, values: Array, records: Sequence[FactorRecords]) -> Array:
+        """The Hessian of ``cost`` by free canonical entries with the curvature of the residuals (n x n).
+
+        Of records that hang together the Gauss-Newton one: their curvature would couple all of them. Nor has it the
+        curvature of groups' means, where these weigh more than their records say.
+        """
+        if correlation_of(records) is not None:
+            return self.normal_equations(values, records).hessian
+        self.residuals(values, records)
+        size = len(self.parameters.free_entries)
+        total = np.zeros((size, size))
+        for kernel, slots, each in zip(self.kernels, self.slots, records, strict=True):
+            for number, columns in slots.parts(each.group, each.count):
+                own, free = slots.values(values, number), slots.free[number]
+                seen = np.flatnonzero(free != gather.HELD)
+                for i in columns:
+                    whitening = declared(kernel.factor.noise) if each.whitening is None else each.whitening[:, :, i]
+                    one = kernel.hessian(own, each.record[:, i], each.state[:, i], whitening)
+                    total[np.ix_(free[seen], free[seen])] += each.weight[i] * np.asarray(one)[np.ix_(seen, seen)]
+        beside, places = self._extra(values, records).jacobian, self._places
+        bends = sum((tie.curvature(values, places, size) for tie in self.ties), np.zeros((size, size)))
+        return total + beside.T @ beside + bends
+
+    def channel_slopes(
+        self, values: Array, records: Sequence[FactorRecords], channels: Sequence[str]
+    ) -> tuple[Array, ...]:
+        """d residual / d record channels in equilibrium, one (n_r x channels x N) array a factor; raw, not whitened."""
+        self.residuals(values, records)
+        result = []
+        for kernel, slots, each in zip(self.kernels, self.slots, records, strict=True):
+            slope = np.empty((kernel.factor.residual.numel() * len(channels), each.record.shape[1]))
+            evaluate = partial(kernel.channel_slopes, channels=channels)
+            gather.evaluated(slots, values, each.group, evaluate, each.record, each.state, slope)
+            result.append(slope.reshape(-1, len(channels), each.record.shape[1])[:, :, : each.count])
+        return tuple(result)
+
+    def predict(self, values: Array, records: Sequence[FactorRecords]) -> tuple[Array, ...]:
+        """Outputs and tool positions in equilibrium, one (n_o + 12 an arm x N) matrix a factor."""
+        self._check_fixed(values)
+        result = []
+        for kernel, slots, each in zip(self.kernels, self.slots, records, strict=True):
+            shown = np.empty((kernel.outputs.numel_out(1), each.record.shape[1]))
+            gather.evaluated(slots, values, each.group, kernel.predict, each.record, each.state, shown)
+            result.append(shown[:, : each.count])
+        return tuple(result)
+
+    def told(self, values: Array, records: Sequence[FactorRecords]) -> tuple[Array, ...]:
+        """What each record alone says of its group's parameters, one (entries x N) matrix a factor."""
+        result = []
+        for kernel, slots, each in zip(self.kernels, self.slots, records, strict=True):
+            said = np.empty((len(kernel.factor.told_names), each.record.shape[1]))
+            if len(said):
+                gather.evaluated(slots, values, each.group, kernel.tell, each.record, each.state, said)
+            result.append(said[:, : each.count])
+        return tuple(result)
+
+    def _extra(self, values: Array, records: Sequence[FactorRecords]) -> ExtraRows:
+        """The rows that belong to no single record."""
+        places = self._places
+        rows = [tie.rows(values, places, len(places)) for tie in self.ties]
+        for kernel, slots, each in zip(self.kernels, self.slots, records, strict=True):
+            means = linearised_means(kernel, slots, each, values)
+            rows += [ExtraRows(residual, jacobian) for jacobian, residual in means]
+        return stacked(rows, len(places))
+
+    @property
+    def _places(self) -> dict[int, int]:
+        """Where each free entry stands among the free ones."""
+        return {entry: i for i, entry in enumerate(self.parameters.free_entries)}
+
+    def _independent_blocks(self, values: Array, records: Sequence[FactorRecords]) -> Iterator[tuple[Array, Array]]:
+        """Blocks whose rows are independent: as they are, or made so where records hang together."""
+        shared = correlation_of(records)
+        if shared is None:
+            yield from self._blocks(values, records)
+            return
+        self._check_fixed(values)
+        rows = []
+        for kernel, slots, each in zip(self.kernels, self.slots, records, strict=True):
+            blocks = linearised(kernel, slots, each, values)
+            rows.append(np.concatenate([np.concatenate([j, r[:, None]], axis=1) for j, r in blocks], axis=2))
+        for made in shared.independent([np.moveaxis(row, 1, 2) for row in rows]):
+            yield np.moveaxis(made[:, :, :-1], 1, 2), made[:, :, -1]
+
+    def _blocks(self, values: Array, records: Sequence[FactorRecords]) -> Iterator[tuple[Array, Array]]:
+        """Whitened, weighted Jacobians (n_r x n_v x B) and residuals (n_r x B), in order."""
+        self._check_fixed(values)
+        for kernel, slots, each in zip(self.kernels, self.slots, records, strict=True):
+            yield from linearised(kernel, slots, each, values)
+
+    def _check_fixed(self, values: Array) -> None:
+        fixed = self._compiled_in
+        if not np.array_equal(values[fixed], self.parameters.nominal()[fixed]):
+            raise ValueError("a fixed parameter differs from the value the problem was compiled with")
+
+    @cached_property
+    def _compiled_in(self) -> NDArray[np.intp]:
+        """Positions of the entries that the kernels hold as numbers."""
+        plan = self.blueprint.parameters
+        held = [block.name for block in plan.blocks if not block.free and not block.nuisance]
+        return np.array([i for name in held for i in range(*plan.entries_of(name).indices(1 << 30))], dtype=np.intp)
+
+
+@lru_cache(maxsize=64)
+def _from_bytes(written: bytes) -> Problem:
+    """A problem that another process sent, compiled once here."""
+    blueprint, choices, parameters = pickle.loads(written)
+    return Problem(parameters, blueprint.kernels(0, choices), blueprint.environment, blueprint, _ties(blueprint))
+
+
+def _ties(blueprint: Blueprint) -> tuple[TieFunction, ...]:
+    owned = ties_of(blueprint.measurements, blueprint.groups)
+    return tuple(TieFunction.of(each, blueprint.parameters) for each in owned)
+
+
+def triangular(rows: Array) -> Array:
+    """R of a QR decomposition."""
+    return np.asarray(np.linalg.qr(rows, mode="r"))
+
+
+def _block_sums(jacobian: Array, residual: Array) -> tuple[float, Array, Array]:
+    """Cost, gradient and Hessian of a block."""
+    hessian = sum((part @ part.T for part in jacobian), np.zeros((jacobian.shape[1],) * 2))
+    gradient = np.einsum("kvb,kb->v", jacobian, residual)
+    return 0.5 * float(np.sum(residual**2)), gradient, hessian

@@ -1,0 +1,169 @@
+"""Records projected onto the model: what would have been measured had the values at hand been the truth.
+
+Rank is judged there. Where a Jacobian depends on measured numbers (a bearing, a contact, a closed chain) their errors
+turn undetermined directions into seemingly determined ones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from armcal.base.domains import Array
+from armcal.problem.factor import Factor
+from armcal.problem.gather import Slots, evaluated
+from armcal.problem.kernel import Kernel
+from armcal.problem.problem import FactorRecords, Problem
+
+_MOST_STEPS = 12
+_AT_ZERO = 1e-6
+"""In units of the noise: a residual below this is none."""
+
+
+def projected(problem: Problem, values: Array, records: Sequence[FactorRecords]) -> tuple[FactorRecords, ...]:
+    """Records whose residuals are zero at these values, for judging rank.
+
+    Measured numbers become what the model predicts; where nothing is measured but the joints (a contact), the joint
+    angles move to the nearest ones that fit. A record that no angles fit is left as it is. Records that a Jacobian
+    does not depend on that way are returned as they are, the same objects.
+
+    Raises:
+        NotConvergedError: a record has no elastic equilibrium at these values.
+    """
+    result = as_predicted(problem, values, records)
+    return tuple(
+        _fitting_joints(kernel, slots, values, each) if _measures_nothing(kernel.factor) else each
+        for kernel, slots, each in zip(problem.kernels, problem.slots, result, strict=True)
+    )
+
+
+def as_predicted(problem: Problem, values: Array, records: Sequence[FactorRecords]) -> tuple[FactorRecords, ...]:
+    """Records with what the model predicts in the place of measured numbers, wherever a Jacobian depends on these.
+
+    Raises:
+        NotConvergedError: a record has no elastic equilibrium at these values.
+    """
+    if not any(_bilinear(kernel.factor) for kernel in problem.kernels):
+        return tuple(records)
+    predicted = predicted_records(problem, values, records)
+    return tuple(
+        after if _bilinear(kernel.factor) else before
+        for kernel, before, after in zip(problem.kernels, records, predicted, strict=True)
+    )
+
+
+def predicted_records(problem: Problem, values: Array, records: Sequence[FactorRecords]) -> tuple[FactorRecords, ...]:
+    """Records with what the model predicts in the place of all measured numbers.
+
+    Raises:
+        NotConvergedError: a record has no elastic equilibrium at these values.
+    """
+    shown = problem.predict(values, records)
+    return tuple(
+        _with_readings(kernel.factor, each, outputs)
+        for kernel, each, outputs in zip(problem.kernels, records, shown, strict=True)
+    )
+
+
+def factor_at_zero(problem: Problem, values: Array, records: Sequence[FactorRecords]) -> Array:
+    """R (m x n) with R'R = J'J of the whitened residuals by coordinates, of the records projected onto the model.
+
+    Raises:
+        NotConvergedError: a record has no elastic equilibrium at these values.
+    """
+    return problem.triangular_factor(values, projected(problem, values, records))
+
+
+def fits(problem: Problem, values: Array, records: Sequence[FactorRecords]) -> tuple[NDArray[np.bool_], ...]:
+    """Which records a contact can be in at these values, one mask a factor; all of any other measurement."""
+    residuals = problem.residuals(values, records)
+    return tuple(
+        _whitened(kernel.factor, residual) < _AT_ZERO
+        if _measures_nothing(kernel.factor)
+        else np.ones(residual.shape[1], dtype=bool)
+        for kernel, residual in zip(problem.kernels, residuals, strict=True)
+    )
+
+
+def joint_channels(factor: Factor) -> tuple[int, ...]:
+    """Which rows of a record are commanded joint angles: those of an arm, approaches aside."""
+    own = f"{factor.name}."
+    return tuple(
+        i for i, c in enumerate(factor.channels) if "." in c and not c.startswith(own) and ".approach." not in c
+    )
+
+
+def approach_channels(factor: Factor) -> tuple[int, ...]:
+    """Which rows of a record are directions of approach."""
+    return tuple(i for i, c in enumerate(factor.channels) if ".approach." in c)
+
+
+def _measured(factor: Factor) -> tuple[int, ...]:
+    return tuple(i for i, c in enumerate(factor.channels) if c in factor.output_channels)
+
+
+def _measures_nothing(factor: Factor) -> bool:
+    return not _measured(factor)
+
+
+def _bilinear(factor: Factor) -> bool:
+    """Whether the derivative by values or deflections depends on what was measured."""
+    rows = _measured(factor)
+    if not rows:
+        return False
+    by_measured = ca.jacobian(factor.residual, factor.record)[:, list(rows)]
+    return bool(ca.depends_on(by_measured, ca.vertcat(factor.values, factor.state)))
+
+
+def _with_readings(factor: Factor, each: FactorRecords, outputs: Array) -> FactorRecords:
+    record = each.record.copy()
+    for row in _measured(factor):
+        predicted = outputs[factor.output_channels.index(factor.channels[row])]
+        record[row, : each.count] = predicted
+        record[row, each.count :] = predicted[-1] if each.count else 0.0
+    return replace(each, record=record)
+
+
+def _fitting_joints(kernel: Kernel, slots: Slots, values: Array, each: FactorRecords) -> FactorRecords:
+    """Joint angles moved by Gauss-Newton steps of least length until the residual is gone."""
+    rows = joint_channels(kernel.factor)
+    if not rows or not each.count:
+        return each
+    moved = replace(each, record=each.record.copy(), state=each.state.copy())
+    for _ in range(_MOST_STEPS):
+        residual = _residual(kernel, slots, values, moved)
+        if (_whitened(kernel.factor, residual) < _AT_ZERO * 1e-3).all():
+            break
+        joints = [kernel.factor.channels[row] for row in rows]
+        inverse = np.linalg.pinv(channel_slopes(kernel, slots, values, moved, joints).transpose(2, 0, 1), rcond=1e-9)
+        step = np.einsum("nqr,rn->qn", inverse, residual)
+        longest = np.abs(step).max(axis=0)
+        moved.record[list(rows)] -= step * np.minimum(1.0, 0.3 / np.maximum(longest, 1e-300))
+    reached = _whitened(kernel.factor, _residual(kernel, slots, values, moved)) < _AT_ZERO
+    return replace(each, record=np.where(reached, moved.record, each.record))
+
+
+def channel_slopes(kernel: Kernel, slots: Slots, values: Array, each: FactorRecords, channels: Sequence[str]) -> Array:
+    """d residual / d channels at states in equilibrium (n_r x channels x N, filled up as the records are)."""
+    size, width = kernel.factor.residual.numel(), each.record.shape[1]
+    slopes = np.empty((size * len(channels), width))
+    evaluate = partial(kernel.channel_slopes, channels=channels)
+    evaluated(slots, values, each.group, evaluate, each.record, each.state, slopes)
+    return slopes.reshape(size, len(channels), width)
+
+
+def _residual(kernel: Kernel, slots: Slots, values: Array, each: FactorRecords) -> Array:
+    """Raw (n_r x N); the state is left in equilibrium."""
+    residual = np.empty((kernel.factor.residual.numel(), each.record.shape[1]))
+    evaluated(slots, values, each.group, kernel.residuals, each.record, each.state, residual)
+    return residual
+
+
+def _whitened(factor: Factor, residual: Array) -> Array:
+    """The largest entry of each record's residual in units of the noise."""
+    return np.asarray(np.abs(residual / np.array(factor.noise)[:, None]).max(axis=0, initial=0.0))

@@ -1,1 +1,0 @@
-"""Third floor: problems, their compiled functions, estimators, identifiability, validation."""

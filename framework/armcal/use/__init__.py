@@ -1,1 +1,0 @@
-"""Fifth floor: what a calibration is used for."""

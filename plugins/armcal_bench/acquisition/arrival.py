@@ -1,0 +1,84 @@
+"""Whether the arm is where it was told to be, as far as a tracker can tell: servos tell nobody."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+from armcal.arm.assembly import Arm
+from armcal.arm.model import forward
+from armcal.base.domains import Array
+
+from armcal_bench.acquisition.settings import ArrivalSettings
+
+_ENOUGH = 5
+
+
+@dataclass(frozen=True)
+class Arrival:
+    """Compares how far apart the target stood in two poses, and by how much it was turned, with the nominal arm.
+
+    Neither needs to be told where the tracker's frame, the base body and the tool body are. What is not known of the
+    arm, and a target that is not at its nominal place, make them differ as well: the limits have to be generous.
+
+    Attributes:
+        expected: ``base_T_tool`` of the nominal, rigid arm in each pose of the plan (N x 4 x 4, m).
+        settings: the limits.
+    """
+
+    expected: Array
+    settings: ArrivalSettings
+
+    def doubt(self, pose: int, seen: Array, measured: Mapping[int, Array]) -> str:
+        """Why the arm is not where it was told to be, a sentence; empty if nothing speaks against it.
+
+        Args:
+            pose: its index.
+            seen: ``base_T_target`` (4 x 4, m); the rotation is NaN where it is not known.
+            measured: those of other poses by index. The one that fits worst decides, or the next where there are five
+                or more: one of them may be wrong itself.
+        """
+        others = [other for other in measured if other != pose]
+        if not others:
+            return ""
+        before, told = np.array([measured[other] for other in others]), self.expected[others]
+        far = _worst(_distances(before, seen) - _distances(told, self.expected[pose]))
+        turned = _worst(_turns(before, seen) - _turns(told, self.expected[pose]))
+        if far <= self.settings.astray and not turned > self.settings.astray_turned:
+            return ""
+        angle = "" if np.isnan(turned) else f" and {np.rad2deg(turned):.0f} deg"
+        return (
+            f"the arm is not where it was told to be: measured {1000 * far:.0f} mm{angle} off, as seen from other "
+            f"poses (allowed: {1000 * self.settings.astray:.0f} mm, {np.rad2deg(self.settings.astray_turned):.0f} deg)"
+        )
+
+
+def tool_poses(arm: Arm, joint_angles: Array) -> Array:
+    """``base_T_tool`` of the nominal, rigid arm (N x 4 x 4, m) at commands (N x joints, rad)."""
+    chain = arm.nominal_chain
+    commands = ca.SX.sym("commands", len(arm.commanded))
+    told = arm.joint_commands(ca.vertsplit(commands))
+    tool = forward(chain, [joint.offset + told[i] for i, joint in enumerate(chain.joints)], {}).base_T_tool
+    function = ca.Function("tool", [commands], [ca.densify(ca.horzcat(tool.rotation, tool.translation))])
+    found = np.tile(np.eye(4), (len(joint_angles), 1, 1))
+    for matrix, pose in zip(found, joint_angles, strict=True):
+        matrix[:3] = function(pose).full()
+    return found
+
+
+def _distances(poses: Array, pose: Array) -> Array:
+    return np.asarray(np.linalg.norm(poses[:, :3, 3] - pose[:3, 3], axis=1))
+
+
+def _turns(poses: Array, pose: Array) -> Array:
+    """By which angle each is turned from one (rad); what frames they are told in does not matter."""
+    traces = np.einsum("nij,ij->n", poses[:, :3, :3], pose[:3, :3])
+    return np.asarray(np.arccos(np.clip((traces - 1) / 2, -1.0, 1.0)))
+
+
+def _worst(differences: Array) -> float:
+    """The largest, or the next where there are enough; NaN where nothing is known."""
+    known = np.sort(np.abs(differences[~np.isnan(differences)]))[::-1]
+    return float(known[1 if len(known) >= _ENOUGH else 0]) if len(known) else np.nan

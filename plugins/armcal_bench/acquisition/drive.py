@@ -1,0 +1,230 @@
+"""Moving the arm: along clear ways, never faster than its rate, with the board told how to get home."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from itertools import pairwise
+from typing import Protocol
+
+import numpy as np
+from armcal.base.domains import Array
+from armcal.devices.clock import Clock
+from armcal.devices.device import JointDevice
+from armcal.devices.faults import DeviceRefusedError
+
+from armcal_bench.acquisition.endings import TooHot
+from armcal_bench.acquisition.heat import HeatModel, Torques
+from armcal_bench.acquisition.settings import AcquisitionSettings
+from armcal_bench.acquisition.ways import Way, Ways
+
+_LONGEST_STEP = 2.0
+"""Periods: after a pause of the host, the arm goes on from where it is and does not catch up."""
+_ALIVE_EVERY_S = 0.1
+_NOTED_EVERY_S = 1.0
+_HEATED_EVERY_S = 0.25
+_STILL_RAD = 1e-9
+_SAME_HEAT = 1e-4
+_FEW = 6
+_PLAY_RAD = np.deg2rad(3.0)
+"""More than servos have play."""
+
+Note = Callable[[Mapping[str, float], Mapping[str, Sequence[float]]], None]
+"""Told angles (rad) and warmth (winding, case) by joint, now and then while the arm moves."""
+
+
+class Looker(Protocol):
+    """What decides between two steps whether the arm may move."""
+
+    why_held: str
+
+    def may_go_on(self) -> bool:
+        """See ``Watch``."""
+
+
+class Drive:
+    """The arm as it is commanded.
+
+    Attributes:
+        at: where it was told to be (joints, rad).
+        warmth: of the servos, by the model (joints x 2).
+        approach: the sign of each joint's last motion, 0 before its first (joints).
+    """
+
+    def __init__(
+        self,
+        device: JointDevice,
+        clock: Clock,
+        ways: Ways,
+        settings: AcquisitionSettings,
+        heat: tuple[HeatModel, Torques],
+        note: Note,
+    ) -> None:
+        self._device, self._clock, self._ways, self._settings = device, clock, ways, settings
+        (self._model, self._torques), self._note = heat, note
+        self._joints = device.joint_names
+        self._rate = float(np.deg2rad(settings.rate_deg_per_s))
+        self._alive = self._noted = self._heated = clock.now()
+        self.park = np.array([settings.park.get(joint, 0.0) for joint in self._joints])
+        self.at = self.park.copy()
+        self.warmth = self._model.cold
+        self.approach = np.zeros(len(self._joints))
+
+    @property
+    def angles(self) -> dict[str, float]:
+        """Where it was told to be, by joint (rad)."""
+        return self._named(self.at)
+
+    def found(self, angles: Mapping[str, float]) -> None:
+        """Where the device says that it is told to be."""
+        self.at = np.array([angles.get(joint, self.at[i]) for i, joint in enumerate(self._joints)])
+
+    def forget_approach(self, joint: str) -> None:
+        """A joint was energised: it may have jumped from either side."""
+        self.approach[self._joints.index(joint)] = 0.0
+
+    def go(self, way: Sequence[Array], looker: Looker) -> None:
+        """Through a way that begins where the arm is.
+
+        Raises:
+            ParkWish, TooHot: it stopped on the way; ``at`` says where.
+            DeviceError: the device failed; what it was told last may have arrived.
+        """
+        for start, goal in pairwise(way):
+            self._guard(start)
+            self._leg(start, goal, looker)
+        self._guard(way[-1])
+
+    def guard_here(self) -> None:
+        """Should the host fall silent from now on: home from where the arm stands; see ``go``."""
+        self._guard(self.at)
+
+    def guard_still(self) -> None:
+        """Should the host fall silent from now on: stay, for joints that hang free make every way unknown."""
+        self._device.guard([self.angles], self._rate, self._settings.silence)
+
+    def take_up_play(self, looker: Looker) -> None:
+        """Give joints a direction of approach that have none since they were energised: a little away, and back.
+
+        Which side a servo's play lies on is not known before it has moved. See ``go`` for what it raises.
+        """
+        unknown, here = self.approach == 0, self.at
+        for away in (-_PLAY_RAD, _PLAY_RAD):
+            there = here + away * unknown
+            if unknown.any() and self._ways.within(there) and self._ways.clear(here, there):
+                self.go((here, there, here), looker)
+                return
+
+    def stand(self, seconds: float, looker: Looker) -> None:
+        """Hold for some time; see ``go``."""
+        until = self._clock.now() + seconds
+        while (left := until - self._clock.now()) > 0:
+            self._pause(min(left, _ALIVE_EVERY_S), looker)
+
+    def tick(self, looker: Looker) -> bool:
+        """One period of holding; whether the arm may move. See ``go``."""
+        return self._pause(self._settings.period, looker)
+
+    def _pause(self, seconds: float, looker: Looker) -> bool:
+        self._clock.sleep(seconds)
+        self.keep_alive()
+        self._warm()
+        return looker.may_go_on()
+
+    def keep_alive(self) -> None:
+        """Often enough for the device, not more often; while the arm moves too, for it also tells how the device is."""
+        now = self._clock.now()
+        if now - self._alive >= _ALIVE_EVERY_S:
+            self._alive = now
+            self._device.keep_alive()
+
+    def way_home(self, start: Array) -> Way | None:
+        """To where it parks."""
+        return self._ways.find(start, self.park)
+
+    def way_to(self, goal: Array) -> Way | None:
+        """From where it is."""
+        return self._ways.find(self.at, goal)
+
+    def note(self) -> None:
+        """Write down where it is and how hot."""
+        self._noted = self._clock.now()
+        self._note(self.angles, self.named_warmth())
+
+    def cool(self, seconds: float) -> None:
+        """The servos had this time to cool, with the torque of where the arm is."""
+        self.warmth = self._model.after(self.warmth, self._torques(self.at), seconds)
+
+    def _leg(self, start: Array, goal: Array, looker: Looker) -> None:
+        """A straight line in joint space, all joints in proportion."""
+        length, gone, before = float(np.max(np.abs(goal - start))), 0.0, self._clock.now()
+        told = self._device.standing(self.angles)
+        moved = goal - start
+        self.approach = np.where(np.abs(moved) > _STILL_RAD, np.sign(moved), self.approach)
+        while gone < length:
+            moves = self.tick(looker)
+            now = self._clock.now()
+            step = min(now - before, _LONGEST_STEP * self._settings.period) * self._rate
+            before = now
+            if not moves:
+                self.check_heat()
+                continue
+            gone = min(gone + step, length)
+            self.at = start + (gone / length) * moved if gone < length else goal.copy()
+            wanted = self._device.standing(self.angles)
+            if wanted != told:
+                self._device.command(wanted)
+                told = wanted
+
+    def _guard(self, start: Array) -> None:
+        """Should the host fall silent: back to where this leg began, which is clear, and home from there.
+
+        Where no way home is found it stays there; what was told before, of another leg, must not remain.
+        """
+        waypoints = [self._named(pose) for pose in self.way_home(start) or (start,)]
+        try:
+            self._device.guard(waypoints, self._rate, self._settings.silence)
+        except DeviceRefusedError:  # more than its memory holds: as far as that goes, which is clear too
+            self._device.guard(waypoints[:_FEW], self._rate, self._settings.silence)
+
+    def _warm(self) -> None:
+        now = self._clock.now()
+        if now - self._heated >= _HEATED_EVERY_S:
+            self.cool(now - self._heated)
+            self._heated = now
+        if now - self._noted >= _NOTED_EVERY_S:
+            self.note()
+
+    def check_heat(self) -> None:
+        """Whether the servos are within their budget.
+
+        Raises:
+            TooHot: they are not.
+        """
+        if self._model.over(self.warmth):
+            raise TooHot(f"the servo of {self._hottest} has come to its budget")
+
+    @property
+    def hottest(self) -> str:
+        """The servo that is nearest to its budget, in words."""
+        share = float(np.max(self._model.heat(self.warmth) / self._model.budget))
+        return f"that of {self._hottest} is at {100 * share:.0f} % of its budget"
+
+    @property
+    def _hottest(self) -> str:
+        return self._joints[int(np.argmax(self._model.heat(self.warmth) / self._model.budget))]
+
+    def hotter_than(self, warmth: Array) -> bool:
+        """Whether a servo is hotter than with some warmth (joints x 2), and cools still where the arm stands."""
+        heat, settled = self._model.heat(self.warmth), self._model.heat(self._steady())
+        return bool(np.any(heat > np.maximum(self._model.heat(warmth), settled) + _SAME_HEAT))
+
+    def _steady(self) -> Array:
+        """The warmth (joints x 2) that the servos come to where the arm stands."""
+        return np.repeat(self._model.steady(self._torques(self.at)), 2, axis=1)
+
+    def named_warmth(self) -> dict[str, list[float]]:
+        """Of winding and case, by joint."""
+        return dict(zip(self._joints, self.warmth.tolist(), strict=True))
+
+    def _named(self, values: Array) -> dict[str, float]:
+        return dict(zip(self._joints, values.tolist(), strict=True))

@@ -1,0 +1,59 @@
+"""The bench's tracker, as a measuring run uses it."""
+
+from __future__ import annotations
+
+from armcal.devices.clock import Clock
+
+from armcal_bench.bench import Bench
+from armcal_bench.settling import Settled, Settling
+from armcal_bench.tracker_health import TrackerHealth
+
+
+class TrackerEyes:
+    """Feeds every frame to what judges whether the arm stands, and to what judges the tracker."""
+
+    def __init__(self, bench: Bench, clock: Clock) -> None:
+        self._clock = clock
+        self._tracker = bench.tracker()
+        self._settling = Settling(bench.settings.acquisition.settle, bench.settings.bodies)
+        bodies = bench.settings.bodies
+        self._health = TrackerHealth(bodies, clock.now())
+        self._with_base = TrackerHealth(bodies.model_copy(update={"base_motion": "moving"}), clock.now())
+        self._longest = bench.settings.acquisition.lost.park
+        self.why = ""
+
+    def open(self) -> None:
+        """Begin to listen; see ``Tracker.open`` for what it raises."""
+        self._tracker.open(self._clock)
+
+    def look(self) -> None:
+        """Take in the frames that came."""
+        frames = self._tracker.frames()
+        for health in (self._health, self._with_base):
+            health.feed(frames, self._tracker.refused)
+        self._settling.feed(frames)
+
+    def trouble(self) -> tuple[float, str]:
+        """Seconds since the last frame that could be used, and why there was none since; (0, "") if all is well.
+
+        A base body that stands still may be out of sight while the arm moves, but not for as long as makes it park.
+        """
+        found, with_base = (health.trouble(self._clock.now()) for health in (self._health, self._with_base))
+        return with_base if with_base[0] >= self._longest else found
+
+    def begin(self) -> None:
+        """The arm has just been told to stand; frames that have come already were seen before that."""
+        self.look()
+        self._settling.begin(self._clock.now())
+
+    def settled(self) -> Settled | None:
+        """The mean, once the arm stands; else None, and ``why`` says why."""
+        found = self._settling.state(self._clock.now())
+        if isinstance(found, Settled):
+            return found
+        self.why = found.why
+        return None
+
+    def close(self) -> None:
+        """Stop listening."""
+        self._tracker.close()

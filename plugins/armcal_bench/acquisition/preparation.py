@@ -1,0 +1,259 @@
+"""A plan made ready to be driven: every pose checked before anything moves."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from armcal.arm.assembly import Arm
+from armcal.arm.clearance import ClearanceCheck
+from armcal.base.dataset import Dataset
+from armcal.base.domains import Array
+from armcal.devices.device import JointDevice
+from armcal.devices.faults import DeviceRefusedError
+from armcal.errors import ConfigError, DataError, Location
+from armcal.run.experiment import Experiment
+from armcal.run.plan_clearance import clearance_check
+from armcal.run.plan_poses import JointSpace, commands_of, read_poses
+from numpy.typing import NDArray
+
+from armcal_bench.acquisition.arrival import Arrival, tool_poses
+from armcal_bench.acquisition.heat import HeatModel, Torques, holding_torques
+from armcal_bench.acquisition.schedule import Scheduler
+from armcal_bench.acquisition.settings import AcquisitionSettings
+from armcal_bench.acquisition.ways import Ways
+from armcal_bench.bench import Bench
+from armcal_bench.hazards import HazardJudge
+
+_AT = ("bench", "acquisition")
+_SLACK = 1e-9
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """All that a run needs besides its devices.
+
+    Attributes:
+        plan: joint commands and the plan's ids, in its order.
+        scheduler: over the angles that the device can set nearest to them.
+        ways: between poses.
+        heat: the servos' model, and the torques that heat them.
+        arrival: whether the arm is where it was told to be.
+        judge: of what is dangerous in the first motions and the last.
+    """
+
+    bench: Bench
+    device: JointDevice
+    plan: Dataset
+    scheduler: Scheduler
+    ways: Ways
+    heat: tuple[HeatModel, Torques]
+    arrival: Arrival
+    judge: HazardJudge
+
+    @property
+    def settings(self) -> AcquisitionSettings:
+        """Those of the run."""
+        return self.bench.settings.acquisition
+
+
+def prepare(experiment: Experiment, plan: Path) -> Prepared:
+    """Read a plan and check it against limits, pulse tables and clearance. Asks no device.
+
+    Raises:
+        ConfigError, PluginError: the bench is refused.
+        DataError: the plan is refused, with the row of the first pose that the arm must not go to.
+    """
+    bench = Bench.of(experiment)
+    settings, arm = bench.settings.acquisition, bench.arm
+    space = JointSpace.of(experiment)
+    commands = commands_of(read_poses(experiment, plan), space)
+    device = bench.device()
+    limits = joint_limits(experiment, settings, arm)
+    check = clearance_of(experiment, arm)
+    asked = commands.stacked(space.channels).T
+    _within(device.joint_names, asked, limits, plan, commands)
+    poses, standing_park = _standing(device, asked, plan, commands), _park(experiment, settings, device, limits)
+    settable = _settable(device, limits, standing_park)
+    ways = Ways(check, settable, np.vstack([standing_park, poses]), settings.path_step, settings.seed)
+    _all_allowed(ways, poses, commands, plan)
+    if not ways.allowed(standing_park):
+        raise ConfigError(
+            "the pose where the arm parks is too near to something.",
+            where=experiment.source.where((*_AT, "park")),
+            hint="Choose another.",
+        )
+    heat = heat_of(experiment, settings, arm)
+    _rests_cool(experiment, device.joint_names, heat, standing_park)
+    settle = settings.settle
+    scheduler = Scheduler(
+        poses=poses,
+        ids=commands.ids,
+        park=standing_park,
+        ways=ways,
+        model=heat[0],
+        torques=heat[1],
+        rate=float(np.deg2rad(settings.rate_deg_per_s)),
+        capture=settle.wait + settle.window + 0.5,
+        order=settings.order,
+    )
+    arrival = Arrival(tool_poses(arm, poses), settings.arrival)
+    judge = HazardJudge(device.joint_names, device.joint_names, limits, heat[1], standing_park)
+    return Prepared(bench, device, commands, scheduler, ways, heat, arrival, judge)
+
+
+def joint_limits(experiment: Experiment, settings: AcquisitionSettings, arm: Arm) -> Array:
+    """The run's own, else the plan's, else the arm model's (joints x 2, rad).
+
+    Raises:
+        ConfigError: a joint has none, is no joint, or does not turn.
+    """
+    source, given = experiment.source, dict(settings.limits)
+    plan = experiment.settings.plan
+    stated = {joint.name: joint.limits for joint in arm.nominal_chain.joints}
+    for joint, dimension in arm.commanded.items():
+        if dimension != "angle":
+            raise ConfigError(
+                f"the joint {joint} slides, expected joints that turn: servos move angles.",
+                where=source.where(("arms",)),
+                hint="Measure this arm with its own controller, and read its data.",
+            )
+        found = given.get(joint) or (plan.limits.get(joint) if plan else None) or stated.get(joint)
+        if found is None:
+            raise ConfigError(
+                f"found no limits of the joint {joint}.",
+                where=source.where((*_AT, "limits")),
+                hint=f"Give them: limits: {{{joint}: [-100 deg, 100 deg]}}.",
+            )
+        given[joint] = found
+    if unknown := sorted(set(given) - set(arm.commanded)):
+        raise ConfigError(
+            f"no joint is called {unknown[0]!r}.",
+            where=source.where((*_AT, "limits")),
+            hint=f"The joints are {', '.join(arm.commanded)}.",
+        )
+    return np.array([given[joint] for joint in arm.commanded])
+
+
+def _park(experiment: Experiment, settings: AcquisitionSettings, device: JointDevice, limits: Array) -> Array:
+    where, joints = experiment.source.where((*_AT, "park")), device.joint_names
+    if unknown := sorted(set(settings.park) - set(joints)):
+        raise ConfigError(
+            f"no joint is called {unknown[0]!r}.", where=where, hint=f"The joints are {', '.join(joints)}."
+        )
+    park = np.array([settings.park.get(joint, 0.0) for joint in joints])
+    if (outside := _outside(park, limits)).any():
+        joint = joints[int(np.argmax(outside))]
+        raise ConfigError(f"{joint} would park outside its limits.", where=where, hint="Choose another pose.")
+    standing = device.standing(dict(zip(joints, park.tolist(), strict=True)))
+    return np.array([standing[joint] for joint in joints])
+
+
+def _rests_cool(experiment: Experiment, joints: tuple[str, ...], heat: tuple[HeatModel, Torques], park: Array) -> None:
+    model, torques = heat
+    torque = torques(park)
+    if (hot := model.too_hot_for_ever(torque)) is not None:
+        share = 100 * float(model.steady(torque)[hot, 0] / model.budget[hot])
+        raise ConfigError(
+            f"the servo of {joints[hot]} would not cool where the arm parks: it carries {abs(torque[hot]):.2f} N m at "
+            f"{np.rad2deg(park[hot]):.1f} deg, which heats it to {share:.0f} % of its budget.",
+            where=experiment.source.where((*_AT, "park")),
+            hint="Choose a pose in which it carries less.",
+        )
+
+
+def _settable(device: JointDevice, limits: Array, inside: Array) -> Array:
+    """The part of the limits, around a pose inside, that the device has pulses for (joints x 2, rad)."""
+    found = limits.copy()
+    for row, joint in enumerate(device.joint_names):
+        for end in (0, 1):
+            found[row, end] = _last_settable(device, joint, float(inside[row]), float(limits[row, end]))
+    return found
+
+
+def _last_settable(device: JointDevice, joint: str, inside: float, beyond: float) -> float:
+    try:
+        device.standing({joint: beyond})
+        return beyond
+    except DeviceRefusedError:
+        pass
+    while abs(beyond - inside) > _SLACK:
+        middle = (inside + beyond) / 2
+        try:
+            device.standing({joint: middle})
+            inside = middle
+        except DeviceRefusedError:
+            beyond = middle
+    return inside
+
+
+def _outside(pose: Array, limits: Array) -> NDArray[np.bool_]:
+    return np.asarray((pose < limits[:, 0] - _SLACK) | (pose > limits[:, 1] + _SLACK))
+
+
+def clearance_of(experiment: Experiment, arm: Arm) -> ClearanceCheck | None:
+    """What ``plan.clearance`` asks for; None where it is not given. See ``clearance_check`` for what it raises."""
+    plan = experiment.settings.plan
+    if plan is None or plan.clearance is None:
+        return None
+    return clearance_check(plan.clearance, {arm.name: arm}, experiment.source)
+
+
+def _within(joints: tuple[str, ...], poses: Array, limits: Array, plan: Path, commands: Dataset) -> None:
+    """What is asked for lies within limits; half a count beyond is the board's affair."""
+    for row, pose in enumerate(poses):
+        if (outside := _outside(pose, limits)).any():
+            joint = int(np.argmax(outside))
+            low, high = np.rad2deg(limits[joint])
+            raise DataError(
+                f"pose {commands.ids[row]} has {joints[joint]} at {np.rad2deg(pose[joint]):.1f} deg, "
+                f"expected {low:.1f} to {high:.1f}.",
+                where=_row(plan, commands, row),
+                hint="Nothing was moved. Plan anew with these limits, or take the pose out.",
+            )
+
+
+def _standing(device: JointDevice, poses: Array, plan: Path, commands: Dataset) -> Array:
+    """The angles that the device can set nearest to the poses (N x joints)."""
+    found = []
+    for row, pose in enumerate(poses):
+        try:
+            standing = device.standing(dict(zip(device.joint_names, pose.tolist(), strict=True)))
+        except DeviceRefusedError as fault:
+            raise DataError(fault.message, where=_row(plan, commands, row), hint=fault.hint) from fault
+        found.append([standing[joint] for joint in device.joint_names])
+    return np.array(found)
+
+
+def _all_allowed(ways: Ways, poses: Array, commands: Dataset, plan: Path) -> None:
+    for row, pose in enumerate(poses):
+        if not ways.allowed(pose):
+            raise DataError(
+                f"pose {commands.ids[row]} is too near to something.",
+                where=_row(plan, commands, row),
+                hint="Nothing was moved. Plan anew with this clearance, or take the pose out.",
+            )
+
+
+def _row(plan: Path, commands: Dataset, row: int) -> Location:
+    return Location(str(plan), row=commands.rows[row] if commands.rows else None)
+
+
+def heat_of(experiment: Experiment, settings: AcquisitionSettings, arm: Arm) -> tuple[HeatModel, Torques]:
+    """The servos' model, and the torques that heat them.
+
+    Raises:
+        ConfigError: the settings name no such joint, or nothing weighs anything.
+    """
+    if settings.heat and not arm.masses and not experiment.system.environment.payload_mass:
+        raise ConfigError(
+            "heat is to be reckoned with, and no part of the arm has a mass: no joint would hold anything.",
+            where=experiment.source.where((*_AT, "heat")),
+            hint="Give the masses of the links (arms.NAME.links), or leave heat out.",
+        )
+    try:
+        model = HeatModel.of(tuple(arm.commanded), settings.heat)
+    except ValueError as fault:
+        raise ConfigError(f"{fault}.", where=experiment.source.where((*_AT, "heat"))) from fault
+    return model, holding_torques(arm, experiment.system.environment)

@@ -1,0 +1,127 @@
+"""A measuring run against a simulated bench, in a process of its own."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from armcal.devices.clock import SimulatedClock
+from armcal.devices.simulated import BOARD, CLOCK
+from armcal.errors import EXIT_BAD_INPUT, ArmcalError, ConfigError, InputError, Location, PluginError
+from armcal.run.experiment import Experiment
+
+from armcal_bench.bench import SECTION, Bench
+
+_STARTED_IN_S = 60.0
+_ENDED_IN_S = 10.0
+_FALLEN_IN_S = 5.0
+_LONGEST_SOCKET_PATH = 107
+
+
+def overrides_for(folder: Path) -> tuple[str, ...]:
+    """What a configuration must say instead to work with the simulated bench in a folder."""
+    there = folder.absolute()
+    return (f"bench.clock={{simulated: {there / CLOCK}}}", f"bench.link.port={there / BOARD}")
+
+
+def port_instead_of_adapter(experiment: Experiment) -> tuple[str, ...]:
+    """What it must say besides, if its link names an adapter: simulated ones have no serial number.
+
+    Raises:
+        ConfigError: its link has no serial port, or there is no bench.
+    """
+    link = Bench.of(experiment).settings.link or {}
+    try:
+        component = experiment.registry.find("link", str(link.get("type")))
+    except PluginError:
+        return ()  # whoever builds it says so, and where
+    settings = getattr(component.load(), "Settings", None)
+    if "port" not in getattr(settings, "model_fields", ("port",)):
+        raise ConfigError(
+            f"found the link {component.name}, expected one with a serial port: simulated boards have nothing else.",
+            where=experiment.source.where((SECTION, "link")),
+            hint=f"Rehearse with the link of the simulated firmware: --set {SECTION}.link='{{type: framed}}'.",
+        )
+    return (f"{SECTION}.link.serial_number=null",) if "serial_number" in link else ()
+
+
+@contextmanager
+def simulated_bench(config: Path, overrides: Sequence[str], folder: Path) -> Iterator[None]:
+    """A simulated bench, from when it answers until it is told to stop.
+
+    Raises:
+        InputError: it does not start; its own words are told.
+    """
+    _make(folder)
+    sets = [word for text in overrides for word in ("--set", text)]
+    # -P: a file of the working directory called like a library is not taken for it, as it is not by the command.
+    command = [sys.executable, "-P", "-m", "armcal.cli", "simulated-bench", str(config), "--dir", str(folder), *sets]
+    with (folder / "said.txt").open("w+", encoding="utf-8") as said:
+        process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=said, stderr=said)
+        try:
+            _wait_for(process, folder, folder / "said.txt")
+            yield
+        finally:
+            _stop(process, folder)
+
+
+def truth(folder: Path) -> dict[str, Any]:
+    """What the simulated bench knows, once the arm has come to hang: its true state, and what was unsafe.
+
+    Raises:
+        InputError: it does not answer.
+    """
+    clock = SimulatedClock(folder / CLOCK)
+    try:
+        return clock.ask({"advance": _FALLEN_IN_S, "state": True})
+    finally:
+        clock.close()
+
+
+def _make(folder: Path) -> None:
+    """Make the folder, where sockets can be."""
+    where = Location(str(folder))
+    if len(os.fsencode(folder.absolute() / CLOCK)) > _LONGEST_SOCKET_PATH:
+        raise InputError(
+            f"the path of the simulated bench's socket would be longer than {_LONGEST_SOCKET_PATH} bytes.",
+            where=where,
+            hint="Give --out a short path.",
+        )
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as fault:
+        raise InputError(
+            f"it cannot be made ({fault.strerror}).", where=where, hint="Give --out a folder that can be written."
+        ) from fault
+
+
+def _wait_for(process: subprocess.Popen[bytes], folder: Path, said: Path) -> None:
+    until = time.monotonic() + _STARTED_IN_S
+    while time.monotonic() < until:
+        if process.poll() is not None:
+            fault = InputError if process.returncode == EXIT_BAD_INPUT else ArmcalError
+            words = said.read_text(encoding="utf-8").strip()[-2000:]
+            raise fault(f"the simulated bench ended before it began: {words}")
+        if (folder / CLOCK).exists():
+            try:
+                SimulatedClock(folder / CLOCK).close()
+                return
+            except InputError:
+                pass
+        time.sleep(0.05)
+    raise ArmcalError(f"the simulated bench did not start in {_STARTED_IN_S:.0f} s.")
+
+
+def _stop(process: subprocess.Popen[bytes], folder: Path) -> None:
+    process.terminate()
+    try:
+        process.wait(_ENDED_IN_S)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()

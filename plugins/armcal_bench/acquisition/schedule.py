@@ -1,0 +1,184 @@
+"""Which pose comes next, and when the servos have to rest first."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from armcal.base.domains import Array
+
+from armcal_bench.acquisition.heat import NEVER, HeatModel, Torques
+from armcal_bench.acquisition.ways import Way, Ways, travel
+
+_SAMPLES = 8
+_CONSIDERED = 12
+_COOLED_TO = 0.5
+"""Of the budget: a rest goes on to here, so that the servos do not rest before every pose."""
+
+
+@dataclass(frozen=True)
+class Measure:
+    """Go to a pose and measure there."""
+
+    pose: int
+    way: Way
+    seconds: float
+    warmth: Array
+
+
+@dataclass(frozen=True)
+class Rest:
+    """Go to where the arm parks and wait there."""
+
+    way: Way
+    seconds: float
+    warmth: Array
+
+
+@dataclass(frozen=True)
+class LeaveOut:
+    """A pose that cannot be measured, and why."""
+
+    pose: int
+    why: str
+
+
+Next = Measure | Rest | LeaveOut
+
+
+@dataclass(frozen=True)
+class Scheduler:
+    """Decides from where the arm stands, how warm its servos are, and what is left.
+
+    Attributes:
+        poses: N x joints, rad.
+        ids: of the poses.
+        park: where it rests (joints, rad).
+        rate: of the fastest joint, rad/s.
+        capture: how long it is expected to stand in a pose, s.
+        order: ``plan``, or ``cool`` (the pose that costs least time, cooling included).
+    """
+
+    poses: Array
+    ids: tuple[str, ...]
+    park: Array
+    ways: Ways
+    model: HeatModel
+    torques: Torques
+    rate: float
+    capture: float
+    order: str
+
+    def next(self, at: Array, warmth: Array, left: Sequence[int]) -> Next:
+        """What to do now; ``left`` are indices of poses, in the plan's order, at least one."""
+        chosen = left[:1] if self.order == "plan" else self._near(at, left)
+        found = [self._measure(at, warmth, pose) for pose in chosen]
+        fitting = [step for step in found if isinstance(step, Measure) and self._fits(step)]
+        if fitting:
+            return min(fitting, key=lambda step: self._cost(warmth, step))
+        return self._rested(at, warmth, chosen[0], found[0])
+
+    def _near(self, at: Array, left: Sequence[int]) -> Sequence[int]:
+        away = np.max(np.abs(self.poses[list(left)] - at), axis=1)
+        return [left[i] for i in np.argsort(away, kind="stable")[:_CONSIDERED]]
+
+    def _measure(self, at: Array, warmth: Array, pose: int) -> Measure | LeaveOut:
+        way = self.ways.find(at, self.poses[pose])
+        if way is None:
+            return LeaveOut(pose, f"no clear way to pose {self.ids[pose]} was found")
+        there = self.model.after(warmth, self._effective(way), travel(way) / self.rate)
+        after = self.model.after(there, self.torques(self.poses[pose]), self.capture)
+        return Measure(pose, way, travel(way) / self.rate + self.capture, np.maximum(there, after))
+
+    def _fits(self, step: Measure) -> bool:
+        """Within the budget there, and on the way to where it rests."""
+        back = self.ways.find(step.way[-1], self.park)
+        if back is None:
+            return not self.model.over(step.warmth)
+        home = self.model.after(step.warmth, self._effective(back), travel(back) / self.rate)
+        return not (self.model.over(step.warmth) or self.model.over(home))
+
+    def _rested(self, at: Array, warmth: Array, pose: int, found: Measure | LeaveOut) -> Next:
+        if isinstance(found, LeaveOut):
+            return found
+        way = self.ways.find(at, self.park)
+        if way is None:
+            return LeaveOut(pose, "no clear way to where the arm parks was found")
+        home = self.model.after(warmth, self._effective(way), travel(way) / self.rate)
+        at_rest = self.torques(self.park)
+        cold = self._measure(self.park, np.minimum(self.model.cold + self.model.steady(at_rest), warmth), pose)
+        if not isinstance(cold, Measure) or not self._fits(cold):
+            return LeaveOut(pose, f"pose {self.ids[pose]} needs more torque than the servos bear, even from cold")
+        seconds = self._rest_for(home, at_rest, pose)
+        if seconds == NEVER:
+            return LeaveOut(pose, f"the servos do not cool enough for pose {self.ids[pose]} where the arm parks")
+        return Rest(way, travel(way) / self.rate + seconds, self.model.after(home, at_rest, seconds))
+
+    def _rest_for(self, warmth: Array, at_rest: Array, pose: int) -> float:
+        """Down to a part of the budget, and on until the pose fits."""
+        for part in (_COOLED_TO, 0.25, 0.1, 0.02):
+            wanted = np.maximum(part * self.model.budget, 1.02 * self.model.steady(at_rest)[:, 0] + 1e-6)
+            seconds = self.model.cooled_in(warmth, at_rest, wanted)
+            if seconds == NEVER:
+                return NEVER
+            step = self._measure(self.park, self.model.after(warmth, at_rest, seconds), pose)
+            if isinstance(step, Measure) and self._fits(step):
+                return seconds
+        return NEVER
+
+    def _effective(self, way: Way) -> Array:
+        """The torque that heats as the way does on average (joints, N m)."""
+        squares, lengths = [], []
+        for start, goal in pairwise(way):
+            parts = [self.torques(start + t * (goal - start)) ** 2 for t in (np.arange(_SAMPLES) + 0.5) / _SAMPLES]
+            squares.append(np.mean(parts, axis=0))
+            lengths.append(float(np.max(np.abs(goal - start))))
+        if not sum(lengths):
+            return self.torques(way[-1])
+        return np.asarray(np.sqrt(np.average(squares, axis=0, weights=lengths)))
+
+    def _cost(self, warmth: Array, step: Measure) -> float:
+        """Its own time, and the time that its heat will take to go again."""
+        added = np.maximum(self.model.shares * (step.warmth - warmth), 0.0) / self.model.budget[:, None]
+        return step.seconds + float(np.max((added * self.model.times).sum(axis=1)))
+
+
+@dataclass(frozen=True)
+class Outlook:
+    """What a run is expected to take.
+
+    Attributes:
+        steps: in order.
+        seconds: from the first move to the last capture.
+        travel: of the joint that turns most in each move, rad.
+        resting: s.
+        hottest: the largest heat of each joint.
+    """
+
+    steps: tuple[Next, ...]
+    seconds: float
+    travel: float
+    resting: float
+    hottest: Array
+
+
+def foretell(scheduler: Scheduler, at: Array, warmth: Array, left: Sequence[int]) -> Outlook:
+    """The whole run, as it will be decided step by step if the servos heat as the model says."""
+    steps: list[Next] = []
+    remaining, seconds, gone, resting, hottest = list(left), 0.0, 0.0, 0.0, scheduler.model.heat(warmth)
+    while remaining:
+        step = scheduler.next(at, warmth, remaining)
+        steps.append(step)
+        if isinstance(step, LeaveOut):
+            remaining.remove(step.pose)
+            continue
+        if isinstance(step, Measure):
+            remaining.remove(step.pose)
+        else:
+            resting += step.seconds
+        seconds, gone = seconds + step.seconds, gone + travel(step.way)
+        warmth, at = step.warmth, step.way[-1]
+        hottest = np.maximum(hottest, scheduler.model.heat(warmth))
+    return Outlook(tuple(steps), seconds, gone, resting, hottest)

@@ -1,0 +1,99 @@
+"""The settings of a measuring run."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from armcal.base.settings import Angle, Duration, Length, Settings, Temperature, Torque
+from pydantic import Field, model_validator
+
+Positive = Annotated[float, Field(gt=0)]
+
+
+class ServoHeatSettings(Settings):
+    """How a servo heats: steadily under ``continuous`` torque it comes to its limit in the end.
+
+    ``winding_share`` of that comes within ``winding_time``, the rest with the slow ``case_time``. A servo may be given
+    as much of its limit as ``budget``: 0.5 is safe where each of these numbers is wrong by 30 %.
+    """
+
+    continuous: Torque
+    winding_time: Duration = 60.0
+    case_time: Duration = 900.0
+    winding_share: Annotated[float, Field(ge=0, le=1)] = 0.3
+    budget: Annotated[float, Field(gt=0, le=1)] = 0.5
+
+    @model_validator(mode="after")
+    def _physical(self) -> ServoHeatSettings:
+        for name in ("continuous", "winding_time", "case_time"):
+            if getattr(self, name) <= 0:
+                raise ValueError(f"found a {name} that is not above zero")
+        return self
+
+
+class SettleSettings(Settings):
+    """When the arm stands: the mean of the last ``window`` is taken once positions scatter by less than ``spread``.
+
+    ``spread`` is of the mean's halves: they differ by less. ``wait`` passes first; after ``longest`` the pose is left.
+    """
+
+    wait: Duration = 0.5
+    window: Duration = 1.0
+    spread: Length = 0.0005
+    longest: Duration = 15.0
+    frames: Annotated[int, Field(ge=2)] = 10
+
+
+class ArrivalSettings(Settings):
+    """How far the arm may be from where it was told to be, by distances and turns between measured poses.
+
+    More than ``astray``, or ``astray_turned``, is no error of the model but a servo that failed, stalls or lost a
+    tooth, or a body that slipped: such a pose is tried again, then left out. After ``in_a_row`` of them the arm parks
+    and the run ends.
+    """
+
+    astray: Length = 0.1
+    astray_turned: Angle = 0.45
+    in_a_row: Annotated[int, Field(ge=1)] = 3
+
+    @model_validator(mode="after")
+    def _positive(self) -> ArrivalSettings:
+        for name in ("astray", "astray_turned"):
+            if getattr(self, name) <= 0:
+                raise ValueError(f"found {name} that is not above zero")
+        return self
+
+
+class LostSettings(Settings):
+    """A tracker that is silent, frozen or blind for ``hold`` makes the arm hold; for ``park``, park."""
+
+    hold: Duration = 0.5
+    park: Duration = 30.0
+
+
+class AcquisitionSettings(Settings):
+    """How the plan is driven.
+
+    ``limits`` of joints are those of ``plan`` where none are given here. ``park`` is where the arm is safe, cool and
+    stays when it is left alone; joints that it does not name park at zero. Without ``heat`` no heat is reckoned with.
+    ``order`` is the plan's, or ``cool``: the next pose is then the one that the servos can best bear. The board waits
+    for ``silence`` of the host before it parks the arm by itself, where its link can. At the end the arm parks, and its
+    servos are let go one by one, or hold. Joints get their first pulses one by one, ``between_joints`` apart.
+    ``temperature`` is that of the room, where it is known; it is written with the data.
+    """
+
+    rate_deg_per_s: Annotated[float, Field(gt=0, le=180)] = 20.0
+    period: Duration = 0.02
+    limits: dict[str, tuple[Angle, Angle]] = Field(default_factory=dict)
+    park: dict[str, Angle] = Field(default_factory=dict)
+    path_step: Angle = 0.0175
+    settle: SettleSettings = Field(default_factory=SettleSettings)
+    arrival: ArrivalSettings = Field(default_factory=ArrivalSettings)
+    lost: LostSettings = Field(default_factory=LostSettings)
+    heat: dict[str, ServoHeatSettings] = Field(default_factory=dict)
+    order: Literal["plan", "cool"] = "plan"
+    silence: Duration = 1.0
+    at_end: Literal["release", "hold"] = "release"
+    between_joints: Duration = 0.5
+    temperature: Temperature | None = None
+    seed: Annotated[int, Field(ge=0)] = 0

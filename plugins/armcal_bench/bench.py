@@ -1,0 +1,112 @@
+"""A configured bench: clock, device and tracker, built."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+from armcal.arm.assembly import Arm
+from armcal.config.system import build_component
+from armcal.config.validate import validate
+from armcal.devices.clock import Clock, RealClock, SimulatedClock
+from armcal.devices.device import JointDevice
+from armcal.devices.joint_stream import JointStream
+from armcal.devices.simulated import SimulatedBench
+from armcal.devices.tracker import Tracker
+from armcal.errors import ConfigError
+from armcal.run.experiment import Experiment
+
+from armcal_bench.settings import BenchSettings, SimulatedClockSettings
+
+SECTION = "bench"
+
+
+@dataclass(frozen=True)
+class Bench:
+    """What an experiment's bench is made of; parts are built when they are asked for, and opened by who uses them."""
+
+    experiment: Experiment
+    settings: BenchSettings
+
+    @classmethod
+    def of(cls, experiment: Experiment) -> Bench:
+        """The bench of an experiment.
+
+        Raises:
+            ConfigError: none is configured, or it is refused.
+        """
+        if experiment.settings.bench is None:
+            raise ConfigError(
+                "found no bench.",
+                where=experiment.source.where((SECTION,)),
+                hint="Say what moves and measures the arm: bench: {link: ..., device: ..., tracker: ...}.",
+            )
+        return cls(experiment, validate(BenchSettings, experiment.source, (SECTION,)))
+
+    @property
+    def arm(self) -> Arm:
+        """The only arm.
+
+        Raises:
+            ConfigError: there are several.
+        """
+        arms = list(self.experiment.system.arms.values())
+        if len(arms) != 1:
+            raise ConfigError(
+                f"found {len(arms)} arms, expected one: a bench moves a single arm.",
+                where=self.experiment.source.where(("arms",)),
+                hint="Configure each arm's bench on its own.",
+            )
+        return arms[0]
+
+    @contextmanager
+    def clock(self) -> Iterator[Clock]:
+        """The machine's clock, or the simulated bench's.
+
+        Raises:
+            InputError: no simulated bench answers.
+        """
+        if not isinstance(self.settings.clock, SimulatedClockSettings):
+            yield RealClock()
+            return
+        clock = SimulatedClock(self.settings.clock.simulated)
+        try:
+            yield clock
+        finally:
+            clock.close()
+
+    def device(self) -> JointDevice:
+        """The device, on its link.
+
+        Raises:
+            ConfigError: refused, or none is configured.
+        """
+        built: JointDevice = self._built("device", tuple(self.arm.commanded), self._built("link"))
+        return built
+
+    def tracker(self) -> Tracker:
+        """The tracker; see ``device``."""
+        built: Tracker = self._built("tracker")
+        return built
+
+    def joints(self) -> JointStream:
+        """The stream of joint readings; see ``device``."""
+        built: JointStream = self._built("joints")
+        return built
+
+    def simulator(self) -> SimulatedBench:
+        """The simulated bench; see ``device``."""
+        built: SimulatedBench = self._built("simulator", kind="bench")
+        return built
+
+    def _built(self, part: str, *context: Any, kind: str = "") -> Any:
+        at = (SECTION, part)
+        if getattr(self.settings, part) is None:
+            raise ConfigError(
+                f"found no {part} of the bench.",
+                where=self.experiment.source.where((SECTION,)),
+                hint=f"Give bench: {{{part}: {{type: NAME, ...}}}}; see armcal plugins list.",
+            )
+        return build_component(self.experiment.source, self.experiment.registry, kind or part, at, *context)[0]

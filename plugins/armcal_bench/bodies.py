@@ -1,0 +1,126 @@
+"""From what a tracker sees to what the calibration wants: the target in the arm's base frame."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from armcal.base.domains import Array
+from armcal.base.pose_settings import PoseSettings
+from armcal.base.quaternions import rotation_matrix
+from armcal.devices.tracker import TrackerFrame
+
+from armcal_bench.body_settings import BodySettings
+from armcal_bench.outliers import far_off
+from armcal_bench.rotations import mean_rotation
+
+_LEAST_OUTLIER_M = 2e-4
+_NAMES_SHOWN = 8
+
+
+@dataclass(frozen=True)
+class Capture:
+    """Some frames, in the arm's base frame.
+
+    Attributes:
+        poses: ``base_T_target`` (N x 4 x 4, m), NaN where a frame does not tell; the rotation alone is NaN where the
+            tracker tells only positions.
+        faults: why a frame does not tell, a sentence; empty where it does (N).
+    """
+
+    poses: Array
+    faults: tuple[str, ...]
+
+
+def in_base(frames: Sequence[TrackerFrame], settings: BodySettings) -> Capture:
+    """The target's pose in each frame: base_T_reference reference_T_world world_T_body body_T_target.
+
+    The reference is the base body, in each frame or on the average of these frames, or the tracker's world.
+    """
+    tool = _stacked(frames, settings.tool)
+    faults = [tool_fault(frame, settings) for frame in frames]
+    reference = _reference(frames, settings)
+    for i in np.flatnonzero(np.isnan(reference).any(axis=(1, 2))).tolist():
+        faults[i] = faults[i] or base_fault(frames[i], settings)
+    base_T_reference, body_T_target = matrix_of(settings.base_T_reference), matrix_of(settings.tool_body_T_target)
+    seen_at = tool[:, :3, 3] + _offset(tool[:, :3, :3], body_T_target[:3, 3])
+    back = np.swapaxes(reference[:, :3, :3], 1, 2)
+    from_reference = np.einsum("nij,nj->ni", back, seen_at - reference[:, :3, 3])
+    poses = np.full((len(frames), 4, 4), np.nan)
+    poses[:, 3] = [0.0, 0.0, 0.0, 1.0]
+    poses[:, :3, 3] = from_reference @ base_T_reference[:3, :3].T + base_T_reference[:3, 3]
+    poses[:, :3, :3] = base_T_reference[:3, :3] @ back @ tool[:, :3, :3] @ body_T_target[:3, :3]
+    poses[[bool(fault) for fault in faults], :3] = np.nan
+    return Capture(poses, tuple(faults))
+
+
+def tool_fault(frame: TrackerFrame, settings: BodySettings) -> str:
+    """Why a frame does not tell where the target is in the tracker's world; empty if it does."""
+    pose = frame.bodies.get(settings.tool)
+    if pose is None:
+        return _unseen(frame, settings.tool, "tool")
+    if np.isnan(pose[0, 0]) and any(settings.tool_body_T_target.position):
+        return f"the tool body {settings.tool!r} has no orientation, and the target is not at its origin"
+    return ""
+
+
+def base_fault(frame: TrackerFrame, settings: BodySettings) -> str:
+    """Why a frame does not tell where the base is; empty if it does, or nobody asks."""
+    if not settings.has_base:
+        return ""
+    pose = frame.bodies.get(settings.base)
+    if pose is None:
+        return _unseen(frame, settings.base, "base")
+    return f"the base body {settings.base!r} has no orientation" if np.isnan(pose[0, 0]) else ""
+
+
+def repeats(frame: TrackerFrame, before: TrackerFrame | None, settings: BodySettings) -> bool:
+    """Whether a frame shows just what the one before showed, to the last digit: no live tracker does."""
+    if before is None:
+        return False
+    if frame.counter == before.counter:
+        return True
+    names = (settings.tool, settings.base) if settings.has_base else (settings.tool,)
+    pairs = [(frame.bodies.get(name), before.bodies.get(name)) for name in names]
+    seen = [(a, b) for a, b in pairs if a is not None and b is not None]
+    return len(seen) == len(pairs) and all(a.tobytes() == b.tobytes() for a, b in seen)
+
+
+def matrix_of(pose: PoseSettings) -> Array:
+    """The homogeneous matrix (4 x 4, m)."""
+    found = np.eye(4)
+    found[:3, :3], found[:3, 3] = rotation_matrix(np.array(pose.unit_quaternion)), pose.position
+    return found
+
+
+def _unseen(frame: TrackerFrame, name: str, role: str) -> str:
+    others = [other for other, pose in frame.bodies.items() if pose is not None][:_NAMES_SHOWN]
+    seen = f"it sees {', '.join(others)}" if others else "it sees none"
+    return f"the tracker does not see the {role} body {name!r} ({seen})"
+
+
+def _stacked(frames: Sequence[TrackerFrame], name: str) -> Array:
+    """``world_T_body`` of each frame, NaN where it is not seen (N x 4 x 4)."""
+    nothing = np.full((4, 4), np.nan)
+    found = [frame.bodies.get(name) for frame in frames]
+    return np.array([nothing if pose is None else pose for pose in found]).reshape(-1, 4, 4)
+
+
+def _reference(frames: Sequence[TrackerFrame], settings: BodySettings) -> Array:
+    """``world_T_reference`` of each frame (N x 4 x 4)."""
+    if not settings.has_base:
+        return np.tile(np.eye(4), (len(frames), 1, 1))
+    found = _stacked(frames, settings.base)
+    seen = found[~np.isnan(found).any(axis=(1, 2))]
+    if settings.base_motion == "moving" or not len(seen):
+        return found
+    kept = seen[~far_off(seen[:, None, :3, 3], _LEAST_OUTLIER_M)]
+    mean = np.eye(4)
+    mean[:3, :3], mean[:3, 3] = mean_rotation(kept[:, :3, :3]), kept[:, :3, 3].mean(axis=0)
+    return np.tile(mean, (len(frames), 1, 1))
+
+
+def _offset(rotations: Array, target: Array) -> Array:
+    """The target off the body's origin, in the world (N x 3); a target at the origin needs no rotation."""
+    return np.asarray(rotations @ target) if target.any() else np.zeros((len(rotations), 3))

@@ -1,0 +1,1 @@
+"""Commands of ``armcal`` that this application adds."""

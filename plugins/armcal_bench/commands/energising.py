@@ -1,0 +1,77 @@
+"""The question before the arm moves for the first time."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterable
+from typing import Any, TypeVar
+
+import click
+from armcal.cli.common import Voice
+from armcal.errors import InputError
+
+from armcal_bench.hazards import FirstMotion, Hazard
+from armcal_bench.waiting import Waits
+
+F = TypeVar("F", bound=Callable[..., Any])
+Question = Callable[[FirstMotion], bool]
+"""Whether the arm may be moved."""
+
+
+def always(motion: FirstMotion) -> bool:
+    """Nobody is asked."""
+    return True
+
+
+def asked(motion: FirstMotion) -> bool:
+    """Whether somebody at the terminal says that the arm may be moved.
+
+    Raises:
+        InputError: there is nobody.
+    """
+    named = ", ".join(motion.free or motion.powered)
+    pulses = "get no pulses yet" if motion.free else "have pulses"
+    if not sys.stdin.isatty():
+        raise InputError(
+            f"{named} {pulses}, and nobody can be asked whether the arm may be moved; nothing was moved.",
+            hint="Stand clear of the arm and give --yes.",
+        )
+    jumps = (
+        "A servo tells nobody where it stands, so each may jump when its first pulse comes, one after the other."
+        if motion.free
+        else "The arm moves as soon as you say yes."
+    )
+    click.echo(f"{named} {pulses}. {jumps}", err=True)
+    return click.confirm("Is everybody clear of the arm?", err=True)
+
+
+def warned(voice: Voice, question: Question) -> Question:
+    """The question, after what is dangerous has been named: whoever gave --yes reads it too."""
+
+    def ask(motion: FirstMotion) -> bool:
+        show_hazards(voice, motion.hazards)
+        return question(motion)
+
+    return ask
+
+
+def waits(voice: Voice) -> Waits:
+    """What is waited for, on standard error: a progress bar alone does not say that."""
+    return Waits(lambda text: voice.err.print(text, markup=False, soft_wrap=True))
+
+
+def show_hazards(voice: Voice, hazards: Iterable[Hazard]) -> None:
+    """A warning line each."""
+    for hazard in hazards:
+        voice.warn(hazard.sentence)
+
+
+def energise_option(command: F) -> F:
+    """The option --yes, handed on as ``may_energise``."""
+    return click.option(
+        "--yes",
+        "may_energise",
+        is_flag=True,
+        callback=lambda ctx, option, yes: always if yes else asked,
+        help="Move the arm without asking.",
+    )(command)

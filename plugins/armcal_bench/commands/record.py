@@ -1,0 +1,144 @@
+"""``armcal record``."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal
+
+import click
+from armcal.base.config_text import ConfigText
+from armcal.cli.common import Voice, overrides, speaking
+from armcal.cli.outlet import say
+from armcal.config.yaml_source import ConfigSource, load_config
+from armcal.devices.line_source import KINDS, STANDARD_INPUT
+from armcal.errors import InputError, Location
+from armcal.io.signals import Signals
+from armcal.plugins import discover
+from armcal.run.experiment import Experiment
+
+from armcal_bench.bench import SECTION, Bench
+from armcal_bench.recording.book import DATASET
+from armcal_bench.recording.keys import Keys, LineKeys, NoKeys, TerminalKeys
+from armcal_bench.recording.recorder import KEYS
+from armcal_bench.recording.session import Course, record
+from armcal_bench.recording.told import Told
+
+_TERMINAL = Path("/dev/tty")
+
+
+@click.command("record")
+@click.argument("config", type=click.Path(path_type=Path))
+@click.option("--out", required=True, type=click.Path(path_type=Path), help="The folder to keep data and journal in.")
+@click.option("--resume", is_flag=True, help="Go on with the recording in that folder.")
+@click.option("--from", "source", metavar="SOURCE", help=f"Where joint readings come from: {KINDS}.")
+@click.option(
+    "--capture",
+    type=click.Choice(["keys", "still"]),
+    default="keys",
+    show_default=True,
+    help="Capture at a key, or whenever the arm has stood still for a while.",
+)
+@overrides
+@speaking
+def record_command(
+    voice: Voice,
+    config: Path,
+    out: Path,
+    resume: bool,
+    source: str | None,
+    capture: Literal["keys", "still"],
+    overrides: tuple[str, ...],
+) -> None:
+    """Record postures of CONFIG's arms while they are guided by hand; keys say when. Each is judged at once."""
+    registry = discover()
+    voice.plugin_faults(registry)
+    experiment = Experiment.of(_with_source(load_config(config, overrides), source), registry=registry)
+    bench = Bench.of(experiment)
+    tell = _teller(voice)
+    with Signals() as signals, _keys(bench, capture) as (keys, is_terminal):
+        if is_terminal and not voice.quiet:
+            click.echo(f"{KEYS}.", err=True)
+        start: Literal["anew", "resume"] = "resume" if resume else "anew"
+        course = Course(out, start, capture, keys, lambda: signals.finish or signals.rotate, tell)
+        ending = record(bench, course)
+    tell(ending)
+    if ending.content["postures"] and not (voice.json or voice.quiet):
+        say(f"next: armcal run {config} {_data(experiment, out / DATASET)} --out DIR")
+
+
+def _with_source(source: ConfigSource, name: str | None) -> ConfigSource:
+    """The configuration with another source of joint readings; a stream of JSON lines where none is configured."""
+    if name is None:
+        return source
+    bench = source.data.get(SECTION)
+    joints = bench.get("joints") if isinstance(bench, dict) else None
+    section: dict[str, Any] = dict(joints) if isinstance(joints, dict) else {"type": ConfigText("json_lines")}
+    section["source"] = ConfigText(name, Location("command line (--from)"))
+    whole = {**(bench if isinstance(bench, dict) else {}), "joints": section}
+    return replace(source, data={**source.data, SECTION: whole})
+
+
+@contextmanager
+def _keys(bench: Bench, capture: str) -> Iterator[tuple[Keys, bool]]:
+    """What a person types, and whether that is a terminal; never what the joint readings come from.
+
+    Raises:
+        InputError: nobody could say when to capture.
+    """
+    joints = bench.settings.joints or {}
+    is_taken = joints.get("source") == STANDARD_INPUT
+    if not is_taken and not sys.stdin.isatty():
+        with LineKeys(sys.stdin.fileno()) as keys:
+            yield keys, False
+        return
+    descriptor = os.dup(sys.stdin.fileno()) if not is_taken else _terminal()
+    if descriptor is None:
+        if capture == "keys":
+            raise InputError(
+                "standard input gives the joint readings and there is no terminal, so nobody can say when to capture.",
+                hint="Give --capture still, or let the readings come from udp:PORT or a file.",
+            )
+        with NoKeys() as none:
+            yield none, False
+        return
+    try:
+        with TerminalKeys(descriptor, lambda text: click.echo(text, err=True, nl=False)) as terminal:
+            yield terminal, True
+    finally:
+        os.close(descriptor)
+
+
+def _terminal() -> int | None:
+    """The terminal that the command was started from, where standard error shows that somebody looks at it."""
+    if not sys.stderr.isatty():
+        return None
+    try:
+        return os.open(_TERMINAL, os.O_RDWR | os.O_CLOEXEC)
+    except OSError:
+        return None
+
+
+def _teller(voice: Voice) -> Callable[[Told], None]:
+    """JSON lines, or sentences; flushed, so that who reads them knows at once what is safe."""
+
+    def tell(told: Told) -> None:
+        if voice.json:
+            click.echo(json.dumps({"event": told.kind, **told.content, "sentence": told.sentence}))
+        elif not voice.quiet:
+            say(told.sentence)
+
+    return tell
+
+
+def _data(experiment: Experiment, dataset: Path) -> str:
+    """How the dataset is given to a run."""
+    configured = experiment.settings.data or {}
+    if configured.get("type", "csv") == "csv" and not configured.get("columns"):
+        return f"--data {dataset}"
+    return f"--set 'data={{type: csv}}' --data {dataset}"

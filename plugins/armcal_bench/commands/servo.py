@@ -1,0 +1,188 @@
+"""``armcal servo``."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import click
+from armcal.cli.common import Voice, overrides, speaking
+from armcal.cli.outlet import say
+from armcal.devices.faults import DeviceError
+from armcal.errors import EXIT_FAULT, EXIT_INCOMPLETE, EXIT_STOPPED, InputError
+from armcal.estimate.estimator import Progress
+from armcal.io.signals import Signals
+from armcal.plugins import discover
+from armcal.run.experiment import Experiment
+from rich.table import Table
+
+from armcal_bench.commands.energising import Question, energise_option, waits, warned
+from armcal_bench.servo.keys import wishes_from
+from armcal_bench.servo.mover import StoppedError
+from armcal_bench.servo.outcome import Outcome
+from armcal_bench.servo.outputs import improved, results, write_results, write_servo_file
+from armcal_bench.servo.record import NAME
+from armcal_bench.servo.session import Conversation, adapter_of, evaluated, measure, park, tried
+from armcal_bench.servo.setup import Setup
+from armcal_bench.servo.trial import Verdict, swapped
+from armcal_bench.wiring import carry_over
+
+_FOLDER = click.Path(path_type=Path)
+
+
+@click.command("servo")
+@click.argument("config", type=_FOLDER)
+@click.option(
+    "--out", type=_FOLDER, help="The folder to keep what is measured in; what it holds is not measured again."
+)
+@click.option("--guided", is_flag=True, help="Without a tracker: you say when a joint is at an angle.")
+@click.option("--check", is_flag=True, help="Only move each joint a little, and say whether it is the right one.")
+@click.option("--park", "parks", is_flag=True, help="Only bring the servos to the base pose.")
+@click.option("--release", is_flag=True, help="Let go of the servos, from the base pose, at the end.")
+@click.option("--evaluate", is_flag=True, help="Measure nothing: fit what the folder holds, and write the tables.")
+@click.option("--keep", is_flag=True, help="Leave the servo file as it is.")
+@energise_option
+@overrides
+@speaking
+def servo(
+    voice: Voice,
+    config: Path,
+    out: Path | None,
+    guided: bool,
+    check: bool,
+    parks: bool,
+    release: bool,
+    evaluate: bool,
+    keep: bool,
+    may_energise: Question,
+    overrides: tuple[str, ...],
+) -> None:
+    """Find which pulse makes which angle of each servo on the bench of CONFIG, and write the servo file."""
+    registry = discover()
+    voice.plugin_faults(registry)
+    setup = Setup.of(Experiment.load(config, overrides, registry=registry))
+    how = "guided" if guided else "automatic"
+    with _talking(voice, setup, may_energise) as talk:
+        if check:
+            _checked(voice, setup, talk, "somebody" if guided else "tracker")
+        elif not parks and not (release and out is None):
+            _calibrated(voice, setup, _given(out), None if evaluate else how, keep, talk)
+        if parks or release:
+            _stoppable(voice, lambda: park(setup, talk, "release" if release else "hold"))
+
+
+def _given(out: Path | None) -> Path:
+    if out is None:
+        raise InputError("found no --out.", hint="Say where what is measured is to be kept, or give --check.")
+    return out
+
+
+def _calibrated(voice: Voice, setup: Setup, out: Path, how: str | None, keep: bool, talk: Conversation) -> None:
+    if how is not None:
+        _stoppable(voice, lambda: measure(setup, out, talk, how))
+    outcome = evaluated(setup, out)
+    changed = improved(setup.file, outcome, adapter_of(out))
+    content = results(outcome, changed)
+    write_results(out, content)
+    kept = None if keep else write_servo_file(setup.path, changed)
+    if kept is not None:
+        carry_over(setup.path, setup.file, changed)
+    written = {"servo_file": str(setup.path), "before": None if kept is None else str(kept)}
+    voice.result({**content, **written})
+    _show(voice, outcome, content)
+    if kept is not None:
+        voice.out.print(f"{setup.path}: written; the one before is {kept.name}", markup=False, soft_wrap=True)
+    _exit_if_incomplete(voice, setup, content)
+
+
+def _exit_if_incomplete(voice: Voice, setup: Setup, content: Mapping[str, Any]) -> None:
+    """Tables that were asked for and are not there must not look like a success to a script."""
+    left = [joint for joint in setup.joints if not content["servos"].get(joint, {"written": False})["written"]]
+    if left:
+        count = len(setup.joints) - len(left)
+        voice.warn(
+            f"{count} of {len(setup.joints)} tables were found; those of {', '.join(left)} are left as they were. Why "
+            "is said above: mend that, and give the same command again."
+        )
+        sys.exit(EXIT_INCOMPLETE)
+
+
+def _checked(voice: Voice, setup: Setup, talk: Conversation, seen: str) -> None:
+    verdicts: list[Verdict] = []
+    _stoppable(voice, lambda: verdicts.extend(tried(setup, talk, seen)))
+    pairs = swapped(verdicts)
+    shown = [{**asdict(v), "turned": v.turned if v.turned == v.turned else None} for v in verdicts]
+    voice.result({"joints": shown, "swapped": pairs})
+    for verdict in verdicts:
+        style = "green" if verdict.kind == "right" else "red"
+        voice.out.print(f"{verdict.sentence} {verdict.mend}".rstrip(), style=style, markup=False, soft_wrap=True)
+    for sentence in pairs:
+        voice.out.print(sentence, style="red", markup=False, soft_wrap=True)
+    if any(verdict.kind != "right" for verdict in verdicts):
+        sys.exit(EXIT_FAULT)
+
+
+def _stoppable(voice: Voice, action: Callable[[], None]) -> None:
+    """Do it; where it was stopped, say what that means."""
+    try:
+        action()
+    except StoppedError as stop:
+        arm = f"{stop.arm[:1].upper()}{stop.arm[1:]}"
+        voice.err.print(
+            f"stopped: {stop}. {arm}, and what was measured is kept: give the same command again to go on.",
+            markup=False,
+            soft_wrap=True,
+        )
+        sys.exit(EXIT_STOPPED)
+    except DeviceError as fault:
+        hint = f"{fault.hint} What was measured is kept: give the same command again to go on.".strip()
+        raise type(fault)(fault.message, where=fault.where, hint=hint) from fault
+
+
+@contextmanager
+def _talking(voice: Voice, setup: Setup, may_energise: Question) -> Iterator[Conversation]:
+    def heard(text: str) -> None:
+        say(text, err=voice.json)
+
+    with Signals() as signals, voice.progress() as show:
+        may_move = warned(voice, may_energise)
+        yield Conversation(lambda: signals.finish, may_move, _teller(show), heard, lambda: wishes_from(0), waits(voice))
+
+
+def _teller(show: Progress) -> Callable[[str, int, int], None]:
+    def tell(joint: str, done: int, planned: int) -> None:
+        show(f"measuring {joint}", done / max(planned, 1))
+
+    return tell
+
+
+def _show(voice: Voice, outcome: Outcome, content: Mapping[str, Any]) -> None:
+    table = Table(title="Pulses at angles, and what changed", title_justify="left")
+    for column in ("servo", "deg", "us", "sd", "before", "change, us", "change, deg", "backlash, deg"):
+        table.add_column(column, justify="left" if column == "servo" else "right")
+    for joint, found in content["servos"].items():
+        for i, knot in enumerate(found["knots"]):
+            lag = found["backlash_deg"]
+            play = "-" if lag is None else f"{lag:.2f} +- {found['backlash_sd_deg'] or 0:.2f}"
+            table.add_row(
+                joint if i == 0 else "",
+                f"{knot['angle_deg']:g}",
+                f"{knot['pulse_us']:.1f}",
+                "-" if knot["sd_us"] is None else f"{knot['sd_us']:.1f}",
+                f"{knot['before_us']:.1f}",
+                f"{knot['change_us']:+.1f}",
+                f"{knot['change_deg']:+.2f}",
+                play if i == 0 else "",
+            )
+    voice.out.print(table)
+    for name, board in content["boards"].items():
+        if board["oscillator_sd_hz"] is not None:
+            text = f"{name}: oscillator {board['oscillator_hz'] / 1e6:.4f} +- {board['oscillator_sd_hz'] / 1e6:.4f} MHz"
+            voice.out.print(text, markup=False)
+    for sentence in content["findings"]:
+        voice.out.print(sentence, markup=False, soft_wrap=True)
+    voice.detail(f"{len(outcome.task.observations)} angles, in {NAME}.")

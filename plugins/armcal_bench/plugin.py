@@ -1,0 +1,29 @@
+"""Registration; imports nothing heavy."""
+
+from armcal.hooks import Register, hookimpl
+
+
+@hookimpl
+def armcal_register_commands(register: Register) -> None:
+    """Announce the commands."""
+    register(
+        "acquire",
+        "armcal_bench.commands.acquire:acquire_command",
+        "Drive a plan with servo board and tracker, and measure it.",
+    )
+    register("rehearse", "armcal_bench.commands.rehearse:rehearse", "Do what acquire does, against a simulated bench.")
+    register(
+        "record",
+        "armcal_bench.commands.record:record_command",
+        "Record postures of an arm that is guided by hand, judged at once.",
+    )
+    register(
+        "servo",
+        "armcal_bench.commands.servo:servo",
+        "Which pulse makes which angle: servo tables, by tracker or by eye.",
+    )
+    register(
+        "simulated-bench",
+        "armcal_bench.commands.simulated_bench:simulated_bench",
+        "Stand in for a servo board, arm and tracker.",
+    )

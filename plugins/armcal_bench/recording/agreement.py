@@ -1,0 +1,163 @@
+"""Which postures agree with the others, judged anew with each posture that comes.
+
+A posture is compared with what a fit without it expects there; it disagrees where chance would make it lie so far off
+once in ten thousand postures (F, the noise being estimated). In a group where more postures disagree than agree the
+majority is right. What disagrees takes no part in the fits that judge the others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from scipy.stats import f as f_distribution
+
+from armcal_bench.recording.quick_fit import Fitted, QuickFitter, Told
+
+_CHANCE = 1e-4
+_CHANCE_LATER = 1e-5
+"""For postures that agreed when they came: they are judged again and again."""
+_LOOKED_AT = 1e-2
+"""A posture this unlikely is fitted without, to see."""
+_MOST_DROPPED_AT_ONCE = 3
+
+
+@dataclass(frozen=True)
+class Offset:
+    """How far a posture lies from where the others expect it, and how far was to be expected (root mean square).
+
+    Turns are zero for contacts that turn freely.
+    """
+
+    off_mm: float
+    expected_mm: float
+    off_deg: float = 0.0
+    expected_deg: float = 0.0
+
+    def __str__(self) -> str:
+        if self.expected_deg == 0:
+            return f"{_short(self.off_mm)} mm (expected {_short(self.expected_mm)})"
+        turn = f"{_short(self.off_deg)} deg (expected {_short(self.expected_deg)})"
+        if self.expected_mm == 0:
+            return turn
+        return f"{_short(self.off_mm)} mm (expected {_short(self.expected_mm)}) and {turn}"
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """What was found of all postures.
+
+    Attributes:
+        doubtful: those that disagree, by place (from 0).
+        newest: of the last one; None where there is nothing to compare it with.
+        values: of the last fit, to begin the next one from.
+    """
+
+    doubtful: Mapping[int, Offset] = field(default_factory=dict)
+    newest: Offset | None = None
+    values: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+
+
+class AgreementJudge:
+    """Judges the postures of a fitter; ``groups`` are their names of groups (N)."""
+
+    def __init__(self, fitter: QuickFitter, groups: Sequence[str]) -> None:
+        self._fitter, self._groups = fitter, np.array(groups, dtype=object)
+        self._last = len(groups) - 1
+
+    def with_newest(self, doubtful: frozenset[int]) -> Agreement:
+        """Judge the last posture, and with it those before, of which some were in doubt.
+
+        Raises:
+            NotConvergedError: a posture has no elastic equilibrium.
+        """
+        before = self._active(doubtful | {self._last})
+        if not before.any():
+            return Agreement()
+        fitted = self._fitter.fit(before)
+        newest = self._told(fitted, self._last)
+        candidates = [*doubtful] if newest is None else [*doubtful, self._last]
+        found = {one for one in candidates if self._disagrees(fitted, one, _CHANCE)}
+        found = self._by_majority(found)
+        agreement = self._settled(found)
+        return replace(agreement, newest=None if newest is None else _offset(newest))
+
+    def anew(self) -> Agreement:
+        """Judge all, of which none was in doubt."""
+        return self._settled(set())
+
+    def _active(self, doubtful: frozenset[int] | set[int]) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+        used = np.ones(len(self._groups), dtype=bool)
+        used[list(doubtful)] = False
+        return used
+
+    def _told(self, fitted: Fitted, one: int) -> Told | None:
+        """None for a posture in whose group nothing was fitted."""
+        alike = (self._groups == self._groups[one]) & fitted.used
+        return self._fitter.told(fitted, one) if alike.any() else None
+
+    def _disagrees(self, fitted: Fitted, one: int, chance: float) -> bool:
+        told = self._told(fitted, one)
+        return told is not None and _is_beyond(told.distance, len(told.residual), fitted.freedom, chance)
+
+    def _by_majority(self, doubtful: set[int]) -> set[int]:
+        """In the last posture's group, those in doubt and the others changed over if that leaves fewer in doubt."""
+        own = {int(i) for i in np.flatnonzero(self._groups == self._groups[self._last])}
+        minority, majority = own - doubtful, own & doubtful
+        if len(majority) <= len(minority):
+            return doubtful
+        other = (doubtful - majority) | minority
+        fitted = self._fitter.fit(self._active(other))
+        left_out = self._fitter.left_out(fitted)
+        off = [_is_beyond(*left_out[one], fitted.freedom, _CHANCE) for one in majority]
+        return doubtful if any(off) else other
+
+    def _settled(self, doubtful: set[int]) -> Agreement:
+        """Drop fitted postures that disagree with the rest, the farthest first."""
+        rounds = _MOST_DROPPED_AT_ONCE if doubtful or self._last < 0 else max(_MOST_DROPPED_AT_ONCE, self._last // 3)
+        fitted = self._fitter.fit(self._active(doubtful))
+        for _ in range(rounds):
+            worst = self._farthest(fitted)
+            if worst is None:
+                break
+            tried = self._fitter.fit(self._active(doubtful | {worst}))
+            if not self._disagrees(tried, worst, _CHANCE_LATER):
+                break
+            doubtful, fitted = doubtful | {worst}, tried
+        offsets = {one: self._fitter.told(fitted, one) for one in sorted(doubtful)}
+        found = {one: _offset(told) for one, told in offsets.items()}
+        return Agreement(found, values=self._fitter.free_values(fitted))
+
+    def _farthest(self, fitted: Fitted) -> int | None:
+        """The fitted posture that is likeliest wrong, of groups with others in them; None if none looks so."""
+        worst, largest = None, 1.0
+        for one, (distance, numbers) in self._fitter.left_out(fitted).items():
+            if np.sum((self._groups == self._groups[one]) & fitted.used) < 2:
+                continue
+            ratio = distance / _limit(numbers, fitted.freedom, _LOOKED_AT)
+            if ratio > largest:
+                worst, largest = one, ratio
+        return worst
+
+
+def _is_beyond(distance: float, numbers: int, freedom: float, chance: float) -> bool:
+    return distance > _limit(numbers, freedom, chance)
+
+
+def _limit(numbers: int, freedom: float, chance: float) -> float:
+    return float(numbers * f_distribution.isf(chance, numbers, max(freedom, 1.0)))
+
+
+def _offset(told: Told) -> Offset:
+    deviations = np.diag(told.covariance)
+    off, expected = [], []
+    for which in (told.lengths, ~told.lengths):
+        off.append(float(np.linalg.norm(told.residual[which])))
+        expected.append(float(np.sqrt(deviations[which].sum())))
+    return Offset(1000 * off[0], 1000 * expected[0], float(np.degrees(off[1])), float(np.degrees(expected[1])))
+
+
+def _short(number: float) -> str:
+    """Two digits."""
+    return f"{number:.2g}" if number < 10 else f"{number:.0f}"

@@ -1,0 +1,95 @@
+"""The journal of a recording: what was captured, and what was undone."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Literal
+
+from armcal.errors import InputError, Location
+from armcal.io.folder import check_folder
+from armcal.io.journal.journal import Journal
+
+from armcal_bench.recording.posture import Posture
+
+DATASET, JOURNAL = "dataset.csv", "journal"
+OURS = (DATASET, JOURNAL)
+CAPTURED, UNDONE = "captured", "undone"
+Start = Literal["anew", "resume"]
+
+
+class Book:
+    """An open journal and the postures in it, in order.
+
+    Attributes:
+        last: the newest that was captured, undone or not; None if there is none.
+    """
+
+    def __init__(self, journal: Journal, wall: Callable[[], float] = time.time) -> None:
+        self._journal, self._wall = journal, wall
+        self._postures: dict[str, Posture] = {}
+        self.last: Posture | None = None
+        self._count = 0
+        for entry in journal.recovered.entries:
+            if entry.kind == CAPTURED:
+                self._take(Posture.from_dict(entry.content))
+            elif entry.kind == UNDONE:
+                self._postures.pop(entry.content["name"], None)
+
+    @property
+    def postures(self) -> tuple[Posture, ...]:
+        """All that stand, in the order of capture."""
+        return tuple(self._postures.values())
+
+    def capture(
+        self, angles: Mapping[str, float], spread: float, readings: int, labels: Mapping[str, str], stamp: float | None
+    ) -> Posture:
+        """Write a posture; it outlasts a power loss when this returns. See ``Journal.record`` for what it raises."""
+        at = max(self._wall(), self.last.at if self.last else 0.0)
+        posture = Posture(str(self._count + 1), dict(angles), spread, readings, at, dict(labels), stamp)
+        self._journal.record(CAPTURED, posture.as_dict())
+        self._take(posture)
+        return posture
+
+    def undo(self) -> Posture | None:
+        """Take the last posture back, for good; None if there is none."""
+        if not self._postures:
+            return None
+        name = next(reversed(self._postures))
+        self._journal.record(UNDONE, {"name": name})
+        return self._postures.pop(name)
+
+    def _take(self, posture: Posture) -> None:
+        self._postures[posture.name] = self.last = posture
+        self._count += 1
+
+
+@contextmanager
+def opened_book(folder: Path, start: Start, channels: Sequence[str], labels: Sequence[str]) -> Iterator[Book]:
+    """The journal in a recording's folder.
+
+    Raises:
+        InputError: there is a recording and it was not said to go on with it, or none and it was; or it is of other
+            joints or labels.
+        JournalDamagedError: it cannot be read.
+    """
+    where, there = Location(str(folder)), (folder / JOURNAL).is_dir()
+    if there and start == "anew":
+        raise InputError("it holds a recording already.", where=where, hint="Go on by --resume, or give another --out.")
+    if start == "resume" and not there:
+        raise InputError("it holds no recording to resume.", where=where, hint="Leave --resume out to begin one.")
+    check_folder(folder, OURS)
+    header: dict[str, Any] = {"joints": list(channels), "labels": list(labels)}
+    with Journal.open(folder / JOURNAL, header) as journal:
+        begun = journal.recovered.header
+        for key in header if begun else ():
+            if list(begun.get(key, ())) != header[key]:
+                found, expected = (", ".join(map(str, each)) or "none" for each in (begun.get(key, ()), header[key]))
+                raise InputError(
+                    f"it was begun with the {key} {found}; the configuration has {expected}.",
+                    where=where,
+                    hint="Give the configuration that it was begun with, or another --out.",
+                )
+        yield Book(journal)

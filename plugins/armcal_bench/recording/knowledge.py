@@ -1,0 +1,154 @@
+"""What the postures so far determine of the free parameters, and what would tell more."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from armcal.base.dataset import Dataset
+from armcal.base.domains import Array
+from armcal.errors import ArmcalError
+from armcal.estimate.identifiability import RANK_TOLERANCE
+from armcal.estimate.nuisance import restricted
+from armcal.estimate.scale import GIVE_A_LENGTH, UNSEEN_SCALE, scale_is_unseen
+from armcal.estimate.structure import explain, identify_from
+from armcal.estimate.validation import hold_out
+from armcal.problem.problem import FactorRecords, Problem
+from armcal.problem.projection import factor_at_zero, projected
+from armcal.run.experiment import Experiment
+from armcal.run.groups import labels_of
+from scipy.linalg import qr
+
+FEW = 6
+"""So many undetermined combinations are named at most."""
+_TURN = np.radians(25.0)
+_SLIDE = 0.05
+_ABOUT = 6
+"""So many of the newest postures are varied, joint by joint."""
+_RIDGE = 1e-6
+_WORTH = 0.7
+"""Joints that tell nearly as much as the best one are named too."""
+_MOST_NAMED = 3
+
+
+@dataclass(frozen=True)
+class Knowledge:
+    """What is known, counted as ``armcal identify`` counts.
+
+    Attributes:
+        rank, free: determined combinations, of so many numbers.
+        records: how many postures train.
+        missing: the undetermined combinations, once they are few: to name many takes long, and tells little.
+        vary: joints that would tell most if they were moved more, the best first.
+    """
+
+    rank: int
+    free: int
+    records: int
+    missing: tuple[str, ...]
+    vary: tuple[str, ...]
+
+
+def knowledge(
+    experiment: Experiment, problem: Problem, records: Sequence[FactorRecords], dataset: Dataset
+) -> Knowledge:
+    """Judge a dataset's postures, those that would train a run.
+
+    Raises:
+        ArmcalError: it cannot be judged.
+    """
+    train = _training(experiment, dataset)
+    problem, training = _restricted(problem, records, train)
+    if not problem.parameters.free:
+        return Knowledge(0, 0, len(train), (), ())
+    triangle = factor_at_zero(problem, problem.parameters.nominal(), training)
+    scaled = triangle * problem.parameters.scales()
+    rank, free = _rank(scaled), scaled.shape[1]
+    missing: tuple[str, ...] = ()
+    if free - rank <= FEW:
+        missing = tuple(map(str, identify_from(triangle, problem.parameters).undetermined))
+    return Knowledge(rank, free, len(train), missing, _joints_to_vary(problem, dataset.subset(train), scaled, rank))
+
+
+def _rank(scaled: Array) -> int:
+    """As ``identifiability.analyse`` decides it."""
+    diagonal = np.abs(np.diag(qr(scaled, pivoting=True, mode="r")[0]))
+    counts = []
+    for values in (np.linalg.svd(scaled, compute_uv=False), diagonal):
+        largest = float(values.max(initial=0.0))
+        counts.append(int(np.sum(values > RANK_TOLERANCE * largest)) if largest > 0 else 0)
+    return max(counts)
+
+
+def explained(
+    experiment: Experiment, problem: Problem, records: Sequence[FactorRecords], dataset: Dataset
+) -> tuple[str, ...]:
+    """Everything that is not determined, or hardly, with why: gauges too, which no posture would tell.
+
+    Raises:
+        ArmcalError: it cannot be judged.
+    """
+    problem, training = _restricted(problem, records, _training(experiment, dataset))
+    if not problem.parameters.free:
+        return ()
+    values = problem.parameters.nominal()
+    known = identify_from(factor_at_zero(problem, values, training), problem.parameters)
+    lines = [str(each) for each in explain(problem, values, training, known)]
+    if scale_is_unseen(problem, values, training, known):
+        lines.insert(0, f"{UNSEEN_SCALE}; {GIVE_A_LENGTH}")
+    hardly = [f"{each}: hardly determined (sd {sd:.2g} ordinary sizes)" for each, sd in known.hardly]
+    return (*lines, *hardly)
+
+
+def _training(experiment: Experiment, dataset: Dataset) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
+    """The postures that a run would train on; all while none would be."""
+    asked, everything = experiment.settings.validation, np.arange(len(dataset), dtype=np.intp)
+    if asked.train_groups:
+        labels = labels_of(experiment, dataset)
+        chosen = np.array([i for i, label in enumerate(labels) if label in asked.train_groups], dtype=np.intp)
+    elif asked.holdout and asked.train_ids is None and len(dataset) > 2:
+        chosen = hold_out(len(dataset), asked.holdout, asked.seed, experiment.poses(dataset)).train
+    else:
+        chosen = everything
+    return chosen if len(chosen) else everything
+
+
+def _restricted(
+    problem: Problem, records: Sequence[FactorRecords], train: np.ndarray[tuple[int], np.dtype[np.intp]]
+) -> tuple[Problem, tuple[FactorRecords, ...]]:
+    training = problem.subset(records, train)
+    return restricted(problem, training), training
+
+
+def _joints_to_vary(problem: Problem, dataset: Dataset, scaled: Array, rank: int) -> tuple[str, ...]:
+    """Joints whose motion from the newest postures, the contact kept, adds most information (log determinant)."""
+    joints = {
+        f"{name}.{joint}": _TURN if kind == "angle" else _SLIDE
+        for name, arm in problem.blueprint.arms.items()
+        for joint, kind in arm.commanded.items()
+    }
+    about = dataset.subset(range(max(0, len(dataset) - _ABOUT), len(dataset)))
+    scales, values = problem.parameters.scales(), problem.parameters.nominal()
+    base = scaled.T @ scaled
+    base += np.eye(len(scales)) * _RIDGE * max(float(np.trace(base)) / max(rank, 1), 1e-300)
+    gains: dict[str, float] = {}
+    for channel, step in joints.items():
+        try:
+            moved = projected(problem, values, problem.records(_moved(about, channel, step)))
+            rows = problem.triangular_factor(values, moved) * scales
+        except ArmcalError:
+            continue
+        gains[channel] = float(np.linalg.slogdet(base + rows.T @ rows)[1] - np.linalg.slogdet(base)[1])
+    best = max(gains.values(), default=0.0)
+    ranked = sorted((c for c, gain in gains.items() if gain > _WORTH * best > 0), key=lambda c: -gains[c])
+    alone = len(problem.blueprint.arms) == 1
+    return tuple(c.partition(".")[2] if alone else c for c in ranked[:_MOST_NAMED])
+
+
+def _moved(about: Dataset, channel: str, step: float) -> Dataset:
+    """The postures with one joint moved to either side."""
+    both = about.subset([*range(len(about)), *range(len(about))])
+    signs = np.repeat([1.0, -1.0], len(about))
+    channels = {**both.channels, channel: both.column(channel) + step * signs}
+    return replace(both, ids=tuple(str(i) for i in range(len(both))), channels=channels)

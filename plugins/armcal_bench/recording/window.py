@@ -1,0 +1,151 @@
+"""The last readings of a stream, and the posture that they show while nothing moves."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from armcal.arm.assembly import Arm
+from armcal.base.domains import Array
+from armcal.base.units import display_unit, to_unit
+from armcal.devices.joint_stream import JointSample
+
+_FULL_TURN = 2 * math.pi * (1 + 1e-9)
+_LONG_ENOUGH = 0.8
+"""Of the window: readings need not fall on its ends."""
+_MOST = 100_000
+
+
+@dataclass(frozen=True)
+class JointKinds:
+    """What the channels of some arms are.
+
+    Attributes:
+        dimensions: ``angle`` or ``length`` by channel, in order.
+        endless: channels of joints that may turn on and on.
+    """
+
+    dimensions: Mapping[str, str]
+    endless: frozenset[str]
+
+    @classmethod
+    def of(cls, arms: Mapping[str, Arm]) -> JointKinds:
+        """Those of arms by name."""
+        dimensions = {f"{name}.{joint}": kind for name, arm in arms.items() for joint, kind in arm.commanded.items()}
+        endless = {f"{name}.{j.name}" for name, arm in arms.items() for j in arm.nominal_chain.joints if j.endless}
+        return cls(dimensions, frozenset(endless & set(dimensions)))
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """In order."""
+        return tuple(self.dimensions)
+
+    def fault_of(self, angles: Mapping[str, float]) -> str:
+        """Why these cannot be joint angles, a sentence; empty if they can."""
+        lacking = [channel for channel in self.dimensions if channel not in angles]
+        if lacking:
+            return f"the readings have no {lacking[0]}: found {len(angles)} joints, expected {len(self.dimensions)}."
+        for channel, kind in self.dimensions.items():
+            value = angles[channel]
+            if not math.isfinite(value):
+                return f"the reading of {channel} is {value}, which is no angle."
+            if kind == "angle" and channel not in self.endless and abs(value) > _FULL_TURN:
+                return (
+                    f"{channel} would stand at {value:.6g} rad, more than one turn (2 pi rad): does the stream give "
+                    "degrees, or turns of the motor?"
+                )
+        return ""
+
+    def shown(self, channel: str, amount: float) -> str:
+        """An amount with its unit."""
+        unit = display_unit(self.dimensions[channel]).name
+        return f"{to_unit(amount, unit):.3g} {unit}"
+
+
+@dataclass(frozen=True)
+class Mean:
+    """The readings of a window, or why they make no posture (a sentence).
+
+    Attributes:
+        angles: means by channel.
+        spread: of the joint that moved most (rad or m).
+    """
+
+    angles: Mapping[str, float]
+    spread: float
+    readings: int
+    labels: Mapping[str, str]
+    stamp: float | None
+    why_not: str = ""
+
+
+class SampleWindow:
+    """The newest readings; times are the source's own where it gives them.
+
+    Args:
+        kinds: of the joints.
+        length: how much is kept (s).
+        spread, sliding_spread: how far turning and sliding joints may move in it (rad, m).
+        least: how many readings it needs.
+    """
+
+    def __init__(self, kinds: JointKinds, length: float, spread: float, sliding_spread: float, least: int) -> None:
+        self._kinds, self._length, self._least = kinds, length, least
+        limits = {"angle": spread, "length": sliding_spread}
+        self._limits = np.array([limits[kind] for kind in kinds.dimensions.values()])
+        self._samples: deque[tuple[float, JointSample]] = deque(maxlen=_MOST)
+
+    def add(self, sample: JointSample) -> None:
+        """The next reading; where time or labels jump, those before are forgotten."""
+        at = sample.arrived if sample.stamp is None else sample.stamp
+        if self._samples:
+            last_at, last = self._samples[-1]
+            is_other = last.labels != sample.labels or (last.stamp is None) != (sample.stamp is None)
+            if is_other or not 0 <= at - last_at <= self._length:
+                self._samples.clear()
+        self._samples.append((at, sample))
+        while at - self._samples[0][0] > self._length * (1 + 1e-9):
+            self._samples.popleft()
+
+    def clear(self) -> None:
+        """Forget all."""
+        self._samples.clear()
+
+    def mean(self) -> Mean:
+        """The posture, or why there is none."""
+        count = len(self._samples)
+        if not count:
+            return _none("no joint readings came.")
+        lasts = self._samples[-1][0] - self._samples[0][0]
+        if count < self._least or lasts < _LONG_ENOUGH * self._length:
+            return _none(
+                f"only {count} readings over {lasts:.2f} s are there, expected {self._least} over "
+                f"{self._length:g} s: wait, or let the source send more often."
+            )
+        newest = self._samples[-1][1]
+        rows = np.array([[s.angles[channel] for channel in self._kinds.channels] for _, s in self._samples])
+        spreads = np.ptp(rows, axis=0)
+        worst = int(np.argmax(spreads / self._limits))
+        if spreads[worst] > self._limits[worst]:
+            return _none(self._not_still(worst, spreads))
+        return Mean(
+            angles=dict(zip(self._kinds.channels, rows.mean(axis=0).tolist(), strict=True)),
+            spread=float(spreads[worst]),
+            readings=count,
+            labels=newest.labels,
+            stamp=None if newest.stamp is None else float(np.mean([at for at, _ in self._samples])),
+        )
+
+    def _not_still(self, worst: int, spreads: Array) -> str:
+        channel = self._kinds.channels[worst]
+        moved, allowed = (self._kinds.shown(channel, x) for x in (spreads[worst], self._limits[worst]))
+        return (
+            f"the arm does not stand still: {channel} moved by {moved} within {self._length:g} s (allowed: {allowed})."
+        )
+
+
+def _none(why: str) -> Mean:
+    return Mean({}, 0.0, 0, {}, None, why)

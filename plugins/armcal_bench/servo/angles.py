@@ -1,0 +1,181 @@
+"""From lines of the record to angles observed at pulses."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from armcal.base.domains import Array
+
+from armcal_bench.servo.known import Observation
+from armcal_bench.servo.nominal import By, NominalArm
+from armcal_bench.servo.record import ANGLE, POSE
+from armcal_bench.servo.settings import ServoCalibrationSettings
+from armcal_bench.servo.turning import NoTurnError, Turning, mean_angle, turning_of_positions, turning_of_rotations
+
+_LEAST_SEEN_M = 1e-4
+_FARTHEST_AXIS = math.radians(30.0)
+_MOST_OFF_AXIS = math.radians(10.0)
+"""Springs, and axes that are not as drawn, give less."""
+_CHECK_IT = "is another servo on its channel? Look with armcal servo --check"
+Entry = Mapping[str, Any]
+
+
+@dataclass(frozen=True, eq=False)
+class Sweeps:
+    """A joint's lines that tell angles, and what they tell.
+
+    Attributes:
+        lines: of the record.
+        angles: found (rad), what springs give taken out as far as it is known.
+        sds: of these (rad).
+        by: what they were found by; None: somebody said so.
+        turning: how the tool turned, where a tracker saw it.
+    """
+
+    lines: tuple[Entry, ...]
+    angles: Array
+    sds: Array
+    by: By | None = None
+    turning: Turning | None = None
+
+    @property
+    def counts(self) -> list[int]:
+        """Of each pulse."""
+        return [int(line["counts"]) for line in self.lines]
+
+    @property
+    def approaches(self) -> list[int]:
+        """From where the angle came: 1 from below."""
+        counts = np.array(self.counts)
+        falls = len(set(self.counts)) > 1 and np.polyfit(counts - counts.mean(), self.angles, 1)[0] < 0
+        return [-int(line["came"]) if falls else int(line["came"]) for line in self.lines]
+
+
+@dataclass(frozen=True, eq=False)
+class Springs:
+    """An arm with its springs, and where a joint stood in each line: what they give there can be taken out.
+
+    Attributes:
+        about: the arm, with the compliances as well as they are known.
+        angles: of the joint (rad), line by line.
+        seat: ``tool_R_body``, how the tracked body sits on the model's tool (3x3).
+    """
+
+    about: NominalArm
+    angles: tuple[float, ...]
+    seat: Array = field(default_factory=lambda: np.eye(3))
+
+    def given(self, lines: Sequence[Entry], joint: str) -> Array:
+        """What springs give in each line (N x 4 x 4): a rotation in the body's axes, a translation in the base's."""
+        found = np.array([self.about.give(pose) for pose in self._poses(lines, joint)])
+        found[:, :3, :3] = self.seat.T @ found[:, :3, :3] @ self.seat
+        return found
+
+    def poses(self, sweeps: Sweeps, joint: str) -> list[dict[str, float]]:
+        """All joints' angles (rad), line by line."""
+        return self._poses(sweeps.lines, joint)
+
+    def _poses(self, lines: Sequence[Entry], joint: str) -> list[dict[str, float]]:
+        return [{**line["told"], joint: angle} for line, angle in zip(lines, self.angles, strict=True)]
+
+
+def sweeps_of(
+    entries: Sequence[Entry],
+    joint: str,
+    nominal: NominalArm,
+    settings: ServoCalibrationSettings,
+    springs: Springs | None = None,
+) -> Sweeps | str:
+    """A joint's angles, or why they cannot be told."""
+    poses = [e for e in entries if e["kind"] == POSE and e["joint"] == joint]
+    said = list({(e["target"], e["came"]): e for e in entries if e["kind"] == ANGLE and e["joint"] == joint}.values())
+    if not poses and not said:
+        return "nothing was measured"
+    if not poses:
+        return Sweeps(tuple(said), np.array([e["angle"] for e in said]), np.array([e["sd"] for e in said]))
+    given = np.tile(np.eye(4), (len(poses), 1, 1)) if springs is None else springs.given(poses, joint)
+    find = _by_positions if any(e["rotation"] is None for e in poses) else _by_rotations
+    try:
+        return find(poses, joint, nominal, settings, given)
+    except NoTurnError as fault:
+        return str(fault)
+
+
+def told_by(sweeps: Sweeps, joint: str, nominal: NominalArm, springs: Springs | None) -> list[Observation]:
+    """As a fit takes them. Of what springs give, the change of compliances from ``nominal`` is left to be found."""
+    rows = list(zip(sweeps.counts, sweeps.approaches, sweeps.angles.tolist(), sweeps.sds.tolist(), strict=True))
+    if springs is None or sweeps.by is None:
+        return [Observation(joint, *row) for row in rows]
+    about = springs.about
+    changes = np.array([about.compliance(name) - nominal.compliance(name) for name in about.compliances])
+    found = []
+    for row, pose in zip(rows, springs.poses(sweeps, joint), strict=True):
+        slopes = about.slopes(joint, pose, sweeps.by)
+        found.append(
+            Observation(joint, *row, -float(slopes @ changes), dict(zip(about.compliances, slopes, strict=True)))
+        )
+    return found
+
+
+def _by_rotations(
+    poses: Sequence[Entry], joint: str, nominal: NominalArm, settings: ServoCalibrationSettings, given: Array
+) -> Sweeps:
+    others = _others(poses, joint)
+    rotations = [np.array(e["rotation"]) @ g[:3, :3].T for e, g in zip(poses, given, strict=True)]
+    axis = nominal.axis(joint, {**others, joint: 0.0})[0]
+    turning = turning_of_rotations(rotations, axis)
+    _check_axis(turning, axis, turning.off_axis)
+    absolute = np.array([nominal.angle_of_rotation(joint, others, r) for r in rotations])
+    angles = turning.angles + mean_angle(absolute - turning.angles)
+    seen = [_about(e, r, turning.axis) for e, r in zip(poses, rotations, strict=True)]
+    return Sweeps(tuple(poses), angles, np.hypot(seen, settings.rotation_sd), "rotation", turning)
+
+
+def _by_positions(
+    poses: Sequence[Entry], joint: str, nominal: NominalArm, settings: ServoCalibrationSettings, given: Array
+) -> Sweeps:
+    others = _others(poses, joint)
+    positions = np.array([np.array(e["position"]) - g[:3, 3] for e, g in zip(poses, given, strict=True)])
+    axis = nominal.axis(joint, {**others, joint: 0.0})[0]
+    turning = turning_of_positions(positions, axis, settings.least_radius)
+    radius = turning.radius or math.inf
+    _check_axis(turning, axis, turning.off_axis / radius)
+    absolute = np.array([nominal.angle_of_position(joint, others, p) for p in positions])
+    angles = turning.angles + mean_angle(absolute - turning.angles)
+    seen = [max(_rms([d or 0.0 for d in e["deviations"][:3]]), _LEAST_SEEN_M) / radius for e in poses]
+    return Sweeps(tuple(poses), angles, np.hypot(seen, settings.rotation_sd), "position", turning)
+
+
+def _check_axis(turning: Turning, axis: Array, off_axis: float) -> None:
+    """Whether it is this joint that turned.
+
+    Raises:
+        NoTurnError: it is not.
+    """
+    apart = math.acos(min(abs(float(turning.axis @ axis)), 1.0))
+    if apart > _FARTHEST_AXIS:
+        raise NoTurnError(
+            f"the tool turned about an axis that is {math.degrees(apart):.0f} deg from this joint's: {_CHECK_IT}"
+        )
+    if off_axis > _MOST_OFF_AXIS:
+        raise NoTurnError(f"the tool did not turn about one axis (it is {math.degrees(off_axis):.0f} deg off it)")
+
+
+def _about(entry: Entry, rotation: Array, axis: Array) -> float:
+    """The deviation of the turn about an axis of the base (rad)."""
+    in_target = rotation.T @ axis
+    return float(np.linalg.norm(in_target * np.array([d or 0.0 for d in entry["deviations"][3:]])))
+
+
+def _others(poses: Sequence[Entry], joint: str) -> dict[str, float]:
+    """Where the other joints stood: the median, since each was told the same pulse every time."""
+    names = {name for e in poses for name in e["told"]} - {joint}
+    return {name: float(np.median([e["told"][name] for e in poses if name in e["told"]])) for name in sorted(names)}
+
+
+def _rms(numbers: Sequence[float]) -> float:
+    return math.sqrt(sum(x * x for x in numbers) / len(numbers))

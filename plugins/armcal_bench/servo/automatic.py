@@ -1,0 +1,169 @@
+"""Servos measured by a tracker, one joint at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from armcal.devices.faults import DeviceError
+
+from armcal_bench.acquisition.eyes import TrackerEyes
+from armcal_bench.servo.mover import Mover, StoppedError
+from armcal_bench.servo.record import LEFT_OUT, POSE, Record
+from armcal_bench.servo.setup import Setup
+from armcal_bench.servo.sweep import Point, angles_told, come_to, left, sweep, to_base
+from armcal_bench.servo.warmth import Warmth
+from armcal_bench.settling import Settled
+
+_MOST_FAULTS = 10
+_MOST_RESTLESS = 3
+_LOOKED_AT_EVERY_S = 1.0
+_WARM = "a servo had to rest before the tracker was back"
+
+Told = Callable[[str, int, int], None]
+"""Told the joint, and how many of its points are done and planned."""
+
+
+class OutOfSightError(StoppedError):
+    """The tracker stays away."""
+
+
+class RestlessError(StoppedError):
+    """Time after time the arm does not come to stand: a servo stalls, or has let go."""
+
+
+@dataclass
+class Automatic:
+    """A tracked calibration. What is in the record is not measured again."""
+
+    setup: Setup
+    mover: Mover
+    eyes: TrackerEyes
+    record: Record
+    told: Told
+    warmth: Warmth
+    faults: int = 0
+    restless: int = 0
+    first: int = 0
+
+    def run(self) -> None:
+        """Measure all that is left; the arm ends in its base pose.
+
+        Raises:
+            StoppedError: it was asked for, and the arm holds; or the tracker stays away, or the arm does not come to
+                stand: then it is in its base pose.
+            DeviceError: the device is gone and does not come back.
+        """
+        try:
+            self._run()
+        except (OutOfSightError, RestlessError):
+            # Nobody may be there for hours, and it could hold a heavy pose.
+            self._persist(lambda: to_base(self.setup, self.mover))
+            raise
+
+    def _run(self) -> None:
+        self.first = len(self.record.entries)
+        if not any(left(sweep(self.setup, self.mover, joint), self._done) for joint in self.setup.joints):
+            return
+        self._persist(lambda: to_base(self.setup, self.mover))
+        self.mover.guard(self.setup.base)
+        for joint in self.setup.joints:
+            points = sweep(self.setup, self.mover, joint)
+            for point in left(points, self._done):
+                self._persist(lambda at=point: self._measure(at))  # type: ignore[misc]
+                self.told(joint, len(points) - len(left(points, self._done)), len(points))
+            self._persist(lambda: to_base(self.setup, self.mover))
+        self.mover.guard({})
+
+    @property
+    def _done(self) -> list[Mapping[str, Any]]:
+        """Lines of points that are not to be measured now; what an earlier run left out is tried once more."""
+        lines = enumerate(self.record.entries)
+        return [line for i, line in lines if i >= self.first or line["kind"] != LEFT_OUT]
+
+    def capture(self) -> Settled | str:
+        """Where the tool stands, once it does; or why that is not known.
+
+        Raises:
+            OutOfSightError: the tracker has told nothing of use for too long.
+        """
+        settings = self.setup.bench.settings.acquisition
+        self.eyes.begin()
+        until = self.mover.clock.now() + settings.settle.longest
+        while self.mover.clock.now() < until:
+            self.mover.tick()
+            found = self.eyes.settled()
+            if found is not None:
+                self.mover.waits.over("tracker", self.mover.clock.now())
+                return found
+            seconds, why = self.eyes.trouble()
+            if seconds >= settings.lost.park:
+                self.mover.waits.given_up("tracker")
+                told = f"the tracker has told nothing for {seconds:.0f} s ({why})"
+                raise OutOfSightError(told, "the arm holds its base pose")
+            if seconds >= settings.lost.hold:
+                left = settings.lost.park - seconds
+                self.mover.waits.goes_on("tracker", f"the arm holds: {why}", left, self.mover.clock.now())
+                if self.warmth.must_rest:
+                    return _WARM
+                until = self.mover.clock.now() + settings.settle.longest
+        return self.eyes.why or "the arm did not come to stand"
+
+    def look(self) -> None:
+        """What is done after every pause: the tracker's frames, and the servos' warmth."""
+        self.eyes.look()
+        self.warmth.pass_to_now(angles_told(self.mover))
+
+    def _rest(self) -> None:
+        """In the base pose, once a servo is near its budget."""
+        if self.warmth.must_rest:
+            to_base(self.setup, self.mover)
+            waits, clock = self.mover.waits, self.mover.clock
+            while (left_s := self.warmth.rest_s) > 0:
+                waits.goes_on("rest", "the servos cool in the base pose", left_s, clock.now())
+                self.mover.stand(min(left_s, _LOOKED_AT_EVERY_S))
+            waits.over("rest", clock.now())
+
+    def _measure(self, point: Point) -> None:
+        found: Settled | str = _WARM
+        while found == _WARM:
+            self._rest()
+            come_to(self.setup, self.mover, point)
+            found = self.capture()
+        here: dict[str, Any] = {"joint": point.joint, "counts": point.counts, "came": point.came}
+        here |= {"at": self.mover.clock.wall(), "warmth": self.warmth.by_joint, "told": angles_told(self.mover)}
+        if isinstance(found, str):
+            self.record.append(LEFT_OUT, {**here, "why": found})
+            self.restless += 1
+            if self.restless >= _MOST_RESTLESS:
+                told = f"{point.joint} did not come to stand {self.restless} times in a row ({found})"
+                raise RestlessError(f"{told}: does a servo stall, or let go?", "the arm is told to hold its base pose")
+            return
+        self.record.append(POSE, {**here, **pose_entry(found)})
+        self.faults = self.restless = 0
+
+    def _persist(self, action: Callable[[], None]) -> None:
+        """Do it; when the device fails, do it again once it is back."""
+        while True:
+            try:
+                action()
+                return
+            except DeviceError as fault:
+                self.faults += 1
+                if self.faults > _MOST_FAULTS:
+                    raise
+                self.mover.recover(fault)
+
+
+def pose_entry(found: Settled) -> dict[str, Any]:
+    """A settled pose as a line of the record tells it."""
+    pose = found.base_T_target
+    seen = not np.isnan(pose[:3, :3]).any()
+    return {
+        "position": pose[:3, 3].tolist(),
+        "rotation": pose[:3, :3].tolist() if seen else None,
+        "deviations": [float(d) if np.isfinite(d) else None for d in found.deviations],
+        "frames": found.frames,
+    }

@@ -1,0 +1,116 @@
+"""What somebody wishes, by single keys of a terminal or by lines from anywhere else."""
+
+from __future__ import annotations
+
+import os
+import select
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Protocol
+
+from armcal_bench.terminal import keep_single_keys, single_keys
+
+QUIT = "quit"
+_KEYS = {
+    b"\x1b[A": "+1",
+    b"\x1b[B": "-1",
+    b"\x1bOA": "+1",
+    b"\x1bOB": "-1",
+    b"\x1b[5~": "+10",
+    b"\x1b[6~": "-10",
+    b"+": "+1",
+    b"-": "-1",
+    b"\r": "ok",
+    b"\n": "ok",
+    b"s": "skip",
+    b"b": "back",
+    b"q": QUIT,
+    b"\x03": QUIT,
+    b"\x04": QUIT,
+    b"y": "y",
+    b"r": "r",
+    b"o": "o",
+    b"n": "n",
+}
+_LONGEST_KEY = max(map(len, _KEYS))
+
+
+class Wishes(Protocol):
+    """Where wishes come from."""
+
+    def next(self, seconds: float) -> str | None:
+        """The next wish: a number of microseconds with its sign, ``ok``, ``skip``, ``back``, ``quit`` or an answer.
+
+        None if none came in so many real seconds. The end of the input is ``quit``.
+        """
+
+
+class Keys:
+    """Single keys of a terminal; see ``terminal.single_keys`` for the mode that it must be in."""
+
+    def __init__(self, descriptor: int) -> None:
+        self._descriptor, self._read = descriptor, b""
+
+    def next(self, seconds: float) -> str | None:
+        """See ``Wishes``."""
+        keep_single_keys(self._descriptor)
+        while (wish := self._taken()) is None:
+            if not select.select([self._descriptor], [], [], seconds)[0]:
+                # An escape with nothing after it is no key.
+                self._read = b""
+                return None
+            try:
+                more = os.read(self._descriptor, 64)
+            except OSError:  # the terminal is gone
+                more = b""
+            if not more:
+                return QUIT
+            self._read += more
+        return wish
+
+    def _taken(self) -> str | None:
+        """The first key of what was read; what is no key is passed over."""
+        while self._read:
+            for length in range(min(_LONGEST_KEY, len(self._read)), 0, -1):
+                if (wish := _KEYS.get(self._read[:length])) is not None:
+                    self._read = self._read[length:]
+                    return wish
+            if any(key.startswith(self._read) for key in _KEYS):
+                return None
+            self._read = self._read[1:]
+        return None
+
+
+class Lines:
+    """A wish a line, for scripts."""
+
+    def __init__(self, descriptor: int) -> None:
+        self._descriptor, self._read, self._ended = descriptor, b"", False
+
+    def next(self, seconds: float) -> str | None:
+        """See ``Wishes``."""
+        while b"\n" not in self._read:
+            if self._ended:
+                last, self._read = self._read, b""
+                return _said(last) or QUIT
+            if not select.select([self._descriptor], [], [], seconds)[0]:
+                return None
+            more = os.read(self._descriptor, 4096)
+            self._ended = not more
+            self._read += more
+        line, _, self._read = self._read.partition(b"\n")
+        return _said(line) or self.next(seconds)
+
+
+@contextmanager
+def wishes_from(descriptor: int) -> Iterator[Wishes]:
+    """Keys where a terminal is, whose mode is put back whatever happens; else lines."""
+    if not os.isatty(descriptor):
+        yield Lines(descriptor)
+        return
+    with single_keys(descriptor):
+        yield Keys(descriptor)
+
+
+def _said(line: bytes) -> str:
+    return line.decode("utf-8", "replace").strip().lower()

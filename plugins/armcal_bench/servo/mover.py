@@ -1,0 +1,257 @@
+"""Servos moved by their pulses, slowly, one at a time."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+from armcal.arm.servo import PulseClock
+from armcal.devices.clock import Clock
+from armcal.devices.device import DeviceIdentity, JointDevice, PulseDevice
+from armcal.devices.faults import DeviceError, DeviceRefusedError
+from armcal.errors import InputError
+
+from armcal_bench.servo.known import KnownServo
+from armcal_bench.waiting import Waits
+
+_ALIVE_EVERY_S = 0.1
+_BETWEEN_JOINTS_S = 0.5
+_AGAIN_EVERY_S = 0.25
+_LONGEST_LOSS_S = 30.0
+
+
+class ServoDevice(JointDevice, PulseDevice, Protocol):
+    """What a servo calibration needs: joints moved by pulses."""
+
+
+class StoppedError(Exception):
+    """The end before everything is measured: somebody asked for it, or the tracker stays away.
+
+    Attributes:
+        arm: what the arm does now, in words.
+    """
+
+    def __init__(self, why: str, arm: str = "the arm holds") -> None:
+        super().__init__(why)
+        self.arm = arm
+
+
+@dataclass(frozen=True)
+class Motion:
+    """How servos may be moved.
+
+    Attributes:
+        rate: the fastest (rad/s, by the stated tables).
+        period: between steps (s).
+        pulses: the shortest and the longest pulse (s), by joint.
+        silence: of the host, after which a board that can goes back to the base pose (s).
+    """
+
+    rate: float
+    period: float
+    pulses: Mapping[str, tuple[float, float]]
+    silence: float = 1.0
+
+
+@dataclass
+class Mover:
+    """Moves servos; ``told`` holds each one's counts as they were set, and ``came`` the sign of its last step.
+
+    Args:
+        device: opened by ``open``.
+        clock: for all waiting.
+        servos: by joint, with the clock of their board: what angles are turned into pulses by.
+        read_by: the same as the device has them, by which it tells its angles.
+        motion: how fast, and how far.
+        asked_to_stop: looked at in every step.
+        look: called after every pause, for who watches the arm meanwhile.
+        waits: says what is waited for.
+    """
+
+    device: ServoDevice
+    clock: Clock
+    servos: Mapping[str, tuple[KnownServo, PulseClock]]
+    read_by: Mapping[str, tuple[KnownServo, PulseClock]]
+    motion: Motion
+    asked_to_stop: Callable[[], bool]
+    look: Callable[[], None] = field(default=lambda: None)
+    waits: Waits = field(default_factory=Waits)
+    identity: DeviceIdentity | None = None
+    told: dict[str, int] = field(default_factory=dict)
+    came: dict[str, int] = field(default_factory=dict)
+    _alive: float = -math.inf
+    _guarded: Mapping[str, float] = field(default_factory=dict)
+
+    def open(self) -> DeviceIdentity:
+        """Open the device and learn which pulses it makes; nothing moves.
+
+        Raises:
+            DeviceRefusedError: it cannot set pulses, or is not the right one.
+        """
+        if not hasattr(self.device, "set_pulse"):
+            raise DeviceRefusedError(
+                "this device cannot set pulses by their length.", hint="Calibrate servos with a device like pca9685."
+            )
+        self.identity = self.device.open(self.clock)
+        # What the board was told by another run must not be done now: ways home of that time are none today.
+        self.device.guard([], self.motion.rate, self.motion.silence)
+        self.told |= self._running()
+        return self.identity
+
+    def counts_at(self, joint: str, angle: float) -> int:
+        """The counts that the stated table gives for an angle (rad)."""
+        return _counts(*self.servos[joint], angle)
+
+    def pulse(self, joint: str, counts: int) -> float:
+        """The pulse of so many counts (s), by the stated oscillator."""
+        return counts * self.servos[joint][1].tick
+
+    def counts_per_rad(self, joint: str) -> float:
+        """By the stated table, where it is least."""
+        servo, clock = self.servos[joint]
+        slopes = np.abs(np.diff(servo.table.pulses) / np.diff(servo.table.angles))
+        return float(slopes.min() / clock.tick)
+
+    def energise(self, joint: str, counts: int) -> None:
+        """A joint's first pulse; nothing if it gets pulses already."""
+        if joint not in self.told:
+            self._set(joint, counts)
+            self.stand(_BETWEEN_JOINTS_S)
+
+    def go(self, joint: str, counts: int) -> None:
+        """Move a joint to a pulse, no faster than allowed.
+
+        Raises:
+            InputError: the pulse is outside the range that is allowed.
+            StoppedError: on the way; the joint holds.
+        """
+        self.check(joint, counts)
+        at = float(self.told[joint])
+        if counts != self.told[joint]:
+            self.came[joint] = 1 if counts > at else -1
+        while self.told[joint] != counts:
+            self._pause(self.motion.period)
+            step = self._counts_per_s(joint) * self.motion.period
+            at += math.copysign(min(step, abs(counts - at)), counts - at)
+            if (near := math.floor(at + 0.5)) != self.told[joint]:
+                self._set(joint, near)
+
+    def check(self, joint: str, counts: int) -> None:
+        """Whether a pulse is allowed.
+
+        Raises:
+            InputError: it is not.
+        """
+        low, high = self.motion.pulses[joint]
+        if not low <= self.pulse(joint, counts) <= high:
+            raise InputError(
+                f"{joint}: found a pulse of {1e6 * self.pulse(joint, counts):.0f} us, expected {1e6 * low:.0f} to "
+                f"{1e6 * high:.0f} us.",
+                hint="Narrow bench.servo.ranges; or widen bench.servo.pulses or its pulse_range if the servo bears it.",
+            )
+
+    def stand(self, seconds: float) -> None:
+        """Wait, and say now and then that the host lives.
+
+        Raises:
+            StoppedError: it was asked for.
+        """
+        until = self.clock.now() + seconds
+        while (left := until - self.clock.now()) > 1e-9:
+            self._pause(min(left, _ALIVE_EVERY_S))
+
+    def tick(self) -> None:
+        """One period of standing still. See ``stand``."""
+        self._pause(self.motion.period)
+
+    def guard(self, base: Mapping[str, float]) -> bool:
+        """What the board is to do when the host falls silent: back to a pose (rad by joint), slowly."""
+        self._guarded = dict(base)
+        return self.device.guard([base] if base else [], self.motion.rate, self.motion.silence)
+
+    def hold(self) -> bool:
+        """The board is to stay where it is when the host falls silent. False: it could not be told, for it is lost."""
+        try:
+            self.guard({})
+        except DeviceError:
+            return False
+        return True
+
+    def recover(self, fault: DeviceError) -> None:
+        """After a fault of the device: open it again, and let every joint have the pulse that it had.
+
+        Raises:
+            StoppedError: it was asked for.
+            DeviceError: it does not come back.
+        """
+        until, last = self.clock.now() + _LONGEST_LOSS_S, fault
+        while (left := until - self.clock.now()) > 0:
+            self.waits.goes_on("device", f"the board is looked for: {last.message.rstrip('.')}", left, self.clock.now())
+            self._stop_if_asked()
+            self.clock.sleep(_AGAIN_EVERY_S)
+            try:
+                self._taken_up()
+                self.waits.over("device", self.clock.now())
+                return
+            except DeviceRefusedError as refused:
+                # Another program or another board may hold the port for a while.
+                last = DeviceError(str(refused))
+            except DeviceError as again:
+                last = again
+        raise last
+
+    def _taken_up(self) -> None:
+        before = dict(self.told)
+        self._same(self.device.open(self.clock))
+        # No way home is known while joints hang free.
+        self.device.guard([], self.motion.rate, self.motion.silence)
+        running = self._running()
+        self.told |= running
+        self.came.clear()
+        for joint in before:
+            if joint not in running:
+                self._set(joint, before[joint])
+                self.stand(_BETWEEN_JOINTS_S)
+        if self._guarded:
+            self.guard(self._guarded)
+
+    def _same(self, found: DeviceIdentity) -> None:
+        begun = self.identity
+        if begun is not None and (found.digest, found.name) != (begun.digest, begun.name):
+            raise DeviceRefusedError(
+                f"found {found.name}, expected {begun.name}, with which the calibration began.",
+                hint="Connect the board that it began with.",
+            )
+
+    def _running(self) -> dict[str, int]:
+        """The counts of the joints that get pulses."""
+        angles = self.device.state().angles
+        return {joint: _counts(*self.read_by[joint], angle) for joint, angle in angles.items() if joint in self.read_by}
+
+    def _set(self, joint: str, counts: int) -> None:
+        self.check(joint, counts)
+        self.device.set_pulse(joint, self.pulse(joint, counts))
+        self.told[joint] = counts
+
+    def _counts_per_s(self, joint: str) -> float:
+        return self.motion.rate * self.counts_per_rad(joint)
+
+    def _pause(self, seconds: float) -> None:
+        self._stop_if_asked()
+        self.clock.sleep(seconds)
+        now = self.clock.now()
+        if now - self._alive >= _ALIVE_EVERY_S:
+            self._alive = now
+            self.device.keep_alive()
+        self.look()
+
+    def _stop_if_asked(self) -> None:
+        if self.asked_to_stop():
+            raise StoppedError("it was asked to stop")
+
+
+def _counts(servo: KnownServo, clock: PulseClock, angle: float) -> int:
+    return math.floor(float(servo.pulses_at(np.array([angle]))[0]) / clock.tick + 0.5)

@@ -1,0 +1,227 @@
+"""What a servo calibration leaves behind: the servo file, and its results."""
+
+from __future__ import annotations
+
+import errno
+import json
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+from armcal.arm.servo import PulseTable
+from armcal.config.servo_file import BoardSettings, ServoFile, ServoSettings, load_servo_file, servo_file_text
+from armcal.config.servo_file_edit import edited_text
+from armcal.errors import ConfigError, InputError, Location
+from armcal.io.journal.files import REAL_FILES, write_whole
+
+from armcal_bench.servo.findings import findings, is_usable
+from armcal_bench.servo.fit import FittedServo
+from armcal_bench.servo.outcome import Outcome
+from armcal_bench.servo.record import next_name
+
+RESULTS = "servo.json"
+_APART = math.radians(0.5)
+"""Knots that are nearer to the end of a shortened table say nothing more."""
+Part = TypeVar("Part", BoardSettings, ServoSettings)
+
+
+def improved(file: ServoFile, outcome: Outcome, adapter: str = "") -> ServoFile:
+    """The servo file with what was found; servos whose board has another oscillator now keep their counts.
+
+    Boards whose adapter was not stated get the one that they were measured on (empty: not known). Of each table that
+    part is kept whose pulses its servo bears.
+    """
+    boards = {name: board if board.id else _changed(board, id=adapter) for name, board in file.boards.items()}
+    for name in outcome.fit.oscillator_sds:
+        hz = outcome.fit.clocks[name].oscillator_hz
+        boards[name] = _changed(boards[name], oscillator_hz=hz)
+    servos: dict[str, ServoSettings] = {}
+    for joint, servo in file.servos.items():
+        found = outcome.fit.servos.get(joint)
+        table = None if found is None else _fitted_table(found, servo, outcome, boards[servo.board])
+        if table is None:
+            longer = file.boards[servo.board].oscillator_hz / boards[servo.board].oscillator_hz
+            same = PulseTable(servo.angles, tuple(pulse * longer for pulse in servo.pulses))
+            table = _borne_part(same, servo, boards[servo.board]) or servo.table
+        servos[joint] = _changed(servo, angles=table.angles, pulses=table.pulses)
+    return ServoFile(boards, servos)
+
+
+def _fitted_table(
+    found: FittedServo, servo: ServoSettings, outcome: Outcome, board: BoardSettings
+) -> PulseTable | None:
+    """The table that is written for a servo that was measured; None where none can be, and its own is kept."""
+    if found.known.trusted_sd is not None:
+        return servo.table
+    if not is_usable(found):
+        return None
+    # Counts stay what they are: the file's board may have another oscillator than that of the record.
+    same = outcome.fit.clocks[servo.board].oscillator_hz / board.oscillator_hz
+    return _borne_part(PulseTable(found.angles, tuple(round(p * same, 9) for p in found.pulses)), servo, board)
+
+
+def _borne_part(table: PulseTable, servo: ServoSettings, board: BoardSettings) -> PulseTable | None:
+    """The part of a table whose pulses (s) its servo bears and its board can make; None where nothing is left."""
+    borne, longest = servo.pulse_range, board.clock.longest_pulse
+    low, high = max(borne[0], min(table.pulses)), min(borne[1], longest, max(table.pulses))
+    if (low, high) == (min(table.pulses), max(table.pulses)):
+        return table
+    if not low < high:
+        return None
+    ends = sorted((float(table.angle(pulse)), pulse) for pulse in (low, high))
+    pairs = list(zip(table.angles, table.pulses, strict=True))
+    inner = [(a, p) for a, p in pairs if low < p < high and ends[0][0] + _APART < a < ends[1][0] - _APART]
+    return PulseTable(*map(tuple, zip(ends[0], *inner, ends[1], strict=True)))
+
+
+def _changed(part: Part, **values: Any) -> Part:
+    stated = {name: getattr(part, name) for name in part.model_fields_set}
+    return type(part).si(**{**stated, **values})
+
+
+def write_servo_file(path: Path, file: ServoFile) -> Path | None:
+    """Put a servo file in place whole; the one before is kept beside it. Where that is, None if nothing changed.
+
+    Numbers are changed where they stand, so that comments stay; where that cannot be, the file is written anew.
+
+    Raises:
+        InputError: it cannot be written; the one before is as it was.
+    """
+    try:
+        path = path.resolve()  # of a link, what it leads to
+        before = path.read_bytes()
+        if not path.stat().st_mode & 0o222:
+            raise PermissionError(errno.EACCES, "it is read-only")
+        text = _text_of(path, before.decode(), file).encode()
+        if text == before:
+            return None
+        kept = next_name(path)
+        write_whole(REAL_FILES, kept, before)
+        write_whole(REAL_FILES, path, text)
+    except OSError as fault:
+        raise InputError(
+            f"it cannot be written ({fault.strerror}).",
+            where=Location(str(path)),
+            hint="Make it writable and give the command again: nothing measured is lost.",
+        ) from fault
+    return kept
+
+
+def _text_of(path: Path, before: str, file: ServoFile) -> str:
+    """The file's text with other numbers, if that is read as what is meant; else the whole file written anew."""
+    text = edited_text(before, load_servo_file(path), file)
+    if text is not None:
+        tried = path.with_name(f".{path.name}.new")
+        try:
+            write_whole(REAL_FILES, tried, text.encode())
+            if load_servo_file(tried) == file:
+                return text
+        except ConfigError:
+            pass
+        finally:
+            tried.unlink(missing_ok=True)
+    return servo_file_text(file)
+
+
+def results(outcome: Outcome, changed: ServoFile) -> dict[str, Any]:
+    """Everything that was found, for programs; units are in the names."""
+    return {
+        "servos": {joint: _servo(servo, outcome, changed) for joint, servo in outcome.fit.servos.items()},
+        "boards": {
+            name: {"oscillator_hz": clock.oscillator_hz, "oscillator_sd_hz": outcome.fit.oscillator_sds.get(name)}
+            for name, clock in outcome.fit.clocks.items()
+        },
+        "compliances_rad_per_Nm": {name: {"value": v, "sd": sd} for name, (v, sd) in outcome.compliances.items()},
+        "not_told": {"servos": dict(outcome.silent), "compliances": list(outcome.fit.untold)},
+        "findings": [*findings(outcome), *_narrowed(outcome, changed)],
+    }
+
+
+def _is_written(found: FittedServo, outcome: Outcome, changed: ServoFile) -> bool:
+    servo = changed.servos[found.known.joint]
+    return _fitted_table(found, servo, outcome, changed.boards[servo.board]) is not None
+
+
+def _narrowed(outcome: Outcome, changed: ServoFile) -> list[str]:
+    """Of tables that reach less far than they were stated to, or than they were to be given for."""
+    said = []
+    for joint, found in outcome.fit.servos.items():
+        servo, stated = changed.servos[joint], found.known.table.angles
+        meant = min(stated[0], found.angles[0]), max(stated[-1], found.angles[-1])
+        if not _is_written(found, outcome, changed):
+            if is_usable(found):
+                said.append(
+                    f"{joint}: the table is left as it was: the servo bears none of the pulses that were found."
+                )
+        elif servo.angles[0] > meant[0] + _APART or servo.angles[-1] < meant[1] - _APART:
+            low, high = (1e6 * pulse for pulse in servo.pulse_range)
+            shortened = (found.angles[0], found.angles[-1]) != (servo.angles[0], servo.angles[-1])
+            why = f"the servo bears {low:g} to {high:g} us" if shortened else "bench.servo.knots ends there"
+            said.append(
+                f"{joint}: its table reaches from {math.degrees(servo.angles[0]):.1f} to "
+                f"{math.degrees(servo.angles[-1]):.1f} deg, not from {math.degrees(meant[0]):.1f} to "
+                f"{math.degrees(meant[1]):.1f} deg: {why}."
+            )
+    return said
+
+
+def write_results(folder: Path, content: Mapping[str, Any]) -> None:
+    """The results beside the record.
+
+    Raises:
+        InputError: the folder cannot be written.
+    """
+    try:
+        write_whole(REAL_FILES, folder / RESULTS, (json.dumps(content, indent=2, allow_nan=False) + "\n").encode())
+    except OSError as fault:
+        raise InputError(
+            f"it cannot be written ({fault.strerror}).", where=Location(str(folder)), hint="Give another --out."
+        ) from fault
+
+
+def _servo(servo: FittedServo, outcome: Outcome, changed: ServoFile) -> dict[str, Any]:
+    sweeps = outcome.sweeps[servo.known.joint]
+    return {
+        "board": servo.known.board,
+        "knots": _knots(servo),
+        "backlash_deg": None if servo.lag is None else 2 * math.degrees(servo.lag),
+        "backlash_sd_deg": _number(2 * math.degrees(servo.lag_sd)),
+        "scatter_deg": math.degrees(servo.scatter),
+        "observations": servo.used,
+        "set_aside": len(servo.outliers),
+        "seen_by": sweeps.by or "somebody",
+        "axis": None if sweeps.turning is None else sweeps.turning.axis.tolist(),
+        "written": _is_written(servo, outcome, changed),
+    }
+
+
+def _knots(servo: FittedServo) -> list[dict[str, Any]]:
+    stated = servo.known.pulses_at(np.array(servo.angles))
+    slopes = _slopes(servo.angles, servo.pulses)
+    rows: Sequence[Any] = list(
+        zip(servo.angles, servo.pulses, servo.pulse_sds, servo.told, stated, slopes, strict=True)
+    )
+    return [
+        {
+            "angle_deg": math.degrees(angle),
+            "pulse_us": 1e6 * pulse,
+            "sd_us": _number(1e6 * sd),
+            "told": told,
+            "before_us": 1e6 * float(before),
+            "change_us": 1e6 * (pulse - float(before)),
+            "change_deg": math.degrees((float(before) - pulse) / slope),
+        }
+        for angle, pulse, sd, told, before, slope in rows
+    ]
+
+
+def _slopes(angles: Sequence[float], pulses: Sequence[float]) -> list[float]:
+    """At each knot, by its neighbours (s/rad)."""
+    each = np.gradient(np.array(pulses), np.array(angles))
+    return [float(slope) if abs(slope) > 1e-9 else math.nan for slope in each]
+
+
+def _number(value: float) -> float | None:
+    return value if math.isfinite(value) else None

@@ -1,0 +1,281 @@
+"""A servo calibration from opening the devices to what it leaves behind."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, cast
+
+from armcal.arm.servo import PulseClock
+from armcal.devices.clock import Clock
+from armcal.devices.faults import DeviceRefusedError
+from armcal.errors import InputError, Location
+
+from armcal_bench.acquisition.eyes import TrackerEyes
+from armcal_bench.hazards import FirstMotion
+from armcal_bench.servo.automatic import Automatic, Told
+from armcal_bench.servo.beginning import begin, check_same, stated_by
+from armcal_bench.servo.guided import Guided
+from armcal_bench.servo.keys import QUIT, Wishes
+from armcal_bench.servo.mover import Motion, Mover, ServoDevice, StoppedError
+from armcal_bench.servo.outcome import Outcome, outcome_of
+from armcal_bench.servo.record import BEGUN, Record
+from armcal_bench.servo.setup import Setup
+from armcal_bench.servo.sweep import angles_told, to_base
+from armcal_bench.servo.trial import Move, Verdict, answered, judged, wrapped
+from armcal_bench.servo.warmth import Warmth
+from armcal_bench.waiting import Waits
+from armcal_bench.wiring import note_checked
+
+_FIRST_FRAME_S = 3.0
+_LOOK_S = 0.1
+_AS_IT_IS = "its pulses go on as they are, unless the board brings the arm to its base pose"
+
+
+@dataclass(frozen=True)
+class Conversation:
+    """How a calibration speaks with whom it is for.
+
+    Attributes:
+        asked_to_stop: whether somebody wants it to hold and end.
+        may_energise: asked once, with what is about to move and what is dangerous in it, before anything does.
+        told: how far a tracked calibration is.
+        say: a line, of a guided one.
+        wishes: what somebody presses or writes, while it is asked for.
+        waits: says what is waited for.
+    """
+
+    asked_to_stop: Callable[[], bool]
+    may_energise: Callable[[FirstMotion], bool]
+    told: Told
+    say: Callable[[str], None]
+    wishes: Callable[[], AbstractContextManager[Wishes]]
+    waits: Waits = field(default_factory=Waits)
+
+
+def measure(setup: Setup, folder: Path, talk: Conversation, how: str) -> None:
+    """Measure all that the record in a folder does not hold yet: ``automatic`` by the tracker, or ``guided``.
+
+    Raises:
+        InputError: the folder, the board or the tracker is refused.
+        StoppedError: it was stopped before its end; the arm holds, and what was measured is kept.
+        DeviceError: the device is gone; what was measured is kept.
+    """
+    record = Record(folder)
+    with setup.bench.clock() as clock, _opened(setup, clock, talk, record) as mover:
+        if how == "guided":
+            begin(setup, record, mover.identity, talk.say)
+            with talk.wishes() as wishes:
+                Guided(setup, mover, wishes, record, talk.say).run()
+            return
+        with _eyes(setup, mover) as eyes:
+            look = Automatic(setup, mover, eyes, record, talk.told, _cooling(setup, mover, record))
+            begin(setup, record, mover.identity, talk.say)
+            mover.look = look.look
+            look.run()
+
+
+def evaluated(setup: Setup, folder: Path) -> Outcome:
+    """What the record in a folder tells, by the tables that it was begun with.
+
+    Raises:
+        InputError: there is no record, or nothing in it.
+    """
+    record = Record(folder)
+    begun = record.of_kind(BEGUN)
+    if not begun:
+        raise InputError("it holds nothing measured.", where=Location(str(folder)), hint="Measure first.")
+    servos, boards = stated_by(setup, begun[0], setup.joints)
+    return outcome_of(record.entries, servos, boards, setup.nominal, setup.settings)
+
+
+def adapter_of(folder: Path) -> str:
+    """The adapter that the record in a folder was measured on; empty if that is not known."""
+    begun = Record(folder).of_kind(BEGUN)
+    return str(begun[0].get("adapter", "")) if begun else ""
+
+
+def tried(setup: Setup, talk: Conversation, seen: str) -> list[Verdict]:
+    """Move each joint a little, and say what it did; ``seen`` by the ``tracker`` or by ``somebody``.
+
+    Joints that turned as commanded, and as no other joint did, are written down as checked beside the servo file.
+
+    Raises: as ``measure``.
+    """
+    away = [verdict for verdict in (_wrapped(setup, joint) for joint in setup.joints) if verdict is not None]
+    if away:  # by such a table no joint can be moved
+        _note(setup, away, {})
+        return away
+    with setup.bench.clock() as clock, _opened(setup, clock, talk, None) as mover:
+        if seen == "tracker":
+            with _eyes(setup, mover) as eyes:
+                to_base(setup, mover)
+                verdicts = _tracked(setup, mover, eyes)
+        else:
+            to_base(setup, mover)
+            with talk.wishes() as wishes:
+                verdicts = [_by_eye(setup, mover, joint, talk, wishes) for joint in setup.joints]
+        adapter = mover.identity.adapter if mover.identity else ""
+        _note(setup, verdicts, {"adapter": adapter, "by": seen, "at": clock.wall()})
+        return verdicts
+
+
+def _note(setup: Setup, verdicts: list[Verdict], seen: dict[str, Any]) -> None:
+    right = [verdict.joint for verdict in verdicts if verdict.kind == "right" and not verdict.other]
+    others = [verdict.joint for verdict in verdicts if verdict.joint not in right]
+    try:
+        note_checked(setup.path, setup.file, right, others, seen)
+    except InputError as fault:  # what was seen must not be lost with it
+        sentences = " ".join(f"{verdict.sentence} {verdict.mend}".rstrip() for verdict in verdicts)
+        raise InputError(
+            f"{fault.message} The check itself: {sentences}", where=fault.where, hint=fault.hint
+        ) from fault
+
+
+def park(setup: Setup, talk: Conversation, how: str) -> None:
+    """Bring the servos to the base pose, and with ``release`` end their pulses, the tip's first.
+
+    Raises: as ``measure``.
+    """
+    with setup.bench.clock() as clock, _opened(setup, clock, talk, None, releases=how == "release") as mover:
+        to_base(setup, mover)
+        mover.guard({})
+        for joint in reversed(tuple(setup.base)) if how == "release" else ():
+            mover.device.release(joint)
+            mover.clock.sleep(_LOOK_S)
+
+
+@contextmanager
+def _opened(
+    setup: Setup, clock: Clock, talk: Conversation, record: Record | None, *, releases: bool = False
+) -> Iterator[Mover]:
+    device = cast(ServoDevice, setup.bench.device())
+    settings = setup.settings
+    pulses = {joint: setup.pulses_of(joint) for joint in setup.base}
+    motion = Motion(math.radians(settings.rate_deg_per_s), settings.period, pulses, settings.silence)
+    read_by = {joint: (setup.known(joint), _clock(setup, joint)) for joint in setup.base}
+    servos = read_by
+    if record is not None and record.is_measured:
+        stated = stated_by(setup, record.of_kind(BEGUN)[0], tuple(setup.base))[0]
+        servos = {each.joint: (each, _clock(setup, each.joint)) for each in stated}
+    mover = Mover(device, clock, servos, read_by, motion, talk.asked_to_stop, waits=talk.waits)
+    try:
+        identity = mover.open()
+        if record is not None and record.is_measured:
+            check_same(setup, record, identity)
+        start = setup.judge.first_motion(angles_told(mover), {}, releases=releases)
+        if (start.free or start.hazards) and not talk.may_energise(start):
+            raise InputError("the arm may not be moved; nothing was moved.", hint="Say yes, or give --yes.")
+        yield mover
+    except StoppedError as stop:
+        if not mover.hold():
+            raise StoppedError(f"{stop}, while the board was lost", _AS_IT_IS) from stop
+        raise
+    finally:
+        device.close()
+
+
+def _clock(setup: Setup, joint: str) -> PulseClock:
+    return setup.file.boards[setup.file.servos[joint].board].clock
+
+
+@contextmanager
+def _eyes(setup: Setup, mover: Mover) -> Iterator[TrackerEyes]:
+    """The tracker, once it tells something of use."""
+    eyes = TrackerEyes(setup.bench, mover.clock)
+    try:
+        eyes.open()
+        mover.look = eyes.look
+        until = mover.clock.now() + _FIRST_FRAME_S
+        while eyes.trouble()[0] and mover.clock.now() < until:
+            mover.tick()
+        if eyes.trouble()[0]:
+            raise DeviceRefusedError(
+                f"the tracker tells nothing that could be used ({eyes.trouble()[1]}); nothing was moved.",
+                hint="Start it, check its address and the names of its bodies; or calibrate with --guided.",
+            )
+        yield eyes
+    finally:
+        mover.look = _nothing
+        eyes.close()
+
+
+def _warmth(setup: Setup, mover: Mover) -> Warmth:
+    """From cold servos on."""
+    return Warmth(setup.heat, tuple(setup.bench.arm.commanded), setup.base, mover.clock)
+
+
+def _cooling(setup: Setup, mover: Mover, record: Record) -> Warmth:
+    """From where the record's last line left it, where the servos may have to rest.
+
+    Raises:
+        InputError: one would not cool where it is to rest.
+    """
+    warmth = _warmth(setup, mover)
+    if joint := warmth.base_is_too_heavy:
+        raise InputError(
+            f"the servo of {joint} would not cool in the base pose, by bench.acquisition.heat; nothing was moved.",
+            hint="Give bench.servo.base a pose in which it carries less.",
+        )
+    last = next((entry for entry in reversed(record.entries) if "warmth" in entry), None)
+    if last is not None:
+        warmth.go_on(last["warmth"], angles_told(mover), mover.clock.wall() - float(last["at"]))
+    return warmth
+
+
+def _wrapped(setup: Setup, joint: str) -> Verdict | None:
+    return wrapped(joint, setup.file.servos[joint].angles, setup.ranges[joint])
+
+
+def _tracked(setup: Setup, mover: Mover, eyes: TrackerEyes) -> list[Verdict]:
+    look = Automatic(setup, mover, eyes, cast(Record, None), _silent, _warmth(setup, mover))
+    base, moves, unseen = angles_told(mover), [], []
+    for joint in setup.joints:
+        told, at = _small(setup, joint), mover.told[joint]
+        before = look.capture()
+        mover.go(joint, mover.counts_at(joint, setup.base[joint] + told))
+        after = look.capture()
+        mover.go(joint, at)
+        if isinstance(before, str) or isinstance(after, str):
+            why = before if isinstance(before, str) else after
+            unseen.append(Verdict(joint, "unclear", f"{joint}: it was not seen to stand ({why})."))
+        else:
+            moves.append(Move(joint, told, before.base_T_target, after.base_T_target))
+    return [*judged(moves, base, setup.nominal), *unseen]
+
+
+def _by_eye(setup: Setup, mover: Mover, joint: str, talk: Conversation, wishes: Wishes) -> Verdict:
+    told, base = _small(setup, joint), mover.told[joint]
+    mover.go(joint, mover.counts_at(joint, setup.base[joint] + told))
+
+    def ask(question: str) -> str:
+        talk.say(question)
+        while True:
+            wish = wishes.next(_LOOK_S)
+            if wish == QUIT or talk.asked_to_stop():
+                raise StoppedError("it was asked to stop")
+            if wish is not None:
+                return wish
+            mover.device.keep_alive()
+
+    verdict = answered(joint, told, ask)
+    mover.go(joint, base)
+    return verdict
+
+
+def _small(setup: Setup, joint: str) -> float:
+    """A turn that the joint's range has room for."""
+    low, high = setup.ranges[joint]
+    at, size = setup.base[joint], setup.settings.check
+    return size if high - at >= size or high - at >= at - low else -size
+
+
+def _silent(joint: str, done: int, planned: int) -> None:
+    """Nobody is told."""
+
+
+def _nothing() -> None:
+    """Nothing is looked at."""

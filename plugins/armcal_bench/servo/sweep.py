@@ -1,0 +1,104 @@
+"""Where a joint is measured: up over its range and down again."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from itertools import permutations
+from typing import Any
+
+import numpy as np
+from armcal.devices.faults import DeviceRefusedError
+
+from armcal_bench.servo.mover import Mover
+from armcal_bench.servo.setup import Setup
+
+
+@dataclass(frozen=True)
+class Point:
+    """A pulse, and from where it is come to: 1 with rising pulses, -1 with falling ones."""
+
+    joint: str
+    counts: int
+    came: int
+
+    @property
+    def key(self) -> tuple[str, int, int]:
+        """Tells it from all others."""
+        return (self.joint, self.counts, self.came)
+
+
+def sweep(setup: Setup, mover: Mover, joint: str) -> list[Point]:
+    """Rising pulses first, then falling ones, as many of the range as leave room to come from either side."""
+    low, high = setup.ranges[joint]
+    margin = setup.settings.approach
+    shortest, longest = setup.pulses_of(joint)
+    steps = max(round((high - low - 2 * margin) / setup.settings.step), 1)
+    wanted = [mover.counts_at(joint, angle) for angle in np.linspace(low + margin, high - margin, steps + 1)]
+    room = approach_counts(setup, mover, joint)
+    fits = [
+        counts
+        for counts in sorted(set(wanted))
+        if mover.pulse(joint, counts - room) >= shortest and mover.pulse(joint, counts + room) <= longest
+    ]
+    return [Point(joint, c, 1) for c in fits] + [Point(joint, c, -1) for c in reversed(fits)]
+
+
+def approach_counts(setup: Setup, mover: Mover, joint: str) -> int:
+    """How many counts a joint comes from aside before it is measured; at most what the sweep leaves room for."""
+    return max(int(setup.settings.approach * mover.counts_per_rad(joint)) - 1, 1)
+
+
+def left(points: Iterable[Point], entries: Iterable[Mapping[str, Any]]) -> list[Point]:
+    """Those that no line of the record is about."""
+    done = {(str(e["joint"]), int(e["counts"]), int(e["came"])) for e in entries if "counts" in e}
+    return [point for point in points if point.key not in done]
+
+
+def come_to(setup: Setup, mover: Mover, point: Point) -> None:
+    """Move to a point from its side, slowly, with the play taken up."""
+    aside = point.counts - point.came * approach_counts(setup, mover, point.joint)
+    if point.came * (aside - mover.told[point.joint]) < 0 or mover.came.get(point.joint) != point.came:
+        mover.go(point.joint, aside)
+    mover.go(point.joint, point.counts)
+
+
+def to_base(setup: Setup, mover: Mover) -> None:
+    """Every servo to the base pose, one by one; those without pulses get their first.
+
+    Raises:
+        DeviceRefusedError: no order of the joints keeps clear on the way from where the arm stands.
+    """
+    for joint, angle in setup.base.items():
+        if joint not in mover.told:
+            mover.energise(joint, mover.counts_at(joint, angle))
+    for joint in _clear_order(setup, mover):
+        mover.go(joint, mover.counts_at(joint, setup.base[joint]))
+
+
+def _clear_order(setup: Setup, mover: Mover) -> tuple[str, ...]:
+    """Joints that are not at the base pose, in an order in which they may go there."""
+    start = angles_told(mover)
+    away = [j for j, angle in setup.base.items() if mover.told[j] != mover.counts_at(j, angle)]
+    for order in permutations(away):
+        here, clear = dict(start), True
+        for joint in order:
+            there = {**here, joint: setup.base[joint]}
+            clear = clear and setup.clear_between(here, there)
+            here = there
+        if clear:
+            return order
+    raise DeviceRefusedError(
+        "no way to the base pose is clear from where the arm stands.",
+        hint="Bring it nearer by armcal servo --guided, or release it and put it there by hand.",
+    )
+
+
+def angles_told(mover: Mover) -> dict[str, float]:
+    """The angles that the pulses ask for by the stated tables (rad, by joint)."""
+    found = {}
+    for joint, counts in mover.told.items():
+        table = mover.servos[joint][0].table
+        found[joint] = float(table.angle(mover.pulse(joint, counts)))
+    return {joint: angle for joint, angle in found.items() if math.isfinite(angle)}

@@ -1,0 +1,248 @@
+"""Whether each joint of a new arm turns as the model says: the right one, the right way, as far as it is told."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations, permutations
+
+import numpy as np
+from armcal.base.domains import Array
+from scipy.spatial.transform import Rotation
+
+from armcal_bench.servo.nominal import NominalArm
+from armcal_bench.servo.turning import twist_angles
+
+_LEVER_M = 0.1
+_STILL = math.radians(1.5)
+_STILL_M = 0.002
+_GAIN_OFF = 0.25
+_USUAL_M = 0.004
+"""How far a move of a few degrees lies from the model's, since arms sag and are not as drawn."""
+_UNCLEAR_M = 0.02
+_EACH_FAULT, _MOST, _UNSURE = 4.0, 100.0, 4.0
+_USUAL_TURN = math.radians(10.0)
+_SURE = 40.0
+_TURN = 2 * math.pi
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What a joint did.
+
+    Attributes:
+        joint: that was told to move.
+        kind: ``right``, ``reversed``, ``gain``, ``another``, ``still``, ``wrapped`` or ``unclear``.
+        sentence: what was seen.
+        mend: what to do; empty if nothing.
+        turned: the angle found (rad); NaN where none is known.
+        other: the joint that moved instead, or that cannot be told apart.
+    """
+
+    joint: str
+    kind: str
+    sentence: str
+    mend: str = ""
+    turned: float = math.nan
+    other: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Move:
+    """What was seen when a joint was told to turn (rad): the tool's pose before and after (4 x 4, base frame).
+
+    Rotations may be NaN.
+    """
+
+    joint: str
+    told: float
+    before: Array
+    after: Array
+
+    @property
+    def is_little(self) -> bool:
+        """Whether next to nothing moved."""
+        apart = float(np.linalg.norm(self.after[:3, 3] - self.before[:3, 3]))
+        if not self.has_rotations:
+            return apart < _STILL_M
+        turned = Rotation.from_matrix(self.after[:3, :3] @ self.before[:3, :3].T).magnitude()
+        return apart < _STILL_M and float(turned) < _STILL
+
+    @property
+    def has_rotations(self) -> bool:
+        """Whether the tracker sees them."""
+        return not (np.isnan(self.before[0, 0]) or np.isnan(self.after[0, 0]))
+
+
+@dataclass(frozen=True)
+class _Wiring:
+    """Which joint each command moves, and with which sign."""
+
+    moves: Mapping[str, str]
+    signs: Mapping[str, int]
+
+    @property
+    def faults(self) -> int:
+        """How many commands do not do what they should."""
+        return sum(a != b for a, b in self.moves.items()) + sum(sign < 0 for sign in self.signs.values())
+
+    def pose(self, base: Mapping[str, float]) -> dict[str, float]:
+        """Where the joints stand then (rad)."""
+        return {self.moves[joint]: self.signs[joint] * angle for joint, angle in base.items()}
+
+
+def judged(moves: Sequence[Move], base: Mapping[str, float], nominal: NominalArm) -> list[Verdict]:
+    """What each joint did, by all that was seen together.
+
+    A swapped or reversed servo stands elsewhere in the base pose too, so that the axes of the joints after it are not
+    where the model has them: each wiring with a few faults is tried, and the one that explains all moves with the
+    fewest faults is taken.
+
+    Args:
+        moves: one of each joint that was tried.
+        base: the angles of all joints that the pulses asked for (rad).
+        nominal: the model.
+    """
+    seen = [move for move in moves if not move.is_little]
+    scored = sorted((_score(wiring, seen, base, nominal), i, wiring) for i, wiring in enumerate(_wirings(tuple(base))))
+    best_score, _, best = scored[0]
+    near = [wiring for score, _, wiring in scored if score < best_score + _UNSURE]
+    return [_judged(move, best, near, base, nominal) for move in moves]
+
+
+def exchanged(moves: Sequence[Move], base: Mapping[str, float], nominal: NominalArm) -> dict[str, str]:
+    """Which joints moved instead of which, where that is beyond doubt; see ``judged``."""
+    seen = [move for move in moves if not move.is_little]
+    straight, *others = _wirings(tuple(base))
+    as_meant = _score(straight, seen, base, nominal)
+    if as_meant <= _SURE:
+        return {}
+    best_score, _, best = min((_score(wiring, seen, base, nominal), i, wiring) for i, wiring in enumerate(others))
+    if best_score > as_meant - _SURE:
+        return {}
+    return {move.joint: best.moves[move.joint] for move in seen if best.moves[move.joint] != move.joint}
+
+
+def _wirings(joints: tuple[str, ...]) -> Iterator[_Wiring]:
+    """All with up to three joints exchanged and up to two reversed."""
+    for count in (0, 2, 3):
+        for chosen in combinations(joints, count):
+            for order in permutations(chosen):
+                if any(a == b for a, b in zip(chosen, order, strict=True)):
+                    continue
+                moves = {**{joint: joint for joint in joints}, **dict(zip(chosen, order, strict=True))}
+                for reversed_ones in range(3):
+                    for turned in combinations(joints, reversed_ones):
+                        yield _Wiring(moves, {joint: -1 if joint in turned else 1 for joint in joints})
+
+
+def _score(wiring: _Wiring, seen: Sequence[Move], base: Mapping[str, float], nominal: NominalArm) -> float:
+    axes = nominal.axes(wiring.pose(base))
+    score = _EACH_FAULT * wiring.faults
+    for move in seen:
+        turned, off = _explained(move, *axes[wiring.moves[move.joint]])
+        usual = _USUAL_M * max(abs(move.told) / _USUAL_TURN, 1.0)
+        score += min((off / usual) ** 2, _MOST)
+        score += _MOST if turned * wiring.signs[move.joint] * move.told < 0 else 0.0
+    return score
+
+
+def _judged(
+    move: Move, best: _Wiring, near: Sequence[_Wiring], base: Mapping[str, float], nominal: NominalArm
+) -> Verdict:
+    joint, told = move.joint, move.told
+    if move.is_little:
+        return _verdict("still", joint, told, 0.0)
+    moved = best.moves[joint]
+    turned, off = _explained(move, *nominal.axis(moved, best.pose(base)))
+    if off > _UNCLEAR_M:
+        return _verdict("unclear", joint, told, turned)
+    if moved != joint:
+        return _verdict("another", joint, told, turned, moved)
+    others = sorted({wiring.moves[joint] for wiring in near} - {joint})
+    if turned * told < 0:
+        return _verdict("reversed", joint, told, turned, " or ".join(others))
+    kind = "gain" if abs(turned / told - 1) > _GAIN_OFF else "right"
+    return _verdict(kind, joint, told, turned, " or ".join(others))
+
+
+def wrapped(joint: str, table: tuple[float, ...], limits: tuple[float, float]) -> Verdict | None:
+    """Whether a table's angles lie a turn away from where the joint moves (rad)."""
+    turns = round((sum(table) / len(table) - sum(limits) / 2) / _TURN)
+    if not turns:
+        return None
+    return Verdict(
+        joint,
+        "wrapped",
+        f"{joint}: its table says {math.degrees(table[0]):.0f} to {math.degrees(table[-1]):.0f} deg, "
+        f"{turns:+d} turn{'s' * (abs(turns) != 1)} away from the joint's {math.degrees(limits[0]):.0f} to "
+        f"{math.degrees(limits[1]):.0f} deg.",
+        f"Subtract {360 * turns} deg from its angles in the servo file.",
+    )
+
+
+def answered(joint: str, told: float, ask: Callable[[str], str]) -> Verdict:
+    """The same by somebody's eyes."""
+    size = f"{math.degrees(told):+.0f} deg"
+    wish = ask(
+        f"{joint} was told to turn by {size}. y: it did, r: the other way, o: another joint did, n: nothing moved"
+    )
+    kinds = {"y": ("right", told), "r": ("reversed", -told), "o": ("another", math.nan), "n": ("still", 0.0)}
+    kind, turned = kinds.get(wish, ("unclear", math.nan))
+    return _verdict(kind, joint, told, turned, "another joint" if kind == "another" else "")
+
+
+def swapped(verdicts: list[Verdict]) -> list[str]:
+    """Pairs of joints that moved instead of each other, in sentences."""
+    went = {v.joint: v.other for v in verdicts if v.kind == "another"}
+    return [
+        f"{a} and {b} are swapped: exchange their channels in the servo file, or their plugs."
+        for a, b in went.items()
+        if went.get(b) == a and a < b
+    ]
+
+
+def _explained(move: Move, axis: Array, origin: Array) -> tuple[float, float]:
+    """The turn about an axis (rad) that is nearest to what was seen, and how far from it that is (m)."""
+    p, q = move.before[:3, 3] - origin, move.after[:3, 3] - origin
+    if not move.has_rotations:
+        flat_p, flat_q = p - (p @ axis) * axis, q - (q @ axis) * axis
+        turned = math.atan2(float(axis @ np.cross(flat_p, flat_q)), float(flat_p @ flat_q))
+        return turned, float(np.linalg.norm(Rotation.from_rotvec(turned * axis).apply(p) - q))
+    seen = Rotation.from_matrix((move.after[:3, :3] @ move.before[:3, :3].T)[None])
+    turned = float(twist_angles(seen, axis)[0])
+    by_joint = Rotation.from_rotvec(turned * axis)
+    left = float(np.max((seen * by_joint.inv()).magnitude()))
+    return turned, float(np.linalg.norm(by_joint.apply(p) - q)) + _LEVER_M * left
+
+
+def _verdict(kind: str, joint: str, told: float, turned: float, other: str = "") -> Verdict:
+    size, seen = f"{math.degrees(told):+.1f} deg", f"{math.degrees(turned):+.1f} deg"
+    alike = (
+        f" It cannot be told from {other} in this base pose: choose one that bends the arm between them."
+        if other
+        else ""
+    )
+    sentences = {
+        "right": (f"{joint} turned by {seen}, told {size}.{alike}", ""),
+        "reversed": (
+            f"{joint} turned by {seen}, told {size}: the other way.{alike}",
+            "Give its pulses in the servo file in the opposite order, or turn the joint's sign in the model.",
+        ),
+        "gain": (
+            f"{joint} turned by {seen}, told {size}: the wrong size.{alike}",
+            "Check its servo's type and its table's angles; then calibrate it.",
+        ),
+        "another": (
+            f"{joint} was told {size}, and {other} turned{'' if math.isnan(turned) else f' by {seen}'}.",
+            f"Give {joint} the channel of {other} in the servo file, or change the plugs.",
+        ),
+        "still": (f"{joint} was told {size} and did not move.", "Check its plug, its channel and its supply."),
+        "unclear": (
+            f"{joint} was told {size}, and what moved is no joint of the model.",
+            "Check that the tracker follows the tool, and the pose of its base (bench.bodies).",
+        ),
+    }
+    sentence, mend = sentences[kind]
+    return Verdict(joint, kind, sentence, mend, turned, other)

@@ -1,0 +1,118 @@
+"""Whether the arm stands, by what the tracker saw in the last moments, and where it stands then."""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from armcal.base.domains import Array
+from armcal.devices.tracker import TrackerFrame
+
+from armcal_bench.acquisition.settings import SettleSettings
+from armcal_bench.bodies import in_base, repeats
+from armcal_bench.body_settings import BodySettings
+from armcal_bench.stillness import deviations_of_mean, judged, mean_pose
+
+FROZEN = "the tracker is frozen: it tells the same frame again"
+_MOST_FRAMES = 20_000
+_GAP = 0.25
+"""A part of the window that may pass without a usable frame."""
+_SLACK_S = 1e-9
+
+
+@dataclass(frozen=True)
+class Settled:
+    """Where the arm stands.
+
+    Attributes:
+        base_T_target: the mean (4 x 4, m); the rotation is NaN where the tracker tells only positions.
+        deviations: standard deviations of the mean (6): x, y, z in the base frame (m), and the turn about each axis of
+            the target (rad). A coordinate that the tracker rounds more coarsely than its noise may have none.
+        frames: how many frames it is the mean of.
+        rejected: how many more were set aside, lying far from the others.
+        begun, ended: when the first and the last of them came, by the bench's clock (s).
+    """
+
+    base_T_target: Array
+    deviations: Array
+    frames: int
+    rejected: int
+    begun: float
+    ended: float
+
+
+@dataclass(frozen=True)
+class Unsettled:
+    """Why the arm is not known to stand: a sentence."""
+
+    why: str
+
+
+class Settling:
+    """Fed with frames, it says whether the arm stands. See ``stillness.judged`` for what that means."""
+
+    def __init__(self, settings: SettleSettings, bodies: BodySettings) -> None:
+        self._settings = settings
+        self._bodies = bodies
+        # base_T_target of a base body that stands still scatters as if it moved: its noise is in the mean as well
+        self._scattered = bodies.model_copy(update={"base_motion": "moving"})
+        self._frames: deque[tuple[TrackerFrame, bool]] = deque(maxlen=_MOST_FRAMES)
+        self._last: TrackerFrame | None = None
+        self._begun = -np.inf
+
+    def begin(self, now: float) -> None:
+        """The arm was told to stand just now (s, by the bench's clock): what came before does not count."""
+        self._begun = now
+        self._frames.clear()
+
+    def feed(self, frames: Iterable[TrackerFrame]) -> None:
+        """Take in frames as they come; what is older than a window is forgotten."""
+        for frame in frames:
+            self._frames.append((frame, repeats(frame, self._last, self._bodies)))
+            self._last = frame
+        while self._frames and self._frames[0][0].arrived <= self._frames[-1][0].arrived - self._settings.window:
+            self._frames.popleft()
+
+    def state(self, now: float) -> Settled | Unsettled:
+        """Whether it stands now (s, by the bench's clock)."""
+        start = now - self._settings.window
+        left = self._begun + self._settings.wait - start
+        if left > _SLACK_S:
+            return Unsettled(f"too early: {left:.2f} s to wait")
+        recent = [(frame, again) for frame, again in self._frames if start < frame.arrived <= now]
+        frames = [frame for frame, _ in recent]
+        capture = in_base(frames, self._bodies)
+        faults = [fault or (FROZEN if again else "") for fault, (_, again) in zip(capture.faults, recent, strict=True)]
+        usable = np.array([not fault for fault in faults], dtype=bool)
+        why = self._too_few(np.array([frame.arrived for frame in frames])[usable], faults, start, now)
+        if why:
+            return Unsettled(why)
+        poses = capture.poses[usable]
+        found = judged(poses, self._settings.spread)
+        if found.why_not:
+            return Unsettled(found.why_not)
+        kept = [frame for frame, use in zip(frames, usable, strict=True) if use]
+        kept = [frame for frame, keep in zip(kept, found.kept, strict=True) if keep]
+        return self._settled(poses[found.kept], kept, int((~found.kept).sum()))
+
+    def _settled(self, poses: Array, kept: list[TrackerFrame], rejected: int) -> Settled:
+        mean = mean_pose(poses)
+        if self._bodies.has_base and self._bodies.base_motion == "still":
+            moving = in_base(kept, self._scattered)
+            poses = moving.poses[[not fault for fault in moving.faults]]
+        deviations = deviations_of_mean(poses, mean)
+        return Settled(mean, deviations, len(kept), rejected, kept[0].arrived, kept[-1].arrived)
+
+    def _too_few(self, times: Array, faults: list[str], start: float, now: float) -> str:
+        """Why the usable frames do not cover the window; empty if they do."""
+        s = self._settings
+        unusable = Counter(fault for fault in faults if fault).most_common(1)
+        reason = unusable[0][0] if unusable else "the tracker is silent" if not faults else "it tells no more"
+        if len(times) < s.frames:
+            return f"too few frames: {len(times)} usable in {s.window:g} s, expected {s.frames}; {reason}"
+        longest = float(np.diff(np.concatenate([[start], times, [now]])).max())
+        if longest > _GAP * s.window + _SLACK_S:
+            return f"no usable frame for {longest:.2f} s within the last {s.window:g} s; {reason}"
+        return ""

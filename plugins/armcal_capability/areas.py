@@ -1,0 +1,95 @@
+"""Areas of the workspace: how much of a box the tool reaches, and what the arm is like there."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from armcal.arm.clearance import Mask
+from armcal.base.domains import Array
+from numpy.typing import NDArray
+
+from armcal_capability.inverse import Pointing, reach_for
+from armcal_capability.mechanics import MechanicsFunction
+from armcal_capability.quantities import Postures, Weights, postures_at
+from armcal_capability.settings import AreaSettings
+from armcal_capability.voxels import grouped
+
+
+@dataclass(frozen=True)
+class AreaMap:
+    """An area, cell by cell.
+
+    Attributes:
+        centres: of its cells (cells x 3; m, base frame).
+        counts: postures found that bring the tool to the centre (cells).
+        held: whether in one of them no servo is asked for more than it holds (cells); None where that is not stated.
+        values: by quantity: best, mean and worst of the postures (3 x cells; not a number where there is none).
+    """
+
+    centres: Array
+    counts: NDArray[np.int64]
+    held: Mask | None
+    values: Mapping[str, Array]
+
+    @property
+    def reached(self) -> Mask:
+        """Which cells the tool reaches."""
+        return np.asarray(self.counts > 0)
+
+
+def cells_of(area: AreaSettings, size: float) -> Array:
+    """Centres of equal cells that fill a box, none longer than ``size`` (cells x 3; m)."""
+    low, high = np.array(area.low), np.array(area.high)
+    numbers = np.maximum(np.ceil((high - low) / size - 1e-9), 1).astype(int)
+    axes = [low[i] + (np.arange(n) + 0.5) * (high[i] - low[i]) / n for i, n in enumerate(numbers)]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+@dataclass(frozen=True)
+class AreaSearch:
+    """Searches areas for one arm.
+
+    Attributes:
+        function: the arm's mechanics.
+        limits: of the commands (joints x 2).
+        allowed: which commands (joints x N) keep their clearance.
+        weights: of the quantities.
+        sampled: postures spread over joint space, to start from.
+    """
+
+    function: MechanicsFunction
+    limits: Array
+    allowed: Callable[[Array], Mask]
+    weights: Weights
+    sampled: Postures
+
+    def __call__(self, area: AreaSettings, size: float, ways: int) -> AreaMap:
+        """What is found in an area cut into cells of ``size`` (m), in so many ``ways`` of reaching each at most."""
+        centres = cells_of(area, size)
+        pointing = Pointing.of(area.tool) if area.tool is not None else None
+        starts = self._starts(centres, ways, pointing)
+        cell = np.repeat(np.arange(len(centres)), starts.shape[1] // len(centres))
+        found = reach_for(self.function, centres[cell].T, starts, self.limits, self.weights.length, pointing)
+        good = np.flatnonzero(found.arrived)
+        good = good[self.allowed(found.commands[:, good])] if len(good) else good
+        postures = postures_at(self.function, found.commands[:, good], self.weights)
+        counts = np.bincount(cell[good], minlength=len(centres)).astype(np.int64)
+        values = grouped(postures.values, cell[good], len(centres))
+        held = None
+        if "effort_ratio" in values:
+            held = np.asarray(np.nan_to_num(values["effort_ratio"][0], nan=np.inf) <= 1)
+        return AreaMap(centres, counts, held, values)
+
+    def _starts(self, centres: Array, ways: int, pointing: Pointing | None) -> Array:
+        """The sampled postures nearest to each centre (joints x cells * ways), rad counted as metres by the length."""
+        from scipy.spatial import cKDTree
+
+        where, wanted = self.sampled.positions, centres
+        if pointing is not None:
+            away = np.maximum(pointing.angles(self.sampled.rotations) - pointing.within, 0.0) * self.weights.length
+            where = np.column_stack([where, away])
+            wanted = np.column_stack([centres, np.zeros(len(centres))])
+        places = cKDTree(where).query(wanted, k=min(ways, len(where)))[1].reshape(-1)
+        return np.asarray(self.sampled.commands[:, places])

@@ -1,0 +1,138 @@
+"""``armcal capability``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import partial
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import click
+from armcal.base.config_text import as_json
+from armcal.cli.common import Voice, command_line, overrides, speaking
+from armcal.io.folder import Reservation, reserved
+from armcal.plugins import discover
+from armcal.run.pipeline import Stopwatch
+from rich.box import SIMPLE_HEAD
+from rich.table import Table as ScreenTable
+
+from armcal_capability import outputs
+from armcal_capability.capability_figures import DRAWN, designs_figure, quantity_figure, reach_figure
+from armcal_capability.capability_page import Picture, conclusions, render_capability
+from armcal_capability.loading import Task, load_task
+from armcal_capability.quantities import BY_NAME
+from armcal_capability.summary import design_summaries, summary_of
+from armcal_capability.survey import Survey, survey
+from armcal_capability.tables import Table, area_table, design_table, quantity_table
+
+_DATA = ("map.csv", "map.npz", "areas.csv", "designs.csv", "capability.json", "capability.html")
+_FIGURES = ("reach.png", "designs.png", *(f"{name}.png" for name in BY_NAME))
+OURS = (*_DATA, *_FIGURES)
+
+
+@click.command()
+@click.argument("source", metavar="CALIBRATION|CONFIG", type=click.Path(path_type=Path))
+@click.option("--out", required=True, type=click.Path(path_type=Path), help="Where the results go.")
+@click.option(
+    "--settings", type=click.Path(path_type=Path), help="A configuration whose sections capability and plan to take."
+)
+@overrides
+@speaking
+def capability(voice: Voice, source: Path, out: Path, settings: Path | None, overrides: tuple[str, ...]) -> None:
+    """Map what an arm can do: its reach, sag, stiffness, accuracy and nimbleness, in all and in areas, for designs."""
+    watch = Stopwatch()
+    kept = click.get_current_context().with_resource(reserved(out, OURS))
+    import_module("matplotlib")  # if it is not here, that is said now and not after the survey
+    registry = discover()
+    voice.plugin_faults(registry)
+    task = load_task(source, settings, overrides, registry)
+    with voice.progress() as progress:
+        with watch.stage("survey"):
+            found = survey(task.subject, task.settings, progress)
+        designs: dict[str, Survey] = {}
+        with watch.stage("designs"):
+            for name, subject in task.designs.items():
+                designs[name] = survey(subject, task.settings, partial(_of_design, progress, name))
+    told = {"source": str(source), **summary_of(found, task.settings)}
+    compared = design_summaries(designs)
+    told["designs"] = {n: {**summary_of(d, task.settings), "areas": compared[n]} for n, d in designs.items()}
+    with watch.stage("figures"):
+        pictures = _pictures(task, found, designs, told)
+    tables = _tables(told)
+    sentences = conclusions(task.subject.name, told, _by_design(told))
+    facts = {"command": command_line(), "files": ", ".join(sorted({str(file) for file in task.files}))}
+    facts |= {"samples": str(task.settings.samples), "seed": str(task.settings.seed)}
+    page = render_capability(task.subject.name, sentences, tables, pictures, facts)
+    _write(kept, found, designs, told, page, pictures)
+    voice.result({**told, "folder": str(out)})
+    for table in tables:
+        voice.out.print(_screen(table))
+    for text in sentences:
+        voice.out.print(text, markup=False, soft_wrap=True)
+    for stage, seconds in watch.seconds.items():
+        voice.detail(f"{stage}: {seconds:.1f} s")
+    voice.out.print(f"page: {out / 'capability.html'}  ({watch.total():.1f} s)", markup=False, soft_wrap=True)
+
+
+def _of_design(progress: Any, name: str, _: str, fraction: float) -> None:
+    progress(name, fraction)
+
+
+def _by_design(told: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: each["areas"] for name, each in told["designs"].items()}
+
+
+def _tables(told: Mapping[str, Any]) -> list[Table]:
+    made = []
+    if any(_by_design(told).values()):
+        made.append(design_table(_by_design(told)))
+    elif told["areas"]:
+        made.append(area_table(told["areas"]))
+    return [*made, quantity_table(told)]
+
+
+def _pictures(task: Task, found: Survey, designs: Mapping[str, Survey], told: Mapping[str, Any]) -> tuple[Picture, ...]:
+    made = []
+    if designs:
+        said = "Left: how far each design's tool comes, seen from the side. Right: how much of each area it reaches."
+        made.append(Picture("designs", "Designs", designs_figure(designs, _by_design(told), task.settings), said))
+    said = "Two sections through the workspace; the darker, the more postures of the sample bring the tool there."
+    made.append(Picture("reach", "Reach", reach_figure(found, task.settings), said))
+    for name in DRAWN:
+        if name in found.voxels.values:
+            quantity = BY_NAME[name]
+            dark = "the darker, the more" if quantity.good == "low" else "the darker, the less"
+            said = f"Two sections through the workspace: {quantity.words}; {dark}. Mean over the postures of each cell."
+            title = quantity.words[0].upper() + quantity.words[1:]
+            made.append(Picture(name, title, quantity_figure(found, task.settings, name), said))
+    return tuple(made)
+
+
+def _write(
+    kept: Reservation,
+    found: Survey,
+    designs: Mapping[str, Survey],
+    told: Mapping[str, Any],
+    page: str,
+    pictures: tuple[Picture, ...],
+) -> None:
+    columns = outputs.map_columns(found)
+    texts: dict[str, str | bytes] = {f"{picture.name}.png": picture.png for picture in pictures}
+    texts |= {"map.npz": outputs.npz_bytes(columns), "map.csv": outputs.csv_text(columns)}
+    if found.areas:
+        texts["areas.csv"] = outputs.areas_text(designs or {found.subject.name: found})
+    if designs:
+        texts["designs.csv"] = outputs.table_text(*outputs.design_rows(_by_design(told)))
+    texts["capability.json"] = as_json(told) + "\n"
+    texts["capability.html"] = page
+    kept.place(texts)
+
+
+def _screen(table: Table) -> ScreenTable:
+    made = ScreenTable(title=table.caption, title_justify="left", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    for words, number in table.headings:
+        made.add_column(words, justify="right" if number else "left")
+    for row in table.rows:
+        made.add_row(*row)
+    return made

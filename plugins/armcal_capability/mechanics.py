@@ -1,0 +1,137 @@
+"""An arm in many postures: tool, its slopes by commands and by a force, and what the joints hold, in equilibrium."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+from armcal.arm.clearance import Mask
+from armcal.arm.loading import LOAD_CHANNELS
+from armcal.base.domains import Array
+from armcal.base.se3 import Expression
+from armcal.calibration.compensation.equilibrium import Equilibrium
+from armcal.calibration.tool_expression import ToolExpression
+from armcal.problem.batch_function import BatchFunction
+from armcal.problem.kernel import EvaluatorChoice
+
+from armcal_capability.settings import LoadSettings
+
+_LANES = 8
+_FORCE = "force_x"
+
+
+@dataclass(frozen=True)
+class Mechanics:
+    """Loaded arms in elastic equilibrium.
+
+    Attributes:
+        positions: of the tool (3 x N; m, base frame).
+        rotations: base_R_tool (3 x 3 x N).
+        slopes: of the tool by commands (N x 6 x n): metres, then rad about the axes of the base frame.
+        compliances: of the tool by a force at it (N x 3 x 3; m/N, base frame).
+        efforts: about or along the axes of all joints (joints x N; N m, N).
+        states: deflections (n_d x N).
+        settled: whether there is an equilibrium (N).
+    """
+
+    positions: Array
+    rotations: Array
+    slopes: Array
+    compliances: Array
+    efforts: Array
+    states: Array
+    settled: Mask
+
+
+class MechanicsFunction:
+    """``Mechanics`` of one arm under one load, for commands (joints x N).
+
+    Attributes:
+        expression: the arm's.
+        is_elastic: whether anything gives.
+        is_loaded: whether there is a load beyond the arm's own weight.
+    """
+
+    def __init__(self, expression: ToolExpression, load: LoadSettings, choice: EvaluatorChoice = "auto") -> None:
+        self.expression = expression
+        self._joints, self._states = len(expression.joints), expression.state.numel()
+        self._record = expression.defaults.copy()
+        for channel, stated in (("payload", load.payload), ("payload_x", load.payload_com), (_FORCE, load.force)):
+            if stated is not None:
+                self._set(channel, np.atleast_1d(stated))
+        force = self._place(_FORCE)
+        self.is_elastic = self._states > 0
+        self.is_loaded = bool(self._record[self._place("payload")]) or bool(np.any(self._record[force : force + 3]))
+        self._equilibrium = Equilibrium(expression, choice)
+        made = self._records(np.linspace(-1, 1, _LANES) * np.ones((self._joints, 1)))
+        self._function = BatchFunction(_function(expression), [made, np.zeros((self._states, _LANES))], choice)
+
+    def __call__(self, commands: Array, states: Array | None = None) -> Mechanics:
+        """Everything; ``states`` are where the search for an equilibrium begins."""
+        record, count = self._records(commands), commands.shape[1]
+        standing = self._equilibrium(record, states)
+        pose, by_commands, by_force, efforts = self._function(record, standing.states)
+        return Mechanics(
+            positions=pose[9:],
+            rotations=pose[:9].reshape(3, 3, count).swapaxes(0, 1),
+            slopes=by_commands.reshape(self._joints, 6, count).transpose(2, 1, 0),
+            compliances=by_force.reshape(3, 3, count).transpose(2, 1, 0),
+            efforts=efforts,
+            states=standing.states,
+            settled=np.asarray(standing.settled, dtype=bool),
+        )
+
+    def without_load(self, commands: Array, states: Array) -> Array:
+        """Where the tool is under the arm's own weight alone (3 x N; m), from states near it."""
+        record = self._records(commands)
+        record[self._place("payload")] = 0.0
+        record[self._place(_FORCE) : self._place(_FORCE) + 3] = 0.0
+        return self._tool(record, states)
+
+    def weightless(self, commands: Array) -> Array:
+        """Where the tool would be if nothing pulled at the arm (3 x N; m)."""
+        record = self._records(commands)
+        start = self._place(LOAD_CHANNELS[0])
+        record[start : start + len(LOAD_CHANNELS)] = 0.0
+        return self._tool(record, None)
+
+    def _tool(self, record: Array, states: Array | None) -> Array:
+        return np.asarray(self._equilibrium(record, states).base_T_tool[:, :3, 3].T)
+
+    def _records(self, commands: Array) -> Array:
+        record = np.repeat(self._record[:, None], commands.shape[1], axis=1)
+        record[: self._joints] = commands
+        return record
+
+    def _place(self, channel: str) -> int:
+        return self.expression.channels.index(channel)
+
+    def _set(self, channel: str, values: Array) -> None:
+        start = self._place(channel)
+        self._record[start : start + len(values)] = values
+
+
+def _function(expression: ToolExpression) -> ca.Function:
+    """(record, state) -> pose, its slope by commands and by a force, efforts. [Griewank2008]"""
+    record, state, joints = expression.record, expression.state, len(expression.joints)
+    force = expression.channels.index(_FORCE)
+    pose = ca.densify(ca.vertcat(ca.vec(expression.base_T_tool.rotation), expression.base_T_tool.translation))
+    by_record, by_state = ca.jacobian(pose, record), ca.jacobian(pose, state)
+    answer = ca.jacobian(expression.next_state, record)
+    moved, given = expression.to_equilibrium(answer[:, :joints], answer[:, force : force + 3])
+    by_commands = by_record[:, :joints] + ca.mtimes(by_state, moved)
+    by_force = ca.mtimes(by_state[9:, :], given)
+    shown = [pose, ca.vec(ca.densify(_twists(pose, by_commands))), ca.vec(ca.densify(by_force)), expression.efforts]
+    return ca.Function("capability", [record, state], [ca.densify(each) for each in shown], {"cse": True})
+
+
+def _twists(pose: Expression, by_commands: Expression) -> Expression:
+    """Slopes of rotation and position (12 x n) as shift and turn (6 x n): half the sum of r_i x dr_i is the turn."""
+    turns = []
+    for joint in range(by_commands.size2()):
+        turned = [
+            ca.cross(pose[3 * i : 3 * i + 3], ca.densify(by_commands[3 * i : 3 * i + 3, joint])) for i in range(3)
+        ]
+        turns.append((turned[0] + turned[1] + turned[2]) / 2)
+    return ca.vertcat(by_commands[9:, :], ca.horzcat(*turns))

@@ -1,0 +1,110 @@
+"""What a survey leaves behind as data: the map and the areas cell by cell, in CSV and npz, units in every name."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from armcal.base.domains import Array
+
+from armcal_capability.survey import Survey
+
+_MM = 1000.0
+_STATISTICS = ("best", "mean", "worst")
+_PLACES = ("x_mm", "y_mm", "z_mm")
+
+
+def map_columns(found: Survey) -> dict[str, Array]:
+    """The map as columns (cells each): centre, postures, and best, mean and worst of each quantity."""
+    columns: dict[str, Array] = _centres(found.voxels.centres)
+    return {**columns, "postures": found.voxels.counts.astype(float), **_statistics(found.voxels.values)}
+
+
+def area_columns(found: Survey) -> dict[str, dict[str, Array]]:
+    """Each area as columns (cells each)."""
+    areas = {}
+    for name, area in found.areas.items():
+        held = {} if area.held is None else {"held": area.held.astype(float)}
+        areas[name] = {
+            **_centres(area.centres),
+            "postures": area.counts.astype(float),
+            **held,
+            **_statistics(area.values),
+        }
+    return areas
+
+
+def csv_text(columns: Mapping[str, Array], before: Mapping[str, str] | None = None) -> str:
+    """Columns as CSV, six digits; empty where a number is not known; ``before`` are texts that begin every row."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow([*(before or {}), *columns])
+    writer.writerows(_rows(columns, tuple((before or {}).values())))
+    return text.getvalue()
+
+
+def areas_text(found: Mapping[str, Survey]) -> str:
+    """The areas of all designs in one CSV: a row a cell."""
+    parts: list[str] = []
+    for design, each in found.items():
+        for area, columns in area_columns(each).items():
+            text = csv_text(columns, {"design": design, "area": area})
+            parts.append(text if not parts else text.partition("\n")[2])
+    return "".join(parts)
+
+
+def table_text(headings: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
+    """A table as CSV."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(headings)
+    writer.writerows(rows)
+    return text.getvalue()
+
+
+def design_rows(designs: Mapping[str, Mapping[str, Any]]) -> tuple[list[str], list[list[Any]]]:
+    """Headings and rows of designs.csv: a row a design and area, every quantity with all that is told of it."""
+    cells = [area for areas in designs.values() for area in areas.values()]
+    names = list(dict.fromkeys(name for area in cells for name in area["quantities"]))
+    keys = ("mean", "p95", "best_posture_mean", "best_posture_p95", "worst")
+    headings = ["design", "area", "reached", "held", "postures_per_cell"]
+    headings += [f"{name}_{key}" for name in names for key in keys]
+    rows = []
+    for design, areas in designs.items():
+        for name, area in areas.items():
+            row = [design, name, *(_text(area[key]) for key in ("reached", "held", "postures_per_cell"))]
+            row += [_text(area["quantities"].get(each, {}).get(key)) for each in names for key in keys]
+            rows.append(row)
+    return headings, rows
+
+
+def npz_bytes(columns: Mapping[str, Array]) -> bytes:
+    """Columns as a compressed npz; the same columns give the same bytes' content."""
+    stream = io.BytesIO()
+    np.savez_compressed(stream, **{name: np.asarray(each) for name, each in columns.items()})  # type: ignore[arg-type]
+    return stream.getvalue()
+
+
+def _centres(centres: Array) -> dict[str, Array]:
+    return {name: centres[:, i] * _MM for i, name in enumerate(_PLACES)}
+
+
+def _statistics(values: Mapping[str, Array]) -> dict[str, Array]:
+    return {f"{name}_{each}": rows[i] for name, rows in values.items() for i, each in enumerate(_STATISTICS)}
+
+
+def _rows(columns: Mapping[str, Array], before: tuple[str, ...]) -> Iterator[list[str]]:
+    texts = [_texts(np.asarray(each)) for each in columns.values()]
+    for row in zip(*texts, strict=True):
+        yield [*before, *row]
+
+
+def _texts(column: Array) -> list[str]:
+    return [_text(each) for each in column.tolist()]
+
+
+def _text(value: float | None) -> str:
+    return "" if value is None or not np.isfinite(value) else f"{value:.6g}"

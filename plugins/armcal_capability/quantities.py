@@ -1,0 +1,164 @@
+"""What is mapped: named numbers of each posture, with units and which end of them is good."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from armcal.arm.clearance import Mask
+from armcal.base.domains import Array
+from numpy.typing import NDArray
+
+from armcal_capability.mechanics import Mechanics, MechanicsFunction
+from armcal_capability.nimbleness import moves, nimbleness, singular_values, weighted
+
+_MM = 1000.0
+AT_ONCE = 16384
+"""Postures in memory together."""
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A number of each posture.
+
+    Attributes:
+        name: with its unit (``sag_mm``).
+        words: for figures and tables.
+        unit: as shown; empty for a ratio.
+        good: which end is good.
+    """
+
+    name: str
+    words: str
+    unit: str
+    good: Literal["low", "high"] = "low"
+
+
+CATALOGUE = (
+    Quantity("sag_mm", "sag under the arm's own weight", "mm"),
+    Quantity("deflection_mm", "further deflection under the load", "mm"),
+    Quantity("give_mm_per_N", "give in the softest direction", "mm/N"),
+    Quantity("effort_ratio", "torque of the joint nearest to its limit, of what its servo holds", ""),
+    Quantity("smallest_mm_per_rad", "smallest singular value, position", "mm/rad", "high"),
+    Quantity("manipulability", "Yoshikawa's manipulability, position", "SI", "high"),
+    Quantity("inverse_condition", "1/condition, position", "", "high"),
+    Quantity("pose_smallest_mm_per_rad", "smallest singular value, position and turn", "mm/rad", "high"),
+    Quantity("pose_manipulability", "Yoshikawa's manipulability, position and turn", "SI", "high"),
+    Quantity("pose_inverse_condition", "1/condition, position and turn", "", "high"),
+    Quantity("expected_mm", "expected error of the calibrated arm", "mm"),
+    Quantity("known_to_mm", "of which: parameters not known better", "mm"),
+    Quantity("quantisation_mm", "of which: steps of the servos", "mm"),
+    Quantity("nominal_mm", "error of the nominal model", "mm"),
+)
+"""All that there may be, in the order in which it is shown."""
+
+BY_NAME: Mapping[str, Quantity] = {each.name: each for each in CATALOGUE}
+
+
+@dataclass(frozen=True)
+class Postures:
+    """Postures that have an equilibrium, and what is known of each.
+
+    Attributes:
+        commands: joints x N (rad or m).
+        positions: of the loaded tool (N x 3; m, base frame).
+        rotations: base_R_tool (3 x 3 x N).
+        efforts: on all joints of the chain (joints x N; N m or N).
+        values: by quantity (N each; in the quantity's unit).
+        levers: how far each commanded joint moves the tool (joints x N; m/rad, or m/m).
+    """
+
+    commands: Array
+    positions: Array
+    rotations: Array
+    efforts: Array
+    values: Mapping[str, Array]
+    levers: Array
+
+    def __len__(self) -> int:
+        return len(self.positions)
+
+    def subset(self, chosen: Mask | NDArray[np.intp]) -> Postures:
+        """Some of them, by place or by mask."""
+        return Postures(
+            self.commands[:, chosen],
+            self.positions[chosen],
+            self.rotations[:, :, chosen],
+            self.efforts[:, chosen],
+            {name: each[chosen] for name, each in self.values.items()},
+            self.levers[:, chosen],
+        )
+
+    def with_values(self, more: Mapping[str, Array]) -> Postures:
+        """With more quantities."""
+        parts = (self.commands, self.positions, self.rotations, self.efforts, {**self.values, **more}, self.levers)
+        return Postures(*parts)
+
+
+@dataclass(frozen=True)
+class Weights:
+    """What quantities take into account.
+
+    Attributes:
+        slides: which commanded joints slide (n, bool).
+        length: metres that a rad counts for.
+        holding: what each joint of the chain holds (joints; N m or N; infinite where nothing is stated).
+    """
+
+    slides: Mask
+    length: float
+    holding: Array
+
+
+def postures_at(
+    function: MechanicsFunction, commands: Array, weights: Weights, told: Callable[[float], None] = lambda _: None
+) -> Postures:
+    """The postures at commands (joints x N) that have an equilibrium, with their mechanical quantities."""
+    count = commands.shape[1]
+    parts = []
+    for start in range(0, max(count, 1), AT_ONCE):
+        parts.append(_part(function, np.ascontiguousarray(commands[:, start : start + AT_ONCE]), weights))
+        told(min(1.0, (start + AT_ONCE) / max(count, 1)))
+    joined = _joined([part for part, _, _ in parts])
+    more: dict[str, Array] = {}
+    for prefix, place in (("", 1), ("pose_", 2)):
+        singular = np.concatenate([part[place] for part in parts])
+        found = nimbleness(singular, moves(singular))
+        more |= {f"{prefix}{name}": found[name] for name in ("manipulability", "inverse_condition")}
+        more[f"{prefix}smallest_mm_per_rad"] = found["smallest"] * _MM
+    return joined.with_values(more)
+
+
+def _part(function: MechanicsFunction, commands: Array, weights: Weights) -> tuple[Postures, Array, Array]:
+    """Some postures, and singular values of the position's and the pose's Jacobian."""
+    found = function(commands)
+    kept = found.settled
+    values = _elastic(function, commands, found) if function.is_elastic else {}
+    if np.isfinite(weights.holding).any():
+        values["effort_ratio"] = np.max(np.abs(found.efforts) / weights.holding[:, None], axis=0)
+    slopes = weighted(found.slopes, weights.slides, weights.length)[kept]
+    levers = np.linalg.norm(found.slopes[:, :3], axis=1).T
+    postures = Postures(commands, found.positions.T, found.rotations, found.efforts, values, levers).subset(kept)
+    return postures, singular_values(slopes[:, :3]), singular_values(slopes)
+
+
+def _elastic(function: MechanicsFunction, commands: Array, found: Mechanics) -> dict[str, Array]:
+    """What the springs give (mm, mm/N)."""
+    unloaded = function.without_load(commands, found.states)
+    values = {"sag_mm": np.linalg.norm(unloaded - function.weightless(commands), axis=0) * _MM}
+    if function.is_loaded:
+        values["deflection_mm"] = np.linalg.norm(found.positions - unloaded, axis=0) * _MM
+    return {**values, "give_mm_per_N": singular_values(found.compliances)[:, 0] * _MM}
+
+
+def _joined(parts: Sequence[Postures]) -> Postures:
+    return Postures(
+        np.concatenate([part.commands for part in parts], axis=1),
+        np.concatenate([part.positions for part in parts]),
+        np.concatenate([part.rotations for part in parts], axis=2),
+        np.concatenate([part.efforts for part in parts], axis=1),
+        {name: np.concatenate([part.values[name] for part in parts]) for name in parts[0].values},
+        np.concatenate([part.levers for part in parts], axis=1),
+    )

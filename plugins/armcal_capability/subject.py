@@ -1,0 +1,200 @@
+"""The arm that is surveyed: from a calibration, a configuration, or a design of one, with limits and clearance."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from armcal.arm.assembly import Arm
+from armcal.arm.clearance import ClearanceCheck, Mask
+from armcal.base.domains import Array
+from armcal.base.parameters import Parameters
+from armcal.base.settings import Settings
+from armcal.calibration.calibration import Calibration
+from armcal.calibration.tool_expression import ToolExpression, arm_expression
+from armcal.config.selection import with_values
+from armcal.config.system import System, build_system
+from armcal.config.validate import validate
+from armcal.config.yaml_source import ConfigSource, load_config
+from armcal.errors import ConfigError, Location
+from armcal.plugins import PluginRegistry
+from armcal.run.plan_clearance import clearance_check
+from armcal.run.plan_settings import PlanSettings
+
+
+class _PlanPart(Settings):
+    plan: PlanSettings | None = None
+
+
+@dataclass(frozen=True)
+class Subject:
+    """One arm whose parameters are numbers.
+
+    Attributes:
+        name: of the design, or of the arm.
+        arm: as described.
+        expression: at its values.
+        nominal: at the nominal values of its calibration; None where it has none.
+        limits: of its commands (joints x 2; rad or m).
+        clearance: what it keeps clear of; None where nothing is stated.
+        calibration: that it comes from; None for a configured arm.
+    """
+
+    name: str
+    arm: Arm
+    expression: ToolExpression
+    nominal: ToolExpression | None
+    limits: Array
+    clearance: ClearanceCheck | None
+    calibration: Calibration | None = None
+
+    def allowed(self, commands: Array) -> Mask:
+        """Which commands (joints x N) keep their clearance."""
+        if self.clearance is None:
+            return np.ones(commands.shape[1], dtype=bool)
+        return self.clearance(commands).allowed
+
+    @property
+    def slides(self) -> Mask:
+        """Which commanded joints slide."""
+        return np.array([dimension == "length" for dimension in self.arm.commanded.values()])
+
+    def holding(self, stated: dict[str, float]) -> Array:
+        """What each joint of the chain holds (joints; infinite where it is not stated).
+
+        Raises:
+            ConfigError: no joint is called so.
+        """
+        names = self.arm.joint_names
+        if unknown := sorted(set(stated) - set(names)):
+            raise ConfigError(
+                f"holding: no joint is called {unknown[0]!r}.", hint=f"The joints are {', '.join(names)}."
+            )
+        return np.array([stated.get(name, np.inf) for name in names])
+
+
+def of_calibration(calibration: Calibration, rules: ConfigSource | None, name: str) -> Subject:
+    """A calibrated arm; ``rules`` is a configuration whose section ``plan`` has limits and clearance.
+
+    Raises:
+        ConfigError: there are several arms, no limits, or the clearance is refused.
+    """
+    arm = _only(calibration.system, name)
+    nominal = calibration.parameters.with_nominal(np.array([e.nominal for e in calibration.record.parameters]))
+    plain = arm_expression(arm, nominal, calibration.system.environment)
+    limits, check = _rules(arm, calibration.system, rules, name)
+    return Subject(name, arm, calibration.expression(), plain, limits, check, calibration)
+
+
+def of_config(
+    source: ConfigSource, registry: PluginRegistry, name: str, corrections: Corrections | None = None
+) -> Subject:
+    """A configured arm, corrected if corrections are given.
+
+    Raises:
+        ConfigError: the configuration is refused, there are several arms, or no limits.
+        PluginError: a component is missing or broken.
+    """
+    system = build_system(source, registry)
+    arm = _only(system, name)
+    parameters = system.parameters()
+    if corrections is not None:
+        parameters = corrections.applied(parameters)
+    limits, check = _rules(arm, system, source, name)
+    return Subject(name, arm, arm_expression(arm, parameters, system.environment), None, limits, check)
+
+
+@dataclass(frozen=True)
+class Corrections:
+    """How a real arm differs from its description: what was stated of it, and what was found."""
+
+    stated: Parameters
+    found: Parameters
+
+    @classmethod
+    def read(cls, path: Path, described: ConfigSource, registry: PluginRegistry) -> Corrections:
+        """From a calibration, which knows what was stated; or from values (``arm.mdh.d1: 47 mm``) of a described arm.
+
+        Raises:
+            ConfigError: the file is neither, or names what the arm has not.
+        """
+        given = load_config(path)
+        if "armcal_calibration" not in given.data:
+            stated = build_system(described, registry).parameters()
+            return cls(stated, with_values(stated, given.data, given, ()))
+        calibration = Calibration.load(path, registry)
+        nominal = np.array([entry.nominal for entry in calibration.record.parameters])
+        return cls(calibration.parameters.with_nominal(nominal), calibration.parameters)
+
+    def applied(self, design: Parameters) -> Parameters:
+        """A design's parameters with the same differences from what the design states.
+
+        Raises:
+            ConfigError: it shares no parameter with the arm that they were found of.
+        """
+        blocks = {}
+        if not set(design.names) & set(self.stated.names):
+            raise ConfigError(
+                "the values are of an arm that has no parameter in common with this one.",
+                hint="Give a calibration, or values, of the same arm: its parameters must be called the same.",
+            )
+        for name in set(design.names) & set(self.stated.names):
+            own, before, after = design[name], self.stated[name], self.found[name]
+            if own.nominal == before.nominal:
+                blocks[name] = replace(own, nominal=after.nominal)
+            elif own.size == before.size:
+                moved = own.domain.local(np.array(before.nominal), np.array(after.nominal))
+                there = own.domain.retract(np.array(own.nominal), moved)
+                blocks[name] = replace(own, nominal=tuple(float(x) for x in there))
+        return design.replaced(blocks)
+
+
+def _only(system: System, name: str) -> Arm:
+    if len(system.arms) != 1:
+        raise ConfigError(
+            f"found {len(system.arms)} arms ({', '.join(system.arms)}), expected one.",
+            where=Location(name),
+            hint="Describe the arm that is to be surveyed alone.",
+        )
+    return next(iter(system.arms.values()))
+
+
+def _rules(arm: Arm, system: System, source: ConfigSource | None, name: str) -> tuple[Array, ClearanceCheck | None]:
+    """Limits and clearance."""
+    settings, check = PlanSettings(), None
+    if source is not None:
+        part = replace(source, data={key: value for key, value in source.data.items() if key == "plan"})
+        settings = validate(_PlanPart, part).plan or settings
+        if settings.clearance is not None:
+            check = clearance_check(settings.clearance, system.arms, source)
+    return _limits(arm, settings, name), check
+
+
+def _limits(arm: Arm, settings: PlanSettings, name: str) -> Array:
+    """Those that are stated, or the model's own."""
+    given = {**settings.limits, **settings.travel_limits}
+    if unknown := sorted(set(given) - set(arm.commanded)):
+        raise ConfigError(
+            f"plan.limits: no such joint is called {unknown[0]!r}.",
+            where=Location(name),
+            hint=f"The joints are {', '.join(arm.commanded)}.",
+        )
+    for joints, dimension in ((settings.limits, "angle"), (settings.travel_limits, "length")):
+        if wrong := [joint for joint in joints if arm.commanded[joint] != dimension]:
+            raise ConfigError(
+                f"{wrong[0]} has its limits under the wrong key.",
+                where=Location(name),
+                hint="Turning joints have theirs under plan.limits, sliding ones under plan.travel_limits.",
+            )
+    own = {joint.name: joint.limits for joint in arm.nominal_chain.joints}
+    found = {joint: given.get(joint) or own[joint] for joint in arm.commanded}
+    missing: Sequence[str] = [joint for joint, limits in found.items() if limits is None]
+    if missing:
+        raise ConfigError(
+            f"found no limits for {', '.join(missing)}.",
+            where=Location(name),
+            hint="Give plan: {limits: {q1: [-100 deg, 100 deg], ...}}, in the configuration or by --settings FILE.",
+        )
+    return np.array([list(limits) for limits in found.values() if limits is not None])

@@ -1,0 +1,110 @@
+"""What a survey comes to: a few numbers of the map and of each area, for tables and other programs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from armcal.arm.clearance import Mask
+from armcal.base.domains import Array
+
+from armcal_capability.areas import AreaMap
+from armcal_capability.quantities import BY_NAME, CATALOGUE
+from armcal_capability.settings import CapabilitySettings
+from armcal_capability.survey import Survey
+
+_MM = 1000.0
+_LITRE = 1000.0
+
+
+def summary_of(found: Survey, settings: CapabilitySettings) -> dict[str, Any]:
+    """Of one arm."""
+    expression, corner = found.subject.expression, found.postures.positions
+    return {
+        "arm": found.subject.arm.name,
+        "postures": {
+            "drawn": found.drawn,
+            "too_little_clearance": found.drawn - found.clear,
+            "no_equilibrium": found.unsettled,
+            "mapped": len(found.postures),
+        },
+        "reach": {
+            "cells": len(found.voxels.counts),
+            "cell_mm": found.voxels.size * _MM,
+            "volume_litres": len(found.voxels.counts) * found.voxels.size**3 * _LITRE,
+            "low_mm": (corner.min(axis=0) * _MM).tolist(),
+            "high_mm": (corner.max(axis=0) * _MM).tolist(),
+        },
+        "length_mm": settings.length * _MM,
+        "loads": settings.loads.to_config(),
+        "holding_Nm": dict(settings.holding),
+        "servos": sorted(expression.servos),
+        "unexplained_mm": None
+        if found.unexplained is None
+        else {"left": found.unexplained.left * _MM, "instrument": found.unexplained.instrument * _MM},
+        "cells": told(found.voxels.values),
+        "joints_Nm": _joints(found),
+        "areas": {name: area_summary(area) for name, area in found.areas.items()},
+    }
+
+
+def told(values: Mapping[str, Array]) -> dict[str, dict[str, float | None]]:
+    """Over cells: mean and 95 % of the cells' means over postures, the same of their best postures, and the worst.
+
+    95 % is what all but a twentieth of the cells are better than.
+    """
+    found: dict[str, dict[str, float | None]] = {}
+    for quantity in CATALOGUE:
+        if quantity.name not in values:
+            continue
+        best, mean, worst = (row[np.isfinite(row)] for row in values[quantity.name])
+        found[quantity.name] = {
+            "mean": _number(np.mean, mean),
+            "p95": _bad_end(quantity.name, mean),
+            "best_posture_mean": _number(np.mean, best),
+            "best_posture_p95": _bad_end(quantity.name, best),
+            "worst": _number(np.max if quantity.good == "low" else np.min, worst),
+        }
+    return found
+
+
+def design_summaries(designs: Mapping[str, Survey]) -> dict[str, dict[str, Any]]:
+    """Areas by design; quantities over the cells that all designs reach, so that none is blamed for reaching more."""
+    names = next((list(each.areas) for each in designs.values()), [])
+    shared = {name: np.all([each.areas[name].reached for each in designs.values()], axis=0) for name in names}
+    return {
+        design: {name: area_summary(each.areas[name], shared[name]) for name in names}
+        for design, each in designs.items()
+    }
+
+
+def area_summary(area: AreaMap, among: Mask | None = None) -> dict[str, Any]:
+    """How much of it is reached and held, and the quantities there, or ``among`` some cells."""
+    chosen = area.reached if among is None else among
+    return {
+        "cells_compared": int(np.sum(chosen)),
+        "cells": len(area.counts),
+        "reached": float(np.mean(area.reached)),
+        "held": None if area.held is None else float(np.mean(area.held)),
+        "postures_per_cell": float(np.mean(area.counts)),
+        "quantities": told({name: rows[:, chosen] for name, rows in area.values.items()}),
+    }
+
+
+def _joints(found: Survey) -> dict[str, dict[str, float]]:
+    """The torque (N m; N on sliding joints) that each joint carries over all postures,."""
+    names, efforts = found.subject.arm.joint_names, np.abs(found.postures.efforts)
+    return {
+        name: {"median": float(np.median(row)), "p95": float(np.percentile(row, 95)), "most": float(row.max())}
+        for name, row in zip(names, efforts, strict=True)
+    }
+
+
+def _bad_end(name: str, cells: Array) -> float | None:
+    level = 95 if BY_NAME[name].good == "low" else 5
+    return float(np.percentile(cells, level)) if len(cells) else None
+
+
+def _number(of: Any, cells: Array) -> float | None:
+    return float(of(cells)) if len(cells) else None

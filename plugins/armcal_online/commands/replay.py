@@ -1,0 +1,217 @@
+"""``armcal replay``."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, cast
+
+import click
+from armcal.base.config_text import finite
+from armcal.cli.common import Voice, overrides, speaking
+from armcal.cli.outlet import say
+from armcal.errors import EXIT_BAD_INPUT, EXIT_FAULT, InputError, Location
+from armcal.io.journal.files import REAL_FILES, write_whole
+from armcal.plugins import discover
+from rich.table import Table
+
+from armcal_online.replaying.begin import begun, journal_folder, kept_calibration, kept_settings
+from armcal_online.replaying.courses import WARM_UP, Comparison, compared, side_by_side
+from armcal_online.replaying.replay import Kept, Replayed, check_until, kept, replay
+from armcal_online.replaying.walk import NoWitness, Walk
+from armcal_online.replaying.witness import Comparer
+from armcal_online.running.session import OURS
+from armcal_online.tracking.settings import RecalibrateSettings, load_settings
+
+_Evaluator = Literal["auto", "compiled", "interpreted"]
+_EVALUATORS = ("auto", "compiled", "interpreted")
+
+
+@dataclass(frozen=True)
+class _Other:
+    """The course that other settings would have taken."""
+
+    walk: Walk
+    comparison: Comparison
+
+
+@click.command("replay")
+@click.argument("journal", type=click.Path(path_type=Path))
+@click.option("--until", type=click.IntRange(min=1), metavar="SEQUENCE", help="Stop after this entry.")
+@click.option("--calibration", type=click.Path(path_type=Path), help="Write the calibration as it was then.")
+@click.option("--evaluator", type=click.Choice(_EVALUATORS), help="Another evaluator than the journal's.")
+@click.option("--config", type=click.Path(path_type=Path), help="What would these settings have done?")
+@overrides
+@speaking
+def replay_command(
+    voice: Voice,
+    journal: Path,
+    until: int | None,
+    calibration: Path | None,
+    evaluator: str | None,
+    config: Path | None,
+    overrides: tuple[str, ...],
+) -> None:
+    """Make every state of a recalibration again from JOURNAL, and compare each with what was noted of it.
+
+    JOURNAL is the folder of a recalibration, or the journal in it; nothing is written there. With --config or --set,
+    what other settings would have done is shown beside what was done, and --calibration writes theirs.
+    """
+    registry = discover()
+    voice.plugin_faults(registry)
+    folder = journal_folder(journal)
+    _check_out(calibration, folder)
+    held = kept(folder)
+    check_until(held, until)
+    header = held.first.header
+    settings = _evaluated(kept_settings(header), evaluator)
+    wanted = _wanted(header, config, overrides)
+    begun_from = kept_calibration(header, folder, registry)
+    session = begun(begun_from, settings, registry)
+    comparer = Comparer(session.evaluator)
+    with voice.progress() as progress:
+        done = replay(held, session, comparer, until, progress)
+        other = None
+        if wanted is not None:
+            others = begun(begun_from, _evaluated(wanted, evaluator), registry)
+            walk = replay(held, others, NoWitness(), until, progress, "with other settings").walk
+            other = _Other(walk, compared(done.walk, walk))
+    chosen = other.walk if other else done.walk
+    written = calibration if calibration and not done.difference else None
+    if written:
+        write_whole(REAL_FILES, written, chosen.session.calibration_text().encode())
+    voice.result(_as_json(held, done, comparer, other, written))
+    _tell(voice, held, done, comparer, other)
+    if written:
+        voice.out.print(f"the calibration after entry {chosen.last}: {written}", markup=False, soft_wrap=True)
+    _leave(held, done)
+
+
+def _wanted(header: Mapping[str, Any], config: Path | None, overrides: tuple[str, ...]) -> RecalibrateSettings | None:
+    """The other settings that are asked about, if any are."""
+    if config is not None:
+        return load_settings(config, overrides)
+    return kept_settings(header, overrides) if overrides else None
+
+
+def _evaluated(settings: RecalibrateSettings, evaluator: str | None) -> RecalibrateSettings:
+    return settings.model_copy(update={"evaluator": cast(_Evaluator, evaluator)}) if evaluator else settings
+
+
+def _check_out(out: Path | None, folder: Path) -> None:
+    """Nothing of a recalibration is written over."""
+    if out is None:
+        return
+    place = out.resolve()
+    if place.parent == folder.resolve() or (place.parent == folder.resolve().parent and place.name in OURS):
+        raise InputError(
+            "it belongs to the recalibration.", where=Location(str(out)), hint="Give --calibration another place."
+        )
+    if place.is_dir() or not place.parent.is_dir():
+        raise InputError("no file can be written there.", where=Location(str(out)), hint="Give a file in a folder.")
+
+
+def _leave(held: Kept, done: Replayed) -> None:
+    """End with what the replay found."""
+    context = click.get_current_context()
+    if held.damage is not None:
+        say(f"armcal: {held.damage}", err=True)
+        context.exit(EXIT_BAD_INPUT)
+    if done.difference is not None:
+        context.exit(EXIT_FAULT)
+
+
+def _verdict(done: Replayed, comparer: Comparer) -> str:
+    counts = f"{done.walk.entries} entries, {comparer.states} states compared"
+    if done.difference is not None:
+        return f"{counts}; after entry {done.difference.sequence} they differ. {done.difference.sentence}"
+    if comparer.equal == comparer.states:
+        return f"{counts}, all the same to the last bit"
+    text = f"{counts}, {comparer.equal} the same to the last bit"
+    if comparer.measured:
+        widest = f"{comparer.widest.values:.1e} sd ({comparer.widest.covariance:.1e} in the covariance)"
+        text += f"; {comparer.measured} of the others were noted in full and differ by at most {widest}"
+    return f"{text}; all {comparer.decisions} decisions and levels are the same"
+
+
+def _tell(voice: Voice, held: Kept, done: Replayed, comparer: Comparer, other: _Other | None) -> None:
+    def say(text: str) -> None:
+        voice.out.print(text, markup=False, soft_wrap=True)
+
+    header, walk = held.first.header, done.walk
+    say(f"{held.folder}: begun from {header['path']}, replayed from entry {walk.first} to {walk.last}")
+    evaluator = walk.session.evaluator
+    same = "as the journal was written" if not comparer.others else f"another than the journal's: {comparer.others[0]}"
+    say(f"evaluator: {evaluator['backend']}, {same}")
+    for text in comparer.others[1:]:
+        voice.detail(f"  {text}")
+    say(_verdict(done, comparer))
+    if other is not None:
+        voice.out.print(_table(done.walk, other))
+    else:
+        state = walk.session.state
+        counts = ", ".join(f"{count} {what}" for what, count in state.counts.items())
+        say(f"{walk.records} records, of these in the estimate: {counts}; level {state.health.level}")
+    if held.cut is not None:
+        voice.warn(held.cut.sentence)
+
+
+def _table(walk: Walk, other: _Other) -> Table:
+    """Both courses."""
+    found = other.comparison
+    table = Table(title="what was done, and what other settings would have done")
+    for heading in ("", "done", "with other settings"):
+        table.add_column(heading)
+    for number, one, two in side_by_side(walk, other.walk):
+        table.add_row(f"entry {number}", one or "-", two or "-")
+    table.add_section()
+    states = walk.session.state, other.walk.session.state
+    for what in states[0].counts:
+        table.add_row(what, *(str(state.counts[what]) for state in states))
+    table.add_row("level at the end", *(state.health.level for state in states))
+    name = f"mean innovation of {found.records} records after the first {WARM_UP} that both accept"
+    table.add_row(name, *("-" if math.isnan(size) else f"{1000 * size:.3f} mm" for size in found.innovation_m))
+    table.add_row("largest difference of a parameter", "", f"{found.apart_sd:.3g} sd, {found.parameter}")
+    return table
+
+
+def _as_json(
+    held: Kept, done: Replayed, comparer: Comparer, other: _Other | None, written: Path | None
+) -> Mapping[str, Any]:
+    difference, walk = done.difference, done.walk
+    found: dict[str, Any] = {
+        "journal": str(held.folder),
+        "entries": walk.entries,
+        "first": walk.first,
+        "last": walk.last,
+        "states": {"compared": comparer.states, "same_to_the_last_bit": comparer.equal, "measured": comparer.measured},
+        "largest_difference_sd": {"values": comparer.widest.values, "covariance": comparer.widest.covariance},
+        "evaluator": walk.session.evaluator,
+        "other_evaluator": list(comparer.others),
+        "difference": {"after": difference.sequence, "sentence": difference.sentence} if difference else None,
+        "damage": str(held.damage) if held.damage else None,
+        "cut": held.cut.sentence if held.cut else None,
+        "calibration": str(written) if written else None,
+        **_course(walk),
+    }
+    if other is not None:
+        comparison = other.comparison
+        found["other_settings"] = {
+            **_course(other.walk),
+            "mean_innovation_mm": [1000 * size for size in comparison.innovation_m],
+            "innovations_compared": comparison.records,
+            "largest_difference": {"parameter": comparison.parameter, "sd": comparison.apart_sd},
+        }
+    return cast(Mapping[str, Any], finite(found))
+
+
+def _course(walk: Walk) -> dict[str, Any]:
+    state = walk.session.state
+    return {
+        "records": walk.records,
+        "counts": dict(state.counts),
+        "level": state.health.level,
+        "decisions": [event for event in walk.decisions if event["event"] == "decision"],
+    }

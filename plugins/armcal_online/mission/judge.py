@@ -1,0 +1,188 @@
+"""A mission judged against its truth: tip errors over time, recovery, availability, alarms."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from armcal.base.domains import Array
+from armcal.estimate.mission_truth import DAY_S, Mission, MissionEvent
+from numpy.typing import NDArray
+
+from armcal_online.mission.story import ALARMS, NAMING, Decision, Story
+
+Flags = NDArray[np.bool_]
+USABLE = ("nominal", "watch")
+EXPECTED = {
+    "slip": ("joint_slipped", "joint_replaced"),
+    "swap": ("joint_slipped", "joint_replaced"),
+    "bump": ("sensor_moved",),
+}
+"""The decisions that name an event right."""
+_WINDOW_S = 2 * DAY_S
+"""A decision within this time after an event is about it."""
+_IN_A_ROW = 3
+
+
+@dataclass(frozen=True)
+class ErrorCurve:
+    """Mean tip errors over time.
+
+    Attributes:
+        times: s since the mission began, in order (T): every record's, and every hour.
+        is_hour: which of them are hours (T).
+        is_record: which are records' (T).
+        frozen: of the calibration before launch, m (T).
+        recalibrated: of the recalibrated one, m (T).
+        levels: T.
+    """
+
+    times: Array
+    is_hour: Flags
+    is_record: Flags
+    frozen: Array
+    recalibrated: Array
+    levels: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class EventReport:
+    """What became of one event.
+
+    ``named``: ``right`` or ``wrong`` by the first decision that names anything, ``seen`` if it was only told that
+    something changed, ``missed`` if nothing was. ``before`` and ``worst`` are mean tip errors (m). Recovery is counted
+    in records that arrived and in s, None if it did not come about before the next event or the end.
+    """
+
+    event: MissionEvent
+    named: str
+    decision: Decision | None
+    before: float
+    worst: float
+    records: int | None
+    seconds: float | None
+
+
+@dataclass(frozen=True)
+class RecordCount:
+    """What became of the records; good ones are those that were not made outliers."""
+
+    made: int
+    lost: int
+    arrived: int
+    outliers: int
+    accepted: int
+    rejected: int
+    ignored: int
+    good_rejected: int
+    good_rejected_apart: int
+    outliers_accepted: int
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """A mission's figures.
+
+    ``availability`` is the share of all hours in which the level allowed use and the error was within the limit;
+    ``frozen_within`` the share in which the calibration before launch was within it.
+    """
+
+    curve: ErrorCurve
+    events: tuple[EventReport, ...]
+    false_alarms: tuple[Decision, ...]
+    records: RecordCount
+    availability: float
+    frozen_within: float
+    limit: float
+
+    @property
+    def missed(self) -> int:
+        """How many events nothing was decided about."""
+        return sum(report.named == "missed" for report in self.events)
+
+
+def judge(mission: Mission, story: Story, curve: ErrorCurve, limit: float, recovered: float) -> Judgement:
+    """Everything but the errors themselves.
+
+    Args:
+        mission: records and truth.
+        story: what the recalibration told.
+        curve: errors over time.
+        limit: of the mean tip error for use, m.
+        recovered: the error is back within so many times what it was before an event.
+    """
+    ends = [*(event.time for event in mission.events), mission.seconds][1:]
+    reports = tuple(
+        _report(event, end, story, curve, recovered) for event, end in zip(mission.events, ends, strict=True)
+    )
+    windows = [(e.time, min(e.time + _WINDOW_S, end)) for e, end in zip(mission.events, ends, strict=True)]
+    alarms = [each for each in story.decisions if each.kind in ALARMS]
+    apart = tuple(each for each in alarms if not _within(each.time, windows))
+    usable = np.array([level in USABLE for level in curve.levels]) & (curve.recalibrated <= limit)
+    return Judgement(
+        curve=curve,
+        events=reports,
+        false_alarms=apart,
+        records=_counted(mission, story, windows),
+        availability=float(usable[curve.is_hour].mean()),
+        frozen_within=float((curve.frozen <= limit)[curve.is_hour].mean()),
+        limit=limit,
+    )
+
+
+def _within(time: float, windows: Sequence[tuple[float, float]]) -> bool:
+    return any(first <= time < last for first, last in windows)
+
+
+def _report(event: MissionEvent, end: float, story: Story, curve: ErrorCurve, recovered: float) -> EventReport:
+    before = _before(event.time, curve)
+    after = (curve.times >= event.time) & (curve.times < end)
+    following = np.flatnonzero(after & curve.is_record)
+    good = curve.recalibrated[following] <= recovered * before
+    runs = np.convolve(good, np.ones(_IN_A_ROW), "valid") == _IN_A_ROW if len(good) >= _IN_A_ROW else np.zeros(0)
+    first = int(np.argmax(runs)) if runs.any() else None
+    last = min(event.time + _WINDOW_S, end)
+    alarms = [d for d in story.decisions if d.kind in ALARMS and event.time <= d.time < last]
+    decision = next((each for each in alarms if each.kind in NAMING), alarms[0] if alarms else None)
+    return EventReport(
+        event=event,
+        named=_named(event, decision),
+        decision=decision,
+        before=before,
+        worst=float(curve.recalibrated[after].max(initial=0.0)),
+        records=None if first is None else first + 1,
+        seconds=None if first is None else float(curve.times[following[first]] - event.time),
+    )
+
+
+def _before(time: float, curve: ErrorCurve) -> float:
+    """The median error in the day before; the first one's where there is none."""
+    chosen = (curve.times < time) & (curve.times >= time - DAY_S)
+    return float(np.median(curve.recalibrated[chosen])) if chosen.any() else float(curve.recalibrated[0])
+
+
+def _named(event: MissionEvent, decision: Decision | None) -> str:
+    if decision is None:
+        return "missed"
+    if decision.kind not in NAMING:
+        return "seen"
+    return "right" if decision.kind in EXPECTED[event.kind] and decision.joint == event.joint else "wrong"
+
+
+def _counted(mission: Mission, story: Story, windows: Sequence[tuple[float, float]]) -> RecordCount:
+    verdicts = np.array([story.verdicts.get(each, "ignored") for each in mission.records.ids])
+    apart = np.array([not _within(time, windows) for time in mission.times.tolist()], dtype=bool)
+    good, rejected, accepted = ~mission.outliers, verdicts == "rejected", verdicts == "accepted"
+    return RecordCount(
+        made=len(verdicts) + mission.lost,
+        lost=mission.lost,
+        arrived=len(verdicts),
+        outliers=int(mission.outliers.sum()),
+        accepted=int(accepted.sum()),
+        rejected=int(rejected.sum()),
+        ignored=int((verdicts == "ignored").sum()),
+        good_rejected=int((good & rejected).sum()),
+        good_rejected_apart=int((good & rejected & apart).sum()),
+        outliers_accepted=int((mission.outliers & accepted).sum()),
+    )

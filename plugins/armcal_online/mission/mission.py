@@ -1,0 +1,150 @@
+"""A mission: simulated, calibrated before launch, recalibrated record by record, and judged against the truth."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from armcal.calibration.calibration import Calibration
+from armcal.calibration.calibration_file import sealed
+from armcal.errors import ConfigError, InputError, NotConvergedError
+from armcal.estimate.estimator import Progress, no_progress
+from armcal.estimate.mission_truth import Mission
+from armcal.estimate.simulation import SimulationRequest
+from armcal.io.plain_files import check_output
+from armcal.measure.csv_writer import write_csv
+from armcal.plugins import PluginRegistry
+from armcal.run.experiment import Experiment
+from armcal.run.outputs import calibration_content
+from armcal.run.pipeline import Stopwatch, calibrate
+
+from armcal_online.mission.errors import error_curve
+from armcal_online.mission.judge import Judgement, judge
+from armcal_online.mission.settings import MissionPlan
+from armcal_online.mission.source import MissionSource, as_incoming
+from armcal_online.mission.story import Story, read_story
+from armcal_online.tracking.settings import RecalibrateSettings
+
+CALIBRATION = "calibration.yaml"
+BENCH = "bench.csv"
+RECORDS = "records.csv"
+RECALIBRATION = "recalibration"
+
+
+class Session(Protocol):
+    """Recalibrates from a source until it ends, in a folder that it goes on from if it was used before."""
+
+    def __call__(
+        self, calibration: Path, settings: RecalibrateSettings, source: MissionSource, folder: Path
+    ) -> Sequence[Mapping[str, Any]]:
+        """The events that it wrote; those up to a power cut, which it does not let through."""
+
+
+@dataclass(frozen=True)
+class MissionResult:
+    """A mission as it went."""
+
+    mission: Mission
+    calibration: Calibration
+    story: Story
+    judgement: Judgement
+
+
+def simulated(plan: MissionPlan) -> Mission:
+    """The mission's records and truth.
+
+    Raises:
+        ConfigError: the simulation does not fit the arm.
+    """
+    experiment = plan.experiment
+    system = experiment.system
+    mission = plan.simulator.mission(
+        SimulationRequest(system.arms, system.measurements, experiment.parameters, system.environment)
+    )
+    if not len(mission.records):
+        raise ConfigError(
+            "no record arrives in this mission.",
+            where=experiment.source.where(("simulation",)),
+            hint="Make it longer, or lose fewer records.",
+        )
+    return mission
+
+
+def write_records(plan: MissionPlan, mission: Mission, folder: Path) -> None:
+    """The records as a CSV that ``armcal recalibrate`` takes too."""
+    write_csv(folder / RECORDS, mission.records, plan.experiment.request(measured=True).wanted)
+
+
+def before_launch(plan: MissionPlan, folder: Path, progress: Progress = no_progress) -> Path:
+    """The calibration to begin with: the one that is given, or that of simulated records of the bench.
+
+    Raises:
+        InputError: the experiment is refused.
+        NotConvergedError: it did not converge.
+    """
+    settings = plan.settings
+    if settings.calibration is not None:
+        return settings.calibration
+    bench = Experiment.load(settings.experiment or "", registry=plan.experiment.registry)
+    system = bench.system
+    made = bench.simulator().simulate(
+        SimulationRequest(system.arms, system.measurements, bench.parameters, system.environment)
+    )
+    write_csv(folder / BENCH, made, bench.request(measured=True).wanted)
+    again = Experiment.load(settings.experiment or "", data=folder / BENCH, registry=bench.registry)
+    result = calibrate(again, progress=progress)
+    if not result.estimate.verdict.converged:
+        raise NotConvergedError(
+            "the calibration before launch did not converge.", hint=f"Try armcal run {settings.experiment}."
+        )
+    path = folder / CALIBRATION
+    check_output(path, InputError)
+    path.write_text(sealed(calibration_content(result, again)), encoding="utf-8")
+    return path
+
+
+def recalibrated(
+    mission: Mission, calibration: Path, settings: RecalibrateSettings, session: Session, folder: Path
+) -> Story:
+    """All records through sessions that power cuts end, each going on from what the one before it left."""
+    incoming = as_incoming(mission.records, mission.times, mission.began)
+    every = settings.model_copy(update={"output": settings.output.model_copy(update={"estimate_every_records": 1})})
+    cuts = [int(np.searchsorted(mission.times, time)) for time in mission.power_cuts]
+    events: list[Mapping[str, Any]] = []
+    for cut in (*cuts, None):
+        events += session(calibration, every, MissionSource(incoming, cut), folder)
+    return read_story(events, mission)
+
+
+def run_mission(
+    plan: MissionPlan,
+    folder: Path,
+    session: Session,
+    registry: PluginRegistry,
+    progress: Progress = no_progress,
+    watch: Stopwatch | None = None,
+) -> MissionResult:
+    """The whole mission in a folder.
+
+    Raises:
+        InputError: the mission, or what it begins with, is refused.
+        NotConvergedError: the calibration before launch did not converge.
+    """
+    watch = watch or Stopwatch()
+    with watch.stage("simulate"):
+        mission = simulated(plan)
+        write_records(plan, mission, folder)
+    with watch.stage("calibrate"):
+        path = before_launch(plan, folder, progress)
+        calibration = Calibration.load(path, registry)
+    with watch.stage("recalibrate"):
+        story = recalibrated(mission, path, plan.recalibrate, session, folder / RECALIBRATION)
+    settings, experiment = plan.settings, plan.experiment
+    with watch.stage("judge"):
+        evaluator = experiment.settings.evaluator
+        curve = error_curve(experiment.system, calibration.parameters, mission, story, settings, evaluator)
+        judged = judge(mission, story, curve, settings.limit, settings.recovered)
+    return MissionResult(mission, calibration, story, judged)

@@ -1,0 +1,86 @@
+"""What the command that runs a mission is told: the calibration to begin with, and how it is judged."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated
+
+from armcal.base.settings import InputPath, Length, Settings
+from armcal.config.validate import validate
+from armcal.config.yaml_source import load_config
+from armcal.errors import ConfigError
+from armcal.estimate.mission_truth import MissionSimulator
+from armcal.plugins import PluginRegistry, discover
+from armcal.run.experiment import Experiment
+from pydantic import Field, model_validator
+
+from armcal_online.tracking.settings import SECTION as RECALIBRATE
+from armcal_online.tracking.settings import RecalibrateSettings
+
+SECTION = "mission"
+
+
+class MissionRunSettings(Settings):
+    """The calibration before launch, and the judge.
+
+    ``experiment`` is a configuration whose simulated records are calibrated first; ``calibration`` a file that is
+    there already. The judge compares tips in so many random ``poses``, within the span of the records, with the truth;
+    the arm can be used while its level is nominal or watch and the mean error is within ``limit``. It has recovered
+    from an event when the error is back within ``recovered`` times what it was in the day before.
+    """
+
+    experiment: InputPath | None = None
+    calibration: InputPath | None = None
+    limit: Length = 0.003
+    poses: Annotated[int, Field(ge=1, le=5000)] = 200
+    seed: Annotated[int, Field(ge=0)] = 0
+    recovered: Annotated[float, Field(ge=1)] = 1.5
+
+    @model_validator(mode="after")
+    def _one_start(self) -> MissionRunSettings:
+        if (self.experiment is None) == (self.calibration is None):
+            raise ValueError("found both or neither of experiment and calibration, expected one of them")
+        if self.limit <= 0:
+            raise ValueError(f"found a limit of {1000 * self.limit:g} mm, expected one above zero")
+        return self
+
+
+@dataclass(frozen=True)
+class MissionPlan:
+    """A mission's configuration, checked and built, before anything is simulated.
+
+    Attributes:
+        experiment: the arm, and the simulator.
+        simulator: knows the truth.
+        settings: of the run.
+        recalibrate: how the calibration is kept true.
+    """
+
+    experiment: Experiment
+    simulator: MissionSimulator
+    settings: MissionRunSettings
+    recalibrate: RecalibrateSettings
+
+    @classmethod
+    def load(cls, path: Path, overrides: Sequence[str] = (), registry: PluginRegistry | None = None) -> MissionPlan:
+        """Read a mission; its sections ``mission`` and ``recalibrate`` are no part of an experiment.
+
+        Raises:
+            ConfigError: a section is missing or refused, or the simulator knows no truth over time.
+        """
+        source = load_config(path, overrides)
+        settings = validate(MissionRunSettings, source, (SECTION,))
+        found = RECALIBRATE in source.data
+        recalibrate = validate(RecalibrateSettings, source, (RECALIBRATE,)) if found else RecalibrateSettings()
+        rest = {key: value for key, value in source.data.items() if key not in (SECTION, RECALIBRATE)}
+        experiment = Experiment.of(replace(source, data=rest), registry=registry or discover())
+        simulator = experiment.simulator()
+        if not isinstance(simulator, MissionSimulator):
+            raise ConfigError(
+                "this simulator knows no truth over time.",
+                where=source.where(("simulation", "type")),
+                hint="Write simulation: {type: mission, ...}.",
+            )
+        return cls(experiment, simulator, settings, recalibrate)

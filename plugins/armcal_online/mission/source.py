@@ -1,0 +1,73 @@
+"""A mission's records as a source that the power may be cut off from."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from armcal.base.dataset import Dataset
+from armcal.base.domains import Array
+
+from armcal_online.sources.incoming import Incoming
+
+SOURCE_KEY = "mission"
+
+
+class PowerCutError(Exception):
+    """The power is gone: nothing is finished, nothing more is written."""
+
+
+def as_incoming(records: Dataset, times: Array, began: float) -> tuple[Incoming, ...]:
+    """Records as they arrive, the clock being that of the mission (times in s since it began)."""
+    names = list(records.channels)
+    columns = [records.channels[name].tolist() for name in names]
+    labels = list(records.extra)
+    return tuple(
+        Incoming(
+            record_id=records.ids[i],
+            channels={name: column[i] for name, column in zip(names, columns, strict=True)},
+            labels={name: records.extra[name][i] for name in labels},
+            arrived=began + float(times[i]),
+            source_key=SOURCE_KEY,
+            source_row=i + 1,
+        )
+        for i in range(len(records))
+    )
+
+
+class MissionSource:
+    """Records one after another; see ``Source``. After row ``cut`` the power goes."""
+
+    keeps_records = True
+
+    def __init__(self, records: Sequence[Incoming], cut: int | None = None) -> None:
+        self._records = records
+        self._cut = cut
+        self._next = 0
+
+    @property
+    def ended(self) -> bool:
+        """See ``Source``."""
+        return self._next >= len(self._records) and self._cut is None
+
+    def resume(self, positions: Mapping[str, int]) -> None:
+        """See ``Source``."""
+        self._next = positions.get(SOURCE_KEY, 0)
+
+    def incoming(self, wait_s: float) -> Incoming | None:
+        """See ``Source``.
+
+        Raises:
+            PowerCutError: it is time.
+        """
+        if self._cut is not None and self._next >= self._cut:
+            raise PowerCutError
+        if self._next >= len(self._records):
+            return None
+        self._next += 1
+        return self._records[self._next - 1]
+
+    def acknowledge(self, incoming: Incoming, sequence: int) -> None:
+        """See ``Source``: the journal remembers the row."""
+
+    def close(self) -> None:
+        """See ``Source``."""

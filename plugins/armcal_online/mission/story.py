@@ -1,0 +1,85 @@
+"""What a recalibration told of a mission, read from its events."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from armcal.base.domains import Array
+from armcal.estimate.mission_truth import Mission
+
+NAMING = ("joint_slipped", "joint_replaced", "sensor_moved")
+"""Decisions that say what happened."""
+ALARMS = (*NAMING, "general_change", "model_no_longer_fits", "unexplained")
+"""Decisions that claim that something happened."""
+
+
+@dataclass(frozen=True)
+class Decision:
+    """One decision: when (s since the mission began), what, of which joint, in words."""
+
+    time: float
+    kind: str
+    joint: str
+    sentence: str
+
+
+@dataclass(frozen=True)
+class Story:
+    """What became of the records, and what was estimated and decided when (s since the mission began).
+
+    Attributes:
+        verdicts: by record id: accepted, rejected or ignored.
+        estimates: values by canonical entry, in order, each with its time; the first is where it began.
+        levels: each with the time from which it held.
+        decisions: in order.
+        resumed: how often it was resumed.
+    """
+
+    verdicts: Mapping[str, str]
+    estimates: tuple[tuple[float, Mapping[str, float]], ...]
+    levels: tuple[tuple[float, str], ...]
+    decisions: tuple[Decision, ...]
+    resumed: int
+
+    def estimate_numbers(self, times: Array) -> Array:
+        """Which estimate held at these times (N; the last one not after)."""
+        known = np.array([time for time, _ in self.estimates])
+        return np.asarray(np.maximum(np.searchsorted(known, times, side="right") - 1, 0))
+
+    def levels_at(self, times: Array) -> tuple[str, ...]:
+        """The level at these times."""
+        known = np.array([time for time, _ in self.levels])
+        return tuple(self.levels[max(int(i) - 1, 0)][1] for i in np.searchsorted(known, times, side="right"))
+
+
+def read_story(events: Iterable[Mapping[str, Any]], mission: Mission) -> Story:
+    """The story of a mission from the events that a recalibration wrote, in order.
+
+    An event without a record of its own has the time of the last record before it.
+    """
+    times = dict(zip(mission.records.ids, mission.times.tolist(), strict=True))
+    verdicts: dict[str, str] = {}
+    estimates: dict[float, Mapping[str, float]] = {}
+    levels: list[tuple[float, str]] = []
+    decisions: list[Decision] = []
+    now, resumed = 0.0, 0
+    for event in events:
+        kind = event.get("event")
+        if kind == "started":
+            resumed += bool(event.get("resumed"))
+            estimates.setdefault(0.0, {p["name"]: float(p["value"]) for p in event.get("parameters", ())})
+            levels = levels or [(0.0, str(event.get("level", "nominal")))]
+        elif kind == "record":
+            now = times.get(str(event["id"]), now)
+            verdicts[str(event["id"])] = str(event["verdict"])
+        elif kind == "estimate":
+            estimates[now] = {name: float(found[0]) for name, found in event["parameters"].items()}
+        elif kind == "level":
+            levels.append((now, str(event["to"])))
+        elif kind == "decision":
+            said = (str(event.get(key) or "") for key in ("kind", "joint", "sentence"))
+            decisions.append(Decision(now, *said))
+    return Story(verdicts, tuple(estimates.items()), tuple(levels or [(0.0, "nominal")]), tuple(decisions), resumed)

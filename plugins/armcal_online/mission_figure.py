@@ -1,0 +1,147 @@
+"""The figure of a mission: tip errors over days with what happened, day and night, and the level."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+from armcal.estimate.mission_truth import DAY_S, Mission
+
+from armcal_online.mission.judge import ErrorCurve, Judgement
+
+_MM = 1000.0
+_FROZEN, _RECALIBRATED, _INK, _GRID, _FAINT = "#b5542a", "#1f5fa8", "#333333", "#d9d9d9", "#6a6a6a"
+_LEVELS = {"nominal": "#4c9f70", "watch": "#e3c14b", "suspect": "#dd7f33", "lost": "#b8322f"}
+_LEAST_MM = 0.02
+_NIGHT = (18.0, 30.0)
+"""Hours from the mission's midnight; evening to morning."""
+_WIDTH, _TURNED, _ROW = 0.24, 0.78, 25
+"""How much of the axes a label takes, from where on it stands to the left of its line, and its height in points."""
+
+
+def mission_figure(mission: Mission, judged: Judgement, title: str) -> bytes:
+    """A PNG."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(11.5, 5.6), dpi=130, layout="constrained")
+    FigureCanvasAgg(figure)
+    axes, band = figure.subplots(2, 1, sharex=True, gridspec_kw={"height_ratios": [16, 1], "hspace": 0.02})
+    days = mission.seconds / DAY_S
+    _curves(axes, judged, days)
+    rows = _happenings(axes, mission, judged)
+    _level_band(band, judged.curve, days)
+    below = {"loc": "upper right", "bbox_to_anchor": (1.0, -2.0), "borderaxespad": 0.0}
+    band.legend(*axes.get_legend_handles_labels(), ncols=2, fontsize=8.5, frameon=False, **below)
+    for each in (axes, band):
+        each.set_xlim(0, days)
+        for side in ("top", "right"):
+            each.spines[side].set_visible(False)
+    axes.set_title(title, loc="left", fontsize=12, color=_INK, pad=8 + _ROW * rows)
+    stream = io.BytesIO()
+    figure.savefig(stream, format="png")
+    return stream.getvalue()
+
+
+def _curves(axes: Any, judged: Judgement, days: float) -> None:
+    curve = judged.curve
+    at, shown = curve.times / DAY_S, np.vstack([curve.frozen, curve.recalibrated]) * _MM
+    low, high = max(float(shown.min()), _LEAST_MM) / 1.4, max(float(shown.max()), judged.limit * _MM) * 1.6
+    for first, last in _nights(days):
+        axes.axvspan(first, last, color="#eef0f4", lw=0, zorder=0)
+    axes.plot(at, shown[0], color=_FROZEN, lw=1.2, label="calibration before launch, frozen")
+    axes.plot(at, shown[1], color=_RECALIBRATED, lw=1.4, label="recalibrated", zorder=4)
+    axes.axhline(judged.limit * _MM, color=_INK, lw=0.9, ls=(0, (5, 4)), zorder=2)
+    axes.annotate(
+        f"limit {judged.limit * _MM:g} mm",
+        (1.0, judged.limit * _MM),
+        xycoords=("axes fraction", "data"),
+        xytext=(-4, 3),
+        textcoords="offset points",
+        ha="right",
+        fontsize=8.5,
+        color=_INK,
+    )
+    axes.set_yscale("log")
+    axes.set_ylim(low, high)
+    ticks = [digit * 10.0**power for power in range(-3, 5) for digit in (1, 3) if low <= digit * 10.0**power <= high]
+    axes.set_yticks(ticks, labels=[f"{tick:g}" for tick in ticks])
+    axes.minorticks_off()
+    axes.grid(axis="y", color=_GRID, lw=0.6)
+    axes.set_axisbelow(True)
+    axes.set_ylabel("mean tip error, mm", fontsize=10, color=_INK)
+    axes.tick_params(labelsize=9, colors=_INK)
+
+
+def _nights(days: float) -> Iterator[tuple[float, float]]:
+    for day in range(-1, int(np.ceil(days))):
+        first, last = (day + hour / 24 for hour in _NIGHT)
+        yield max(first, 0.0), min(last, days)
+
+
+def _happenings(axes: Any, mission: Mission, judged: Judgement) -> int:
+    """Events as labelled lines, each label in the lowest free row; power cuts inside the axes. How many rows."""
+    labels = [(e.event.time / mission.seconds, _told(e.event.label, e.records)) for e in judged.events]
+    rows = _rows([place for place, _ in labels])
+    for (place, text), row in zip(labels, rows, strict=True):
+        day = place * mission.seconds / DAY_S
+        axes.axvline(day, color=_INK, lw=1.0, zorder=3)
+        side = "right" if place > _TURNED else "left"
+        _write(axes, day, text, xytext=(2 if side == "right" else -2, 4 + _ROW * row), ha=side, color=_INK)
+    for time in mission.power_cuts:
+        axes.axvline(time / DAY_S, color=_FAINT, lw=0.9, ls=":", zorder=3)
+        _write(axes, time / DAY_S, "power cut", xytext=(3, -4), rotation=90, va="top", color=_FAINT)
+    return max(rows, default=-1) + 1
+
+
+def _told(label: str, records: int | None) -> str:
+    if records is None:
+        return f"{label}\nnot recovered"
+    return f"{label}\nrecovered in {records} record{'' if records == 1 else 's'}"
+
+
+def _write(axes: Any, day: float, text: str, **how: Any) -> None:
+    """At the top of the axes, moved by ``xytext`` points."""
+    where = {"xycoords": ("data", "axes fraction"), "textcoords": "offset points", "annotation_clip": False}
+    axes.annotate(text, (day, 1.0), fontsize=8.5, **where, **how)
+
+
+def _rows(places: Sequence[float]) -> list[int]:
+    """A line of text for each label (places from 0 to 1), so that neighbours do not run into each other."""
+    taken: list[list[tuple[float, float]]] = []
+    rows = []
+    for place in places:
+        first = place - _WIDTH if place > _TURNED else place
+        free = [i for i, row in enumerate(taken) if all(first >= end or first + _WIDTH <= at for at, end in row)]
+        row = free[0] if free else len(taken)
+        taken[row : row + 1] = [[*(taken[row] if free else []), (first, first + _WIDTH)]]
+        rows.append(row)
+    return rows
+
+
+def _level_band(band: Any, curve: ErrorCurve, days: float) -> None:
+    from matplotlib.patches import Patch
+
+    at = curve.times / DAY_S
+    starts = [0, *(i for i in range(1, len(at)) if curve.levels[i] != curve.levels[i - 1])]
+    for first, last in zip(starts, [*starts[1:], len(at) - 1], strict=True):
+        end = days if last == len(at) - 1 else at[last]
+        band.axvspan(at[first], end, color=_LEVELS.get(curve.levels[first], "#999999"), lw=0)
+    seen = [level for level in _LEVELS if level in curve.levels]
+    levels = band.legend(
+        handles=[Patch(color=_LEVELS[level], label=level) for level in seen],
+        loc="upper left",
+        bbox_to_anchor=(0.0, -2.0),
+        ncols=len(seen),
+        fontsize=8.5,
+        frameon=False,
+        borderaxespad=0.0,
+    )
+    band.add_artist(levels)
+    band.set_yticks([])
+    band.set_ylabel("level", fontsize=9, rotation=0, ha="right", va="center", color=_INK)
+    band.set_xlabel("days since the mission began", fontsize=10, color=_INK)
+    band.tick_params(labelsize=9, colors=_INK)
+    band.spines["left"].set_visible(False)

@@ -1,0 +1,165 @@
+"""The socket by which a running recalibration is asked things: a JSON object a line, a reply a line."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import select
+import socket
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from armcal.base.config_text import as_line
+from armcal.errors import ArmcalError, InputError, Location
+from armcal.io.unix_socket import listening, short_address
+
+SOCKET = "control.sock"
+COMMANDS = ("status", "pause", "resume", "rollback", "finish", "what_if")
+
+_LONGEST = 64 * 1024
+_CLIENTS = 8
+_PATIENCE_S = 10.0
+"""A client that neither asks nor reads for so long is let go of."""
+
+Answer = Callable[[Mapping[str, Any]], Mapping[str, Any]]
+"""The reply to a request; an ArmcalError becomes an error reply."""
+
+
+class _Client:
+    def __init__(self, connection: socket.socket) -> None:
+        self.connection = connection
+        self.asked = bytearray()
+        self.replies = bytearray()
+        self.ends = False
+        self.heard = time.monotonic()
+
+
+class ControlServer:
+    """Serves the socket in a folder, in the caller's thread: only while ``serve`` is called is anyone answered.
+
+    Raises:
+        InputError: somebody else serves it, or it cannot be made.
+    """
+
+    def __init__(self, folder: Path, answer: Answer) -> None:
+        self._path = folder / SOCKET
+        self._answer = answer
+        self._clients: list[_Client] = []
+        self._listener = listening(self._path, "a recalibration is running here.", "Give another --out.", _CLIENTS)
+
+    def serve(self) -> None:
+        """Answer what was asked by now; returns at once."""
+        open_now = [client.connection for client in self._clients]
+        writing = [client.connection for client in self._clients if client.replies]
+        try:
+            readable, writable, _ = select.select([self._listener, *open_now], writing, [], 0)
+        except (OSError, ValueError):
+            return
+        if self._listener in readable:
+            self._accept()
+        for client in [*self._clients]:
+            if client.connection in readable:
+                self._read(client)
+            if client.connection in writable or client.replies:
+                self._write(client)
+            if (client.ends and not client.replies) or time.monotonic() - client.heard > _PATIENCE_S:
+                self._drop(client)
+
+    def close(self) -> None:
+        """Send what is ready, and take the socket away."""
+        for client in [*self._clients]:
+            self._write(client)
+            self._drop(client)
+        self._listener.close()
+        with contextlib.suppress(OSError):
+            self._path.unlink()
+
+    def _accept(self) -> None:
+        try:
+            connection, _ = self._listener.accept()
+        except OSError:
+            return
+        connection.setblocking(False)
+        self._clients.append(_Client(connection))
+        if len(self._clients) > _CLIENTS:
+            self._drop(self._clients[0])
+
+    def _read(self, client: _Client) -> None:
+        try:
+            data = client.connection.recv(_LONGEST)
+        except BlockingIOError:
+            return
+        except OSError:
+            data = b""
+        client.heard = time.monotonic()
+        client.ends |= not data
+        *lines, rest = bytes(client.asked + data).split(b"\n")
+        client.asked = bytearray(rest)
+        for line in lines:
+            if line.strip():
+                client.replies += as_line(self._reply(line)).encode() + b"\n"
+        if len(client.asked) > _LONGEST:
+            client.replies += as_line(_refusal("The request has more than 64 KiB.")).encode() + b"\n"
+            client.asked.clear()
+            client.ends = True
+
+    def _write(self, client: _Client) -> None:
+        try:
+            sent = client.connection.send(client.replies)
+        except BlockingIOError:
+            return
+        except OSError:
+            client.replies.clear()
+            client.ends = True
+            return
+        if sent:
+            client.heard = time.monotonic()
+        del client.replies[:sent]
+
+    def _drop(self, client: _Client) -> None:
+        client.connection.close()
+        if client in self._clients:
+            self._clients.remove(client)
+
+    def _reply(self, line: bytes) -> Mapping[str, Any]:
+        try:
+            request = json.loads(line.decode("utf-8"))
+        except (ValueError, RecursionError) as fault:
+            return _refusal(f"The request is not JSON ({fault}).")
+        if not isinstance(request, dict) or request.get("command") not in COMMANDS:
+            return _refusal(f"Expected an object with a command: {', '.join(COMMANDS)}.")
+        try:
+            return {"ok": True, **self._answer(request)}
+        except ArmcalError as fault:
+            return _refusal(str(fault))
+        except Exception as fault:  # whoever asks, and whatever, cannot end a recalibration
+            return _refusal(f"It failed ({type(fault).__name__}: {fault}).")
+
+
+def ask(folder: Path, request: Mapping[str, Any], timeout_s: float = 30.0) -> dict[str, Any]:
+    """The reply of the recalibration that runs in a folder: ``ok``, and what was asked for or an ``error``.
+
+    Raises:
+        InputError: none runs there, or it does not answer in time.
+    """
+    where = Location(str(folder / SOCKET))
+    try:
+        with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection, short_address(folder / SOCKET) as address:
+            connection.settimeout(timeout_s)
+            connection.connect(address)
+            connection.sendall(json.dumps(request).encode() + b"\n")
+            with connection.makefile("rb") as replies:
+                reply = json.loads(replies.readline())
+    except TimeoutError as fault:
+        hint = "It may be busy with a long replay; ask again."
+        raise InputError(f"no answer within {timeout_s:g} s.", where=where, hint=hint) from fault
+    except (OSError, ValueError) as fault:
+        hint = "Start it with `armcal recalibrate`, or give the folder it was given as --out."
+        raise InputError(f"no recalibration answers here ({fault}).", where=where, hint=hint) from fault
+    return dict(reply)
+
+
+def _refusal(sentence: str) -> dict[str, Any]:
+    return {"ok": False, "error": sentence}

@@ -1,0 +1,177 @@
+"""What the entries of a journal make of a recalibration: the same in the field, after a restart, and in a replay.
+
+Everything that changes the estimate goes through ``Course.apply``, with what was journalled and nothing else.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any, Protocol
+
+from armcal.errors import ArmcalError, DataError, Location
+
+from armcal_online.running.progress import Progress
+from armcal_online.sources.incoming import Incoming
+
+RECORD = "record"
+ROLLBACK = "rollback"
+PAUSE = "pause"
+RESUME = "resume"
+STARTED = "started"
+DECISION = "decision"
+
+Event = dict[str, Any]
+
+
+class Estimation(Protocol):
+    """What is asked of a recalibrator here."""
+
+    def take(self, incoming: Incoming, sequence: int) -> tuple[Event, ...]:
+        """Judge and use a record; what there is to tell of it. The state is as it was if this raises."""
+
+    def snapshot(self) -> dict[str, Any]:
+        """The whole state, as JSON, exactly."""
+
+    def restore(self, snapshot: Mapping[str, Any]) -> None:
+        """Take up a state."""
+
+    def digest(self) -> str:
+        """Of the state, bit for bit."""
+
+
+class JournalEntry(Protocol):
+    """An entry as the journal gives it."""
+
+    @property
+    def sequence(self) -> int:
+        """Its number."""
+
+    @property
+    def kind(self) -> str:
+        """Its kind."""
+
+    @property
+    def content(self) -> Any:
+        """What it says."""
+
+
+Reach = Callable[[int], tuple[JournalEntry, tuple[JournalEntry, ...]]]
+"""The last checkpoint at or before a sequence number, and the entries after it up to that number."""
+
+
+class ReplayDiffersError(DataError):
+    """Going through the journal again gives another state than was noted in it."""
+
+
+@contextmanager
+def parsing(sequence: int, journal: str = "the journal") -> Iterator[None]:
+    """For what is read of an entry whose checksum is right.
+
+    Raises:
+        DataError: it is not what this version writes there.
+    """
+    try:
+        yield
+    except (KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError) as fault:
+        raise DataError(
+            f"entry {sequence} is whole, but none that this version writes ({type(fault).__name__}: {fault}).",
+            where=Location(journal or None),
+            hint="Read it with the version of armcal that wrote it, or begin a new --out from its calibration.yaml.",
+        ) from fault
+
+
+class Course:
+    """An estimate and how far its source was taken, moved on by journal entries."""
+
+    def __init__(self, estimation: Estimation, reach: Reach, journal_name: str = "") -> None:
+        self._estimation = estimation
+        self._reach = reach
+        self._name = journal_name
+        self._initial = estimation.snapshot()
+        self.progress = Progress()
+
+    def checkpoint(self) -> dict[str, Any]:
+        """The whole state, for the journal."""
+        return {
+            "state": self._estimation.snapshot(),
+            "digest": self._estimation.digest(),
+            "progress": self.progress.as_dict(),
+        }
+
+    def restore(self, checkpoint: Mapping[str, Any] | None, sequence: int) -> None:
+        """Take up the state of a checkpoint; without one, that of the beginning.
+
+        Raises:
+            ReplayDiffersError: it is not the state that was noted with it.
+        """
+        if checkpoint is None:
+            self._estimation.restore(self._initial)
+            self.progress = Progress()
+            return
+        with parsing(sequence, self._name):
+            state, digest = checkpoint["state"], str(checkpoint["digest"])
+            progress = Progress.from_dict(checkpoint["progress"])
+            self._estimation.restore(state)
+        self.progress = progress
+        self._compare(digest, sequence)
+
+    def apply(self, sequence: int, kind: str, content: Mapping[str, Any]) -> tuple[Event, ...]:
+        """What an entry does, and what there is to tell of it.
+
+        Raises:
+            ReplayDiffersError: the entry notes a state, and this is another.
+            DataError: a rollback goes to where the journal no longer reaches.
+        """
+        if kind == RECORD:
+            with parsing(sequence, self._name):
+                incoming = Incoming.from_dict(content)
+            return self._take(sequence, incoming)
+        if kind in (PAUSE, RESUME):
+            self.progress.paused = kind == PAUSE
+        elif kind == ROLLBACK:
+            with parsing(sequence, self._name):
+                to = int(content["to"])
+            self.go_back(to)
+        if kind in (ROLLBACK, DECISION) and "digest" in content:
+            self._compare(str(content["digest"]), sequence)
+        return ()
+
+    def go_back(self, sequence: int) -> None:
+        """The estimate as it was after an entry; how far the source was taken stays.
+
+        Raises:
+            DataError: the journal does not reach there; nothing is changed.
+        """
+        before = self._estimation.snapshot()
+        try:
+            checkpoint, entries = self._reach(sequence)
+            earlier = Course(self._estimation, self._reach, self._name)
+            earlier._initial = self._initial
+            earlier.restore(checkpoint.content, checkpoint.sequence)
+            for entry in entries:
+                earlier.apply(entry.sequence, entry.kind, entry.content)
+        except BaseException:
+            self._estimation.restore(before)
+            raise
+
+    def _take(self, sequence: int, incoming: Incoming) -> tuple[Event, ...]:
+        self.progress.take(incoming, sequence)
+        why = "The recalibration is paused."
+        if not self.progress.paused:
+            try:
+                return self._estimation.take(incoming, sequence)
+            except ArmcalError as fault:
+                why = f"It could not be used: {fault}"
+        event = {"event": RECORD, "sequence": sequence, "id": incoming.record_id, "at": incoming.arrived}
+        return ({**event, "verdict": "ignored", "why": why},)
+
+    def _compare(self, noted: str, sequence: int) -> None:
+        found = self._estimation.digest()
+        if found != noted:
+            raise ReplayDiffersError(
+                f"after entry {sequence} the state is {found[:12]}, expected {noted[:12]} as was noted then.",
+                where=Location(self._name or None),
+                hint="Use the version of armcal, the libraries and the evaluator that wrote it, or begin a new --out "
+                "from its calibration.yaml.",
+            )

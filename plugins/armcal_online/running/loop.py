@@ -1,0 +1,282 @@
+"""The loop of a recalibration: a record is journalled, acknowledged, used and told of, one at a time."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from armcal.base.config_text import finite
+from armcal.io.journal.journal import Journal, JournalFullError
+from armcal.io.signals import Signals
+
+from armcal_online.running.course import DECISION, PAUSE, RECORD, RESUME, ROLLBACK, Course, Estimation, Event
+from armcal_online.running.outputs import Outputs
+from armcal_online.sources.incoming import Incoming
+from armcal_online.sources.source import Source
+
+WAIT_S = 0.1
+"""How long a source is waited for before control and signals are looked at again."""
+FULL_WAIT_S = 1.0
+"""How long a record waits for room in the journal before it is tried again."""
+
+
+class Session(Estimation, Protocol):
+    """What the loop asks of a recalibrator."""
+
+    def status(self) -> dict[str, Any]:
+        """What there is to say of it now, as JSON."""
+
+    def calibration_text(self) -> str:
+        """The updated calibration, as the text of its file."""
+
+
+class Served(Protocol):
+    """What the loop asks of a control socket."""
+
+    def serve(self) -> None:
+        """Answer what was asked by now; returns at once."""
+
+
+@dataclass(frozen=True)
+class Pace:
+    """How often things are written; seconds are of a monotonic clock, and nothing that is estimated hangs on them.
+
+    The calibration is written after so many records or so much time, but not twice within ``calibration_gap_s``:
+    it takes longer than many records do. A decision, and the end, write it at once.
+    """
+
+    calibration_records: int = 20
+    calibration_s: float = 600.0
+    calibration_gap_s: float = 1.0
+    status_s: float = 1.0
+    checkpoint_records: int = 1000
+    digest_records: int = 100
+
+
+class Recalibration:
+    """A source, a journal, an estimate and its outputs, moved on record by record.
+
+    Attributes:
+        sequence: of the last entry that changed anything.
+        finishing: why it is about to end; empty while it is not.
+    """
+
+    def __init__(
+        self,
+        source: Source,
+        journal: Journal,
+        session: Session,
+        course: Course,
+        outputs: Outputs,
+        pace: Pace,
+        since_checkpoint: int = 0,
+    ) -> None:
+        self._source = source
+        self._journal = journal
+        self._session = session
+        self._course = course
+        self._outputs = outputs
+        self._pace = pace
+        self._held: Incoming | None = None
+        self._held_until = 0.0
+        self._is_full = False
+        self._is_written = False
+        self._since_calibration = self._since_digest = 0
+        self._since_checkpoint = since_checkpoint
+        self._calibrated = self._told = -float("inf")
+        self.sequence = journal.sequence
+        self.finishing = ""
+
+    @property
+    def paused(self) -> bool:
+        """Whether records are passed over, or left where they are."""
+        return self._course.progress.paused
+
+    def run(self, control: Served) -> None:
+        """Until the source ends, a signal comes, or it is told to finish.
+
+        Raises:
+            JournalFailedError: the disk fails; what was acknowledged is safe.
+        """
+        with Signals() as signals:
+            self.write_calibration()
+            while not self.finishing:
+                control.serve()
+                self._heed(signals)
+                if not self.finishing:
+                    self.step(WAIT_S)
+            self._finish()
+            control.serve()
+
+    def step(self, wait_s: float) -> None:
+        """Take one record, if there is one within the wait, and write what is due."""
+        if self._waits():
+            time.sleep(wait_s)
+        elif (incoming := self._held or self._source.incoming(wait_s)) is not None:
+            self._take(incoming)
+        elif self._source.ended:
+            self.finishing = "The source has ended."
+        self._write_due()
+
+    def pause(self) -> None:
+        """Pass records over, or leave them in the source."""
+        if not self.paused:
+            self._command(PAUSE)
+
+    def resume(self) -> None:
+        """Take records again."""
+        if self.paused:
+            self._command(RESUME)
+
+    def roll_back(self, sequence: int) -> None:
+        """Take up the estimate as it was after an entry; records since then stay taken, and have no effect.
+
+        Raises:
+            DataError, InputError: the journal does not reach there; nothing is changed.
+            JournalFullError: there is no room to note it; nothing is changed.
+        """
+        before = self._session.snapshot()
+        self._course.go_back(sequence)
+        try:
+            self.sequence = self._journal.record(ROLLBACK, {"to": sequence, "digest": self._session.digest()})
+        except BaseException:
+            self._session.restore(before)
+            raise
+        sentence = f"The estimate was set back to what it was after entry {sequence}."
+        event = {"event": "decision", "sequence": self.sequence, "at": time.time(), "kind": "rollback"}
+        self._outputs.event({**event, "to": sequence, "sentence": sentence})
+        self._checkpoint()
+        self.write_calibration()
+
+    def status(self) -> dict[str, Any]:
+        """What there is to say now."""
+        return {
+            **self._session.status(),
+            "sequence": self.sequence,
+            "records": self._course.progress.records,
+            "paused": self.paused,
+            "journal": "full" if self._is_full else "good",
+            "at": time.time(),
+            "process": os.getpid(),
+        }
+
+    def write_calibration(self) -> None:
+        """Replace the updated calibration."""
+        self._since_calibration = 0
+        self._calibrated = time.monotonic()
+        self._is_written = self._outputs.calibration(self._session.calibration_text())
+        if self._is_written:
+            path = str(self._outputs.calibration_path)
+            self._outputs.event({"event": "calibration", "sequence": self.sequence, "at": time.time(), "path": path})
+
+    def _waits(self) -> bool:
+        """Whether records stay where they are for now."""
+        if self._held is not None:
+            return time.monotonic() < self._held_until
+        return self.paused and self._source.keeps_records
+
+    def _take(self, incoming: Incoming) -> None:
+        self._held = None
+        earlier = None if self._source.keeps_records else self._course.progress.repeated(incoming)
+        if earlier is not None:
+            self._source.acknowledge(incoming, earlier)
+            return
+        content = incoming.as_dict()
+        try:
+            self.sequence = self._journal.record(RECORD, content)
+        except JournalFullError as fault:
+            self._hold(incoming, fault)
+            return
+        self._has_room()
+        self._source.acknowledge(incoming, self.sequence)
+        self._tell(self._course.apply(self.sequence, RECORD, content))
+
+    def _tell(self, events: tuple[Event, ...]) -> None:
+        """Events go out; decisions are noted, with the state that they led to, for a replay to be compared with."""
+        self._since_calibration += 1
+        self._since_checkpoint += 1
+        self._since_digest += 1
+        for event in events:
+            self._outputs.event(event)
+        decided = [finite(event) for event in events if event["event"] in ("decision", "level")]
+        if decided or self._since_digest >= self._pace.digest_records:
+            self._since_digest = 0
+            self._note({"after": self.sequence, "digest": self._session.digest(), "events": decided})
+        if any(event["event"] == "decision" for event in decided):
+            self.write_calibration()
+
+    def _note(self, content: Mapping[str, Any]) -> None:
+        try:
+            self._journal.note(DECISION, content)
+        except JournalFullError as fault:
+            self._lacks_room(fault)
+
+    def _hold(self, incoming: Incoming, fault: JournalFullError) -> None:
+        """Keep a record that could not be made safe, unacknowledged, until there is room."""
+        self._held = incoming
+        self._held_until = time.monotonic() + FULL_WAIT_S
+        self._lacks_room(fault)
+
+    def _lacks_room(self, fault: JournalFullError) -> None:
+        if not self._is_full:
+            self._is_full = True
+            self._outputs.alarm(f"The journal is full, and records wait. {fault}")
+
+    def _has_room(self) -> None:
+        if self._is_full:
+            self._is_full = False
+            self._outputs.alarm("The journal has room again.")
+
+    def _command(self, kind: str) -> None:
+        self.sequence = self._journal.record(kind, {"at": time.time()})
+        self._course.apply(self.sequence, kind, {})
+        self._outputs.event({"event": "control", "sequence": self.sequence, "at": time.time(), "command": kind})
+
+    def _checkpoint(self) -> None:
+        try:
+            self._journal.checkpoint(self._course.checkpoint())
+        except JournalFullError as fault:
+            self._lacks_room(fault)
+        else:
+            self._since_checkpoint = 0
+
+    def _write_due(self) -> None:
+        """Checkpoint, calibration and status, where it is time."""
+        if self._since_checkpoint and (
+            self._journal.wants_checkpoint or self._since_checkpoint >= self._pace.checkpoint_records
+        ):
+            self._checkpoint()
+        now = time.monotonic()
+        enough = self._since_calibration >= self._pace.calibration_records
+        gap_s = self._pace.calibration_gap_s if enough else self._pace.calibration_s
+        if self._since_calibration and now - self._calibrated >= gap_s:
+            self.write_calibration()
+        if now - self._told >= self._pace.status_s:
+            self._write_status()
+
+    def _write_status(self) -> None:
+        self._told = time.monotonic()
+        self._outputs.status(self.status())
+
+    def _heed(self, signals: Signals) -> None:
+        if signals.finish:
+            self.finishing = "It was asked to finish by a signal."
+        if signals.rotate:
+            signals.rotate = False
+            self._outputs.rotate()
+        if signals.status:
+            signals.status = False
+            self._write_status()
+
+    def _finish(self) -> None:
+        self._outputs.retry()
+        if self._since_checkpoint:
+            self._checkpoint()
+        if self._since_calibration or not self._is_written:
+            self.write_calibration()
+        sentence = f"{self.finishing} {self._course.progress.records} records were taken in all."
+        self._outputs.event({"event": "finished", "sequence": self.sequence, "at": time.time(), "sentence": sentence})
+        self._outputs.status({**self.status(), "finished": True})

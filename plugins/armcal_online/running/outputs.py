@@ -1,0 +1,153 @@
+"""What a recalibration leaves for others: events, a status, the updated calibration. Trouble here never stops it."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from armcal.base.config_text import as_line
+from armcal.io.event_file import EventFile
+from armcal.io.journal.files import REAL_FILES, FileLayer, is_full, write_whole
+from armcal.io.standard_output import StandardOutput
+
+CALIBRATION = "calibration.yaml"
+STATUS = "status.json"
+RESERVE = "calibration.reserve"
+"""As much room as a calibration needs: the journal would take all that is left of a disk."""
+RETRY_S = 10.0
+"""What could not be written is tried again after so long."""
+
+
+class Outputs:
+    """Events to standard output and ``events.jsonl``; ``status.json`` and ``calibration.yaml``, replaced whole.
+
+    When a disk is full, events are given up first, then the status; the calibration is tried again later.
+    """
+
+    def __init__(self, folder: Path, stream: StandardOutput, events: EventFile, files: FileLayer = REAL_FILES) -> None:
+        self._folder = folder
+        self._stream = stream
+        self._events = events
+        self._files = files
+        self._silent_until: dict[str, float] = {}
+        self._troubled: set[str] = set()
+
+    @property
+    def calibration_path(self) -> Path:
+        """Where the calibration is."""
+        return self._folder / CALIBRATION
+
+    def event(self, event: Mapping[str, Any]) -> None:
+        """One event, everywhere."""
+        line = as_line(event)
+        self._say(line)
+        if self._may("events"):
+            try:
+                self._events.write(line)
+            except OSError as fault:
+                self._failed("events", f"The events are not written to a file ({fault.strerror}).")
+            else:
+                self._mended("events", "The events are written to a file again.")
+
+    def status(self, status: Mapping[str, Any]) -> None:
+        """The newest status, in place of the one before."""
+        if not self._may("status"):
+            return
+        try:
+            write_whole(self._files, self._folder / STATUS, as_line(status).encode() + b"\n")
+        except OSError as fault:
+            self._failed("status", f"The status is not written ({fault.strerror}).")
+        else:
+            self._mended("status", "The status is written again.")
+
+    def calibration(self, text: str) -> bool:
+        """The updated calibration, in place of the one before; whether that went well."""
+        if not self._may("calibration"):
+            return False
+        try:
+            self._replace_calibration(text.encode())
+        except OSError as fault:
+            sentence = f"The calibration is not written ({fault.strerror}); the one before stands. It is tried again."
+            self._failed("calibration", sentence)
+            return False
+        self._mended("calibration", "The calibration is written again.")
+        return True
+
+    def rotate(self) -> None:
+        """Begin a new file of events."""
+        with contextlib.suppress(OSError):
+            self._events.rotate()
+
+    def alarm(self, sentence: str) -> None:
+        """An event that somebody should see."""
+        self.event({"event": "alarm", "at": time.time(), "sentence": sentence})
+
+    def retry(self) -> None:
+        """Try everything again that could not be written."""
+        self._silent_until.clear()
+
+    def close(self) -> None:
+        """Close the file of events."""
+        self._events.close()
+
+    def _replace_calibration(self, data: bytes) -> None:
+        """The calibration; if the disk is full, in the place of the reserve."""
+        try:
+            write_whole(self._files, self.calibration_path, data)
+        except OSError as fault:
+            if not is_full(fault):
+                raise
+            self._make_room()
+            write_whole(self._files, self.calibration_path, data)
+        with contextlib.suppress(OSError):
+            self._keep_reserve(len(data))
+
+    def _make_room(self) -> None:
+        """Give up the events and the reserve."""
+        with contextlib.suppress(OSError):
+            self._events.give_up()
+        self._failed("events", "The events of the past were dropped: the disk is full.")
+        with contextlib.suppress(OSError):
+            self._files.remove(self._folder / RESERVE)
+
+    def _keep_reserve(self, size: int) -> None:
+        """A file somewhat larger than the calibration, in whose place the next one can be written."""
+        path = self._folder / RESERVE
+        if path.exists() and self._files.size(path) >= size:
+            return
+        write_whole(self._files, path, b"\0" * (size + size // 4 + 4096))
+
+    def _say(self, line: str) -> None:
+        lost = self._stream.lost
+        self._stream.write(line)
+        if lost and self._stream.lost == lost:
+            self._stream.lost = 0
+            sentence = f"{lost} events were left out here: nobody read them in time."
+            self._stream.write(as_line({"event": "alarm", "at": time.time(), "sentence": sentence}))
+
+    def _may(self, what: str) -> bool:
+        """Whether it is time to try."""
+        return time.monotonic() >= self._silent_until.get(what, -math.inf)
+
+    def _failed(self, what: str, sentence: str) -> None:
+        self._silent_until[what] = time.monotonic() + RETRY_S
+        if what not in self._troubled:
+            self._troubled.add(what)
+            self._tell(what, sentence)
+
+    def _mended(self, what: str, sentence: str) -> None:
+        self._silent_until.pop(what, None)
+        if what in self._troubled:
+            self._troubled.discard(what)
+            self._tell(what, sentence)
+
+    def _tell(self, what: str, sentence: str) -> None:
+        """An alarm, which is not written to the file that is in trouble itself."""
+        if what == "events":
+            self._say(as_line({"event": "alarm", "at": time.time(), "sentence": sentence}))
+        else:
+            self.alarm(sentence)

@@ -1,0 +1,200 @@
+"""A recalibration in its folder: begun, or gone on with where it was left."""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any, Protocol
+
+from armcal.errors import DataError, InputError, Location
+from armcal.io.event_file import EARLIER, EVENTS, EventFile
+from armcal.io.folder import check_folder
+from armcal.io.journal.files import REAL_FILES, FileLayer
+from armcal.io.journal.journal import Journal, JournalLimits
+from armcal.io.journal.reader import read_until, verify
+from armcal.io.standard_output import StandardOutput
+from armcal.measure.reader import ReadRequest
+
+from armcal_online.running.control import SOCKET, ControlServer
+from armcal_online.running.course import STARTED, Course, Event, ReplayDiffersError
+from armcal_online.running.loop import Pace, Recalibration
+from armcal_online.running.loop import Session as LoopSession
+from armcal_online.running.outputs import CALIBRATION, RESERVE, STATUS, Outputs
+from armcal_online.running.requests import Requests
+from armcal_online.sources.row_parser import RowParser
+from armcal_online.sources.source import Source
+
+JOURNAL = "journal"
+_REPLACED = (CALIBRATION, STATUS, RESERVE)
+OURS = (JOURNAL, EVENTS, EARLIER, SOCKET, *_REPLACED, *(f"{name}.new" for name in _REPLACED))
+
+_DECIDING = ("calibration", "settings")
+"""Of the journal's header: what may not differ when it is gone on with."""
+
+
+class Recalibrating(LoopSession, Protocol):
+    """What is asked of a recalibrator."""
+
+    @property
+    def request(self) -> ReadRequest:
+        """What its records may hold."""
+
+    @property
+    def evaluator(self) -> Mapping[str, Any]:
+        """What evaluates it, for the journal."""
+
+    def what_if(self, joints: Mapping[str, float]) -> dict[str, Any]:
+        """What it would do at joint angles, by channel (SI)."""
+
+    def started_event(self, resumed: bool) -> Event:
+        """What there is to tell at the beginning."""
+
+
+@dataclass(frozen=True)
+class Setup:
+    """What a recalibration is made of, besides its source and its recalibrator.
+
+    Attributes:
+        folder: where everything of it is kept.
+        calibration: the file it begins from.
+        settings: what its decisions hang on, as JSON.
+        columns: the source's own names (wanted name to own name).
+        pace: how often things are written.
+        limits: how large the journal may grow.
+        stream: where events are written to, besides the file.
+    """
+
+    folder: Path
+    calibration: Path
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    columns: Mapping[str, str] = field(default_factory=dict)
+    pace: Pace = field(default_factory=Pace)
+    limits: JournalLimits = field(default_factory=JournalLimits)
+    stream: StandardOutput = field(default_factory=lambda: StandardOutput(None))
+    files: FileLayer = REAL_FILES
+
+
+@dataclass(frozen=True)
+class Open:
+    """An open recalibration, and the socket that it is controlled by."""
+
+    recalibration: Recalibration
+    control: ControlServer
+
+    def run(self) -> None:
+        """Until it ends; see ``Recalibration.run``."""
+        self.recalibration.run(self.control)
+
+
+SourceOf = Callable[[RowParser], Source]
+
+
+@contextmanager
+def opened(setup: Setup, session: Recalibrating, source_of: SourceOf) -> Iterator[Open]:
+    """Begin in a new folder, or go on in one: its newest checkpoint, the entries after it, the source after these.
+
+    Raises:
+        InputError: the folder is another's, is in use, or belongs to another calibration or other settings.
+        DataError: the journal is damaged, or going through it again gives another state.
+    """
+    _check(setup)
+    with ExitStack() as stack:
+        source = source_of(RowParser(session.request, setup.columns))
+        stack.callback(source.close)
+        header = _header(setup, session)
+        journal = stack.enter_context(
+            Journal.open(setup.folder / JOURNAL, header, files=setup.files, limits=setup.limits)
+        )
+        course = Course(session, partial(_reach, setup.folder / JOURNAL), str(setup.folder / JOURNAL))
+        resumed = _recover(setup, journal, course, header)
+        source.resume(course.progress.positions)
+        outputs = Outputs(setup.folder, setup.stream, EventFile(setup.folder), setup.files)
+        stack.callback(outputs.close)
+        _tell_start(journal, outputs, session, header, resumed)
+        _tell_damage(setup, outputs)
+        left = len(journal.recovered.entries) if resumed else 0
+        recalibration = Recalibration(source, journal, session, course, outputs, setup.pace, left)
+        control = ControlServer(setup.folder, Requests(recalibration, session).answer)
+        stack.callback(control.close)
+        yield Open(recalibration, control)
+
+
+def _check(setup: Setup) -> None:
+    if setup.calibration.resolve() == (setup.folder / CALIBRATION).resolve():
+        raise InputError(
+            "the calibration to begin from would be replaced by the updated one.",
+            where=Location(str(setup.calibration)),
+            hint="Copy it elsewhere first, or give another --out.",
+        )
+    if not (setup.folder / JOURNAL).is_dir():
+        check_folder(setup.folder, OURS)
+
+
+def _header(setup: Setup, session: Recalibrating) -> dict[str, Any]:
+    """What the journal says of its writer: all that a replay needs besides the entries."""
+    begun_from = setup.calibration.read_bytes()
+    return {
+        "calibration": hashlib.sha256(begun_from).hexdigest(),
+        "text": begun_from.decode("utf-8", errors="replace"),
+        "path": str(setup.calibration),
+        "settings": dict(setup.settings),
+        "evaluator": dict(session.evaluator),
+    }
+
+
+def _recover(setup: Setup, journal: Journal, course: Course, header: Mapping[str, Any]) -> bool:
+    """Take up the newest state; whether there was one."""
+    found = journal.recovered
+    if not found.header:
+        journal.checkpoint(course.checkpoint())
+        return False
+    for key in _DECIDING:
+        if found.header.get(key) != header[key]:
+            raise InputError(
+                f"it was begun with {'another calibration' if key == 'calibration' else 'other settings'}.",
+                where=Location(str(setup.folder)),
+                hint="Give what it was begun with, or a new --out (perhaps from a copy of its calibration.yaml).",
+            )
+    course.restore(found.checkpoint, found.checkpoint_sequence)
+    same_evaluator = found.header.get("evaluator") == header["evaluator"]
+    for entry in found.entries:
+        try:
+            course.apply(entry.sequence, entry.kind, entry.content)
+        except ReplayDiffersError:
+            # Another version gives other last bits: no reason for a rover to stand still after an update.
+            if same_evaluator:
+                raise
+    if not same_evaluator:
+        journal.checkpoint(course.checkpoint())
+    return True
+
+
+def _tell_start(
+    journal: Journal, outputs: Outputs, session: Recalibrating, header: Mapping[str, Any], resumed: bool
+) -> None:
+    sequence = journal.record(STARTED, {"at": time.time(), "resumed": resumed, "evaluator": header["evaluator"]})
+    told = {"sequence": sequence, "at": time.time(), "resumed": resumed, "calibration": header["path"]}
+    outputs.event({**session.started_event(resumed), **told})
+    cut = journal.recovered.cut
+    if cut is not None:
+        outputs.alarm(cut.sentence)
+    before = journal.recovered.header.get("evaluator", header["evaluator"])
+    if before != header["evaluator"]:
+        outputs.alarm("Another evaluator than before is used: a replay has to go over from one to the other here.")
+
+
+def _tell_damage(setup: Setup, outputs: Outputs) -> None:
+    """The estimate goes on from the newest checkpoint, which was checked; what is damaged before it is told of."""
+    try:
+        verify(setup.folder / JOURNAL, setup.files)
+    except DataError as fault:
+        outputs.alarm(f"{fault.message} The estimate is not touched by it: only what lies before is out of reach.")
+
+
+def _reach(folder: Path, sequence: int) -> Any:
+    return read_until(folder, sequence)

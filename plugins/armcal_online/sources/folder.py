@@ -1,0 +1,201 @@
+"""A directory into which files are put: CSV, JSON lines, JSON."""
+
+from __future__ import annotations
+
+import math
+import os
+import time
+from collections.abc import Mapping
+from pathlib import Path
+
+from armcal_online.sources.incoming import Incoming, Place
+from armcal_online.sources.line_parser import Kind, LineParser
+from armcal_online.sources.reading import LineReading, Reading, WholeReading
+from armcal_online.sources.row_parser import RowParser, faulty
+from armcal_online.sources.source import THROUGH, Clock, key_of, wait_until
+
+SETTLED_S = 1.0
+"""A file whose size has not changed for so long is read; one that never stops growing after ``IMPATIENT_S``."""
+IMPATIENT_S = 10.0
+"""A last line without an end is taken after so long."""
+
+_KINDS: Mapping[str, Kind] = {".csv": "csv", ".jsonl": "json", ".ndjson": "json"}
+_WHOLE = ".json"
+_GONE = -1
+_WATCHED = 16
+"""So many of the files read last are read on when they grow."""
+_RESCAN_S = 5.0
+"""The directory is listed when it changes, and this often besides: its time may have too few digits."""
+
+
+class _Watched:
+    """One file: its size when last looked at, and since when."""
+
+    def __init__(self, size: int, at: float) -> None:
+        self.size = size
+        self.modified = math.inf
+        self.seen = at
+        self.changed = at
+        self.reading: Reading | None = None
+        self.told = False
+
+    def look(self, path: Path) -> None:
+        """At its size, and when it was written to (unix seconds)."""
+        try:
+            found = path.stat()
+        except OSError:
+            size, self.modified = _GONE, math.inf
+        else:
+            size, self.modified = found.st_size, found.st_mtime
+        if size != self.size:
+            self.size, self.changed = size, time.monotonic()
+
+
+class Folder:
+    """Files in the order of their names; new ones may come at any time, under any name.
+
+    Names that begin with a dot, and endings other than .csv, .jsonl, .ndjson and .json, are no files of records: write
+    under such a name, and rename. A file whose name comes before all that are remembered was taken already.
+    """
+
+    keeps_records = True
+
+    def __init__(self, path: Path, rows: RowParser, clock: Clock = time.time, settled_s: float = SETTLED_S) -> None:
+        self._path = path
+        self._rows = rows
+        self._clock = clock
+        self._settled_s = settled_s
+        self._positions: dict[str, int] = {}
+        self._through = ""
+        self._pending: list[str] = []
+        self._known: set[str] = set()
+        self._watched: dict[str, _Watched] = {}
+        self._stamp = (0, 0.0)
+        self._open = True
+
+    @property
+    def ended(self) -> bool:
+        """See ``Source``."""
+        return not self._open
+
+    def resume(self, positions: Mapping[str, int]) -> None:
+        """See ``Source``."""
+        self._positions = {key: row for key, row in positions.items() if not key.startswith(THROUGH)}
+        self._through = max((key[1:] for key in positions if key.startswith(THROUGH)), default="")
+
+    def incoming(self, wait_s: float) -> Incoming | None:
+        """See ``Source``."""
+        deadline = time.monotonic() + wait_s
+        while self._open:
+            self._scan()
+            found = self._next()
+            if found is not None or not wait_until(deadline):
+                return found
+        return None
+
+    def acknowledge(self, incoming: Incoming, sequence: int) -> None:
+        """See ``Source``: the journal remembers the row."""
+
+    def close(self) -> None:
+        """See ``Source``."""
+        self._open = False
+        for name in [*self._watched]:
+            self._forget(name)
+
+    def _scan(self) -> None:
+        """List the directory if it changed."""
+        now = time.monotonic()
+        try:
+            changed = self._path.stat().st_mtime_ns
+            if changed == self._stamp[0] and now < self._stamp[1] + _RESCAN_S:
+                return
+            with os.scandir(self._path) as entries:
+                names = {entry.name for entry in entries if _is_ours(entry.name) and entry.is_file()}
+        except OSError:
+            return
+        self._stamp = (changed, now)
+        taken = {n for n in names - self._known if self._through >= key_of(n) and key_of(n) not in self._positions}
+        new = names - self._known - taken
+        self._known = names
+        present = {key_of(name) for name in names}
+        self._positions = {key: row for key, row in self._positions.items() if key in present}
+        self._pending = sorted({*(name for name in self._pending if name in names), *new})
+
+    def _next(self) -> Incoming | None:
+        """A record of the first file that has one; a file that is still being written holds up those after it."""
+        for name in [*self._watched]:
+            found = self._advance(name, self._watched[name]) if self._watched[name].reading else None
+            if found is not None:
+                return found
+        while self._pending:
+            name = self._pending[0]
+            watched = self._watched.setdefault(name, _Watched(_GONE, time.monotonic()))
+            if not self._is_settled(name, watched):
+                return None
+            self._pending.pop(0)
+            found = self._begun(name, watched) or self._advance(name, watched)
+            self._trim()
+            if found is not None:
+                return found
+        return None
+
+    def _is_settled(self, name: str, watched: _Watched) -> bool:
+        watched.look(self._path / name)
+        now = time.monotonic()
+        return (
+            now - watched.changed >= self._settled_s
+            or self._clock() - watched.modified >= self._settled_s
+            or now - watched.seen >= IMPATIENT_S
+        )
+
+    def _begun(self, name: str, watched: _Watched) -> Incoming | None:
+        """Open a file; a fault if that cannot be."""
+        key, path = key_of(name), self._path / name
+        through = self._positions.get(key, 0)
+        if isinstance(watched.reading, WholeReading):
+            through = max(through, watched.reading.row)
+        watched.reading = None
+        try:
+            file = path.open("rb", buffering=0)
+            if path.suffix == _WHOLE:
+                watched.reading = WholeReading(file, self._rows, key, through, self._clock)
+            else:
+                parser = LineParser(self._rows, _KINDS[path.suffix], str(path))
+                watched.reading = LineReading(file, parser, key, through, self._clock)
+        except FileNotFoundError:
+            return None
+        except OSError as fault:
+            return faulty(Place(self._clock(), key, 0), f"{key} cannot be read ({fault.strerror}).")
+        return None
+
+    def _advance(self, name: str, watched: _Watched) -> Incoming | None:
+        """The next record of a file that is being read."""
+        if watched.reading is None:
+            return None
+        found = watched.reading.next()
+        if found is not None:
+            return found
+        watched.look(self._path / name)
+        if isinstance(watched.reading, WholeReading):
+            if watched.size not in (_GONE, watched.reading.offset) and self._is_settled(name, watched):
+                return self._begun(name, watched)
+        elif _GONE < watched.size < watched.reading.offset and not watched.told:
+            watched.told = True
+            mend = "give what is new a name of its own"
+            return faulty(Place(self._clock(), key_of(name), 0), f"{name} became shorter after it was read; {mend}.")
+        quiet = time.monotonic() - watched.changed >= IMPATIENT_S
+        return watched.reading.last() if watched.reading.begun and quiet else None
+
+    def _trim(self) -> None:
+        """Let go of the files read first."""
+        for name in [*self._watched][:-_WATCHED]:
+            self._forget(name)
+
+    def _forget(self, name: str) -> None:
+        reading = self._watched.pop(name).reading
+        if reading is not None:
+            reading.close()
+
+
+def _is_ours(name: str) -> bool:
+    return not name.startswith(".") and Path(name).suffix in (*_KINDS, _WHOLE)

@@ -1,0 +1,201 @@
+"""Rows of a table and JSON objects become records, by the names and units that the csv reader knows.
+
+A source must survive any input: what cannot be read becomes a record with a fault, never an exception.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from armcal.base.units import from_unit
+from armcal.errors import DataError
+from armcal.io.cells import DELIMITERS, CellFault, is_missing, read_cell, split
+from armcal.measure.column_match import Header, Plan, header_of, match_columns, refuse_missing, renamed
+from armcal.measure.reader import ReadRequest, WantedChannel
+
+from armcal_online.sources.incoming import Incoming, Place
+
+MAX_LABELS = 50
+MAX_LABEL = 500
+MAX_ID = 200
+MAX_FAULT = 500
+
+_APPROACH = ".approach."
+_PLANS = 64
+"""So many ways of naming a record's numbers are kept in mind; a sender has one or two."""
+
+
+@dataclass(frozen=True)
+class Table:
+    """A header that was understood: its cells as written, its delimiter, and which column is what."""
+
+    cells: tuple[str, ...]
+    delimiter: str
+    plan: Plan
+
+
+class RowParser:
+    """Records for a request, with a source's own names of columns (wanted name to own name)."""
+
+    def __init__(self, request: ReadRequest, columns: Mapping[str, str]) -> None:
+        self._wanted = request.wanted
+        self._optional = tuple(replace(channel, required=False) for channel in request.wanted)
+        self._columns = dict(columns)
+        self._plans: dict[tuple[str, ...], Plan | str] = {}
+
+    def table(self, line: str, source: str, number: int) -> Table:
+        """The header of a CSV table.
+
+        Raises:
+            DataError: a column is ambiguous, has no unit, or one that every record needs is not there.
+        """
+        delimiter = next((d for d in DELIMITERS if d in line), DELIMITERS[0])
+        try:
+            cells = split(line, delimiter)
+        except csv.Error as fault:
+            raise DataError(f"the header is not CSV ({fault}).", hint="Close every quote.") from fault
+        header = renamed(header_of(cells, source, number), self._columns)
+        plan = match_columns(header, self._optional)
+        lacking = self._lacking(set(plan.channels))
+        if lacking is not None:
+            known = {column.known_as for column, _ in plan.channels.values()}
+            refuse_missing(header, lacking, [c.known_as for c in header.columns if c.known_as not in known])
+        return Table(tuple(cells), delimiter, plan)
+
+    def row(self, table: Table, line: str, place: Place) -> Incoming | None:
+        """The record in a line of a table; None for the header, written again."""
+        try:
+            cells = split(line, table.delimiter)
+        except csv.Error as fault:
+            return faulty(place, f"The row is not CSV ({fault}).")
+        if tuple(cells) == table.cells:
+            return None
+        if len(cells) != len(table.cells):
+            return faulty(place, f"Found {len(cells)} cells, expected {len(table.cells)} as in the header.")
+        return self._record(table.plan, cells, place)
+
+    def json_text(self, text: str, place: Place) -> Incoming:
+        """The record in the text of a JSON object."""
+        try:
+            content = json.loads(text, object_pairs_hook=_without_repeats)
+        except (ValueError, RecursionError) as fault:
+            return faulty(place, f"It is not JSON ({_short(str(fault), 120)}).")
+        return self.object(content, place)
+
+    def object(self, content: Any, place: Place) -> Incoming:
+        """The record in a JSON object, name to number or text."""
+        if not isinstance(content, dict):
+            found = "an array" if isinstance(content, list) else _short(json.dumps(content), 40)
+            return faulty(place, f"Found {found}, expected a JSON object.")
+        names = tuple(content)
+        plan = self._plan(names)
+        if isinstance(plan, str):
+            return faulty(place, plan)
+        return self._record(plan, list(content.values()), place)
+
+    def _plan(self, names: tuple[str, ...]) -> Plan | str:
+        """Which name is what, or why that cannot be told."""
+        if names not in self._plans:
+            if len(self._plans) >= _PLANS:
+                self._plans.clear()
+            try:
+                self._plans[names] = self._planned(names)
+            except DataError as fault:
+                self._plans[names] = str(fault)
+        return self._plans[names]
+
+    def _planned(self, names: tuple[str, ...]) -> Plan:
+        own = {name: column for name, column in self._columns.items() if column in names}
+        header = renamed(header_of(names, "", None) if names else Header("", None, ()), own)
+        plan = match_columns(header, self._optional)
+        lacking = self._lacking(set(plan.channels))
+        if lacking is not None:
+            known = {column.known_as for column, _ in plan.channels.values()}
+            refuse_missing(header, lacking, [name for name in names if name not in known])
+        return plan
+
+    def _lacking(self, present: set[str]) -> WantedChannel | None:
+        """What a record lacks to be of use: to all, or to the measurement that comes nearest to having all."""
+        by_part: dict[str, list[WantedChannel]] = {}
+        for channel in self._wanted:
+            if channel.required and not channel.parts and channel.channel not in present:
+                return channel
+            for part in channel.parts:
+                by_part.setdefault(part, [])
+                if channel.required and channel.channel not in present:
+                    by_part[part].append(channel)
+        nearest = min(by_part.values(), key=len, default=[])
+        return nearest[0] if nearest else None
+
+    def _record(self, plan: Plan, cells: Sequence[Any], place: Place) -> Incoming:
+        labels = {
+            _clean(column.known_as[:MAX_LABEL]): text
+            for column in plan.extra[:MAX_LABELS]
+            if (text := _text(cells[column.index])) and len(text) <= MAX_LABEL
+        }
+        given = _text(cells[plan.record_id.index]).strip() if plan.record_id else str(place.row)
+        record_id = _short(given, MAX_ID)
+        if not record_id:
+            return faulty(place, "Its id is empty.")
+        channels: dict[str, float] = {}
+        for channel, (column, unit) in plan.channels.items():
+            found = _number(cells[column.index])
+            if _APPROACH in channel and isinstance(found, float) and abs(found) not in (0.0, 1.0) and found == found:
+                found = CellFault(f"found the approach {found:g}, expected -1, 0 or 1.", "")
+            if isinstance(found, CellFault):
+                sentence = f"{_short(column.name, MAX_ID)}: {found.found} {found.hint}".rstrip()
+                return replace(faulty(place, sentence), record_id=record_id)
+            channels[channel] = from_unit(found, unit)
+        return Incoming(record_id, channels, labels, place.arrived, place.source_key, place.row)
+
+
+def faulty(place: Place, sentence: str) -> Incoming:
+    """A record that could not be read."""
+    return Incoming(
+        str(place.row), {}, {}, place.arrived, place.source_key, place.row, _short(_clean(sentence), MAX_FAULT)
+    )
+
+
+def _number(value: Any) -> float | CellFault:
+    """A cell, or a value of a JSON object; NaN where it is missing."""
+    if value is None:
+        return math.nan
+    if isinstance(value, str):
+        return read_cell(value)
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return CellFault(f"found {_short(json.dumps(value), 40)}, expected a number.", "")
+    try:
+        return float(value)
+    except OverflowError:
+        return CellFault("found a number that is too large.", "")
+
+
+def _text(value: Any) -> str:
+    """A label; empty for what is none."""
+    if isinstance(value, str):
+        return "" if is_missing(value) else _clean(value)
+    return "" if value is None or isinstance(value, dict | list) else _clean(json.dumps(value))
+
+
+def _clean(text: str) -> str:
+    """Text that can be written as UTF-8: JSON may hold half a surrogate pair."""
+    return text.encode("utf-8", "replace").decode("utf-8")
+
+
+def _short(text: str, length: int) -> str:
+    return text if len(text) <= length else f"{text[: length - 3]}..."
+
+
+def _without_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """An object, each of whose names is given once."""
+    found = dict(pairs)
+    if len(found) != len(pairs):
+        names = [name for name, _ in pairs]
+        twice = next(name for name in names if names.count(name) > 1)
+        raise ValueError(f"{_short(twice, 40)} is given twice")
+    return found

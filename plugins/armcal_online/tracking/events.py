@@ -1,0 +1,137 @@
+"""What a recalibration tells: one JSON object an event; a finished sentence wherever something was decided."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from armcal.estimate.online import Linearised
+
+from armcal_online.sources.incoming import Incoming
+from armcal_online.tracking.directions import Steps
+from armcal_online.tracking.health import Health
+from armcal_online.tracking.hypotheses import Recent
+from armcal_online.tracking.sentences import Decision
+from armcal_online.tracking.settings import RecalibrateSettings
+from armcal_online.tracking.start import Footing
+from armcal_online.tracking.state import State
+
+
+def started(
+    state: State,
+    ground: Footing,
+    settings: RecalibrateSettings,
+    parameters: Mapping[str, Any],
+    resumed: bool,
+    steps: Steps,
+) -> dict[str, Any]:
+    """At the beginning."""
+    blocks = {name: block.entry_unit for block in ground.chart.parameters.free for name in block.entry_names}
+    return {
+        "event": "started",
+        "sequence": state.sequence,
+        "at": state.at,
+        "level": state.health.level,
+        "gate": {"probability": settings.gate.probability},
+        "parameters": [{"name": n, "unit": blocks[n], "value": v, "sd": sd} for n, (v, sd) in parameters.items()],
+        "evaluator": ground.problem.backend,
+        "resumed": resumed,
+        "left_out": list(ground.left_out),
+        "joint_steps": {each.joint: each.parameter or "several parameters" for each in steps.joints},
+        "joint_steps_not_followed": list(steps.unfollowed),
+        "sensor_motions": {name: list(which) for name, (_, which) in steps.sensors.items()},
+    }
+
+
+def ignored(incoming: Incoming, state: State, why: str) -> dict[str, Any]:
+    """A record that was passed over."""
+    return {**_record(incoming, state, "ignored"), "why": f"Passed over: {why.rstrip('.')}."}
+
+
+def judged(
+    incoming: Incoming, state: State, recent: Recent, first: Linearised, limit: float, ground: Footing
+) -> dict[str, Any]:
+    """A record that was accepted or rejected."""
+    verdict = "rejected" if recent.rejected else "accepted"
+    relation = "above" if recent.rejected else "within"
+    told = {
+        **_record(incoming, state, verdict),
+        "why": f"Its surprise {recent.nis:.3g} is {relation} the limit {limit:.3g}.",
+        "nis": recent.nis,
+        "limit": limit,
+        "dof": recent.dof,
+        "measurement": ground.problem.kernels[recent.readings[0].factor].factor.name,
+    }
+    position = _position(incoming, recent, first, ground)
+    return {**told, **position}
+
+
+def decided(state: State, decision: Decision) -> dict[str, Any]:
+    """Something that was decided."""
+    told = {
+        "event": "decision",
+        "sequence": state.sequence,
+        "at": state.at,
+        "kind": decision.kind,
+        "since": decision.since,
+        "sentence": decision.sentence,
+    }
+    if decision.subject:
+        told["joint" if decision.kind.startswith("joint") else "measurement"] = decision.subject
+    if len(decision.candidates) > 1:
+        told["candidates"] = list(decision.candidates)
+    if decision.size is not None:
+        turned = decision.dimension == "angle"
+        told["size_deg" if turned else "size_mm"] = math.degrees(decision.size) if turned else 1000 * decision.size
+    return told
+
+
+def noted(state: State, kind: str, text: str) -> dict[str, Any]:
+    """Something odd that did no harm."""
+    sentence = f"{text[:1].upper()}{text[1:]}."
+    return {"event": "decision", "sequence": state.sequence, "at": state.at, "kind": kind, "sentence": sentence}
+
+
+def level_changed(state: State, before: str, health: Health) -> dict[str, Any]:
+    """Health got better or worse."""
+    return {
+        "event": "level",
+        "sequence": state.sequence,
+        "at": state.at,
+        "from": before,
+        "to": health.level,
+        "sentence": health.sentence,
+    }
+
+
+def estimated(state: State, parameters: Mapping[str, list[float]]) -> dict[str, Any]:
+    """What is believed: value and standard deviation by entry (SI)."""
+    return {"event": "estimate", "sequence": state.sequence, "at": state.at, "parameters": dict(parameters)}
+
+
+def _record(incoming: Incoming, state: State, verdict: str) -> dict[str, Any]:
+    return {
+        "event": "record",
+        "sequence": state.sequence,
+        "id": incoming.record_id,
+        "at": state.at if verdict != "ignored" else incoming.arrived,
+        "verdict": verdict,
+        "level": state.health.level,
+        "inputs": {name: value for name, value in incoming.channels.items() if np.isfinite(value)},
+    }
+
+
+def _position(incoming: Incoming, recent: Recent, first: Linearised, ground: Footing) -> dict[str, Any]:
+    """Residual, measured and predicted position in mm, where a single instrument read one."""
+    name = ground.problem.kernels[recent.readings[0].factor].factor.name
+    measured = [incoming.channels.get(f"{name}.{axis}", math.nan) for axis in "xyz"]
+    if len(recent.readings) != 1 or len(first.innovation) < 3 or not np.isfinite(measured).all():
+        return {}
+    residual = 1000 * first.innovation[:3]
+    return {
+        "residual_mm": residual.tolist(),
+        "measured_mm": (1000 * np.array(measured)).tolist(),
+        "predicted_mm": (1000 * np.array(measured) - residual).tolist(),
+    }

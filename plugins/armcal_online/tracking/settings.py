@@ -1,0 +1,145 @@
+"""The settings of a recalibration."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from armcal.base.settings import Angle, Duration, Length, Settings
+from armcal.config.validate import validate
+from armcal.config.yaml_source import load_config
+from armcal.errors import ConfigError
+from pydantic import Field, model_validator
+
+SECTION = "recalibrate"
+"""A file may hold more than a recalibration: then it stands under this key."""
+DAY = 86400.0
+Probability = Annotated[float, Field(gt=0, lt=1)]
+
+
+class GateSettings(Settings):
+    """Which records are believed: those whose surprise would be exceeded with a probability of ``1 - probability``.
+
+    Of the last ``window`` records ``rejected`` have to be rejected before an unexplained change is suspected.
+    """
+
+    probability: Probability = 0.999
+    window: Annotated[int, Field(ge=2, le=64)] = 8
+    rejected: Annotated[int, Field(ge=2, le=64)] = 4
+
+    @model_validator(mode="after")
+    def _within(self) -> GateSettings:
+        if self.rejected > self.window:
+            raise ValueError(f"found rejected: {self.rejected} of a window of {self.window}")
+        return self
+
+
+class OutlierSettings(Settings):
+    """What is known of wrong records: how many of all, and how large (standard deviation)."""
+
+    fraction: Probability = 0.05
+    length: Length = 0.03
+    angle: Angle = 0.1
+
+
+class ChangeSettings(Settings):
+    """Sudden changes that are looked for: standard deviations of how large they are, and how likely in one record.
+
+    ``joint`` of a joint's offset (``slide`` of one that slides), as a slipped horn or a replaced servo makes;
+    ``sensor_shift`` and ``sensor_turn`` of the frame that an instrument measures in, as a bump makes. ``factor``
+    multiplies all standard deviations when something else has changed. A change is followed once it is ``odds`` times
+    likelier than outliers, and ``naming_odds`` times likelier than any other.
+    """
+
+    joint: Angle = 0.26
+    slide: Length = 0.02
+    sensor_shift: Length = 0.03
+    sensor_turn: Angle = 0.05
+    factor: Annotated[float, Field(gt=1)] = 10.0
+    probability: Probability = 1e-4
+    odds: Annotated[float, Field(gt=1)] = 100.0
+    naming_odds: Annotated[float, Field(gt=1)] = 20.0
+
+
+class LevelSettings(Settings):
+    """When health changes: after ``calm`` records without trouble it gets better by a level.
+
+    The mean surprise of the last ``window`` records is watched; it is trouble where chance would make it so large
+    with a probability below ``probability``. ``tip_sd`` is the largest tolerable standard deviation of a predicted tip.
+    """
+
+    calm: Annotated[int, Field(ge=1)] = 16
+    window: Annotated[int, Field(ge=10, le=1000)] = 50
+    probability: Probability = 1e-5
+    tip_sd: Length | None = None
+
+
+class ClockSettings(Settings):
+    """How time is believed: steps between records count as at most ``longest_step``; older ones are ``stale``.
+
+    A record older than the last by more than ``tolerance`` is passed over. When ``reset_after`` records in a row are,
+    the clock is taken to have been set back. ``longest_age`` is the greatest age on arrival; none by default.
+    """
+
+    longest_step: Duration = DAY
+    tolerance: Duration = 0.0
+    reset_after: Annotated[int, Field(ge=2, le=100)] = 3
+    longest_age: Duration | None = None
+
+
+class OutputSettings(Settings):
+    """How often results are written: the calibration after so many records or so much time, whichever is first."""
+
+    calibration_every_records: Annotated[int, Field(ge=1)] = 20
+    calibration_every: Duration = 600.0
+    estimate_every_records: Annotated[int, Field(ge=1)] = 10
+
+
+class JournalSettings(Settings):
+    """Bytes in a segment of the journal, and in all of them together."""
+
+    segment_bytes: Annotated[int, Field(ge=4096)] = 4 * 1024**2
+    total_bytes: Annotated[int, Field(ge=65536)] = 64 * 1024**2
+
+
+class RecalibrateSettings(Settings):
+    """How a calibration is kept true.
+
+    ``process_noise`` says how far a parameter may wander, by glob: ``0.05 deg in 30 d``. ``model_error``: a model that
+    is wrong errs alike in neighbouring records (``calibrated``: as much as the calibration's residuals did), or each
+    time anew (``white``). ``free`` opens parameters that the calibration held, with a standard deviation.
+    ``columns`` are the source's names for what is wanted, as in a configuration's data section.
+    """
+
+    estimator: dict[str, Any] = Field(default_factory=lambda: {"type": "extended"})
+    process_noise: dict[str, str] = Field(default_factory=dict)
+    model_error: Literal["calibrated", "white"] = "calibrated"
+    free: dict[str, str | float] = Field(default_factory=dict)
+    gate: GateSettings = Field(default_factory=GateSettings)
+    gating: Literal["on", "off"] = "on"
+    outliers: OutlierSettings = Field(default_factory=OutlierSettings)
+    changes: ChangeSettings = Field(default_factory=ChangeSettings)
+    levels: LevelSettings = Field(default_factory=LevelSettings)
+    clock: ClockSettings = Field(default_factory=ClockSettings)
+    output: OutputSettings = Field(default_factory=OutputSettings)
+    journal: JournalSettings = Field(default_factory=JournalSettings)
+    columns: dict[str, str] = Field(default_factory=dict)
+    evaluator: Literal["auto", "compiled", "interpreted"] = "compiled"
+
+
+def load_settings(path: str | Path | None, overrides: Sequence[str] = ()) -> RecalibrateSettings:
+    """The settings in a file, checked; the ordinary ones without a file.
+
+    Raises:
+        ConfigError: no such file, not YAML, or a setting is refused, with file, line and field.
+    """
+    if path is None:
+        if overrides:
+            raise ConfigError(
+                f"found --set {overrides[0]} without a file of settings.",
+                hint="Give the file with --config; it may be empty but for a comment.",
+            )
+        return RecalibrateSettings()
+    source = load_config(path, overrides)
+    return validate(RecalibrateSettings, source, (SECTION,) if SECTION in source.data else ())

@@ -1,0 +1,136 @@
+"""Parameters over time: how far each has come since the start, and how sure that is."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from armcal.base.units import UNITS, display_unit
+
+from armcal_online.watch.lenient import number, rounded, text, whole
+from armcal_online.watch.thinned import Thinned
+
+MOST_PARAMETERS = 256
+_RECENT, _OLDER = 200, 200
+_COMPLIANCE = {"rad_per_Nm": "deg_per_Nm"}
+
+
+@dataclass(frozen=True)
+class Followed:
+    """One parameter: where it started (SI), and the unit it is shown in."""
+
+    name: str
+    unit: str
+    shown_unit: str
+    factor: float
+    start: float
+    start_sd: float | None
+
+    def told(self) -> dict[str, Any]:
+        """As pages are told: in the unit shown."""
+        sd = None if self.start_sd is None else self.start_sd * self.factor
+        return {
+            "name": self.name,
+            "unit": self.shown_unit,
+            "start": rounded(self.start * self.factor, 12),
+            "start_sd": rounded(sd, 4),
+        }
+
+
+class Estimates:
+    """All that is known of all parameters, in bounded memory."""
+
+    def __init__(self) -> None:
+        self._followed: dict[str, Followed] = {}
+        self._rows: Thinned[dict[str, Any]] = Thinned(_RECENT, _OLDER)
+
+    def clear(self) -> None:
+        """Forget everything."""
+        self._followed.clear()
+        self._rows.clear()
+
+    def start(self, event: Mapping[str, Any]) -> dict[str, Any] | None:
+        """Where parameters stand at a start; where one started before is not changed by a later start."""
+        listed = event.get("parameters")
+        entries = [each for each in listed if isinstance(each, Mapping)] if isinstance(listed, list) else []
+        found = {}
+        for entry in entries:
+            name, value = text(entry.get("name")), number(entry.get("value"))
+            if name is not None and value is not None:
+                found[name] = (value, number(entry.get("sd")))
+                self._follow(name, found[name], entry.get("unit"))
+        return self._row(event, found)
+
+    def take(self, event: Mapping[str, Any]) -> dict[str, Any] | None:
+        """An estimate, as pages are told: columns in the order of the parameters."""
+        listed = event.get("parameters")
+        found = {}
+        for key, pair in listed.items() if isinstance(listed, Mapping) else ():
+            name, value = text(key), number(pair[0]) if isinstance(pair, list) and pair else None
+            if name is not None and value is not None:
+                found[name] = (value, number(pair[1]) if len(pair) > 1 else None)
+                self._follow(name, found[name], None)
+        return self._row(event, found)
+
+    def told(self) -> dict[str, Any]:
+        """As pages are told."""
+        return {"parameters": [each.told() for each in self._followed.values()], "rows": list(self._rows)}
+
+    @property
+    def without_unit(self) -> bool:
+        """Whether there are parameters whose unit no event told: the start was rotated away."""
+        return any(not each.unit for each in self._followed.values())
+
+    def add_units(self, units: Mapping[str, str]) -> bool:
+        """Units by name, where none is known yet; rows that are kept are told in them from now on.
+
+        Returns:
+            whether any was new.
+        """
+        new = False
+        for index, (name, known) in enumerate(self._followed.items()):
+            if known.unit or name not in units:
+                continue
+            followed = Followed(name, *_shown(units[name]), known.start, known.start_sd)
+            self._followed[name] = followed
+            new = True
+            for row in self._rows:
+                for column in (row["change"], row["sd"]):
+                    if index < len(column) and column[index] is not None:
+                        column[index] = rounded(column[index] * followed.factor)
+        return new
+
+    def _follow(self, name: str, found: tuple[float, float | None], unit: Any) -> None:
+        known = self._followed.get(name)
+        if known is None and len(self._followed) < MOST_PARAMETERS:
+            self._followed[name] = Followed(name, *_shown(unit), *found)
+        elif known is not None and isinstance(unit, str):
+            self.add_units({name: unit})
+
+    def _row(self, event: Mapping[str, Any], found: Mapping[str, tuple[float, float | None]]) -> dict[str, Any] | None:
+        if not found:
+            return None
+        change: list[float | None] = []
+        deviations: list[float | None] = []
+        for name, followed in self._followed.items():
+            value, sd = found.get(name, (None, None))
+            change.append(None if value is None else rounded((value - followed.start) * followed.factor))
+            deviations.append(None if sd is None else rounded(sd * followed.factor, 4))
+        row = {
+            "sequence": whole(event.get("sequence")) or 0,
+            "at": number(event.get("at")),
+            "change": change,
+            "sd": deviations,
+        }
+        self._rows.add(row)
+        return {"event": "estimate", **row}
+
+
+def _shown(unit: Any) -> tuple[str, str, float]:
+    """The unit as given, the one shown, and the factor between them."""
+    name = text(unit) or ""
+    if name not in UNITS:
+        return name, name, 1.0
+    shown = UNITS[_COMPLIANCE[name]] if name in _COMPLIANCE else display_unit(UNITS[name].dimension)
+    return name, "" if shown.name == "1" else shown.name.replace("_per_", "/"), UNITS[name].factor / shown.factor

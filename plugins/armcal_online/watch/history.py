@@ -1,0 +1,144 @@
+"""All that a watcher knows of a recalibration, in bounded memory, and what each event adds to it."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping
+from typing import Any
+
+from armcal_online.watch.estimates import Estimates
+from armcal_online.watch.events import LEVELS, VERDICTS, Message, record_of, shortened, told_of
+from armcal_online.watch.lenient import number, text, whole
+from armcal_online.watch.thinned import Thinned
+
+RECENT_RECORDS = 2000
+"""The newest records, kept whole."""
+OLDER_ACCEPTED, OLDER_OTHERS = 2000, 1000
+MOST_TOLD = 400
+"""Events in the list; the oldest are forgotten."""
+
+
+class History:
+    """What the events said so far."""
+
+    def __init__(self) -> None:
+        self._accepted: Thinned[Message] = Thinned(RECENT_RECORDS, OLDER_ACCEPTED, shortened)
+        self._others: Thinned[Message] = Thinned(RECENT_RECORDS // 2, OLDER_OTHERS, shortened)
+        self.estimates = Estimates()
+        self._told: deque[Message] = deque(maxlen=MOST_TOLD)
+        self.unknown = self.unreadable = 0
+        self._forget()
+
+    def _forget(self) -> None:
+        self._accepted.clear()
+        self._others.clear()
+        self.estimates.clear()
+        self._told.clear()
+        self.written: Message | None = None
+        self._counts = dict.fromkeys(VERDICTS, 0)
+        self._first: int | None = None
+        self._sequence = -1
+        self.last: Message | None = None
+        self.level, self.level_sentence = "unknown", ""
+        self.calibration: str | None = None
+        self.gate: float | None = None
+
+    def take(self, event: Mapping[str, Any] | None) -> list[Message]:
+        """Add an event (None: a line that could not be read); returns what pages are told of it.
+
+        A start that is not the going on of an earlier one makes everything before it void: pages are told ``reset``.
+        """
+        kind = None if event is None else event.get("event")
+        if event is None:
+            self.unreadable += 1
+        elif kind == "record":
+            return self._record(event)
+        elif kind == "estimate":
+            row = self.estimates.take(event)
+            return [row] if row else []
+        elif kind == "started":
+            return self._started(event)
+        else:
+            return self._other(event)
+        return []
+
+    def state(self) -> dict[str, Any]:
+        """Everything, for a page that begins; numbers are SI unless their key says otherwise."""
+        records = sorted([*self._accepted, *self._others], key=lambda r: r.get("sequence") or 0)
+        return {
+            "level": self.level,
+            "level_sentence": self.level_sentence,
+            "counts": dict(self._counts),
+            "first_sequence": self._first,
+            "last": self.last,
+            "gate_probability": self.gate,
+            "records": [{k: v for k, v in r.items() if k != "event"} for r in records],
+            "estimates": self.estimates.told(),
+            "told": list(self._told),
+            "written": self.written,
+            "unknown": self.unknown,
+            "unreadable": self.unreadable,
+        }
+
+    def newest(self, count: int) -> list[Message]:
+        """The newest records, oldest first."""
+        both = [*self._accepted.newest(count), *self._others.newest(count)]
+        return sorted(both, key=lambda r: r.get("sequence") or 0)[-count:]
+
+    def _record(self, event: Mapping[str, Any]) -> list[Message]:
+        record = record_of(event)
+        if record is None:
+            self.unknown += 1
+            return []
+        if record.setdefault("sequence", self._sequence + 1) <= self._sequence:
+            return []  # told a second time
+        self._sequence = record["sequence"]
+        self._counts[record["verdict"]] += 1
+        if self._first is None:
+            self._first = record["sequence"]
+        self.last = record
+        record = {key: value for key, value in record.items() if key != "inputs"}
+        (self._accepted if record["verdict"] == "accepted" else self._others).add(record)
+        self._stand(record.get("level"), None)
+        standing = {"standing": self.level, "standing_sentence": self.level_sentence}
+        return [{**record, "counts": dict(self._counts), **standing}]
+
+    def _started(self, event: Mapping[str, Any]) -> list[Message]:
+        told = told_of(event)
+        messages: list[Message] = []
+        if event.get("resumed") is not True and (self.last or self._told):
+            self._forget()
+            messages.append({"event": "reset"})
+        self.calibration = text(event.get("calibration")) or self.calibration
+        gate = event.get("gate")
+        self.gate = number(gate.get("probability")) if isinstance(gate, Mapping) else self.gate
+        first = whole(event.get("sequence"))
+        self._sequence = self._sequence if first is None else first - 1
+        row = self.estimates.start(event)
+        self._stand(text(event.get("level")), None)
+        if told:
+            self._told.append(told)
+            messages.append(told)
+        return [*messages, *([row] if row else [])]
+
+    def _other(self, event: Mapping[str, Any]) -> list[Message]:
+        told = told_of(event)
+        if told is None:
+            self.unknown += 1
+            return []
+        if told["event"] == "level":
+            self._stand(told.get("to"), told["sentence"])
+        if told["event"] == "calibration":
+            self.written = told
+        else:
+            self._told.append(told)
+        return [told]
+
+    def _stand(self, level: Any, sentence: str | None) -> None:
+        if level not in LEVELS:
+            return
+        if sentence is not None:
+            self.level_sentence = sentence
+        elif level != self.level:
+            self.level_sentence = "Nothing out of the ordinary." if level == "nominal" else ""
+        self.level = level

@@ -1,0 +1,177 @@
+"""The page's server: three addresses that are read, nothing that is written."""
+
+from __future__ import annotations
+
+import gzip
+import json
+import socket
+import threading
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import Any
+from urllib.parse import parse_qs, urlsplit
+
+from armcal.errors import InputError, Location
+
+from armcal_online.watch.access import Access
+from armcal_online.watch.feed import Feed
+from armcal_online.watch.page import page
+
+MOST_STREAMS = 32
+"""Pages that are open at once."""
+_MOST_CONNECTIONS = 64
+_HEARTBEAT = 5.0
+_PATIENCE = 10.0
+
+
+class WatchServer(ThreadingHTTPServer):
+    """Serves a feed.
+
+    Args:
+        feed: what is shown.
+        host: the address to listen on; further than this machine, every request needs ``token``.
+        port: 0 for any free one.
+        heartbeat: how often an idle stream is written to (s).
+        patience: how long a client may take to send a request or to take a part of an answer (s).
+
+    Raises:
+        InputError: the address cannot be listened on.
+    """
+
+    daemon_threads = True
+    block_on_close = False
+    request_queue_size = 64
+
+    def __init__(
+        self,
+        feed: Feed,
+        host: str = "127.0.0.1",
+        port: int = 0,
+        heartbeat: float = _HEARTBEAT,
+        patience: float = _PATIENCE,
+    ) -> None:
+        self.feed, self.heartbeat, self.patience = feed, heartbeat, patience
+        self.access = Access.of(host)
+        self.page = page()
+        self.streams = threading.BoundedSemaphore(MOST_STREAMS)
+        self.ending = threading.Event()
+        self._connections = threading.BoundedSemaphore(_MOST_CONNECTIONS)
+        self.address_family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        try:
+            super().__init__((host, port), _Handler)
+        except (OSError, OverflowError) as fault:
+            raise InputError(
+                f"{host}, port {port}, cannot be listened on ({fault}).",
+                where=Location("--port"),
+                hint="Give another --port; 0 takes any free one.",
+            ) from fault
+
+    @property
+    def address(self) -> str:
+        """What to open in a browser."""
+        host = socket.gethostname() if self.access.host in ("0.0.0.0", "::") else self.access.host
+        host = f"[{host}]" if ":" in host else host
+        query = f"?token={self.access.token}" if self.access.token else ""
+        return f"http://{host}:{self.server_port}/{query}"
+
+    def server_bind(self) -> None:
+        """Without asking a name server for this machine's name."""
+        socket.socket.setsockopt(self.socket, socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        self.socket.bind(self.server_address)
+        self.server_address = self.socket.getsockname()
+        self.server_name, self.server_port = str(self.server_address[0]), int(self.server_address[1])
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        """One thread a connection, as long as there are not too many."""
+        if not self._connections.acquire(blocking=False):
+            self.shutdown_request(request)
+            return
+        super().process_request(request, client_address)
+
+    def process_request_thread(self, request: Any, client_address: Any) -> None:
+        """Give the place back when a connection ends."""
+        try:
+            super().process_request_thread(request, client_address)
+        finally:
+            self._connections.release()
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """A client that went away is no fault."""
+
+
+class _Handler(BaseHTTPRequestHandler):
+    server: WatchServer
+    server_version, sys_version = "armcal", ""
+
+    def setup(self) -> None:
+        """A client that stalls is dropped."""
+        super().setup()
+        self.connection.settimeout(self.server.patience)
+
+    def do_GET(self) -> None:
+        """The page, the state, or the stream of events."""
+        asked = urlsplit(self.path)
+        query = {key: values[-1] for key, values in parse_qs(asked.query).items()}
+        if not self.server.access.allows(self.headers.get("Host"), query.get("token")):
+            self._answer(HTTPStatus.FORBIDDEN, b"Forbidden: wrong name or token in the address.\n")
+        elif asked.path == "/":
+            self._answer(HTTPStatus.OK, self.server.page.html, "text/html")
+        elif asked.path == "/state":
+            state = json.dumps(self.server.feed.state(), allow_nan=False, separators=(",", ":"))
+            self._answer(HTTPStatus.OK, state.encode(), "application/json")
+        elif asked.path == "/events":
+            self._stream(self.headers.get("Last-Event-ID") or query.get("after", ""))
+        else:
+            self._answer(HTTPStatus.NOT_FOUND, b"Not found.\n")
+
+    def log_message(self, format: str, *args: Any) -> None:
+        """Nothing: a token would be in it."""
+
+    def _answer(self, status: HTTPStatus, body: bytes, kind: str = "text/plain") -> None:
+        self._head(status, f"{kind}; charset=utf-8")
+        if "gzip" in self.headers.get("Accept-Encoding", "") and len(body) > 4096:
+            body = gzip.compress(body, 5)
+            self.send_header("Content-Encoding", "gzip")
+        self.send_header("Content-Length", str(len(body)))
+        self.end_headers()
+        self.wfile.write(body)
+
+    def _head(self, status: HTTPStatus, kind: str) -> None:
+        self.send_response(status)
+        self.send_header("Content-Type", kind)
+        self.send_header("Content-Security-Policy", self.server.page.policy)
+        for name, value in _ALWAYS.items():
+            self.send_header(name, value)
+
+    def _stream(self, place: str) -> None:
+        if not self.server.streams.acquire(blocking=False):
+            self._answer(HTTPStatus.SERVICE_UNAVAILABLE, b"Too many pages are open.\n")
+            return
+        try:
+            self._head(HTTPStatus.OK, "text/event-stream")
+            self.end_headers()
+            self.wfile.write(b"retry: 2000\n\n")
+            self._follow(place)
+        finally:
+            self.server.streams.release()
+
+    def _follow(self, place: str) -> None:
+        while not self.server.ending.is_set():
+            messages = self.server.feed.after(place, self.server.heartbeat)
+            if messages is None:
+                self.wfile.write(b"event: reset\ndata: {}\n\n")
+                return
+            if not messages:
+                self.wfile.write(b": still there\n\n")
+                continue
+            place = messages[-1][0]
+            self.wfile.write("".join(f"id: {at}\ndata: {text}\n\n" for at, text in messages).encode())
+
+
+_ALWAYS = {
+    "Cache-Control": "no-store",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Referrer-Policy": "no-referrer",
+    "X-Content-Type-Options": "nosniff",
+    "X-Frame-Options": "DENY",
+}

@@ -1,0 +1,111 @@
+"""``armcal serve``."""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any, get_args
+
+import click
+from armcal.base.config_text import as_line
+from armcal.calibration.compensation.request import Redundancy
+from armcal.calibration.measured_point import Point
+from armcal.cli.common import Voice, accept, point, speaking
+from armcal.errors import InputError
+from armcal.io.signals import Signals
+from armcal.io.standard_output import StandardOutput
+from armcal.problem.kernel import EvaluatorChoice
+
+from armcal_serve.server import Opening, Server
+from armcal_serve.transports.datagrams import Datagrams
+from armcal_serve.transports.standard import StandardStreams
+from armcal_serve.transports.unix import UnixSocket
+
+_ALWAYS = ("refused", "worker_lost", "missing", "status", "notice")
+"""Events that are told although all is to be quiet."""
+
+
+@click.command()
+@click.argument("calibration", type=click.Path(path_type=Path))
+@click.option("--socket", "path", type=click.Path(path_type=Path), help="Answer at this Unix socket.")
+@click.option("--udp", "port", type=click.IntRange(0, 65535), help="Answer at this port of 127.0.0.1; 0: any free one.")
+@click.option("--within", type=click.Path(path_type=Path), help="A configuration whose plan has limits and clearance.")
+@click.option(
+    "--redundancy",
+    type=click.Choice(get_args(Redundancy)),
+    default="nearest",
+    show_default=True,
+    help="Which of many commands.",
+)
+@click.option(
+    "--workers",
+    type=click.IntRange(1, 64),
+    default=None,
+    help="Processes that answer side by side [default: 2, or 1 on one processor].",
+)
+@click.option(
+    "--evaluator",
+    type=click.Choice(["compiled", "interpreted"]),
+    default="compiled",
+    show_default=True,
+    help="Compiled C where a compiler is found: answers come sooner, a new calibration some seconds later.",
+)
+@point
+@accept
+@speaking
+def serve(
+    voice: Voice,
+    calibration: Path,
+    path: Path | None,
+    port: int | None,
+    within: Path | None,
+    redundancy: Redundancy,
+    workers: int | None,
+    evaluator: EvaluatorChoice,
+    point: Point | None,
+    accept: bool,
+) -> None:
+    """Answer requests by CALIBRATION, a JSON object a line: forward, compensate, status.
+
+    By default they come by standard input and answers go to standard output. The file may be replaced at any time.
+    """
+    openings: list[Opening] = []
+    if path is not None:
+        openings.append(partial(UnixSocket, path))
+    if port is not None:
+        openings.append(partial(Datagrams, port))
+    if not openings:
+        openings.append(_standard_streams())
+    said = _Said(voice, StandardOutput(getattr(sys.stderr, "buffer", None), patience_s=0.0))
+    how: dict[str, Any] = {"redundancy": redundancy, "within": str(within or ""), "evaluator": evaluator}
+    how |= {"point": point or "tool", "accept": accept}
+    with Signals() as signals:
+        Server(calibration, workers or min(2, os.cpu_count() or 1), how, openings, said.tell).run(signals)
+
+
+def _standard_streams() -> Opening:
+    incoming, outgoing = sys.__stdin__, sys.__stdout__
+    if incoming is None or outgoing is None:
+        found = "standard input or output is closed, expected requests by the one and a reader of the other."
+        raise InputError(found, hint="Open both, or give --socket or --udp.")
+    return partial(StandardStreams, incoming.fileno(), outgoing.fileno())
+
+
+class _Said:
+    """Events to standard error, which nobody need read: a sentence a line, or a JSON object with --json."""
+
+    def __init__(self, voice: Voice, out: StandardOutput) -> None:
+        self._voice, self._out = voice, out
+
+    def tell(self, event: str, sentence: str, content: Mapping[str, Any]) -> None:
+        """See ``armcal_serve.protocol.Tell``."""
+        if self._voice.quiet and event not in _ALWAYS:
+            return
+        if self._voice.json:
+            self._out.write(as_line({"event": event, "at": time.time(), "sentence": sentence, **content}))
+        else:
+            self._out.write(f"armcal serve: {sentence}")

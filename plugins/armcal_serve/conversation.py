@@ -1,0 +1,81 @@
+"""One client's requests and answers: answers go out in the order in which requests came."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+
+from armcal.errors import ArmcalError
+
+from armcal_serve.protocol import as_bytes, id_of, refusal
+
+MOST_WAITING = 64
+"""So many of a client's requests are taken before the first is answered."""
+
+
+class Ticket:
+    """A request on its way.
+
+    Attributes:
+        number: never used twice.
+        line: the request.
+        arrived: when it came (monotonic seconds).
+        tries: how many workers were lost over it.
+        answer: None before there is one.
+    """
+
+    def __init__(self, number: int, line: bytes, arrived: float, conversation: Conversation) -> None:
+        self.number = number
+        self.line = line
+        self.arrived = arrived
+        self.conversation = conversation
+        self.tries = 0
+        self.answer: bytes | None = None
+
+    def answered(self, answer: bytes) -> None:
+        """The answer has come."""
+        self.answer = answer
+        self.conversation.flush()
+
+    def refused(self, fault: ArmcalError) -> None:
+        """It is answered with an error."""
+        self.answered(as_bytes(refusal(id_of(self.line), fault)))
+
+
+class Conversation:
+    """What one client asked and has not been told yet.
+
+    Attributes:
+        waiting: tickets that no worker has yet.
+        ended: whether nobody is there any more to be told.
+    """
+
+    def __init__(self, send: Callable[[bytes], None]) -> None:
+        self.waiting: deque[Ticket] = deque()
+        self.ended = False
+        self._asked: deque[Ticket] = deque()
+        self._send = send
+
+    @property
+    def open(self) -> int:
+        """How many requests have no answer that was sent."""
+        return len(self._asked)
+
+    def ask(self, number: int, line: bytes, arrived: float) -> Ticket:
+        """A new request, after the others."""
+        ticket = Ticket(number, line, arrived, self)
+        self._asked.append(ticket)
+        return ticket
+
+    def flush(self) -> None:
+        """Send what can be sent in order."""
+        while self._asked and self._asked[0].answer is not None:
+            answer = self._asked.popleft().answer
+            if not self.ended and answer is not None:
+                self._send(answer)
+
+    def end(self) -> None:
+        """The client is gone: what it asked is forgotten."""
+        self.ended = True
+        self.waiting.clear()
+        self._asked.clear()

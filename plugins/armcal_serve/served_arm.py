@@ -1,0 +1,199 @@
+"""An arm that requests are about: its joints by name, in their units, and what acts on it."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NoReturn
+
+import numpy as np
+from armcal.arm.loading import LOAD_CHANNELS
+from armcal.base.domains import Array
+from armcal.base.units import from_unit, split_suffix, to_unit
+from armcal.errors import DataError, Location
+
+from armcal_serve.protocol import Acting
+
+if TYPE_CHECKING:
+    from armcal.calibration.compensation.compensator import Compensator
+    from armcal.calibration.measured_point import Point
+
+TEMPERATURE = "temperature"
+TEMPERATURE_KEY = "temperature_C"
+_VECTORS = ("gravity", "payload_com", "force", "torque")
+_CHANNEL = {"payload_com": "payload"}
+"""The channels of the payload's centre are called ``payload_x`` and so on, those of the others as the field."""
+
+
+@dataclass(frozen=True)
+class ServedArm:
+    """One arm.
+
+    Attributes:
+        name: the arm's instance name.
+        dimensions: ``angle`` or ``length`` by commanded joint, in order.
+        compensator: of the calibration as it was loaded.
+        needs_payload: whether it gives under load and nothing says what hangs on it.
+        heated: the compensator of requests that tell the temperature; None where the arm does not change with it.
+        point: what requests and answers are about: the tool's frame, or the target that was measured.
+    """
+
+    name: str
+    dimensions: Mapping[str, str]
+    compensator: Compensator
+    needs_payload: bool
+    heated: Compensator | None = None
+    point: Point = "tool"
+
+    @property
+    def joints(self) -> tuple[str, ...]:
+        """The commanded ones."""
+        return tuple(self.dimensions)
+
+    @property
+    def turns_only(self) -> bool:
+        """Whether no commanded joint slides."""
+        return set(self.dimensions.values()) <= {"angle"}
+
+    @property
+    def shown(self) -> Mapping[str, str | list[str]]:
+        """What a client can know of it: joints, what arrives, and the keys of the surroundings that it changes with."""
+        found: dict[str, str | list[str]] = {"joints": [*self.joints], "point": self.point}
+        return found if self.heated is None else {**found, "conditions": [TEMPERATURE_KEY]}
+
+    def angles(self, given: Sequence[Sequence[float] | Mapping[str, float]], field: str) -> Array:
+        """Postures (N x n; rad) from angles in order or by name.
+
+        Raises:
+            DataError: joints are missing or unknown, or some slide.
+        """
+        if not self.turns_only:
+            hint = f"Give them by name with the unit, as {field.replace('joint_angles', 'joints')}."
+            raise DataError("the arm has sliding joints.", where=Location(field=field), hint=hint)
+        return np.array([self._in_order(row, f"{field}.{i}") for i, row in enumerate(given)])
+
+    def named(self, given: Sequence[Mapping[str, float]], field: str) -> Array:
+        """Postures (N x n; rad, or m) from values by name with the unit (``q1_deg``).
+
+        Raises:
+            DataError: joints are missing or unknown, or have no unit of theirs.
+        """
+        rows = []
+        for i, row in enumerate(given):
+            values: dict[str, float] = {}
+            for key, value in row.items():
+                name, number = self._read(key, value, f"{field}.{i}")
+                if name in values:
+                    _refuse(f"the joint {name} is given twice.", f"{field}.{i}", "Give it once.")
+                values[name] = number
+            rows.append(self._in_order(values, f"{field}.{i}"))
+        return np.array(rows)
+
+    def written(self, values: Sequence[float], angle_unit: str) -> dict[str, float]:
+        """One posture by name with the unit: angles in ``rad`` or ``deg``, lengths in m or mm to match."""
+        units = {"angle": angle_unit, "length": "mm" if angle_unit == "deg" else "m"}
+        named = zip(self.dimensions.items(), values, strict=True)
+        return {f"{name}_{units[kind]}": to_unit(float(value), units[kind]) for (name, kind), value in named}
+
+    def approach(self, said: Acting, count: int) -> Array:
+        """From where each joint comes (n x count)."""
+        given = said.approach
+        if given is None:
+            return np.zeros((len(self.joints), count))
+        if isinstance(given, Mapping):
+            for name in given:
+                self._known(name, "approach")
+            row: Sequence[float] = [given.get(name, 0) for name in self.joints]
+        else:
+            row = self._in_order(given, "approach")
+        return np.repeat(np.array(row, dtype=float)[:, None], count, axis=1)
+
+    def acting(self, general: Acting, count: int, single: Sequence[Acting] = ()) -> Array:
+        """What acts (LOAD_CHANNELS x count): as said for all, then as said for each.
+
+        Raises:
+            DataError: what hangs on the arm is needed, and said nowhere.
+        """
+        expression = self.compensator.expression
+        start = expression.channels.index(LOAD_CHANNELS[0])
+        defaults = expression.defaults[start : start + len(LOAD_CHANNELS)]
+        found = np.repeat(np.asarray(defaults, dtype=float)[:, None], count, axis=1)
+        _put(found, general, slice(None))
+        for i, each in enumerate(single):
+            _put(found, each, slice(i, i + 1))
+        if self.needs_payload and general.payload is None and not (single and all(_has_payload(e) for e in single)):
+            _refuse(
+                "the arm gives under load, and neither the request nor the calibration says what hangs on it.",
+                "payload_g",
+                "Give payload_g, 0 where nothing hangs on it.",
+            )
+        return found
+
+    def at_temperature(self, field: str) -> Compensator:
+        """What answers where a field of the request tells the temperature.
+
+        Raises:
+            DataError: the arm does not change with it.
+        """
+        if self.heated is None:
+            hint = "Leave it out, or calibrate the arm with an effect that depends on it, such as thermal_length."
+            _refuse(f"the arm {self.name} does not change with the temperature.", field, hint)
+        return self.heated
+
+    def _in_order(self, row: Sequence[float] | Mapping[str, float], field: str) -> list[float]:
+        if isinstance(row, Mapping):
+            for name in row:
+                self._known(name, field)
+            missing = [name for name in self.joints if name not in row]
+            if missing:
+                _refuse(f"found no {', '.join(missing)}.", field, f"Give all of {', '.join(self.joints)}.")
+            return [float(row[name]) for name in self.joints]
+        if len(row) != len(self.joints):
+            found = f"found {len(row)} values, expected {len(self.joints)}: {', '.join(self.joints)}."
+            _refuse(found, field, "Give one for each joint, in this order, or give them by name.")
+        return [float(value) for value in row]
+
+    def _read(self, key: str, value: float, field: str) -> tuple[str, float]:
+        split = split_suffix(key)
+        if split is None:
+            _refuse(f"found {_short(key)!r} without a unit.", field, f"For example {self._example()}.")
+        name, unit = split
+        self._known(name, field)
+        if unit.dimension != self.dimensions[name]:
+            message = f"found {unit.name} for the joint {name}, expected a unit of {self.dimensions[name]}."
+            _refuse(message, field, f"For example {self._example()}.")
+        return name, from_unit(value, unit.name)
+
+    def _known(self, name: str, field: str) -> None:
+        if name in self.dimensions:
+            return
+        near = difflib.get_close_matches(name, self.joints, n=1)
+        hint = f"Did you mean {near[0]}?" if near else f"The joints are {', '.join(self.joints)}."
+        _refuse(f"the arm {self.name} has no joint {_short(name)!r}.", field, hint)
+
+    def _example(self) -> str:
+        name, kind = next(iter(self.dimensions.items()))
+        return f"{name}_{'deg' if kind == 'angle' else 'mm'}"
+
+
+def _put(found: Array, said: Acting, columns: slice) -> None:
+    if said.payload is not None:
+        found[LOAD_CHANNELS.index("payload"), columns] = said.payload
+    for field in _VECTORS:
+        vector = getattr(said, field)
+        if vector is not None:
+            first = LOAD_CHANNELS.index(f"{_CHANNEL.get(field, field)}_x")
+            found[first : first + 3, columns] = np.array(vector)[:, None]
+
+
+def _has_payload(said: Acting) -> bool:
+    return said.payload is not None
+
+
+def _refuse(message: str, field: str, hint: str) -> NoReturn:
+    raise DataError(message, where=Location(field=field), hint=hint)
+
+
+def _short(text: Any) -> str:
+    return text if len(text) <= 40 else f"{text[:37]}..."

@@ -1,0 +1,132 @@
+"""The server: requests from its transports, answers from its crew of workers, until it is told to end."""
+
+from __future__ import annotations
+
+import gc
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from armcal.io.signals import Signals
+
+from armcal_serve.calibration_watch import CalibrationWatch
+from armcal_serve.crew import Crew
+from armcal_serve.dispatcher import Dispatcher
+from armcal_serve.poller import Poller
+from armcal_serve.protocol import VERSION, Tell
+from armcal_serve.transports.transport import Transport
+
+_STEP_S = 0.1
+"""How long it may take until a signal, a client that left or a new file is noticed, when nothing else happens."""
+_GRACE_S = 10.0
+"""How long answers may take after the end was asked for."""
+
+Opening = Callable[[Poller, Dispatcher], Transport]
+
+
+class Server:
+    """Serves one calibration's file.
+
+    Args:
+        path: the file, which may be replaced at any time.
+        workers: how many processes answer.
+        how: commands are found; see ``armcal_serve.crew.Crew``.
+        openings: make the transports.
+        tell: is told what whoever started it should know.
+
+    Raises:
+        InputError: a transport cannot be had.
+    """
+
+    def __init__(
+        self, path: Path, workers: int, how: Mapping[str, Any], openings: Sequence[Opening], tell: Tell
+    ) -> None:
+        self._began = time.monotonic()
+        self._tell = tell
+        self._poller = Poller()
+        self._watch = CalibrationWatch(path)
+        self._dispatcher = Dispatcher(self.status)
+        self._crew = Crew(workers, self._watch, how, self._poller, self._dispatcher, tell)
+        self._transports: list[Transport] = []
+        try:
+            for opening in openings:
+                self._transports.append(opening(self._poller, self._dispatcher))
+        except BaseException:
+            self._close()
+            raise
+
+    def run(self, signals: Signals) -> None:
+        """Until a signal asks for the end, or nobody can ask anything any more.
+
+        Raises:
+            ArmcalError: the calibration cannot be used.
+        """
+        try:
+            self._make_ready(signals)
+            if not signals.finish:
+                self._serve(signals)
+        finally:
+            self._close()
+
+    def status(self) -> Mapping[str, Any]:
+        """How the server is doing, as an answer."""
+        return {
+            "armcal_serve": VERSION,
+            "ok": True,
+            "calibration": self._crew.tag,
+            "arms": self._crew.arms,
+            "file": {"path": str(self._watch.path), "state": self._watch.state, "why": self._watch.why},
+            "requests": self._dispatcher.asked,
+            "waiting": self._dispatcher.waiting,
+            "clients": sum(transport.clients for transport in self._transports),
+            "worker_pids": self._crew.worker_pids,
+            "workers_lost": self._crew.lost,
+            "up_s": round(time.monotonic() - self._began, 1),
+        }
+
+    def _make_ready(self, signals: Signals) -> None:
+        self._crew.begin(self._watch.first())
+        while self._crew.tag is None and not signals.finish:
+            self._poller.step(_STEP_S)
+            self._crew.tend(looking=False)
+
+    def _serve(self, signals: Signals) -> None:
+        names = [transport.name for transport in self._transports]
+        told = {"calibration": self._crew.tag, "arms": self._crew.arms, "by": names}
+        self._tell("ready", f"ready: {self._watch.path} by {', '.join(names)}", told)
+        gc.collect()
+        gc.freeze()
+        for transport in self._transports:
+            transport.open()
+        while not signals.finish and not all(transport.ended for transport in self._transports):
+            self._step()
+            if signals.status:
+                signals.status = False
+                tag = self._crew.tag
+                number = 0 if tag is None else tag["sequence"]
+                sentence = f"calibration {number} is answered from, {self._dispatcher.asked} requests so far; "
+                self._tell(
+                    "status", f"{sentence}the file is {self._watch.state}. {self._watch.why}".rstrip(), self.status()
+                )
+        self._finish()
+
+    def _finish(self) -> None:
+        """Answer what was asked."""
+        for transport in self._transports:
+            transport.listen_no_more()
+        ends = time.monotonic() + _GRACE_S
+        while not all(transport.finished for transport in self._transports) and time.monotonic() < ends:
+            self._step(looking=False)
+
+    def _step(self, looking: bool = True) -> None:
+        self._poller.step(_STEP_S)
+        self._crew.tend(looking)
+        for transport in self._transports:
+            transport.tend()
+
+    def _close(self) -> None:
+        for transport in self._transports:
+            transport.close()
+        self._crew.close()
+        self._watch.close()

@@ -1,0 +1,104 @@
+"""Datagrams on this machine: a request in each, and its answer in one to the sender."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+from collections.abc import Callable
+from typing import Any
+
+from armcal.errors import ArmcalError, DataError
+from armcal.io.udp import LOOPBACK, bound
+
+from armcal_serve.conversation import Conversation
+from armcal_serve.dispatcher import Dispatcher
+from armcal_serve.poller import Poller
+from armcal_serve.protocol import as_bytes, id_of, refusal
+
+_LONGEST = 65_507
+"""What a datagram can hold (bytes)."""
+_MOST_OPEN = 256
+_AT_ONCE = 32
+"""So many are taken before others have their turn."""
+
+
+class Datagrams:
+    """Serves a port of the loopback address; what is lost on the way, or comes when too much waits, is asked again.
+
+    Raises:
+        InputError: the port cannot be had.
+    """
+
+    ended = False
+
+    def __init__(self, port: int, poller: Poller, dispatcher: Dispatcher) -> None:
+        self._poller, self._dispatcher = poller, dispatcher
+        self._senders: dict[Any, Conversation] = {}
+        self._socket = bound(LOOPBACK, port)
+
+    @property
+    def port(self) -> int:
+        """The one that it has, where any was wanted."""
+        return int(self._socket.getsockname()[1])
+
+    @property
+    def name(self) -> str:
+        """See ``Transport``."""
+        return f"udp {LOOPBACK}:{self.port}"
+
+    @property
+    def clients(self) -> int:
+        """See ``Transport``: those that wait for an answer."""
+        return len(self._senders)
+
+    @property
+    def finished(self) -> bool:
+        """See ``Transport``."""
+        return not any(each.open for each in self._senders.values())
+
+    def open(self) -> None:
+        """See ``Transport``."""
+        self._poller.watch(self._socket, self._read)
+
+    def tend(self) -> None:
+        """Forget senders that were answered."""
+        for sender, conversation in [*self._senders.items()]:
+            if not conversation.open:
+                del self._senders[sender]
+
+    def listen_no_more(self) -> None:
+        """See ``Transport``."""
+        self._poller.watch(self._socket)
+
+    def close(self) -> None:
+        """See ``Transport``."""
+        self._poller.watch(self._socket)
+        for conversation in self._senders.values():
+            conversation.end()
+        self._socket.close()
+
+    def _read(self) -> None:
+        for _ in range(_AT_ONCE):
+            try:
+                data, sender = self._socket.recvfrom(_LONGEST + 1)
+            except OSError:
+                return
+            if sum(each.open for each in self._senders.values()) >= _MOST_OPEN:
+                busy = ArmcalError(f"{_MOST_OPEN} requests are waiting.", hint="Ask again in a while.")
+                self._send(sender, as_bytes(refusal(None, busy)))
+                continue
+            conversation = self._senders.get(sender)
+            if conversation is None:
+                conversation = self._senders[sender] = Conversation(self._sending(sender))
+            self._dispatcher.ask(conversation, data)
+
+    def _sending(self, sender: Any) -> Callable[[bytes], None]:
+        return lambda answer: self._send(sender, answer)
+
+    def _send(self, sender: Any, answer: bytes) -> None:
+        if len(answer) > _LONGEST:
+            hint = "Ask for fewer targets at a time, or by the socket."
+            fault = DataError(f"the answer has more than {_LONGEST} bytes, which no datagram holds.", hint=hint)
+            answer = as_bytes(refusal(id_of(answer), fault))
+        with contextlib.suppress(OSError):
+            self._socket.sendto(answer, socket.MSG_DONTWAIT, sender)

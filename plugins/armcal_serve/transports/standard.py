@@ -1,0 +1,70 @@
+"""Standard input and output: one client, the program that started the server."""
+
+from __future__ import annotations
+
+import os
+import select
+
+from armcal_serve.dispatcher import Dispatcher
+from armcal_serve.poller import Poller
+from armcal_serve.transports.stream import CHUNK, StreamClient
+
+_AT_ONCE = 4096
+"""A pipe that is ready takes so many bytes without waiting (PIPE_BUF)."""
+
+
+class StandardStreams:
+    """Requests from one descriptor, answers to another, which stay the caller's; no waiting in either.
+
+    They are shared with other programs (a terminal with its shell), so neither is made non-blocking.
+    """
+
+    name = "standard input"
+
+    def __init__(self, incoming: int, outgoing: int, poller: Poller, dispatcher: Dispatcher) -> None:
+        self._incoming, self._outgoing = incoming, outgoing
+        self._poller, self._dispatcher = poller, dispatcher
+        self._client: StreamClient | None = None
+
+    @property
+    def clients(self) -> int:
+        """See ``Transport``."""
+        return int(not self.ended)
+
+    @property
+    def ended(self) -> bool:
+        """See ``Transport``."""
+        client = self._client
+        return client is not None and (client.ended or (client.heard_all and client.finished))
+
+    @property
+    def finished(self) -> bool:
+        """See ``Transport``."""
+        return self._client is None or self._client.ended or self._client.finished
+
+    def open(self) -> None:
+        """See ``Transport``."""
+        self._client = StreamClient(
+            self._incoming, self._outgoing, self._receive, self._send, self._poller, self._dispatcher
+        )
+
+    def tend(self) -> None:
+        """See ``Transport``: whoever reads slowly here holds up nobody else."""
+
+    def listen_no_more(self) -> None:
+        """See ``Transport``."""
+        if self._client is not None:
+            self._client.listen_no_more()
+
+    def close(self) -> None:
+        """See ``Transport``."""
+        if self._client is not None and not self._client.ended:
+            self._client.end()
+
+    def _receive(self) -> bytes | None:
+        return os.read(self._incoming, CHUNK)
+
+    def _send(self, data: memoryview) -> int:
+        poll = select.poll()
+        poll.register(self._outgoing, select.POLLOUT)
+        return os.write(self._outgoing, data[:_AT_ONCE]) if poll.poll(0) else 0

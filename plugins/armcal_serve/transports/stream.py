@@ -1,0 +1,159 @@
+"""A client at a stream of bytes: lines in, lines out, no more of either in memory than is bearable."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable
+from typing import Any
+
+from armcal.errors import ArmcalError, DataError
+from armcal.io.line_cutter import LineCutter
+
+from armcal_serve.conversation import MOST_WAITING, Conversation
+from armcal_serve.dispatcher import Dispatcher
+from armcal_serve.poller import Poller
+from armcal_serve.protocol import MAX_LINE_BYTES
+
+CHUNK = 64 * 1024
+MOST_UNREAD_BYTES = 1024**2
+"""A client that leaves so much unread is not listened to until it reads."""
+
+Receive = Callable[[], bytes | None]
+"""What has come: nothing where the stream has ended, None where it turns out that there is none."""
+Send = Callable[[memoryview], int]
+
+
+class StreamClient:
+    """One client. It is read from as long as it reads what it is told.
+
+    Args:
+        incoming, outgoing: descriptors, or what has one; the same for a socket.
+        receive, send: raise OSError when nobody is there any more.
+
+    Attributes:
+        ended: whether there is nobody to be told anything any more.
+        heard_all: whether all of its requests have come.
+        moved: when it last took something, or had nothing to take (monotonic seconds).
+        asked: whether it ever sent a whole line.
+    """
+
+    def __init__(
+        self, incoming: Any, outgoing: Any, receive: Receive, send: Send, poller: Poller, dispatcher: Dispatcher
+    ) -> None:
+        self.ended = False
+        self.heard_all = False
+        self.asked = False
+        self.moved = self._said = time.monotonic()
+        self._incoming, self._outgoing = incoming, outgoing
+        self._receive, self._take = receive, send
+        self._poller, self._dispatcher = poller, dispatcher
+        self._cutter = LineCutter(MAX_LINE_BYTES)
+        self._lines: deque[bytes | None] = deque()
+        self._out = bytearray()
+        self.conversation = Conversation(self._tell)
+        self.arrange()
+
+    @property
+    def finished(self) -> bool:
+        """Whether everything that was asked was answered, and the answers were taken."""
+        return not (self._lines or self.conversation.open or self._out)
+
+    @property
+    def stuck_s(self) -> float:
+        """How long it has left answers unread (s)."""
+        return time.monotonic() - self.moved if self._out else 0.0
+
+    @property
+    def idle_s(self) -> float:
+        """How long it has asked nothing, a line that it only began left out; 0 while it is owed something (s)."""
+        return time.monotonic() - max(self._said, self.moved) if self.finished else 0.0
+
+    @property
+    def owes_line(self) -> bool:
+        """Whether it has yet to end its first line, or one that it began."""
+        return not self.heard_all and (not self.asked or self._cutter.begun)
+
+    def dismiss(self, why: ArmcalError) -> None:
+        """Say why, and listen no more."""
+        self._dispatcher.refuse(self.conversation, why)
+        self.listen_no_more()
+
+    def listen_no_more(self) -> None:
+        """Take no further requests."""
+        self.heard_all = True
+        self.arrange()
+
+    def end(self) -> None:
+        """Forget it."""
+        self.ended = True
+        self.conversation.end()
+        self._out.clear()
+        self._lines.clear()
+        for place in (self._incoming, self._outgoing):
+            self._poller.watch(place)
+
+    def arrange(self) -> None:
+        """Ask what can be asked, and say what is to be waited for."""
+        while self._lines and self.conversation.open < MOST_WAITING and not self.ended:
+            self._ask(self._lines.popleft())
+        if self.ended:
+            return
+        full = bool(self._lines) or len(self._out) > MOST_UNREAD_BYTES
+        read = None if full or self.heard_all else self._read
+        write = self._write if self._out else None
+        if self._incoming is self._outgoing:
+            self._poller.watch(self._incoming, read, write)
+        else:
+            self._poller.watch(self._incoming, read)
+            self._poller.watch(self._outgoing, None, write)
+
+    def _ask(self, line: bytes | None) -> None:
+        if line is None:
+            fault = DataError(
+                f"the request has more than {MAX_LINE_BYTES // 1024} KiB.", hint="Ask for less at a time."
+            )
+            self._dispatcher.refuse(self.conversation, fault)
+        elif line.strip():
+            self._dispatcher.ask(self.conversation, line)
+
+    def _read(self) -> None:
+        try:
+            data = self._receive()
+        except OSError:
+            self.end()
+            return
+        if data is None:
+            return
+        began = not self._cutter.begun
+        lines = self._cutter.feed(data)
+        if began or lines:
+            self._said = time.monotonic()
+        self.asked = self.asked or bool(lines)
+        self._lines.extend(lines)
+        if not data:
+            self.heard_all = True
+            if self._cutter.begun:
+                self._lines.append(self._cutter.rest())
+        self.arrange()
+
+    def _tell(self, answer: bytes) -> None:
+        if not self._out:
+            self.moved = time.monotonic()
+        self._out += answer
+        self._out += b"\n"
+        self._write()
+
+    def _write(self) -> None:
+        try:
+            while self._out:
+                with memoryview(self._out) as view:
+                    sent = self._take(view)
+                if not sent:
+                    break
+                del self._out[:sent]
+                self.moved = time.monotonic()
+        except OSError:
+            self.end()
+            return
+        self.arrange()

@@ -1,0 +1,167 @@
+"""A Unix socket that many clients may connect to; only its owner may."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import socket
+import time
+from pathlib import Path
+
+from armcal.errors import ArmcalError
+from armcal.io.unix_socket import listening
+
+from armcal_serve.dispatcher import Dispatcher
+from armcal_serve.poller import Poller
+from armcal_serve.protocol import as_bytes, refusal
+from armcal_serve.transports.stream import CHUNK, StreamClient
+
+MOST_CLIENTS = 64
+PATIENCE_S = 10.0
+"""A client that leaves answers unread for so long is let go of."""
+FIRST_LINE_S = 30.0
+"""So long a client may take over its first line, and over any that it began."""
+_LEAST_IDLE_S = 1.0
+"""A client that has asked nothing for so long gives way where there is no place left."""
+_PAUSE_S = 1.0
+"""Nobody is let in for so long where the system has no descriptor and no client is idle: who waits is reported on."""
+_NO_MORE = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM)
+
+
+class UnixSocket:
+    """Serves a path.
+
+    Raises:
+        InputError: another server serves it, something else is there, or it cannot be made.
+    """
+
+    ended = False
+
+    def __init__(
+        self,
+        path: Path,
+        poller: Poller,
+        dispatcher: Dispatcher,
+        patience_s: float = PATIENCE_S,
+        first_line_s: float = FIRST_LINE_S,
+    ) -> None:
+        self._path = path
+        self._poller, self._dispatcher = poller, dispatcher
+        self._patience_s, self._first_line_s = patience_s, first_line_s
+        self._opens_at: float | None = None
+        self._clients: dict[socket.socket, StreamClient] = {}
+        self._listener = listening(path, "a server is running here.", "Give another --socket.", MOST_CLIENTS)
+
+    @property
+    def name(self) -> str:
+        """See ``Transport``."""
+        return f"socket {self._path}"
+
+    @property
+    def clients(self) -> int:
+        """See ``Transport``."""
+        return len(self._clients)
+
+    @property
+    def finished(self) -> bool:
+        """See ``Transport``."""
+        return all(client.ended or client.finished for client in self._clients.values())
+
+    def open(self) -> None:
+        """See ``Transport``."""
+        self._opens_at = None
+        self._poller.watch(self._listener, self._accept)
+
+    def tend(self) -> None:
+        """Let go of clients that are done, that do not read, or that do not end a line."""
+        if self._opens_at is not None and time.monotonic() >= self._opens_at:
+            self.open()
+        for connection, client in [*self._clients.items()]:
+            if client.owes_line and client.idle_s > self._first_line_s:
+                _dismiss(client, f"no whole request came within {self._first_line_s:g} s")
+            if client.heard_all and client.finished and not client.ended:
+                client.end()
+            if client.stuck_s > self._patience_s:
+                client.end()
+            if client.ended:
+                del self._clients[connection]
+                connection.close()
+
+    def listen_no_more(self) -> None:
+        """See ``Transport``."""
+        self._opens_at = None
+        self._poller.watch(self._listener)
+        for client in self._clients.values():
+            client.listen_no_more()
+
+    def close(self) -> None:
+        """Take the socket away."""
+        for connection, client in self._clients.items():
+            if not client.ended:
+                client.end()
+            connection.close()
+        self._clients.clear()
+        self._poller.watch(self._listener)
+        with contextlib.suppress(OSError):
+            self._path.unlink()
+        self._listener.close()
+
+    def _accept(self) -> None:
+        try:
+            connection, _ = self._listener.accept()
+        except OSError as fault:
+            if fault.errno in _NO_MORE and not self._make_room("the system has no place for another"):
+                self._poller.watch(self._listener)
+                self._opens_at = time.monotonic() + _PAUSE_S
+            return
+        connection.setblocking(False)
+        if self._staying >= MOST_CLIENTS and not self._make_room(f"{MOST_CLIENTS} clients are connected"):
+            _turn_away(connection)
+            return
+        client = StreamClient(
+            connection,
+            connection,
+            lambda: _received(connection),
+            lambda data: _sent(connection, data),
+            self._poller,
+            self._dispatcher,
+        )
+        self._clients[connection] = client
+
+    @property
+    def _staying(self) -> int:
+        return sum(not client.heard_all for client in self._clients.values())
+
+    def _make_room(self, why: str) -> bool:
+        """Let go of the client that has asked nothing for longest; False where none is idle."""
+        staying = [client for client in self._clients.values() if not client.heard_all]
+        idlest = max(staying, key=lambda client: client.idle_s, default=None)
+        if idlest is None or idlest.idle_s < _LEAST_IDLE_S:
+            return False
+        _dismiss(idlest, f"{why}, and this one asked nothing for {idlest.idle_s:.0f} s")
+        return True
+
+
+def _dismiss(client: StreamClient, why: str) -> None:
+    client.dismiss(ArmcalError(f"{why}: the connection is closed.", hint="Connect anew when there is a request."))
+
+
+def _received(connection: socket.socket) -> bytes | None:
+    try:
+        return connection.recv(CHUNK)
+    except BlockingIOError:
+        return None
+
+
+def _sent(connection: socket.socket, data: memoryview) -> int:
+    try:
+        return connection.send(data)
+    except BlockingIOError:
+        return 0
+
+
+def _turn_away(connection: socket.socket) -> None:
+    fault = ArmcalError(f"{MOST_CLIENTS} clients are connected.", hint="Close connections that are not used.")
+    with contextlib.suppress(OSError):
+        connection.send(as_bytes(refusal(None, fault)) + b"\n")
+    connection.close()
