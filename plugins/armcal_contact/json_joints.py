@@ -9,10 +9,11 @@ from typing import Any, ClassVar, Literal
 from armcal.base.settings import Settings
 from armcal.base.units import split_suffix
 from armcal.devices.clock import Clock
-from armcal.devices.joint_stream import JointSample
+from armcal.devices.joint_stream import JointSample, JointStream
 from armcal.devices.line_source import Begin, LineSource, SourceName, open_lines
 from armcal.errors import ConfigError
 from pydantic import Field, field_validator
+from typing_extensions import override
 
 from armcal_contact.json_joint_message import JointMessages, RefusedLine
 
@@ -46,7 +47,7 @@ class JsonLinesJointSettings(Settings):
         return name
 
 
-class JsonLinesJoints:
+class JsonLinesJoints(JointStream):
     """Joint readings as ``json_joint_message`` reads them. See ``armcal.devices.joint_stream.JointStream``."""
 
     Settings: ClassVar[type[JsonLinesJointSettings]] = JsonLinesJointSettings
@@ -61,17 +62,17 @@ class JsonLinesJoints:
         self._refused: Counter[str] = Counter()
 
     @property
+    @override
     def refused(self) -> Mapping[str, int]:
-        """See ``JointStream``."""
         return dict(self._refused)
 
     @property
+    @override
     def ended(self) -> bool:
-        """See ``JointStream``."""
         return self._source is None or self._source.ended
 
+    @override
     def open(self, clock: Clock, channels: tuple[str, ...]) -> None:
-        """See ``JointStream``."""
         self.close()
         s = self._settings
         try:
@@ -80,16 +81,16 @@ class JsonLinesJoints:
             raise ConfigError(f"bench.joints: {fault}.", hint="Correct bench.joints.joints.") from fault
         self._source, self._clock, self._last = open_lines(s.source, s.begin), clock, None
 
+    @override
     def samples(self) -> list[JointSample]:
-        """See ``JointStream``."""
         if self._source is None or self._clock is None:
             return []
         now = self._clock.now()
         found = (self._read(line, now) for line in self._source.lines())
         return [sample for sample in found if sample is not None]
 
+    @override
     def close(self) -> None:
-        """See ``JointStream``."""
         if self._source is not None:
             self._source.close()
         self._source = None

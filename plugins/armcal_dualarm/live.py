@@ -10,9 +10,11 @@ from typing import Any, ClassVar
 import numpy as np
 from armcal.base.units import from_unit
 from armcal.devices.clock import Clock
-from armcal.devices.joint_stream import JointSample
+from armcal.devices.joint_stream import JointSample, JointStream
 from armcal.devices.line_source import Begin, LineSource, SourceName, open_lines
+from armcal.devices.rest_stream import RestStream
 from armcal.errors import ConfigError, DataError
+from typing_extensions import override
 
 from armcal_dualarm.live_still import LiveRests, Rows
 from armcal_dualarm.live_table import LiveTable, Row
@@ -32,7 +34,7 @@ class TwoArmStreamSettings(LogColumns):
     begin: Begin = "end"
 
 
-class TwoArmLogStream:
+class TwoArmLogStream(JointStream, RestStream):
     """Readings, or with ``still`` the means of rests. See ``armcal.devices.joint_stream.JointStream``."""
 
     Settings: ClassVar[type[TwoArmStreamSettings]] = TwoArmStreamSettings
@@ -57,17 +59,17 @@ class TwoArmLogStream:
         return self._settings.still is not None
 
     @property
+    @override
     def refused(self) -> Mapping[str, int]:
-        """See ``JointStream``."""
         return dict(self._refused)
 
     @property
+    @override
     def ended(self) -> bool:
-        """See ``JointStream``."""
         return self._source is None or self._source.ended
 
+    @override
     def open(self, clock: Clock, channels: tuple[str, ...]) -> None:
-        """See ``JointStream``."""
         self.close()
         s = self._settings
         names = tuple(dict.fromkeys(channel.partition(".")[0] for channel in channels))
@@ -84,8 +86,8 @@ class TwoArmLogStream:
                 self._row(file.readline().rstrip(b"\r\n") or None)
             self._refused.clear()
 
+    @override
     def samples(self) -> list[JointSample]:
-        """See ``JointStream``."""
         if self._source is None:
             return []
         rows = [row for line in self._source.lines() if (row := self._row(line)) is not None]
@@ -96,12 +98,12 @@ class TwoArmLogStream:
             return self._samples([whole.part(i, i + 1) for i in range(len(whole))])
         return self._samples(self._rests.add(whole))
 
+    @override
     def lasting(self) -> list[JointSample]:
-        """See ``RestStream``."""
         return [] if self._rests is None else self._samples(self._rests.lasting())
 
+    @override
     def close(self) -> None:
-        """See ``JointStream``."""
         if self._source is not None:
             self._source.close()
         self._source = None

@@ -11,10 +11,11 @@ from armcal.arm.servo import COUNTS
 from armcal.base.settings import InputPath, Settings
 from armcal.config.servo_file import ServoFile, digest, load_servo_file
 from armcal.devices.clock import Clock
-from armcal.devices.device import DeviceIdentity, DeviceState
+from armcal.devices.device import DeviceIdentity, DeviceState, JointDevice, PulseDevice
 from armcal.devices.faults import DeviceLostError, DeviceRefusedError
 from armcal.devices.link import GuardedLink, Link, LinkIdentity
 from armcal.errors import Location
+from typing_extensions import override
 
 from armcal_pca9685.chip import Chip, ForeignPulses
 from armcal_pca9685.guard import Guard
@@ -29,7 +30,7 @@ class Pca9685Settings(Settings):
     foreign_pulses: ForeignPulses = "refuse"
 
 
-class Pca9685Device:
+class Pca9685Device(JointDevice, PulseDevice):
     """The device ``pca9685``; see ``JointDevice`` and ``PulseDevice`` in ``armcal.devices.device``."""
 
     Settings: ClassVar[type[Pca9685Settings]] = Pca9685Settings
@@ -48,12 +49,12 @@ class Pca9685Device:
         self._guard = Guard((), 0.0, 0.0)
 
     @property
+    @override
     def joint_names(self) -> tuple[str, ...]:
-        """See ``JointDevice``."""
         return tuple(self._servos)
 
+    @override
     def open(self, clock: Clock) -> DeviceIdentity:
-        """See ``JointDevice``."""
         identity = self._link.open(clock)
         try:
             self._check_identity(identity)
@@ -71,22 +72,22 @@ class Pca9685Device:
         calibrated = digest({joint: servo.calibrated for joint, servo in self._servos.items()})
         return DeviceIdentity(name, calibrated, identity.boots, identity.adapter)
 
+    @override
     def state(self) -> DeviceState:
-        """See ``JointDevice``."""
         self._read_counts()
         angles = {joint: self._servos[joint].angle(counts) for joint, counts in self._counts.items()}
         return DeviceState(angles, isinstance(self._link, GuardedLink) and self._link.took_over)
 
+    @override
     def standing(self, angles: Mapping[str, float]) -> dict[str, float]:
-        """See ``JointDevice``."""
         return {joint: self._servos[joint].angle(self._counts_of(joint, angle)) for joint, angle in angles.items()}
 
+    @override
     def energise(self, joint: str, angle: float) -> None:
-        """See ``JointDevice``."""
         self._begin(joint, self._counts_of(joint, angle))
 
+    @override
     def command(self, angles: Mapping[str, float]) -> None:
-        """See ``JointDevice``."""
         targets = {joint: self._counts_of(joint, angle) for joint, angle in angles.items()}
         limp = [joint for joint in targets if joint not in self._counts]
         if limp:
@@ -101,16 +102,18 @@ class Pca9685Device:
             if counts != self._counts[joint]:
                 self._set_counts(joint, counts)
 
+    @override
     def keep_alive(self) -> None:
-        """See ``JointDevice``. A guarded link says, too, whether its other end drives by itself meanwhile."""
+        """A guarded link says, too, whether its other end drives by itself meanwhile."""
         self._check_open()
         if isinstance(self._link, GuardedLink):
             self._link.beat()
         for chip in self._chips.values():
             chip.check()
 
+    @override
     def guard(self, waypoints: Sequence[Mapping[str, float]], rate: float, after_s: float) -> bool:
-        """See ``JointDevice``. Joints without pulses stay without; a joint that gets them later is looked after too."""
+        """Joints without pulses stay without; a joint that gets them later is looked after too."""
         if not isinstance(self._link, GuardedLink):
             return False
         ways = tuple({joint: self._counts_of(joint, a) for joint, a in way.items()} for way in waypoints)
@@ -118,15 +121,15 @@ class Pca9685Device:
         self._guard.tell(self._link, self._servos, self._counts)
         return True
 
+    @override
     def release(self, joint: str) -> None:
-        """See ``JointDevice``."""
         address, channel = self._known(joint).place
         self._counts.pop(joint, None)
         self._renew_guard()  # before the pulses end: the board must not begin them anew
         self._chip(address).set_channel(channel, no_pulse(channel))
 
+    @override
     def set_pulse(self, joint: str, pulse: float) -> float:
-        """See ``PulseDevice``."""
         servo = self._known(joint)
         counts = int(servo.clock.counts(pulse)) if math.isfinite(pulse) else 0
         fewest, most = servo.borne
@@ -141,8 +144,8 @@ class Pca9685Device:
         self._begin(joint, counts)
         return counts * servo.clock.tick
 
+    @override
     def close(self) -> None:
-        """See ``JointDevice``."""
         self._chips, self._counts = {}, {}
         self._link.close()
 

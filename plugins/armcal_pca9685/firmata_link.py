@@ -13,9 +13,10 @@ from typing import Any, ClassVar
 from armcal.base.settings import Duration
 from armcal.devices.clock import Clock
 from armcal.devices.faults import DeviceError, DeviceLostError, DeviceRefusedError, DeviceResetError
-from armcal.devices.link import LinkIdentity
+from armcal.devices.link import Link, LinkIdentity
 from armcal.devices.serial_port import SerialPort, SerialPortSettings
 from armcal.errors import Location
+from typing_extensions import override
 
 from armcal_pca9685 import firmata_messages as firmata
 from armcal_pca9685.firmata_messages import FirmataDecoder, Message
@@ -34,7 +35,7 @@ class FirmataSettings(SerialPortSettings):
     start: Duration = 4.0
 
 
-class FirmataLink:
+class FirmataLink(Link):
     """The link ``firmata``."""
 
     Settings: ClassVar[type[FirmataSettings]] = FirmataSettings
@@ -59,13 +60,15 @@ class FirmataLink:
             raise
         return LinkIdentity(adapter, firmware)
 
+    @override
     def write(self, address: int, data: bytes) -> None:
-        """See ``Link``. Nobody says whether it arrived: read it back."""
+        """Nobody says whether it arrived: read it back."""
         self._heard(0.0)
         self._port.write(firmata.i2c_write(address, data))
 
+    @override
     def read(self, address: int, register: int, count: int) -> bytes:
-        """See ``Link``. It asks for up to three bytes more than it gives: no late answer is taken for this one."""
+        """It asks for up to three bytes more than it gives: no late answer is taken for this one."""
         complaint = ""
         for _ in range(_TRIES):
             self._heard(0.0)
@@ -84,8 +87,8 @@ class FirmataLink:
         self._port.close()
         raise DeviceLostError("the board does not answer.", where=self._where, hint="Look at its cable and power.")
 
+    @override
     def close(self) -> None:
-        """See ``Link``."""
         self._port.close()
 
     def _answer(self, address: int, register: int, length: int) -> tuple[bytes | None, str]:

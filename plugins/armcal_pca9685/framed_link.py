@@ -13,9 +13,10 @@ from armcal.devices.faults import DeviceError, DeviceLostError, DeviceRefusedErr
 from armcal.devices.framed import messages
 from armcal.devices.framed.frames import DELIMITER, MAX_PAYLOAD, Frame, FrameDecoder, encoded
 from armcal.devices.framed.messages import Code, Flag, Kind
-from armcal.devices.link import Counts, LinkIdentity
+from armcal.devices.link import Counts, GuardedLink, Link, LinkIdentity
 from armcal.devices.serial_port import SerialPort, SerialPortSettings
 from armcal.errors import Location
+from typing_extensions import override
 
 _TRIES = 4
 _REPLY_S = 0.1
@@ -30,7 +31,7 @@ class FramedSettings(SerialPortSettings):
     start: Duration = 4.0
 
 
-class FramedLink:
+class FramedLink(GuardedLink, Link):
     """The link ``framed``, version 1 of the protocol."""
 
     Settings: ClassVar[type[FramedSettings]] = FramedSettings
@@ -47,8 +48,9 @@ class FramedLink:
         self._flags = Flag(0)
 
     @property
+    @override
     def took_over(self) -> bool:
-        """See ``GuardedLink``; what the board did before ``open`` counts too."""
+        """What the board did before ``open`` counts too."""
         return self._took_over
 
     def open(self, clock: Clock) -> LinkIdentity:
@@ -68,33 +70,31 @@ class FramedLink:
             raise
         return LinkIdentity(hello.board_id or adapter, hello.firmware, self._boots)
 
+    @override
     def write(self, address: int, data: bytes) -> None:
-        """See ``Link``."""
         self._ask(Kind.WRITE, messages.Write(address, data).pack())
 
+    @override
     def read(self, address: int, register: int, count: int) -> bytes:
-        """See ``Link``."""
         data = self._ask(Kind.READ, messages.Read(address, register, count).pack())
         if len(data) != count:
             found = f"found {len(data)} bytes of 0x{address:02x}, expected {count}."
             raise DeviceError(found, where=self._where, hint="Load the board's firmware anew.")
         return data
 
+    @override
     def beat(self) -> None:
-        """See ``GuardedLink``.
-
-        Raises:
-            DeviceLostError: the board drives by itself.
+        """Raises:
+        DeviceLostError: the board drives by itself.
         """
         self._ask(Kind.BEAT, b"")
         if Flag.TOOK_OVER in self._flags:
             self._lose_to_board()
 
+    @override
     def guard(self, waypoints: Sequence[Counts], counts_per_s: Mapping[tuple[int, int], float], after_s: float) -> None:
-        """See ``GuardedLink``.
-
-        Raises:
-            DeviceRefusedError: the waypoints are more than a frame holds.
+        """Raises:
+        DeviceRefusedError: the waypoints are more than a frame holds.
         """
         places = list(counts_per_s)
         most = (MAX_PAYLOAD - 4 - 4 * len(places)) // (2 * len(places)) if places else 0
@@ -109,14 +109,14 @@ class FramedLink:
         after_ms = min(max(round(after_s * 1000), 1), _LARGEST)
         self._ask(Kind.GUARD, messages.Guard(after_ms, channels, ways).pack())
 
+    @override
     def set_counts(self, targets: Mapping[tuple[int, int], tuple[int, int]]) -> None:
-        """See ``GuardedLink``."""
         listed = [messages.ChannelTarget(*place, *registers) for place, registers in targets.items()]
         for first in range(0, len(listed), _TARGETS_AT_ONCE):
             self._ask(Kind.SET, messages.Set(tuple(listed[first : first + _TARGETS_AT_ONCE])).pack())
 
+    @override
     def close(self) -> None:
-        """See ``Link``."""
         self._port.close()
 
     def _greet_starting(self, clock: Clock) -> messages.HelloReply:

@@ -12,9 +12,10 @@ from typing import Annotated, Any, ClassVar, NoReturn, TypeVar
 from armcal.base.settings import Settings
 from armcal.devices.clock import Clock
 from armcal.devices.faults import DeviceError, DeviceLostError, DeviceRefusedError
-from armcal.devices.link import LinkIdentity
+from armcal.devices.link import Link, LinkIdentity
 from armcal.errors import Location, PluginError
 from pydantic import Field
+from typing_extensions import override
 
 T = TypeVar("T")
 
@@ -28,7 +29,7 @@ class LinuxI2cSettings(Settings):
     bus: Annotated[int, Field(ge=0, le=255)] = 1
 
 
-class LinuxI2cLink:
+class LinuxI2cLink(Link):
     """The link ``linux_i2c``. Nothing tells one such bus from another, and nothing counts its starts."""
 
     Settings: ClassVar[type[LinuxI2cSettings]] = LinuxI2cSettings
@@ -55,20 +56,20 @@ class LinuxI2cLink:
             self._refuse(fault)
         return LinkIdentity("", f"Linux I2C, {self._path}")
 
+    @override
     def write(self, address: int, data: bytes) -> None:
-        """See ``Link``."""
         self._transfer(address, lambda library: [library.i2c_msg.write(address, data)])
 
+    @override
     def read(self, address: int, register: int, count: int) -> bytes:
-        """See ``Link``."""
 
         def messages(library: Any) -> list[Any]:
             return [library.i2c_msg.write(address, [register]), library.i2c_msg.read(address, count)]
 
         return bytes(self._transfer(address, messages)[1])
 
+    @override
     def close(self) -> None:
-        """See ``Link``."""
         bus, self._bus = self._bus, None
         if bus is not None:
             bus.close()

@@ -10,8 +10,9 @@ from typing import Annotated, Any, ClassVar
 
 from armcal.base.settings import Settings
 from armcal.devices.clock import Clock
-from armcal.devices.tracker import TrackerFrame
+from armcal.devices.tracker import Tracker, TrackerFrame
 from pydantic import Field, field_validator
+from typing_extensions import override
 
 from armcal_tracker.dtrack_message import Message, messages
 from armcal_tracker.frame_counter import FrameCounter
@@ -51,7 +52,7 @@ class DTrackSettings(Settings):
         return value
 
 
-class DTrackTracker:
+class DTrackTracker(Tracker):
     """Listens on a port; what DTrack is to send is set up in DTrack. See ``armcal.devices.tracker.Tracker``."""
 
     Settings: ClassVar[type[DTrackSettings]] = DTrackSettings
@@ -67,8 +68,9 @@ class DTrackTracker:
         self._stamp: float | None = None
 
     @property
+    @override
     def refused(self) -> Mapping[str, int]:
-        """See ``Tracker``; bodies that were listed as seen and cannot be believed are counted as well."""
+        """Bodies that were listed as seen and cannot be believed are counted as well."""
         return dict(self._refused)
 
     @property
@@ -95,8 +97,8 @@ class DTrackTracker:
         assert self._port is not None
         return self._port.address
 
+    @override
     def open(self, clock: Clock) -> None:
-        """See ``Tracker``."""
         self.close()
         s = self._settings
         self._port = UdpPort(s.host, s.port, s.group, s.sender)
@@ -104,8 +106,9 @@ class DTrackTracker:
         self._counter, self._stamp = FrameCounter(), None
         self._latencies.clear()
 
+    @override
     def frames(self) -> list[TrackerFrame]:
-        """See ``Tracker``. Call it every few seconds at least: what the system cannot hold is lost, and ``missing``."""
+        """Call it every few seconds at least: what the system cannot hold is lost, and ``missing``."""
         found: list[TrackerFrame] = []
         if self._port is None or self._clock is None:
             return found
@@ -117,8 +120,8 @@ class DTrackTracker:
             found += self._read(data, now, wall)
         return found
 
+    @override
     def close(self) -> None:
-        """See ``Tracker``."""
         if self._port is not None:
             self._port.close()
         self._port = None

@@ -8,8 +8,9 @@ from typing import Any, ClassVar, Literal
 
 from armcal.base.settings import InputPath, Settings
 from armcal.devices.clock import Clock
-from armcal.devices.tracker import TrackerFrame
+from armcal.devices.tracker import Tracker, TrackerFrame
 from armcal.errors import DataError
+from typing_extensions import override
 
 from armcal_tracker.frame_counter import FrameCounter
 from armcal_tracker.frame_table import FrameTable, frame_table, row_of
@@ -24,7 +25,7 @@ class GrowingCsvSettings(Settings):
     begin: Literal["start", "end"] = "end"
 
 
-class GrowingCsvTracker:
+class GrowingCsvTracker(Tracker):
     """Rows as ``frame_table`` reads them. See ``armcal.devices.tracker.Tracker``."""
 
     Settings: ClassVar[type[GrowingCsvSettings]] = GrowingCsvSettings
@@ -40,8 +41,8 @@ class GrowingCsvTracker:
         self._counter = FrameCounter()
 
     @property
+    @override
     def refused(self) -> Mapping[str, int]:
-        """See ``Tracker``."""
         return dict(self._refused)
 
     @property
@@ -49,11 +50,10 @@ class GrowingCsvTracker:
         """How many frames never came, by their number."""
         return self._counter.missing
 
+    @override
     def open(self, clock: Clock) -> None:
-        """See ``Tracker``.
-
-        Raises:
-            DataError: the header, if it is there, cannot be used.
+        """Raises:
+        DataError: the header, if it is there, cannot be used.
         """
         self.close()
         self._file = GrowingFile(self._settings.path)
@@ -61,8 +61,8 @@ class GrowingCsvTracker:
         self._table = None if header is None else self._understood(header)
         self._clock, self._counter, self._renewed = clock, FrameCounter(), 0
 
+    @override
     def frames(self) -> list[TrackerFrame]:
-        """See ``Tracker``."""
         if self._file is None or self._clock is None:
             return []
         now = self._clock.now()
@@ -72,8 +72,8 @@ class GrowingCsvTracker:
             self._counter.begin_anew()
         return [frame for frame in found if frame is not None]
 
+    @override
     def close(self) -> None:
-        """See ``Tracker``."""
         if self._file is not None:
             self._file.close()
         self._file = None

@@ -9,8 +9,9 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from armcal.base.settings import InputPath, Settings
 from armcal.devices.clock import Clock
-from armcal.devices.tracker import TrackerFrame
+from armcal.devices.tracker import Tracker, TrackerFrame
 from pydantic import Field, field_validator, model_validator
+from typing_extensions import override
 
 from armcal_tracker.frame_counter import FrameCounter
 from armcal_tracker.growing_file import MAX_LINE_BYTES, GrowingFile, Line
@@ -43,7 +44,7 @@ class JsonLinesSettings(Settings):
         return self
 
 
-class JsonLinesTracker:
+class JsonLinesTracker(Tracker):
     """Frames as ``json_message`` reads them. See ``armcal.devices.tracker.Tracker``."""
 
     Settings: ClassVar[type[JsonLinesSettings]] = JsonLinesSettings
@@ -58,8 +59,8 @@ class JsonLinesTracker:
         self._renewed = 0
 
     @property
+    @override
     def refused(self) -> Mapping[str, int]:
-        """See ``Tracker``."""
         return dict(self._refused)
 
     @property
@@ -73,8 +74,8 @@ class JsonLinesTracker:
         assert isinstance(self._source, UdpPort)
         return self._source.address
 
+    @override
     def open(self, clock: Clock) -> None:
-        """See ``Tracker``."""
         self.close()
         s = self._settings
         if s.path is not None:
@@ -84,16 +85,16 @@ class JsonLinesTracker:
             self._source = UdpPort(s.host, s.port or 0)
         self._clock, self._counter, self._renewed = clock, FrameCounter(), 0
 
+    @override
     def frames(self) -> list[TrackerFrame]:
-        """See ``Tracker``."""
         if self._source is None or self._clock is None:
             return []
         now = self._clock.now()
         found = (self._read(line, now) for line in self._lines(self._source))
         return [frame for frame in found if frame is not None]
 
+    @override
     def close(self) -> None:
-        """See ``Tracker``."""
         if self._source is not None:
             self._source.close()
         self._source = None

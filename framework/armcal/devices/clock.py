@@ -8,6 +8,8 @@ import time
 from pathlib import Path
 from typing import Any, Protocol
 
+from typing_extensions import override
+
 from armcal.errors import InputError, Location
 
 _LONGEST_ANSWER_S = 60.0
@@ -26,24 +28,24 @@ class Clock(Protocol):
         """Wait."""
 
 
-class RealClock:
+class RealClock(Clock):
     """The machine's own."""
 
+    @override
     def now(self) -> float:
-        """See ``Clock``."""
         return time.monotonic()
 
+    @override
     def wall(self) -> float:
-        """See ``Clock``."""
         return time.time()
 
+    @override
     def sleep(self, seconds: float) -> None:
-        """See ``Clock``."""
         if seconds > 0:
             time.sleep(seconds)
 
 
-class SimulatedClock:
+class SimulatedClock(Clock):
     """The clock of a simulated bench: time passes there, and only there, while this one sleeps.
 
     Everything else takes no time at all. When ``sleep`` returns, the bench has done all that it does in that time:
@@ -66,16 +68,16 @@ class SimulatedClock:
         self._answers = self._socket.makefile("r", encoding="utf-8")
         self._read = self.ask({"advance": 0.0})
 
+    @override
     def now(self) -> float:
-        """See ``Clock``."""
         return float(self._read["now"])
 
+    @override
     def wall(self) -> float:
-        """See ``Clock``."""
         return float(self._read["wall"])
 
+    @override
     def sleep(self, seconds: float) -> None:
-        """See ``Clock``."""
         if seconds > 0:
             self._read = self.ask({"advance": seconds})
 

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Annotated, Literal, Protocol
 
 from pydantic import BeforeValidator
+from typing_extensions import override
 
 from armcal.base.config_text import resolve_path
 from armcal.devices.faults import DeviceRefusedError
@@ -94,7 +95,7 @@ def told_refused(refused: Mapping[str, int]) -> str:
     return f"{sum(refused.values())} lines were passed over: {listed}"
 
 
-class PipeLines:
+class PipeLines(LineSource):
     """Lines of a pipe. A last line without an end is not trusted."""
 
     def __init__(self, descriptor: int, *, owned: bool) -> None:
@@ -103,12 +104,12 @@ class PipeLines:
         self._open = True
 
     @property
+    @override
     def ended(self) -> bool:
-        """See ``LineSource``."""
         return not self._open
 
+    @override
     def lines(self) -> list[bytes | None]:
-        """See ``LineSource``."""
         found: list[bytes | None] = []
         for _ in range(_MOST_AT_ONCE):
             if not self._open or not select.select([self._descriptor], [], [], 0)[0]:
@@ -126,14 +127,14 @@ class PipeLines:
                 break
         return found
 
+    @override
     def close(self) -> None:
-        """See ``LineSource``."""
         if self._owned and self._open:
             os.close(self._descriptor)
         self._open = False
 
 
-class UdpLines:
+class UdpLines(LineSource):
     """Lines of datagrams on a port of this machine; what comes while nobody looks waits in the system's queue."""
 
     def __init__(self, name: str) -> None:
@@ -153,12 +154,12 @@ class UdpLines:
         return int(self._socket.getsockname()[1])
 
     @property
+    @override
     def ended(self) -> bool:
-        """See ``LineSource``."""
         return not self._open
 
+    @override
     def lines(self) -> list[bytes | None]:
-        """See ``LineSource``."""
         found: list[bytes | None] = []
         for _ in range(1000 * _MOST_AT_ONCE if self._open else 0):
             try:
@@ -170,13 +171,13 @@ class UdpLines:
             found += [None] if flags & socket.MSG_TRUNC else data.split(b"\n")
         return found
 
+    @override
     def close(self) -> None:
-        """See ``LineSource``."""
         self._open = False
         self._socket.close()
 
 
-class FileLines:
+class FileLines(LineSource):
     """Lines of a file that grows; one that was cut or replaced is read from its start."""
 
     ended = False
@@ -187,8 +188,8 @@ class FileLines:
         self._file = path.open("rb", buffering=0)
         self._position = self._after_last_line() if begin == "end" else 0
 
+    @override
     def lines(self) -> list[bytes | None]:
-        """See ``LineSource``."""
         found: list[bytes | None] = []
         try:
             self._look()
@@ -202,8 +203,8 @@ class FileLines:
             return found
         return found
 
+    @override
     def close(self) -> None:
-        """See ``LineSource``."""
         self._file.close()
 
     def _look(self) -> None:

@@ -6,8 +6,10 @@ from collections.abc import Mapping, Sequence
 
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
+from typing_extensions import override
 
 from armcal_online.sources.incoming import Incoming
+from armcal_online.sources.source import Source
 
 SOURCE_KEY = "mission"
 
@@ -34,7 +36,7 @@ def as_incoming(records: Dataset, times: Array, began: float) -> tuple[Incoming,
     )
 
 
-class MissionSource:
+class MissionSource(Source):
     """Records one after another; see ``Source``. After row ``cut`` the power goes."""
 
     keeps_records = True
@@ -45,19 +47,18 @@ class MissionSource:
         self._next = 0
 
     @property
+    @override
     def ended(self) -> bool:
-        """See ``Source``."""
         return self._next >= len(self._records) and self._cut is None
 
+    @override
     def resume(self, positions: Mapping[str, int]) -> None:
-        """See ``Source``."""
         self._next = positions.get(SOURCE_KEY, 0)
 
+    @override
     def incoming(self, wait_s: float) -> Incoming | None:
-        """See ``Source``.
-
-        Raises:
-            PowerCutError: it is time.
+        """Raises:
+        PowerCutError: it is time.
         """
         if self._cut is not None and self._next >= self._cut:
             raise PowerCutError
@@ -66,8 +67,9 @@ class MissionSource:
         self._next += 1
         return self._records[self._next - 1]
 
+    @override
     def acknowledge(self, incoming: Incoming, sequence: int) -> None:
-        """See ``Source``: the journal remembers the row."""
+        """The journal remembers the row."""
 
-    def close(self) -> None:
-        """See ``Source``."""
+    @override
+    def close(self) -> None: ...

@@ -13,19 +13,20 @@ from zlib import crc32
 from armcal.errors import DataError, InputError, Location
 from armcal.io.line_cutter import MAX_LINE_BYTES
 from armcal.io.plain_files import input_file
+from typing_extensions import override
 
 from armcal_online.sources.incoming import Incoming
 from armcal_online.sources.line_parser import Kind, LineParser
 from armcal_online.sources.reading import LineReading
 from armcal_online.sources.row_parser import RowParser
-from armcal_online.sources.source import AtEnd, Clock, key_of, wait_until
+from armcal_online.sources.source import AtEnd, Clock, Source, key_of, wait_until
 
 _LINE_END = b"\n"
 _TELLING: Mapping[Kind, int] = {"csv": 2, "json": 1}
 """So many lines that are not blank tell which file it is: a header alone does not."""
 
 
-class CsvFile:
+class CsvFile(Source):
     """A file of lines. Where it is waited for, half a line waits for its end, and a file that takes its place is read.
 
     A file is known again by its name and its first record: positions of another file of that name do not count.
@@ -49,16 +50,16 @@ class CsvFile:
         _check(path, rows, at_end)
 
     @property
+    @override
     def ended(self) -> bool:
-        """See ``Source``."""
         return self._ended
 
+    @override
     def resume(self, positions: Mapping[str, int]) -> None:
-        """See ``Source``."""
         self._positions = positions
 
+    @override
     def incoming(self, wait_s: float) -> Incoming | None:
-        """See ``Source``."""
         deadline = time.monotonic() + wait_s
         while not self._ended:
             found = self._next()
@@ -66,11 +67,12 @@ class CsvFile:
                 return found
         return None
 
+    @override
     def acknowledge(self, incoming: Incoming, sequence: int) -> None:
-        """See ``Source``: the journal remembers the row."""
+        """The journal remembers the row."""
 
+    @override
     def close(self) -> None:
-        """See ``Source``."""
         if self._reading is not None:
             self._reading.close()
         self._reading = None

@@ -8,11 +8,13 @@ import time
 from collections.abc import Mapping
 from pathlib import Path
 
+from typing_extensions import override
+
 from armcal_online.sources.incoming import Incoming, Place
 from armcal_online.sources.line_parser import Kind, LineParser
 from armcal_online.sources.reading import LineReading, Reading, WholeReading
 from armcal_online.sources.row_parser import RowParser, faulty
-from armcal_online.sources.source import THROUGH, Clock, key_of, wait_until
+from armcal_online.sources.source import THROUGH, Clock, Source, key_of, wait_until
 
 SETTLED_S = 1.0
 """A file whose size has not changed for so long is read; one that never stops growing after ``IMPATIENT_S``."""
@@ -51,7 +53,7 @@ class _Watched:
             self.size, self.changed = size, time.monotonic()
 
 
-class Folder:
+class Folder(Source):
     """Files in the order of their names; new ones may come at any time, under any name.
 
     Names that begin with a dot, and endings other than .csv, .jsonl, .ndjson and .json, are no files of records: write
@@ -74,17 +76,17 @@ class Folder:
         self._open = True
 
     @property
+    @override
     def ended(self) -> bool:
-        """See ``Source``."""
         return not self._open
 
+    @override
     def resume(self, positions: Mapping[str, int]) -> None:
-        """See ``Source``."""
         self._positions = {key: row for key, row in positions.items() if not key.startswith(THROUGH)}
         self._through = max((key[1:] for key in positions if key.startswith(THROUGH)), default="")
 
+    @override
     def incoming(self, wait_s: float) -> Incoming | None:
-        """See ``Source``."""
         deadline = time.monotonic() + wait_s
         while self._open:
             self._scan()
@@ -93,11 +95,12 @@ class Folder:
                 return found
         return None
 
+    @override
     def acknowledge(self, incoming: Incoming, sequence: int) -> None:
-        """See ``Source``: the journal remembers the row."""
+        """The journal remembers the row."""
 
+    @override
     def close(self) -> None:
-        """See ``Source``."""
         self._open = False
         for name in [*self._watched]:
             self._forget(name)

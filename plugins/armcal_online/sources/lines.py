@@ -9,16 +9,17 @@ from collections import deque
 from collections.abc import Mapping
 
 from armcal.io.line_cutter import LineCutter
+from typing_extensions import override
 
 from armcal_online.sources.incoming import Incoming, Place
 from armcal_online.sources.line_parser import LineParser
 from armcal_online.sources.row_parser import RowParser, faulty
-from armcal_online.sources.source import Clock
+from armcal_online.sources.source import Clock, Source
 
 _CHUNK = 64 * 1024
 
 
-class Lines:
+class Lines(Source):
     """Lines from a file descriptor, which stays the caller's. A last line without an end is not trusted."""
 
     keeps_records = False
@@ -33,15 +34,16 @@ class Lines:
         self._open = True
 
     @property
+    @override
     def ended(self) -> bool:
-        """See ``Source``."""
         return not self._open and not self._lines
 
+    @override
     def resume(self, positions: Mapping[str, int]) -> None:
-        """See ``Source``: a pipe begins anew."""
+        """A pipe begins anew."""
 
+    @override
     def incoming(self, wait_s: float) -> Incoming | None:
-        """See ``Source``."""
         deadline = time.monotonic() + wait_s
         while True:
             while self._lines:
@@ -58,11 +60,12 @@ class Lines:
             if found is not None:
                 return found
 
+    @override
     def acknowledge(self, incoming: Incoming, sequence: int) -> None:
-        """See ``Source``: nobody listens at a pipe's other end."""
+        """Nobody listens at a pipe's other end."""
 
+    @override
     def close(self) -> None:
-        """See ``Source``."""
         self._open = False
         self._lines.clear()
 

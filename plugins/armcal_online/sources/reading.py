@@ -8,6 +8,7 @@ from collections import deque
 from typing import Any, BinaryIO, Protocol
 
 from armcal.io.line_cutter import LineCutter
+from typing_extensions import override
 
 from armcal_online.sources.incoming import Incoming, Place
 from armcal_online.sources.line_parser import LineParser
@@ -40,7 +41,7 @@ class Reading(Protocol):
         """Close the file."""
 
 
-class LineReading:
+class LineReading(Reading):
     """A file of lines; rows are line numbers."""
 
     def __init__(self, file: BinaryIO, parser: LineParser, key: str, through: int, clock: Clock) -> None:
@@ -55,17 +56,17 @@ class LineReading:
         self._offset = 0
 
     @property
+    @override
     def offset(self) -> int:
-        """See ``Reading``."""
         return self._offset
 
     @property
+    @override
     def begun(self) -> bool:
-        """See ``Reading``."""
         return self._cutter.begun
 
+    @override
     def next(self) -> Incoming | None:
-        """See ``Reading``."""
         while True:
             while self._lines:
                 found = self._record(self._lines.popleft())
@@ -80,12 +81,12 @@ class LineReading:
             self._offset += len(data)
             self._lines.extend(self._cutter.feed(data))
 
+    @override
     def last(self) -> Incoming | None:
-        """See ``Reading``."""
         return self._record(self._cutter.rest()) if self._cutter.begun else None
 
+    @override
     def close(self) -> None:
-        """See ``Reading``."""
         self._file.close()
 
     def _record(self, line: bytes | None) -> Incoming | None:
@@ -99,7 +100,7 @@ class LineReading:
         return Place(self._clock(), self._key, self._row)
 
 
-class WholeReading:
+class WholeReading(Reading):
     """A file that is one JSON object, or an array of them; rows count these."""
 
     def __init__(self, file: BinaryIO, rows: RowParser, key: str, through: int, clock: Clock) -> None:
@@ -139,17 +140,17 @@ class WholeReading:
         """Whether it may yet become what it is not: it was cut short."""
         return bool(self._fault)
 
+    @override
     def next(self) -> Incoming | None:
-        """See ``Reading``."""
         if not self._objects:
             return None
         self._row += 1
         return self._rows.object(self._objects.popleft(), Place(self._clock(), self._key, self._row))
 
+    @override
     def last(self) -> Incoming | None:
-        """See ``Reading``."""
         fault, self._fault = self._fault, ""
         return faulty(Place(self._clock(), self._key, 0), fault) if fault else None
 
-    def close(self) -> None:
-        """See ``Reading``."""
+    @override
+    def close(self) -> None: ...

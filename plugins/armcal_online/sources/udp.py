@@ -12,16 +12,17 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from armcal.io.udp import MAX_DATAGRAM_BYTES, listening
+from typing_extensions import override
 
 from armcal_online.sources.incoming import Incoming, Place
 from armcal_online.sources.row_parser import RowParser, faulty
-from armcal_online.sources.source import Clock
+from armcal_online.sources.source import Clock, Source
 
 _WAITING = 64
 """So many senders are remembered until their records are acknowledged; there is one unless a disk is full."""
 
 
-class Udp:
+class Udp(Source):
     """A socket on a port; what it did not take before the record was lost has to be sent again by its sender.
 
     The reply is ``{"acknowledged": sequence, "id": id}``, with a ``fault`` where the record could not be read.
@@ -51,15 +52,16 @@ class Udp:
         return str(found[0]), int(found[1])
 
     @property
+    @override
     def ended(self) -> bool:
-        """See ``Source``."""
         return not self._open
 
+    @override
     def resume(self, positions: Mapping[str, int]) -> None:
-        """See ``Source``: datagrams have no positions."""
+        """Datagrams have no positions."""
 
+    @override
     def incoming(self, wait_s: float) -> Incoming | None:
-        """See ``Source``."""
         if not self._open or not select.select([self._socket], [], [], max(wait_s, 0.0))[0]:
             return None
         try:
@@ -89,8 +91,8 @@ class Udp:
         fault = f"A datagram came from {sender}, which is not named as a sender. Further ones are passed over unseen."
         return faulty(Place(self._clock(), "", self._row), fault)
 
+    @override
     def acknowledge(self, incoming: Incoming, sequence: int) -> None:
-        """See ``Source``."""
         sender = self._senders.pop(incoming.source_row, None)
         if sender is None or not self._open:
             return
@@ -100,7 +102,7 @@ class Udp:
         with contextlib.suppress(OSError):
             self._socket.sendto(json.dumps(reply).encode(), socket.MSG_DONTWAIT, sender)
 
+    @override
     def close(self) -> None:
-        """See ``Source``."""
         self._open = False
         self._socket.close()

@@ -9,11 +9,13 @@ from typing import Any
 
 from armcal.errors import ArmcalError, DataError
 from armcal.io.udp import LOOPBACK, bound
+from typing_extensions import override
 
 from armcal_serve.conversation import Conversation
 from armcal_serve.dispatcher import Dispatcher
 from armcal_serve.poller import Poller
 from armcal_serve.protocol import as_bytes, id_of, refusal
+from armcal_serve.transports.transport import Transport
 
 _LONGEST = 65_507
 """What a datagram can hold (bytes)."""
@@ -22,7 +24,7 @@ _AT_ONCE = 32
 """So many are taken before others have their turn."""
 
 
-class Datagrams:
+class Datagrams(Transport):
     """Serves a port of the loopback address; what is lost on the way, or comes when too much waits, is asked again.
 
     Raises:
@@ -42,22 +44,23 @@ class Datagrams:
         return int(self._socket.getsockname()[1])
 
     @property
+    @override
     def name(self) -> str:
-        """See ``Transport``."""
         return f"udp {LOOPBACK}:{self.port}"
 
     @property
+    @override
     def clients(self) -> int:
-        """See ``Transport``: those that wait for an answer."""
+        """Those that wait for an answer."""
         return len(self._senders)
 
     @property
+    @override
     def finished(self) -> bool:
-        """See ``Transport``."""
         return not any(each.open for each in self._senders.values())
 
+    @override
     def open(self) -> None:
-        """See ``Transport``."""
         self._poller.watch(self._socket, self._read)
 
     def tend(self) -> None:
@@ -66,12 +69,12 @@ class Datagrams:
             if not conversation.open:
                 del self._senders[sender]
 
+    @override
     def listen_no_more(self) -> None:
-        """See ``Transport``."""
         self._poller.watch(self._socket)
 
+    @override
     def close(self) -> None:
-        """See ``Transport``."""
         self._poller.watch(self._socket)
         for conversation in self._senders.values():
             conversation.end()

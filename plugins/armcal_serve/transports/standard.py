@@ -5,15 +5,18 @@ from __future__ import annotations
 import os
 import select
 
+from typing_extensions import override
+
 from armcal_serve.dispatcher import Dispatcher
 from armcal_serve.poller import Poller
 from armcal_serve.transports.stream import CHUNK, StreamClient
+from armcal_serve.transports.transport import Transport
 
 _AT_ONCE = 4096
 """A pipe that is ready takes so many bytes without waiting (PIPE_BUF)."""
 
 
-class StandardStreams:
+class StandardStreams(Transport):
     """Requests from one descriptor, answers to another, which stay the caller's; no waiting in either.
 
     They are shared with other programs (a terminal with its shell), so neither is made non-blocking.
@@ -27,37 +30,38 @@ class StandardStreams:
         self._client: StreamClient | None = None
 
     @property
+    @override
     def clients(self) -> int:
-        """See ``Transport``."""
         return int(not self.ended)
 
     @property
+    @override
     def ended(self) -> bool:
-        """See ``Transport``."""
         client = self._client
         return client is not None and (client.ended or (client.heard_all and client.finished))
 
     @property
+    @override
     def finished(self) -> bool:
-        """See ``Transport``."""
         return self._client is None or self._client.ended or self._client.finished
 
+    @override
     def open(self) -> None:
-        """See ``Transport``."""
         self._client = StreamClient(
             self._incoming, self._outgoing, self._receive, self._send, self._poller, self._dispatcher
         )
 
+    @override
     def tend(self) -> None:
-        """See ``Transport``: whoever reads slowly here holds up nobody else."""
+        """Whoever reads slowly here holds up nobody else."""
 
+    @override
     def listen_no_more(self) -> None:
-        """See ``Transport``."""
         if self._client is not None:
             self._client.listen_no_more()
 
+    @override
     def close(self) -> None:
-        """See ``Transport``."""
         if self._client is not None and not self._client.ended:
             self._client.end()
 

@@ -10,11 +10,13 @@ from pathlib import Path
 
 from armcal.errors import ArmcalError
 from armcal.io.unix_socket import listening
+from typing_extensions import override
 
 from armcal_serve.dispatcher import Dispatcher
 from armcal_serve.poller import Poller
 from armcal_serve.protocol import as_bytes, refusal
 from armcal_serve.transports.stream import CHUNK, StreamClient
+from armcal_serve.transports.transport import Transport
 
 MOST_CLIENTS = 64
 PATIENCE_S = 10.0
@@ -28,7 +30,7 @@ _PAUSE_S = 1.0
 _NO_MORE = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM)
 
 
-class UnixSocket:
+class UnixSocket(Transport):
     """Serves a path.
 
     Raises:
@@ -53,22 +55,22 @@ class UnixSocket:
         self._listener = listening(path, "a server is running here.", "Give another --socket.", MOST_CLIENTS)
 
     @property
+    @override
     def name(self) -> str:
-        """See ``Transport``."""
         return f"socket {self._path}"
 
     @property
+    @override
     def clients(self) -> int:
-        """See ``Transport``."""
         return len(self._clients)
 
     @property
+    @override
     def finished(self) -> bool:
-        """See ``Transport``."""
         return all(client.ended or client.finished for client in self._clients.values())
 
+    @override
     def open(self) -> None:
-        """See ``Transport``."""
         self._opens_at = None
         self._poller.watch(self._listener, self._accept)
 
@@ -87,8 +89,8 @@ class UnixSocket:
                 del self._clients[connection]
                 connection.close()
 
+    @override
     def listen_no_more(self) -> None:
-        """See ``Transport``."""
         self._opens_at = None
         self._poller.watch(self._listener)
         for client in self._clients.values():

@@ -9,6 +9,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Protocol
 
+from typing_extensions import override
+
 
 class FileLayer(Protocol):
     """Files and folders. Every method raises OSError where the system does."""
@@ -50,37 +52,38 @@ class FileLayer(Protocol):
         """Take a file away."""
 
 
-class RealFiles:
+class RealFiles(FileLayer):
     """The operating system's files. Python itself repeats a call that a signal interrupted (PEP 475)."""
 
+    @override
     def make_folder(self, folder: Path) -> None:
-        """See FileLayer."""
         missing = [place for place in (folder, *folder.parents) if not place.is_dir()]
         folder.mkdir(parents=True, exist_ok=True)
         for place in reversed(missing):
             self.sync_folder(place.parent)
 
+    @override
     def names(self, folder: Path) -> tuple[str, ...]:
-        """See FileLayer."""
         try:
             return tuple(sorted(entry.name for entry in folder.iterdir()))
         except FileNotFoundError:
             return ()
 
+    @override
     def read(self, path: Path) -> bytes:
-        """See FileLayer."""
         return path.read_bytes()
 
+    @override
     def size(self, path: Path) -> int:
-        """See FileLayer."""
         return path.stat().st_size
 
+    @override
     def open_append(self, path: Path) -> int:
-        """See FileLayer."""
         return os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o644)
 
+    @override
     def write(self, descriptor: int, data: bytes) -> None:
-        """See FileLayer. One call of the system; more only where it wrote a part."""
+        """One call of the system; more only where it wrote a part."""
         left = memoryview(data)
         while left:
             written = os.write(descriptor, left)
@@ -88,32 +91,32 @@ class RealFiles:
                 raise OSError(errno.EIO, "the system wrote nothing and gave no reason")
             left = left[written:]
 
+    @override
     def truncate(self, descriptor: int, size: int) -> None:
-        """See FileLayer."""
         os.ftruncate(descriptor, size)
 
+    @override
     def sync(self, descriptor: int) -> None:
-        """See FileLayer."""
         os.fsync(descriptor)
 
+    @override
     def close(self, descriptor: int) -> None:
-        """See FileLayer."""
         os.close(descriptor)
 
+    @override
     def sync_folder(self, folder: Path) -> None:
-        """See FileLayer."""
         descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
         try:
             os.fsync(descriptor)
         finally:
             os.close(descriptor)
 
+    @override
     def rename(self, old: Path, new: Path) -> None:
-        """See FileLayer."""
         old.rename(new)
 
+    @override
     def remove(self, path: Path) -> None:
-        """See FileLayer."""
         path.unlink()
 
 
