@@ -34,11 +34,8 @@ def armcal(*arguments: str) -> Result:
 
 
 @pytest.fixture(scope="module")
-def calibration(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("calibrated")
-    result = armcal("run", DEMO, "--out", str(folder), "-q", *FAST)
-    assert result.exit_code == 0, result.output
-    return folder / "calibration.yaml"
+def calibration(demo_calibration: Path) -> Path:
+    return demo_calibration
 
 
 def predicted(path: Path) -> Result:

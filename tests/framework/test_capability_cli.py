@@ -28,11 +28,8 @@ def studied(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict]:
 
 
 @pytest.fixture(scope="module")
-def calibration(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("demo") / "run"
-    options = ("--set", "validation.folds=0", "--set", "evaluator=interpreted", "-q", "--out", folder)
-    assert armcal("run", CONFIGS / "demo.yaml", *options).exit_code == 0
-    return folder / "calibration.yaml"
+def calibration(demo_calibration: Path) -> Path:
+    return demo_calibration
 
 
 @pytest.mark.slow

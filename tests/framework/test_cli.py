@@ -25,6 +25,7 @@ from rich.table import Table
 ROOT = Path(__file__).resolve().parents[2]
 DEMO = str(ROOT / "configs" / "lrm_arm" / "demo.yaml")
 FAST = ["--set", "validation.folds=0", "--set", "evaluator=interpreted"]
+FEW = ["--set", "validation.folds=2"]
 
 
 def armcal(*arguments: str) -> Result:
@@ -35,7 +36,7 @@ def armcal(*arguments: str) -> Result:
 @pytest.fixture(scope="module")
 def said(tmp_path_factory: pytest.TempPathFactory) -> Result:
     """What a run of the shipped demonstration says."""
-    result = armcal("run", DEMO, "--out", str(tmp_path_factory.mktemp("demo") / "run"), "--json")
+    result = armcal("run", DEMO, "--out", str(tmp_path_factory.mktemp("demo") / "run"), "--json", *FEW)
     assert result.exit_code == 0, result.output
     return result
 

@@ -363,16 +363,17 @@ def improved(found: Compensator, cost, position: np.ndarray, starts: np.ndarray)
     return best
 
 
-def test_the_nearest_commands_cannot_be_bettered() -> None:
+@pytest.mark.parametrize("count", [2, pytest.param(5, marks=pytest.mark.slow)])
+def test_the_nearest_commands_cannot_be_bettered(count: int) -> None:
     """From where they are, limits included, nor from elsewhere."""
     found = with_options("five", Options(limits=NARROW))
     elsewhere = drawn(found, 8, seed=6)
     start = np.array([0.9, -0.8, 1.0, -1.0, 0.6])
-    targets = of(found, drawn(found, 5, seed=11))
+    targets = of(found, drawn(found, count, seed=11))
     commands = found.solve(targets, start)
     assert commands.found.all()
     assert within(found, commands)
-    for i in range(5):
+    for i in range(count):
 
         def cost(q: np.ndarray) -> float:
             return float(((q - start) ** 2).sum())

@@ -412,17 +412,11 @@ def test_a_file_without_an_arm_is_refused(tmp_path, text):
         load_source(path, None, REGISTRY)
 
 
-def test_a_calibration_gives_its_calibrated_arm(tmp_path):
+def test_a_calibration_gives_its_calibrated_arm(demo_calibration, tmp_path):
     """The shipped demonstration, run and converted: not the nominal arm, and the one that predicts."""
     from armcal.calibration.calibration import Calibration
 
-    demo = str(ROOT / "configs" / "lrm_arm" / "demo.yaml")
-    run = CliRunner().invoke(
-        cli,
-        ["run", demo, "--out", str(tmp_path / "run"), "--set", "validation.folds=0", "--set", "evaluator=interpreted"],
-    )
-    assert run.exit_code == 0, run.output
-    path = tmp_path / "run" / "calibration.yaml"
+    path = demo_calibration
     assert armcal(path, "--to", "poe", "--out", tmp_path / "poe.yaml").exit_code == 0
     section = yaml.safe_load((tmp_path / "poe.yaml").read_text())["model"]
     off = difference(lrm_chain(), loaded(section))
