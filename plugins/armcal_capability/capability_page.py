@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from armcal import report
 from armcal.report.numbers import count, plural, unbroken
 from armcal.version import __version__
 
@@ -71,7 +72,7 @@ def render_capability(
     """One self-contained HTML file."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-    loader = FileSystemLoader(Path(__file__).parent)
+    loader = FileSystemLoader([Path(__file__).parent, Path(report.__file__).parent])
     environment = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True)
     environment.lstrip_blocks = True
     environment.filters.update(count=count, plural=plural, unbroken=unbroken)

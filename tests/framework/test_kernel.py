@@ -21,7 +21,7 @@ from armcal.errors import NotConvergedError
 from armcal.problem import c_source, compiler, kernel
 from armcal.problem.factor import Factor
 from armcal.problem.kernel import build_kernel, kernel_source
-from armcal.problem.problem import BLOCK_RECORDS
+from armcal.problem.linearised import BLOCK_RECORDS
 
 AGREEMENT = 1e-12
 needs_compiler = pytest.mark.skipif(compiler.find_compiler() is None, reason="no C compiler on this machine")

@@ -17,6 +17,7 @@ import pytest
 import yaml
 from armcal.cli.main import cli
 from armcal.errors import PluginError
+from armcal.hooks import KINDS
 from armcal.plugins import Component, PluginRegistry, discover
 from armcal.testing.contract import CheckResult, check_component
 from click.testing import CliRunner
@@ -77,7 +78,9 @@ def test_our_plugins_keep_the_contract() -> None:
         assert [check for check in report["checks"] if check["fault"]] == []
         assert (report["fault"], report["failed"]) == (None, 0)
         assert report["ran"] + report["not_run"] == len(report["checks"])
-        assert report["ran"] > 10
+        components = {check["component"] for check in report["checks"] if check["component"].partition(" ")[0] in KINDS}
+        commands = {name for name in components if name.startswith("command ")}
+        assert report["ran"] > 2 * len(commands) + 10 * (components > commands)
         assert {check["not_run"] for check in report["checks"]} <= {None, "it reads nothing"}
 
 

@@ -146,5 +146,5 @@ def test_what_is_wrong_with_a_temperature_is_said(other: Answerer, warm: Answere
         assert says in answer["error"], answer
     infinite = b'{"do": "forward", "joint_angles_deg": [1, 2, 3], "temperature_C": 1e999}'
     assert "finite" in json.loads(warm.answer(infinite, 0.0))["error"]
-    assert other.arms["arm"].shown == {"joints": NAMES}
-    assert warm.arms["arm"].shown == {"joints": NAMES, "conditions": ["temperature_C"]}
+    assert other.arms["arm"].shown == {"joints": NAMES, "point": "tool"}
+    assert warm.arms["arm"].shown == {"joints": NAMES, "conditions": ["temperature_C"], "point": "tool"}

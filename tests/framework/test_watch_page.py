@@ -55,7 +55,7 @@ def test_the_wheel_holds_the_page(tmp_path: Path) -> None:
     subprocess.run(command, cwd=ROOT, check=True, capture_output=True, timeout=120)
     with zipfile.ZipFile(next(tmp_path.glob("*.whl"))) as wheel:
         held = {Path(name).name for name in wheel.namelist() if name.startswith("armcal_online/watch/")}
-    files = {path.name for path in (ROOT / "framework/armcal_online/watch").iterdir() if path.is_file()}
+    files = {path.name for path in (ROOT / "plugins/armcal_online/watch").iterdir() if path.is_file()}
     assert files <= held and "page.html" in held
 
 

@@ -144,7 +144,7 @@ BOMB = "a0: &a0 [x, x, x, x, x, x, x, x, x, x]\n" + "".join(
         ("b: &b {c: 1}\na:\n  <<: *b\n", 3, [", a:", "merge keys", "'extends'"]),
         ("a: *nowhere\n", 1, [", a:", "*nowhere names no anchor", "Write &nowhere"]),
         ("a: &a [1, *a]\n", 1, ["a.1", "inside what it names", "Write the value out"]),
-        (BOMB, 5, ["more than 1000000 values", "CSV"]),
+        (BOMB, 6, ["more than 1000000 values", "CSV"]),
         (f"b: 1\n{DEEP}\n", 2, ["deeper than 50 levels", "Flatten"]),
         ("a: " + "- " * 5 + "1\n", 1, ["not valid YAML"]),
         ("a:\n  " + "- " * 200_000 + "1\n", 2, ["deeper than 50 levels"]),

@@ -8,6 +8,8 @@ from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import Any
 
+import click
+
 from armcal.plugins import Component, PluginInfo, PluginRegistry
 from armcal.testing.bench_checks import check_bench
 from armcal.testing.board_checks import check_device, check_link
@@ -77,12 +79,21 @@ def check_made(kind: str, name: str, load: Callable[[], Any]) -> list[CheckResul
 
 
 def _check(record: Recorder, kind: str, load: Callable[[], Any]) -> None:
+    if kind == "command":  # it is imported for one call of armcal, and may do to the process what it needs
+        command = record.check("it imports", load)
+        record.check("it is a click command that says what it does", lambda: _check_command(command))
+        return
     with watched(record) as begin:
         made = record.check("it imports", load)
         begin(made)
         subject = None if made is None else check_settings(record, kind, made)
         if subject is not None:
             record.guard(lambda: _CHECKS[kind](record, subject))
+
+
+def _check_command(made: Any) -> None:
+    expect(isinstance(made, click.Command), f"found {type(made).__name__}, expected a click.Command")
+    expect(bool(made.help), f"found no help of the command {made.name!r}, expected a docstring")
 
 
 def _light(target: str) -> None:
