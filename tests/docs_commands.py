@@ -210,10 +210,9 @@ def run_armcal(words: list[str]) -> tuple[int, str, str]:
 def _main(words: list[str], out: Path, err: Path) -> None:
     from armcal.cli.main import main
 
-    sys.stdin = sys.stdout = sys.stderr = None  # one that owns its descriptor closes it here, not once it is replaced
     for path, number in ((Path(os.devnull), 0), (out, 1), (err, 2)):
         os.dup2(os.open(path, os.O_RDWR | os.O_CREAT), number)
-    sys.stdin, sys.stdout, sys.stderr = open(0), open(1, "w"), open(2, "w")  # noqa: SIM115
+    sys.stdin, sys.stdout, sys.stderr = (open(n, m, closefd=False) for n, m in enumerate("rww"))  # noqa: SIM115
     sys.argv = words
     with no_workers_left():
         main()
