@@ -42,14 +42,14 @@ class ClampErrors:
 
 
 @dataclass(frozen=True)
-class Way:
+class JointPath:
     """One experiment whose problem is built once."""
 
     experiment: Experiment
     problem: Problem
 
     @classmethod
-    def of(cls, experiment: Experiment, dataset: Dataset) -> Way:
+    def of(cls, experiment: Experiment, dataset: Dataset) -> JointPath:
         """Compiled for recordings like this one."""
         system, own = experiment.system, experiment.of_records(dataset)
         parameters: Parameters = own.parameters
@@ -86,12 +86,12 @@ def clamp_study(seeds: Iterable[int]) -> dict[str, ClampErrors]:
     true = yaml.safe_load((CONFIGS / "wrong_clamp.truth.yaml").read_text())
     truth = np.array([float(true[name].split()[0]) for name in OFFSETS])
     recordings = [recording(1000 + seed) for seed in seeds]
-    ways = {name: Way.of(experiment, recordings[0]) for name, experiment in experiments.items()}
+    ways = {name: JointPath.of(experiment, recordings[0]) for name, experiment in experiments.items()}
     result = {}
     for name, way in ways.items():
         fits = [way.fit(dataset) for dataset in recordings]
         errors = [[found.values[found.parameters.entries_of(n)][0] for n in OFFSETS] for found in fits]
-        told = [dict(zip(found.names, found.told_by_data, strict=True)) for found in fits]
+        told = [dict(zip(found.names, found.identified_by_data, strict=True)) for found in fits]
         result[name] = ClampErrors(np.array(errors) - truth, tuple({n for n in OFFSETS if not t[n]} for t in told))
     return result
 

@@ -22,7 +22,7 @@ from benchmarks.timing import once
 NAME = "fit, 100,000 poses"
 POSES = 100_000
 PEER = "scipy, armcal's compiled Jacobian stacked"
-Way = Literal["compiled", "interpreted", "scipy"]
+JointPath = Literal["compiled", "interpreted", "scipy"]
 
 
 def run(*, long: bool = False) -> Iterator[Row]:
@@ -45,7 +45,7 @@ def _in_a_process(way: str) -> dict[str, Any]:
     return answer
 
 
-def _measure(way: Way) -> dict[str, Any]:
+def _measure(way: JointPath) -> dict[str, Any]:
     """One fit, in this process."""
     case = lrm.simulated(POSES)
     problem = case.problem("interpreted" if way == "interpreted" else "compiled")

@@ -18,9 +18,9 @@ from armcal.problem.problem import Problem
 from armcal.run.experiment import Experiment
 from armcal_kalman.extended import ExtendedFilter, ExtendedSettings
 from armcal_online.tracking.belief import Belief
-from armcal_online.tracking.chart import Chart
-from armcal_online.tracking.companions import Companions
+from armcal_online.tracking.gauss_markov import GaussMarkovStates
 from armcal_online.tracking.observer import Observer, Reading, Seen
+from armcal_online.tracking.state_space import StateSpace
 from filterpy.kalman import ExtendedKalmanFilter
 
 from benchmarks import lrm
@@ -50,11 +50,11 @@ class Case:
 
     def run(self, updates: int = UPDATES, settings: ExtendedSettings = ONCE) -> Belief:
         """Take records one after another; the belief after them."""
-        estimator, belief, chart = ExtendedFilter(settings), self.belief, self.observer.chart
+        estimator, belief, state_space = ExtendedFilter(settings), self.belief, self.observer.state_space
         for i in range(updates):
             reading = self.readings[i % len(self.readings)]
             seen = Seen(self.observer, belief.origin, belief.gaussian.mean, (reading,))
-            belief = belief.updated(chart, estimator.update(belief.gaussian, [seen]).posterior)
+            belief = belief.updated(state_space, estimator.update(belief.gaussian, [seen]).posterior)
         return belief
 
 
@@ -80,7 +80,7 @@ def _compared(experiment: Experiment, parameters: Parameters, dataset: Dataset, 
     contenders: dict[str, Callable[[], object]] = {name: case.run for name, case in cases.items()}
     contenders |= {f"{name}, again": partial(case.run, settings=ExtendedSettings()) for name, case in cases.items()}
     times = best_times({**contenders, "plain": plain}, repeats=10)
-    apart = _apart(cases["compiled"].run(), plain(), cases["compiled"].observer.chart)
+    apart = _apart(cases["compiled"].run(), plain(), cases["compiled"].observer.state_space)
     agreement = "the same estimate" if apart < SAME else f"bounds and cones kept, which moves it by {apart:.1g} sd"
     peer = "filterpy's ExtendedKalmanFilter fed by casadi.Function calls"
     for choice, case in cases.items():
@@ -95,9 +95,9 @@ def case_of(experiment: Experiment, parameters: Parameters, dataset: Dataset, ev
     """A belief near the configured values, and a data set's records."""
     system = experiment.system
     problem = Problem.build(system.arms, system.measurements, parameters, system.environment, dataset, evaluator)
-    chart = Chart(parameters)
+    state_space = StateSpace(parameters)
     noise = {"tracker": np.eye(3) * NOISE_M**2}
-    observer = Observer(problem, chart, Companions(), Companions(), noise, {})
+    observer = Observer(problem, state_space, GaussMarkovStates(), GaussMarkovStates(), noise, {})
     size = observer.size
     belief = Belief(parameters.nominal(), Gaussian(np.zeros(size), np.eye(size) * 0.01**2))
     channels = dataset.channels
@@ -107,7 +107,7 @@ def case_of(experiment: Experiment, parameters: Parameters, dataset: Dataset, ev
 
 def _plain(case: Case, settle: ca.Function, linearise: ca.Function) -> tuple[Array, Array]:
     """The same updates in the obvious way: the state is the values, and CasADi takes and gives its own matrices."""
-    entries, scales = case.observer.chart.entries, case.observer.chart.scales
+    entries, scales = case.observer.state_space.entries, case.observer.state_space.scales
     one = ExtendedKalmanFilter(dim_x=len(scales), dim_z=3)
     one.x = case.belief.origin[entries]
     one.P = case.belief.gaussian.covariance * np.outer(scales, scales)
@@ -127,10 +127,10 @@ def _plain(case: Case, settle: ca.Function, linearise: ca.Function) -> tuple[Arr
     return one.x, one.P
 
 
-def _apart(ours: Belief, plain: tuple[Array, Array], chart: Chart) -> float:
+def _apart(ours: Belief, plain: tuple[Array, Array], state_space: StateSpace) -> float:
     """The largest difference in standard deviations."""
     values, covariance = plain
-    apart = np.abs(ours.values(chart)[chart.entries] - values) / np.sqrt(np.diag(covariance))
+    apart = np.abs(ours.values(state_space)[state_space.entries] - values) / np.sqrt(np.diag(covariance))
     return float(apart.max())
 
 

@@ -93,7 +93,7 @@ class FakeDevice:
 
 
 @dataclass
-class FakeEyes:
+class FakeTrackerMonitor:
     """Sees where the device stands, one second after it was told to stand, unless it is blind."""
 
     clock: FakeClock

@@ -24,7 +24,7 @@ from armcal_bench.acquisition.outputs import dataset_of
 from armcal_bench.acquisition.preparation import Prepared, prepare
 from armcal_bench.acquisition.progress import Progress, progress_of
 from armcal_bench.acquisition.rehearsal import overrides_for
-from armcal_bench.acquisition.session import Course, Outcome, acquire
+from armcal_bench.acquisition.session import Outcome, RunOptions, acquire
 from armcal_bench.bench import Bench
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -118,8 +118,10 @@ class BenchRun:
     def acquire(self, asked: Callable[[], bool] = lambda: False, prepared: Prepared | None = None) -> Outcome:
         """Begin or go on."""
         there = (self.out / "journal").is_dir()
-        course = Course(self.out, "resume" if there else "anew", asked, lambda start: True, lambda progress: None, True)
-        return acquire(prepared or self.prepared(), self.plan, course)
+        options = RunOptions(
+            self.out, "resume" if there else "anew", asked, lambda start: True, lambda progress: None, True
+        )
+        return acquire(prepared or self.prepared(), self.plan, options)
 
     def acquire_until_killed(self, sleeps: int) -> bool:
         """In a child that is killed (SIGKILL) when it sleeps for the n-th time; False if it ended before."""

@@ -26,7 +26,7 @@ from armcal_online.tracking.belief import Belief
 from armcal_online.tracking.observer import Seen
 from armcal_online.tracking.recalibrator import Recalibrator
 from armcal_online.tracking.settings import RecalibrateSettings
-from armcal_online.tracking.start import Footing, footing
+from armcal_online.tracking.start import FilterSetup, filter_setup
 from made_calibrations import made_record
 
 CONFIG = Path(__file__).resolve().parents[1] / "configs" / "lrm_arm" / "arm.yaml"
@@ -110,7 +110,7 @@ def _prior(system, parameters) -> np.ndarray:
     return 0.5 * (covariance + covariance.T)
 
 
-def walk_of(factor: float = 1.0, held_base: bool = False) -> dict[str, str]:
+def random_walk(factor: float = 1.0, held_base: bool = False) -> dict[str, str]:
     """The random walk made faster by a factor; none for zero."""
     amounts = {} if factor == 0 else {"arm.mdh.theta[1-6]": f"{0.3 * factor} deg in 30 d"}
     return amounts if held_base or factor == 0 else {**amounts, "arm.mdh.base_[xyz]": f"{1.0 * factor} mm in 30 d"}
@@ -118,20 +118,20 @@ def walk_of(factor: float = 1.0, held_base: bool = False) -> dict[str, str]:
 
 def settings(**changed) -> RecalibrateSettings:
     """Of a recalibration that walks as the truth does."""
-    return RecalibrateSettings.model_validate({"process_noise": walk_of(), **changed})
+    return RecalibrateSettings.model_validate({"process_noise": random_walk(), **changed})
 
 
 @cache
-def ground_of(
+def begun_setup(
     noise_mm: float = 0.3,
     sd_factor: float = 1.0,
     held_base: bool = False,
     walk: float = 1.0,
     evaluator: str = "compiled",
-) -> Footing:
+) -> FilterSetup:
     """What a filter of the arm stands on; the observer's buffers are shared."""
-    given = settings(evaluator=evaluator, process_noise=walk_of(walk, held_base))
-    return footing(calibration(noise_mm, sd_factor, held_base), given, shares=True)
+    given = settings(evaluator=evaluator, process_noise=random_walk(walk, held_base))
+    return filter_setup(calibration(noise_mm, sd_factor, held_base), given, shares=True)
 
 
 @dataclass
@@ -139,7 +139,7 @@ class World:
     """The arm as it is.
 
     Attributes:
-        ground: for its predictions, chart and random walk.
+        setup: for its predictions, chart and random walk.
         random: for all chance.
         values: true ones; a test may change them.
         now: s.
@@ -149,7 +149,7 @@ class World:
         wanders: whether the truth walks.
     """
 
-    ground: Footing
+    setup: FilterSetup
     random: np.random.Generator
     values: np.ndarray
     now: float = 1e9
@@ -162,23 +162,23 @@ class World:
     was_outlier: bool = False
 
     @classmethod
-    def drawn(cls, seed: int, ground: Footing | None = None, **given) -> World:
+    def drawn(cls, seed: int, setup: FilterSetup | None = None, **given) -> World:
         """A truth drawn from the calibration's covariance."""
-        ground, random = ground or ground_of(), np.random.default_rng(seed)
-        root = np.linalg.cholesky(ground.belief.gaussian.covariance)
-        values = ground.chart.moved(ground.belief.origin, root @ random.normal(size=STATES))
-        return cls(ground, random, ground.chart.inside(values), **given)
+        setup, random = setup or begun_setup(), np.random.default_rng(seed)
+        root = np.linalg.cholesky(setup.belief.gaussian.covariance)
+        values = setup.space.moved(setup.belief.origin, root @ random.normal(size=STATES))
+        return cls(setup, random, setup.space.inside(values), **given)
 
     def step(self, seconds: float = EVERY_S) -> None:
         """Time passes."""
         self.now += seconds
         if self.wanders:
-            moved = np.sqrt(self.ground.fading.rates * seconds) * self.random.normal(size=STATES)
-            self.values = self.ground.chart.moved(self.values, moved)
+            moved = np.sqrt(self.setup.process_noise.rates * seconds) * self.random.normal(size=STATES)
+            self.values = self.setup.space.moved(self.values, moved)
 
     def tip(self, q: np.ndarray) -> np.ndarray:
         """Where the target is (3; m)."""
-        return predicted(self.ground, self.values, q)
+        return predicted(self.setup, self.values, q)
 
     def measured(self, q: np.ndarray | None = None) -> dict[str, float]:
         """The channels of a record at joint angles (6; rad), at random ones if none are given."""
@@ -199,29 +199,29 @@ class World:
     def moved(self, name: str, by: float) -> None:
         """Change a true parameter."""
         values = self.values.copy()
-        values[self.ground.chart.parameters.entries_of(name)] += by
+        values[self.setup.space.parameters.entries_of(name)] += by
         self.values = values
 
 
-def predicted(ground: Footing, values: np.ndarray, q: np.ndarray) -> np.ndarray:
+def predicted(setup: FilterSetup, values: np.ndarray, q: np.ndarray) -> np.ndarray:
     """Where the target is at joint angles (6; rad), by a value vector (3; m)."""
-    (reading,) = ground.observer.readings(dict(zip(JOINTS, q.tolist(), strict=True)) | dict.fromkeys(AXES, 0.0), {})
-    return -ground.observer.look(values, reading)[0]
+    (reading,) = setup.observer.readings(dict(zip(JOINTS, q.tolist(), strict=True)) | dict.fromkeys(AXES, 0.0), {})
+    return -setup.observer.look(values, reading)[0]
 
 
 PROBES = random_poses(np.random.default_rng(99), 25)
 
 
-def tip_error_mm(ground: Footing, values: np.ndarray, truth: np.ndarray) -> float:
+def tip_error_mm(setup: FilterSetup, values: np.ndarray, truth: np.ndarray) -> float:
     """Mean distance over probing poses between two value vectors' tips."""
-    inside = ground.chart.inside(values)
-    far = [np.linalg.norm(predicted(ground, inside, q) - predicted(ground, truth, q)) for q in PROBES]
+    inside = setup.space.inside(values)
+    far = [np.linalg.norm(predicted(setup, inside, q) - predicted(setup, truth, q)) for q in PROBES]
     return float(1000 * np.mean(far))
 
 
-def nees(ground: Footing, belief: Belief, truth: np.ndarray) -> float:
+def nees(setup: FilterSetup, belief: Belief, truth: np.ndarray) -> float:
     """Squared Mahalanobis distance of the truth, chi-square with 35 degrees of freedom."""
-    off = ground.chart.between(belief.values(ground.chart), truth)
+    off = setup.space.between(belief.values(setup.space), truth)
     return float(off @ np.linalg.solve(belief.gaussian.covariance[:STATES, :STATES], off))
 
 
@@ -229,25 +229,25 @@ def nees(ground: Footing, belief: Belief, truth: np.ndarray) -> float:
 class Filtered:
     """An estimator on its own: no gate, no judgement."""
 
-    ground: Footing
+    setup: FilterSetup
     estimator: OnlineEstimator
     belief: Belief
 
     @classmethod
-    def fresh(cls, estimator: OnlineEstimator, ground: Footing) -> Filtered:
+    def fresh(cls, estimator: OnlineEstimator, setup: FilterSetup) -> Filtered:
         """At the calibration."""
-        return cls(ground, estimator, ground.belief)
+        return cls(setup, estimator, setup.belief)
 
     def seen(self, belief: Belief, channels: Mapping[str, float]) -> Seen:
         """A record as a belief looks at it."""
-        readings = self.ground.observer.readings(channels, {})
-        return Seen(self.ground.observer, belief.origin, belief.gaussian.mean, readings)
+        readings = self.setup.observer.readings(channels, {})
+        return Seen(self.setup.observer, belief.origin, belief.gaussian.mean, readings)
 
     def take(self, channels: Mapping[str, float], seconds: float = EVERY_S) -> Update:
         """One record."""
-        before = self.ground.fading.faded(self.belief, {"time": seconds})
+        before = self.setup.process_noise.faded(self.belief, {"time": seconds})
         update = self.estimator.update(before.gaussian, [self.seen(before, channels)])
-        self.belief = before.updated(self.ground.chart, update.posterior)
+        self.belief = before.updated(self.setup.space, update.posterior)
         return update
 
 

@@ -11,8 +11,8 @@ from typing import Any
 
 from armcal.io.journal.files import RealFiles
 from armcal.io.journal.reader import read_entries, read_until
-from armcal_online.running.course import Course
 from armcal_online.running.session import Open, opened
+from armcal_online.running.state_replayer import Course
 from armcal_online.sources.incoming import Incoming
 from fake_recalibrator import HEADER, FakeRecalibrator, row, setup
 

@@ -126,8 +126,8 @@ def _bars(axes: Any, tables: Mapping[str, Any], areas: Sequence[str]) -> None:
     axes.set_xticks(range(len(areas)), labels=list(areas))
     axes.set_ylim(0, 108)
     axes.set_ylabel("share of the area, %", fontsize=9.5, color=_INK)
-    held_told = any(area["held"] is not None for each in tables.values() for area in each.values())
-    words = "reached" + ("; the dark part: held by the servos too" if held_told else "")
+    held_text = any(area["held"] is not None for each in tables.values() for area in each.values())
+    words = "reached" + ("; the dark part: held by the servos too" if held_text else "")
     axes.set_title(words, fontsize=9.5, color=_INK)
     _style(axes)
 

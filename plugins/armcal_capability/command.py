@@ -10,7 +10,7 @@ from typing import Any
 
 import click
 from armcal.base.config_text import as_json
-from armcal.cli.common import Voice, command_line, overrides, speaking
+from armcal.cli.common import Console, command_line, overrides, speaking
 from armcal.io.folder import Reservation, reserved
 from armcal.plugins import discover
 from armcal.run.pipeline import Stopwatch
@@ -39,15 +39,15 @@ OURS = (*_DATA, *_FIGURES)
 )
 @overrides
 @speaking
-def capability(voice: Voice, source: Path, out: Path, settings: Path | None, overrides: tuple[str, ...]) -> None:
+def capability(console: Console, source: Path, out: Path, settings: Path | None, overrides: tuple[str, ...]) -> None:
     """Map what an arm can do: its reach, sag, stiffness, accuracy and nimbleness, in all and in areas, for designs."""
     watch = Stopwatch()
     kept = click.get_current_context().with_resource(reserved(out, OURS))
     import_module("matplotlib")  # if it is not here, that is said now and not after the survey
     registry = discover()
-    voice.plugin_faults(registry)
+    console.plugin_faults(registry)
     task = load_task(source, settings, overrides, registry)
-    with voice.progress() as progress:
+    with console.progress() as progress:
         with watch.stage("survey"):
             found = survey(task.subject, task.settings, progress)
         designs: dict[str, Survey] = {}
@@ -65,14 +65,14 @@ def capability(voice: Voice, source: Path, out: Path, settings: Path | None, ove
     facts |= {"samples": str(task.settings.samples), "seed": str(task.settings.seed)}
     page = render_capability(task.subject.name, sentences, tables, pictures, facts)
     _write(kept, found, designs, told, page, pictures)
-    voice.result({**told, "folder": str(out)})
+    console.result({**told, "folder": str(out)})
     for table in tables:
-        voice.out.print(_screen(table))
+        console.out.print(_screen(table))
     for text in sentences:
-        voice.out.print(text, markup=False, soft_wrap=True)
+        console.out.print(text, markup=False, soft_wrap=True)
     for stage, seconds in watch.seconds.items():
-        voice.detail(f"{stage}: {seconds:.1f} s")
-    voice.out.print(f"page: {out / 'capability.html'}  ({watch.total():.1f} s)", markup=False, soft_wrap=True)
+        console.detail(f"{stage}: {seconds:.1f} s")
+    console.out.print(f"page: {out / 'capability.html'}  ({watch.total():.1f} s)", markup=False, soft_wrap=True)
 
 
 def _of_design(progress: Any, name: str, _: str, fraction: float) -> None:

@@ -11,8 +11,8 @@ from armcal.arm.clearance import Mask
 from armcal.base.domains import Array
 from numpy.typing import NDArray
 
+from armcal_capability.dexterity import dexterity, moves, singular_values, weighted
 from armcal_capability.mechanics import Mechanics, MechanicsFunction
-from armcal_capability.nimbleness import moves, nimbleness, singular_values, weighted
 
 _MM = 1000.0
 AT_ONCE = 16384
@@ -125,7 +125,7 @@ def postures_at(
     more: dict[str, Array] = {}
     for prefix, place in (("", 1), ("pose_", 2)):
         singular = np.concatenate([part[place] for part in parts])
-        found = nimbleness(singular, moves(singular))
+        found = dexterity(singular, moves(singular))
         more |= {f"{prefix}{name}": found[name] for name in ("manipulability", "inverse_condition")}
         more[f"{prefix}smallest_mm_per_rad"] = found["smallest"] * _MM
     return joined.with_values(more)

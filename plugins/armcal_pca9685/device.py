@@ -168,7 +168,7 @@ class Pca9685Device(JointDevice, PulseDevice):
         servo = self._known(joint)
         if not servo.has(angle):
             raise DeviceRefusedError(
-                f"found {math.degrees(angle):.3f} deg for {joint}, expected {servo.told_span}, its pulse table.",
+                f"found {math.degrees(angle):.3f} deg for {joint}, expected {servo.span_text}, its pulse table.",
                 where=Location(str(self._settings.servos), field=f"servos.{joint}"),
                 hint="Keep the plan within the table, or measure the servo further: armcal servo.",
             )

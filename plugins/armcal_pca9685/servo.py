@@ -39,7 +39,7 @@ class Servo:
         return min(ends[0], rounded[0]) - _ANGLE_SLACK, max(ends[1], rounded[1]) + _ANGLE_SLACK
 
     @property
-    def told_span(self) -> str:
+    def span_text(self) -> str:
         """The same for people, as it is in the table."""
         return f"{math.degrees(self._table.angles[0]):g} to {math.degrees(self._table.angles[-1]):g} deg"
 

@@ -14,7 +14,7 @@ import click
 from armcal.base.config_text import as_line
 from armcal.calibration.compensation.request import Redundancy
 from armcal.calibration.measured_point import Point
-from armcal.cli.common import Voice, accept, point, speaking
+from armcal.cli.common import Console, accept, point, speaking
 from armcal.errors import InputError
 from armcal.io.signals import Signals
 from armcal.io.standard_output import StandardOutput
@@ -58,7 +58,7 @@ _ALWAYS = ("refused", "worker_lost", "missing", "status", "notice")
 @accept
 @speaking
 def serve(
-    voice: Voice,
+    console: Console,
     calibration: Path,
     path: Path | None,
     port: int | None,
@@ -80,7 +80,7 @@ def serve(
         openings.append(partial(Datagrams, port))
     if not openings:
         openings.append(_standard_streams())
-    said = _Said(voice, StandardOutput(getattr(sys.stderr, "buffer", None), patience_s=0.0))
+    said = _Said(console, StandardOutput(getattr(sys.stderr, "buffer", None), patience_s=0.0))
     how: dict[str, Any] = {"redundancy": redundancy, "within": str(within or ""), "evaluator": evaluator}
     how |= {"point": point or "tool", "accept": accept}
     with Signals() as signals:
@@ -98,8 +98,8 @@ def _standard_streams() -> Opening:
 class _Said:
     """Events to standard error, which nobody need read: a sentence a line, or a JSON object with --json."""
 
-    def __init__(self, voice: Voice, out: StandardOutput) -> None:
-        self._voice, self._out = voice, out
+    def __init__(self, console: Console, out: StandardOutput) -> None:
+        self._voice, self._out = console, out
 
     def tell(self, event: str, sentence: str, content: Mapping[str, Any]) -> None:
         """See ``armcal_serve.protocol.Tell``."""

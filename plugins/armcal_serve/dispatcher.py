@@ -57,7 +57,7 @@ class Dispatcher:
         self.asked += 1
         conversation.ask(self.asked, b"", time.monotonic()).refused(fault)
 
-    def hand_out(self, workers: Iterable[WorkerProcess]) -> None:
+    def dispatch(self, workers: Iterable[WorkerProcess]) -> None:
         """Give each worker that has nothing to do a request."""
         for worker in workers:
             if worker.given is None and not worker.gone:
@@ -66,7 +66,7 @@ class Dispatcher:
                     return
                 worker.give(ticket)
 
-    def take_back(self, ticket: Ticket, why: ArmcalError) -> None:
+    def requeue(self, ticket: Ticket, why: ArmcalError) -> None:
         """The request of a worker that was lost; it may have been the cause, and is given up after another loss."""
         ticket.tries += 1
         if ticket.tries < _MOST_TRIES:

@@ -11,11 +11,11 @@ from typing import Any
 from armcal.io.signals import Signals
 
 from armcal_serve.calibration_watch import CalibrationWatch
-from armcal_serve.crew import Crew
 from armcal_serve.dispatcher import Dispatcher
 from armcal_serve.poller import Poller
 from armcal_serve.protocol import VERSION, Tell
 from armcal_serve.transports.transport import Transport
+from armcal_serve.worker_pool import WorkerPool
 
 _STEP_S = 0.1
 """How long it may take until a signal, a client that left or a new file is noticed, when nothing else happens."""
@@ -31,7 +31,7 @@ class Server:
     Args:
         path: the file, which may be replaced at any time.
         workers: how many processes answer.
-        how: commands are found; see ``armcal_serve.crew.Crew``.
+        how: commands are found; see ``armcal_serve.worker_pool.WorkerPool``.
         openings: make the transports.
         tell: is told what whoever started it should know.
 
@@ -47,7 +47,7 @@ class Server:
         self._poller = Poller()
         self._watch = CalibrationWatch(path)
         self._dispatcher = Dispatcher(self.status)
-        self._crew = Crew(workers, self._watch, how, self._poller, self._dispatcher, tell)
+        self._pool = WorkerPool(workers, self._watch, how, self._poller, self._dispatcher, tell)
         self._transports: list[Transport] = []
         try:
             for opening in openings:
@@ -74,26 +74,26 @@ class Server:
         return {
             "armcal_serve": VERSION,
             "ok": True,
-            "calibration": self._crew.tag,
-            "arms": self._crew.arms,
+            "calibration": self._pool.tag,
+            "arms": self._pool.arms,
             "file": {"path": str(self._watch.path), "state": self._watch.state, "why": self._watch.why},
             "requests": self._dispatcher.asked,
             "waiting": self._dispatcher.waiting,
             "clients": sum(transport.clients for transport in self._transports),
-            "worker_pids": self._crew.worker_pids,
-            "workers_lost": self._crew.lost,
+            "worker_pids": self._pool.worker_pids,
+            "workers_lost": self._pool.lost,
             "up_s": round(time.monotonic() - self._began, 1),
         }
 
     def _make_ready(self, signals: Signals) -> None:
-        self._crew.begin(self._watch.first())
-        while self._crew.tag is None and not signals.finish:
+        self._pool.begin(self._watch.first())
+        while self._pool.tag is None and not signals.finish:
             self._poller.step(_STEP_S)
-            self._crew.tend(looking=False)
+            self._pool.tend(looking=False)
 
     def _serve(self, signals: Signals) -> None:
         names = [transport.name for transport in self._transports]
-        told = {"calibration": self._crew.tag, "arms": self._crew.arms, "by": names}
+        told = {"calibration": self._pool.tag, "arms": self._pool.arms, "by": names}
         self._tell("ready", f"ready: {self._watch.path} by {', '.join(names)}", told)
         gc.collect()
         gc.freeze()
@@ -103,7 +103,7 @@ class Server:
             self._step()
             if signals.status:
                 signals.status = False
-                tag = self._crew.tag
+                tag = self._pool.tag
                 number = 0 if tag is None else tag["sequence"]
                 sentence = f"calibration {number} is answered from, {self._dispatcher.asked} requests so far; "
                 self._tell(
@@ -121,12 +121,12 @@ class Server:
 
     def _step(self, looking: bool = True) -> None:
         self._poller.step(_STEP_S)
-        self._crew.tend(looking)
+        self._pool.tend(looking)
         for transport in self._transports:
             transport.tend()
 
     def _close(self) -> None:
         for transport in self._transports:
             transport.close()
-        self._crew.close()
+        self._pool.close()
         self._watch.close()

@@ -22,11 +22,11 @@ from armcal.errors import ArmcalError, InputError
 from armcal.io.journal.journal import Journal, JournalFailedError, JournalFullError
 from armcal.run.experiment import Experiment
 from armcal_bench.acquisition.arrival import Arrival
-from armcal_bench.acquisition.eyes import TrackerEyes
+from armcal_bench.acquisition.path_planner import PathPlanner
 from armcal_bench.acquisition.schedule import Rest
-from armcal_bench.acquisition.session import Course, acquire
+from armcal_bench.acquisition.session import RunOptions, acquire
 from armcal_bench.acquisition.settings import AcquisitionSettings, ArrivalSettings, ServoHeatSettings
-from armcal_bench.acquisition.ways import Ways
+from armcal_bench.acquisition.tracker_monitor import BenchTrackerMonitor
 from armcal_bench.bench import Bench
 from armcal_bench.hazards import FirstMotion
 from armcal_pca9685.firmata_link import FirmataLink
@@ -85,13 +85,13 @@ class TestHostThatStalls:
         self, run: BenchRun, undisturbed: dict, seconds: float, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         begun = [0, 0]
-        begin = TrackerEyes.begin
+        begin = BenchTrackerMonitor.begin
 
-        def counted(eyes: TrackerEyes) -> None:
+        def counted(monitor: BenchTrackerMonitor) -> None:
             begun[0] += 1
-            begin(eyes)
+            begin(monitor)
 
-        monkeypatch.setattr(TrackerEyes, "begin", counted)
+        monkeypatch.setattr(BenchTrackerMonitor, "begin", counted)
         with run.simulated() as clock:
 
             def asked() -> bool:
@@ -135,8 +135,8 @@ class TestHostThatStalls:
                 return True
 
             clock.ask({"fault": {"kind": "seen"}})
-            course = Course(run.out, "resume", never, thinks, lambda progress: None, unchecked=True)
-            assert acquire(run.prepared(), run.plan, course).ending.how == "done"
+            options = RunOptions(run.out, "resume", never, thinks, lambda progress: None, unchecked=True)
+            assert acquire(run.prepared(), run.plan, options).ending.how == "done"
             assert clock.ask({"state": True})["offences"] == {}
 
 
@@ -206,9 +206,9 @@ class TestJournalThatFails:
             raise fault
 
         with run.simulated() as clock:
-            course = Course(run.out, "anew", never, lambda start: True, told, unchecked=True)
+            options = RunOptions(run.out, "anew", never, lambda start: True, told, unchecked=True)
             with pytest.raises(type(fault)):
-                acquire(run.prepared(), run.plan, course)
+                acquire(run.prepared(), run.plan, options)
             state = clock.ask({"state": True})
             assert is_parked(state) and state["offences"] == {}
             assert run.acquire().ending.how == "done"
@@ -246,9 +246,9 @@ class TestAskedToEnd:
             return True
 
         with run.simulated() as clock:
-            course = Course(run.out, "anew", lambda: answered[0], answer, lambda progress: None, unchecked=True)
+            options = RunOptions(run.out, "anew", lambda: answered[0], answer, lambda progress: None, unchecked=True)
             with pytest.raises(InputError, match="nothing was moved"):
-                acquire(run.prepared(), run.plan, course)
+                acquire(run.prepared(), run.plan, options)
             assert clock.ask({"state": True})["events"] == {}
 
 
@@ -321,13 +321,13 @@ class TestBoard:
                 run.acquire()
         other = BenchRun(tmp_path, (*SETS, "bench.acquisition.settle.window_s=0.9"))
         with other.simulated():
-            course = Course(other.out, "anew", never, lambda start: True, lambda progress: None, unchecked=True)
-            assert acquire(other.prepared(), other.plan, course).ending.how == "done"
+            options = RunOptions(other.out, "anew", never, lambda start: True, lambda progress: None, unchecked=True)
+            assert acquire(other.prepared(), other.plan, options).ending.how == "done"
 
     def test_pulses_that_are_not_those_that_were_told_are_not_measured(self) -> None:
         """Another program, or a chip that lost its supply and nothing else."""
         run = Run()
-        recovery = run.conduct()._parts.recovery
+        recovery = run.acquisition()._parts.recovery
         run.device.running = {"q1": 0.0, "q2": 0.0}
         assert recovery.standing() == {"q1": 0.0, "q2": 0.0}
         run.device.running["q1"] = 5 * COUNT_RAD
@@ -346,7 +346,7 @@ class TestBoard:
 
     def test_the_board_is_never_left_with_the_way_home_of_another_leg(self) -> None:
         run = Run()
-        made = run.conduct()
+        made = run.acquisition()
         made._parts.drive._ways.find = lambda start, goal: None  # type: ignore[method-assign]
         made._parts.drive.found({"q1": 0.4, "q2": 0.2})
         made._parts.drive.guard_here()
@@ -413,10 +413,10 @@ class TestNobodyFeelsWhereTheArmIs:
                 looks[0] += 1
                 return False
 
-            pose = TrackerEyes.settled
+            pose = BenchTrackerMonitor.settled
 
-            def slipped(eyes: TrackerEyes) -> Any:
-                found = pose(eyes)
+            def slipped(monitor: BenchTrackerMonitor) -> Any:
+                found = pose(monitor)
                 if found is not None and run_measured() >= 1:
                     found.base_T_target[:3, 3] += [0.0, 2.0, 2.0]
                 return found
@@ -425,10 +425,10 @@ class TestNobodyFeelsWhereTheArmIs:
                 return len(seen)
 
             seen: list[Any] = []
-            course = Course(run.out, "anew", asked, lambda start: True, seen.append, unchecked=True)
+            options = RunOptions(run.out, "anew", asked, lambda start: True, seen.append, unchecked=True)
             with pytest.MonkeyPatch.context() as patch:
-                patch.setattr(TrackerEyes, "settled", slipped)
-                outcome = acquire(run.prepared(), run.plan, course)
+                patch.setattr(BenchTrackerMonitor, "settled", slipped)
+                outcome = acquire(run.prepared(), run.plan, options)
             assert outcome.ending.how == "parked" and "3 times in a row" in outcome.ending.sentence
             assert is_let_go(clock.ask({"state": True}))
 
@@ -461,18 +461,18 @@ class TestTracker:
     def test_lost_exactly_as_the_arm_settles(
         self, run: BenchRun, undisturbed: dict, kind: str, monkeypatch: Any
     ) -> None:
-        begin, begun = TrackerEyes.begin, [0]
+        begin, begun = BenchTrackerMonitor.begin, [0]
         with run.simulated() as clock:
 
-            def counted(eyes: TrackerEyes) -> None:
+            def counted(monitor: BenchTrackerMonitor) -> None:
                 begun[0] += 1
                 if begun[0] % 2:
                     now = clock.ask({"state": True})["now"]
                     clock.ask({"fault": {"kind": kind, "at": now + 0.9}})
                     clock.ask({"fault": {"kind": "seen", "at": now + 1.25}})
-                begin(eyes)
+                begin(monitor)
 
-            monkeypatch.setattr(TrackerEyes, "begin", counted)
+            monkeypatch.setattr(BenchTrackerMonitor, "begin", counted)
             assert run.acquire().ending.how == "done"
         found = positions(run.measured())
         assert set(found) == set(undisturbed)
@@ -498,7 +498,7 @@ class TestTracker:
                 since[0] = run.clock.now()
             return run.clock.now() - since[0], "body lost"
 
-        run.eyes.trouble = trouble  # type: ignore[method-assign]
+        run.monitor.trouble = trouble  # type: ignore[method-assign]
         run.clock.at.append((5000.0, lambda: pytest.fail("it never ends")))
         assert run.run() == "done"
         assert list(run.progress.left_out) == ["p3"] and "body lost" in run.progress.left_out["p3"]
@@ -518,24 +518,24 @@ class TestTracker:
 
     def test_nor_does_one_that_does_so_for_hours(self) -> None:
         run = Run()
-        run.eyes.restless.update(tuple(round(a, 6) for a in pose) for pose in run.poses)
-        run.eyes.trouble = lambda: (0.6, "silent") if run.clock.now() % 1.2 < 0.6 else (0.0, "")  # type: ignore[method-assign]
+        run.monitor.restless.update(tuple(round(a, 6) for a in pose) for pose in run.poses)
+        run.monitor.trouble = lambda: (0.6, "silent") if run.clock.now() % 1.2 < 0.6 else (0.0, "")  # type: ignore[method-assign]
         run.clock.at.append((5000.0, lambda: pytest.fail("it never ends")))
         assert run.run() == "done"
         assert len(run.progress.left_out) == len(run.poses)
 
     def test_frames_from_before_are_not_taken_for_frames_of_now(self, run: BenchRun) -> None:
         with run.simulated() as clock:
-            eyes = TrackerEyes(Bench.of(run.experiment), clock)
-            eyes.open()
+            monitor = BenchTrackerMonitor(Bench.of(run.experiment), clock)
+            monitor.open()
             try:
                 clock.sleep(0.5)
-                eyes.begin()
+                monitor.begin()
                 clock.sleep(0.001)
-                eyes.look()
-                assert len(eyes._settling._frames) <= 1
+                monitor.look()
+                assert len(monitor._settling._frames) <= 1
             finally:
-                eyes.close()
+                monitor.close()
 
 
 class TestHeat:
@@ -544,8 +544,8 @@ class TestHeat:
         heat = {"q2": ServoHeatSettings.si(continuous=1.0, winding_time=20.0, case_time=30.0, budget=0.5)}
         run = Run(AcquisitionSettings.si(lost={"hold_s": 0.5, "park_s": 600}), heat=heat)
         run.clock.at += [
-            (8.0, lambda: setattr(run.eyes, "blind_since", 8.0)),
-            (400.0, lambda: setattr(run.eyes, "blind_since", None)),
+            (8.0, lambda: setattr(run.monitor, "blind_since", 8.0)),
+            (400.0, lambda: setattr(run.monitor, "blind_since", None)),
         ]
         run.run()
         heats = [float(np.dot([0.3, 0.7], c["warmth"]["q2"])) for kind, c in run.log.entries if "warmth" in c]
@@ -554,13 +554,13 @@ class TestHeat:
     def test_a_rest_ends_though_another_servo_warms_in_it(self) -> None:
         run = Run(heat={joint: ServoHeatSettings.si(continuous=1.3) for joint in ("q1", "q2")})
         run.clock.at.append((3600.0, lambda: pytest.fail("it rests for ever")))
-        conduct = run.conduct()
-        drive = conduct._parts.drive
+        acquisition = run.acquisition()
+        drive = acquisition._parts.drive
         drive.found({"q1": 0.0, "q2": 0.0})
         run.device.running = {"q1": 0.0, "q2": 0.0}
         expected = drive._model.after(np.array([[0.90, 0.5], [0.0, 0.0]]), torques(drive.at), 20.0)
-        drive.warmth = np.array([[0.95, 0.5], [0.0, 0.0]])
-        conduct._rest(Rest((drive.at,), 20.0, expected))
+        drive.thermal_state = np.array([[0.95, 0.5], [0.0, 0.0]])
+        acquisition._rest(Rest((drive.at,), 20.0, expected))
         assert 20 < run.clock.now() < 120
 
 
@@ -587,7 +587,7 @@ class TestPlans:
         run = self.sub(tmp_path, ((-100, 0, 0, 0, 0, 0), (100, 0, 0, 0, 0, 10)), *wide, park)
         prepared = run.prepared()
         device = prepared.device
-        for pose in prepared.ways._roadmap:
+        for pose in prepared.planner._roadmap:
             device.standing(dict(zip(device.joint_names, pose.tolist(), strict=True)))
         with run.simulated() as clock:
             assert run.acquire(prepared=prepared).ending.how == "done"
@@ -615,20 +615,20 @@ class TestWays:
             return Checked(np.abs(poses[:1]) - 0.1)
 
         alive: list[int] = []
-        ways = Ways(wall, np.array([[-1.0, 1.0]] * 2), np.zeros((0, 2)), 0.02)  # type: ignore[arg-type]
-        ways.meanwhile = lambda: alive.append(1)
-        assert ways.find(np.array([-0.5, 0.0]), np.array([0.5, 0.0])) is None
+        planner = PathPlanner(wall, np.array([[-1.0, 1.0]] * 2), np.zeros((0, 2)), 0.02)  # type: ignore[arg-type]
+        planner.meanwhile = lambda: alive.append(1)
+        assert planner.find(np.array([-0.5, 0.0]), np.array([0.5, 0.0])) is None
         assert len(alive) > 100
 
     def test_an_arm_that_stands_too_near_goes_away_from_it(self) -> None:
-        ways = Ways(_Wall(), np.array([[-1.0, 1.0]] * 2), np.zeros((1, 2)), 0.02)  # type: ignore[arg-type]
-        way = ways.find(np.array([0.52, 0.3]), np.array([0.4, -0.5]))
+        planner = PathPlanner(_Wall(), np.array([[-1.0, 1.0]] * 2), np.zeros((1, 2)), 0.02)  # type: ignore[arg-type]
+        way = planner.find(np.array([0.52, 0.3]), np.array([0.4, -0.5]))
         assert way is not None and np.allclose(way[0], [0.52, 0.3]) and np.allclose(way[-1], [0.4, -0.5])
         assert all(np.diff([pose[0] for pose in way[:2]]) <= 0)
 
     def test_no_way_leads_into_what_is_too_near(self) -> None:
-        ways = Ways(_Wall(), np.array([[-1.0, 1.0]] * 2), np.zeros((1, 2)), 0.02)  # type: ignore[arg-type]
-        assert ways.find(np.array([0.52, 0.3]), np.array([0.6, 0.3])) is None
+        planner = PathPlanner(_Wall(), np.array([[-1.0, 1.0]] * 2), np.zeros((1, 2)), 0.02)  # type: ignore[arg-type]
+        assert planner.find(np.array([0.52, 0.3]), np.array([0.6, 0.3])) is None
 
 
 class TestResume:
@@ -662,8 +662,8 @@ class TestResume:
             monkeypatch.setattr(SimulatedClock, "wall", lambda clock: wall(clock) + 3e7)
             assert run.acquire().ending.how == "done"
         assert before >= 1 and len(run.entries("measured")) == len(POSES)
-        warmth = [c["warmth"] for c in run.entries("going")]
-        assert all(0 <= part < 2 for each in warmth for parts in each.values() for part in parts)
+        thermal_state = [c["warmth"] for c in run.entries("going")]
+        assert all(0 <= part < 2 for each in thermal_state for parts in each.values() for part in parts)
         data = Experiment.load(CONFIG, data=run.out / "dataset.csv").read()
         assert sorted(data.ids) == ["p1", "p2", "p3", "p4"] and not data.has("time")
         assert "set back" in json.loads((run.out / "summary.json").read_text())["times"]

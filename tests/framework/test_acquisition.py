@@ -8,17 +8,17 @@ from functools import partial
 import numpy as np
 import pytest
 from armcal.devices.faults import DeviceError, DeviceLostError
-from armcal_bench.acquisition.conduct import Conduct, Parts
+from armcal_bench.acquisition.acquisition_run import AcquisitionRun, Parts
 from armcal_bench.acquisition.drive import Drive
 from armcal_bench.acquisition.heat import HeatModel
+from armcal_bench.acquisition.path_planner import PathPlanner
 from armcal_bench.acquisition.progress import Progress
 from armcal_bench.acquisition.recovery import Recovery
 from armcal_bench.acquisition.schedule import Scheduler
 from armcal_bench.acquisition.settings import AcquisitionSettings, ServoHeatSettings
 from armcal_bench.acquisition.watch import Patient, Watch
-from armcal_bench.acquisition.ways import Ways
 
-from tests.bench_fakes import COUNT_RAD, FakeClock, FakeDevice, FakeEyes, FakeLog, KilledError
+from tests.bench_fakes import COUNT_RAD, FakeClock, FakeDevice, FakeLog, FakeTrackerMonitor, KilledError
 
 POSES = COUNT_RAD * np.round(np.random.default_rng(5).uniform(-1.5, 1.5, (8, 2)) / COUNT_RAD)
 IDS = tuple(f"p{i}" for i in range(len(POSES)))
@@ -39,36 +39,36 @@ class Run:
         self.clock = clock or FakeClock()
         self.device = device or FakeDevice(self.clock)
         self.settings = settings or AcquisitionSettings()
-        self.eyes, self.log, self.asked = FakeEyes(self.clock, self.device), FakeLog(), False
+        self.monitor, self.log, self.asked = FakeTrackerMonitor(self.clock, self.device), FakeLog(), False
         self.progress, self.poses = progress or Progress(), POSES
         self.model = HeatModel.of(self.device.joint_names, heat or {})
 
-    def conduct(self) -> Conduct:
+    def acquisition(self) -> AcquisitionRun:
         settings, clock, device = self.settings, self.clock, self.device
-        ways = Ways(None, np.array([[-2.0, 2.0]] * 2), self.poses, 0.02)
-        drive = Drive(device, clock, ways, settings, (self.model, torques), lambda angles, warmth: None)
-        scheduler = Scheduler(self.poses, IDS, drive.park, ways, self.model, torques, RATE, 2.0, settings.order)
+        planner = PathPlanner(None, np.array([[-2.0, 2.0]] * 2), self.poses, 0.02)
+        drive = Drive(device, clock, planner, settings, (self.model, torques), lambda angles, thermal_state: None)
+        scheduler = Scheduler(self.poses, IDS, drive.park, planner, self.model, torques, RATE, 2.0, settings.order)
         recovery = Recovery(device, drive, clock, settings, self.announce, lambda: self.asked)
         recovery.open()
         parts = Parts(
             drive=drive,
             recovery=recovery,
             scheduler=scheduler,
-            eyes=self.eyes,
+            monitor=self.monitor,
             clock=clock,
             settings=settings,
             log=self.log,
-            watch=Watch(clock, self.eyes, settings.lost, lambda: self.asked),
-            patient=Patient(self.eyes, lambda: self.asked),
+            watch=Watch(clock, self.monitor, settings.lost, lambda: self.asked),
+            patient=Patient(self.monitor, lambda: self.asked),
             told=lambda progress: None,
         )
-        return Conduct(parts, self.progress)
+        return AcquisitionRun(parts, self.progress)
 
     def announce(self, joint: str, angle: float) -> None:
         self.log.record("energised", {"joint": joint, "angle": angle, "at": self.clock.wall()})
 
     def run(self) -> str:
-        self.made = self.conduct()
+        self.made = self.acquisition()
         ending = self.made.run()
         self.progress = self.made.progress
         assert ending.sentence
@@ -157,8 +157,8 @@ def test_someone_who_asks_for_the_end_gets_a_parked_arm() -> None:
 def test_a_tracker_that_comes_back_costs_time_alone() -> None:
     run = Run()
     run.clock.at += [
-        (15.0, lambda: setattr(run.eyes, "blind_since", 15.0)),
-        (25.0, lambda: setattr(run.eyes, "blind_since", None)),
+        (15.0, lambda: setattr(run.monitor, "blind_since", 15.0)),
+        (25.0, lambda: setattr(run.monitor, "blind_since", None)),
     ]
     assert run.run() == "done"
     still = [t for t, what, _ in run.device.log if what == "command" and 15.6 < t < 25.0]
@@ -167,7 +167,7 @@ def test_a_tracker_that_comes_back_costs_time_alone() -> None:
 
 def test_a_tracker_that_stays_away_makes_it_park() -> None:
     run = Run()
-    run.clock.at.append((15.0, lambda: setattr(run.eyes, "blind_since", 15.0)))
+    run.clock.at.append((15.0, lambda: setattr(run.monitor, "blind_since", 15.0)))
     assert run.run() == "parked"
     assert "30 s" in run.log.entries[-1][1]["sentence"] and "silent" in run.log.entries[-1][1]["sentence"]
 
@@ -224,7 +224,7 @@ def test_a_device_that_fails_again_and_again_is_given_up() -> None:
 
 def test_a_pose_that_never_settles_is_tried_again_at_the_end_and_then_left_out() -> None:
     run = Run()
-    run.eyes.restless.add(tuple(round(a, 6) for a in POSES[2]))
+    run.monitor.restless.add(tuple(round(a, 6) for a in POSES[2]))
     assert run.run() == "done"
     assert list(run.measured()) == [name for name in IDS if name != "p2"]
     assert run.progress.left_out["p2"] == "still moving by 3 mm"
@@ -280,8 +280,8 @@ def test_random_troubles_end_in_done_held_or_parked(seed: int) -> None:
     def trouble(kind: str, seconds: float) -> None:
         now = run.clock.now()
         if kind == "blind":
-            run.eyes.blind_since = now
-            run.clock.at.append((now + seconds, lambda: setattr(run.eyes, "blind_since", None)))
+            run.monitor.blind_since = now
+            run.clock.at.append((now + seconds, lambda: setattr(run.monitor, "blind_since", None)))
         elif kind == "gone":
             run.device.gone = True
             run.clock.at.append((now + seconds, lambda: setattr(run.device, "gone", False)))

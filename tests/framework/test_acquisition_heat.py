@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from armcal_bench.acquisition.heat import NEVER, HeatModel
-from armcal_bench.acquisition.schedule import LeaveOut, Measure, Rest, Scheduler, foretell
+from armcal_bench.acquisition.path_planner import PathPlanner, travel
+from armcal_bench.acquisition.schedule import LeaveOut, Measure, Rest, Scheduler, forecast_schedule
 from armcal_bench.acquisition.settings import ServoHeatSettings
-from armcal_bench.acquisition.ways import Ways, travel
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
@@ -24,14 +24,14 @@ def torques(pose: np.ndarray) -> np.ndarray:
 def scheduler(poses: np.ndarray, order: str = "plan", model: HeatModel = HEAT, check=None) -> Scheduler:
     limits = np.array([[-np.pi, np.pi]] * 2)
     park = np.zeros(2)
-    ways = Ways(check, limits, np.vstack([park, poses]), 0.02)
+    planner = PathPlanner(check, limits, np.vstack([park, poses]), 0.02)
     names = tuple(f"p{i}" for i in range(len(poses)))
-    return Scheduler(poses, names, park, ways, model, torques, np.deg2rad(20), 8.0, order)
+    return Scheduler(poses, names, park, planner, model, torques, np.deg2rad(20), 8.0, order)
 
 
 def test_heat_follows_its_differential_equations() -> None:
-    warmth, torque = np.array([[0.0, 0.0], [0.2, 0.1]]), np.array([0.3, 0.9])
-    found = HEAT.heat(HEAT.after(warmth, torque, 400.0))
+    thermal_state, torque = np.array([[0.0, 0.0], [0.2, 0.1]]), np.array([0.3, 0.9])
+    found = HEAT.heat(HEAT.after(thermal_state, torque, 400.0))
 
     def rise(time: float, parts: np.ndarray) -> np.ndarray:
         return (0.81 - parts) / [60.0, 600.0]
@@ -63,41 +63,42 @@ def test_a_joint_that_is_not_there_is_refused() -> None:
 
 def test_rests_come_before_the_budget_is_spent() -> None:
     poses = np.array([[0.1 * i, 1.2] for i in range(-15, 15)])
-    outlook = foretell(scheduler(poses), np.zeros(2), HEAT.cold, list(range(30)))
-    assert sum(isinstance(step, Measure) for step in outlook.steps) == 30
-    assert any(isinstance(step, Rest) for step in outlook.steps)
-    assert outlook.hottest[1] <= 0.6
+    forecast = forecast_schedule(scheduler(poses), np.zeros(2), HEAT.cold, list(range(30)))
+    assert sum(isinstance(step, Measure) for step in forecast.steps) == 30
+    assert any(isinstance(step, Rest) for step in forecast.steps)
+    assert forecast.hottest[1] <= 0.6
     never = replace(HEAT, budget=np.array([np.inf, np.inf]))
-    hot = foretell(scheduler(poses, model=never), np.zeros(2), HEAT.cold, list(range(30)))
+    hot = forecast_schedule(scheduler(poses, model=never), np.zeros(2), HEAT.cold, list(range(30)))
     assert hot.hottest[1] > 0.6 and hot.resting == 0, "without a budget there would have been no rest"
-    assert outlook.seconds > hot.seconds
+    assert forecast.seconds > hot.seconds
 
 
 def test_a_pose_that_no_servo_bears_is_left_out_and_the_others_are_not() -> None:
     weak = replace(HEAT, continuous=np.array([np.inf, 0.05]), times=np.full((2, 2), 5.0))
     poses = np.array([[0.5, 0.0], [0.5, 1.5], [1.0, 0.0]])
-    outlook = foretell(scheduler(poses, model=weak), np.zeros(2), weak.cold, [0, 1, 2])
-    left = [step for step in outlook.steps if isinstance(step, LeaveOut)]
+    forecast = forecast_schedule(scheduler(poses, model=weak), np.zeros(2), weak.cold, [0, 1, 2])
+    left = [step for step in forecast.steps if isinstance(step, LeaveOut)]
     assert [step.pose for step in left] == [1] and "even from cold" in left[0].why
-    assert sorted(step.pose for step in outlook.steps if isinstance(step, Measure)) == [0, 2]
+    assert sorted(step.pose for step in forecast.steps if isinstance(step, Measure)) == [0, 2]
 
 
 def test_a_cool_order_takes_no_longer_than_the_plans() -> None:
     random = np.random.default_rng(3)
     poses = random.uniform([-2, -1.5], [2, 1.5], (40, 2))
     times = {
-        order: foretell(scheduler(poses, order), np.zeros(2), HEAT.cold, list(range(40))) for order in ("plan", "cool")
+        order: forecast_schedule(scheduler(poses, order), np.zeros(2), HEAT.cold, list(range(40)))
+        for order in ("plan", "cool")
     }
     assert times["cool"].seconds < times["plan"].seconds
     assert times["cool"].hottest[1] <= 0.6
-    for outlook in times.values():
-        assert sorted(step.pose for step in outlook.steps if isinstance(step, Measure)) == list(range(40))
+    for forecast in times.values():
+        assert sorted(step.pose for step in forecast.steps if isinstance(step, Measure)) == list(range(40))
 
 
 def test_each_step_begins_where_the_one_before_ended() -> None:
     poses = np.array([[0.1 * i, 1.2 * (-1) ** i] for i in range(-8, 8)])
     at = np.zeros(2)
-    for step in foretell(scheduler(poses), at, HEAT.cold, list(range(16))).steps:
+    for step in forecast_schedule(scheduler(poses), at, HEAT.cold, list(range(16))).steps:
         assert not isinstance(step, LeaveOut)
         assert np.array_equal(step.way[0], at)
         at = step.way[-1]

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from armcal.cli.tables import _compliances, _matrices
-from armcal.diagnose.evidence_findings import shifted_told
+from armcal.diagnose.evidence_findings import shift_findings
 from armcal.estimate.estimator import Estimate, estimate
 from armcal.estimate.simulation import SimulationRequest, measured_without_noise, with_channels
 from armcal.problem.problem import Problem
@@ -55,13 +55,13 @@ def test_an_estimate_far_beyond_its_bound_keeps_an_interval_as_wide_as_its_devia
 
 
 def test_what_a_bound_shifts_beside_itself_is_named(beyond: Estimate) -> None:
-    (finding,) = shifted_told(beyond)
+    (finding,) = shift_findings(beyond)
     assert finding.grade == "note" and "Bounds that hold arm.spring.k2 shift other estimates" in finding.text
     moved = (beyond.free_values - beyond.unconstrained) / beyond.deviations
     worst = max((n for n in beyond.names if n != "arm.spring.k2"), key=lambda n: abs(moved[beyond.names.index(n)]))
     assert f"{worst} ({moved[beyond.names.index(worst)]:+.1f} sd)" in finding.text
     free = fitted(SPRINGS, {**BEYOND, "arm.spring.k2": 0.05})
-    assert not shifted_told(free)
+    assert not shift_findings(free)
 
 
 def test_names_and_values_pair(beyond: Estimate) -> None:
@@ -114,9 +114,9 @@ def test_what_a_cone_shifts_beside_its_matrix_is_named() -> None:
         for along in (-0.01, 0.05)
     )
     assert not edge.at_bound
-    (finding,) = shifted_told(edge)
+    (finding,) = shift_findings(edge)
     moved = dict(zip(edge.names, (edge.free_values - edge.unconstrained) / edge.deviations, strict=True))
     worst = max((n for n in edge.names if n.startswith("arm.mdh")), key=lambda n: abs(moved[n]))
     assert f"Bounds that hold arm.flex.C2 shift other estimates: {worst} ({moved[worst]:+.1f} sd)" in finding.text
     assert finding.grade == "note" and "C2[" not in finding.text
-    assert not shifted_told(inside)
+    assert not shift_findings(inside)

@@ -17,10 +17,10 @@ from armcal.problem.problem import Problem
 from armcal_capability.accuracy import steps_at, with_accuracy
 from armcal_capability.areas import AreaSearch, cells_of
 from armcal_capability.designs import load_designs
+from armcal_capability.dexterity import dexterity, moves, singular_values, weighted
 from armcal_capability.inverse import Pointing
 from armcal_capability.loading import Task, load_task
 from armcal_capability.mechanics import MechanicsFunction
-from armcal_capability.nimbleness import moves, nimbleness, singular_values, weighted
 from armcal_capability.quantities import Weights, postures_at
 from armcal_capability.sampling import spread
 from armcal_capability.settings import AreaSettings, CapabilitySettings, LoadSettings, ToolDirectionSettings
@@ -145,7 +145,7 @@ def test_measures_of_a_singular_posture_are_finite() -> None:
     values = singular_values(np.diag([1.0, 0.5, 0.0])[None])
     # The zero is not the arm's inability: another posture moves that way.
     both = np.concatenate([values, [[1.0, 0.5, 0.1]]])
-    found = nimbleness(both, moves(both))
+    found = dexterity(both, moves(both))
     assert found["inverse_condition"][0] == pytest.approx(0, abs=1e-8) and found["manipulability"][0] < 1e-8
     assert np.isfinite(found["inverse_condition"]).all()
 

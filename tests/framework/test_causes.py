@@ -10,12 +10,12 @@ import numpy as np
 import oracle
 import pytest
 from armcal.cli.main import cli
-from armcal.diagnose.evidence_findings import neighbours_told, structures_told
+from armcal.diagnose.evidence_findings import neighbour_findings, structure_findings
 from armcal.diagnose.fit_rows import FitRows
 from armcal.diagnose.gross import scale_deviation
-from armcal.diagnose.leftover import LEVEL, leftover
 from armcal.diagnose.odds import UNLISTED
 from armcal.diagnose.outside import predicted_positions
+from armcal.diagnose.residual_structure import LEVEL, structure
 from armcal.diagnose.smooth import CLEAR
 from armcal.estimate.weighing import fit
 from armcal.problem.motion import Motion, recorded_position
@@ -94,7 +94,7 @@ def found_in(lrm, name, seed, in_order=False):
     estimate = fit(problem, records, IpoptEstimator(IpoptEstimator.Settings()), start).estimate
     dataset = lrm.dataset(q, points, **columns)
     motion = Motion.of(problem, estimate.values, records, dataset)
-    return leftover(problem, records, estimate, dataset, motion, recorded_position(dataset))
+    return structure(problem, records, estimate, dataset, motion, recorded_position(dataset))
 
 
 def graded(found, name):
@@ -112,7 +112,7 @@ def graded(found, name):
 
 
 def said(found):
-    return " ".join(finding.whole for finding in structures_told(found))
+    return " ".join(finding.whole for finding in structure_findings(found))
 
 
 @pytest.mark.parametrize("name", NAMED)
@@ -177,7 +177,8 @@ def test_a_stretched_instrument_is_named_by_the_command(tmp_path):
     arguments = ["run", str(DEMO / "demo.yaml"), "--data", str(tmp_path / "data.csv"), "--out", str(tmp_path / "out")]
     result = CliRunner().invoke(cli, [*arguments, "--json", "--set", "validation.folds=0"])
     assert result.exit_code == 0, result.output
-    first = json.loads((tmp_path / "out" / "metrics.json").read_text())["structure"]["leftover"]["structures"][0]
+    structure = json.loads((tmp_path / "out" / "metrics.json").read_text())["structure"]
+    first = structure["residual_structure"]["structures"][0]
     assert (first["kind"], first["subject"]) == ("scale", "z") and first["odds"] > 0.5
     assert first["size"].startswith("share: 0.")
 
@@ -187,7 +188,7 @@ def test_time_is_blamed_only_where_poses_do_not_follow_it(lrm, name, in_order, c
     found = found_in(lrm, name, 0, in_order)
     assert found.lag_p <= LEVEL
     assert found.alike is not None and found.alike.cause == cause
-    finding = neighbours_told(found, SimpleNamespace(widened=()))[0]
+    finding = neighbour_findings(found, SimpleNamespace(widened=()))[0]
     assert ("It goes with time" in finding.text) == (cause == "time")
     assert ("Let the base drift" in finding.action) == (cause == "time")
     assert ("is the cause is not known" in finding.text) == (cause == "open")

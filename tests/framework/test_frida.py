@@ -226,7 +226,7 @@ def test_without_noise_what_is_determined_comes_back_exactly(name):
     """Joints that read exactly, and are believed; so believed, priors pull by less than 1e-8."""
     case = Case.load(name, joint_noise=0.0)
     found = case.fit(case.records())
-    told = np.array(found.told_by_data)
+    told = np.array(found.identified_by_data)
     assert found.verdict.converged and told.any()
     off = found.values[list(found.free_entries)] - case.true_values[list(found.free_entries)]
     assert np.abs(off[told]).max() < 1e-8
@@ -243,7 +243,7 @@ def coverage(names, seeds):
             found = case.fit(case.records(seed))
             assert found.verdict.converged
             true = case.true_values[list(found.free_entries)]
-            rows = zip(found.intervals, true, found.told_by_data, strict=True)
+            rows = zip(found.intervals, true, found.identified_by_data, strict=True)
             inside += [i.lower <= x <= i.upper for i, x, told in rows if told]
     return float(np.mean(inside)), len(inside)
 
@@ -285,7 +285,7 @@ def test_where_the_size_is_a_gauge_it_is_told_and_the_closing_angle_is_that_of_t
     assert case.closing_error(found.values, judge, slice(0, 3)) < 1.15 * case.closing_error(
         case.true_values, judge, slice(0, 3)
     )
-    assert not any(found.told_by_data)
+    assert not any(found.identified_by_data)
     assert any("scale is not observable" in text for text in case.warnings(train))
 
 
@@ -309,7 +309,7 @@ def test_all_fourteen_offsets_from_any_truth_in_few_iterations(count):
     scores = []
     for found, off in far_starts(count):
         assert found.verdict.converged and found.verdict.iterations <= 15
-        assert all(found.told_by_data)
+        assert all(found.identified_by_data)
         assert np.abs(off).max() < 1e-3
         scores.append(off / found.deviations)
     assert np.mean(np.square(scores)) == pytest.approx(1, abs=0.3)
@@ -324,7 +324,7 @@ def test_where_the_last_axes_are_one_line_thirteen_are_determined_and_the_rest_i
     true = dict(zip(names, np.random.default_rng(3).uniform(-0.07, 0.07, 14), strict=True))
     found = case.fit(case.told({n: x - case.truth[n] for n, x in true.items()}, 0))
     assert found.identifiability.rank == 13 and len(found.identifiability) == 14
-    told = dict(zip(found.names, found.told_by_data, strict=True))
+    told = dict(zip(found.names, found.identified_by_data, strict=True))
     assert {n for n, flag in told.items() if not flag} == {"left.poe.offset7", "right.poe.offset7"}
     (only,) = found.identifiability.undetermined
     weights = dict(only.terms)

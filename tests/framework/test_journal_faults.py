@@ -30,7 +30,7 @@ def entries_of(files: MemoryFiles) -> dict[int, tuple[str, object]]:
     return {entry.sequence: (entry.kind, entry.content) for entry in read_entries(FOLDER, files)}
 
 
-class Witness:
+class ReplayVerifier:
     """What was written under which number, and up to where it was acknowledged."""
 
     def __init__(self) -> None:
@@ -61,7 +61,7 @@ class Witness:
         return f"wrong: {wrong}" if wrong else "lost" if last < self.acknowledged else ""
 
 
-def work(journal: Journal, witness: Witness, rng: random.Random, count: int) -> None:
+def work(journal: Journal, witness: ReplayVerifier, rng: random.Random, count: int) -> None:
     """Records, notes and checkpoints of sizes below and above a sector."""
     for _ in range(count):
         content = {"x": [rng.random() for _ in range(rng.choice((1, 1, 4, 30, 70)))]}
@@ -74,7 +74,7 @@ def lives(seed: int, **layer: bool) -> str:
     """Four power losses of one journal, each at any call; what was wrong after one."""
     rng = random.Random(seed)
     held: dict[Path, bytes] = {}
-    witness = Witness()
+    witness = ReplayVerifier()
     for _ in range(4):
         files = MemoryFiles(held, dies_after=rng.choice((3, 10, 40, 80)) + rng.randrange(12), rng=rng, **layer)
         try:
@@ -89,7 +89,7 @@ def lives(seed: int, **layer: bool) -> str:
     return ""
 
 
-def _reopen(held: dict[Path, bytes], witness: Witness) -> str:
+def _reopen(held: dict[Path, bytes], witness: ReplayVerifier) -> str:
     """Going on gives the same as reading without writing, and all is whole then."""
     seen = MemoryFiles(held)
     before = entries_of(seen) if witness.acknowledged else {}
@@ -133,7 +133,7 @@ def test_a_power_loss_at_every_call() -> None:
     calls = 0
     for dies_after in range(10_000):
         rng = random.Random(3)
-        files, witness = MemoryFiles(dies_after=dies_after, rng=random.Random(dies_after)), Witness()
+        files, witness = MemoryFiles(dies_after=dies_after, rng=random.Random(dies_after)), ReplayVerifier()
         try:
             with opened(files) as journal:
                 work(journal, witness, rng, 40)
@@ -148,7 +148,7 @@ def test_a_power_loss_at_every_call() -> None:
 
 def small_journal() -> tuple[dict[Path, bytes], list[dict]]:
     """Two segments, records and notes; entries after each frame of the last segment."""
-    files, witness = MemoryFiles(), Witness()
+    files, witness = MemoryFiles(), ReplayVerifier()
     with opened(files) as journal:
         for kind, size in [("record", 1), ("note", 2), ("checkpoint", 1), ("record", 1), ("note", 30), ("record", 2)]:
             witness.write(journal, kind, {"x": [0.1] * size, "@ `": "p@`0 "})
@@ -240,7 +240,7 @@ def test_half_an_entry_that_was_taken_back_does_not_return_after_a_power_loss() 
     """A full disk tore an entry; other notes went in its place; then the power fails."""
     for seed in range(150):
         rng = random.Random(seed)
-        files, witness = MemoryFiles(rng=rng), Witness()
+        files, witness = MemoryFiles(rng=rng), ReplayVerifier()
         journal = opened(files)
         for number in range(12):
             torn = number == 3
@@ -271,7 +271,7 @@ def test_damage_says_where_and_what_is_still_good() -> None:
 
 
 def test_a_hole_behind_which_an_acknowledged_entry_stands_is_damage() -> None:
-    files, witness = MemoryFiles(), Witness()
+    files, witness = MemoryFiles(), ReplayVerifier()
     with opened(files, JournalLimits(1 << 20)) as journal:
         for _ in range(40):
             witness.write(journal, "record", {"x": [0.1] * 20})
@@ -323,10 +323,10 @@ class Failing:
         return None
 
 
-def under_fault(failing: Failing) -> tuple[MemoryFiles, Witness, list[Exception]]:
+def under_fault(failing: Failing) -> tuple[MemoryFiles, ReplayVerifier, list[Exception]]:
     """The same work over a disk that fails; what it held, what it acknowledged, what was raised."""
     rng = random.Random(5)
-    files, witness, raised = MemoryFiles(rng=random.Random(failing.number)), Witness(), []
+    files, witness, raised = MemoryFiles(rng=random.Random(failing.number)), ReplayVerifier(), []
     files.fault = failing
     try:
         journal = opened(files)
@@ -371,7 +371,7 @@ def test_a_fault_at_every_call_loses_nothing_acknowledged(kinds: tuple[str, ...]
 
 
 def test_a_failed_sync_is_never_asked_for_again() -> None:
-    files, witness = MemoryFiles(), Witness()
+    files, witness = MemoryFiles(), ReplayVerifier()
     journal = opened(files)
     witness.write(journal, "record", 1)
     syncs = []
@@ -393,7 +393,7 @@ def test_a_failed_sync_is_never_asked_for_again() -> None:
 
 
 def test_a_full_disk_gives_up_old_segments_then_the_reserve_and_goes_on_when_there_is_room() -> None:
-    files, witness = MemoryFiles(capacity=14_000), Witness()
+    files, witness = MemoryFiles(capacity=14_000), ReplayVerifier()
     journal = opened(files, JournalLimits(3000, 1 << 30))
     number = 0
     while sum("journal-" in name for name in files.names(FOLDER)) < 3:
@@ -458,7 +458,7 @@ def test_a_read_only_disk_is_refused_and_told() -> None:
 @pytest.mark.parametrize("moment", range(60))
 def test_an_interrupt_leaves_a_whole_journal(moment: int) -> None:
     """A signal's handler may raise anywhere."""
-    files, witness, rng = MemoryFiles(rng=random.Random(moment)), Witness(), random.Random(9)
+    files, witness, rng = MemoryFiles(rng=random.Random(moment)), ReplayVerifier(), random.Random(9)
     journal = opened(files)
 
     def interrupt(call: str, number: int) -> None:
@@ -480,7 +480,7 @@ def test_an_interrupt_leaves_a_whole_journal(moment: int) -> None:
 
 
 def test_a_spent_reserve_asks_for_a_checkpoint_before_the_segment_is_full() -> None:
-    files, witness = MemoryFiles(capacity=9000), Witness()
+    files, witness = MemoryFiles(capacity=9000), ReplayVerifier()
     journal = opened(files, JournalLimits(1 << 20))
     while not journal.wants_checkpoint:
         witness.write(journal, "record", {"n": [1] * 40})

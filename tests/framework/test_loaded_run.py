@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from armcal.run.experiment import Experiment
 from armcal_bench.acquisition.heat import HeatModel
+from armcal_bench.acquisition.path_planner import travel
 from armcal_bench.acquisition.preparation import prepare
-from armcal_bench.acquisition.schedule import LeaveOut, Measure, Outlook, Rest, Scheduler, foretell
+from armcal_bench.acquisition.schedule import LeaveOut, Measure, Rest, ScheduleForecast, Scheduler, forecast_schedule
 from armcal_bench.acquisition.settings import ServoHeatSettings
-from armcal_bench.acquisition.ways import travel
 from armcal_simulation.servo_heat import HeatPath, ServoHeat
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs" / "lrm_arm"
@@ -44,10 +44,10 @@ def with_constants(scheduler: Scheduler, wrong: np.ndarray, budget: float) -> Sc
     return replace(scheduler, model=HeatModel(continuous, times, shares, budgets))
 
 
-def truly(scheduler: Scheduler, outlook: Outlook) -> np.ndarray:
+def truly(scheduler: Scheduler, forecast: ScheduleForecast) -> np.ndarray:
     """Time (s) and true heat of joint 4 after each step, and where it was hottest (steps x 3)."""
-    servo, course, now = ServoHeat(TRUTH), [], 0.0
-    for step in outlook.steps:
+    servo, heat, now = ServoHeat(TRUTH), [], 0.0
+    for step in forecast.steps:
         if isinstance(step, LeaveOut):
             continue
         hottest = 0.0
@@ -58,20 +58,20 @@ def truly(scheduler: Scheduler, outlook: Outlook) -> np.ndarray:
                 hottest = max(hottest, servo.winding)
         servo.advance(step.seconds - travel(step.way) / scheduler.rate, float(scheduler.torques(step.way[-1])[Q4]))
         now += step.seconds
-        course.append((now, servo.winding, max(hottest, servo.winding)))
-    return np.array(course)
+        heat.append((now, servo.winding, max(hottest, servo.winding)))
+    return np.array(heat)
 
 
-def foretold(scheduler: Scheduler) -> Outlook:
-    return foretell(scheduler, scheduler.park, scheduler.model.cold, list(range(POSES)))
+def whole_forecast(scheduler: Scheduler) -> ScheduleForecast:
+    return forecast_schedule(scheduler, scheduler.park, scheduler.model.cold, list(range(POSES)))
 
 
 def test_without_reckoning_with_heat_joint_4_fails_after_about_half_an_hour(scheduler: Scheduler) -> None:
     careless = with_constants(scheduler, np.ones(4), np.inf)
-    outlook = foretold(careless)
-    course = truly(careless, outlook)
-    assert not any(isinstance(step, Rest) for step in outlook.steps)
-    failed = course[course[:, 2] > 1.0, 0]
+    forecast = whole_forecast(careless)
+    heat = truly(careless, forecast)
+    assert not any(isinstance(step, Rest) for step in forecast.steps)
+    failed = heat[heat[:, 2] > 1.0, 0]
     assert len(failed) and 20 < failed[0] / 60 < 40
 
 
@@ -81,11 +81,11 @@ def test_with_rests_it_stays_below_its_limit_though_every_constant_is_wrong_by_u
     scheduler: Scheduler, wrong: tuple[float, ...]
 ) -> None:
     careful = with_constants(scheduler, np.array(wrong), BUDGET)
-    outlook = foretold(careful)
-    course = truly(careful, outlook)
-    assert any(isinstance(step, Rest) for step in outlook.steps)
-    assert course[:, 2].max() < 1.0
-    left_out = [step.why for step in outlook.steps if isinstance(step, LeaveOut)]
-    assert sum(isinstance(step, Measure) for step in outlook.steps) + len(left_out) == POSES
+    forecast = whole_forecast(careful)
+    heat = truly(careful, forecast)
+    assert any(isinstance(step, Rest) for step in forecast.steps)
+    assert heat[:, 2].max() < 1.0
+    left_out = [step.why for step in forecast.steps if isinstance(step, LeaveOut)]
+    assert sum(isinstance(step, Measure) for step in forecast.steps) + len(left_out) == POSES
     assert all("even from cold" in why or "do not cool enough" in why for why in left_out)
     assert len(left_out) < 0.25 * POSES and not (left_out and wrong[0] > 1)

@@ -24,9 +24,9 @@ from armcal_online.mission.errors import error_curve
 from armcal_online.mission.files import curve_text, figures, schedule, truth_text
 from armcal_online.mission.judge import Judgement, judge
 from armcal_online.mission.mission import MissionResult, before_launch, recalibrated, simulated
+from armcal_online.mission.mission_log import MissionLog
 from armcal_online.mission.settings import MissionPlan
 from armcal_online.mission.source import MissionSource, PowerCutError
-from armcal_online.mission.story import Story
 from armcal_online.mission.tips import random_poses
 from armcal_online.mission_figure import mission_figure
 from armcal_online.tracking.settings import RecalibrateSettings
@@ -124,11 +124,11 @@ RIGHT = {
 }
 
 
-def judged(start: Calibration, session: Knowing, recovered: float | None = None) -> tuple[Story, Judgement]:
-    story = recalibrated(mission(), Path("calibration.yaml"), plan().recalibrate, session, Path("folder"))
+def judged(start: Calibration, session: Knowing, recovered: float | None = None) -> tuple[MissionLog, Judgement]:
+    log = recalibrated(mission(), Path("calibration.yaml"), plan().recalibrate, session, Path("folder"))
     settings = plan().settings
-    curve = error_curve(plan().experiment.system, start.parameters, mission(), story, settings, "interpreted")
-    return story, judge(mission(), story, curve, settings.limit, recovered or settings.recovered)
+    curve = error_curve(plan().experiment.system, start.parameters, mission(), log, settings, "interpreted")
+    return log, judge(mission(), log, curve, settings.limit, recovered or settings.recovered)
 
 
 def tips(values: np.ndarray, poses: Dataset) -> np.ndarray:
@@ -142,20 +142,20 @@ def tips(values: np.ndarray, poses: Dataset) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def knowing(start: Calibration) -> tuple[Story, Judgement]:
+def knowing(start: Calibration) -> tuple[MissionLog, Judgement]:
     """Who knows the truth at each record, and names what happens."""
     return judged(start, Knowing(0, RIGHT))
 
 
 def test_power_cuts_end_sessions_and_each_record_is_taken_once() -> None:
     session = Knowing()
-    story = recalibrated(mission(), Path("c.yaml"), plan().recalibrate, session, Path("folder"))
-    assert session.sessions == 3 and story.resumed == 2
+    log = recalibrated(mission(), Path("c.yaml"), plan().recalibrate, session, Path("folder"))
+    assert session.sessions == 3 and log.resumed == 2
     assert tuple(session.taken) == mission().records.ids
 
 
 def test_frozen_errors_are_distances_between_tips_worked_out_apart(
-    start: Calibration, knowing: tuple[Story, Judgement]
+    start: Calibration, knowing: tuple[MissionLog, Judgement]
 ) -> None:
     curve, settings = knowing[1].curve, plan().settings
     joints = tuple(f"q{i}" for i in range(1, 7))
@@ -168,7 +168,7 @@ def test_frozen_errors_are_distances_between_tips_worked_out_apart(
         assert curve.frozen[i] == pytest.approx(np.linalg.norm(before - true, axis=1).mean(), abs=1e-9)
 
 
-def test_who_knows_the_truth_has_no_error_until_the_camera_moves(knowing: tuple[Story, Judgement]) -> None:
+def test_who_knows_the_truth_has_no_error_until_the_camera_moves(knowing: tuple[MissionLog, Judgement]) -> None:
     curve = knowing[1].curve
     bumped = curve.times >= 2.5 * DAY_S
     assert curve.recalibrated[curve.is_record & ~bumped].max() < 1e-9
@@ -177,8 +177,8 @@ def test_who_knows_the_truth_has_no_error_until_the_camera_moves(knowing: tuple[
     assert curve.is_record.sum() == len(mission().records)
 
 
-def test_events_are_named_right_and_nothing_is_missed(knowing: tuple[Story, Judgement]) -> None:
-    story, judgement = knowing
+def test_events_are_named_right_and_nothing_is_missed(knowing: tuple[MissionLog, Judgement]) -> None:
+    log, judgement = knowing
     assert [report.named for report in judgement.events] == ["right"] * 3
     assert judgement.missed == 0 and judgement.false_alarms == ()
     made = mission()
@@ -189,7 +189,7 @@ def test_events_are_named_right_and_nothing_is_missed(knowing: tuple[Story, Judg
     assert counts.rejected == counts.outliers == made.outliers.sum() and counts.good_rejected == 0
     assert counts.accepted + counts.rejected + counts.ignored == counts.arrived == len(made.records)
     assert counts.made == counts.arrived + made.lost
-    assert story.verdicts[made.records.ids[0]] in ("accepted", "rejected")
+    assert log.verdicts[made.records.ids[0]] in ("accepted", "rejected")
 
 
 def test_recovery_is_counted_in_records_that_arrived(start: Calibration) -> None:
@@ -225,7 +225,7 @@ def test_wrong_names_missed_events_and_false_alarms_are_told_apart(start: Calibr
     assert alarm.kind == "model_no_longer_fits" and alarm.time == made.times[2]
 
 
-def test_availability_needs_a_good_level_and_a_small_error(knowing: tuple[Story, Judgement]) -> None:
+def test_availability_needs_a_good_level_and_a_small_error(knowing: tuple[MissionLog, Judgement]) -> None:
     _, judgement = knowing
     curve = judgement.curve
     hours = [i for i in range(len(curve.times)) if curve.is_hour[i]]
@@ -238,9 +238,9 @@ def test_availability_needs_a_good_level_and_a_small_error(knowing: tuple[Story,
     assert curve.levels[first - 1] == "nominal" and curve.levels[first] == "suspect"
 
 
-def test_what_is_written_says_the_same_as_what_was_judged(knowing: tuple[Story, Judgement]) -> None:
-    story, judgement = knowing
-    told = json.loads(json.dumps(figures("short", mission(), story, judgement), allow_nan=False))
+def test_what_is_written_says_the_same_as_what_was_judged(knowing: tuple[MissionLog, Judgement]) -> None:
+    log, judgement = knowing
+    told = json.loads(json.dumps(figures("short", mission(), log, judgement), allow_nan=False))
     assert told["availability"] == judgement.availability and len(told["events"]) == 3
     assert sum(told["hours_at_level"].values()) == 72
     rows = list(csv.DictReader(truth_text(mission(), plan().experiment.parameters).splitlines()))
@@ -257,17 +257,17 @@ def test_what_is_written_says_the_same_as_what_was_judged(knowing: tuple[Story, 
     assert [float(line["frozen_mm"]) for line in lines] == pytest.approx(1000 * judgement.curve.frozen, abs=1e-5)
 
 
-def test_the_figure_is_a_picture_of_fair_size(knowing: tuple[Story, Judgement]) -> None:
+def test_the_figure_is_a_picture_of_fair_size(knowing: tuple[MissionLog, Judgement]) -> None:
     picture = mission_figure(mission(), knowing[1], "Three days")
     assert picture.startswith(b"\x89PNG") and len(picture) > 20_000
     assert int.from_bytes(picture[16:20], "big") >= 1200
 
 
 def test_a_calibration_of_another_arm_is_refused(start: Calibration) -> None:
-    story = Story({}, ((0.0, {}),), ((0.0, "nominal"),), (), 0)
+    log = MissionLog({}, ((0.0, {}),), ((0.0, "nominal"),), (), 0)
     fewer = replace(start.parameters, blocks=start.parameters.blocks[1:])
     with pytest.raises(ConfigError, match="not those of the simulated arm"):
-        error_curve(plan().experiment.system, fewer, mission(), story, plan().settings, "interpreted")
+        error_curve(plan().experiment.system, fewer, mission(), log, plan().settings, "interpreted")
 
 
 def armcal(*arguments: str) -> Result:
@@ -367,7 +367,9 @@ def test_records_of_the_mission_are_what_was_simulated(short: tuple[Path, dict[s
     assert np.allclose(read.T, mission().records.stacked([f"tracker.{axis}" for axis in "xyz"]), atol=1e-12)
 
 
-def test_a_mission_writes_through_no_link(start: Calibration, knowing: tuple[Story, Judgement], tmp_path: Path) -> None:
+def test_a_mission_writes_through_no_link(
+    start: Calibration, knowing: tuple[MissionLog, Judgement], tmp_path: Path
+) -> None:
     """One that stands by its end where one of its files goes, however it came there."""
     folder, elsewhere = tmp_path / "out", tmp_path / "elsewhere.csv"
     folder.mkdir()

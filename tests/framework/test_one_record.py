@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 from armcal.base.domains import Array
 from armcal.errors import NotConvergedError
-from armcal.estimate.online import surprise, weighed
+from armcal.estimate.online import normalised_innovation_squared as nis
+from armcal.estimate.online import weighed
 from armcal.problem.compiler import find_compiler
 from armcal.problem.kernel import EvaluatorChoice
 from armcal.problem.one_record import OneRecord
 from armcal.problem.problem import Problem
 from armcal.run.experiment import Experiment
-from armcal_online.tracking.chart import nearest_semidefinite
+from armcal_online.tracking.state_space import nearest_semidefinite
 
 DEMO = Path(__file__).resolve().parents[2] / "configs" / "lrm_arm" / "demo.yaml"
 COMPLIANCE = 0.05
@@ -95,7 +96,7 @@ def test_small_systems_are_solved_as_numpy_does_and_indefinite_ones_too() -> Non
         root, right = random.normal(size=(rows, rows + 2)), random.normal(size=rows)
         covariance = root @ root.T
         assert np.allclose(weighed(covariance, right), np.linalg.solve(covariance, right), rtol=1e-10)
-        assert surprise(right, covariance) == pytest.approx(right @ np.linalg.inv(covariance) @ right, rel=1e-10)
+        assert nis(right, covariance) == pytest.approx(right @ np.linalg.inv(covariance) @ right, rel=1e-10)
     indefinite = np.diag([1.0, -2.0, 3.0])
     assert np.allclose(weighed(indefinite, np.ones(3)), [1.0, -0.5, 1 / 3])
     before = covariance.copy()

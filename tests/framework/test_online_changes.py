@@ -47,7 +47,7 @@ def run(recalibrator: Recalibrator, arm: World, count: int, every: int = 1) -> R
         rejected.append((judged == "rejected", arm.was_outlier))
         decisions += [(k, d["kind"], d.get("joint") or "") for d in told(events, "decision")]
         if k % every == 0:
-            errors.append(tip_error_mm(arm.ground, recalibrator.values, arm.values))
+            errors.append(tip_error_mm(arm.setup, recalibrator.values, arm.values))
     table = np.array(rejected)
     return Ran(
         np.array(errors),
@@ -128,9 +128,9 @@ class Bench:
         """Mean distance of what is predicted now from what a moved instrument reads (mm)."""
         arm = copy.copy(self._arm)
         change(arm)
-        values = arm.ground.chart.inside(self._recalibrator.values)
+        values = arm.setup.space.inside(self._recalibrator.values)
         read = [arm.turn @ arm.tip(q) + arm.bias for q in PROBES]
-        far = [np.linalg.norm(predicted(arm.ground, values, q) - r) for q, r in zip(PROBES, read, strict=True)]
+        far = [np.linalg.norm(predicted(arm.setup, values, q) - r) for q, r in zip(PROBES, read, strict=True)]
         return float(1000 * np.mean(far))
 
 

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from armcal.estimate.online import surprise
+from armcal.estimate.online import normalised_innovation_squared
 from armcal_kalman.extended import ExtendedFilter, ExtendedSettings
-from armcal_online.tracking.start import Footing
-from online_arm import STATES, Filtered, World, begun, ground_of, nees, settings, told, walk_of
+from armcal_online.tracking.start import FilterSetup
+from online_arm import STATES, Filtered, World, begun, begun_setup, nees, replayer_of, settings, told
 from scipy.stats import chi2
 
 UPDATES = 300
@@ -45,21 +45,21 @@ class Study:
         return abs(self.nis.mean() - 3) > max(0.05, 4 * np.sqrt(6 / self.nis.size))
 
 
-def study(runs: int, ground: Footing, world: Callable[[int], World], updates: int = UPDATES) -> Study:
+def study(runs: int, setup: FilterSetup, world: Callable[[int], World], updates: int = UPDATES) -> Study:
     nis, errors = np.zeros((runs, updates)), np.zeros((runs, updates))
     for run in range(runs):
-        arm, one = world(run), Filtered.fresh(ExtendedFilter(ExtendedSettings()), ground)
+        arm, one = world(run), Filtered.fresh(ExtendedFilter(ExtendedSettings()), setup)
         for k in range(updates):
             arm.step()
             update = one.take(arm.measured())
-            nis[run, k] = surprise(update.innovation, update.covariance)
-            errors[run, k] = nees(ground, one.belief, arm.values)
+            nis[run, k] = normalised_innovation_squared(update.innovation, update.covariance)
+            errors[run, k] = nees(setup, one.belief, arm.values)
     return Study(nis, errors)
 
 
 @pytest.mark.parametrize("runs", [12, pytest.param(50, marks=pytest.mark.slow)])
 def test_nees_and_nis_of_a_sound_filter(runs: int) -> None:
-    found = study(runs, ground_of(), World.drawn)
+    found = study(runs, begun_setup(), World.drawn)
     low, high = found.band
     print(
         f"\nNEES of {runs} runs of {UPDATES}: mean {found.nees.mean():.2f}, {100 * found.inside:.1f} % of steps in "
@@ -78,18 +78,18 @@ def _drawn(**given) -> Callable[[int], World]:
 
 BIAS = np.array([0.0, 0.001, 0.0])
 LIES = {
-    "a quarter of the noise": (lambda: ground_of(noise_mm=0.15), _drawn(), True, True),
-    "no process noise under drift": (lambda: ground_of(walk=0.0), _drawn(), True, True),
+    "a quarter of the noise": (lambda: begun_setup(noise_mm=0.15), _drawn(), True, True),
+    "no process noise under drift": (lambda: begun_setup(walk=0.0), _drawn(), True, True),
     # Surprise cannot tell: records take the prior's place before their number makes it significant.
-    "half the prior's deviations": (lambda: ground_of(sd_factor=0.5), _drawn(), False, True),
+    "half the prior's deviations": (lambda: begun_setup(sd_factor=0.5), _drawn(), False, True),
     "1 mm bias": (
-        lambda: ground_of(held_base=True),
-        lambda seed: World.drawn(seed, ground_of(held_base=True), bias=BIAS),
+        lambda: begun_setup(held_base=True),
+        lambda seed: World.drawn(seed, begun_setup(held_base=True), bias=BIAS),
         True,
         True,
     ),
     # A shift of the base is a parameter of its own: records cannot tell a biased instrument from it.
-    "1 mm bias, base free": (lambda: ground_of(), _drawn(bias=BIAS), False, True),
+    "1 mm bias, base free": (lambda: begun_setup(), _drawn(bias=BIAS), False, True),
 }
 
 
@@ -98,8 +98,8 @@ LIES = {
     "a quarter of the noise", "no process noise under drift", "half the prior's deviations", "1 mm bias, base free"
 )
 def test_a_planted_inconsistency_is_seen(lie: str) -> None:
-    ground, world, by_nis, by_nees = LIES[lie]
-    found = study(2, ground(), world)
+    setup, world, by_nis, by_nees = LIES[lie]
+    found = study(2, setup(), world)
     print(f"\n{lie}: NIS {found.nis.mean():.2f}, NEES {found.nees.mean():.0f}, {100 * found.inside:.0f} % in the band")
     assert found.sees_by_nees() == by_nees
     if by_nis:
@@ -110,15 +110,15 @@ def test_a_planted_inconsistency_is_seen(lie: str) -> None:
 
 @pytest.mark.parametrize("held", [False, True])
 def test_what_is_sound_is_not_seen_as_inconsistent(held: bool) -> None:
-    ground = ground_of(held_base=held)
-    found = study(2, ground, lambda seed: World.drawn(100 + seed, ground))
+    setup = begun_setup(held_base=held)
+    found = study(2, setup, lambda seed: World.drawn(100 + seed, setup))
     assert not found.sees_by_nees() and not found.sees_by_nis()
 
 
 NOTICED = {
     "a quarter of the noise": ({"noise_mm": 0.15}, {}, {}),
     "no process noise under drift": ({}, {"process_noise": {}}, {}),
-    "1 mm bias": ({"held_base": True}, {"process_noise": walk_of(1, True)}, {"bias": BIAS}),
+    "1 mm bias": ({"held_base": True}, {"process_noise": replayer_of(1, True)}, {"bias": BIAS}),
 }
 
 
@@ -130,7 +130,7 @@ def test_the_recalibrator_notices(lie: str) -> None:
     fresh, after = recalibrator.snapshot(), []
     for seed in range(2):
         recalibrator.restore(fresh)
-        arm = World.drawn(seed, ground_of(held_base=of.get("held_base", False)), **world)
+        arm = World.drawn(seed, begun_setup(held_base=of.get("held_base", False)), **world)
         for sequence in range(1, UPDATES + 1):
             events = recalibrator.take(arm.record(), sequence)
             if told(events, "decision"):

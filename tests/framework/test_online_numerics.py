@@ -15,11 +15,11 @@ from armcal.estimate.online import Gaussian
 from armcal_kalman.extended import ExtendedFilter, ExtendedSettings
 from armcal_online.sources.incoming import Incoming
 from armcal_online.tracking.belief import Belief
-from armcal_online.tracking.chart import Chart
 from armcal_online.tracking.observer import Observer
 from armcal_online.tracking.recalibrator import Recalibrator
 from armcal_online.tracking.settings import DAY
-from armcal_online.tracking.start import Footing
+from armcal_online.tracking.start import FilterSetup
+from armcal_online.tracking.state_space import StateSpace
 from online_arm import (
     AXES,
     JOINTS,
@@ -27,7 +27,7 @@ from online_arm import (
     Filtered,
     World,
     begun,
-    ground_of,
+    begun_setup,
     random_poses,
     settings,
     told,
@@ -38,8 +38,8 @@ from scipy.spatial.transform import Rotation
 POSE = np.array([0.4, 0.3, -0.5, 0.7, -0.6, 0.4])
 
 
-def extended(ground: Footing) -> Filtered:
-    return Filtered.fresh(ExtendedFilter(ExtendedSettings()), ground)
+def extended(setup: FilterSetup) -> Filtered:
+    return Filtered.fresh(ExtendedFilter(ExtendedSettings()), setup)
 
 
 def still(seed: int, count: int, **given) -> tuple[World, list[dict[str, float]]]:
@@ -62,7 +62,7 @@ def still(seed: int, count: int, **given) -> tuple[World, list[dict[str, float]]
 )
 def test_the_covariance_stays_sound_over_many_updates(updates: int, walk: float) -> None:
     _, records = still(3, 400)
-    one, lowest = extended(ground_of(walk=walk)), math.inf
+    one, lowest = extended(begun_setup(walk=walk)), math.inf
     for k in range(updates):
         one.take(records[k % len(records)])
         covariance = one.belief.gaussian.covariance
@@ -76,7 +76,7 @@ def test_the_covariance_stays_sound_over_many_updates(updates: int, walk: float)
 
 def test_a_repeated_pose_tells_nothing_of_what_it_does_not_determine() -> None:
     arm = World.drawn(5, wanders=False)
-    one = extended(ground_of(walk=0.0))
+    one = extended(begun_setup(walk=0.0))
     root = np.linalg.cholesky(one.belief.gaussian.covariance)
     for _ in range(100):
         arm.step()
@@ -223,13 +223,13 @@ def test_a_restored_state_goes_on_as_if_nothing_had_been(estimator: str) -> None
 
 
 def test_both_evaluators_agree() -> None:
-    one, other = ground_of(), ground_of(evaluator="interpreted")
+    one, other = begun_setup(), begun_setup(evaluator="interpreted")
     if one.problem.backend != "compiled":
         pytest.skip("no compiler here: there is one evaluator")
     random, worst = np.random.default_rng(1), 0.0
     for _ in range(60):
         spread = np.sqrt(np.diag(one.belief.gaussian.covariance)) * random.normal(size=STATES)
-        values = one.chart.inside(one.chart.moved(one.belief.origin, 3 * spread))
+        values = one.space.inside(one.space.moved(one.belief.origin, 3 * spread))
         angles = dict(zip(JOINTS, random_poses(random, 1)[0].tolist(), strict=True))
         (reading,) = one.observer.readings(angles | dict.fromkeys(AXES, 0.0), {})
         for a, b in zip(one.observer.look(values, reading), other.observer.look(values, reading), strict=True):
@@ -242,26 +242,26 @@ def test_both_evaluators_agree() -> None:
         for each in filters:
             each.take(channels)
     sd = np.sqrt(np.diag(filters[0].belief.gaussian.covariance))
-    off = one.chart.between(filters[0].belief.values(one.chart), filters[1].belief.values(one.chart))
+    off = one.space.between(filters[0].belief.values(one.space), filters[1].belief.values(one.space))
     apart = float(np.abs(off / sd).max())
     print(f"\ncompiled against interpreted: {worst:.1e} relative; after 300 updates {apart:.1e} standard deviations")
     assert worst < 1e-12
     assert apart < 1e-8
 
 
-def ended(ground: Footing, records: Sequence[dict[str, float]]) -> tuple[np.ndarray, np.ndarray]:
+def ended(setup: FilterSetup, records: Sequence[dict[str, float]]) -> tuple[np.ndarray, np.ndarray]:
     """Mean (about the calibration) and covariance after records, with no process noise."""
-    one = extended(ground)
+    one = extended(setup)
     for channels in records:
         one.take(channels)
-    return ground.chart.between(ground.belief.origin, one.belief.values(ground.chart)), one.belief.gaussian.covariance
+    return setup.space.between(setup.belief.origin, one.belief.values(setup.space)), one.belief.gaussian.covariance
 
 
 def test_the_order_of_records_does_not_matter_where_nothing_wanders() -> None:
     _, records = still(8, 80)
-    mean, covariance = ended(ground_of(walk=0.0), records)
+    mean, covariance = ended(begun_setup(walk=0.0), records)
     for order in (records[::-1], [records[i] for i in np.random.default_rng(0).permutation(len(records))]):
-        other, others = ended(ground_of(walk=0.0), order)
+        other, others = ended(begun_setup(walk=0.0), order)
         off = np.abs(other - mean) / np.sqrt(np.diag(covariance))
         print(f"\nanother order: {off.max():.3f} standard deviations")
         assert off.max() < 0.1
@@ -270,17 +270,17 @@ def test_the_order_of_records_does_not_matter_where_nothing_wanders() -> None:
 
 def test_the_unit_of_length_does_not_matter() -> None:
     """Lengths counted in another unit are coordinates scaled otherwise."""
-    ground = ground_of()
-    blocks = [replace(b, scale=b.scale * (1000.0 if b.unit == "m" else 0.1)) for b in ground.chart.parameters.blocks]
-    chart = Chart(Parameters(tuple(blocks)).with_free([b.name for b in ground.chart.parameters.free]))
-    ratio = ground.chart.scales / chart.scales
-    old = ground.observer
+    setup = begun_setup()
+    blocks = [replace(b, scale=b.scale * (1000.0 if b.unit == "m" else 0.1)) for b in setup.space.parameters.blocks]
+    space = StateSpace(Parameters(tuple(blocks)).with_free([b.name for b in setup.space.parameters.free]))
+    ratio = setup.space.scales / space.scales
+    old = setup.observer
     scaled = replace(
-        ground,
-        chart=chart,
+        setup,
+        space=space,
         observer=Observer(
-            ground.problem,
-            chart,
+            setup.problem,
+            space,
             old.companions,
             type(old.companions)(),
             old._noise,
@@ -288,18 +288,18 @@ def test_the_unit_of_length_does_not_matter() -> None:
             {**old._defaults},
         ),
         belief=Belief(
-            ground.belief.origin,
-            Gaussian(ground.belief.gaussian.mean * ratio, ground.belief.gaussian.covariance * np.outer(ratio, ratio)),
+            setup.belief.origin,
+            Gaussian(setup.belief.gaussian.mean * ratio, setup.belief.gaussian.covariance * np.outer(ratio, ratio)),
         ),
-        fading=replace(ground.fading, rates=ground.fading.rates * ratio**2),
+        process_noise=replace(setup.process_noise, rates=setup.process_noise.rates * ratio**2),
     )
-    one, other, arm = extended(ground), extended(scaled), World.drawn(4)
+    one, other, arm = extended(setup), extended(scaled), World.drawn(4)
     for _ in range(100):
         arm.step()
         channels = arm.measured()
         one.take(channels), other.take(channels)
     sd = np.sqrt(np.diag(one.belief.gaussian.covariance))
-    off = ground.chart.between(one.belief.values(ground.chart), other.belief.values(chart)) / sd
+    off = setup.space.between(one.belief.values(setup.space), other.belief.values(space)) / sd
     assert np.abs(off).max() < 1e-6
     assert np.sqrt(np.diag(other.belief.gaussian.covariance)) / ratio == pytest.approx(sd, rel=1e-6)
 
@@ -317,51 +317,49 @@ def test_where_the_instrument_stands_does_not_matter() -> None:
         channels = {**taken.channels, **dict(zip(AXES, read.tolist(), strict=True))}
         moved.take(replace(taken, channels=channels), sequence)
     sd = np.sqrt(np.diag(plain.state.belief.gaussian.covariance))
-    chart = plain.ground.chart
-    one, other = (r.state.belief.values(r.ground.chart)[r.ground.chart.entries] for r in (plain, moved))
+    space = plain.setup.space
+    one, other = (r.state.belief.values(r.setup.space)[r.setup.space.entries] for r in (plain, moved))
     assert plain.state.counts == moved.state.counts
-    assert np.abs((one - other) / chart.scales / sd).max() < 1e-6
+    assert np.abs((one - other) / space.scales / sd).max() < 1e-6
 
 
 SMALL = 0.004
 """rad/Nm; half a standard deviation of what is known of a compliance."""
 
 
-def batch(ground: Footing, records: Sequence[dict[str, float]]) -> np.ndarray:
+def batch(setup: FilterSetup, records: Sequence[dict[str, float]]) -> np.ndarray:
     """The values that all records and the prior make likeliest within the bounds, by scipy."""
-    prior = np.linalg.cholesky(np.linalg.inv(ground.belief.gaussian.covariance)).T
-    chart, origin, mean = ground.chart, ground.belief.origin, ground.belief.gaussian.mean
-    readings = [ground.observer.readings(each, {})[0] for each in records]
+    prior = np.linalg.cholesky(np.linalg.inv(setup.belief.gaussian.covariance)).T
+    space, origin, mean = setup.space, setup.belief.origin, setup.belief.gaussian.mean
+    readings = [setup.observer.readings(each, {})[0] for each in records]
     weight = np.linalg.inv(np.linalg.cholesky(readings[0].noise))
 
     def residual(place: np.ndarray) -> np.ndarray:
-        values = chart.moved(origin, place)
-        return np.concatenate(
-            [prior @ (place - mean), *(weight @ ground.observer.look(values, r)[0] for r in readings)]
-        )
+        values = space.moved(origin, place)
+        return np.concatenate([prior @ (place - mean), *(weight @ setup.observer.look(values, r)[0] for r in readings)])
 
     def jacobian(place: np.ndarray) -> np.ndarray:
-        values = chart.moved(origin, place)
-        return np.vstack([prior, *(-weight @ ground.observer.look(values, r)[1] for r in readings)])
+        values = space.moved(origin, place)
+        return np.vstack([prior, *(-weight @ setup.observer.look(values, r)[1] for r in readings)])
 
     lower, upper = np.full(STATES, -np.inf), np.full(STATES, np.inf)
-    at, coordinates, low, high = chart.bounds
-    lower[coordinates] = (low - origin[at]) / chart.scales[coordinates]
-    upper[coordinates] = (high - origin[at]) / chart.scales[coordinates]
+    at, coordinates, low, high = space.bounds
+    lower[coordinates] = (low - origin[at]) / space.scales[coordinates]
+    upper[coordinates] = (high - origin[at]) / space.scales[coordinates]
     start = np.clip(np.zeros(STATES), lower + 1e-6, upper - 1e-6)
     found = least_squares(residual, start, jacobian, bounds=(lower, upper), xtol=1e-14, ftol=1e-14, gtol=1e-10)
-    return chart.moved(origin, found.x)
+    return space.moved(origin, found.x)
 
 
-def stiff(ground: Footing, seed: int) -> World:
+def stiff(setup: FilterSetup, seed: int) -> World:
     """An arm that does not bend, whose other parameters are as likely as that leaves them."""
-    arm, chart, belief = World.drawn(seed, ground, wanders=False), ground.chart, ground.belief
-    springs = [chart.names.index(f"arm.spring.k{i}") for i in range(7)]
+    arm, space, belief = World.drawn(seed, setup, wanders=False), setup.space, setup.belief
+    springs = [space.names.index(f"arm.spring.k{i}") for i in range(7)]
     place = np.linalg.cholesky(belief.gaussian.covariance) @ np.random.default_rng(seed).normal(size=STATES)
-    wanted = -SMALL / chart.scales[springs]
+    wanted = -SMALL / space.scales[springs]
     own = belief.gaussian.covariance[np.ix_(springs, springs)]
     place += belief.gaussian.covariance[:, springs] @ np.linalg.solve(own, wanted - place[springs])
-    arm.values = chart.inside(chart.moved(belief.origin, place))
+    arm.values = space.inside(space.moved(belief.origin, place))
     return arm
 
 
@@ -369,21 +367,21 @@ def stiff(ground: Footing, seed: int) -> World:
 def test_the_filter_ends_where_a_batch_of_all_records_does(bounded: bool) -> None:
     compliance = {"compliance": SMALL} if bounded else {}
     one = begun(settings(process_noise={}, gating="off"), **compliance)
-    arm = stiff(one.ground, 11) if bounded else World.drawn(9, one.ground, wanders=False)
-    springs, records = [one.ground.chart.parameters.entries_of(f"arm.spring.k{i}").start for i in range(7)], []
+    arm = stiff(one.setup, 11) if bounded else World.drawn(9, one.setup, wanders=False)
+    springs, records = [one.setup.space.parameters.entries_of(f"arm.spring.k{i}").start for i in range(7)], []
     for sequence in range(1, 121):
         taken = arm.record()
         records.append(taken.channels)
         one.take(taken, sequence)
         assert (one.values[springs] >= 0).all()
-    chart, covariance = one.ground.chart, one.state.belief.gaussian.covariance
-    off = chart.between(batch(one.ground, records), one.values) / np.sqrt(np.diag(covariance))
-    held = int(np.sum(chart.inside(one.state.belief.values(chart)) != one.state.belief.values(chart)))
+    space, covariance = one.setup.space, one.state.belief.gaussian.covariance
+    off = space.between(batch(one.setup, records), one.values) / np.sqrt(np.diag(covariance))
+    held = int(np.sum(space.inside(one.state.belief.values(space)) != one.state.belief.values(space)))
     print(f"\n120 records, {held} compliances beyond their bounds: {np.abs(off).max():.3f} sd from the batch at most")
     assert bool(held) == bounded
     assert np.abs(off).max() < 0.1
     # The covariance is that of the belief without bounds: the information of prior and records.
-    slopes = [one.ground.observer.look(one.values, one.ground.observer.readings(each, {})[0])[1] for each in records]
-    whole = np.linalg.inv(one.ground.belief.gaussian.covariance) + sum(s.T @ s for s in slopes) / 0.0003**2
+    slopes = [one.setup.observer.look(one.values, one.setup.observer.readings(each, {})[0])[1] for each in records]
+    whole = np.linalg.inv(one.setup.belief.gaussian.covariance) + sum(s.T @ s for s in slopes) / 0.0003**2
     expected = np.sqrt(np.diag(np.linalg.inv(whole)))
     assert np.sqrt(np.diag(covariance)) == pytest.approx(expected, rel=0.05)

@@ -214,7 +214,7 @@ def from_nominal(batch: Calibration, experiment: Experiment, estimator: dict | N
     """A session that knows nothing but nominal values and priors, five times the ordinary size where none is stated."""
     settings = RecalibrateSettings(gating="off", model_error="white", estimator=estimator or {"type": "extended"})
     session = Recalibrator.begin(batch, settings)
-    free = session.ground.chart.parameters.free
+    free = session.setup.space.parameters.free
     stated = [(b, experiment.parameters[b.name].prior_sd or 5 * b.scale) for b in free]
     deviations = np.array([sd / b.scale for b, sd in stated for _ in range(b.domain.dof)])
     start = Gaussian(np.zeros(len(deviations)), np.diag(deviations**2))
@@ -224,8 +224,8 @@ def from_nominal(batch: Calibration, experiment: Experiment, estimator: dict | N
 
 
 def mean_error(session: Recalibrator, dataset: Dataset, values: np.ndarray) -> float:
-    observer, found = session.ground.observer, []
+    observer, found = session.setup.observer, []
     for i in range(len(dataset)):
         readings = observer.readings({name: float(column[i]) for name, column in dataset.channels.items()}, {})
-        found.append(np.linalg.norm(observer.look(session.ground.chart.inside(values), readings[0])[0]))
+        found.append(np.linalg.norm(observer.look(session.setup.space.inside(values), readings[0])[0]))
     return 1000 * float(np.mean(found))

@@ -234,20 +234,20 @@ class TestUncheckedWiring:
 class TestFirstAndLastMotion:
     def test_jump_and_fall_are_foretold_as_the_simulated_arm_then_bears_them(self, either: OwnArm) -> None:
         plan = either.plan((0,) * len(either.kind["joints"]))
-        foretold = {each["kind"]: each for each in dangers(either, plan)["hazards"]}
+        forecast = {each["kind"]: each for each in dangers(either, plan)["hazards"]}
         done = either.armcal("rehearse", "--plan", plan, "--out", either.out)
         said = said_by(done)
         assert done.exit_code == 0, done.output
         fell = re.search(r"the deepest fall when let go: (\w+) (-?[\d.]+) deg", said)
         jumped = re.search(r"the largest jump at a first pulse: (\w+) (-?[\d.]+) deg", said)
         assert fell and jumped
-        assert fell[1] == foretold["drop"]["joint"]
-        assert abs(float(fell[2])) == pytest.approx(foretold["drop"]["amount_deg"], abs=2)
-        assert abs(float(jumped[2])) <= foretold["first_pulse"]["amount_deg"]
+        assert fell[1] == forecast["drop"]["joint"]
+        assert abs(float(fell[2])) == pytest.approx(forecast["drop"]["amount_deg"], abs=2)
+        assert abs(float(jumped[2])) <= forecast["first_pulse"]["amount_deg"]
         for kind in ("drop", "first_pulse"):
-            amount = f"{foretold[kind]['amount_deg']:.1f} deg"
-            assert foretold[kind]["joint"] in foretold[kind]["what"] and amount in foretold[kind]["what"]
-            assert " ".join(foretold[kind]["what"].split()) in said
+            amount = f"{forecast[kind]['amount_deg']:.1f} deg"
+            assert forecast[kind]["joint"] in forecast[kind]["what"] and amount in forecast[kind]["what"]
+            assert " ".join(forecast[kind]["what"].split()) in said
 
     def test_servos_that_hold_are_not_let_go_and_so_nothing_falls(self, tmp_path: Path) -> None:
         arm = OwnArm(tmp_path, POST)

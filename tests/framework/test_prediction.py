@@ -74,10 +74,10 @@ def test_covariances_are_those_of_dense_gaussian_conditioning(drifting) -> None:
     noise, s = 5e-4, found.noise_scale
     j, a = slopes[rows["t"]] / noise, drift[rows["t"]] / noise
     # The estimate's own covariance, and the drift given the values; then both together at the new records.
-    told_of = np.linalg.inv(np.eye(a.shape[1]) + a.T @ a)
-    h = slopes[rows["h"]] - drift[rows["h"]] @ told_of @ a.T @ j
+    message_of = np.linalg.inv(np.eye(a.shape[1]) + a.T @ a)
+    h = slopes[rows["h"]] - drift[rows["h"]] @ message_of @ a.T @ j
     g = drift[rows["h"]]
-    whole = h @ found.covariance @ h.T + s**2 * (g @ told_of @ g.T + noise**2 * np.eye(len(g)))
+    whole = h @ found.covariance @ h.T + s**2 * (g @ message_of @ g.T + noise**2 * np.eye(len(g)))
     (spread,) = by.in_recording(problem.subset(records, held))
     for i in range(len(held)):
         block = whole[3 * i : 3 * i + 3, 3 * i : 3 * i + 3]
@@ -299,9 +299,9 @@ def predicted(folder: Path, *options: str, calibration: Path | None = None, pose
     """``armcal predict``: the rows by id."""
     out = folder / "predicted.csv"
     out.unlink(missing_ok=True)
-    told_of = calibration or folder / "run" / "calibration.yaml"
+    message_of = calibration or folder / "run" / "calibration.yaml"
     data = str(poses or folder / "poses.csv")
-    result = armcal("predict", str(told_of), "--poses", data, "--out", str(out), *options)
+    result = armcal("predict", str(message_of), "--poses", data, "--out", str(out), *options)
     return result, {row["pose_id"]: row for row in csv.DictReader(out.open())} if out.exists() else {}
 
 
@@ -450,11 +450,11 @@ def test_a_dataset_without_places_is_refused_in_the_same_recording(recording: Pa
 
 
 def test_a_run_tells_what_its_intervals_hold(recording: Path) -> None:
-    told_of = json.loads((recording / "run" / "metrics.json").read_text())["prediction_intervals"]
-    assert set(told_of) == {"same_recording", "new_recording"}
-    same = told_of["same_recording"]
+    message_of = json.loads((recording / "run" / "metrics.json").read_text())["prediction_intervals"]
+    assert set(message_of) == {"same_recording", "new_recording"}
+    same = message_of["same_recording"]
     assert same["holdout"]["coordinates"] == 114 and same["cross_validated"]["records"] == 114
-    assert same["radius_95_mm"] < 0.8 * told_of["new_recording"]["radius_95_mm"]
+    assert same["radius_95_mm"] < 0.8 * message_of["new_recording"]["radius_95_mm"]
     page = (recording / "run" / "report.html").read_text()
     assert "What a +- is worth" in page and "Predicted and found errors" in page
     assert "90 % prediction intervals" in (recording / "run" / "log.txt").read_text()

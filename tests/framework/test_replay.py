@@ -24,10 +24,10 @@ from armcal.plugins import discover
 from armcal.problem.compiler import find_compiler
 from armcal.run.experiment import Experiment
 from armcal_online.commands.recalibrate import setup_of
+from armcal_online.replaying.journal_replayer import NoVerifier
 from armcal_online.replaying.replay import kept, replay
+from armcal_online.replaying.replay_verifier import Comparer, DiffersError
 from armcal_online.replaying.state_distance import BOUND, distance
-from armcal_online.replaying.walk import NoWitness
-from armcal_online.replaying.witness import Comparer, DiffersError
 from armcal_online.running.loop import Pace
 from armcal_online.running.session import Open, opened
 from armcal_online.sources.incoming import Incoming
@@ -207,7 +207,7 @@ def test_a_state_or_a_decision_that_differs_is_told(whole: Path, calibration: Pa
     moved = replace(belief, gaussian=replace(belief.gaussian, mean=mean))
     nudged.state = State(moved, moved)
     done = replay(journal, nudged, Comparer(header["evaluator"]), None, no_progress)
-    assert done.difference is not None and done.walk.entries < 10
+    assert done.difference is not None and done.replayer.entries < 10
     with pytest.raises(DiffersError, match="noted was"):
         Comparer({}).told(7, [{"event": "decision", "kind": "drift", "sequence": 7, "sentence": "A drift."}], [])
     with pytest.raises(DiffersError, match="noted was nothing"):
@@ -232,23 +232,23 @@ def test_what_cannot_be_replayed_ends_with_2(whole: Path, tmp_path: Path) -> Non
 
 def test_distance_is_measured_in_standard_deviations(calibration: Path) -> None:
     session = Recalibrator.begin(Calibration.load(calibration), SETTINGS)
-    state, chart = session.state, session.ground.chart
+    state, space = session.state, session.setup.space
     belief = state.belief
     sd = np.sqrt(np.diag(belief.gaussian.covariance))
     mean = belief.gaussian.mean.copy()
     mean[3] += 0.25 * sd[3]
     moved = replace(belief, gaussian=replace(belief.gaussian, mean=mean))
-    assert distance(chart, state, replace(state, belief=moved)).values == pytest.approx(0.25)
-    values = moved.about(chart, moved.values(chart))
-    assert distance(chart, state, replace(state, belief=values)).values == pytest.approx(0.25)
+    assert distance(space, state, replace(state, belief=moved)).values == pytest.approx(0.25)
+    values = moved.about(space, moved.values(space))
+    assert distance(space, state, replace(state, belief=values)).values == pytest.approx(0.25)
     wider = replace(belief, gaussian=replace(belief.gaussian, covariance=1.5 * belief.gaussian.covariance))
-    assert distance(chart, state, replace(state, belief=wider)).covariance == pytest.approx(0.5)
-    assert distance(chart, state, state).is_small
+    assert distance(space, state, replace(state, belief=wider)).covariance == pytest.approx(0.5)
+    assert distance(space, state, state).is_small
 
 
-def replayed(folder: Path, witness: Any = None) -> tuple[Any, FakeRecalibrator]:
+def replayed(folder: Path, verifier: Any = None) -> tuple[Any, FakeRecalibrator]:
     fake: Any = FakeRecalibrator()
-    done = replay(kept(folder / "journal"), fake, witness or Comparer(fake.evaluator), None, no_progress)
+    done = replay(kept(folder / "journal"), fake, verifier or Comparer(fake.evaluator), None, no_progress)
     return done, fake
 
 
@@ -278,16 +278,16 @@ def test_a_rollback_to_what_is_no_longer_kept_goes_on_at_the_checkpoint_after_it
         path.unlink()
     done, fake = replayed(folder)
     assert done.difference is None and fake.digest() == end
-    assert [event["to"] for event in done.walk.decisions if event["event"] == "decision" and "to" in event] == [
+    assert [event["to"] for event in done.replayer.decisions if event["event"] == "decision" and "to" in event] == [
         sequence_of_first(done)
     ]
     with pytest.raises(DataError, match="no longer holds"):
-        replayed(folder, NoWitness())
+        replayed(folder, NoVerifier())
 
 
 def sequence_of_first(done: Any) -> int:
     """Where the rollback went."""
-    return int(next(event["to"] for event in done.walk.decisions if "to" in event))
+    return int(next(event["to"] for event in done.replayer.decisions if "to" in event))
 
 
 def test_a_journal_without_its_calibration_is_refused(whole: Path) -> None:

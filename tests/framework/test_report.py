@@ -92,7 +92,7 @@ def estimate_of(parameters: Parameters, freedom: int = 700, undetermined: int = 
         degrees_of_freedom=freedom,
         identifiability=known,
         determined=determined,
-        told_by_data=determined,
+        identified_by_data=determined,
         verdict=told,
     )
 

@@ -7,10 +7,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from armcal.base.dataset import Dataset
-from armcal.estimate.scatter import Scatter, scatter_of
+from armcal.estimate.residual_spread import ResidualSpread, residual_spread
 
 
-def told(residual: np.ndarray, places: np.ndarray | None = None, weight: np.ndarray | None = None) -> Scatter:
+def told(residual: np.ndarray, places: np.ndarray | None = None, weight: np.ndarray | None = None) -> ResidualSpread:
     """The scatter of one measurement's residuals (3 x N), none of their freedom used up."""
     count = residual.shape[1]
     factor = SimpleNamespace(name="tracker", noise=(1.0, 1.0, 1.0))
@@ -24,7 +24,7 @@ def told(residual: np.ndarray, places: np.ndarray | None = None, weight: np.ndar
     records = [SimpleNamespace(count=count, weight=weights, measured=np.ones(count, dtype=bool), correlation=None)]
     channels = {} if places is None else {"sequence": places}
     dataset = Dataset(tuple(str(i) for i in range(count)), channels)
-    return scatter_of(problem, estimate, records, dataset)["tracker"]
+    return residual_spread(problem, estimate, records, dataset)["tracker"]
 
 
 def made(count: int, share: float, over: float, seed: int = 0) -> np.ndarray:

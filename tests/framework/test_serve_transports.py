@@ -59,7 +59,7 @@ class House:
         for _ in range(times):
             self.poller.step(0.001)
             if self.answering:
-                self.dispatcher.hand_out(self.workers)  # type: ignore[arg-type]
+                self.dispatcher.dispatch(self.workers)  # type: ignore[arg-type]
                 for worker in self.workers:
                     worker.answer(self.size)
             for transport in self.transports:
@@ -133,7 +133,7 @@ def test_a_later_answer_waits_for_an_earlier_one(house: House, tmp_path: Path) -
     with connected(tmp_path) as client:
         client.sendall(b"one\ntwo\n")
         house.turn(5)
-        house.dispatcher.hand_out(house.workers)  # type: ignore[arg-type]
+        house.dispatcher.dispatch(house.workers)  # type: ignore[arg-type]
         house.workers[1].answer()
         house.turn(5)
         with pytest.raises(BlockingIOError):
@@ -315,10 +315,10 @@ def test_a_request_that_costs_two_workers_is_given_up(house: House, tmp_path: Pa
         client.sendall(b'{"id": 3}\n{"id": 4}\n')
         house.turn(3)
         for _ in range(2):
-            house.dispatcher.hand_out(house.workers)  # type: ignore[arg-type]
+            house.dispatcher.dispatch(house.workers)  # type: ignore[arg-type]
             assert worker.given is not None and worker.lines[-1] == b'{"id": 3}'
             given, worker.given = worker.given, None
-            house.dispatcher.take_back(given, why)
+            house.dispatcher.requeue(given, why)
         house.answering = True
         first, second = heard(house, client, 2)
     assert first["id"] == 3 and not first["ok"] and "ended" in first["error"]

@@ -21,7 +21,7 @@ from armcal_bench.servo.outputs import improved, write_servo_file
 from armcal_bench.servo.record import NAME, Record
 from armcal_bench.servo.session import Conversation, evaluated, measure
 from armcal_bench.servo.setup import Setup
-from armcal_bench.servo.warmth import Warmth
+from armcal_bench.servo.thermal_state import ThermalState
 
 from tests.bench_fakes import FakeClock
 from tests.framework.test_acquire_faults import faults
@@ -255,7 +255,7 @@ class TestTracker:
     def test_warmth_outlasts_the_program(self, run: ServoRun) -> None:
         heat = HeatModel(np.array([1.0]), np.array([[20.0, 300.0]]), np.array([[0.3, 0.7]]), np.array([0.6]))
         clock = FakeClock()
-        warm = Warmth((heat, lambda pose: 2.0 * np.abs(pose)), ("q1",), {"q1": 0.0}, clock)
+        warm = ThermalState((heat, lambda pose: 2.0 * np.abs(pose)), ("q1",), {"q1": 0.0}, clock)
         warm.go_on({"q1": [0.9, 0.5]}, {"q1": 0.0}, 0.0)
         assert warm.must_rest
         warm.go_on({"q1": [0.9, 0.5]}, {"q1": 0.0}, 3600.0)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import oracle
 import pytest
-from armcal.diagnose.noise_findings import components_told
+from armcal.diagnose.noise_findings import component_findings
 from armcal.errors import ProblemError
 from armcal.estimate.likelihood import Term, _evaluate, maximise
 from armcal.estimate.variance import apply_components, estimate_components
@@ -197,7 +197,7 @@ def test_is_it_the_tracker_or_the_joints(lrm):
         found = weighed_fit(*posed(lrm, q, points)).components
         assert found.share(kind) > 0.75
         assert sum(c.share for c in found.components) == pytest.approx(1)
-        told = components_told(found)[0].text
+        told = component_findings(found)[0].text
         assert told.startswith(f"The scatter is mostly the {kind}s'")
 
 
@@ -237,7 +237,7 @@ def test_one_pose_again_and_again_tells_no_joint_from_another(lrm):
     problem, records, start = posed(lrm, q, points, ("base_x", "base_z"))
     found = estimate_components(problem, start, records)
     assert found.inseparable
-    assert any("hardly tell apart" in finding.text for finding in components_told(found))
+    assert any("hardly tell apart" in finding.text for finding in component_findings(found))
 
 
 def test_joints_through_the_tip_are_unseen(lrm):
@@ -249,7 +249,7 @@ def test_joints_through_the_tip_are_unseen(lrm):
     problem = lrm.problem(experiment, dataset, "auto", parameters)
     found = estimate_components(problem, parameters.nominal(), problem.records(dataset))
     assert found.unseen == ("arm.q5", "arm.q6")
-    assert "arm.q6" in components_told(found)[-1].text
+    assert "arm.q6" in component_findings(found)[-1].text
 
 
 def test_outliers_do_not_pass_for_noise(lrm):

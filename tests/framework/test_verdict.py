@@ -101,7 +101,7 @@ def test_missed_records_are_listed_where_the_limit_says(tmp_path: Path) -> None:
 
     data = disturbed(tmp_path, spoil)
     run = verdict(tmp_path / "run", "validation.holdout=0", "validation.folds=3", "validation.limit_mm=6", data=data)
-    missed = run["structure"]["misses"]
+    missed = run["structure"]["large_errors"]
     assert {m["record_id"] for m in missed["explained"]} == {"8", "91"} and missed["beyond"] == 2
     assert missed["judged"] == 200 and missed["configured"]
     assert all(m["error_mm"] > 15 and m["advice"] for m in missed["explained"])
@@ -112,7 +112,7 @@ def test_missed_records_are_listed_where_the_limit_says(tmp_path: Path) -> None:
     relaxed = verdict(
         tmp_path / "relaxed", "validation.holdout=0", "validation.folds=2", "validation.limit_mm=60", data=data
     )
-    assert relaxed["structure"]["misses"]["beyond"] == 0
+    assert relaxed["structure"]["large_errors"]["beyond"] == 0
 
 
 @pytest.mark.parametrize("limit", ["limit_mm=0", "limit_mm=-3", "limit=4"])

@@ -21,7 +21,7 @@ import yaml
 from armcal.calibration.calibration import Calibration
 from armcal.cli.main import cli
 from armcal.io.event_file import EventFile
-from armcal_online.watch.events import record_of, told_of
+from armcal_online.watch.events import message_of, record_of
 from armcal_online.watch.feed import Feed
 from armcal_online.watch.history import OLDER_ACCEPTED, OLDER_OTHERS, RECENT_RECORDS, History
 from armcal_online.watch.lenient import LONGEST_TEXT, number, parsed, text
@@ -262,7 +262,7 @@ def test_numbers_that_json_cannot_hold_and_texts_that_act_on_terminals_are_made_
     assert text("\x1b[2Jred\x07\u202egnp") == "\ufffd[2Jred\ufffd\ufffdgnp"
     assert text("two\nlines") == "two lines"
     assert len(text("x" * 10_000) or "") == LONGEST_TEXT
-    told = told_of({"event": "decision", "sentence": "\x1b]0;title\x07"})
+    told = message_of({"event": "decision", "sentence": "\x1b]0;title\x07"})
     assert told is not None and "\x1b" not in str(line(told))
     record = record_of({"event": "record", "verdict": "accepted", "id": "[bold red]x[/]", "nis": float("inf")})
     assert record is not None and "nis" not in record

@@ -76,11 +76,11 @@ def test_bits_and_deviations_are_those_of_the_covariance_with_the_record(calibra
     assert [row["bits"] for row in rows] == sorted((row["bits"] for row in rows), reverse=True)
     for row in rows[:4] + rows[-4:]:
         slope = jacobians[ids.index(row["id"])]
-        foretold = slope @ covariance @ slope.T
-        after = covariance - covariance @ slope.T @ np.linalg.solve(foretold + noise, slope @ covariance)
+        forecast = slope @ covariance @ slope.T
+        after = covariance - covariance @ slope.T @ np.linalg.solve(forecast + noise, slope @ covariance)
         bits = 0.5 * (np.linalg.slogdet(covariance)[1] - np.linalg.slogdet(after)[1]) / math.log(2)
         assert row["bits"] == pytest.approx(bits, rel=1e-3)
-        assert row["prediction_sd_mm"] == pytest.approx(1000 * math.sqrt(np.linalg.eigvalsh(foretold)[-1]), rel=1e-3)
+        assert row["prediction_sd_mm"] == pytest.approx(1000 * math.sqrt(np.linalg.eigvalsh(forecast)[-1]), rel=1e-3)
         left = dict(zip(known.entries, np.sqrt(np.diag(after) / np.diag(covariance)), strict=True))
         assert sorted(row["tells_most"].values()) == pytest.approx(sorted(left.values())[:3], rel=1e-4)
         for name, ratio in row["tells_most"].items():

@@ -120,7 +120,7 @@ def test_shared_sockets_tell_where_the_arms_stand_to_each_other(in_sockets):
     assert np.isnan(data.channels["left.q1"]).sum() == np.isnan(data.channels["right.q1"]).sum() == len(data) / 2
     assert max(apart(by_hand(in_sockets, data), true)) < 1e-7, "the simulated postures are not in the sockets"
     found = in_sockets.fit(data)
-    assert found.verdict.converged and all(found.told_by_data)
+    assert found.verdict.converged and all(found.identified_by_data)
     assert found.identifiability.rank == 6 + 3 * len(SOCKETS)
     # Priors of a millimetre pull a little, against joints that are believed to a tenth of a milliradian.
     assert max(apart(pose_of(found), true)) < 2e-5
@@ -162,7 +162,7 @@ def test_records_that_only_one_arm_takes_part_in_run_from_a_file(in_sockets, tmp
     assert all(abs(kept[n]["value"] - true[n]) < 4.5 * kept[n]["sd"] for n in kept)
     assert set(PLACEMENT) <= {n for n, p in kept.items() if p["determined"]}
     assert told["noise"]["scale"] == pytest.approx(1, abs=0.2)
-    assert not told["structure"]["leftover"]["structures"]
+    assert not told["structure"]["residual_structure"]["structures"]
     if settings:
         held, trained = (told["error_mm"]["calibrated"][who]["mean"] for who in ("cross_validated", "train"))
         assert held == pytest.approx(trained, rel=0.5)
@@ -179,7 +179,7 @@ def test_sockets_of_their_own_tell_nothing_of_the_placement(in_sockets):
     alone = Case(path)
     alone.__dict__["postures"] = in_sockets.postures
     found = alone.fit(in_sockets.records())
-    told = dict(zip(found.names, found.told_by_data, strict=True))
+    told = dict(zip(found.names, found.identified_by_data, strict=True))
     assert not any(told[name] for name in PLACEMENT)
     assert all(told[name] for name in told if name.startswith("touches."))
 
@@ -312,7 +312,7 @@ def test_the_placement_trades_with_the_first_joint_of_each_arm_and_both_are_name
     turning = next(c for c in combinations if c & FIRST == {"right.poe.offset1"})
     assert turning == {"right.poe.offset1", "right.placement_rotation<rz>"}
     found = chained.fit(data)
-    told = dict(zip(found.names, found.told_by_data, strict=True))
+    told = dict(zip(found.names, found.identified_by_data, strict=True))
     assert {n for n in told if "offset" in n and not told[n]} == FIRST
 
 

@@ -211,12 +211,12 @@ def test_temperature_goes_by_day_and_night_and_acts() -> None:
     still, made = mission(days=2), mission(days=2, thermal=thermal)
     temperature = made.truth.temperature_at(np.array([2, 14, 20]) * 3600.0)
     assert np.allclose(temperature, [-20, 40, 10])
-    warmth = made.records.column("temperature")
-    assert np.allclose(warmth, made.truth.temperature_at(made.times))
+    thermal_state = made.records.column("temperature")
+    assert np.allclose(thermal_state, made.truth.temperature_at(made.times))
     values = still.truth.values_at(np.zeros(1))[0]
-    for i in (0, len(warmth) // 2, len(warmth) - 1):
+    for i in (0, len(thermal_state) // 2, len(thermal_state) - 1):
         moved = values.copy()
-        moved[made.truth.names.index("arm.mdh.theta1")] += np.deg2rad(0.01) * (warmth[i] - 20)
+        moved[made.truth.names.index("arm.mdh.theta1")] += np.deg2rad(0.01) * (thermal_state[i] - 20)
         alone = replace(made, records=made.records.subset([i]))
         assert np.abs(tips(made)[i] - tips_at(alone, moved)[0]).max() < 1e-10
 

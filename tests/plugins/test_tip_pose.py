@@ -12,7 +12,7 @@ from armcal.base.parameters import Parameters
 from armcal.estimate.simulation import SimulationRequest, measured_without_noise
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import calibrate
-from armcal.run.plan_ground import ground_of
+from armcal.run.plan_context import plan_context
 from armcal.run.plan_poses import JointSpace
 from armcal.run.plan_settings import PlanSettings
 from armcal_tracker.pose import TipPose, TipPoseSettings
@@ -253,8 +253,8 @@ def test_a_plan_counts_what_measured_orientations_would_tell(tmp_path):
     experiment = Experiment.load(tmp_path / "arm.yaml", ("parameters.free=['arm.mdh.theta[2-4]']",))
     q = np.random.default_rng(5).uniform(-1.5, 1.5, (20, 5))
     poses = Dataset(tuple(map(str, range(20))), {f"arm.q{i + 1}": q[:, i] for i in range(5)})
-    ground = ground_of(experiment, PlanSettings(), JointSpace.of(experiment), experiment.parameters, None)
-    step, found = 1e-6, ground.rows(poses)[0]
+    setup = plan_context(experiment, PlanSettings(), JointSpace.of(experiment), experiment.parameters, None)
+    step, found = 1e-6, setup.rows(poses)[0]
     scales = experiment.parameters.scales()
     for n, angles in enumerate(q):
         turn, place = turned_and_placed(angles, np.zeros(5), Rotation.identity())

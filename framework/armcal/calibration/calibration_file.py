@@ -200,8 +200,8 @@ def _uncertainty(estimate: Estimate, index: int) -> dict[str, Any]:
         "sd": _finite(estimate.deviations[index]),
         "lower": _finite(interval.lower),
         "upper": _finite(interval.upper),
-        "determined": estimate.told_by_data[index],
-        "held_by_prior": estimate.determined[index] and not estimate.told_by_data[index],
+        "determined": estimate.identified_by_data[index],
+        "held_by_prior": estimate.determined[index] and not estimate.identified_by_data[index],
     }
 
 

@@ -21,7 +21,7 @@ from armcal.base.settings import Settings
 from armcal.config.system import System
 from armcal.diagnose.coverage import Recording, Stretch, level_name
 from armcal.errors import DataError, Location
-from armcal.estimate.prediction import LEVELS, STATED, Predictor, Spread, ToldDrift, is_position
+from armcal.estimate.prediction import LEVELS, STATED, KnownDrift, Predictor, Spread, is_position
 from armcal.estimate.validation import Indices
 from armcal.estimate.variance import Axes, Component, VarianceComponents, apply_components
 from armcal.problem.drift import Chain, chain, with_drift
@@ -178,7 +178,7 @@ class Uncertainty:
         return _Part(places, recording, still, spreads, reading_slopes(problem, self.values, records))
 
     def _within(
-        self, problem: Problem, commands: Dataset, places: Indices, drift: ToldDrift, along: Chain | None
+        self, problem: Problem, commands: Dataset, places: Indices, drift: KnownDrift, along: Chain | None
     ) -> _Part:
         """In the recording, which tells of a drift."""
         records = self._drifted(problem, commands, along)
@@ -187,16 +187,16 @@ class Uncertainty:
         off = tuple(m[:, : len(places), 0] for m in moved)
         return _Part(places, "same", off, spreads, reading_slopes(problem, self.values, records))
 
-    def _predictor(self, problem: Problem, drift: ToldDrift | None) -> Predictor:
+    def _predictor(self, problem: Problem, drift: KnownDrift | None) -> Predictor:
         return Predictor(problem, self.values, self._covariance, self.noise_scale, self.freedom, drift)
 
-    def _told(self, told: RecordingRecord, dataset: Dataset, along: Chain | None) -> ToldDrift:
+    def _told(self, told: RecordingRecord, dataset: Dataset, along: Chain | None) -> KnownDrift:
         """The drift of the recording, told by its records, along a chain of places."""
         problem = self._problem(dataset)
         records = self._drifted(problem, dataset, along)
         if told.weights:
             records = problem.weighted(records, [np.array(row) for row in told.weights])
-        found = ToldDrift.by(problem, self.values, records)
+        found = KnownDrift.by(problem, self.values, records)
         if found is None:
             raise TypeError("a recording is kept only where something drifts")
         return found

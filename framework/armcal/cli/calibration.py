@@ -9,7 +9,7 @@ import click
 
 from armcal.calibration.acceptance import accept as accepted
 from armcal.calibration.calibration_file import sealed
-from armcal.cli.common import Voice, speaking
+from armcal.cli.common import Console, speaking
 from armcal.io.file_set import write_over
 from armcal.plugins import discover
 
@@ -22,20 +22,20 @@ def calibration() -> None:
 @calibration.command()
 @click.argument("path", metavar="FILE", type=click.Path(path_type=Path))
 @speaking
-def accept(voice: Voice, path: Path) -> None:
+def accept(console: Console, path: Path) -> None:
     """Take FILE as it is, after it was edited by hand or is to be used with other versions of its plugins.
 
     All but its hash is checked again. The acceptance is noted in FILE, and every command that uses it says so.
     """
     registry = discover()
-    voice.plugin_faults(registry)
+    console.plugin_faults(registry)
     found = accepted(path, datetime.now(UTC).date().isoformat(), registry)
     if found.was_needed:
         write_over({path.resolve(): sealed(found.calibration.record.to_config()).encode()})
     moved = None if found.moved_m is None else found.moved_m * 1000
-    voice.result({"file": str(path), "edited": found.was_edited, "moved_mm": moved})
+    console.result({"file": str(path), "edited": found.was_edited, "moved_mm": moved})
     moved_text = (
         "it keeps no check poses" if moved is None else f"tools at its check poses moved by up to {moved:.3f} mm"
     )
     done = "accepted" if found.was_needed else "nothing to accept, it is as armcal wrote it"
-    voice.out.print(f"{done}: {path} ({moved_text})", markup=False, soft_wrap=True)
+    console.out.print(f"{done}: {path} ({moved_text})", markup=False, soft_wrap=True)

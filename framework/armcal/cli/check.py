@@ -11,7 +11,7 @@ import click
 import numpy as np
 from rich.table import Table
 
-from armcal.cli.common import Voice, overrides, speaking
+from armcal.cli.common import Console, overrides, speaking
 from armcal.cli.outlet import say
 from armcal.errors import ProblemError
 from armcal.estimate.estimator import require_solvable
@@ -28,10 +28,10 @@ from armcal.run.pipeline import Prepared, Stopwatch, assemble
 @click.option("--data", type=click.Path(path_type=Path), help="A dataset to read instead of the configured one.")
 @overrides
 @speaking
-def check(voice: Voice, config: Path, data: Path | None, overrides: tuple[str, ...]) -> None:
+def check(console: Console, config: Path, data: Path | None, overrides: tuple[str, ...]) -> None:
     """Check CONFIG and its data without solving: counts, units, rank, excitation."""
     registry = discover()
-    voice.plugin_faults(registry)
+    console.plugin_faults(registry)
     experiment = Experiment.load(config, overrides, data, registry)
     ready = assemble(experiment, Stopwatch())
     start = ready.problem.parameters.nominal()
@@ -44,16 +44,16 @@ def check(voice: Voice, config: Path, data: Path | None, overrides: tuple[str, .
     gravity = [f"{finding.text} {finding.action}" for finding in gravity_findings(experiment.system, ready.dataset)]
     ready = replace(ready, warnings=(*ready.warnings, *gravity))
     for text in ready.warnings:
-        voice.warn(text)
+        console.warn(text)
     content = _content(experiment, ready, known)
     if refused:
         content["error"] = {"message": str(refused), "exit_code": refused.exit_code}
-    voice.result(content)
-    _show(voice, experiment, content)
+    console.result(content)
+    _show(console, experiment, content)
     if refused:
         say(f"armcal: {refused}", err=True)
         sys.exit(refused.exit_code)
-    voice.out.print("Ready to run.", style="green")
+    console.out.print("Ready to run.", style="green")
 
 
 def _content(experiment: Experiment, ready: Prepared, known: Identifiability) -> dict[str, Any]:
@@ -90,8 +90,8 @@ def _excitation(ready: Prepared, channel: str) -> dict[str, float | int]:
     return {"min": float(values.min()), "max": float(values.max()), "levels": len(np.unique(values))}
 
 
-def _show(voice: Voice, experiment: Experiment, content: dict[str, Any]) -> None:
-    out, records, parameters = voice.out, content["records"], content["parameters"]
+def _show(console: Console, experiment: Experiment, content: dict[str, Any]) -> None:
+    out, records, parameters = console.out, content["records"], content["parameters"]
     out.print(
         f"{experiment.name}: {records['used']} records ({records['train']} train, {records['holdout']} held out, "
         f"{len(records['set_aside'])} set aside), {content['equations']} equations for "
@@ -112,6 +112,6 @@ def _show(voice: Voice, experiment: Experiment, content: dict[str, Any]) -> None
     )
     if parameters["weakest"]:
         out.print(f"least determined: {parameters['weakest']}.", markup=False)
-    if voice.verbose:
+    if console.verbose:
         for name in parameters["all"]:
             out.print(f"  {'free ' if name in parameters['free'] else 'fixed'} {name}", markup=False)

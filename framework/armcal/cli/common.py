@@ -26,7 +26,7 @@ _SAME_POINT_M = 1e-5
 
 
 @dataclass(frozen=True)
-class Voice:
+class Console:
     """How a command speaks: results to standard output, everything else to standard error."""
 
     json: bool
@@ -101,16 +101,16 @@ class Voice:
 
 
 def speaking(command: F) -> F:
-    """The options --json, -q and -v, handed on as ``voice``."""
+    """The options --json, -q and -v, handed on as ``console``."""
 
     @click.option("--json", "as_json", is_flag=True, help="Print the result as JSON on standard output.")
     @click.option("-q", "--quiet", is_flag=True, help="Say nothing but errors.")
     @click.option("-v", "--verbose", is_flag=True, help="Say more on standard error.")
     @click.pass_context
     def wrapped(ctx: click.Context, /, as_json: bool, quiet: bool, verbose: bool, **given: Any) -> Any:
-        voice = Voice(as_json, quiet, verbose)
-        with voice.telling_notices():
-            return ctx.invoke(command, voice=voice, **given)
+        console = Console(as_json, quiet, verbose)
+        with console.telling_notices():
+            return ctx.invoke(command, console=console, **given)
 
     wrapped.__doc__ = command.__doc__
     wrapped.__name__ = command.__name__
@@ -162,11 +162,11 @@ def spare_inputs(out: Path, *given: Path | None) -> None:
             raise DataError("it is one of the inputs.", where=Location(str(out)), hint="Give another --out.")
 
 
-def warn_of_target(voice: Voice, subject: str, target: MeasuredPoint | None) -> None:
+def warn_of_target(console: Console, subject: str, target: MeasuredPoint | None) -> None:
     """Nobody said which point shall arrive, and it matters."""
     if target is not None and target.distance > _SAME_POINT_M:
         x, y, z = 1000 * target.tool_T_target[:3, 3]
-        voice.warn(
+        console.warn(
             f"{subject} the tool frame's origin to the targets. The target that "
             f"{target.measurement} measured sits at ({x:.3f}, {y:.3f}, {z:.3f}) mm on the tool and misses them by "
             f"{1000 * target.distance:.3g} mm. To bring that one there, give --point target; otherwise --point tool."

@@ -14,7 +14,7 @@ from armcal.base.units import parse_quantity
 from armcal.calibration.calibration import Calibration
 from armcal.calibration.compensation.compensator import Compensator
 from armcal.calibration.compensation.request import Redundancy
-from armcal.cli.common import Voice, accept, point, spare_inputs, speaking, warn_of_target
+from armcal.cli.common import Console, accept, point, spare_inputs, speaking, warn_of_target
 from armcal.errors import InputError, Location
 from armcal.plugins import discover
 from armcal.run.command_file import write_commands
@@ -44,21 +44,21 @@ _ARRIVES = {"tool": "by the tool frame's origin", "target": "by the measured tar
 @click.option("--angles", type=click.Choice(["deg", "rad"]), default="deg", show_default=True, help="Unit of commands.")
 @accept
 @speaking
-def compensate(voice: Voice, calibration: Path, targets: Path, out: Path, angles: str, **asked: Any) -> None:
+def compensate(console: Console, calibration: Path, targets: Path, out: Path, angles: str, **asked: Any) -> None:
     """Find what to command so that the arm in CALIBRATION, as it really is, arrives at targets."""
     spare_inputs(out, calibration, targets, asked["within"])
     registry = discover()
-    voice.plugin_faults(registry)
+    console.plugin_faults(registry)
     loaded = Calibration.load(calibration, registry, asked["accept"])
     bench = Bench.of(loaded, asked["arm"], asked["within"], asked["redundancy"], registry, asked["point"] or "tool")
     file = bench.read(targets, registry)
     for text in file.dataset.warnings:
-        voice.warn(text)
+        console.warn(text)
     compensator = bench.compensator(file.targets)
     check_units(targets, file.targets, compensator.reach)
-    _warn_of_free_joints(voice, compensator)
+    _warn_of_free_joints(console, compensator)
     if asked["point"] is None:
-        warn_of_target(voice, "these commands bring", bench.target)
+        warn_of_target(console, "these commands bring", bench.target)
     start = _start(asked["start"], compensator)
     if asked["kind"] == "path":
         commands = compensator.follow(file.targets, start)
@@ -66,14 +66,14 @@ def compensate(voice: Voice, calibration: Path, targets: Path, out: Path, angles
         commands = compensator.solve(file.targets, start)
     assessed = assess(loaded, compensator, bench.nominal(), file.targets, commands)
     write_commands(out, compensator, file.targets, file.dataset, assessed, angles)
-    _tell(voice, file, assessed, bench, out)
+    _tell(console, file, assessed, bench, out)
 
 
-def _warn_of_free_joints(voice: Voice, compensator: Compensator) -> None:
+def _warn_of_free_joints(console: Console, compensator: Compensator) -> None:
     limits = zip(compensator.joints, compensator.limits, strict=True)
     free = [joint for joint, ends in limits if not np.isfinite(ends).all()]
     if free:
-        voice.warn(f"no limits are known of {', '.join(free)}: commands may lie beyond them. Give --within CONFIG.")
+        console.warn(f"no limits are known of {', '.join(free)}: commands may lie beyond them. Give --within CONFIG.")
 
 
 def _start(stated: Sequence[str], compensator: Compensator) -> Array | None:
@@ -97,7 +97,7 @@ def _start(stated: Sequence[str], compensator: Compensator) -> Array | None:
     return np.array(list(at.values()))
 
 
-def _tell(voice: Voice, file: TargetFile, assessed: Assessed, bench: Bench, out: Path) -> None:
+def _tell(console: Console, file: TargetFile, assessed: Assessed, bench: Bench, out: Path) -> None:
     found, commands = summary(assessed), assessed.commands
     missed = [
         {"id": name, "reason": reason, "nearest_mm": 1000 * float(distance) if np.isfinite(distance) else None}
@@ -106,23 +106,25 @@ def _tell(voice: Voice, file: TargetFile, assessed: Assessed, bench: Bench, out:
     ]
     set_aside = [{"row": each.row, "reason": each.reason} for each in file.dataset.set_aside]
     offset = None if bench.target is None else [1000 * float(x) for x in bench.target.tool_T_target[:3, 3]]
-    voice.result(
+    console.result(
         {**found, "point": bench.point, "target_mm": offset, "missed": missed, "set_aside": set_aside, "out": str(out)}
     )
     for each in missed[:_SHOWN]:
         away = each["nearest_mm"]
-        voice.warn(f"{each['id']}: {each['reason']}" + ("" if away is None else f"; the nearest is {away:.3f} mm away"))
+        console.warn(
+            f"{each['id']}: {each['reason']}" + ("" if away is None else f"; the nearest is {away:.3f} mm away")
+        )
     if len(missed) > _SHOWN:
-        voice.warn(f"{len(missed) - _SHOWN} more targets cannot be reached; the file says why")
+        console.warn(f"{len(missed) - _SHOWN} more targets cannot be reached; the file says why")
     for cell in set_aside[:_SHOWN]:
-        voice.warn(f"row {cell['row']} is set aside: {cell['reason']}")
-    voice.out.print(
+        console.warn(f"row {cell['row']} is set aside: {cell['reason']}")
+    console.out.print(
         f"{found['had']} of {found['targets']} targets are reached, {_ARRIVES[bench.point]}: {out}",
         markup=False,
         soft_wrap=True,
     )
     if found["had"]:
-        voice.out.print(f"error {_accuracy(found)}", markup=False, soft_wrap=True)
+        console.out.print(f"error {_accuracy(found)}", markup=False, soft_wrap=True)
 
 
 def _accuracy(found: Any) -> str:

@@ -14,7 +14,7 @@ from armcal.calibration.convert_mdh import Convention, mdh_section
 from armcal.calibration.convert_poe import poe_section
 from armcal.calibration.convert_urdf import urdf_text
 from armcal.calibration.rigid_chain import rigid_chain
-from armcal.cli.common import Voice, speaking
+from armcal.cli.common import Console, speaking
 from armcal.errors import ArmcalError, InputError, Location, PluginError
 from armcal.io.plain_files import check_output
 from armcal.plugins import PluginRegistry, discover
@@ -37,7 +37,7 @@ LARGEST = 1e-9
 @click.option("--out", default=None, type=click.Path(path_type=Path), help="The file to write [default: print it].")
 @speaking
 def convert(
-    voice: Voice,
+    console: Console,
     source: Path,
     target: str,
     arm: str | None,
@@ -50,11 +50,11 @@ def convert(
     compared with the original over 10,000 random poses.
     """
     registry = discover()
-    voice.plugin_faults(registry)
+    console.plugin_faults(registry)
     found = load_source(source, arm, registry)
     text, section = _converted(found, target, convention)
     off = _compared(found, section, target, registry)
-    _tell_left(voice, found, target, off)
+    _tell_left(console, found, target, off)
     apart = f"{off.position_m:.1e} m in position, {off.angle_rad:.1e} rad in angle"
     said = f"largest difference over {off.poses} poses: {apart}"
     content = {
@@ -65,15 +65,15 @@ def convert(
         "largest_angle_rad": off.angle_rad,
     }
     if out is None:
-        voice.result({**content, "text": text})
-        if not voice.json:
+        console.result({**content, "text": text})
+        if not console.json:
             click.echo(text, nl=False)
-        voice.err.print(said, markup=False, soft_wrap=True)
+        console.err.print(said, markup=False, soft_wrap=True)
         return
     _write(out, source, text)
-    voice.result({**content, "out": str(out)})
-    voice.out.print(f"{found.arm} as {target} written: {out}", markup=False, soft_wrap=True)
-    voice.out.print(said, markup=False, soft_wrap=True)
+    console.result({**content, "out": str(out)})
+    console.out.print(f"{found.arm} as {target} written: {out}", markup=False, soft_wrap=True)
+    console.out.print(said, markup=False, soft_wrap=True)
 
 
 def _converted(found: ConvertSource, target: str, convention: Convention) -> tuple[str, str]:
@@ -106,7 +106,7 @@ def _compared(found: ConvertSource, section: str, target: str, registry: PluginR
     return off
 
 
-def _tell_left(voice: Voice, found: ConvertSource, target: str, off: Difference) -> None:
+def _tell_left(console: Console, found: ConvertSource, target: str, off: Difference) -> None:
     left = list(found.left)
     known = [joint.name for joint in found.chain.joints if joint.limits]
     if known and target != "urdf":
@@ -114,10 +114,10 @@ def _tell_left(voice: Voice, found: ConvertSource, target: str, off: Difference)
     if left and not off.same_mount:
         left.append("the mount, about which springs at the base deflect")
     if left:
-        voice.err.print(f"not converted: {'; '.join(left)}", markup=False, soft_wrap=True)
+        console.err.print(f"not converted: {'; '.join(left)}", markup=False, soft_wrap=True)
     unknown = [joint.name for joint in found.chain.joints if not joint.is_revolute and not joint.limits]
     if target == "urdf" and unknown:
-        voice.warn(f"the travel of {', '.join(unknown)} is not known; the URDF states none.")
+        console.warn(f"the travel of {', '.join(unknown)} is not known; the URDF states none.")
 
 
 def _write(out: Path, source: Path, text: str) -> None:

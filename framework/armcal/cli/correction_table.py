@@ -9,7 +9,7 @@ import numpy as np
 
 from armcal.calibration.calibration import Calibration
 from armcal.calibration.measured_point import Point
-from armcal.cli.common import Voice, accept, point, spare_inputs, speaking, warn_of_target
+from armcal.cli.common import Console, accept, point, spare_inputs, speaking, warn_of_target
 from armcal.plugins import discover
 from armcal.run.compensate import Bench
 from armcal.run.correction_table import correction_table as made_table
@@ -26,7 +26,7 @@ from armcal.run.correction_table import read_table_settings, write_table
 @accept
 @speaking
 def correction_table(
-    voice: Voice,
+    console: Console,
     calibration: Path,
     grid: Path,
     out: Path,
@@ -38,13 +38,13 @@ def correction_table(
     """Make a table of what to tell a controller that takes the arm in CALIBRATION for the nominal one."""
     spare_inputs(out, calibration, grid, within)
     registry = discover()
-    voice.plugin_faults(registry)
+    console.plugin_faults(registry)
     settings = read_table_settings(grid)
     loaded = Calibration.load(calibration, registry, accept)
     loaded.require_payload(settings.payload is not None)
     bench = Bench.of(loaded, arm, within, "nearest", registry, point or "tool")
     if point is None:
-        warn_of_target(voice, "this table brings", bench.target)
+        warn_of_target(console, "this table brings", bench.target)
     table = made_table(bench.compensator(), bench.nominal(), settings)
     write_table(out, table)
     with_table, without = (1000 * column[np.isfinite(column)] for column in table.tried.T)
@@ -57,12 +57,12 @@ def correction_table(
         "error_95_mm": float(np.percentile(with_table, 95)) if with_table.size else None,
         "nominal_error_mm": float(without.mean()) if without.size else None,
     }
-    voice.result({**found, "point": bench.point, "out": str(out)})
-    voice.out.print(f"{found['had']} of {found['nodes']} nodes are had: {out}", markup=False, soft_wrap=True)
+    console.result({**found, "point": bench.point, "out": str(out)})
+    console.out.print(f"{found['had']} of {found['nodes']} nodes are had: {out}", markup=False, soft_wrap=True)
     if not with_table.size:
-        voice.warn("no cell has all its corners: nothing between the nodes could be tried")
+        console.warn("no cell has all its corners: nothing between the nodes could be tried")
         return
     told = f"between nodes {found['error_mm']:.3g} mm (95 %: {found['error_95_mm']:.3g} mm)"
     if found["nominal_error_mm"] is not None:
         told += f", without the table {found['nominal_error_mm']:.3g} mm"
-    voice.out.print(told, markup=False, soft_wrap=True)
+    console.out.print(told, markup=False, soft_wrap=True)

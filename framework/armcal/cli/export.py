@@ -8,7 +8,7 @@ import click
 
 from armcal.calibration.calibration import Calibration
 from armcal.calibration.exporter import POSES, Exported, Exporter, ExportRequest, effects_reach, request_of
-from armcal.cli.common import Voice, accept, speaking
+from armcal.cli.common import Console, accept, speaking
 from armcal.config.options import settings_from
 from armcal.errors import InputError, Location, PluginError
 from armcal.io.file_set import require_new, write_new, write_over
@@ -28,7 +28,7 @@ _NOTHING_MM = 1e-6
 @accept
 @speaking
 def export(
-    voice: Voice,
+    console: Console,
     calibration: Path,
     kind: str,
     out: Path,
@@ -42,7 +42,7 @@ def export(
     Some formats write further files beside --out. What a format cannot hold is told.
     """
     registry = discover()
-    voice.plugin_faults(registry)
+    console.plugin_faults(registry)
     exporter = _exporter(registry, kind, options)
     _check_place(out, calibration, force)
     loaded = Calibration.load(calibration, registry, accept)
@@ -52,7 +52,7 @@ def export(
     files = _files(out, found, calibration)
     new = {file: content for file, content in files.items() if not _holds(file, content)}
     (write_over if force else write_new)(new)
-    _tell(voice, request, found, reach, list(files), kind)
+    _tell(console, request, found, reach, list(files), kind)
 
 
 def _exporter(registry: PluginRegistry, kind: str, options: tuple[str, ...]) -> Exporter:
@@ -116,10 +116,10 @@ def _holds(file: Path, content: bytes) -> bool:
 
 
 def _tell(
-    voice: Voice, request: ExportRequest, found: Exported, reach: float | None, files: list[Path], kind: str
+    console: Console, request: ExportRequest, found: Exported, reach: float | None, files: list[Path], kind: str
 ) -> None:
     apart = None if reach is None else reach * 1000
-    voice.result(
+    console.result(
         {
             "out": str(files[0]),
             "files": [str(file) for file in files],
@@ -132,12 +132,12 @@ def _tell(
         }
     )
     listed = ", ".join(str(file) for file in files)
-    voice.out.print(f"{request.name}: {found.changed} numbers changed: {listed}", markup=False, soft_wrap=True)
+    console.out.print(f"{request.name}: {found.changed} numbers changed: {listed}", markup=False, soft_wrap=True)
     for remark in found.remarks:
-        voice.warn(f"{remark}.")
+        console.warn(f"{remark}.")
     if found.left_out:
         words = "the calibrated arm does not settle in all poses" if apart is None else _up_to(apart)
-        voice.warn(
+        console.warn(
             f"left out, a {kind} file cannot hold it: {', '.join(found.left_out)} ({words}, in {POSES} random poses)."
         )
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from armcal.base.domains import Array
 from armcal.base.parameters import Parameters
-from armcal.cli.common import Voice, overrides, speaking
+from armcal.cli.common import Console, overrides, speaking
 from armcal.diagnose.minimal import Dropped, MinimalSet, minimal_set
 from armcal.errors import ConfigError, Location
 from armcal.estimate.combination import Combination
@@ -37,7 +37,7 @@ from armcal.run.pipeline import Prepared, Stopwatch, assemble
 @overrides
 @speaking
 def identify(
-    voice: Voice,
+    console: Console,
     config: Path,
     data: Path | None,
     minimal: bool,
@@ -48,7 +48,7 @@ def identify(
 ) -> None:
     """Tell which combinations of CONFIG's free parameters its poses determine. Refuses no rank, solves nothing."""
     registry = discover()
-    voice.plugin_faults(registry)
+    console.plugin_faults(registry)
     experiment = Experiment.load(config, overrides, data, registry)
     ready = assemble(experiment, Stopwatch())
     parameters = ready.problem.parameters
@@ -62,11 +62,11 @@ def identify(
         found = minimal_set(triangle, parameters, preferred, most, np.inf if max_sd is None else max_sd)
         content["minimal"] = _minimal_content(found)
     for text in ready.warnings:
-        voice.warn(text)
-    voice.result(content)
-    _show(voice, content)
+        console.warn(text)
+    console.result(content)
+    _show(console, content)
     if "minimal" in content:
-        _show_minimal(voice, content["minimal"])
+        _show_minimal(console, content["minimal"])
 
 
 def _preferred(parameters: Parameters, glob: str) -> tuple[str, ...]:
@@ -138,71 +138,75 @@ def _dropped(dropped: Dropped) -> dict[str, Any]:
     return {"name": dropped.name, "effect_left": dropped.left, **_told(dropped.absorbed_by)}
 
 
-def _show(voice: Voice, content: dict[str, Any]) -> None:
+def _show(console: Console, content: dict[str, Any]) -> None:
     free, rank = len(content["free"]), content["rank"]
     condition = content["scaled_condition"]
     _line(
-        voice,
+        console,
         f"{content['experiment']}: {content['records']} records, {content['equations']} equations, {free} free "
         f"parameters.",
     )
     by_qr = f" ({content['rank_by_qr']} by QR)" if content["rank_by_qr"] != rank else ""
     told = f", scaled condition {condition:.3g}" if condition is not None else ""
-    _line(voice, f"rank {rank} of {free}{by_qr}{told}.")
+    _line(console, f"rank {rank} of {free}{by_qr}{told}.")
     if content["observability_of_the_determined"]:
         shown = ", ".join(f"{n.upper()} {v:.3g}" for n, v in content["observability_of_the_determined"].items())
-        _line(voice, f"observability of {'them' if rank == free else f'the {rank} determined combinations'}: {shown}.")
-    _show_undetermined(voice, content)
+        _line(
+            console, f"observability of {'them' if rank == free else f'the {rank} determined combinations'}: {shown}."
+        )
+    _show_undetermined(console, content)
     hardly = [
         f"{each['text']}: sd {each['sd_ordinary_sizes'] or np.inf:.3g} ordinary sizes"
         for each in content["hardly_determined"]
     ]
-    _section(voice, "Hardly determined (worse than an ordinary size of correction, by the declared noise):", hardly)
+    _section(console, "Hardly determined (worse than an ordinary size of correction, by the declared noise):", hardly)
     pairs = [f"{each['one']} and {each['other']} ({each['correlation']:+.3f})" for each in content["correlated"]]
-    _section(voice, f"Correlated above {CORRELATED:g}:", pairs)
-    if voice.verbose:
+    _section(console, f"Correlated above {CORRELATED:g}:", pairs)
+    if console.verbose:
         deviations = content["expected_sd"].items()
         shown_sd = [f"{name}: {'undetermined' if sd is None else f'{sd:.3g}'}" for name, sd in deviations]
-        _section(voice, "Expected standard deviations by the declared noise and the priors (SI):", shown_sd)
+        _section(console, "Expected standard deviations by the declared noise and the priors (SI):", shown_sd)
 
 
-def _show_undetermined(voice: Voice, content: dict[str, Any]) -> None:
+def _show_undetermined(console: Console, content: dict[str, Any]) -> None:
     for cause, said in SAID.items():
         found = [
             each["text"] + (f", held by the prior of {' and '.join(each['priors'])}" if each["priors"] else "")
             for each in content["undetermined"]
             if each["cause"] == cause
         ]
-        _section(voice, f"Undetermined, {said} ({len(found)}):", found)
+        _section(console, f"Undetermined, {said} ({len(found)}):", found)
     free = content["held_by_nothing"]
     if not content["undetermined"]:
-        _line(voice, "No combination is undetermined.", "green")
+        _line(console, "No combination is undetermined.", "green")
     elif not free:
-        _line(voice, "Priors hold every undetermined combination: what they say of it is all that will be known.")
+        _line(console, "Priors hold every undetermined combination: what they say of it is all that will be known.")
     else:
-        _section(voice, f"Held by nothing, so that armcal run refuses ({len(free)}):", [each["text"] for each in free])
+        _section(
+            console, f"Held by nothing, so that armcal run refuses ({len(free)}):", [each["text"] for each in free]
+        )
 
 
-def _show_minimal(voice: Voice, found: dict[str, Any]) -> None:
+def _show_minimal(console: Console, found: dict[str, Any]) -> None:
     redundant = [each["text"] for each in found["redundant"]]
-    _section(voice, f"Not needed, the kept ones do the same ({len(redundant)}):", redundant)
+    _section(console, f"Not needed, the kept ones do the same ({len(redundant)}):", redundant)
     left_out = [
         f"{each['name']} ({100 * each['effect_left']:.0f} % of its effect is its own)" for each in found["left_out"]
     ]
-    _section(voice, f"Left out as asked, though determined ({len(left_out)}):", left_out)
+    _section(console, f"Left out as asked, though determined ({len(left_out)}):", left_out)
     within = sorted({name for name, sd in found["sd_ordinary_sizes"].items() if sd is None})
-    _section(voice, "Kept, and undetermined in part (these need priors):", within)
-    _line(voice, f"A minimal set of {len(found['kept'])}:", "bold")
+    _section(console, "Kept, and undetermined in part (these need priors):", within)
+    _line(console, f"A minimal set of {len(found['kept'])}:", "bold")
     for text in ("parameters:", "  free:", *(f"    - {name}" for name in found["kept"])):
-        _line(voice, text)
+        _line(console, text)
 
 
-def _section(voice: Voice, title: str, lines: list[str]) -> None:
+def _section(console: Console, title: str, lines: list[str]) -> None:
     if lines:
-        _line(voice, title, "bold")
+        _line(console, title, "bold")
         for text in lines:
-            _line(voice, f"  {text}")
+            _line(console, f"  {text}")
 
 
-def _line(voice: Voice, text: str, style: str = "") -> None:
-    voice.out.print(text, style=style, markup=False, soft_wrap=True)
+def _line(console: Console, text: str, style: str = "") -> None:
+    console.out.print(text, style=style, markup=False, soft_wrap=True)

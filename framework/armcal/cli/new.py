@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from armcal.cli.common import Voice, speaking
+from armcal.cli.common import Console, speaking
 from armcal.plugins import discover
 from armcal.scaffold.naming import plugin_name
 from armcal.scaffold.plugin_files import KINDS, write_plugin
@@ -24,21 +24,21 @@ def new() -> None:
 @click.option("--package", is_flag=True, help="To be installed by pip, in place of one file.")
 @click.option("--out", type=click.Path(path_type=Path), help="The folder to make [default: armcal-NAME].")
 @speaking
-def new_plugin(voice: Voice, name: str, kind: str, package: bool, out: Path | None) -> None:
+def new_plugin(console: Console, name: str, kind: str, package: bool, out: Path | None) -> None:
     """Write one file that adds a component called NAME, and a test of it: they work, and are yours to change."""
     registry = discover()
-    voice.plugin_faults(registry)
+    console.plugin_faults(registry)
     chosen = plugin_name(name, registry)
     folder = out or Path(f"armcal-{chosen.replace('_', '-')}")
     files = write_plugin(chosen, kind, folder, package)
-    voice.result({"plugin": chosen, "kind": kind, "out": str(folder), "files": list(files)})
+    console.result({"plugin": chosen, "kind": kind, "out": str(folder), "files": list(files)})
     for file in files:
-        voice.detail(str(folder / file))
+        console.detail(str(folder / file))
     check = f"armcal plugins check {chosen} -v"
     after = ("pip install -e '.[test]'", check, "pytest") if package else (f"{check} --plugin {chosen}.py", "pytest")
     told = (f"the {kind} {chosen}: {len(files)} files in {folder}", "next, in that folder:", *(f"  {c}" for c in after))
     for text in told:
-        voice.out.print(text, markup=False, soft_wrap=True)
+        console.out.print(text, markup=False, soft_wrap=True)
 
 
 @new.command("robot")
@@ -51,11 +51,11 @@ def new_plugin(voice: Voice, name: str, kind: str, package: bool, out: Path | No
 @click.option("--target", metavar="X,Y,Z", help="Where the target sits in the tool's frame, roughly, in mm or as 2 cm.")
 @click.option("--out", type=click.Path(path_type=Path), help="The folder to make [default: NAME].")
 @speaking
-def new_robot(voice: Voice, name: str, out: Path | None, **source: Any) -> None:
+def new_robot(console: Console, name: str, out: Path | None, **source: Any) -> None:
     """Write all that the robot NAME needs to be calibrated, and try it on simulated records.
 
     Without --dh and --urdf it asks for the rows.
     """
     from armcal.cli.new_robot import Source, begin  # all of the solver, which a plugin's files do without
 
-    begin(voice, name, Source(**source), out or Path(name))
+    begin(console, name, Source(**source), out or Path(name))

@@ -6,7 +6,7 @@ import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from armcal.cli.common import Voice, command_line
+from armcal.cli.common import Console, command_line
 from armcal.cli.outlet import say
 from armcal.cli.robot_questions import ask_rows, ask_target, ask_up, direction, place
 from armcal.errors import EXIT_FAULT, EXIT_NOT_CONVERGED, ConfigError
@@ -33,15 +33,15 @@ class Source:
     target: str | None
 
 
-def begin(voice: Voice, name: str, source: Source, folder: Path) -> None:
+def begin(console: Console, name: str, source: Source, folder: Path) -> None:
     """Write a robot's folder, calibrate its simulated records, and say how that went."""
     registry = discover()
-    voice.plugin_faults(registry)
+    console.plugin_faults(registry)
     robot = _measured(_upright(_robot(robot_name(name), source, registry), source.up), source.target)
     made = write_robot(robot, folder, registry)
-    with voice.progress() as progress:
+    with console.progress() as progress:
         trial = try_out(made, registry, command_line(), progress)
-    _show(voice, robot, made, trial)
+    _show(console, robot, made, trial)
     if trial.fault:
         say(f"armcal: {made.folder}: the calibration of simulated records failed: {trial.fault}.", err=True)
         sys.exit(EXIT_FAULT if trial.result.estimate.verdict.converged else EXIT_NOT_CONVERGED)
@@ -81,7 +81,7 @@ def _measured(robot: Robot, target: str | None) -> Robot:
     return replace(robot, target=place(target)) if target else robot
 
 
-def _show(voice: Voice, robot: Robot, made: RobotFolder, trial: Trial) -> None:
+def _show(console: Console, robot: Robot, made: RobotFolder, trial: Trial) -> None:
     content = {
         "robot": robot.name,
         "out": str(made.folder),
@@ -93,24 +93,26 @@ def _show(voice: Voice, robot: Robot, made: RobotFolder, trial: Trial) -> None:
         "verdict": trial.result.verdict.headline,
         "works": not trial.fault,
     }
-    voice.result(content)
+    console.result(content)
     for text in trial.result.warnings:
-        voice.warn(text)
-    _say(voice, f"{robot.name}: {len(robot.joints)} joints, {len(made.choice.kept)} free parameters, in {made.folder}")
+        console.warn(text)
+    _say(
+        console, f"{robot.name}: {len(robot.joints)} joints, {len(made.choice.kept)} free parameters, in {made.folder}"
+    )
     assumed = [joint.name for joint in robot.joints if joint.assumed]
     if assumed:
-        _say(voice, f"limits were assumed for {', '.join(assumed)}: correct them in plan.yaml before the arm moves")
+        _say(console, f"limits were assumed for {', '.join(assumed)}: correct them in plan.yaml before the arm moves")
     _say(
-        voice,
+        console,
         f"held-out tips of simulated records: nominal {trial.nominal_mm:.3f} mm, calibrated "
         f"{trial.calibrated_mm:.3f} mm (the noise alone: {trial.noise_mm:.3f} mm)",
     )
     findings = [f for f in trial.result.verdict.findings if f.grade in ("bad", "warning")]
     for finding in findings:
-        _say(voice, f"{finding.grade}: {finding.text}")
-    _say(voice, trial.result.verdict.headline)
-    _say(voice, f"report: {trial.results / 'report.html'}; next: {made.folder / 'README.md'}")
+        _say(console, f"{finding.grade}: {finding.text}")
+    _say(console, trial.result.verdict.headline)
+    _say(console, f"report: {trial.results / 'report.html'}; next: {made.folder / 'README.md'}")
 
 
-def _say(voice: Voice, text: str) -> None:
-    voice.out.print(text, markup=False, soft_wrap=True)
+def _say(console: Console, text: str) -> None:
+    console.out.print(text, markup=False, soft_wrap=True)

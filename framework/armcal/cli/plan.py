@@ -12,7 +12,7 @@ import numpy as np
 from rich.table import Table
 
 from armcal.base.units import display_unit, to_unit
-from armcal.cli.common import Voice, overrides, speaking
+from armcal.cli.common import Console, overrides, speaking
 from armcal.config.selection import DIMENSION_OF_UNIT
 from armcal.errors import ConfigError
 from armcal.measure.csv_writer import write_csv
@@ -39,23 +39,23 @@ _FILE = click.Path(path_type=Path)
 @click.option("--order", type=click.Choice(["travel", "torque", "none"]), help="Order of visit [default: travel].")
 @overrides
 @speaking
-def plan(voice: Voice, config: Path, count: int, out: Path, overrides: tuple[str, ...], **given: Any) -> None:
+def plan(console: Console, config: Path, count: int, out: Path, overrides: tuple[str, ...], **given: Any) -> None:
     """Choose the poses that determine the free parameters of CONFIG best, and say how good any could be."""
     began = time.perf_counter()
     _check_out(out)
     registry = discover()
-    voice.plugin_faults(registry)
+    console.plugin_faults(registry)
     chosen = [f"plan.{key}={given[key]}" for key in ("goal", "order") if given[key]]
     experiment = Experiment.load(config, (*overrides, *chosen), given["data"], registry)
     request = PlanRequest(count, given["candidates"], given["given"], given["calibration"])
-    with voice.progress() as progress:
+    with console.progress() as progress:
         result = make_plan(experiment, request, progress)
     write_csv(out, result.dataset, experiment.request(measured=False).wanted)
     content = {**_content(experiment, result), "out": str(out), "seconds": time.perf_counter() - began}
-    voice.result(content)
+    console.result(content)
     for text in experiment.warnings:
-        voice.warn(text)
-    _show(voice, content)
+        console.warn(text)
+    _show(console, content)
 
 
 def _check_out(out: Path) -> None:
@@ -113,8 +113,8 @@ def _parameters(experiment: Experiment, result: PlanResult) -> list[dict[str, An
     ]
 
 
-def _show(voice: Voice, content: dict[str, Any]) -> None:
-    out, pool = voice.out, content["candidates"]
+def _show(console: Console, content: dict[str, Any]) -> None:
+    out, pool = console.out, content["candidates"]
     left = f" ({told(pool['left_out'])} left out)" if pool["left_out"] else ""
     given = f" after {content['given_records']} given records" if content["given_records"] else ""
     moved = f"; {pool['refined']} of the plan moved on from there" if pool["refined"] else ""
@@ -134,9 +134,9 @@ def _show(voice: Voice, content: dict[str, Any]) -> None:
     out.print(f"least determined: {content['weakest']}.", markup=False, soft_wrap=True)
     visit = content["visit"]
     hot = visit["peak_squared_torque"]
-    told_hot = f", squared torque averaged over 5 poses at most {hot:.2f} of the largest" if hot is not None else ""
+    heat_text = f", squared torque averaged over 5 poses at most {hot:.2f} of the largest" if hot is not None else ""
     out.print(
-        f"visited by {visit['order']}: {visit['travel_s']:.0f} s on the way{told_hot}.", markup=False, soft_wrap=True
+        f"visited by {visit['order']}: {visit['travel_s']:.0f} s on the way{heat_text}.", markup=False, soft_wrap=True
     )
     out.print(f"plan: {content['out']}  ({content['seconds']:.1f} s)", markup=False, soft_wrap=True)
 

@@ -18,7 +18,7 @@ from armcal.base.pose_settings import quaternion_of
 from armcal.base.units import DIMENSIONLESS, split_suffix, to_unit
 from armcal.calibration.calibration import Calibration
 from armcal.calibration.intervals import PlusMinus
-from armcal.cli.common import Voice, accept, speaking
+from armcal.cli.common import Console, accept, speaking
 from armcal.errors import DataError, InputError, Location
 from armcal.io.plain_files import input_file
 from armcal.measure.csv_writer import column_names, write_csv
@@ -45,26 +45,26 @@ _RECORDINGS: Mapping[str, Literal["same", "new"]] = {"calibrated": "same", "new"
 @accept
 @speaking
 def predict(
-    voice: Voice, calibration: Path, poses: Path, out: Path, recording: str, columns: tuple[str, ...], accept: bool
+    console: Console, calibration: Path, poses: Path, out: Path, recording: str, columns: tuple[str, ...], accept: bool
 ) -> None:
     """Predict the tip of the arm in CALIBRATION for each row of commanded joint angles, and how far it may be off."""
     registry = discover()
-    voice.plugin_faults(registry)
+    console.plugin_faults(registry)
     loaded = Calibration.load(calibration, registry, accept)
     system = loaded.system
     commands = read_commands(registry, loaded, poses, columns)
-    _tell_missing(voice, loaded, commands, recording)
+    _tell_missing(console, loaded, commands, recording)
     channels, placed = loaded.predict(commands)
     found = None
     if not loaded.readable:
         channels = _tools(placed, tuple(system.arms))
     elif loaded.record.prediction is None:
-        voice.warn("the calibration keeps nothing about the errors of predictions: run it again to have them.")
+        console.warn("the calibration keeps nothing about the errors of predictions: run it again to have them.")
     else:
         found = loaded.plus_minus(commands, _RECORDINGS[recording])
         channels = {name: values + found.shift.get(name, 0.0) for name, values in channels.items()}
         if unknown := [name for name in channels if not np.isfinite(found.half_widths.get(name, np.nan)).any()]:
-            voice.warn(f"how far {', '.join(unknown)} may be off is not known: no residual determines it.")
+            console.warn(f"how far {', '.join(unknown)} may be off is not known: no residual determines it.")
     if out.resolve() == poses.resolve():
         raise DataError("it is the file of poses itself.", where=Location(str(out)), hint="Give another --out.")
     wanted = wanted_channels(system.arms, loaded.readable, measured=False)
@@ -73,13 +73,18 @@ def predict(
     shown = [channel for channel in wanted if channel.channel in channels]
     extra, medians = (_columns(found, shown), _medians(found, shown)) if found else ({}, {})
     write_csv(out, replace(commands, channels=channels, extra=extra), shown)
-    _report(voice, commands, out, recording, found, medians)
+    _report(console, commands, out, recording, found, medians)
 
 
 def _report(
-    voice: Voice, commands: Dataset, out: Path, recording: str, found: PlusMinus | None, medians: Mapping[str, float]
+    console: Console,
+    commands: Dataset,
+    out: Path,
+    recording: str,
+    found: PlusMinus | None,
+    medians: Mapping[str, float],
 ) -> None:
-    voice.result(
+    console.result(
         {
             "poses": len(commands),
             "set_aside": len(commands.set_aside),
@@ -89,11 +94,11 @@ def _report(
             "half_width_90": medians,
         }
     )
-    voice.out.print(f"{len(commands)} poses predicted: {out}", markup=False)
-    _show_typical(voice, _typical(found), medians)
+    console.out.print(f"{len(commands)} poses predicted: {out}", markup=False)
+    _show_typical(console, _typical(found), medians)
 
 
-def _show_typical(voice: Voice, typical: Mapping[str, Any], medians: Mapping[str, float]) -> None:
+def _show_typical(console: Console, typical: Mapping[str, Any], medians: Mapping[str, float]) -> None:
     """How far a prediction may be off in the median pose: of a position, else of every column."""
     text = ", ".join(f"{column} {half:.2g}" for column, half in medians.items())
     if typical:
@@ -103,7 +108,7 @@ def _show_typical(voice: Voice, typical: Mapping[str, Any], medians: Mapping[str
     elif text:
         text += " (90 %)"
     if text:
-        voice.out.print(f"+- {text}, in the median pose", markup=False, soft_wrap=not typical)
+        console.out.print(f"+- {text}, in the median pose", markup=False, soft_wrap=not typical)
 
 
 def _tools(placed: Array, arms: Sequence[str]) -> dict[str, Array]:
@@ -164,25 +169,25 @@ def _given(columns: Sequence[str]) -> dict[str, str]:
     return {text.partition("=")[0].strip(): text.partition("=")[2].strip() for text in columns}
 
 
-def _tell_missing(voice: Voice, loaded: Calibration, commands: Dataset, recording: str) -> None:
+def _tell_missing(console: Console, loaded: Calibration, commands: Dataset, recording: str) -> None:
     """What the calibration knew and these poses do not say."""
     order = ("time", "sequence")
     missing = [name for name in loaded.record.environment_columns if not commands.has(name) and name not in order]
     declared = [(f"{arm.name}.{effect}", c.name) for arm in loaded.system.arms.values() for effect, c in arm.declared]
     for effect, name in declared:
         if name in missing:
-            voice.warn(f"the effect {effect} reads {name}, which these poses do not state: it takes its reference.")
+            console.warn(f"the effect {effect} reads {name}, which these poses do not state: it takes its reference.")
     plain = [name for name in missing if name not in {column for _, column in declared}]
     if plain:
-        voice.warn(f"the calibration's records had {', '.join(plain)}; these poses take the configured values.")
+        console.warn(f"the calibration's records had {', '.join(plain)}; these poses take the configured values.")
     for text in commands.warnings:
-        voice.warn(text)
+        console.warn(text)
     kept = loaded.record.prediction
     if kept is not None and kept.recording is None and recording == "calibrated":
-        voice.warn("no parameter drifts in this calibration: all recordings are alike.")
+        console.warn("no parameter drifts in this calibration: all recordings are alike.")
     if kept is not None and kept.recording is not None and recording == "new" and any(map(commands.has, order)):
         text = "these poses are taken for another recording than the calibration's, of whose drift nothing is known"
-        voice.warn(f"{text}; if they belong to it, say --recording calibrated.")
+        console.warn(f"{text}; if they belong to it, say --recording calibrated.")
 
 
 def _columns(found: PlusMinus, shown: Sequence[WantedChannel]) -> dict[str, tuple[str, ...]]:

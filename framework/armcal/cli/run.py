@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from armcal.cli.common import Voice, command_line, overrides, parallel, speaking
+from armcal.cli.common import Console, command_line, overrides, parallel, speaking
 from armcal.cli.outlet import say
 from armcal.cli.tables import show_run
 from armcal.errors import EXIT_DO_NOT_USE, EXIT_NOT_CONVERGED
@@ -30,7 +30,7 @@ from armcal.run.result import RunResult
 @parallel
 @speaking
 def run(
-    voice: Voice,
+    console: Console,
     config: Path,
     data: Path | None,
     out: Path | None,
@@ -43,35 +43,35 @@ def run(
     folder = out or Path("runs") / config.stem
     reserved = click.get_current_context().with_resource(outputs.reserved(folder))
     registry = discover()
-    voice.plugin_faults(registry)
+    console.plugin_faults(registry)
     experiment = Experiment.load(config, overrides, data, registry)
-    with voice.progress() as progress:
+    with console.progress() as progress:
         result = calibrate(experiment, command_line(), progress, watch, parallel)
-    _show_details(voice, result)
+    _show_details(console, result)
     result.seconds["total"] = watch.total()
     outputs.place(reserved, result, experiment, render, accept)
     converged = result.estimate.verdict.converged
     for text in registry.notify("armcal_run_ended", name=result.name, folder=str(folder), converged=converged):
-        voice.warn(text)
-    voice.result({**outputs.metrics(result), "folder": str(folder)})
-    show_run(voice, result, folder, watch.total())
+        console.warn(text)
+    console.result({**outputs.metrics(result), "folder": str(folder)})
+    show_run(console, result, folder, watch.total())
     _end(result, folder, accept)
 
 
-def _show_details(voice: Voice, result: RunResult) -> None:
+def _show_details(console: Console, result: RunResult) -> None:
     """Warnings, and with -v which records took no part and how long each stage took."""
     for text in result.warnings:
-        voice.warn(text)
+        console.warn(text)
     for aside in result.dataset.set_aside:
-        voice.detail(f"set aside: row {aside.row}, record {aside.record_id}: {aside.reason}")
+        console.detail(f"set aside: row {aside.row}, record {aside.record_id}: {aside.reason}")
     for record in result.noise.suspicious:
-        voice.detail(
+        console.detail(
             f"suspicious: row {record.row}, record {record.record_id}: {record.deviations:.1f} sd "
             f"(limit {record.limit:.1f}), {record.fate}"
         )
     for stage, seconds in result.seconds.items():
-        voice.detail(f"{stage}: {seconds:.3f} s")
-    voice.detail(f"evaluated by: {result.backend}")
+        console.detail(f"{stage}: {seconds:.3f} s")
+    console.detail(f"evaluated by: {result.backend}")
 
 
 def _end(result: RunResult, folder: Path, accept: bool) -> None:

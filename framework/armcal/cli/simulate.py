@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from armcal.cli.common import Voice, overrides, speaking
+from armcal.cli.common import Console, overrides, speaking
 from armcal.estimate.simulation import SimulationRequest
 from armcal.measure.csv_writer import write_csv
 from armcal.plugins import discover
@@ -18,14 +18,14 @@ from armcal.run.experiment import Experiment
 @click.option("--out", required=True, type=click.Path(path_type=Path), help="The CSV to write.")
 @overrides
 @speaking
-def simulate(voice: Voice, config: Path, out: Path, overrides: tuple[str, ...]) -> None:
+def simulate(console: Console, config: Path, out: Path, overrides: tuple[str, ...]) -> None:
     """Make measurements up as the simulation section of CONFIG says."""
     registry = discover()
-    voice.plugin_faults(registry)
+    console.plugin_faults(registry)
     experiment = Experiment.load(config, overrides, registry=registry)
     system = experiment.system
     request = SimulationRequest(system.arms, system.measurements, experiment.parameters, system.environment)
     dataset = experiment.simulator().simulate(request)
     write_csv(out, dataset, experiment.request(measured=True).wanted)
-    voice.result({"records": len(dataset), "out": str(out)})
-    voice.out.print(f"{len(dataset)} records written: {out}", markup=False)
+    console.result({"records": len(dataset), "out": str(out)})
+    console.out.print(f"{len(dataset)} records written: {out}", markup=False)

@@ -8,7 +8,7 @@ from pathlib import Path
 import click
 from rich.table import Table
 
-from armcal.cli.common import Voice, command_line, overrides, parallel, speaking
+from armcal.cli.common import Console, command_line, overrides, parallel, speaking
 from armcal.io.folder import reserved
 from armcal.io.parallel import Executor
 from armcal.plugins import discover
@@ -29,37 +29,37 @@ from armcal.run.study_settings import LoadTransferSettings
 @parallel
 @speaking
 def study(
-    voice: Voice, config: Path, data: Path | None, out: Path | None, overrides: tuple[str, ...], parallel: Executor
+    console: Console, config: Path, data: Path | None, out: Path | None, overrides: tuple[str, ...], parallel: Executor
 ) -> None:
     """Compare the variants that CONFIG lists by cross-validated error, or by load transfer."""
     watch = Stopwatch()
     folder = out or Path("runs") / config.stem
     kept = click.get_current_context().with_resource(reserved(folder, study_outputs.FILES))
     registry = discover()
-    voice.plugin_faults(registry)
+    console.plugin_faults(registry)
     asked = Study.load(config, overrides, data, registry)
     result: StudyResult | TransferResult
-    with voice.progress() as progress:
+    with console.progress() as progress:
         if isinstance(asked.settings, LoadTransferSettings):
             result = transfer(asked, parallel, command_line(), progress, watch)
         else:
             result = compare(asked, parallel, command_line(), progress, watch)
     for text in result.warnings:
-        voice.warn(text)
+        console.warn(text)
     for stage, seconds in result.seconds.items():
-        voice.detail(f"{stage}: {seconds:.3f} s")
+        console.detail(f"{stage}: {seconds:.3f} s")
     result.seconds["total"] = watch.total()
     page = render_study(result) if isinstance(result, StudyResult) else render_transfer(result)
     kept.place(study_outputs.files(result, asked, page))
-    voice.result({**result.as_dict(), "folder": str(folder)})
+    console.result({**result.as_dict(), "folder": str(folder)})
     if isinstance(result, StudyResult):
-        _show_study(voice, result)
+        _show_study(console, result)
     else:
-        _show_transfer(voice, result)
-    voice.out.print(f"page: {folder / 'study.html'}  ({watch.total():.1f} s)", markup=False, soft_wrap=True)
+        _show_transfer(console, result)
+    console.out.print(f"page: {folder / 'study.html'}  ({watch.total():.1f} s)", markup=False, soft_wrap=True)
 
 
-def _show_study(voice: Voice, result: StudyResult) -> None:
+def _show_study(console: Console, result: StudyResult) -> None:
     records = f"{len(result.dataset)} records, {result.folds} folds"
     records += f" drawn {result.repeats} times" if result.repeats > 1 else ""
     columns = ("free", "train", "cv", "cv 95 %", "change", "± se", "helps")
@@ -72,21 +72,21 @@ def _show_study(voice: Voice, result: StudyResult) -> None:
         if v.failed_folds:  # over fewer records than the others
             figures[1:] = [f"({x})" for x in figures[1:]]
         table.add_row(v.name, str(v.free), *figures, *moved)
-        voice.detail(f"{v.name}: {v.fit_seconds:.2f} s for the fit on all records, {v.seconds:.2f} s for all fits")
-    voice.out.print(table)
+        console.detail(f"{v.name}: {v.fit_seconds:.2f} s for the fit on all records, {v.seconds:.2f} s for all fits")
+    console.out.print(table)
     for text in conclusions(result):
-        voice.out.print(text, markup=False, soft_wrap=True)
+        console.out.print(text, markup=False, soft_wrap=True)
 
 
-def _show_transfer(voice: Voice, result: TransferResult) -> None:
+def _show_transfer(console: Console, result: TransferResult) -> None:
     shown = transfer_table(result)
     words = [[name for name, number in shown.headings if number is wanted] for wanted in (False, True)]
     table = _table(f"{result.name}: {shown.caption}", words[0], words[1])
     for row in shown.rows:
         table.add_row(*row)
-    voice.out.print(table)
+    console.out.print(table)
     for text in transfer_conclusions(result):
-        voice.out.print(text, markup=False, soft_wrap=True)
+        console.out.print(text, markup=False, soft_wrap=True)
 
 
 def _table(title: str, words: Sequence[str], numbers: Sequence[str]) -> Table:

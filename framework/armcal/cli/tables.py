@@ -10,7 +10,7 @@ from rich.table import Table
 from rich.text import Text
 
 from armcal.base.domains import Semidefinite, symmetric
-from armcal.cli.common import Voice
+from armcal.cli.common import Console
 from armcal.estimate.bootstrap import Bootstrap
 from armcal.estimate.estimator import Estimate
 from armcal.estimate.validation import ErrorSummary
@@ -23,9 +23,9 @@ _SETS = {"train": "training", "holdout": "held out", "cross_validated": "cross-v
 _STYLES = {"bad": "bold red", "warning": "yellow", "note": "", "good": "green"}
 
 
-def show_run(voice: Voice, result: RunResult, folder: Path, seconds: float) -> None:
+def show_run(console: Console, result: RunResult, folder: Path, seconds: float) -> None:
     """The end of a run: errors, compliances, verdict, where the report is."""
-    out = voice.out
+    out = console.out
     out.print(_errors(result))
     if result.groups.errors:
         out.print(_groups(result))
@@ -115,7 +115,7 @@ def _in_ascii(text: str) -> str:
 
 
 def _held(estimate: Estimate, index: int) -> str:
-    if estimate.told_by_data[index]:
+    if estimate.identified_by_data[index]:
         return ""
     return "held by its prior" if estimate.determined[index] else "not determined"
 

@@ -86,7 +86,7 @@ def open_lines(name: str, begin: Begin) -> LineSource:
     raise _refusal(name, "it is no file that can be read line by line")
 
 
-def told_refused(refused: Mapping[str, int]) -> str:
+def refused_lines_text(refused: Mapping[str, int]) -> str:
     """Why lines were passed over, the commonest reasons in words; empty if none was."""
     if not refused:
         return ""

@@ -24,7 +24,16 @@ from armcal.diagnose.noise_findings import Finding
 from armcal.errors import NotConvergedError
 from armcal.estimate.blocks import automatic_block_length, standard_error_of_mean
 from armcal.estimate.estimator import Estimator
-from armcal.estimate.prediction import LEVELS, RADIUS_LEVEL, STATED, Predictor, Spread, ToldDrift, is_position, quantile
+from armcal.estimate.prediction import (
+    LEVELS,
+    RADIUS_LEVEL,
+    STATED,
+    KnownDrift,
+    Predictor,
+    Spread,
+    is_position,
+    quantile,
+)
 from armcal.estimate.validation import FitTask, Indices, JudgedFit, Split, failed_fit, fit_and_judge, judged_fit
 from armcal.estimate.variance import apply_components
 from armcal.estimate.weighing import WeighedFit, Weighing, fit
@@ -32,7 +41,7 @@ from armcal.problem.problem import FactorRecords, Problem
 
 Recording = Literal["same", "new"]
 """Whether what is predicted lies within the recording of the fit, whose drift is told, or in another one."""
-Misses = tuple[Array, ...]
+LargeErrors = tuple[Array, ...]
 """Raw residuals, one (n_r x N) a factor."""
 FEWEST = 40
 """Judged records for a stretch to be found."""
@@ -82,10 +91,10 @@ class PredictedFit(JudgedFit):
     """A fit that also tells how its predictions missed.
 
     Attributes:
-        misses: raw residuals of the records that judge, by recording (``new`` only where something drifts).
+        large_errors: raw residuals of the records that judge, by recording (``new`` only where something drifts).
     """
 
-    misses: Mapping[Recording, Misses]
+    large_errors: Mapping[Recording, LargeErrors]
 
 
 @dataclass(frozen=True)
@@ -139,18 +148,18 @@ def level_name(level: float) -> str:
 def predictor(problem: Problem, fitted: WeighedFit) -> Predictor:
     """What a fit predicts."""
     found = fitted.estimate
-    drift = ToldDrift.by(problem, found.values, fitted.records)
+    drift = KnownDrift.by(problem, found.values, fitted.records)
     return Predictor(problem, found.values, found.covariance, found.noise_scale, found.degrees_of_freedom, drift)
 
 
-def missed(by: Predictor, held: Sequence[FactorRecords]) -> dict[Recording, Misses]:
+def missed(by: Predictor, held: Sequence[FactorRecords]) -> dict[Recording, LargeErrors]:
     """Residuals of records that a fit did not see; nan where a measurement was not made."""
-    found: dict[Recording, Misses] = {"same": by.residuals(held)}
+    found: dict[Recording, LargeErrors] = {"same": by.residuals(held)}
     if by.drifts:
         found["new"] = by.problem.residuals(by.values, held)
     return {
-        name: tuple(np.where(each.measured, own, np.nan) for each, own in zip(held, misses, strict=True))
-        for name, misses in found.items()
+        name: tuple(np.where(each.measured, own, np.nan) for each, own in zip(held, large_errors, strict=True))
+        for name, large_errors in found.items()
     }
 
 
@@ -160,7 +169,7 @@ def score(by: Predictor, held: Sequence[FactorRecords]) -> dict[Recording, Score
     return {name: scored(by.problem, found, ways[name](held)) for name, found in missed(by, held).items()}
 
 
-def scored(problem: Problem, found: Misses, spreads: Sequence[Spread]) -> Scores:
+def scored(problem: Problem, found: LargeErrors, spreads: Sequence[Spread]) -> Scores:
     """Residuals in units of what is predicted for them; nan where there are none."""
     errors = [residual / spread.deviations for residual, spread in zip(found, spreads, strict=True)]
     reaches = [
@@ -193,10 +202,12 @@ def fit_and_predict(task: FitTask) -> JudgedFit:
         judged = judged_fit(task, fitted.solution, train, held, began)
         if not judged.converged:
             return judged
-        misses = missed(predictor(task.problem, fitted), whitened_like(task.problem, fitted, held, task.estimator))
+        large_errors = missed(
+            predictor(task.problem, fitted), whitened_like(task.problem, fitted, held, task.estimator)
+        )
     except NotConvergedError:
         return failed_fit(task, began)
-    return PredictedFit(judged.errors, judged.at_rest, True, time.perf_counter() - began, misses)
+    return PredictedFit(judged.errors, judged.at_rest, True, time.perf_counter() - began, large_errors)
 
 
 def besides(scores: Scores, places: Indices) -> Scores:
@@ -207,12 +218,12 @@ def besides(scores: Scores, places: Indices) -> Scores:
 
 
 def collected(
-    splits: Sequence[Split], found: Sequence[Mapping[Recording, Misses]], count: int
-) -> dict[Recording, Misses]:
+    splits: Sequence[Split], found: Sequence[Mapping[Recording, LargeErrors]], count: int
+) -> dict[Recording, LargeErrors]:
     """The residuals of all folds in the order of the records; nan where a fold has none."""
-    result: dict[Recording, Misses] = {}
-    for split, misses in zip(splits, found, strict=True):
-        for name, own in misses.items():
+    result: dict[Recording, LargeErrors] = {}
+    for split, large_errors in zip(splits, found, strict=True):
+        for name, own in large_errors.items():
             whole = result.setdefault(name, tuple(np.full((len(each), count), np.nan) for each in own))
             for mine, each in zip(whole, own, strict=True):
                 mine[:, split.holdout] = each

@@ -10,8 +10,8 @@ import numpy as np
 
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
-from armcal.diagnose.leftover import Leftover
-from armcal.diagnose.misses import Misses
+from armcal.diagnose.large_errors import LargeErrors
+from armcal.diagnose.residual_structure import ResidualStructure
 from armcal.estimate.estimator import Estimate
 from armcal.planning.candidates import whitened_rows
 from armcal.problem.problem import Problem
@@ -42,8 +42,8 @@ class PriorsAlone:
 class Evidence:
     """All of it; what was not looked at, or is not known, is None. ``unit`` is that of all errors, mm or mrad."""
 
-    leftover: Leftover | None = None
-    misses: Misses | None = None
+    structure: ResidualStructure | None = None
+    large_errors: LargeErrors | None = None
     priors_alone: PriorsAlone | None = None
     unit: str = "mm"
 
@@ -51,8 +51,8 @@ class Evidence:
         """For metrics.json."""
         alone = self.priors_alone
         return {
-            "leftover": None if self.leftover is None else self.leftover.as_dict(),
-            "misses": None if self.misses is None else self.misses.as_dict(),
+            "residual_structure": None if self.structure is None else self.structure.as_dict(),
+            "large_errors": None if self.large_errors is None else self.large_errors.as_dict(),
             "priors_alone": None if alone is None else {"worst_mm": alone.worst_mm, "poses": alone.poses},
         }
 

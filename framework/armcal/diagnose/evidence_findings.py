@@ -10,10 +10,10 @@ from scipy.special import stdtrit
 from armcal.base.domains import Array, Semidefinite, symmetric
 from armcal.base.parameters import ParameterBlock
 from armcal.diagnose.evidence import PriorsAlone
-from armcal.diagnose.leftover import Leftover, Structure
-from armcal.diagnose.misses import MEDIANS, Misses
+from armcal.diagnose.large_errors import MEDIANS, LargeErrors
 from armcal.diagnose.noise_findings import Finding
 from armcal.diagnose.odds import UNLISTED
+from armcal.diagnose.residual_structure import ResidualStructure, Structure
 from armcal.diagnose.smooth import CLEAR, IMITATED, TimeOrPose
 from armcal.estimate.estimator import AT_BOUND, Estimate
 
@@ -29,7 +29,7 @@ NOTICEABLE_SD = 0.3
 _MM = "mm"
 
 
-def determined_told(estimate: Estimate, alone: PriorsAlone | None, typical_mm: float | None) -> Finding:
+def determined_finding(estimate: Estimate, alone: PriorsAlone | None, typical_mm: float | None) -> Finding:
     """What the data determines, and whether what it does not matters to the tip."""
     known = estimate.identifiability
     test = "rank of the Jacobian in ordinary sizes"
@@ -56,7 +56,7 @@ def determined_told(estimate: Estimate, alone: PriorsAlone | None, typical_mm: f
     return Finding("warning", text, test, "armcal identify names them, and armcal plan the poses that would tell.")
 
 
-def shifted_told(estimate: Estimate) -> list[Finding]:
+def shift_findings(estimate: Estimate) -> list[Finding]:
     """Which estimates are moved by bounds and cones that hold others, and by how many standard deviations."""
     blocks = {block.name for block in estimate.parameters.free if _at_its_edge(estimate, block)}
     sd = np.where(estimate.deviations > 0, estimate.deviations, np.inf)
@@ -99,13 +99,13 @@ def worse_than_nominal(judged_mm: Array, nominal_mm: Array, unit: str = _MM) -> 
     return [Finding("bad", f"Worse than the nominal arm {which}", test, action)]
 
 
-def structures_told(found: Leftover | None, unit: str = _MM) -> list[Finding]:
+def structure_findings(found: ResidualStructure | None, unit: str = _MM) -> list[Finding]:
     """What residuals still depend on."""
     if found is None:
         return []
     test = _test_of(found)
     kept = found.worthwhile
-    findings = [_structure_told(s, found, unit, test) for s in kept] + _unlisted(found)
+    findings = [_structure_finding(s, found, unit, test) for s in kept] + _unlisted(found)
     if not findings:
         slight = f" {_plural(len(found.structures), 'dependence', 'dependences')} found would not lower it by 1 %."
         text = f"Of {found.tested} things that residuals might depend on none explains the error left."
@@ -116,7 +116,7 @@ def structures_told(found: Leftover | None, unit: str = _MM) -> list[Finding]:
     return [*findings, *_scatter(found)]
 
 
-def _structure_told(s: Structure, found: Leftover, unit: str, test: str) -> Finding:
+def _structure_finding(s: Structure, found: ResidualStructure, unit: str, test: str) -> Finding:
     """One cause if it is clearly the likeliest, else all that it does not beat."""
     falls = f"the mean training residual of {found.mean_mm:.2f} {unit} would fall by {s.falls_mm:.2f} {unit}"
     what = s.words + (f" ({s.size})" if s.size else "")
@@ -138,7 +138,7 @@ def _share(odds: float) -> str:
     return "over 99 %" if odds > 0.99 else "less than 1 %" if odds < 0.01 else f"{100 * odds:.0f} %"
 
 
-def _unlisted(found: Leftover) -> list[Finding]:
+def _unlisted(found: ResidualStructure) -> list[Finding]:
     """What follows the pose, and is none of the causes; those that may stand for it say so themselves."""
     if found.unlisted <= CLEAR or any(UNLISTED in s.alternatives for s in found.worthwhile):
         return []
@@ -148,7 +148,7 @@ def _unlisted(found: Leftover) -> list[Finding]:
     return [Finding("warning", text, test, "Free more of the geometry; repeat some poses with a second payload.")]
 
 
-def _scatter(found: Leftover) -> list[Finding]:
+def _scatter(found: ResidualStructure) -> list[Finding]:
     """What the size of residuals depends on."""
     noise = found.noise
     if noise is None:
@@ -163,13 +163,13 @@ def _scatter(found: Leftover) -> list[Finding]:
     return [Finding("warning", text, test, action)]
 
 
-def _test_of(found: Leftover) -> str:
+def _test_of(found: ResidualStructure) -> str:
     blocks = f", blocks of {found.block} records" if found.block > 1 else ""
     level = f"{100 * found.level:g} % over all {found.tested} dependences{blocks}"
     return f"score test, {level}, and likelier than chance"
 
 
-def neighbours_told(found: Leftover | None, estimate: Estimate, unit: str = _MM) -> list[Finding]:
+def neighbour_findings(found: ResidualStructure | None, estimate: Estimate, unit: str = _MM) -> list[Finding]:
     """Whether records that follow one another miss alike, why, and whether that made intervals wider."""
     if found is None:
         return []
@@ -220,7 +220,7 @@ def _why(alike: TimeOrPose, unit: str) -> str:
     return text + "."
 
 
-def misses_told(found: Misses | None, unit: str = _MM) -> list[Finding]:
+def large_error_findings(found: LargeErrors | None, unit: str = _MM) -> list[Finding]:
     """Records beyond the limit, each with what is unusual about it."""
     if found is None:
         return []

@@ -8,9 +8,9 @@ import numpy as np
 
 from armcal.base.domains import Array
 from armcal.diagnose.gross import BEYOND, FAR_BEYOND, Displaced, Figure
-from armcal.diagnose.leftover import Leftover
 from armcal.diagnose.majority import Minority
 from armcal.diagnose.noise_findings import Finding
+from armcal.diagnose.residual_structure import ResidualStructure
 from armcal.estimate.estimator import CHECK_THE_DATA, Estimate
 
 OF_REACH = 0.03
@@ -27,7 +27,7 @@ MOST_NAMED = 3
 
 
 def gross_error(
-    judged_mm: Array, figure: Figure, estimate: Estimate, left: Leftover | None, unit: str = "mm"
+    judged_mm: Array, figure: Figure, estimate: Estimate, left: ResidualStructure | None, unit: str = "mm"
 ) -> list[Finding]:
     """Errors of records that did not train (N; nan where not judged) beside the reach and the noise.
 
@@ -75,7 +75,7 @@ def contradicting(found: Minority | None, ids: Sequence[str]) -> list[Finding]:
     return [Finding("bad", f"{text}.", test, action)]
 
 
-def size_told(figure: Figure) -> list[Finding]:
+def size_findings(figure: Figure) -> list[Finding]:
     """Is the calibrated arm as large as the nominal one?"""
     off = abs(figure.size - 1)
     if not off > SIZE:
@@ -86,7 +86,7 @@ def size_told(figure: Figure) -> list[Finding]:
     return [Finding("bad" if off > GROSS_SIZE else "warning", text, test, action)]
 
 
-def displaced_told(figure: Figure) -> list[Finding]:
+def displacement_findings(figure: Figure) -> list[Finding]:
     """Parameters that contradict their priors, or are implausibly far from their nominal values."""
     geometry = [each for each in figure.displaced if each.by_prior or not each.placement]
     gross = [each for each in geometry if each.times > FAR_BEYOND]
@@ -119,7 +119,7 @@ def _displacement(each: Displaced) -> str:
     return f"{each.name} by {each.amount:.3g} {each.unit} ({each.times:.0f} times {measure})"
 
 
-def limits_told(figure: Figure, scale_sd: float | None) -> list[Finding]:
+def limit_findings(figure: Figure, scale_sd: float | None) -> list[Finding]:
     """What no residual shows: in which frame the answer is, and how large an error of the instrument's scale may be."""
     if scale_sd is None:
         return []

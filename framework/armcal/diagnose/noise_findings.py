@@ -30,7 +30,7 @@ class Finding:
         return self.text + (f" [{self.test}]" if self.test else "") + (f" {self.action}" if self.action else "")
 
 
-def suspects_told(fitted: WeighedFit, ids: Sequence[str]) -> list[Finding]:
+def suspect_findings(fitted: WeighedFit, ids: Sequence[str]) -> list[Finding]:
     """Which training records lie beyond what noise does, at 1 % over all of them; ``ids`` are theirs."""
     if not fitted.suspects:
         return [Finding("good", "No training record lies farther from the fit than noise allows (1 % over all).")]
@@ -57,7 +57,7 @@ def _distance(suspect: Suspect) -> str:
     return f"{suspect.distance:.1f} sd{weight}"
 
 
-def components_told(found: VarianceComponents) -> list[Finding]:
+def component_findings(found: VarianceComponents) -> list[Finding]:
     """Is it the tracker or the model?"""
     joints = found.share("joint")
     parts = sorted(found.components, key=lambda c: -c.share)

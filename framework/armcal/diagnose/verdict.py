@@ -13,14 +13,14 @@ from armcal.base.domains import Array
 from armcal.diagnose.evidence import Evidence
 from armcal.diagnose.evidence_findings import (
     MOST_TOLD,
-    determined_told,
-    misses_told,
-    neighbours_told,
-    shifted_told,
-    structures_told,
+    determined_finding,
+    large_error_findings,
+    neighbour_findings,
+    shift_findings,
+    structure_findings,
     what_neighbours_cost,
 )
-from armcal.diagnose.noise_findings import Finding, components_told, suspects_told
+from armcal.diagnose.noise_findings import Finding, component_findings, suspect_findings
 from armcal.estimate.estimator import CHECK_THE_DATA, Estimate
 from armcal.estimate.identifiability import POOR_CONDITION, bound_together, correlated_pairs
 from armcal.estimate.validation import summarise
@@ -79,13 +79,17 @@ def judge(
     """
     seen = evidence or Evidence()
     typical = float(np.median(judged_mm)) if len(judged_mm) else None
-    determined = determined_told(estimate, seen.priors_alone, typical)
+    determined = determined_finding(estimate, seen.priors_alone, typical)
     own, kept = [ids[i] for i in train], train if fitted is None else train[fitted.kept]
     suspicious = _suspicious(errors_mm[train], own, fitted)
     findings = [_convergence(estimate), determined, *_condition(estimate), *_bounds(estimate)]
-    findings += [*shifted_told(estimate), *_noise(estimate, fitted, seen), *structures_told(seen.leftover, seen.unit)]
-    findings += neighbours_told(seen.leftover, estimate, seen.unit) or _neighbours(whitened, kept, estimate)
-    findings += [*_correlated(estimate), *predicted, *misses_told(seen.misses, seen.unit)]
+    findings += [
+        *shift_findings(estimate),
+        *_noise(estimate, fitted, seen),
+        *structure_findings(seen.structure, seen.unit),
+    ]
+    findings += neighbour_findings(seen.structure, estimate, seen.unit) or _neighbours(whitened, kept, estimate)
+    findings += [*_correlated(estimate), *predicted, *large_error_findings(seen.large_errors, seen.unit)]
     findings += [*_outliers(suspicious, own, fitted), *_next(estimate, suggestions)]
     ranked = tuple(sorted(findings, key=lambda finding: _ORDER[finding.grade]))
     first = _first(judged_mm, judged_on, ranked[0], seen.unit)
@@ -101,11 +105,11 @@ def _first(judged_mm: Array, judged_on: str, worst: Finding, unit: str) -> str:
 
 def _headline(judged_mm: Array, judged_on: str, worst: Finding, unit: str) -> str:
     if worst.grade == "bad":
-        return f"{DO_NOT_USE}. {_errors_told(judged_mm, judged_on, unit)}"
-    return _errors_told(judged_mm, judged_on, unit)
+        return f"{DO_NOT_USE}. {_errors_text(judged_mm, judged_on, unit)}"
+    return _errors_text(judged_mm, judged_on, unit)
 
 
-def _errors_told(judged_mm: Array, judged_on: str, unit: str) -> str:
+def _errors_text(judged_mm: Array, judged_on: str, unit: str) -> str:
     if not len(judged_mm):
         return "No record was held out: how good the model is on new poses is not known."
     errors = summarise(judged_mm)
@@ -142,22 +146,22 @@ def _in_short(
     sentences = []
     if estimate.identifiability.undetermined:
         sentences.append(f"Not determined: {determined.text[:1].lower()}{determined.text[1:]}")
-    missed = seen.misses
+    missed = seen.large_errors
     if missed is not None and missed.beyond:
         ids = ", ".join(miss.record_id for miss in missed.explained[:MOST_TOLD])
         more = f" and {missed.beyond - MOST_TOLD} more" if missed.beyond > MOST_TOLD else ""
         sentences.append(f"Missed by more than {missed.limit_mm:.2f} {seen.unit}: {ids}{more}.")
     sentences.append(f"Suspicious records: {_few(suspicious)}." if suspicious else "No training record is suspicious.")
-    if seen.leftover is not None and seen.leftover.worthwhile:
+    if seen.structure is not None and seen.structure.worthwhile:
         listed = "; ".join(
             f"{s.words}{', or on another cause' if s.alternatives else ''} ({s.falls_mm:.2f} {seen.unit})"
-            for s in seen.leftover.worthwhile
+            for s in seen.structure.worthwhile
         )
         sentences.append(f"Residuals still depend on {listed}.")
-    elif seen.leftover is not None and seen.leftover.lag_after_p <= seen.leftover.level:
-        after = f"{seen.leftover.lag_after:.2f}"
+    elif seen.structure is not None and seen.structure.lag_after_p <= seen.structure.level:
+        after = f"{seen.structure.lag_after:.2f}"
         sentences.append(f"No cause that was looked for is left in the residuals, yet neighbours correlate by {after}.")
-    elif seen.leftover is not None:
+    elif seen.structure is not None:
         sentences.append("Nothing that was looked for is left in the residuals.")
     if suggestions:
         sentences.append(f"Measure these poses next: {'; '.join(suggestion.text for suggestion in suggestions)}.")
@@ -213,7 +217,7 @@ def _few(listed: Sequence[str], separator: str = ", ") -> str:
 def _noise(estimate: Estimate, fitted: WeighedFit | None, seen: Evidence) -> list[Finding]:
     """Whose the scatter is if that was estimated, else whether it is as large as declared."""
     if fitted is not None and fitted.components is not None:
-        return components_told(fitted.components)
+        return component_findings(fitted.components)
     return [_size(estimate, seen)]
 
 
@@ -222,7 +226,7 @@ def _size(estimate: Estimate, seen: Evidence) -> Finding:
     freedom, ratio = max(1, estimate.degrees_of_freedom), estimate.noise_scale
     total, test = ratio**2 * freedom, "chi-square, 5 %"
     if total > chdtri(freedom, LEVEL / 2):
-        found = seen.leftover
+        found = seen.structure
         why = "the model's error or the instrument's, which this test cannot tell apart"
         if found is not None:
             known = "some of it is the model's: what residuals depend on is named below"
@@ -273,7 +277,7 @@ def _outliers(suspicious: Sequence[str], ids: Sequence[str], fitted: WeighedFit 
     """Records beyond their limits if the loss sought them, else beyond five robust deviations of the errors."""
     if fitted is not None and fitted.loss != "none":
         action = "Look at them in residuals.csv, and measure them again."
-        return [replace(f, action=action) if f.grade == "warning" else f for f in suspects_told(fitted, ids)]
+        return [replace(f, action=action) if f.grade == "warning" else f for f in suspect_findings(fitted, ids)]
     if not suspicious:
         return []
     listed = ", ".join(suspicious[:MOST_TOLD])

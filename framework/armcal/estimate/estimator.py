@@ -129,7 +129,7 @@ class Estimate:
         degrees_of_freedom: residual numbers less what the fit takes up of them, see ``degrees_of_freedom``.
         identifiability: what the data alone determines.
         determined: per free entry, whether data and priors together determine it.
-        told_by_data: per free entry, whether the data alone does; else only a prior holds it, if anything does.
+        identified_by_data: per free entry, whether the data alone does; else only a prior holds it, if anything does.
         verdict: the solver's.
         widened: by what the standard deviations of free entries grew because neighbouring records err alike; empty
             where they do and nothing grew by it, None where no such correlation was found.
@@ -145,7 +145,7 @@ class Estimate:
     degrees_of_freedom: float
     identifiability: Identifiability
     determined: tuple[bool, ...]
-    told_by_data: tuple[bool, ...]
+    identified_by_data: tuple[bool, ...]
     verdict: SolverVerdict
     widened: tuple[float, ...] | None = None
 
@@ -249,12 +249,12 @@ def estimate(
         degrees_of_freedom=freedom,
         identifiability=known,
         determined=tuple(bool(x) for x in ~(np.abs(chain) @ unseen > 1e-6)),
-        told_by_data=_told_by_data(chain, scales, known),
+        identified_by_data=_identified_by_data(chain, scales, known),
         verdict=solution.verdict,
     )
 
 
-def _told_by_data(chain: Array, scales: Array, known: Identifiability) -> tuple[bool, ...]:
+def _identified_by_data(chain: Array, scales: Array, known: Identifiability) -> tuple[bool, ...]:
     """Of each entry, whether it takes part in no undetermined combination (by more than 1e-6 of its ordinary size)."""
     if not len(known.null):
         return (True,) * len(chain)

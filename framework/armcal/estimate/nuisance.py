@@ -29,10 +29,10 @@ def started(problem: Problem, records: Sequence[FactorRecords]) -> Problem:
         return problem
     nominal = problem.parameters.nominal()
     for owner, key, factor, said in _sayings(problem, problem.told(nominal, records), records):
-        for local in dict.fromkeys(problem.kernels[factor].factor.told_names):
+        for local in dict.fromkeys(problem.kernels[factor].factor.nuisance_names):
             name = group_name(owner, key, local)
             if problem.parameters[name].free and problem.parameters[name].prior_sd is None:
-                rows = [i for i, told in enumerate(problem.kernels[factor].factor.told_names) if told == local]
+                rows = [i for i, told in enumerate(problem.kernels[factor].factor.nuisance_names) if told == local]
                 nominal[problem.parameters.entries_of(name)] = said[rows]
     return replace(problem, parameters=problem.parameters.with_nominal(nominal))
 

@@ -59,7 +59,7 @@ class Update:
 
     Attributes:
         posterior: the belief with it.
-        innovation: by which it surprised the belief before it, seen from where the update ended (m).
+        innovation: how far it lay from the prediction of the belief before it, seen from where the update ended (m).
         covariance: of that innovation, as expected (m x m).
     """
 
@@ -87,7 +87,7 @@ class OnlineEstimator(Protocol):
         """
 
 
-def surprise(innovation: Array, covariance: Array) -> float:
+def normalised_innovation_squared(innovation: Array, covariance: Array) -> float:
     """The squared Mahalanobis distance, NIS: chi-square with as many degrees of freedom as numbers."""
     return float(innovation @ weighed(covariance, innovation))
 
@@ -101,19 +101,19 @@ def weighed(covariance: Array, right: Array) -> Array:
 def log_likelihood(innovation: Array, covariance: Array, freedom: float = math.inf) -> float:
     """Of an innovation under its expected covariance, which is known with so many degrees of freedom."""
     logarithm = float(np.linalg.slogdet(covariance)[1])
-    return log_density(surprise(innovation, covariance), logarithm, len(innovation), freedom)
+    return log_density(normalised_innovation_squared(innovation, covariance), logarithm, len(innovation), freedom)
 
 
-def log_density(surprise: float, logarithm: float, count: int, freedom: float = math.inf) -> float:
+def log_density(nis: float, logarithm: float, count: int, freedom: float = math.inf) -> float:
     """Of numbers by their squared Mahalanobis distance and their covariance's log determinant.
 
     Normal, or Student's t where the covariance is known with so many degrees of freedom up to a common factor.
     """
     if math.isinf(freedom):
-        return -0.5 * (surprise + logarithm + count * math.log(2 * math.pi))
+        return -0.5 * (nis + logarithm + count * math.log(2 * math.pi))
     whole = 0.5 * (freedom + count)
     normal = math.lgamma(whole) - math.lgamma(0.5 * freedom) - 0.5 * count * math.log(freedom * math.pi)
-    return normal - 0.5 * logarithm - whole * math.log1p(surprise / freedom)
+    return normal - 0.5 * logarithm - whole * math.log1p(nis / freedom)
 
 
 def absorbed(prior: Gaussian, seen: Linearised, place: Array) -> Gaussian:

@@ -71,7 +71,7 @@ def quantile(level: float, freedom: float | Array) -> Array:
 
 
 @dataclass(frozen=True)
-class ToldDrift:
+class KnownDrift:
     """What the records of a fit tell of a drift.
 
     Attributes:
@@ -85,7 +85,7 @@ class ToldDrift:
     covariance: Array
 
     @classmethod
-    def by(cls, problem: Problem, values: Array, records: Sequence[FactorRecords]) -> ToldDrift | None:
+    def by(cls, problem: Problem, values: Array, records: Sequence[FactorRecords]) -> KnownDrift | None:
         """From the records of a fit at the values found; None where nothing drifts."""
         shared = records[0].correlation if records else None
         if shared is None:
@@ -114,7 +114,7 @@ class Predictor:
     covariance: Array
     noise_scale: float
     freedom: float
-    drift: ToldDrift | None = None
+    drift: KnownDrift | None = None
 
     @property
     def drifts(self) -> bool:

@@ -47,7 +47,7 @@ class Factor:
         noise_channels: of each residual entry, the channels that may carry a record's own one, the nearest first.
         dimensions: ``length`` or ``angle`` of each residual entry.
         told: what the record alone says of these, to start from; empty where it says nothing.
-        told_names: local names of the group's parameters that ``told`` holds the entries of, one an entry.
+        nuisance_names: local names of the group's parameters that ``told`` holds the entries of, one an entry.
         mean_weight: how many times more the mean of a group's residuals weighs.
         springs: of each number of the state, what gives, in words.
         joints: channels of commanded joints, each with ``angle`` or ``length``.
@@ -67,7 +67,7 @@ class Factor:
     noise_channels: tuple[tuple[str, ...], ...] = ()
     dimensions: tuple[str, ...] = ()
     told: Expression = None
-    told_names: tuple[str, ...] = ()
+    nuisance_names: tuple[str, ...] = ()
     mean_weight: float = 1.0
     springs: tuple[str, ...] = ()
     joints: tuple[tuple[str, str], ...] = ()
@@ -85,7 +85,7 @@ class Factor:
         shown = ca.densify(ca.vertcat(self.outputs, self.tools))
         return ca.Function("outputs", self._inputs, [self.next_state, shown], {"cse": True})
 
-    def told_function(self) -> ca.Function:
+    def nuisance_function(self) -> ca.Function:
         """(values, record, state) -> (next state, what the record says of its group's parameters)."""
         return ca.Function("told", self._inputs, [self.next_state, ca.densify(self.told)], {"cse": True})
 
@@ -210,7 +210,7 @@ def build_factor(
     next_state = ca.densify(ca.vertcat(*[states[a].next_deflection for a in measurement.arms]))
     outputs = ca.vertcat(*predicted.values())
     tools = ca.vertcat(*[ca.vec(states[a].base_T_tool.matrix()[:3, :]) for a in measurement.arms])
-    told, told_names = _told(measurement, states, local)
+    told, nuisance_names = _told(measurement, states, local)
     _check_rows(name, measurement, residual)
     used = records.used_by(ca.vertcat(residual, next_state, outputs, tools, told))
     return Factor(
@@ -225,7 +225,7 @@ def build_factor(
         outputs=outputs,
         tools=tools,
         told=told,
-        told_names=told_names,
+        nuisance_names=nuisance_names,
         **_of_arms(measurement, arms),
         **_of_residual(name, measurement),
     )

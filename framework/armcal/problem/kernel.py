@@ -284,7 +284,7 @@ class Kernel:
 
     def tell(self, values: Array, record: Array, state: Array, said: Array) -> None:
         """What each record says of its group's parameters, in equilibrium (entries x records)."""
-        self._in_equilibrium(self.factor.told_function(), values, record, state, said)
+        self._in_equilibrium(self.factor.nuisance_function(), values, record, state, said)
 
     def _in_equilibrium(self, function: ca.Function, values: Array, record: Array, state: Array, shown: Array) -> None:
         mapped, following, before = Mapped(function), np.empty_like(state), state.copy()

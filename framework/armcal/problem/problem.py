@@ -283,7 +283,7 @@ class Problem:
         """What each record alone says of its group's parameters, one (entries x N) matrix a factor."""
         result = []
         for kernel, slots, each in zip(self.kernels, self.slots, records, strict=True):
-            said = np.empty((len(kernel.factor.told_names), each.record.shape[1]))
+            said = np.empty((len(kernel.factor.nuisance_names), each.record.shape[1]))
             if len(said):
                 gather.evaluated(slots, values, each.group, kernel.tell, each.record, each.state, said)
             result.append(said[:, : each.count])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from armcal.diagnose.misses import Misses
+from armcal.diagnose.large_errors import LargeErrors
 from armcal.report.numbers import NONE, fixed
 
 
@@ -29,12 +29,12 @@ class MissedTable:
     rows: tuple[MissedRow, ...]
 
 
-def missed_records(misses: Misses | None) -> MissedTable | None:
+def missed_records(large_errors: LargeErrors | None) -> MissedTable | None:
     """None if no record judged, or none lies beyond the limit."""
-    if misses is None or not misses.beyond:
+    if large_errors is None or not large_errors.beyond:
         return None
     rows = tuple(
         MissedRow(m.record_id, str(m.row) if m.row else NONE, fixed(m.error_mm, 2), "; ".join(m.reasons), m.advice)
-        for m in misses.explained
+        for m in large_errors.explained
     )
-    return MissedTable(misses.beyond, misses.judged, fixed(misses.limit_mm, 2), rows)
+    return MissedTable(large_errors.beyond, large_errors.judged, fixed(large_errors.limit_mm, 2), rows)

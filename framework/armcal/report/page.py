@@ -92,7 +92,7 @@ def _poses(result: RunResult) -> dict[str, Any]:
         "workspace": workspace.views(result),
         "order": error_figures.in_order(result, worst),
         "worst": worst_rows(result, worst),
-        "missed": missed_records(result.evidence.misses),
+        "missed": missed_records(result.evidence.large_errors),
         "crossed": bool(np.isfinite(result.errors.cross_validated_mm).any()),
     }
 

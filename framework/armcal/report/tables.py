@@ -138,7 +138,7 @@ def parameter_rows(estimate: Estimate) -> tuple[ParameterRow, ...]:
         _row(names[i], units[i], raw[i], estimate.intervals[i], decimals[i], widest, names[i] in bounds)
         for i in range(len(names))
     )
-    return tuple(replace(row, held=not seen) for row, seen in zip(rows, estimate.told_by_data, strict=True))
+    return tuple(replace(row, held=not seen) for row, seen in zip(rows, estimate.identified_by_data, strict=True))
 
 
 def _decimals(raw: RawParameter) -> int:

@@ -142,9 +142,9 @@ def _crossed(
         return {}, {}, {}
     judged, splits = crossed
     fits = [fit if isinstance(fit, PredictedFit) else None for fit in judged.fits]
-    misses = collected(splits, [fit.misses if fit else {} for fit in fits], len(split.train))
+    large_errors = collected(splits, [fit.large_errors if fit else {} for fit in fits], len(split.train))
     ways = {"same": by.left_out_of_recording, "new": by.left_out_of_new_recording}
-    found = {name: scored(by.problem, own, ways[name](fitted.records)) for name, own in misses.items()}
+    found = {name: scored(by.problem, own, ways[name](fitted.records)) for name, own in large_errors.items()}
     shares: dict[Recording, Coverage] = {}
     for name, own in found.items():
         others: list[Stretch | None] = [None] * len(split.train)

@@ -15,13 +15,19 @@ from armcal.diagnose.evidence import Evidence, priors_alone, unseen_poses
 from armcal.diagnose.evidence_findings import worse_than_nominal
 from armcal.diagnose.fit_rows import FitRows
 from armcal.diagnose.gross import MOST_RECORDS, figure_of, scale_deviation, thinned
-from armcal.diagnose.gross_findings import contradicting, displaced_told, gross_error, limits_told, size_told
-from armcal.diagnose.leftover import leftover
+from armcal.diagnose.gross_findings import (
+    contradicting,
+    displacement_findings,
+    gross_error,
+    limit_findings,
+    size_findings,
+)
+from armcal.diagnose.large_errors import Judged, large_errors
 from armcal.diagnose.majority import minority
-from armcal.diagnose.misses import Judged, misses
 from armcal.diagnose.moved import Moved, moved_findings, moved_groups
 from armcal.diagnose.noise_findings import Finding
 from armcal.diagnose.outside import predicted_positions
+from armcal.diagnose.residual_structure import structure
 from armcal.diagnose.verdict import Verdict, judge
 from armcal.estimate.validation import Split, error_unit
 from armcal.estimate.weighing import WeighedFit
@@ -100,14 +106,14 @@ def gather(run: FittedRecords, judged_mm: Array, system: System, limit: float | 
     position, motion = recorded_position(dataset), Motion.of(problem, found.values, run.records, dataset)
     judged = Judged(judged_mm, problem.residuals(found.values, run.records), position)
     limit_mm = None if limit is None else limit * _MM
-    missed = misses(problem, run.records, found, dataset, motion, judged, limit_mm)
+    missed = large_errors(problem, run.records, found, dataset, motion, judged, limit_mm)
     training, train = dataset.subset(run.split.train), run.split.train
     alone = None
     if len(found.identifiability.null):
         alone = priors_alone(problem, found, unseen_poses(training, motion.channels))
     acting = problem.weighted(run.fitted.records, run.fitted.weights)
     own = (training, motion.subset(train), position[train])
-    left = leftover(problem, acting, found, *own, modelled=effect_types(system))
+    left = structure(problem, acting, found, *own, modelled=effect_types(system))
     return Evidence(left, missed, alone, error_unit(problem))
 
 
@@ -125,11 +131,11 @@ def _gross(run: FittedRecords, judged_mm: Array, evidence: Evidence) -> list[Fin
     position = recorded_position(run.dataset)[looked_at]
     read = predicted_positions(problem, found.values, acting, dataset)
     return [
-        *gross_error(judged_mm, figure, found, evidence.leftover, evidence.unit),
+        *gross_error(judged_mm, figure, found, evidence.structure, evidence.unit),
         *contradicting(minority(rows, found.noise_scale, position), dataset.ids),
-        *size_told(figure),
-        *displaced_told(figure),
-        *limits_told(figure, scale_deviation(problem, rows, read, found.noise_scale)),
+        *size_findings(figure),
+        *displacement_findings(figure),
+        *limit_findings(figure, scale_deviation(problem, rows, read, found.noise_scale)),
     ]
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
-from armcal.estimate.scatter import Scatter, scatter_of
+from armcal.estimate.residual_spread import ResidualSpread, residual_spread
 from armcal.estimate.validation import Split
 from armcal.estimate.variance import VarianceComponents
 from armcal.estimate.weighing import WeighedFit
@@ -61,7 +61,7 @@ class NoiseResult:
     suspicious: tuple[SuspiciousRecord, ...] = ()
     components: VarianceComponents | None = None
     rounds: int = 0
-    scatter: Mapping[str, Scatter] = field(default_factory=dict)
+    scatter: Mapping[str, ResidualSpread] = field(default_factory=dict)
 
     @property
     def set_aside(self) -> tuple[SuspiciousRecord, ...]:
@@ -103,7 +103,7 @@ def noise_result(problem: Problem, fit: WeighedFit, dataset: Dataset, split: Spl
         row = dataset.rows[i] if dataset.rows else 0
         numbers = (suspect.distance, suspect.limit, suspect.weight, float(errors_mm[i]))
         suspicious.append(SuspiciousRecord(row, dataset.ids[i], suspect.measurement, *numbers))
-    scatter = scatter_of(problem, fit.estimate, fit.records, dataset.subset(split.train))
+    scatter = residual_spread(problem, fit.estimate, fit.records, dataset.subset(split.train))
     return NoiseResult(fit.loss, weights, tuple(suspicious), fit.components, len(fit.rounds), scatter)
 
 

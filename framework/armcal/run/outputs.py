@@ -155,7 +155,9 @@ def metrics(result: RunResult) -> dict[str, Any]:
         "parameters": {
             "free": len(known),
             "determined": known.rank,
-            "held_by_priors": [n for n, seen in zip(estimate.names, estimate.told_by_data, strict=True) if not seen],
+            "held_by_priors": [
+                n for n, seen in zip(estimate.names, estimate.identified_by_data, strict=True) if not seen
+            ],
             "at_bound": list(estimate.at_bound),
             "undetermined": [str(combination) for combination in known.undetermined],
             "scaled_condition": _finite(known.condition),

@@ -43,11 +43,11 @@ from armcal.problem.drift import residuals, with_drift
 from armcal.problem.joint_noise import with_joint_noise
 from armcal.problem.motion import recorded_position
 from armcal.problem.problem import FactorRecords, Problem
+from armcal.run.axes_check import check_permuted_axes
 from armcal.run.experiment import Experiment
 from armcal.run.groups import RunGroups, group_errors, labels_of
 from armcal.run.intervals import IntervalResult, interval_result
 from armcal.run.judging import FittedRecords, verdict_of
-from armcal.run.mixup import check_mixups
 from armcal.run.noise import noise_result
 from armcal.run.provenance import provenance
 from armcal.run.reach import check_reach
@@ -129,7 +129,7 @@ def assemble(experiment: Experiment, watch: Stopwatch) -> Prepared:
         records = with_drift(problem, records, dataset, problem.parameters.nominal())
     with watch.stage("check"):
         check_reach(problem, records, dataset)
-        check_mixups(problem, records, dataset)
+        check_permuted_axes(problem, records, dataset)
         split = _split(experiment, dataset)
         _check_folds(experiment, dataset, split)
         if experiment.settings.validation.limit is not None and error_unit(problem) != "mm":

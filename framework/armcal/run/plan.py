@@ -22,7 +22,7 @@ from armcal.planning.refinement import Allowed, refine
 from armcal.planning.relaxation import Relaxation, Task
 from armcal.run.experiment import Experiment
 from armcal.run.plan_clearance import clearance_check
-from armcal.run.plan_ground import Ground, as_if_measured, draws_of, ground_of, parameters_of, problem_of
+from armcal.run.plan_context import PlanContext, as_if_measured, draws_of, parameters_of, plan_context, problem_of
 from armcal.run.plan_poses import JointSpace, Pool, dataset_of, given_records, pool_of, same_poses, told
 from armcal.run.plan_settings import PlanSettings
 from armcal.run.plan_visit import visit
@@ -111,12 +111,12 @@ def make_plan(experiment: Experiment, request: PlanRequest, progress: Progress =
             f"{request.count} poses of {len(pool.dataset)} candidates ({told(pool.left_out)}).",
             hint="Ask for fewer poses, give more candidates, or allow plan.repeats.",
         )
-    ground = ground_of(experiment, settings, space, parameters, given)
+    context = plan_context(experiment, settings, space, parameters, given)
     if settings.robust is not None:
-        ground = ground.about(draws_of(experiment, settings.robust, parameters))
+        context = context.about(draws_of(experiment, settings.robust, parameters))
     progress("planning", 0.2)
-    rows = ground.rows(pool.dataset)
-    task = Task(Candidates(ground.base, rows), criterion(settings.goal), request.count, settings.repeats)
+    rows = context.rows(pool.dataset)
+    task = Task(Candidates(context.base, rows), criterion(settings.goal), request.count, settings.repeats)
     _require_enough(task, parameters)
     plan = choose(task, settings.starts, settings.seed)
     _require_determined(task, plan.chosen, parameters)
@@ -124,10 +124,10 @@ def make_plan(experiment: Experiment, request: PlanRequest, progress: Progress =
     if pool.kind == "continuous" and settings.sweeps:
         progress("refinement", 0.5)
         allowed = (lambda q: np.ones(q.shape[1], dtype=bool)) if check is None else (lambda q: check(q).allowed)
-        task, plan, pool, refined = _refined(ground, task, plan, pool, allowed)
+        task, plan, pool, refined = _refined(context, task, plan, pool, allowed)
     progress("bound", 0.8)
     relaxed = bounded(task, settings.bound, plan.relaxation)
-    return _result(ground, task, plan, pool, relaxed, refined)
+    return _result(context, task, plan, pool, relaxed, refined)
 
 
 def _analysed(task: Task, chosen: Indices, parameters: Parameters) -> Identifiability:
@@ -167,45 +167,49 @@ def _require_determined(task: Task, chosen: Indices, parameters: Parameters) -> 
         )
 
 
-def _refined(ground: Ground, task: Task, plan: Plan, pool: Pool, allowed: Allowed) -> tuple[Task, Plan, Pool, int]:
+def _refined(
+    context: PlanContext, task: Task, plan: Plan, pool: Pool, allowed: Allowed
+) -> tuple[Task, Plan, Pool, int]:
     """The chosen poses moved through joint space, and chosen again from all candidates and these."""
-    channels, limits = ground.space.channels, ground.space.limits(ground.settings)
+    channels, limits = context.space.channels, context.space.limits(context.settings)
     before = pool.dataset.stacked(channels)[:, plan.chosen]
-    problem = problem_of(ground.experiment, ground.parameters, as_if_measured(ground.experiment, pool.dataset))
+    problem = problem_of(context.experiment, context.parameters, as_if_measured(context.experiment, pool.dataset))
 
     def rows(poses: Array) -> Array:
-        return over_draws(problem, ground.draws, as_if_measured(ground.experiment, dataset_of(poses, ground.space)))
+        return over_draws(problem, context.draws, as_if_measured(context.experiment, dataset_of(poses, context.space)))
 
     known, by = task.candidates.known(), task.criterion
-    after = refine(before, limits, known, by, rows, allowed, ground.settings.sweeps)
+    after = refine(before, limits, known, by, rows, allowed, context.settings.sweeps)
     moved = np.flatnonzero(np.any(after != before, axis=0))
     if not len(moved):
         return task, plan, pool, 0
     number = task.candidates.count
     poses = np.concatenate([pool.dataset.stacked(channels), after[:, moved]], axis=1)
-    pool = replace(pool, dataset=dataset_of(poses, ground.space))
+    pool = replace(pool, dataset=dataset_of(poses, context.space))
     together = np.concatenate([task.candidates.rows, rows(after[:, moved])], axis=2)
-    task = replace(task, candidates=Candidates(ground.base, together))
+    task = replace(task, candidates=Candidates(context.base, together))
     begin = plan.chosen.copy()
     begin[moved] = number + np.arange(len(moved))
-    plan = choose(task, 0, ground.settings.seed, begin)
+    plan = choose(task, 0, context.settings.seed, begin)
     return task, plan, pool, int(np.sum(plan.chosen >= number))
 
 
-def _result(ground: Ground, task: Task, plan: Plan, pool: Pool, relaxed: Relaxation | None, refined: int) -> PlanResult:
+def _result(
+    context: PlanContext, task: Task, plan: Plan, pool: Pool, relaxed: Relaxation | None, refined: int
+) -> PlanResult:
     """What is told of a plan; all but the criterion and its bound at the nominal values."""
-    parameters, chosen = ground.parameters, pool.dataset.subset(plan.chosen)
+    parameters, chosen = context.parameters, pool.dataset.subset(plan.chosen)
     certificate = None
     if relaxed is not None:
         efficiency = task.criterion.efficiency(plan.value, relaxed.bound, task.candidates.size)
         certificate = Certificate(relaxed.bound, efficiency, relaxed.how)
-    nominal = ground.about((parameters.nominal(),))
+    nominal = context.about((parameters.nominal(),))
     measured = Task(Candidates(nominal.base, nominal.rows(chosen)), criterion("D"), task.count)
     everything = np.arange(task.count)
     triangle = measured.candidates.triangles(everything)[0]
-    given = 0 if ground.given is None else len(ground.given)
-    equations = (task.count + given) * measured.candidates.rows.shape[1] + len(ground.priors)
-    dataset, seconds, hottest = visit(ground, chosen)
+    given = 0 if context.given is None else len(context.given)
+    equations = (task.count + given) * measured.candidates.rows.shape[1] + len(context.priors)
+    dataset, seconds, hottest = visit(context, chosen)
     return PlanResult(
         dataset=dataset,
         pool=pool,

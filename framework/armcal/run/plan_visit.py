@@ -11,15 +11,15 @@ from armcal.arm.holding import holding_efforts
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.planning.candidates import Indices
-from armcal.run.plan_ground import Ground
+from armcal.run.plan_context import PlanContext
 from armcal.run.visit import cool_order, heat, path_time, peak, quick_order, travel_times
 
 _SPEEDS = {"angle": np.deg2rad(60.0), "length": 0.05}
 
 
-def visit(ground: Ground, chosen: Dataset) -> tuple[Dataset, float, float | None]:
+def visit(context: PlanContext, chosen: Dataset) -> tuple[Dataset, float, float | None]:
     """The poses in the order of visit, the time that takes, and the peak of the holding torque's moving average."""
-    settings, space = ground.settings, ground.space
+    settings, space = context.settings, context.space
     angles = chosen.stacked(space.channels)
     given = space.by_joint(
         {n: [np.deg2rad(v)] for n, v in settings.speeds_deg_per_s.items()},
@@ -28,23 +28,23 @@ def visit(ground: Ground, chosen: Dataset) -> tuple[Dataset, float, float | None
     )
     usual = [np.array([_SPEEDS[dimension]]) for dimension in space.dimensions]
     speeds = np.concatenate([given.get(n, u) for n, u in zip(space.names, usual, strict=True)])
-    times, heats = travel_times(angles, speeds), heat(_efforts(ground, chosen))
+    times, heats = travel_times(angles, speeds), heat(_efforts(context, chosen))
     orders: Mapping[str, Callable[[], Indices]] = {
         "travel": lambda: quick_order(times),
         "torque": lambda: cool_order(heats, times),
         "none": lambda: np.arange(len(chosen)),
     }
     order = orders[settings.order]()
-    visited = _with_approach(_named(chosen.subset(order)), ground)
+    visited = _with_approach(_named(chosen.subset(order)), context)
     hottest = peak(heats, order) if heats.any() else None
     return visited, path_time(times, order), hottest
 
 
-def _efforts(ground: Ground, chosen: Dataset) -> Array:
+def _efforts(context: PlanContext, chosen: Dataset) -> Array:
     """Holding efforts of all arms' joints under the configured load (joints x N)."""
-    environment = ground.experiment.system.environment
+    environment = context.experiment.system.environment
     parts = []
-    for name, arm in ground.experiment.system.arms.items():
+    for name, arm in context.experiment.system.arms.items():
         angles = chosen.stacked([f"{name}.{joint}" for joint in arm.commanded])
         load = environment.gravity, environment.payload_mass, environment.payload_com
         parts.append(holding_efforts(arm, angles, *load))
@@ -62,10 +62,10 @@ def _named(chosen: Dataset) -> Dataset:
     return replace(chosen, ids=tuple(ids), extra={"order": order})
 
 
-def _with_approach(visited: Dataset, ground: Ground) -> Dataset:
+def _with_approach(visited: Dataset, context: PlanContext) -> Dataset:
     """The sign of each joint's last motion, as the order of visit makes it; 0 before the first."""
     channels = dict(visited.channels)
-    for name, arm in ground.experiment.system.arms.items():
+    for name, arm in context.experiment.system.arms.items():
         for joint in arm.commanded:
             signs = np.sign(np.diff(visited.column(f"{name}.{joint}"), prepend=visited.column(f"{name}.{joint}")[:1]))
             moved = np.maximum.accumulate(np.where(signs != 0, np.arange(len(signs)), 0))

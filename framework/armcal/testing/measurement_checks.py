@@ -163,7 +163,7 @@ def _groups(measurement: GroupedMeasurement) -> None:
 def _told(factor: Factor, measurement: Measurement, arms: Mapping[str, Arm], blocks: Sequence[ParameterBlock]) -> None:
     """What a record says of its group fits that record."""
     own = _group_blocks(measurement)
-    if not factor.told_names or set(factor.told_names) != {block.name for block in own}:
+    if not factor.nuisance_names or set(factor.nuisance_names) != {block.name for block in own}:
         raise NotRun("a record alone does not say all of its group's parameters")
     values, record = _point(factor, measurement, arms, blocks)
     said = np.asarray(_function(factor, factor.told)(np.concatenate([values, record]))).ravel()

@@ -46,7 +46,7 @@ def check_online(record: Recorder, subject: Subject) -> None:
         return
     record.check("its covariance is exactly symmetric and positive", lambda: _sound(updates))
     record.check("it finds what prior and records say together", lambda: _near(updates, prior, lines))
-    record.check("it tells the surprise of the last record", lambda: _surprise(updates[0], prior, lines[0]))
+    record.check("it reports the NIS of the last record", lambda: _nis(updates[0], prior, lines[0]))
     record.check("it changes nothing that it is given", lambda: _untouched(estimator, prior, lines))
     record.check("it keeps nothing from one update to the next", lambda: _repeats(estimator, window, updates))
     record.check("a variance below zero is an error", lambda: _refuses(estimator, prior, lines))
@@ -115,7 +115,7 @@ def _near(updates: Sequence[Update], prior: Gaussian, lines: Sequence[_Line]) ->
         expect(wide < TOLERANCE, f"found a covariance {wide:.1e} off after record {place + 1}, in units of variances")
 
 
-def _surprise(update: Update, prior: Gaussian, first: _Line) -> None:
+def _nis(update: Update, prior: Gaussian, first: _Line) -> None:
     """Of the first record, where what was believed before it is the prior whatever the window."""
     innovation = first.measured - first.slope @ prior.mean
     covariance = first.slope @ prior.covariance @ first.slope.T + first.noise

@@ -37,7 +37,7 @@ def check_reader(record: Recorder, subject: Subject) -> None:
     if reader is None:
         return
     record.check("it reads", lambda: _has_read(reader))
-    record.check("a missing file is refused by an armcal error", lambda: _misses(subject))
+    record.check("a missing file is refused by an armcal error", lambda: _large_errors(subject))
     for name, content in _DAMAGED.items():
         record.check(f"damaged files are refused: {name}", lambda c=content: _refuses(subject, c))  # type: ignore[misc]
     record.check("a folder in place of a file, or a file in place of a folder, is refused", lambda: _confused(subject))
@@ -67,7 +67,7 @@ def _read(subject: Subject, path: str, asked: ReadRequest | None = None) -> Data
         ) from fault
 
 
-def _misses(subject: Subject) -> None:
+def _large_errors(subject: Subject) -> None:
     try:
         _read(subject, MISSING_FILE)
     except (InputError, ValidationError):

@@ -12,10 +12,10 @@ from armcal.devices.clock import Clock
 from armcal.devices.device import JointDevice
 from armcal.devices.faults import DeviceRefusedError
 
-from armcal_bench.acquisition.endings import TooHot
+from armcal_bench.acquisition.endings import ThermalLimit
 from armcal_bench.acquisition.heat import HeatModel, Torques
+from armcal_bench.acquisition.path_planner import JointPath, PathPlanner
 from armcal_bench.acquisition.settings import AcquisitionSettings
-from armcal_bench.acquisition.ways import Way, Ways
 
 _LONGEST_STEP = 2.0
 """Periods: after a pause of the host, the arm goes on from where it is and does not catch up."""
@@ -32,7 +32,7 @@ Note = Callable[[Mapping[str, float], Mapping[str, Sequence[float]]], None]
 """Told angles (rad) and warmth (winding, case) by joint, now and then while the arm moves."""
 
 
-class Looker(Protocol):
+class MotionGate(Protocol):
     """What decides between two steps whether the arm may move."""
 
     why_held: str
@@ -46,7 +46,7 @@ class Drive:
 
     Attributes:
         at: where it was told to be (joints, rad).
-        warmth: of the servos, by the model (joints x 2).
+        thermal_state: of the servos, by the model (joints x 2).
         approach: the sign of each joint's last motion, 0 before its first (joints).
     """
 
@@ -54,19 +54,19 @@ class Drive:
         self,
         device: JointDevice,
         clock: Clock,
-        ways: Ways,
+        planner: PathPlanner,
         settings: AcquisitionSettings,
         heat: tuple[HeatModel, Torques],
         note: Note,
     ) -> None:
-        self._device, self._clock, self._ways, self._settings = device, clock, ways, settings
+        self._device, self._clock, self._planner, self._settings = device, clock, planner, settings
         (self._model, self._torques), self._note = heat, note
         self._joints = device.joint_names
         self._rate = float(np.deg2rad(settings.rate_deg_per_s))
         self._alive = self._noted = self._heated = clock.now()
         self.park = np.array([settings.park.get(joint, 0.0) for joint in self._joints])
         self.at = self.park.copy()
-        self.warmth = self._model.cold
+        self.thermal_state = self._model.cold
         self.approach = np.zeros(len(self._joints))
 
     @property
@@ -82,17 +82,17 @@ class Drive:
         """A joint was energised: it may have jumped from either side."""
         self.approach[self._joints.index(joint)] = 0.0
 
-    def go(self, way: Sequence[Array], looker: Looker) -> None:
+    def go(self, path: Sequence[Array], gate: MotionGate) -> None:
         """Through a way that begins where the arm is.
 
         Raises:
-            ParkWish, TooHot: it stopped on the way; ``at`` says where.
+            ParkRequested, ThermalLimit: it stopped on the way; ``at`` says where.
             DeviceError: the device failed; what it was told last may have arrived.
         """
-        for start, goal in pairwise(way):
+        for start, goal in pairwise(path):
             self._guard(start)
-            self._leg(start, goal, looker)
-        self._guard(way[-1])
+            self._leg(start, goal, gate)
+        self._guard(path[-1])
 
     def guard_here(self) -> None:
         """Should the host fall silent from now on: home from where the arm stands; see ``go``."""
@@ -102,7 +102,7 @@ class Drive:
         """Should the host fall silent from now on: stay, for joints that hang free make every way unknown."""
         self._device.guard([self.angles], self._rate, self._settings.silence)
 
-    def take_up_play(self, looker: Looker) -> None:
+    def preload_backlash(self, gate: MotionGate) -> None:
         """Give joints a direction of approach that have none since they were energised: a little away, and back.
 
         Which side a servo's play lies on is not known before it has moved. See ``go`` for what it raises.
@@ -110,25 +110,25 @@ class Drive:
         unknown, here = self.approach == 0, self.at
         for away in (-_PLAY_RAD, _PLAY_RAD):
             there = here + away * unknown
-            if unknown.any() and self._ways.within(there) and self._ways.clear(here, there):
-                self.go((here, there, here), looker)
+            if unknown.any() and self._planner.within(there) and self._planner.clear(here, there):
+                self.go((here, there, here), gate)
                 return
 
-    def stand(self, seconds: float, looker: Looker) -> None:
+    def stand(self, seconds: float, gate: MotionGate) -> None:
         """Hold for some time; see ``go``."""
         until = self._clock.now() + seconds
         while (left := until - self._clock.now()) > 0:
-            self._pause(min(left, _ALIVE_EVERY_S), looker)
+            self._pause(min(left, _ALIVE_EVERY_S), gate)
 
-    def tick(self, looker: Looker) -> bool:
+    def tick(self, gate: MotionGate) -> bool:
         """One period of holding; whether the arm may move. See ``go``."""
-        return self._pause(self._settings.period, looker)
+        return self._pause(self._settings.period, gate)
 
-    def _pause(self, seconds: float, looker: Looker) -> bool:
+    def _pause(self, seconds: float, gate: MotionGate) -> bool:
         self._clock.sleep(seconds)
         self.keep_alive()
         self._warm()
-        return looker.may_go_on()
+        return gate.may_go_on()
 
     def keep_alive(self) -> None:
         """Often enough for the device, not more often; while the arm moves too, for it also tells how the device is."""
@@ -137,31 +137,31 @@ class Drive:
             self._alive = now
             self._device.keep_alive()
 
-    def way_home(self, start: Array) -> Way | None:
+    def path_home(self, start: Array) -> JointPath | None:
         """To where it parks."""
-        return self._ways.find(start, self.park)
+        return self._planner.find(start, self.park)
 
-    def way_to(self, goal: Array) -> Way | None:
+    def path_to(self, goal: Array) -> JointPath | None:
         """From where it is."""
-        return self._ways.find(self.at, goal)
+        return self._planner.find(self.at, goal)
 
     def note(self) -> None:
         """Write down where it is and how hot."""
         self._noted = self._clock.now()
-        self._note(self.angles, self.named_warmth())
+        self._note(self.angles, self.named_thermal_state())
 
     def cool(self, seconds: float) -> None:
         """The servos had this time to cool, with the torque of where the arm is."""
-        self.warmth = self._model.after(self.warmth, self._torques(self.at), seconds)
+        self.thermal_state = self._model.after(self.thermal_state, self._torques(self.at), seconds)
 
-    def _leg(self, start: Array, goal: Array, looker: Looker) -> None:
+    def _leg(self, start: Array, goal: Array, gate: MotionGate) -> None:
         """A straight line in joint space, all joints in proportion."""
         length, gone, before = float(np.max(np.abs(goal - start))), 0.0, self._clock.now()
         told = self._device.standing(self.angles)
         moved = goal - start
         self.approach = np.where(np.abs(moved) > _STILL_RAD, np.sign(moved), self.approach)
         while gone < length:
-            moves = self.tick(looker)
+            moves = self.tick(gate)
             now = self._clock.now()
             step = min(now - before, _LONGEST_STEP * self._settings.period) * self._rate
             before = now
@@ -180,7 +180,7 @@ class Drive:
 
         Where no way home is found it stays there; what was told before, of another leg, must not remain.
         """
-        waypoints = [self._named(pose) for pose in self.way_home(start) or (start,)]
+        waypoints = [self._named(pose) for pose in self.path_home(start) or (start,)]
         try:
             self._device.guard(waypoints, self._rate, self._settings.silence)
         except DeviceRefusedError:  # more than its memory holds: as far as that goes, which is clear too
@@ -198,33 +198,33 @@ class Drive:
         """Whether the servos are within their budget.
 
         Raises:
-            TooHot: they are not.
+            ThermalLimit: they are not.
         """
-        if self._model.over(self.warmth):
-            raise TooHot(f"the servo of {self._hottest} has come to its budget")
+        if self._model.over(self.thermal_state):
+            raise ThermalLimit(f"the servo of {self._hottest} has come to its budget")
 
     @property
     def hottest(self) -> str:
         """The servo that is nearest to its budget, in words."""
-        share = float(np.max(self._model.heat(self.warmth) / self._model.budget))
+        share = float(np.max(self._model.heat(self.thermal_state) / self._model.budget))
         return f"that of {self._hottest} is at {100 * share:.0f} % of its budget"
 
     @property
     def _hottest(self) -> str:
-        return self._joints[int(np.argmax(self._model.heat(self.warmth) / self._model.budget))]
+        return self._joints[int(np.argmax(self._model.heat(self.thermal_state) / self._model.budget))]
 
-    def hotter_than(self, warmth: Array) -> bool:
+    def hotter_than(self, thermal_state: Array) -> bool:
         """Whether a servo is hotter than with some warmth (joints x 2), and cools still where the arm stands."""
-        heat, settled = self._model.heat(self.warmth), self._model.heat(self._steady())
-        return bool(np.any(heat > np.maximum(self._model.heat(warmth), settled) + _SAME_HEAT))
+        heat, settled = self._model.heat(self.thermal_state), self._model.heat(self._steady())
+        return bool(np.any(heat > np.maximum(self._model.heat(thermal_state), settled) + _SAME_HEAT))
 
     def _steady(self) -> Array:
         """The warmth (joints x 2) that the servos come to where the arm stands."""
         return np.repeat(self._model.steady(self._torques(self.at)), 2, axis=1)
 
-    def named_warmth(self) -> dict[str, list[float]]:
+    def named_thermal_state(self) -> dict[str, list[float]]:
         """Of winding and case, by joint."""
-        return dict(zip(self._joints, self.warmth.tolist(), strict=True))
+        return dict(zip(self._joints, self.thermal_state.tolist(), strict=True))
 
     def _named(self, values: Array) -> dict[str, float]:
         return dict(zip(self._joints, values.tolist(), strict=True))

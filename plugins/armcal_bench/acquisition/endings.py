@@ -16,13 +16,13 @@ class Ending:
     sentence: str
 
 
-class ParkWish(Exception):  # noqa: N818 - no error: somebody or something wants the arm parked
+class ParkRequested(Exception):  # noqa: N818 - no error: somebody or something wants the arm parked
     """The arm is to be parked, and the run to end. The message says why."""
 
 
-class OutOfSight(ParkWish):
+class TrackerLost(ParkRequested):
     """The tracker has told nothing of use for long, be it for where the arm is or for good."""
 
 
-class TooHot(Exception):  # noqa: N818 - see above
+class ThermalLimit(Exception):  # noqa: N818 - see above
     """A servo has come to its budget before its time."""

@@ -24,7 +24,7 @@ class HeatModel:
 
     What a servo loses goes with the square of its current, and the current with its torque. It warms the winding, which
     is quick, and the case, which is slow; each has a share of the heat and a time constant:
-    ``warmth' = ((torque / continuous)^2 - warmth) / time``, and heat is the sum of share times warmth.
+    ``thermal_state' = ((torque / continuous)^2 - thermal_state) / time``, and heat is the sum of share times warmth.
 
     Attributes:
         continuous: N m (joints; infinite where a servo is not reckoned with).
@@ -61,33 +61,33 @@ class HeatModel:
         """Warmth of servos that have rested for long (joints x 2)."""
         return np.zeros(self.times.shape)
 
-    def heat(self, warmth: Array) -> Array:
+    def heat(self, thermal_state: Array) -> Array:
         """Of each joint, from the warmth of its parts (joints x 2)."""
-        return np.asarray((self.shares * warmth).sum(axis=1))
+        return np.asarray((self.shares * thermal_state).sum(axis=1))
 
     def steady(self, torque: Array) -> Array:
         """The warmth of all parts (joints x 1) that a torque (joints, N m) leads to in the end."""
         return np.asarray((torque / self.continuous) ** 2)[:, None]
 
-    def after(self, warmth: Array, torque: Array, seconds: float) -> Array:
+    def after(self, thermal_state: Array, torque: Array, seconds: float) -> Array:
         """Warmth (joints x 2) after holding a torque (joints, N m) for some time."""
         steady = self.steady(torque)
-        return np.asarray(steady + (warmth - steady) * np.exp(-seconds / self.times))
+        return np.asarray(steady + (thermal_state - steady) * np.exp(-seconds / self.times))
 
-    def over(self, warmth: Array) -> bool:
+    def over(self, thermal_state: Array) -> bool:
         """Whether a servo is above its budget."""
-        return bool(np.any(self.heat(warmth) > self.budget))
+        return bool(np.any(self.heat(thermal_state) > self.budget))
 
     def too_hot_for_ever(self, torque: Array, part: float = 1.0) -> int | None:
         """The first servo that stays above a part of its budget under a torque (joints, N m); None if none does."""
         over = self.steady(torque)[:, 0] > part * self.budget
         return int(np.argmax(over)) if over.any() else None
 
-    def cooled_in(self, warmth: Array, torque: Array, wanted: Array) -> float:
+    def cooled_in(self, thermal_state: Array, torque: Array, wanted: Array) -> float:
         """Seconds of holding a torque until no heat is above what is wanted (joints); infinite if it never comes so."""
 
         def hot(seconds: float) -> bool:
-            return bool(np.any(self.heat(self.after(warmth, torque, seconds)) > wanted))
+            return bool(np.any(self.heat(self.after(thermal_state, torque, seconds)) > wanted))
 
         if not hot(0.0):
             return 0.0

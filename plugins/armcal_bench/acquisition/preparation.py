@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 
 from armcal_bench.acquisition.arrival import Arrival, tool_poses
 from armcal_bench.acquisition.heat import HeatModel, Torques, holding_torques
+from armcal_bench.acquisition.path_planner import PathPlanner
 from armcal_bench.acquisition.schedule import Scheduler
 from armcal_bench.acquisition.settings import AcquisitionSettings
-from armcal_bench.acquisition.ways import Ways
 from armcal_bench.bench import Bench
 from armcal_bench.hazards import HazardJudge
 
@@ -37,7 +37,7 @@ class Prepared:
     Attributes:
         plan: joint commands and the plan's ids, in its order.
         scheduler: over the angles that the device can set nearest to them.
-        ways: between poses.
+        planner: between poses.
         heat: the servos' model, and the torques that heat them.
         arrival: whether the arm is where it was told to be.
         judge: of what is dangerous in the first motions and the last.
@@ -47,7 +47,7 @@ class Prepared:
     device: JointDevice
     plan: Dataset
     scheduler: Scheduler
-    ways: Ways
+    planner: PathPlanner
     heat: tuple[HeatModel, Torques]
     arrival: Arrival
     judge: HazardJudge
@@ -76,9 +76,9 @@ def prepare(experiment: Experiment, plan: Path) -> Prepared:
     _within(device.joint_names, asked, limits, plan, commands)
     poses, standing_park = _standing(device, asked, plan, commands), _park(experiment, settings, device, limits)
     settable = _settable(device, limits, standing_park)
-    ways = Ways(check, settable, np.vstack([standing_park, poses]), settings.path_step, settings.seed)
-    _all_allowed(ways, poses, commands, plan)
-    if not ways.allowed(standing_park):
+    planner = PathPlanner(check, settable, np.vstack([standing_park, poses]), settings.path_step, settings.seed)
+    _all_allowed(planner, poses, commands, plan)
+    if not planner.allowed(standing_park):
         raise ConfigError(
             "the pose where the arm parks is too near to something.",
             where=experiment.source.where((*_AT, "park")),
@@ -91,7 +91,7 @@ def prepare(experiment: Experiment, plan: Path) -> Prepared:
         poses=poses,
         ids=commands.ids,
         park=standing_park,
-        ways=ways,
+        planner=planner,
         model=heat[0],
         torques=heat[1],
         rate=float(np.deg2rad(settings.rate_deg_per_s)),
@@ -100,7 +100,7 @@ def prepare(experiment: Experiment, plan: Path) -> Prepared:
     )
     arrival = Arrival(tool_poses(arm, poses), settings.arrival)
     judge = HazardJudge(device.joint_names, device.joint_names, limits, heat[1], standing_park)
-    return Prepared(bench, device, commands, scheduler, ways, heat, arrival, judge)
+    return Prepared(bench, device, commands, scheduler, planner, heat, arrival, judge)
 
 
 def joint_limits(experiment: Experiment, settings: AcquisitionSettings, arm: Arm) -> Array:
@@ -226,9 +226,9 @@ def _standing(device: JointDevice, poses: Array, plan: Path, commands: Dataset) 
     return np.array(found)
 
 
-def _all_allowed(ways: Ways, poses: Array, commands: Dataset, plan: Path) -> None:
+def _all_allowed(planner: PathPlanner, poses: Array, commands: Dataset, plan: Path) -> None:
     for row, pose in enumerate(poses):
-        if not ways.allowed(pose):
+        if not planner.allowed(pose):
             raise DataError(
                 f"pose {commands.ids[row]} is too near to something.",
                 where=_row(plan, commands, row),

@@ -29,7 +29,7 @@ class Progress:
         measured: what was written of each pose, by its id, in the order of measuring.
         left_out: why, by pose id.
         angles: the angles that were commanded last (rad, by joint); empty before the first.
-        warmth: of winding and case, by joint, when ``angles`` were written.
+        thermal_state: of winding and case, by joint, when ``angles`` were written.
         at: unix s of that.
         ended: how it ended, if it did: ``done``, ``held`` or ``parked``.
     """
@@ -37,7 +37,7 @@ class Progress:
     measured: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     left_out: Mapping[str, str] = field(default_factory=dict)
     angles: Mapping[str, float] = field(default_factory=dict)
-    warmth: Mapping[str, Sequence[float]] = field(default_factory=dict)
+    thermal_state: Mapping[str, Sequence[float]] = field(default_factory=dict)
     at: float = 0.0
     ended: str = ""
 
@@ -52,7 +52,7 @@ class Progress:
         if kind == ENERGISED:
             return replace(self, angles={**self.angles, content["joint"]: content["angle"]})
         if kind in (HERE, GOING):
-            return replace(self, angles=content["angles"], warmth=content["warmth"], at=content["at"])
+            return replace(self, angles=content["angles"], thermal_state=content["warmth"], at=content["at"])
         if kind == ENDED:
             return replace(self, ended=content["how"])
         return self

@@ -24,7 +24,7 @@ Announce = Callable[[str, float], None]
 """Told a joint and its angle (rad) before its first pulse."""
 
 
-class StaysLost(Exception):  # noqa: N818 - an ending, not an error of a caller
+class DeviceLost(Exception):  # noqa: N818 - an ending, not an error of a caller
     """The device does not come back. The message is a sentence about what the arm does now."""
 
 
@@ -82,7 +82,7 @@ class Recovery:
         """After a fault: open it again and energise what hangs, for as long as a lost tracker would be waited for.
 
         Raises:
-            StaysLost: in vain.
+            DeviceLost: in vain.
         """
         self._again(fault, lambda: self.energise(known))
 
@@ -97,7 +97,7 @@ class Recovery:
             why = f"the arm holds, the device is looked for: {last.message.rstrip('.')}"
             self._waits.goes_on("device", why, left, self._clock.now())
             if self._asked() and self._clock.now() >= began + _LAST_TRIES_S:
-                raise StaysLost(f"it was asked to stop while the device was lost ({last}); {_AS_IT_IS}")
+                raise DeviceLost(f"it was asked to stop while the device was lost ({last}); {_AS_IT_IS}")
             self._clock.sleep(_AGAIN_EVERY_S)
             try:
                 self._same(self._device.open(self._clock))
@@ -110,7 +110,7 @@ class Recovery:
             except DeviceError as again:
                 last = again
         self._waits.given_up("device")
-        raise StaysLost(f"the device did not come back in {self._settings.lost.park:.0f} s ({last}); {_AS_IT_IS}")
+        raise DeviceLost(f"the device did not come back in {self._settings.lost.park:.0f} s ({last}); {_AS_IT_IS}")
 
     def standing(self) -> dict[str, float]:
         """The angles that its pulses ask for (rad), read back.
@@ -151,7 +151,7 @@ class Recovery:
             self._in_a_row = 0
         self._in_a_row, self._since = self._in_a_row + 1, self._clock.now()
         if self._in_a_row > _MOST_IN_A_ROW:
-            raise StaysLost(f"the device failed {self._in_a_row} times in a row ({fault}); {_AS_IT_IS}")
+            raise DeviceLost(f"the device failed {self._in_a_row} times in a row ({fault}); {_AS_IT_IS}")
 
 
 _AS_IT_IS = "its pulses go on as they are, unless the board parks the arm by itself"

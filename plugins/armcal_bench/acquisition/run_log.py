@@ -38,10 +38,10 @@ class RunLog:
         with self._once():
             self._journal.record(kind, dict(content))
 
-    def note_angles(self, angles: Mapping[str, float], warmth: Mapping[str, Any], wall: float) -> None:
+    def note_angles(self, angles: Mapping[str, float], thermal_state: Mapping[str, Any], wall: float) -> None:
         """Write where the arm is told to be; a power loss may take the last of these. See ``record``."""
         with self._once():
-            self._journal.note(HERE, {"angles": dict(angles), "warmth": dict(warmth), "at": wall})
+            self._journal.note(HERE, {"angles": dict(angles), "warmth": dict(thermal_state), "at": wall})
 
     @contextmanager
     def _once(self) -> Iterator[None]:

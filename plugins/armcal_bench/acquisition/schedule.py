@@ -10,7 +10,7 @@ import numpy as np
 from armcal.base.domains import Array
 
 from armcal_bench.acquisition.heat import NEVER, HeatModel, Torques
-from armcal_bench.acquisition.ways import Way, Ways, travel
+from armcal_bench.acquisition.path_planner import JointPath, PathPlanner, travel
 
 _SAMPLES = 8
 _CONSIDERED = 12
@@ -23,18 +23,18 @@ class Measure:
     """Go to a pose and measure there."""
 
     pose: int
-    way: Way
+    path: JointPath
     seconds: float
-    warmth: Array
+    thermal_state: Array
 
 
 @dataclass(frozen=True)
 class Rest:
     """Go to where the arm parks and wait there."""
 
-    way: Way
+    path: JointPath
     seconds: float
-    warmth: Array
+    thermal_state: Array
 
 
 @dataclass(frozen=True)
@@ -64,89 +64,89 @@ class Scheduler:
     poses: Array
     ids: tuple[str, ...]
     park: Array
-    ways: Ways
+    planner: PathPlanner
     model: HeatModel
     torques: Torques
     rate: float
     capture: float
     order: str
 
-    def next(self, at: Array, warmth: Array, left: Sequence[int]) -> Next:
+    def next(self, at: Array, thermal_state: Array, left: Sequence[int]) -> Next:
         """What to do now; ``left`` are indices of poses, in the plan's order, at least one."""
         chosen = left[:1] if self.order == "plan" else self._near(at, left)
-        found = [self._measure(at, warmth, pose) for pose in chosen]
+        found = [self._measure(at, thermal_state, pose) for pose in chosen]
         fitting = [step for step in found if isinstance(step, Measure) and self._fits(step)]
         if fitting:
-            return min(fitting, key=lambda step: self._cost(warmth, step))
-        return self._rested(at, warmth, chosen[0], found[0])
+            return min(fitting, key=lambda step: self._cost(thermal_state, step))
+        return self._rested(at, thermal_state, chosen[0], found[0])
 
     def _near(self, at: Array, left: Sequence[int]) -> Sequence[int]:
         away = np.max(np.abs(self.poses[list(left)] - at), axis=1)
         return [left[i] for i in np.argsort(away, kind="stable")[:_CONSIDERED]]
 
-    def _measure(self, at: Array, warmth: Array, pose: int) -> Measure | LeaveOut:
-        way = self.ways.find(at, self.poses[pose])
-        if way is None:
+    def _measure(self, at: Array, thermal_state: Array, pose: int) -> Measure | LeaveOut:
+        path = self.planner.find(at, self.poses[pose])
+        if path is None:
             return LeaveOut(pose, f"no clear way to pose {self.ids[pose]} was found")
-        there = self.model.after(warmth, self._effective(way), travel(way) / self.rate)
+        there = self.model.after(thermal_state, self._effective(path), travel(path) / self.rate)
         after = self.model.after(there, self.torques(self.poses[pose]), self.capture)
-        return Measure(pose, way, travel(way) / self.rate + self.capture, np.maximum(there, after))
+        return Measure(pose, path, travel(path) / self.rate + self.capture, np.maximum(there, after))
 
     def _fits(self, step: Measure) -> bool:
         """Within the budget there, and on the way to where it rests."""
-        back = self.ways.find(step.way[-1], self.park)
+        back = self.planner.find(step.path[-1], self.park)
         if back is None:
-            return not self.model.over(step.warmth)
-        home = self.model.after(step.warmth, self._effective(back), travel(back) / self.rate)
-        return not (self.model.over(step.warmth) or self.model.over(home))
+            return not self.model.over(step.thermal_state)
+        home = self.model.after(step.thermal_state, self._effective(back), travel(back) / self.rate)
+        return not (self.model.over(step.thermal_state) or self.model.over(home))
 
-    def _rested(self, at: Array, warmth: Array, pose: int, found: Measure | LeaveOut) -> Next:
+    def _rested(self, at: Array, thermal_state: Array, pose: int, found: Measure | LeaveOut) -> Next:
         if isinstance(found, LeaveOut):
             return found
-        way = self.ways.find(at, self.park)
-        if way is None:
+        path = self.planner.find(at, self.park)
+        if path is None:
             return LeaveOut(pose, "no clear way to where the arm parks was found")
-        home = self.model.after(warmth, self._effective(way), travel(way) / self.rate)
+        home = self.model.after(thermal_state, self._effective(path), travel(path) / self.rate)
         at_rest = self.torques(self.park)
-        cold = self._measure(self.park, np.minimum(self.model.cold + self.model.steady(at_rest), warmth), pose)
+        cold = self._measure(self.park, np.minimum(self.model.cold + self.model.steady(at_rest), thermal_state), pose)
         if not isinstance(cold, Measure) or not self._fits(cold):
             return LeaveOut(pose, f"pose {self.ids[pose]} needs more torque than the servos bear, even from cold")
         seconds = self._rest_for(home, at_rest, pose)
         if seconds == NEVER:
             return LeaveOut(pose, f"the servos do not cool enough for pose {self.ids[pose]} where the arm parks")
-        return Rest(way, travel(way) / self.rate + seconds, self.model.after(home, at_rest, seconds))
+        return Rest(path, travel(path) / self.rate + seconds, self.model.after(home, at_rest, seconds))
 
-    def _rest_for(self, warmth: Array, at_rest: Array, pose: int) -> float:
+    def _rest_for(self, thermal_state: Array, at_rest: Array, pose: int) -> float:
         """Down to a part of the budget, and on until the pose fits."""
         for part in (_COOLED_TO, 0.25, 0.1, 0.02):
             wanted = np.maximum(part * self.model.budget, 1.02 * self.model.steady(at_rest)[:, 0] + 1e-6)
-            seconds = self.model.cooled_in(warmth, at_rest, wanted)
+            seconds = self.model.cooled_in(thermal_state, at_rest, wanted)
             if seconds == NEVER:
                 return NEVER
-            step = self._measure(self.park, self.model.after(warmth, at_rest, seconds), pose)
+            step = self._measure(self.park, self.model.after(thermal_state, at_rest, seconds), pose)
             if isinstance(step, Measure) and self._fits(step):
                 return seconds
         return NEVER
 
-    def _effective(self, way: Way) -> Array:
+    def _effective(self, path: JointPath) -> Array:
         """The torque that heats as the way does on average (joints, N m)."""
         squares, lengths = [], []
-        for start, goal in pairwise(way):
+        for start, goal in pairwise(path):
             parts = [self.torques(start + t * (goal - start)) ** 2 for t in (np.arange(_SAMPLES) + 0.5) / _SAMPLES]
             squares.append(np.mean(parts, axis=0))
             lengths.append(float(np.max(np.abs(goal - start))))
         if not sum(lengths):
-            return self.torques(way[-1])
+            return self.torques(path[-1])
         return np.asarray(np.sqrt(np.average(squares, axis=0, weights=lengths)))
 
-    def _cost(self, warmth: Array, step: Measure) -> float:
+    def _cost(self, thermal_state: Array, step: Measure) -> float:
         """Its own time, and the time that its heat will take to go again."""
-        added = np.maximum(self.model.shares * (step.warmth - warmth), 0.0) / self.model.budget[:, None]
+        added = np.maximum(self.model.shares * (step.thermal_state - thermal_state), 0.0) / self.model.budget[:, None]
         return step.seconds + float(np.max((added * self.model.times).sum(axis=1)))
 
 
 @dataclass(frozen=True)
-class Outlook:
+class ScheduleForecast:
     """What a run is expected to take.
 
     Attributes:
@@ -164,12 +164,12 @@ class Outlook:
     hottest: Array
 
 
-def foretell(scheduler: Scheduler, at: Array, warmth: Array, left: Sequence[int]) -> Outlook:
+def forecast_schedule(scheduler: Scheduler, at: Array, thermal_state: Array, left: Sequence[int]) -> ScheduleForecast:
     """The whole run, as it will be decided step by step if the servos heat as the model says."""
     steps: list[Next] = []
-    remaining, seconds, gone, resting, hottest = list(left), 0.0, 0.0, 0.0, scheduler.model.heat(warmth)
+    remaining, seconds, gone, resting, hottest = list(left), 0.0, 0.0, 0.0, scheduler.model.heat(thermal_state)
     while remaining:
-        step = scheduler.next(at, warmth, remaining)
+        step = scheduler.next(at, thermal_state, remaining)
         steps.append(step)
         if isinstance(step, LeaveOut):
             remaining.remove(step.pose)
@@ -178,7 +178,7 @@ def foretell(scheduler: Scheduler, at: Array, warmth: Array, left: Sequence[int]
             remaining.remove(step.pose)
         else:
             resting += step.seconds
-        seconds, gone = seconds + step.seconds, gone + travel(step.way)
-        warmth, at = step.warmth, step.way[-1]
-        hottest = np.maximum(hottest, scheduler.model.heat(warmth))
-    return Outlook(tuple(steps), seconds, gone, resting, hottest)
+        seconds, gone = seconds + step.seconds, gone + travel(step.path)
+        thermal_state, at = step.thermal_state, step.path[-1]
+        hottest = np.maximum(hottest, scheduler.model.heat(thermal_state))
+    return ScheduleForecast(tuple(steps), seconds, gone, resting, hottest)

@@ -19,15 +19,15 @@ from armcal.devices.faults import DeviceRefusedError
 from armcal.errors import InputError, Location
 
 from armcal_bench.acquisition import progress as entry
-from armcal_bench.acquisition.conduct import Conduct, Parts
+from armcal_bench.acquisition.acquisition_run import AcquisitionRun, Parts
 from armcal_bench.acquisition.drive import Drive
 from armcal_bench.acquisition.endings import Ending
-from armcal_bench.acquisition.eyes import TrackerEyes
 from armcal_bench.acquisition.outputs import in_order, measured_by, write_outputs
 from armcal_bench.acquisition.preparation import Prepared
 from armcal_bench.acquisition.progress import Progress
 from armcal_bench.acquisition.recovery import Recovery
 from armcal_bench.acquisition.run_log import RunLog, Start, opened_log
+from armcal_bench.acquisition.tracker_monitor import BenchTrackerMonitor
 from armcal_bench.acquisition.watch import Patient, Watch
 from armcal_bench.hazards import FirstMotion
 from armcal_bench.waiting import Waits
@@ -37,7 +37,7 @@ _FIRST_FRAME_S = 3.0
 
 
 @dataclass(frozen=True)
-class Course:
+class RunOptions:
     """What a run is told, and whom it tells.
 
     Attributes:
@@ -67,7 +67,7 @@ class Outcome:
     summary: dict[str, Any]
 
 
-def acquire(prepared: Prepared, plan: Path, course: Course) -> Outcome:
+def acquire(prepared: Prepared, plan: Path, options: RunOptions) -> Outcome:
     """Drive the plan.
 
     Raises:
@@ -76,13 +76,13 @@ def acquire(prepared: Prepared, plan: Path, course: Course) -> Outcome:
         ArmcalError: the journal cannot be written; the arm was parked.
     """
     measured_by(prepared.bench.experiment)
-    with prepared.bench.clock() as clock, opened_log(course.folder, course.start, _header(prepared, plan)) as log:
+    with prepared.bench.clock() as clock, opened_log(options.folder, options.start, _header(prepared, plan)) as log:
         if log.identity is not None and _is_over(prepared, log):
-            return _written(prepared, course, log.progress, Ending("done", "it was done before"), log.identity)
-        with _opened(prepared, course, clock, log) as (device, eyes, identity):
+            return _written(prepared, options, log.progress, Ending("done", "it was done before"), log.identity)
+        with _opened(prepared, options, clock, log) as (device, monitor, identity):
             log.record(entry.STARTED, {"at": clock.wall(), "device": identity.digest, "name": identity.name})
-            ending, progress = _conducted(prepared, course, clock, log, (device, eyes, identity))
-        return _written(prepared, course, progress, ending, identity)
+            ending, progress = _carried_out(prepared, options, clock, log, (device, monitor, identity))
+        return _written(prepared, options, progress, ending, identity)
 
 
 def _is_over(prepared: Prepared, log: RunLog) -> bool:
@@ -93,20 +93,20 @@ def _is_over(prepared: Prepared, log: RunLog) -> bool:
 
 
 def _written(
-    prepared: Prepared, course: Course, progress: Progress, ending: Ending, identity: DeviceIdentity
+    prepared: Prepared, options: RunOptions, progress: Progress, ending: Ending, identity: DeviceIdentity
 ) -> Outcome:
     summary = _summary(prepared, progress, ending, identity)
-    write_outputs(course.folder, prepared.bench.experiment, progress, summary)
+    write_outputs(options.folder, prepared.bench.experiment, progress, summary)
     return Outcome(ending, summary)
 
 
 @contextmanager
 def _opened(
-    prepared: Prepared, course: Course, clock: Clock, log: RunLog
-) -> Iterator[tuple[JointDevice, TrackerEyes, DeviceIdentity]]:
+    prepared: Prepared, options: RunOptions, clock: Clock, log: RunLog
+) -> Iterator[tuple[JointDevice, BenchTrackerMonitor, DeviceIdentity]]:
     """Device and tracker, both alive; nothing moves."""
     device, settings = prepared.device, prepared.settings
-    eyes = TrackerEyes(prepared.bench, clock)
+    monitor = BenchTrackerMonitor(prepared.bench, clock)
     try:
         identity = device.open(clock)
         if log.identity is not None and log.identity.digest != identity.digest:
@@ -114,80 +114,80 @@ def _opened(
                 f"the run was begun with another board, or another calibration of it, than {identity.name}.",
                 hint="Connect the board that the run began with, with the servo file that it began with.",
             )
-        if not course.unchecked:
+        if not options.unchecked:
             check_wiring(prepared.bench, device.joint_names, identity.adapter)
-        eyes.open()
+        monitor.open()
         until = clock.now() + _FIRST_FRAME_S
-        while eyes.trouble()[0] and clock.now() < until:
+        while monitor.trouble()[0] and clock.now() < until:
             clock.sleep(settings.period)
             device.keep_alive()
-            eyes.look()
-        if eyes.trouble()[0]:
+            monitor.look()
+        if monitor.trouble()[0]:
             raise DeviceRefusedError(
-                f"the tracker tells nothing that could be used ({eyes.trouble()[1]}); nothing was moved.",
+                f"the tracker tells nothing that could be used ({monitor.trouble()[1]}); nothing was moved.",
                 hint="Start it, check its address and the names of its bodies, and let it see them.",
             )
-        yield device, eyes, identity
+        yield device, monitor, identity
     finally:
-        eyes.close()
+        monitor.close()
         device.close()
 
 
-def _conducted(
+def _carried_out(
     prepared: Prepared,
-    course: Course,
+    options: RunOptions,
     clock: Clock,
     log: RunLog,
-    opened: tuple[JointDevice, TrackerEyes, DeviceIdentity],
+    opened: tuple[JointDevice, BenchTrackerMonitor, DeviceIdentity],
 ) -> tuple[Ending, Progress]:
     """The run itself; everything is written down as it goes."""
-    settings, progress, (device, eyes, identity) = prepared.settings, log.progress, opened
+    settings, progress, (device, monitor, identity) = prepared.settings, log.progress, opened
 
-    def note(angles: Any, warmth: Any) -> None:
-        log.note_angles(angles, warmth, clock.wall())
+    def note(angles: Any, thermal_state: Any) -> None:
+        log.note_angles(angles, thermal_state, clock.wall())
 
     def announce(joint: str, angle: float) -> None:
         log.record(entry.ENERGISED, {"joint": joint, "angle": angle, "at": clock.wall()})
 
-    drive = Drive(device, clock, prepared.ways, settings, prepared.heat, note)
-    prepared.ways.meanwhile = drive.keep_alive  # the board would take a host that plans for one that died
+    drive = Drive(device, clock, prepared.planner, settings, prepared.heat, note)
+    prepared.planner.meanwhile = drive.keep_alive  # the board would take a host that plans for one that died
     _warmed(drive, progress, clock)
-    _permitted(prepared, course, progress)
+    _permitted(prepared, options, progress)
     parts = Parts(
         drive=drive,
-        recovery=Recovery(device, drive, clock, settings, announce, course.asked_to_end, identity, course.waits),
+        recovery=Recovery(device, drive, clock, settings, announce, options.asked_to_end, identity, options.waits),
         scheduler=prepared.scheduler,
-        eyes=eyes,
+        monitor=monitor,
         clock=clock,
         settings=settings,
         log=log,
-        watch=Watch(clock, eyes, settings.lost, course.asked_to_end, course.waits),
-        patient=Patient(eyes, course.asked_to_end),
-        told=course.told,
+        watch=Watch(clock, monitor, settings.lost, options.asked_to_end, options.waits),
+        patient=Patient(monitor, options.asked_to_end),
+        told=options.told,
         arrival=prepared.arrival,
-        waits=course.waits,
+        waits=options.waits,
     )
-    conduct = Conduct(parts, replace(progress, ended=""))
-    return conduct.run(), conduct.progress
+    acquisition = AcquisitionRun(parts, replace(progress, ended=""))
+    return acquisition.run(), acquisition.progress
 
 
-def _permitted(prepared: Prepared, course: Course, progress: Progress) -> None:
+def _permitted(prepared: Prepared, options: RunOptions, progress: Progress) -> None:
     """Ask before anything moves, be it limp or powered."""
     device, settings = prepared.device, prepared.settings
     angles = device.state().angles
     start = prepared.judge.first_motion(angles, progress.angles, releases=settings.at_end == "release")
     if angles:  # nobody beats while somebody thinks: joints that hold are to stay where they are
         device.guard([angles], float(np.deg2rad(settings.rate_deg_per_s)), settings.silence)
-    before = course.asked_to_end()
-    if not course.may_energise(start) or (course.asked_to_end() and not before):
+    before = options.asked_to_end()
+    if not options.may_energise(start) or (options.asked_to_end() and not before):
         raise InputError("the arm may not be moved; nothing was moved.", hint="Say yes, or give --yes.")
 
 
 def _warmed(drive: Drive, progress: Progress, clock: Clock) -> None:
     """The warmth that an earlier part of the run has left."""
-    if progress.warmth:
+    if progress.thermal_state:
         drive.found(progress.angles)
-        drive.warmth = np.array([progress.warmth.get(joint, (0.0, 0.0)) for joint in drive.angles])
+        drive.thermal_state = np.array([progress.thermal_state.get(joint, (0.0, 0.0)) for joint in drive.angles])
         drive.cool(max(clock.wall() - progress.at, 0.0))
 
 

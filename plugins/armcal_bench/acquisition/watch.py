@@ -7,7 +7,7 @@ from typing import Protocol
 
 from armcal.devices.clock import Clock
 
-from armcal_bench.acquisition.endings import OutOfSight, ParkWish
+from armcal_bench.acquisition.endings import ParkRequested, TrackerLost
 from armcal_bench.acquisition.settings import LostSettings
 from armcal_bench.waiting import Waits
 
@@ -25,7 +25,7 @@ class Sight(Protocol):
 class Watch:
     """Looks, and says whether the arm may go on.
 
-    Raises ParkWish where somebody asks for the end, or the tracker stays away for too long.
+    Raises ParkRequested where somebody asks for the end, or the tracker stays away for too long.
     """
 
     def __init__(
@@ -44,15 +44,15 @@ class Watch:
         """Whether to move now; ``why_held`` says why not.
 
         Raises:
-            ParkWish: it is time to park.
+            ParkRequested: it is time to park.
         """
         self._sight.look()
         if self._asked():
-            raise ParkWish("it was asked to stop")
+            raise ParkRequested("it was asked to stop")
         seconds, why = self._sight.trouble()
         if seconds >= self._lost.park:
             self._waits.given_up("tracker")
-            raise OutOfSight(f"the tracker has told nothing for {seconds:.0f} s: {why}")
+            raise TrackerLost(f"the tracker has told nothing for {seconds:.0f} s: {why}")
         self.why_held = why if seconds >= self._lost.hold else ""
         if self.why_held:
             self._waits.goes_on("tracker", f"the arm holds: {why}", self._lost.park - seconds, self._clock.now())
@@ -73,11 +73,11 @@ class Patient:
         """Always.
 
         Raises:
-            ParkWish: it was asked to stop.
+            ParkRequested: it was asked to stop.
         """
         self._sight.look()
         if self._asked():
-            raise ParkWish("it was asked to stop")
+            raise ParkRequested("it was asked to stop")
         return True
 
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable
 from typing import Any, TypeVar
 
 import click
-from armcal.cli.common import Voice
+from armcal.cli.common import Console
 from armcal.errors import InputError
 
 from armcal_bench.hazards import FirstMotion, Hazard
@@ -45,25 +45,25 @@ def asked(motion: FirstMotion) -> bool:
     return click.confirm("Is everybody clear of the arm?", err=True)
 
 
-def warned(voice: Voice, question: Question) -> Question:
+def warned(console: Console, question: Question) -> Question:
     """The question, after what is dangerous has been named: whoever gave --yes reads it too."""
 
     def ask(motion: FirstMotion) -> bool:
-        show_hazards(voice, motion.hazards)
+        show_hazards(console, motion.hazards)
         return question(motion)
 
     return ask
 
 
-def waits(voice: Voice) -> Waits:
+def waits(console: Console) -> Waits:
     """What is waited for, on standard error: a progress bar alone does not say that."""
-    return Waits(lambda text: voice.err.print(text, markup=False, soft_wrap=True))
+    return Waits(lambda text: console.err.print(text, markup=False, soft_wrap=True))
 
 
-def show_hazards(voice: Voice, hazards: Iterable[Hazard]) -> None:
+def show_hazards(console: Console, hazards: Iterable[Hazard]) -> None:
     """A warning line each."""
     for hazard in hazards:
-        voice.warn(hazard.sentence)
+        console.warn(hazard.sentence)
 
 
 def energise_option(command: F) -> F:

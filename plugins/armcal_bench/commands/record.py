@@ -13,7 +13,7 @@ from typing import Any, Literal
 
 import click
 from armcal.base.config_text import ConfigText
-from armcal.cli.common import Voice, overrides, speaking
+from armcal.cli.common import Console, overrides, speaking
 from armcal.cli.outlet import say
 from armcal.config.yaml_source import ConfigSource, load_config
 from armcal.devices.line_source import KINDS, STANDARD_INPUT
@@ -23,10 +23,10 @@ from armcal.plugins import discover
 from armcal.run.experiment import Experiment
 
 from armcal_bench.bench import SECTION, Bench
-from armcal_bench.recording.book import DATASET
 from armcal_bench.recording.keys import Keys, LineKeys, NoKeys, TerminalKeys
 from armcal_bench.recording.recorder import KEYS
-from armcal_bench.recording.session import Course, record
+from armcal_bench.recording.recording_log import DATASET
+from armcal_bench.recording.session import RecordingOptions, record
 from armcal_bench.recording.told import Told
 
 _TERMINAL = Path("/dev/tty")
@@ -47,7 +47,7 @@ _TERMINAL = Path("/dev/tty")
 @overrides
 @speaking
 def record_command(
-    voice: Voice,
+    console: Console,
     config: Path,
     out: Path,
     resume: bool,
@@ -57,18 +57,18 @@ def record_command(
 ) -> None:
     """Record postures of CONFIG's arms while they are guided by hand; keys say when. Each is judged at once."""
     registry = discover()
-    voice.plugin_faults(registry)
+    console.plugin_faults(registry)
     experiment = Experiment.of(_with_source(load_config(config, overrides), source), registry=registry)
     bench = Bench.of(experiment)
-    tell = _teller(voice)
+    tell = _teller(console)
     with Signals() as signals, _keys(bench, capture) as (keys, is_terminal):
-        if is_terminal and not voice.quiet:
+        if is_terminal and not console.quiet:
             click.echo(f"{KEYS}.", err=True)
         start: Literal["anew", "resume"] = "resume" if resume else "anew"
-        course = Course(out, start, capture, keys, lambda: signals.finish or signals.rotate, tell)
-        ending = record(bench, course)
+        options = RecordingOptions(out, start, capture, keys, lambda: signals.finish or signals.rotate, tell)
+        ending = record(bench, options)
     tell(ending)
-    if ending.content["postures"] and not (voice.json or voice.quiet):
+    if ending.content["postures"] and not (console.json or console.quiet):
         say(f"next: armcal run {config} {_data(experiment, out / DATASET)} --out DIR")
 
 
@@ -124,13 +124,13 @@ def _terminal() -> int | None:
         return None
 
 
-def _teller(voice: Voice) -> Callable[[Told], None]:
+def _teller(console: Console) -> Callable[[Told], None]:
     """JSON lines, or sentences; flushed, so that who reads them knows at once what is safe."""
 
     def tell(told: Told) -> None:
-        if voice.json:
+        if console.json:
             click.echo(json.dumps({"event": told.kind, **told.content, "sentence": told.sentence}))
-        elif not voice.quiet:
+        elif not console.quiet:
             say(told.sentence)
 
     return tell

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import click
-from armcal.cli.common import Voice, overrides, speaking
+from armcal.cli.common import Console, overrides, speaking
 from armcal.errors import EXIT_DONE, EXIT_INCOMPLETE
 from armcal.io.folder import check_folder
 from armcal.plugins import discover
@@ -17,7 +17,7 @@ from armcal.run.experiment import Experiment
 from armcal_bench.acquisition.outputs import BENCH, OURS
 from armcal_bench.acquisition.preparation import prepare
 from armcal_bench.acquisition.rehearsal import overrides_for, port_instead_of_adapter, simulated_bench, truth
-from armcal_bench.commands.acquire import driven, exit_code_of, outlook_of, show_outcome, show_outlook
+from armcal_bench.commands.acquire import driven, exit_code_of, schedule_forecast, show_forecast, show_outcome
 from armcal_bench.commands.energising import always
 
 _ANGLE = 180 / math.pi
@@ -30,37 +30,37 @@ _FILE = click.Path(path_type=Path)
 @click.option("--out", required=True, type=_FILE, help="The folder to keep data, journal and the simulated bench in.")
 @overrides
 @speaking
-def rehearse(voice: Voice, config: Path, plan: Path, out: Path, overrides: tuple[str, ...]) -> None:
+def rehearse(console: Console, config: Path, plan: Path, out: Path, overrides: tuple[str, ...]) -> None:
     """Do what armcal acquire does, against the simulated bench of CONFIG, and say what its arm came to bear."""
     registry = discover()
-    voice.plugin_faults(registry)
+    console.plugin_faults(registry)
     bench = out / BENCH
     adapter = port_instead_of_adapter(Experiment.load(config, overrides, registry=registry))
     experiment = Experiment.load(config, (*overrides, *overrides_for(bench), *adapter), registry=registry)
     prepared = prepare(experiment, plan)
     check_folder(out, OURS)
-    if not voice.json:
-        show_outlook(voice, prepared, outlook_of(prepared))
+    if not console.json:
+        show_forecast(console, prepared, schedule_forecast(prepared))
     with simulated_bench(config, overrides, bench):
-        outcome = driven(voice, prepared, plan, (out, "anew"), always, unchecked=True)
+        outcome = driven(console, prepared, plan, (out, "anew"), always, unchecked=True)
         found = truth(bench)
     outcome.summary["truth"] = found
-    show_outcome(voice, outcome, config, out)
-    _show_truth(voice, found)
+    show_outcome(console, outcome, config, out)
+    _show_truth(console, found)
     code = exit_code_of(outcome)
     sys.exit(EXIT_INCOMPLETE if code == EXIT_DONE and any(found.get("offences", {}).values()) else code)
 
 
-def _show_truth(voice: Voice, found: dict[str, Any]) -> None:
+def _show_truth(console: Console, found: dict[str, Any]) -> None:
     """What the simulated arm had to bear: how often, and the worst of each kind."""
     offences, worst = found.get("offences", {}), found.get("worst", {})
     counted = [f"{kind} {count} times{_worst(kind, worst)}" for kind, count in offences.items() if count]
-    voice.out.print(
+    console.out.print(
         f"on the simulated arm's side, unsafe was: {'; '.join(counted) or 'nothing'}.", markup=False, soft_wrap=True
     )
     for kind, what in (("first_pulse", "the largest jump at a first pulse"), ("drop", "the deepest fall when let go")):
         if kind in worst:
-            voice.out.print(f"{what}: {_amount(kind, worst[kind])}.", markup=False, soft_wrap=True)
+            console.out.print(f"{what}: {_amount(kind, worst[kind])}.", markup=False, soft_wrap=True)
 
 
 _UNITS = {

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import click
-from armcal.cli.common import Voice, overrides, speaking
+from armcal.cli.common import Console, overrides, speaking
 from armcal.cli.outlet import say
 from armcal.devices.faults import DeviceError
 from armcal.errors import EXIT_FAULT, EXIT_INCOMPLETE, EXIT_STOPPED, InputError
@@ -49,7 +49,7 @@ _FOLDER = click.Path(path_type=Path)
 @overrides
 @speaking
 def servo(
-    voice: Voice,
+    console: Console,
     config: Path,
     out: Path | None,
     guided: bool,
@@ -63,16 +63,16 @@ def servo(
 ) -> None:
     """Find which pulse makes which angle of each servo on the bench of CONFIG, and write the servo file."""
     registry = discover()
-    voice.plugin_faults(registry)
+    console.plugin_faults(registry)
     setup = Setup.of(Experiment.load(config, overrides, registry=registry))
     how = "guided" if guided else "automatic"
-    with _talking(voice, setup, may_energise) as talk:
+    with _talking(console, setup, may_energise) as talk:
         if check:
-            _checked(voice, setup, talk, "somebody" if guided else "tracker")
+            _checked(console, setup, talk, "somebody" if guided else "tracker")
         elif not parks and not (release and out is None):
-            _calibrated(voice, setup, _given(out), None if evaluate else how, keep, talk)
+            _calibrated(console, setup, _given(out), None if evaluate else how, keep, talk)
         if parks or release:
-            _stoppable(voice, lambda: park(setup, talk, "release" if release else "hold"))
+            _stoppable(console, lambda: park(setup, talk, "release" if release else "hold"))
 
 
 def _given(out: Path | None) -> Path:
@@ -81,9 +81,9 @@ def _given(out: Path | None) -> Path:
     return out
 
 
-def _calibrated(voice: Voice, setup: Setup, out: Path, how: str | None, keep: bool, talk: Conversation) -> None:
+def _calibrated(console: Console, setup: Setup, out: Path, how: str | None, keep: bool, talk: Conversation) -> None:
     if how is not None:
-        _stoppable(voice, lambda: measure(setup, out, talk, how))
+        _stoppable(console, lambda: measure(setup, out, talk, how))
     outcome = evaluated(setup, out)
     changed = improved(setup.file, outcome, adapter_of(out))
     content = results(outcome, changed)
@@ -92,47 +92,47 @@ def _calibrated(voice: Voice, setup: Setup, out: Path, how: str | None, keep: bo
     if kept is not None:
         carry_over(setup.path, setup.file, changed)
     written = {"servo_file": str(setup.path), "before": None if kept is None else str(kept)}
-    voice.result({**content, **written})
-    _show(voice, outcome, content)
+    console.result({**content, **written})
+    _show(console, outcome, content)
     if kept is not None:
-        voice.out.print(f"{setup.path}: written; the one before is {kept.name}", markup=False, soft_wrap=True)
-    _exit_if_incomplete(voice, setup, content)
+        console.out.print(f"{setup.path}: written; the one before is {kept.name}", markup=False, soft_wrap=True)
+    _exit_if_incomplete(console, setup, content)
 
 
-def _exit_if_incomplete(voice: Voice, setup: Setup, content: Mapping[str, Any]) -> None:
+def _exit_if_incomplete(console: Console, setup: Setup, content: Mapping[str, Any]) -> None:
     """Tables that were asked for and are not there must not look like a success to a script."""
     left = [joint for joint in setup.joints if not content["servos"].get(joint, {"written": False})["written"]]
     if left:
         count = len(setup.joints) - len(left)
-        voice.warn(
+        console.warn(
             f"{count} of {len(setup.joints)} tables were found; those of {', '.join(left)} are left as they were. Why "
             "is said above: mend that, and give the same command again."
         )
         sys.exit(EXIT_INCOMPLETE)
 
 
-def _checked(voice: Voice, setup: Setup, talk: Conversation, seen: str) -> None:
+def _checked(console: Console, setup: Setup, talk: Conversation, seen: str) -> None:
     verdicts: list[Verdict] = []
-    _stoppable(voice, lambda: verdicts.extend(tried(setup, talk, seen)))
+    _stoppable(console, lambda: verdicts.extend(tried(setup, talk, seen)))
     pairs = swapped(verdicts)
     shown = [{**asdict(v), "turned": v.turned if v.turned == v.turned else None} for v in verdicts]
-    voice.result({"joints": shown, "swapped": pairs})
+    console.result({"joints": shown, "swapped": pairs})
     for verdict in verdicts:
         style = "green" if verdict.kind == "right" else "red"
-        voice.out.print(f"{verdict.sentence} {verdict.mend}".rstrip(), style=style, markup=False, soft_wrap=True)
+        console.out.print(f"{verdict.sentence} {verdict.mend}".rstrip(), style=style, markup=False, soft_wrap=True)
     for sentence in pairs:
-        voice.out.print(sentence, style="red", markup=False, soft_wrap=True)
+        console.out.print(sentence, style="red", markup=False, soft_wrap=True)
     if any(verdict.kind != "right" for verdict in verdicts):
         sys.exit(EXIT_FAULT)
 
 
-def _stoppable(voice: Voice, action: Callable[[], None]) -> None:
+def _stoppable(console: Console, action: Callable[[], None]) -> None:
     """Do it; where it was stopped, say what that means."""
     try:
         action()
     except StoppedError as stop:
         arm = f"{stop.arm[:1].upper()}{stop.arm[1:]}"
-        voice.err.print(
+        console.err.print(
             f"stopped: {stop}. {arm}, and what was measured is kept: give the same command again to go on.",
             markup=False,
             soft_wrap=True,
@@ -144,13 +144,15 @@ def _stoppable(voice: Voice, action: Callable[[], None]) -> None:
 
 
 @contextmanager
-def _talking(voice: Voice, setup: Setup, may_energise: Question) -> Iterator[Conversation]:
+def _talking(console: Console, setup: Setup, may_energise: Question) -> Iterator[Conversation]:
     def heard(text: str) -> None:
-        say(text, err=voice.json)
+        say(text, err=console.json)
 
-    with Signals() as signals, voice.progress() as show:
-        may_move = warned(voice, may_energise)
-        yield Conversation(lambda: signals.finish, may_move, _teller(show), heard, lambda: wishes_from(0), waits(voice))
+    with Signals() as signals, console.progress() as show:
+        may_move = warned(console, may_energise)
+        yield Conversation(
+            lambda: signals.finish, may_move, _teller(show), heard, lambda: wishes_from(0), waits(console)
+        )
 
 
 def _teller(show: Progress) -> Callable[[str, int, int], None]:
@@ -160,7 +162,7 @@ def _teller(show: Progress) -> Callable[[str, int, int], None]:
     return tell
 
 
-def _show(voice: Voice, outcome: Outcome, content: Mapping[str, Any]) -> None:
+def _show(console: Console, outcome: Outcome, content: Mapping[str, Any]) -> None:
     table = Table(title="Pulses at angles, and what changed", title_justify="left")
     for column in ("servo", "deg", "us", "sd", "before", "change, us", "change, deg", "backlash, deg"):
         table.add_column(column, justify="left" if column == "servo" else "right")
@@ -178,11 +180,11 @@ def _show(voice: Voice, outcome: Outcome, content: Mapping[str, Any]) -> None:
                 f"{knot['change_deg']:+.2f}",
                 play if i == 0 else "",
             )
-    voice.out.print(table)
+    console.out.print(table)
     for name, board in content["boards"].items():
         if board["oscillator_sd_hz"] is not None:
             text = f"{name}: oscillator {board['oscillator_hz'] / 1e6:.4f} +- {board['oscillator_sd_hz'] / 1e6:.4f} MHz"
-            voice.out.print(text, markup=False)
+            console.out.print(text, markup=False)
     for sentence in content["findings"]:
-        voice.out.print(sentence, markup=False, soft_wrap=True)
-    voice.detail(f"{len(outcome.task.observations)} angles, in {NAME}.")
+        console.out.print(sentence, markup=False, soft_wrap=True)
+    console.detail(f"{len(outcome.task.observations)} angles, in {NAME}.")

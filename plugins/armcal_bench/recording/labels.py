@@ -44,7 +44,7 @@ class Labels:
         text = text.strip()
         if text.isascii() and text.isdecimal() and self.known:
             if not 1 <= int(text) <= len(self.known):
-                return f"{text} stands for no name: {self.told_known()}."
+                return f"{text} stands for no name: {self.known_labels_text()}."
             text = self.known[int(text) - 1]
         parts = [part.strip() for part in text.split("/")]
         if not all(parts) or len(parts) > len(self.columns):
@@ -63,10 +63,10 @@ class Labels:
         if missing:
             example = self.known[0].replace(KEPT, "front") if self.known else "/".join(self.columns)
             why = f"no {' and no '.join(missing)} was named: which one does the arm touch? Type g {example}"
-            return labels, f"{why}, or a digit ({self.told_known()})." if self.known else f"{why}."
+            return labels, f"{why}, or a digit ({self.known_labels_text()})." if self.known else f"{why}."
         return labels, self._fault(labels)
 
-    def told_known(self) -> str:
+    def known_labels_text(self) -> str:
         """What the digits stand for."""
         return ", ".join(f"{i} {name}" for i, name in enumerate(self.known, start=1))
 

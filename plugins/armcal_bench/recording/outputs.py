@@ -10,8 +10,8 @@ from armcal.base.dataset import Dataset
 from armcal.measure.csv_writer import write_csv
 from armcal.run.experiment import Experiment
 
-from armcal_bench.recording.book import DATASET
 from armcal_bench.recording.posture import Posture
+from armcal_bench.recording.recording_log import DATASET
 
 
 def dataset_of(postures: Sequence[Posture], doubts: Mapping[str, str]) -> Dataset:

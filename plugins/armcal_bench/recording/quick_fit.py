@@ -148,8 +148,8 @@ class QuickFitter:
         data = self._weak.normal_equations(values, records).chained(chain * parameters.scales())
         prior = parameters.prior_information() * parameters.scales() ** 2
         numbers = self._weak.equations(records)
-        told_by_data = float(np.trace(np.linalg.solve(data.hessian + np.diag(prior), data.hessian)))
-        freedom = max(numbers - told_by_data, 0.0)
+        identified_by_data = float(np.trace(np.linalg.solve(data.hessian + np.diag(prior), data.hessian)))
+        freedom = max(numbers - identified_by_data, 0.0)
         squares = 2 * data.cost
         scale = max(float(np.sqrt((squares + _DECLARED_COUNTS) / (freedom + _DECLARED_COUNTS))), _LEAST_SCALE)
         known, directions = np.linalg.eigh(data.hessian / scale**2 + np.diag(prior))

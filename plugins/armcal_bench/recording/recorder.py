@@ -15,10 +15,10 @@ from armcal.run.experiment import Experiment
 
 from armcal_bench.recording import told
 from armcal_bench.recording.assessor import Assessment, Assessor
-from armcal_bench.recording.book import Book
 from armcal_bench.recording.labels import Labels
 from armcal_bench.recording.outputs import dataset_of, write_dataset
 from armcal_bench.recording.posture import Posture
+from armcal_bench.recording.recording_log import RecordingLog
 from armcal_bench.recording.settings import RecordingSettings
 from armcal_bench.recording.told import Told
 from armcal_bench.recording.window import JointKinds, Mean, SampleWindow
@@ -50,9 +50,9 @@ class Task:
 class Recorder:
     """Takes readings and commands, and says what came of them."""
 
-    def __init__(self, task: Task, book: Book, clock: Clock) -> None:
+    def __init__(self, task: Task, log: RecordingLog, clock: Clock) -> None:
         s = task.settings
-        self._task, self._book, self._clock = task, book, clock
+        self._task, self._log, self._clock = task, log, clock
         self.kinds = JointKinds.of(task.experiment.system.arms)
         self.labels = Labels(task.experiment.system.measurements, s.groups)
         self._assessor = Assessor(task.experiment)
@@ -62,12 +62,12 @@ class Recorder:
         self._fault, self._fault_at = "", clock.now()
         self._complaint = ""
         self._assessment = Assessment()
-        if book.last is not None:
-            self.labels.present.update(book.last.labels)
+        if log.last is not None:
+            self.labels.present.update(log.last.labels)
 
     def begin(self) -> list[Told]:
         """Where an earlier part of the recording had come to."""
-        postures = self._book.postures
+        postures = self._log.postures
         if not postures:
             return []
         self._assessment = self._assessor.anew(postures)
@@ -112,7 +112,7 @@ class Recorder:
 
     def finished(self) -> Told:
         """How it ended."""
-        postures, assessment = self._book.postures, self._assessment
+        postures, assessment = self._log.postures, self._assessment
         doubts = sorted(assessment.doubts, key=int)
         sentence = f"{len(postures)} postures are recorded"
         sentence += f"; in doubt: {', '.join(doubts)}" if doubts else ""
@@ -132,7 +132,7 @@ class Recorder:
         if mean.why_not:
             self._complaint = ""
             return []
-        last = self._book.last
+        last = self._log.last
         if last is not None and self._apart(mean.angles, last.angles) < self._task.settings.moved:
             return []
         found = self._kept(mean)
@@ -146,9 +146,9 @@ class Recorder:
         labels, fault = self.labels.of(mean.labels)
         if fault:
             return [_refused(fault)]
-        posture = self._book.capture(mean.angles, mean.spread, mean.readings, labels, mean.stamp)
+        posture = self._log.capture(mean.angles, mean.spread, mean.readings, labels, mean.stamp)
         self._write()
-        postures, before = self._book.postures, self._assessment
+        postures, before = self._log.postures, self._assessment
         self._assessment = self._assessor.with_newest(postures)
         if set(before.doubts) != set(self._assessment.doubts):
             self._write()
@@ -157,35 +157,35 @@ class Recorder:
         return found + self._warnings(posture) + self._known()
 
     def _undone(self) -> list[Told]:
-        posture = self._book.undo()
+        posture = self._log.undo()
         if posture is None:
             return [_refused("there is no posture to take back.")]
         before = self._assessment
-        self._assessment = self._assessor.anew(self._book.postures)
+        self._assessment = self._assessor.anew(self._log.postures)
         self._write()
         found = [Told("undone", f"posture {posture.name} is taken back.", {"posture": posture.name})]
-        return found + told.doubts_changed(before, self._assessment, self._book.postures) + self._known()
+        return found + told.doubts_changed(before, self._assessment, self._log.postures) + self._known()
 
     def _status(self) -> list[Told]:
         by_place: dict[str, int] = {}
-        for posture in self._book.postures:
+        for posture in self._log.postures:
             by_place[posture.place] = by_place.get(posture.place, 0) + 1
         listed = ", ".join(f"{count} in {place}" for place, count in by_place.items() if place)
-        lines = [f"{len(self._book.postures)} postures{f': {listed}' if listed else ''}."]
+        lines = [f"{len(self._log.postures)} postures{f': {listed}' if listed else ''}."]
         lines += [f"posture {name} disagrees by {offset}." for name, offset in self._assessment.doubts.items()]
         lines += [f"the next one touches {self.labels.shown}."] if self.labels.columns else []
-        lines += [f"digits: {self.labels.told_known()}."] if self.labels.known else []
+        lines += [f"digits: {self.labels.known_labels_text()}."] if self.labels.known else []
         why = self._task.why_silent()
         lines += [f"{why}."] if why else []
-        missing = self._assessor.explained(self._book.postures)
-        content = {"postures": len(self._book.postures), "groups": by_place, "name": self.labels.shown}
+        missing = self._assessor.explained(self._log.postures)
+        content = {"postures": len(self._log.postures), "groups": by_place, "name": self.labels.shown}
         content |= {"in_doubt": sorted(self._assessment.doubts, key=int), "missing": list(missing)}
         return [Told("status", "\n".join((*lines, *missing)), content), *self._known()]
 
     def _warnings(self, posture: Posture) -> list[Told]:
         """A posture much like one before, or beyond the joints' limits."""
         found = []
-        for other in self._book.postures[:-1]:
+        for other in self._log.postures[:-1]:
             apart = self._apart(posture.angles, other.angles)
             if other.labels == posture.labels and apart < self._task.settings.alike:
                 sentence = f"posture {posture.name} is nearly posture {other.name} again: it tells little that is new."
@@ -216,12 +216,12 @@ class Recorder:
         if self._fault and self._clock.now() - self._fault_at <= self._task.settings.stale:
             return self._fault
         why = self._task.why_silent()
-        told_why = f" ({why})" if why else ": is the sender running?"
-        return f"no joint readings came for {self._silence():.1f} s{told_why}"
+        reason = f" ({why})" if why else ": is the sender running?"
+        return f"no joint readings came for {self._silence():.1f} s{reason}"
 
     def _write(self) -> None:
         doubts = {name: f"disagrees by {offset}" for name, offset in self._assessment.doubts.items()}
-        write_dataset(self._task.folder, self._task.experiment, self._book.postures, doubts)
+        write_dataset(self._task.folder, self._task.experiment, self._log.postures, doubts)
 
 
 def _refused(why: str) -> Told:

@@ -8,16 +8,16 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from armcal.devices.joint_stream import JointStream
-from armcal.devices.line_source import told_refused
+from armcal.devices.line_source import refused_lines_text
 from armcal.devices.rest_stream import RestStream
 from armcal.errors import ConfigError
 
 from armcal_bench.bench import SECTION, Bench
 from armcal_bench.recording.assessor import contacts_of
-from armcal_bench.recording.book import Start, opened_book
 from armcal_bench.recording.keys import END, Keys
 from armcal_bench.recording.labels import Labels
 from armcal_bench.recording.recorder import Capture, Recorder, Task
+from armcal_bench.recording.recording_log import Start, opened_recording_log
 from armcal_bench.recording.told import Told
 from armcal_bench.recording.window import JointKinds
 
@@ -25,7 +25,7 @@ _PERIOD_S = 0.02
 
 
 @dataclass(frozen=True)
-class Course:
+class RecordingOptions:
     """What a recording is told, and whom it tells.
 
     Attributes:
@@ -45,7 +45,7 @@ class Course:
     tell: Callable[[Told], None]
 
 
-def record(bench: Bench, course: Course) -> Told:
+def record(bench: Bench, options: RecordingOptions) -> Told:
     """Record until somebody ends it, or the stream ends; how it ended.
 
     Raises:
@@ -57,20 +57,24 @@ def record(bench: Bench, course: Course) -> Told:
     kinds = JointKinds.of(experiment.system.arms)
     columns = Labels(experiment.system.measurements, ()).columns
     stream = bench.joints()
-    capture = _capture(bench, stream, course.asked)
+    capture = _capture(bench, stream, options.asked)
     with bench.clock() as clock:
         try:
             stream.open(clock, kinds.channels)
-            with opened_book(course.folder, course.start, kinds.channels, columns) as book:
+            with opened_recording_log(options.folder, options.start, kinds.channels, columns) as log:
                 task = Task(
-                    experiment, bench.settings.recording, capture, course.folder, lambda: told_refused(stream.refused)
+                    experiment,
+                    bench.settings.recording,
+                    capture,
+                    options.folder,
+                    lambda: refused_lines_text(stream.refused),
                 )
-                recorder = Recorder(task, book, clock)
-                _tell(course, recorder.begin())
+                recorder = Recorder(task, log, clock)
+                _tell(options, recorder.begin())
                 typed: deque[str] = deque()
-                while _goes_on(course, recorder, stream, typed):
+                while _goes_on(options, recorder, stream, typed):
                     clock.sleep(_PERIOD_S)
-                _tell(course, _rest(recorder, stream))
+                _tell(options, _rest(recorder, stream))
                 return recorder.finished()
         finally:
             stream.close()
@@ -89,18 +93,18 @@ def _capture(bench: Bench, stream: JointStream, asked: Capture) -> Capture:
     return "rests"
 
 
-def _goes_on(course: Course, recorder: Recorder, stream: JointStream, typed: deque[str]) -> bool:
+def _goes_on(options: RecordingOptions, recorder: Recorder, stream: JointStream, typed: deque[str]) -> bool:
     """One round; whether there is to be another."""
     has_ended = stream.ended  # before its last samples are taken
-    _tell(course, recorder.take(stream.samples()))
-    typed.extend(course.keys.commands())
+    _tell(options, recorder.take(stream.samples()))
+    typed.extend(options.keys.commands())
     if typed:  # one a round, so that each finds fresh readings
         command = typed.popleft()
         if command.strip() == END:
             return False
-        _tell(course, recorder.command(command))
-    is_unattended = course.keys.ended and course.asked == "keys"
-    return not course.asked_to_end() and (bool(typed) or not (has_ended or is_unattended))
+        _tell(options, recorder.command(command))
+    is_unattended = options.keys.ended and options.asked == "keys"
+    return not options.asked_to_end() and (bool(typed) or not (has_ended or is_unattended))
 
 
 def _rest(recorder: Recorder, stream: JointStream) -> list[Told]:
@@ -110,6 +114,6 @@ def _rest(recorder: Recorder, stream: JointStream) -> list[Told]:
     return []
 
 
-def _tell(course: Course, found: list[Told]) -> None:
+def _tell(options: RecordingOptions, found: list[Told]) -> None:
     for each in found:
-        course.tell(each)
+        options.tell(each)

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 from armcal.devices.faults import DeviceError
 
-from armcal_bench.acquisition.eyes import TrackerEyes
+from armcal_bench.acquisition.tracker_monitor import BenchTrackerMonitor
 from armcal_bench.servo.mover import Mover, StoppedError
 from armcal_bench.servo.record import LEFT_OUT, POSE, Record
 from armcal_bench.servo.setup import Setup
-from armcal_bench.servo.sweep import Point, angles_told, come_to, left, sweep, to_base
-from armcal_bench.servo.warmth import Warmth
+from armcal_bench.servo.sweep import Point, come_to, commanded_angles, left, sweep, to_base
+from armcal_bench.servo.thermal_state import ThermalState
 from armcal_bench.settling import Settled
 
 _MOST_FAULTS = 10
@@ -26,7 +26,7 @@ Told = Callable[[str, int, int], None]
 """Told the joint, and how many of its points are done and planned."""
 
 
-class OutOfSightError(StoppedError):
+class TrackerLostError(StoppedError):
     """The tracker stays away."""
 
 
@@ -40,10 +40,10 @@ class Automatic:
 
     setup: Setup
     mover: Mover
-    eyes: TrackerEyes
+    monitor: BenchTrackerMonitor
     record: Record
     told: Told
-    warmth: Warmth
+    thermal_state: ThermalState
     faults: int = 0
     restless: int = 0
     first: int = 0
@@ -58,7 +58,7 @@ class Automatic:
         """
         try:
             self._run()
-        except (OutOfSightError, RestlessError):
+        except (TrackerLostError, RestlessError):
             # Nobody may be there for hours, and it could hold a heavy pose.
             self._persist(lambda: to_base(self.setup, self.mover))
             raise
@@ -87,41 +87,41 @@ class Automatic:
         """Where the tool stands, once it does; or why that is not known.
 
         Raises:
-            OutOfSightError: the tracker has told nothing of use for too long.
+            TrackerLostError: the tracker has told nothing of use for too long.
         """
         settings = self.setup.bench.settings.acquisition
-        self.eyes.begin()
+        self.monitor.begin()
         until = self.mover.clock.now() + settings.settle.longest
         while self.mover.clock.now() < until:
             self.mover.tick()
-            found = self.eyes.settled()
+            found = self.monitor.settled()
             if found is not None:
                 self.mover.waits.over("tracker", self.mover.clock.now())
                 return found
-            seconds, why = self.eyes.trouble()
+            seconds, why = self.monitor.trouble()
             if seconds >= settings.lost.park:
                 self.mover.waits.given_up("tracker")
                 told = f"the tracker has told nothing for {seconds:.0f} s ({why})"
-                raise OutOfSightError(told, "the arm holds its base pose")
+                raise TrackerLostError(told, "the arm holds its base pose")
             if seconds >= settings.lost.hold:
                 left = settings.lost.park - seconds
                 self.mover.waits.goes_on("tracker", f"the arm holds: {why}", left, self.mover.clock.now())
-                if self.warmth.must_rest:
+                if self.thermal_state.must_rest:
                     return _WARM
                 until = self.mover.clock.now() + settings.settle.longest
-        return self.eyes.why or "the arm did not come to stand"
+        return self.monitor.why or "the arm did not come to stand"
 
     def look(self) -> None:
         """What is done after every pause: the tracker's frames, and the servos' warmth."""
-        self.eyes.look()
-        self.warmth.pass_to_now(angles_told(self.mover))
+        self.monitor.look()
+        self.thermal_state.pass_to_now(commanded_angles(self.mover))
 
     def _rest(self) -> None:
         """In the base pose, once a servo is near its budget."""
-        if self.warmth.must_rest:
+        if self.thermal_state.must_rest:
             to_base(self.setup, self.mover)
             waits, clock = self.mover.waits, self.mover.clock
-            while (left_s := self.warmth.rest_s) > 0:
+            while (left_s := self.thermal_state.rest_s) > 0:
                 waits.goes_on("rest", "the servos cool in the base pose", left_s, clock.now())
                 self.mover.stand(min(left_s, _LOOKED_AT_EVERY_S))
             waits.over("rest", clock.now())
@@ -133,7 +133,11 @@ class Automatic:
             come_to(self.setup, self.mover, point)
             found = self.capture()
         here: dict[str, Any] = {"joint": point.joint, "counts": point.counts, "came": point.came}
-        here |= {"at": self.mover.clock.wall(), "warmth": self.warmth.by_joint, "told": angles_told(self.mover)}
+        here |= {
+            "at": self.mover.clock.wall(),
+            "warmth": self.thermal_state.by_joint,
+            "told": commanded_angles(self.mover),
+        }
         if isinstance(found, str):
             self.record.append(LEFT_OUT, {**here, "why": found})
             self.restless += 1

@@ -13,8 +13,8 @@ from armcal_bench.servo.alignment import Alignment, aligned, begin, seat_of, shi
 from armcal_bench.servo.angles import Entry, Springs, Sweeps, sweeps_of, told_by
 from armcal_bench.servo.fit import ServoFit, fit_servos
 from armcal_bench.servo.known import KnownBoard, KnownServo, Zero, interpolated
-from armcal_bench.servo.mixup import mixed_up
 from armcal_bench.servo.nominal import NominalArm
+from armcal_bench.servo.permuted_servos import mixed_up
 from armcal_bench.servo.settings import ServoCalibrationSettings
 from armcal_bench.servo.unknowns import FitTask
 

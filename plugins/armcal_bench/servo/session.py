@@ -14,7 +14,7 @@ from armcal.devices.clock import Clock
 from armcal.devices.faults import DeviceRefusedError
 from armcal.errors import InputError, Location
 
-from armcal_bench.acquisition.eyes import TrackerEyes
+from armcal_bench.acquisition.tracker_monitor import BenchTrackerMonitor
 from armcal_bench.hazards import FirstMotion
 from armcal_bench.servo.automatic import Automatic, Told
 from armcal_bench.servo.beginning import begin, check_same, stated_by
@@ -24,9 +24,9 @@ from armcal_bench.servo.mover import Motion, Mover, ServoDevice, StoppedError
 from armcal_bench.servo.outcome import Outcome, outcome_of
 from armcal_bench.servo.record import BEGUN, Record
 from armcal_bench.servo.setup import Setup
-from armcal_bench.servo.sweep import angles_told, to_base
+from armcal_bench.servo.sweep import commanded_angles, to_base
+from armcal_bench.servo.thermal_state import ThermalState
 from armcal_bench.servo.trial import Move, Verdict, answered, judged, wrapped
-from armcal_bench.servo.warmth import Warmth
 from armcal_bench.waiting import Waits
 from armcal_bench.wiring import note_checked
 
@@ -71,8 +71,8 @@ def measure(setup: Setup, folder: Path, talk: Conversation, how: str) -> None:
             with talk.wishes() as wishes:
                 Guided(setup, mover, wishes, record, talk.say).run()
             return
-        with _eyes(setup, mover) as eyes:
-            look = Automatic(setup, mover, eyes, record, talk.told, _cooling(setup, mover, record))
+        with _monitor(setup, mover) as monitor:
+            look = Automatic(setup, mover, monitor, record, talk.told, _cooling(setup, mover, record))
             begin(setup, record, mover.identity, talk.say)
             mover.look = look.look
             look.run()
@@ -111,9 +111,9 @@ def tried(setup: Setup, talk: Conversation, seen: str) -> list[Verdict]:
         return away
     with setup.bench.clock() as clock, _opened(setup, clock, talk, None) as mover:
         if seen == "tracker":
-            with _eyes(setup, mover) as eyes:
+            with _monitor(setup, mover) as monitor:
                 to_base(setup, mover)
-                verdicts = _tracked(setup, mover, eyes)
+                verdicts = _tracked(setup, mover, monitor)
         else:
             to_base(setup, mover)
             with talk.wishes() as wishes:
@@ -166,7 +166,7 @@ def _opened(
         identity = mover.open()
         if record is not None and record.is_measured:
             check_same(setup, record, identity)
-        start = setup.judge.first_motion(angles_told(mover), {}, releases=releases)
+        start = setup.judge.first_motion(commanded_angles(mover), {}, releases=releases)
         if (start.free or start.hazards) and not talk.may_energise(start):
             raise InputError("the arm may not be moved; nothing was moved.", hint="Say yes, or give --yes.")
         yield mover
@@ -183,56 +183,56 @@ def _clock(setup: Setup, joint: str) -> PulseClock:
 
 
 @contextmanager
-def _eyes(setup: Setup, mover: Mover) -> Iterator[TrackerEyes]:
+def _monitor(setup: Setup, mover: Mover) -> Iterator[BenchTrackerMonitor]:
     """The tracker, once it tells something of use."""
-    eyes = TrackerEyes(setup.bench, mover.clock)
+    monitor = BenchTrackerMonitor(setup.bench, mover.clock)
     try:
-        eyes.open()
-        mover.look = eyes.look
+        monitor.open()
+        mover.look = monitor.look
         until = mover.clock.now() + _FIRST_FRAME_S
-        while eyes.trouble()[0] and mover.clock.now() < until:
+        while monitor.trouble()[0] and mover.clock.now() < until:
             mover.tick()
-        if eyes.trouble()[0]:
+        if monitor.trouble()[0]:
             raise DeviceRefusedError(
-                f"the tracker tells nothing that could be used ({eyes.trouble()[1]}); nothing was moved.",
+                f"the tracker tells nothing that could be used ({monitor.trouble()[1]}); nothing was moved.",
                 hint="Start it, check its address and the names of its bodies; or calibrate with --guided.",
             )
-        yield eyes
+        yield monitor
     finally:
         mover.look = _nothing
-        eyes.close()
+        monitor.close()
 
 
-def _warmth(setup: Setup, mover: Mover) -> Warmth:
+def _thermal_state(setup: Setup, mover: Mover) -> ThermalState:
     """From cold servos on."""
-    return Warmth(setup.heat, tuple(setup.bench.arm.commanded), setup.base, mover.clock)
+    return ThermalState(setup.heat, tuple(setup.bench.arm.commanded), setup.base, mover.clock)
 
 
-def _cooling(setup: Setup, mover: Mover, record: Record) -> Warmth:
+def _cooling(setup: Setup, mover: Mover, record: Record) -> ThermalState:
     """From where the record's last line left it, where the servos may have to rest.
 
     Raises:
         InputError: one would not cool where it is to rest.
     """
-    warmth = _warmth(setup, mover)
-    if joint := warmth.base_is_too_heavy:
+    thermal_state = _thermal_state(setup, mover)
+    if joint := thermal_state.base_is_too_heavy:
         raise InputError(
             f"the servo of {joint} would not cool in the base pose, by bench.acquisition.heat; nothing was moved.",
             hint="Give bench.servo.base a pose in which it carries less.",
         )
     last = next((entry for entry in reversed(record.entries) if "warmth" in entry), None)
     if last is not None:
-        warmth.go_on(last["warmth"], angles_told(mover), mover.clock.wall() - float(last["at"]))
-    return warmth
+        thermal_state.go_on(last["warmth"], commanded_angles(mover), mover.clock.wall() - float(last["at"]))
+    return thermal_state
 
 
 def _wrapped(setup: Setup, joint: str) -> Verdict | None:
     return wrapped(joint, setup.file.servos[joint].angles, setup.ranges[joint])
 
 
-def _tracked(setup: Setup, mover: Mover, eyes: TrackerEyes) -> list[Verdict]:
-    look = Automatic(setup, mover, eyes, cast(Record, None), _silent, _warmth(setup, mover))
-    base, moves, unseen = angles_told(mover), [], []
+def _tracked(setup: Setup, mover: Mover, monitor: BenchTrackerMonitor) -> list[Verdict]:
+    look = Automatic(setup, mover, monitor, cast(Record, None), _silent, _thermal_state(setup, mover))
+    base, moves, unseen = commanded_angles(mover), [], []
     for joint in setup.joints:
         told, at = _small(setup, joint), mover.told[joint]
         before = look.capture()

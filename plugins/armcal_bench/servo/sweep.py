@@ -79,7 +79,7 @@ def to_base(setup: Setup, mover: Mover) -> None:
 
 def _clear_order(setup: Setup, mover: Mover) -> tuple[str, ...]:
     """Joints that are not at the base pose, in an order in which they may go there."""
-    start = angles_told(mover)
+    start = commanded_angles(mover)
     away = [j for j, angle in setup.base.items() if mover.told[j] != mover.counts_at(j, angle)]
     for order in permutations(away):
         here, clear = dict(start), True
@@ -95,7 +95,7 @@ def _clear_order(setup: Setup, mover: Mover) -> tuple[str, ...]:
     )
 
 
-def angles_told(mover: Mover) -> dict[str, float]:
+def commanded_angles(mover: Mover) -> dict[str, float]:
     """The angles that the pulses ask for by the stated tables (rad, by joint)."""
     found = {}
     for joint, counts in mover.told.items():

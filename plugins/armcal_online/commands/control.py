@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import click
-from armcal.cli.common import Voice, speaking
+from armcal.cli.common import Console, speaking
 from armcal.errors import InputError, Location
 
 from armcal_online.running.control import ask
@@ -22,7 +22,7 @@ _COMMANDS = ("status", "pause", "resume", "finish", "rollback", "what-if")
 @click.argument("values", nargs=-1)
 @click.option("--timeout", default=60.0, show_default=True, help="How long to wait for the answer, in seconds.")
 @speaking
-def control(voice: Voice, folder: Path, command: str, values: tuple[str, ...], timeout: float) -> None:
+def control(console: Console, folder: Path, command: str, values: tuple[str, ...], timeout: float) -> None:
     """Ask the recalibration that runs in FOLDER, or tell it what to do.
 
     `rollback N` takes up the estimate as it was after record N; `what-if q1_deg=10 q2_deg=20 ...` predicts the tip.
@@ -31,7 +31,7 @@ def control(voice: Voice, folder: Path, command: str, values: tuple[str, ...], t
     if not reply.pop("ok", False):
         error = str(reply.get("error", "it answered with nothing that is known."))
         raise InputError(error, hint="" if error.endswith((".", "?")) else "Ask `armcal control DIR status` first.")
-    if not voice.quiet:
+    if not console.quiet:
         click.echo(json.dumps(reply, indent=2))
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 from armcal.base.config_text import as_json
-from armcal.cli.common import Voice, overrides, speaking
+from armcal.cli.common import Console, overrides, speaking
 from armcal.errors import InputError, Location
 from armcal.io.folder import reserved
 from armcal.io.plain_files import check_output
@@ -35,23 +35,23 @@ _NAMED = {"right": "named right", "wrong": "named wrong", "seen": "seen but not 
 @click.option("--out", required=True, type=click.Path(path_type=Path), help="Where the mission goes.")
 @overrides
 @speaking
-def mission(voice: Voice, config: Path, out: Path, overrides: tuple[str, ...]) -> None:
+def mission(console: Console, config: Path, out: Path, overrides: tuple[str, ...]) -> None:
     """Simulate the mission of CONFIG, recalibrate over all of it, and judge that against the truth."""
     watch = Stopwatch()
     kept = click.get_current_context().with_resource(reserved(out, OURS))
     registry = discover()
-    voice.plugin_faults(registry)
+    console.plugin_faults(registry)
     plan = MissionPlan.load(config, overrides, registry)
     kept.place({})
-    with voice.progress() as progress:
+    with console.progress() as progress:
         result = run_mission(plan, out, loop_session(registry), registry, progress, watch)
-    told = {**figures(plan.experiment.name, result.mission, result.story, result.judgement), "seconds": watch.seconds}
+    told = {**figures(plan.experiment.name, result.mission, result.log, result.judgement), "seconds": watch.seconds}
     _write(out, plan, result, told)
-    voice.result({**told, "folder": str(out)})
-    _show(voice, told)
+    console.result({**told, "folder": str(out)})
+    _show(console, told)
     for stage, seconds in watch.seconds.items():
-        voice.detail(f"{stage}: {seconds:.1f} s")
-    voice.out.print(f"figure: {out / 'mission.png'}  ({watch.total():.1f} s)", markup=False, soft_wrap=True)
+        console.detail(f"{stage}: {seconds:.1f} s")
+    console.out.print(f"figure: {out / 'mission.png'}  ({watch.total():.1f} s)", markup=False, soft_wrap=True)
 
 
 def _write(folder: Path, plan: MissionPlan, result: MissionResult, told: dict[str, Any]) -> None:
@@ -75,7 +75,7 @@ def _write(folder: Path, plan: MissionPlan, result: MissionResult, told: dict[st
         ) from fault
 
 
-def _show(voice: Voice, told: dict[str, Any]) -> None:
+def _show(console: Console, told: dict[str, Any]) -> None:
     errors, counts = told["error_mm"], told["records"]
     table = Table(title=f"Mean tip error over {told['days']:g} days, mm", title_justify="left")
     table.add_column("calibration")
@@ -83,23 +83,23 @@ def _show(voice: Voice, told: dict[str, Any]) -> None:
         table.add_column(column, justify="right")
     for name, figures_ in errors.items():
         table.add_row(name, *(f"{figures_[column]:.3f}" for column in ("mean", "median", "p95", "max", "last")))
-    voice.out.print(table)
+    console.out.print(table)
     for event in told["events"]:
         records = event["recovered_after_records"]
         back = "not recovered" if records is None else f"recovered after {records} records"
-        _line(voice, f"day {event['day']:.2f}: {event['label']}: {_NAMED[event['named']]}, {back}")
+        _line(console, f"day {event['day']:.2f}: {event['label']}: {_NAMED[event['named']]}, {back}")
     _line(
-        voice,
+        console,
         f"available {told['availability']:.1%} of the time (frozen: within {told['limit_mm']:g} mm "
         f"{told['frozen_within_limit']:.1%}); {len(told['false_alarms'])} false alarms, {told['missed']} events missed",
     )
     _line(
-        voice,
+        console,
         f"{counts['arrived']} records: {counts['accepted']} accepted, {counts['rejected']} rejected "
         f"({counts['good_rejected_apart']} good ones apart from events), {counts['ignored']} ignored; "
         f"{counts['outliers_accepted']} of {counts['outliers']} outliers accepted",
     )
 
 
-def _line(voice: Voice, text: str) -> None:
-    voice.out.print(text, markup=False, soft_wrap=True)
+def _line(console: Console, text: str) -> None:
+    console.out.print(text, markup=False, soft_wrap=True)

@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 from armcal.calibration.calibration import Calibration
-from armcal.cli.common import Voice, overrides, speaking
+from armcal.cli.common import Console, overrides, speaking
 from armcal.io.journal.journal import JournalLimits
 from armcal.io.standard_output import StandardOutput
 from armcal.plugins import discover
@@ -39,7 +39,7 @@ _NOT_DECIDING = ("output", "journal")
 @click.option("--follow", is_flag=True, help="Wait for more at the end of a CSV file.")
 @speaking
 def recalibrate(
-    voice: Voice,
+    console: Console,
     calibration: Path,
     source: str,
     config: Path | None,
@@ -52,15 +52,15 @@ def recalibrate(
     Given the same folder again, it goes on where it was left.
     """
     registry = discover()
-    voice.plugin_faults(registry)
+    console.plugin_faults(registry)
     settings = load_settings(config, overrides)
     loaded = Calibration.load(calibration, registry)
     session = Recalibrator.begin(loaded, settings, registry)
-    stream = StandardOutput(None if voice.quiet else sys.stdout.buffer)
+    stream = StandardOutput(None if console.quiet else sys.stdout.buffer)
     at_end: AtEnd = "wait" if follow else "stop"
     setup = setup_of(settings, calibration, out, stream)
     with opened(setup, session, lambda rows: open_source(source, rows, at_end)) as going:
-        voice.detail(f"records from {source}, kept in {out}")
+        console.detail(f"records from {source}, kept in {out}")
         going.run()
 
 

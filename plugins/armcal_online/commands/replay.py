@@ -10,7 +10,7 @@ from typing import Any, Literal, cast
 
 import click
 from armcal.base.config_text import finite
-from armcal.cli.common import Voice, overrides, speaking
+from armcal.cli.common import Console, overrides, speaking
 from armcal.cli.outlet import say
 from armcal.errors import EXIT_BAD_INPUT, EXIT_FAULT, InputError, Location
 from armcal.io.journal.files import REAL_FILES, write_whole
@@ -18,10 +18,10 @@ from armcal.plugins import discover
 from rich.table import Table
 
 from armcal_online.replaying.begin import begun, journal_folder, kept_calibration, kept_settings
-from armcal_online.replaying.courses import WARM_UP, Comparison, compared, side_by_side
+from armcal_online.replaying.comparison import WARM_UP, Comparison, compared, side_by_side
+from armcal_online.replaying.journal_replayer import JournalReplayer, NoVerifier
 from armcal_online.replaying.replay import Kept, Replayed, check_until, kept, replay
-from armcal_online.replaying.walk import NoWitness, Walk
-from armcal_online.replaying.witness import Comparer
+from armcal_online.replaying.replay_verifier import Comparer
 from armcal_online.running.session import OURS
 from armcal_online.tracking.settings import RecalibrateSettings, load_settings
 
@@ -33,7 +33,7 @@ _EVALUATORS = ("auto", "compiled", "interpreted")
 class _Other:
     """The course that other settings would have taken."""
 
-    walk: Walk
+    replayer: JournalReplayer
     comparison: Comparison
 
 
@@ -46,7 +46,7 @@ class _Other:
 @overrides
 @speaking
 def replay_command(
-    voice: Voice,
+    console: Console,
     journal: Path,
     until: int | None,
     calibration: Path | None,
@@ -60,7 +60,7 @@ def replay_command(
     what other settings would have done is shown beside what was done, and --calibration writes theirs.
     """
     registry = discover()
-    voice.plugin_faults(registry)
+    console.plugin_faults(registry)
     folder = journal_folder(journal)
     _check_out(calibration, folder)
     held = kept(folder)
@@ -71,21 +71,21 @@ def replay_command(
     begun_from = kept_calibration(header, folder, registry)
     session = begun(begun_from, settings, registry)
     comparer = Comparer(session.evaluator)
-    with voice.progress() as progress:
+    with console.progress() as progress:
         done = replay(held, session, comparer, until, progress)
         other = None
         if wanted is not None:
             others = begun(begun_from, _evaluated(wanted, evaluator), registry)
-            walk = replay(held, others, NoWitness(), until, progress, "with other settings").walk
-            other = _Other(walk, compared(done.walk, walk))
-    chosen = other.walk if other else done.walk
+            replayer = replay(held, others, NoVerifier(), until, progress, "with other settings").replayer
+            other = _Other(replayer, compared(done.replayer, replayer))
+    chosen = other.replayer if other else done.replayer
     written = calibration if calibration and not done.difference else None
     if written:
         write_whole(REAL_FILES, written, chosen.session.calibration_text().encode())
-    voice.result(_as_json(held, done, comparer, other, written))
-    _tell(voice, held, done, comparer, other)
+    console.result(_as_json(held, done, comparer, other, written))
+    _tell(console, held, done, comparer, other)
     if written:
-        voice.out.print(f"the calibration after entry {chosen.last}: {written}", markup=False, soft_wrap=True)
+        console.out.print(f"the calibration after entry {chosen.last}: {written}", markup=False, soft_wrap=True)
     _leave(held, done)
 
 
@@ -124,7 +124,7 @@ def _leave(held: Kept, done: Replayed) -> None:
 
 
 def _verdict(done: Replayed, comparer: Comparer) -> str:
-    counts = f"{done.walk.entries} entries, {comparer.states} states compared"
+    counts = f"{done.replayer.entries} entries, {comparer.states} states compared"
     if done.difference is not None:
         return f"{counts}; after entry {done.difference.sequence} they differ. {done.difference.sentence}"
     if comparer.equal == comparer.states:
@@ -136,38 +136,38 @@ def _verdict(done: Replayed, comparer: Comparer) -> str:
     return f"{text}; all {comparer.decisions} decisions and levels are the same"
 
 
-def _tell(voice: Voice, held: Kept, done: Replayed, comparer: Comparer, other: _Other | None) -> None:
+def _tell(console: Console, held: Kept, done: Replayed, comparer: Comparer, other: _Other | None) -> None:
     def say(text: str) -> None:
-        voice.out.print(text, markup=False, soft_wrap=True)
+        console.out.print(text, markup=False, soft_wrap=True)
 
-    header, walk = held.first.header, done.walk
-    say(f"{held.folder}: begun from {header['path']}, replayed from entry {walk.first} to {walk.last}")
-    evaluator = walk.session.evaluator
+    header, replayer = held.first.header, done.replayer
+    say(f"{held.folder}: begun from {header['path']}, replayed from entry {replayer.first} to {replayer.last}")
+    evaluator = replayer.session.evaluator
     same = "as the journal was written" if not comparer.others else f"another than the journal's: {comparer.others[0]}"
     say(f"evaluator: {evaluator['backend']}, {same}")
     for text in comparer.others[1:]:
-        voice.detail(f"  {text}")
+        console.detail(f"  {text}")
     say(_verdict(done, comparer))
     if other is not None:
-        voice.out.print(_table(done.walk, other))
+        console.out.print(_table(done.replayer, other))
     else:
-        state = walk.session.state
+        state = replayer.session.state
         counts = ", ".join(f"{count} {what}" for what, count in state.counts.items())
-        say(f"{walk.records} records, of these in the estimate: {counts}; level {state.health.level}")
+        say(f"{replayer.records} records, of these in the estimate: {counts}; level {state.health.level}")
     if held.cut is not None:
-        voice.warn(held.cut.sentence)
+        console.warn(held.cut.sentence)
 
 
-def _table(walk: Walk, other: _Other) -> Table:
+def _table(replayer: JournalReplayer, other: _Other) -> Table:
     """Both courses."""
     found = other.comparison
     table = Table(title="what was done, and what other settings would have done")
     for heading in ("", "done", "with other settings"):
         table.add_column(heading)
-    for number, one, two in side_by_side(walk, other.walk):
+    for number, one, two in side_by_side(replayer, other.replayer):
         table.add_row(f"entry {number}", one or "-", two or "-")
     table.add_section()
-    states = walk.session.state, other.walk.session.state
+    states = replayer.session.state, other.replayer.session.state
     for what in states[0].counts:
         table.add_row(what, *(str(state.counts[what]) for state in states))
     table.add_row("level at the end", *(state.health.level for state in states))
@@ -180,26 +180,26 @@ def _table(walk: Walk, other: _Other) -> Table:
 def _as_json(
     held: Kept, done: Replayed, comparer: Comparer, other: _Other | None, written: Path | None
 ) -> Mapping[str, Any]:
-    difference, walk = done.difference, done.walk
+    difference, replayer = done.difference, done.replayer
     found: dict[str, Any] = {
         "journal": str(held.folder),
-        "entries": walk.entries,
-        "first": walk.first,
-        "last": walk.last,
+        "entries": replayer.entries,
+        "first": replayer.first,
+        "last": replayer.last,
         "states": {"compared": comparer.states, "same_to_the_last_bit": comparer.equal, "measured": comparer.measured},
         "largest_difference_sd": {"values": comparer.widest.values, "covariance": comparer.widest.covariance},
-        "evaluator": walk.session.evaluator,
+        "evaluator": replayer.session.evaluator,
         "other_evaluator": list(comparer.others),
         "difference": {"after": difference.sequence, "sentence": difference.sentence} if difference else None,
         "damage": str(held.damage) if held.damage else None,
         "cut": held.cut.sentence if held.cut else None,
         "calibration": str(written) if written else None,
-        **_course(walk),
+        **_state_replayer(replayer),
     }
     if other is not None:
         comparison = other.comparison
         found["other_settings"] = {
-            **_course(other.walk),
+            **_state_replayer(other.replayer),
             "mean_innovation_mm": [1000 * size for size in comparison.innovation_m],
             "innovations_compared": comparison.records,
             "largest_difference": {"parameter": comparison.parameter, "sd": comparison.apart_sd},
@@ -207,11 +207,11 @@ def _as_json(
     return cast(Mapping[str, Any], finite(found))
 
 
-def _course(walk: Walk) -> dict[str, Any]:
-    state = walk.session.state
+def _state_replayer(replayer: JournalReplayer) -> dict[str, Any]:
+    state = replayer.session.state
     return {
-        "records": walk.records,
+        "records": replayer.records,
         "counts": dict(state.counts),
         "level": state.health.level,
-        "decisions": [event for event in walk.decisions if event["event"] == "decision"],
+        "decisions": [event for event in replayer.decisions if event["event"] == "decision"],
     }

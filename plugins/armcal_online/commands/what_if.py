@@ -10,7 +10,7 @@ from typing import Any
 import click
 from armcal.base.dataset import Dataset
 from armcal.calibration.calibration import Calibration
-from armcal.cli.common import Voice, speaking
+from armcal.cli.common import Console, speaking
 from armcal.cli.predict import read_commands
 from armcal.errors import InputError, Location
 from armcal.estimate.validation import error_unit
@@ -20,7 +20,7 @@ from rich.table import Table
 
 from armcal_online.tracking.pose_worth import PoseWorth, ranked
 from armcal_online.tracking.settings import RecalibrateSettings
-from armcal_online.tracking.start import footing
+from armcal_online.tracking.start import filter_setup
 
 _SHOWN = 10
 
@@ -31,30 +31,30 @@ _SHOWN = 10
 @click.option("--out", type=click.Path(path_type=Path), help="A CSV to write all poses to, best first.")
 @click.option("--columns", multiple=True, metavar="NAME=COLUMN", help="What the CSV calls a column: sequence=pose_id.")
 @speaking
-def what_if(voice: Voice, calibration: Path, poses: Path, out: Path | None, columns: tuple[str, ...]) -> None:
+def what_if(console: Console, calibration: Path, poses: Path, out: Path | None, columns: tuple[str, ...]) -> None:
     """How much one more record at each of POSES would tell of the arm in CALIBRATION, best first.
 
     That is the information in bits, how well the prediction there is known, and the parameters whose standard
     deviations would shrink most.
     """
     registry = discover()
-    voice.plugin_faults(registry)
+    console.plugin_faults(registry)
     loaded = Calibration.load(calibration, registry)
     commands = read_commands(registry, loaded, poses, columns)
     if out is not None and (out.resolve() in (poses.resolve(), calibration.resolve()) or not out.parent.is_dir()):
         raise InputError("it cannot be written there.", where=Location(str(out)), hint="Give another --out.")
-    ground = footing(loaded, RecalibrateSettings(evaluator="auto"), shares=False)
-    found, lost = ranked(ground, commands)
+    setup = filter_setup(loaded, RecalibrateSettings(evaluator="auto"), shares=False)
+    found, lost = ranked(setup, commands)
     if lost:
-        voice.warn(f"{len(lost)} poses have no elastic equilibrium, the first is {commands.ids[lost[0]]}.")
-    unit = error_unit(ground.problem)
+        console.warn(f"{len(lost)} poses have no elastic equilibrium, the first is {commands.ids[lost[0]]}.")
+    unit = error_unit(setup.problem)
     rows = [_row(rank, each, commands, unit) for rank, each in enumerate(found, 1)]
     if out is not None:
         _write(out, rows, unit)
-    voice.result({"poses": rows, "no_equilibrium": [commands.ids[place] for place in lost]})
-    voice.out.print(_table(rows, unit))
+    console.result({"poses": rows, "no_equilibrium": [commands.ids[place] for place in lost]})
+    console.out.print(_table(rows, unit))
     if out is not None:
-        voice.out.print(f"{len(rows)} poses, best first: {out}", markup=False, soft_wrap=True)
+        console.out.print(f"{len(rows)} poses, best first: {out}", markup=False, soft_wrap=True)
 
 
 def _row(rank: int, each: PoseWorth, commands: Dataset, unit: str) -> dict[str, Any]:

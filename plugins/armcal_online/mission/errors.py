@@ -13,8 +13,8 @@ from armcal.estimate.mission_truth import Mission
 from armcal.problem.kernel import EvaluatorChoice
 
 from armcal_online.mission.judge import ErrorCurve, Flags
+from armcal_online.mission.mission_log import MissionLog
 from armcal_online.mission.settings import MissionRunSettings
-from armcal_online.mission.story import Story
 from armcal_online.mission.tips import Tips, random_poses
 
 _HOUR_S = 3600.0
@@ -24,7 +24,7 @@ def error_curve(
     system: System,
     parameters: Parameters,
     mission: Mission,
-    story: Story,
+    log: MissionLog,
     settings: MissionRunSettings,
     evaluator: EvaluatorChoice = "auto",
 ) -> ErrorCurve:
@@ -34,7 +34,7 @@ def error_curve(
         system: the arm on its mission: gravity of the level rover.
         parameters: nominal values are those of the calibration before launch.
         mission: records and truth.
-        story: the estimates over time.
+        log: the estimates over time.
         settings: how many poses.
         evaluator: of the arm.
 
@@ -47,7 +47,7 @@ def error_curve(
             hint="Let mission.experiment describe the same arm, effects and measurements as the mission.",
         )
     times, is_record, is_hour = _moments(mission)
-    true, estimated = mission.truth.values_at(times), [_vector(parameters, found) for _, found in story.estimates]
+    true, estimated = mission.truth.values_at(times), [_vector(parameters, found) for _, found in log.estimates]
     frozen = parameters.nominal()
     arm, instrument = next(iter(system.arms.values())), next(iter(system.measurements))
     poses = random_poses(mission.records, tuple(arm.commanded), arm.name, settings.poses, settings.seed)
@@ -56,7 +56,7 @@ def error_curve(
     changing = [b.name for b in parameters.blocks if differing & set(range(*_span(parameters, b.name)))]
     tips = Tips.of(system, instrument, parameters, changing, poses, evaluator)
     ours, start, cameras = tips.again(poses), tips.again(poses).at(frozen), mission.truth.camera_T_base_at(times)
-    found, errors, last = story.estimate_numbers(times), np.zeros((2, len(times))), -1
+    found, errors, last = log.estimate_numbers(times), np.zeros((2, len(times))), -1
     now = start
     for i in range(len(times)):
         if found[i] != last:
@@ -64,7 +64,7 @@ def error_curve(
             now = ours.at(estimated[last])
         truth = tips.at(true[i]) @ cameras[i, :3, :3].T + cameras[i, :3, 3]
         errors[:, i] = [float(np.linalg.norm(each - truth, axis=1).mean()) for each in (start, now)]
-    return ErrorCurve(times, is_hour, is_record, errors[0], errors[1], story.levels_at(times))
+    return ErrorCurve(times, is_hour, is_record, errors[0], errors[1], log.levels_at(times))
 
 
 def _moments(mission: Mission) -> tuple[Array, Flags, Flags]:

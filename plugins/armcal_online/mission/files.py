@@ -13,7 +13,7 @@ from armcal.base.units import to_unit
 from armcal.estimate.mission_truth import DAY_S, Mission
 
 from armcal_online.mission.judge import ErrorCurve, EventReport, Judgement
-from armcal_online.mission.story import Decision, Story
+from armcal_online.mission.mission_log import Decision, MissionLog
 
 _MM = 1000.0
 _SHOWN = {"m": "mm", "rad": "deg"}
@@ -66,7 +66,7 @@ def curve_text(curve: ErrorCurve, temperature: Array) -> str:
     return _csv(["day", "moment", "frozen_mm", "recalibrated_mm", "level", "temperature_C"], rows)
 
 
-def figures(name: str, mission: Mission, story: Story, judged: Judgement) -> dict[str, Any]:
+def figures(name: str, mission: Mission, log: MissionLog, judged: Judgement) -> dict[str, Any]:
     """The whole judgement for other programs."""
     curve, counts = judged.curve, judged.records
     return {
@@ -84,7 +84,7 @@ def figures(name: str, mission: Mission, story: Story, judged: Judgement) -> dic
         "false_alarms": [_decision(each) for each in judged.false_alarms],
         "records": {key: getattr(counts, key) for key in counts.__dataclass_fields__},
         "power_cuts": [time / DAY_S for time in mission.power_cuts],
-        "resumed": story.resumed,
+        "resumed": log.resumed,
         "hours_at_level": _hours(curve),
     }
 

@@ -10,7 +10,7 @@ from armcal.base.domains import Array
 from armcal.estimate.mission_truth import DAY_S, Mission, MissionEvent
 from numpy.typing import NDArray
 
-from armcal_online.mission.story import ALARMS, NAMING, Decision, Story
+from armcal_online.mission.mission_log import ALARMS, NAMING, Decision, MissionLog
 
 Flags = NDArray[np.bool_]
 USABLE = ("nominal", "watch")
@@ -102,29 +102,27 @@ class Judgement:
         return sum(report.named == "missed" for report in self.events)
 
 
-def judge(mission: Mission, story: Story, curve: ErrorCurve, limit: float, recovered: float) -> Judgement:
+def judge(mission: Mission, log: MissionLog, curve: ErrorCurve, limit: float, recovered: float) -> Judgement:
     """Everything but the errors themselves.
 
     Args:
         mission: records and truth.
-        story: what the recalibration told.
+        log: what the recalibration told.
         curve: errors over time.
         limit: of the mean tip error for use, m.
         recovered: the error is back within so many times what it was before an event.
     """
     ends = [*(event.time for event in mission.events), mission.seconds][1:]
-    reports = tuple(
-        _report(event, end, story, curve, recovered) for event, end in zip(mission.events, ends, strict=True)
-    )
+    reports = tuple(_report(event, end, log, curve, recovered) for event, end in zip(mission.events, ends, strict=True))
     windows = [(e.time, min(e.time + _WINDOW_S, end)) for e, end in zip(mission.events, ends, strict=True)]
-    alarms = [each for each in story.decisions if each.kind in ALARMS]
+    alarms = [each for each in log.decisions if each.kind in ALARMS]
     apart = tuple(each for each in alarms if not _within(each.time, windows))
     usable = np.array([level in USABLE for level in curve.levels]) & (curve.recalibrated <= limit)
     return Judgement(
         curve=curve,
         events=reports,
         false_alarms=apart,
-        records=_counted(mission, story, windows),
+        records=_counted(mission, log, windows),
         availability=float(usable[curve.is_hour].mean()),
         frozen_within=float((curve.frozen <= limit)[curve.is_hour].mean()),
         limit=limit,
@@ -135,7 +133,7 @@ def _within(time: float, windows: Sequence[tuple[float, float]]) -> bool:
     return any(first <= time < last for first, last in windows)
 
 
-def _report(event: MissionEvent, end: float, story: Story, curve: ErrorCurve, recovered: float) -> EventReport:
+def _report(event: MissionEvent, end: float, log: MissionLog, curve: ErrorCurve, recovered: float) -> EventReport:
     before = _before(event.time, curve)
     after = (curve.times >= event.time) & (curve.times < end)
     following = np.flatnonzero(after & curve.is_record)
@@ -143,7 +141,7 @@ def _report(event: MissionEvent, end: float, story: Story, curve: ErrorCurve, re
     runs = np.convolve(good, np.ones(_IN_A_ROW), "valid") == _IN_A_ROW if len(good) >= _IN_A_ROW else np.zeros(0)
     first = int(np.argmax(runs)) if runs.any() else None
     last = min(event.time + _WINDOW_S, end)
-    alarms = [d for d in story.decisions if d.kind in ALARMS and event.time <= d.time < last]
+    alarms = [d for d in log.decisions if d.kind in ALARMS and event.time <= d.time < last]
     decision = next((each for each in alarms if each.kind in NAMING), alarms[0] if alarms else None)
     return EventReport(
         event=event,
@@ -170,8 +168,8 @@ def _named(event: MissionEvent, decision: Decision | None) -> str:
     return "right" if decision.kind in EXPECTED[event.kind] and decision.joint == event.joint else "wrong"
 
 
-def _counted(mission: Mission, story: Story, windows: Sequence[tuple[float, float]]) -> RecordCount:
-    verdicts = np.array([story.verdicts.get(each, "ignored") for each in mission.records.ids])
+def _counted(mission: Mission, log: MissionLog, windows: Sequence[tuple[float, float]]) -> RecordCount:
+    verdicts = np.array([log.verdicts.get(each, "ignored") for each in mission.records.ids])
     apart = np.array([not _within(time, windows) for time in mission.times.tolist()], dtype=bool)
     good, rejected, accepted = ~mission.outliers, verdicts == "rejected", verdicts == "accepted"
     return RecordCount(

@@ -23,9 +23,9 @@ from armcal.run.pipeline import Stopwatch, calibrate
 
 from armcal_online.mission.errors import error_curve
 from armcal_online.mission.judge import Judgement, judge
+from armcal_online.mission.mission_log import MissionLog, read_mission_log
 from armcal_online.mission.settings import MissionPlan
 from armcal_online.mission.source import MissionSource, as_incoming
-from armcal_online.mission.story import Story, read_story
 from armcal_online.tracking.settings import RecalibrateSettings
 
 CALIBRATION = "calibration.yaml"
@@ -49,7 +49,7 @@ class MissionResult:
 
     mission: Mission
     calibration: Calibration
-    story: Story
+    log: MissionLog
     judgement: Judgement
 
 
@@ -108,7 +108,7 @@ def before_launch(plan: MissionPlan, folder: Path, progress: Progress = no_progr
 
 def recalibrated(
     mission: Mission, calibration: Path, settings: RecalibrateSettings, session: Session, folder: Path
-) -> Story:
+) -> MissionLog:
     """All records through sessions that power cuts end, each going on from what the one before it left."""
     incoming = as_incoming(mission.records, mission.times, mission.began)
     every = settings.model_copy(update={"output": settings.output.model_copy(update={"estimate_every_records": 1})})
@@ -116,7 +116,7 @@ def recalibrated(
     events: list[Mapping[str, Any]] = []
     for cut in (*cuts, None):
         events += session(calibration, every, MissionSource(incoming, cut), folder)
-    return read_story(events, mission)
+    return read_mission_log(events, mission)
 
 
 def run_mission(
@@ -141,10 +141,10 @@ def run_mission(
         path = before_launch(plan, folder, progress)
         calibration = Calibration.load(path, registry)
     with watch.stage("recalibrate"):
-        story = recalibrated(mission, path, plan.recalibrate, session, folder / RECALIBRATION)
+        log = recalibrated(mission, path, plan.recalibrate, session, folder / RECALIBRATION)
     settings, experiment = plan.settings, plan.experiment
     with watch.stage("judge"):
         evaluator = experiment.settings.evaluator
-        curve = error_curve(experiment.system, calibration.parameters, mission, story, settings, evaluator)
-        judged = judge(mission, story, curve, settings.limit, settings.recovered)
-    return MissionResult(mission, calibration, story, judged)
+        curve = error_curve(experiment.system, calibration.parameters, mission, log, settings, evaluator)
+        judged = judge(mission, log, curve, settings.limit, settings.recovered)
+    return MissionResult(mission, calibration, log, judged)

@@ -9,10 +9,10 @@ from pathlib import Path
 from armcal.errors import InputError, Location
 from armcal.io.journal.segment import Cut, JournalDamagedError, Segment
 
+from armcal_online.replaying.journal_replayer import JournalReplayer, ReplayVerifier
+from armcal_online.replaying.replay_verifier import DiffersError
 from armcal_online.replaying.salvage import good_segments
-from armcal_online.replaying.walk import Walk, Witness
-from armcal_online.replaying.witness import DiffersError
-from armcal_online.running.course import ROLLBACK, parsing
+from armcal_online.running.state_replayer import ROLLBACK, parsing
 from armcal_online.tracking.recalibrator import Recalibrator
 
 Progress = Callable[[str, float], None]
@@ -45,7 +45,7 @@ class Kept:
 class Replayed:
     """A walk to its end, or to its first difference from the journal."""
 
-    walk: Walk
+    replayer: JournalReplayer
     difference: DiffersError | None
 
 
@@ -92,14 +92,19 @@ def check_until(journal: Kept, until: int | None) -> None:
 
 
 def replay(
-    journal: Kept, session: Recalibrator, witness: Witness, until: int | None, progress: Progress, what: str = "replay"
+    journal: Kept,
+    session: Recalibrator,
+    verifier: ReplayVerifier,
+    until: int | None,
+    progress: Progress,
+    what: str = "replay",
 ) -> Replayed:
     """Take a session through a journal, from the oldest checkpoint that it keeps.
 
     Args:
         journal: see ``kept``.
         session: at its beginning.
-        witness: compares.
+        verifier: compares.
         until: the last entry, which the journal holds; None for all.
         progress: is told how far it is.
         what: the name for that.
@@ -107,15 +112,15 @@ def replay(
     Raises:
         DataError: the state it begins with is none of this session's.
     """
-    walk = Walk(session, journal.targets, witness, until)
+    replayer = JournalReplayer(session, journal.targets, verifier, until)
     try:
         for segment in good_segments(journal.folder):
-            walk.segment(segment)
-            progress(what, min(walk.entries / max(journal.entries, 1), 1.0))
-            if walk.is_done:
+            replayer.segment(segment)
+            progress(what, min(replayer.entries / max(journal.entries, 1), 1.0))
+            if replayer.is_done:
                 break
     except JournalDamagedError:
         pass  # the journal says so
     except DiffersError as difference:
-        return Replayed(walk, difference)
-    return Replayed(walk, None)
+        return Replayed(replayer, difference)
+    return Replayed(replayer, None)

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from armcal_online.tracking.chart import Chart
 from armcal_online.tracking.state import State
+from armcal_online.tracking.state_space import StateSpace
 
 BOUND = 1e-6
 """Evaluators differ in the last digits: states that are nearer than this are the same."""
@@ -35,14 +35,17 @@ class Distance:
         return Distance(max(self.values, other.values), max(self.covariance, other.covariance))
 
 
-def distance(chart: Chart, one: State, other: State) -> Distance:
+def distance(space: StateSpace, one: State, other: State) -> Distance:
     """Between two states of one problem; infinite where they do not have as many coordinates."""
     ours, theirs = one.belief.gaussian, other.belief.gaussian
     if ours.mean.shape != theirs.mean.shape:
         return Distance(np.inf, np.inf)
-    n = len(chart.scales)
+    n = len(space.scales)
     moved = np.concatenate(
-        [chart.between(one.belief.values(chart), other.belief.values(chart)), theirs.mean[n:] - ours.mean[n:]]
+        [
+            space.between(one.belief.values(space), other.belief.values(space)),
+            theirs.mean[n:] - ours.mean[n:],
+        ]
     )
     deviations = np.sqrt(np.diag(ours.covariance))
     deviations = np.where(deviations > 0, deviations, 1.0)

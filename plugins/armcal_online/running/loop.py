@@ -12,8 +12,17 @@ from armcal.base.config_text import finite
 from armcal.io.journal.journal import Journal, JournalFullError
 from armcal.io.signals import Signals
 
-from armcal_online.running.course import DECISION, PAUSE, RECORD, RESUME, ROLLBACK, Course, Estimation, Event
 from armcal_online.running.outputs import Outputs
+from armcal_online.running.state_replayer import (
+    DECISION,
+    PAUSE,
+    RECORD,
+    RESUME,
+    ROLLBACK,
+    Estimation,
+    Event,
+    StateReplayer,
+)
 from armcal_online.sources.incoming import Incoming
 from armcal_online.sources.source import Source
 
@@ -69,7 +78,7 @@ class Recalibration:
         source: Source,
         journal: Journal,
         session: Session,
-        course: Course,
+        state_replayer: StateReplayer,
         outputs: Outputs,
         pace: Pace,
         since_checkpoint: int = 0,
@@ -77,7 +86,7 @@ class Recalibration:
         self._source = source
         self._journal = journal
         self._session = session
-        self._course = course
+        self._state_replayer = state_replayer
         self._outputs = outputs
         self._pace = pace
         self._held: Incoming | None = None
@@ -93,7 +102,7 @@ class Recalibration:
     @property
     def paused(self) -> bool:
         """Whether records are passed over, or left where they are."""
-        return self._course.progress.paused
+        return self._state_replayer.progress.paused
 
     def run(self, control: Served) -> None:
         """Until the source ends, a signal comes, or it is told to finish.
@@ -139,7 +148,7 @@ class Recalibration:
             JournalFullError: there is no room to note it; nothing is changed.
         """
         before = self._session.snapshot()
-        self._course.go_back(sequence)
+        self._state_replayer.go_back(sequence)
         try:
             self.sequence = self._journal.record(ROLLBACK, {"to": sequence, "digest": self._session.digest()})
         except BaseException:
@@ -156,7 +165,7 @@ class Recalibration:
         return {
             **self._session.status(),
             "sequence": self.sequence,
-            "records": self._course.progress.records,
+            "records": self._state_replayer.progress.records,
             "paused": self.paused,
             "journal": "full" if self._is_full else "good",
             "at": time.time(),
@@ -180,7 +189,7 @@ class Recalibration:
 
     def _take(self, incoming: Incoming) -> None:
         self._held = None
-        earlier = None if self._source.keeps_records else self._course.progress.repeated(incoming)
+        earlier = None if self._source.keeps_records else self._state_replayer.progress.repeated(incoming)
         if earlier is not None:
             self._source.acknowledge(incoming, earlier)
             return
@@ -192,7 +201,7 @@ class Recalibration:
             return
         self._has_room()
         self._source.acknowledge(incoming, self.sequence)
-        self._tell(self._course.apply(self.sequence, RECORD, content))
+        self._tell(self._state_replayer.apply(self.sequence, RECORD, content))
 
     def _tell(self, events: tuple[Event, ...]) -> None:
         """Events go out; decisions are noted, with the state that they led to, for a replay to be compared with."""
@@ -232,12 +241,12 @@ class Recalibration:
 
     def _command(self, kind: str) -> None:
         self.sequence = self._journal.record(kind, {"at": time.time()})
-        self._course.apply(self.sequence, kind, {})
+        self._state_replayer.apply(self.sequence, kind, {})
         self._outputs.event({"event": "control", "sequence": self.sequence, "at": time.time(), "command": kind})
 
     def _checkpoint(self) -> None:
         try:
-            self._journal.checkpoint(self._course.checkpoint())
+            self._journal.checkpoint(self._state_replayer.checkpoint())
         except JournalFullError as fault:
             self._lacks_room(fault)
         else:
@@ -277,6 +286,6 @@ class Recalibration:
             self._checkpoint()
         if self._since_calibration or not self._is_written:
             self.write_calibration()
-        sentence = f"{self.finishing} {self._course.progress.records} records were taken in all."
+        sentence = f"{self.finishing} {self._state_replayer.progress.records} records were taken in all."
         self._outputs.event({"event": "finished", "sequence": self.sequence, "at": time.time(), "sentence": sentence})
         self._outputs.status({**self.status(), "finished": True})

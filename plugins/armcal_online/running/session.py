@@ -21,11 +21,11 @@ from armcal.io.standard_output import StandardOutput
 from armcal.measure.reader import ReadRequest
 
 from armcal_online.running.control import SOCKET, ControlServer
-from armcal_online.running.course import STARTED, Course, Event, ReplayDiffersError
 from armcal_online.running.loop import Pace, Recalibration
 from armcal_online.running.loop import Session as LoopSession
 from armcal_online.running.outputs import CALIBRATION, RESERVE, STATUS, Outputs
 from armcal_online.running.requests import Requests
+from armcal_online.running.state_replayer import STARTED, Event, ReplayDiffersError, StateReplayer
 from armcal_online.sources.row_parser import RowParser
 from armcal_online.sources.source import Source
 
@@ -110,15 +110,15 @@ def opened(setup: Setup, session: Recalibrating, source_of: SourceOf) -> Iterato
         journal = stack.enter_context(
             Journal.open(setup.folder / JOURNAL, header, files=setup.files, limits=setup.limits)
         )
-        course = Course(session, partial(_reach, setup.folder / JOURNAL), str(setup.folder / JOURNAL))
-        resumed = _recover(setup, journal, course, header)
-        source.resume(course.progress.positions)
+        state_replayer = StateReplayer(session, partial(_reach, setup.folder / JOURNAL), str(setup.folder / JOURNAL))
+        resumed = _recover(setup, journal, state_replayer, header)
+        source.resume(state_replayer.progress.positions)
         outputs = Outputs(setup.folder, setup.stream, EventFile(setup.folder), setup.files)
         stack.callback(outputs.close)
         _tell_start(journal, outputs, session, header, resumed)
         _tell_damage(setup, outputs)
         left = len(journal.recovered.entries) if resumed else 0
-        recalibration = Recalibration(source, journal, session, course, outputs, setup.pace, left)
+        recalibration = Recalibration(source, journal, session, state_replayer, outputs, setup.pace, left)
         control = ControlServer(setup.folder, Requests(recalibration, session).answer)
         stack.callback(control.close)
         yield Open(recalibration, control)
@@ -147,11 +147,11 @@ def _header(setup: Setup, session: Recalibrating) -> dict[str, Any]:
     }
 
 
-def _recover(setup: Setup, journal: Journal, course: Course, header: Mapping[str, Any]) -> bool:
+def _recover(setup: Setup, journal: Journal, state_replayer: StateReplayer, header: Mapping[str, Any]) -> bool:
     """Take up the newest state; whether there was one."""
     found = journal.recovered
     if not found.header:
-        journal.checkpoint(course.checkpoint())
+        journal.checkpoint(state_replayer.checkpoint())
         return False
     for key in _DECIDING:
         if found.header.get(key) != header[key]:
@@ -160,17 +160,17 @@ def _recover(setup: Setup, journal: Journal, course: Course, header: Mapping[str
                 where=Location(str(setup.folder)),
                 hint="Give what it was begun with, or a new --out (perhaps from a copy of its calibration.yaml).",
             )
-    course.restore(found.checkpoint, found.checkpoint_sequence)
+    state_replayer.restore(found.checkpoint, found.checkpoint_sequence)
     same_evaluator = found.header.get("evaluator") == header["evaluator"]
     for entry in found.entries:
         try:
-            course.apply(entry.sequence, entry.kind, entry.content)
+            state_replayer.apply(entry.sequence, entry.kind, entry.content)
         except ReplayDiffersError:
             # Another version gives other last bits: no reason for a rover to stand still after an update.
             if same_evaluator:
                 raise
     if not same_evaluator:
-        journal.checkpoint(course.checkpoint())
+        journal.checkpoint(state_replayer.checkpoint())
     return True
 
 

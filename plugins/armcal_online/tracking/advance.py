@@ -11,7 +11,7 @@ from armcal_online.tracking.belief import Belief
 from armcal_online.tracking.hypotheses import Recent
 from armcal_online.tracking.observer import Reading, Seen
 from armcal_online.tracking.projection import most_likely
-from armcal_online.tracking.start import Footing
+from armcal_online.tracking.start import FilterSetup
 from armcal_online.tracking.state import State
 
 _REFRESHED = 25
@@ -22,17 +22,17 @@ class Advance:
     """Takes good records in, by an estimator.
 
     Args:
-        ground: what it stands on.
+        setup: what it stands on.
         estimator: that is asked.
-        surprises: how many are kept.
+        nis_window: how many are kept.
     """
 
-    def __init__(self, ground: Footing, estimator: OnlineEstimator, surprises: int) -> None:
-        self._ground, self._estimator, self._surprises = ground, estimator, surprises
+    def __init__(self, setup: FilterSetup, estimator: OnlineEstimator, nis_window: int) -> None:
+        self._setup, self._estimator, self._nis_window = setup, estimator, nis_window
 
     def seen(self, belief: Belief, readings: tuple[Reading, ...], noise: tuple[Array | None, ...]) -> Seen:
         """A record as a belief looks at it."""
-        return Seen(self._ground.observer, belief.origin, belief.gaussian.mean, readings, noise)
+        return Seen(self._setup.observer, belief.origin, belief.gaussian.mean, readings, noise)
 
     def after(self, state: State, recent: Recent) -> State:
         """The state with a record in it.
@@ -41,24 +41,24 @@ class Advance:
             NotConvergedError: the arm has no elastic equilibrium near what is believed.
             ProblemError: the numbers of the belief are no longer sound.
         """
-        surprises = (*state.surprises, (recent.nis, recent.dof))[-self._surprises :]
-        state = replace(state, surprises=surprises)
+        nis_window = (*state.nis_window, (recent.nis, recent.dof))[-self._nis_window :]
+        state = replace(state, nis_window=nis_window)
         after = self._filtered(state, recent) if self._estimator.window == 1 else self._held(state, recent)
         return self._refreshed(after) if state.counts["accepted"] % _REFRESHED == _REFRESHED - 1 else after
 
     def _filtered(self, state: State, recent: Recent) -> State:
         prior = recent.before
         update = self._estimator.update(prior.gaussian, [self.seen(prior, recent.readings, recent.joint_noise)])
-        belief = prior.updated(self._ground.chart, update.posterior)
+        belief = prior.updated(self._setup.space, update.posterior)
         return replace(state, belief=belief, anchor=belief)
 
     def _held(self, state: State, recent: Recent) -> State:
         """With the last records held back; one that leaves them is taken for good, as it looks from where they led."""
-        chart, believed, held = self._ground.chart, state.belief, (*state.held, recent)
-        prior = state.anchor.about(chart, believed.origin).gaussian
+        space, believed, held = self._setup.space, state.belief, (*state.held, recent)
+        prior = state.anchor.about(space, believed.origin).gaussian
         observations = [self.seen(believed, each.readings, each.joint_noise) for each in held]
         update = self._estimator.update(prior, observations, believed.gaussian.mean)
-        belief, anchor = believed.updated(chart, update.posterior), Belief(believed.origin, prior)
+        belief, anchor = believed.updated(space, update.posterior), Belief(believed.origin, prior)
         if len(held) >= self._estimator.window:
             place = update.posterior.mean
             anchor, held = Belief(believed.origin, absorbed(prior, observations[0].at(place), place)), held[1:]
@@ -66,6 +66,6 @@ class Advance:
 
     def _refreshed(self, state: State) -> State:
         """The same beliefs about the most likely origin: where bounds hold, steps of the mean lead it astray slowly."""
-        chart = self._ground.chart
-        belief = state.belief.about(chart, most_likely(chart, state.belief))
+        space = self._setup.space
+        belief = state.belief.about(space, most_likely(space, state.belief))
         return replace(state, belief=belief, anchor=state.anchor if state.held else belief)

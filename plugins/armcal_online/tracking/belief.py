@@ -10,8 +10,8 @@ from armcal.base.domains import Array
 from armcal.base.process import passed_on
 from armcal.estimate.online import Gaussian, checked
 
-from armcal_online.tracking.chart import Chart
-from armcal_online.tracking.companions import Companions
+from armcal_online.tracking.gauss_markov import GaussMarkovStates
+from armcal_online.tracking.state_space import StateSpace
 
 
 @dataclass(frozen=True)
@@ -25,34 +25,34 @@ class Belief:
     origin: Array
     gaussian: Gaussian
 
-    def values(self, chart: Chart) -> Array:
+    def values(self, space: StateSpace) -> Array:
         """Its mean as a value vector; numbers and matrices may lie outside of their domain."""
-        return chart.moved(self.origin, self.gaussian.mean[: len(chart.scales)])
+        return space.moved(self.origin, self.gaussian.mean[: len(space.scales)])
 
-    def updated(self, chart: Chart, posterior: Gaussian) -> Belief:
+    def updated(self, space: StateSpace, posterior: Gaussian) -> Belief:
         """Another belief, about an origin that has moved as the mean did, as far as the domains allow."""
-        n = len(chart.scales)
+        n = len(space.scales)
         step = posterior.mean[:n] - self.gaussian.mean[:n]
-        return Belief(self.origin, posterior).about(chart, chart.inside(chart.moved(self.origin, step)))
+        return Belief(self.origin, posterior).about(space, space.inside(space.moved(self.origin, step)))
 
-    def about(self, chart: Chart, origin: Array) -> Belief:
+    def about(self, space: StateSpace, origin: Array) -> Belief:
         """The same belief about another origin."""
-        n, mean = len(chart.scales), self.gaussian.mean.copy()
-        mean[:n] = chart.left(self.origin, mean[:n], origin)
+        n, mean = len(space.scales), self.gaussian.mean.copy()
+        mean[:n] = space.left(self.origin, mean[:n], origin)
         return Belief(origin, Gaussian(mean, self.gaussian.covariance))
 
 
 @dataclass(frozen=True)
-class Fading:
+class ProcessNoise:
     """How beliefs fade: random walks of parameters, and companions that forget.
 
     Attributes:
         rates: variance that each scaled coordinate gains in a second (n).
-        companions: what moves beside the parameters.
+        gauss_markov: what moves beside the parameters.
     """
 
     rates: Array
-    companions: Companions
+    gauss_markov: GaussMarkovStates
 
     def faded(self, belief: Belief, passed: Mapping[str, float]) -> Belief:
         """The belief after some distance in ``time`` (s) and ``sequence`` (records)."""
@@ -62,9 +62,9 @@ class Fading:
         if seconds > 0 and self.rates.any():
             covariance = covariance.copy()
             covariance[np.arange(n), np.arange(n)] += self.rates * seconds
-        if len(self.companions):
+        if len(self.gauss_markov):
             kept = np.ones(len(mean))
-            kept[n:] = self.companions.kept(passed)
+            kept[n:] = self.gauss_markov.kept(passed)
             covariance = passed_on(covariance, kept)
             mean = mean * kept
         return Belief(belief.origin, checked(Gaussian(mean, covariance)))

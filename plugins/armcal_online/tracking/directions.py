@@ -70,18 +70,18 @@ def find_steps(observer: Observer, values: Array, predicted: Mapping[str, Array]
         predicted: what instruments read in the poses, by channel.
         poses: joint angles (see ``probing_poses``).
     """
-    problem, chart = observer.problem, observer.chart
+    problem, space = observer.problem, observer.space
     complete = Dataset(poses.ids, {**_defaulted(problem, len(poses)), **poses.channels, **predicted})
     records = problem.records(complete)
     slopes = -np.concatenate([_rows(jacobian) for jacobian in problem.jacobians(values, records)])
-    slopes = chart.by_coordinates(values, slopes)
+    slopes = space.by_coordinates(values, slopes)
     arms = problem.blueprint.arms.values()
     commanded = {f"{arm.name}.{joint}": dimension for arm in arms for joint, dimension in arm.commanded.items()}
     motions = -_whitened(problem, values, records, list(commanded))
     joints, unfollowed = [], []
     for (channel, dimension), moved in zip(commanded.items(), motions.T, strict=True):
         seen = float(moved @ moved) >= _CUT * len(moved)
-        step = _joint_step(channel, dimension, moved, slopes, chart.names) if seen else None
+        step = _joint_step(channel, dimension, moved, slopes, space.names) if seen else None
         if step is None:
             unfollowed.append(channel)
         else:

@@ -15,20 +15,20 @@ from armcal_online.tracking.health import Health
 from armcal_online.tracking.hypotheses import Recent
 from armcal_online.tracking.sentences import Decision
 from armcal_online.tracking.settings import RecalibrateSettings
-from armcal_online.tracking.start import Footing
+from armcal_online.tracking.start import FilterSetup
 from armcal_online.tracking.state import State
 
 
 def started(
     state: State,
-    ground: Footing,
+    setup: FilterSetup,
     settings: RecalibrateSettings,
     parameters: Mapping[str, Any],
     resumed: bool,
     steps: Steps,
 ) -> dict[str, Any]:
     """At the beginning."""
-    blocks = {name: block.entry_unit for block in ground.chart.parameters.free for name in block.entry_names}
+    blocks = {name: block.entry_unit for block in setup.space.parameters.free for name in block.entry_names}
     return {
         "event": "started",
         "sequence": state.sequence,
@@ -36,9 +36,9 @@ def started(
         "level": state.health.level,
         "gate": {"probability": settings.gate.probability},
         "parameters": [{"name": n, "unit": blocks[n], "value": v, "sd": sd} for n, (v, sd) in parameters.items()],
-        "evaluator": ground.problem.backend,
+        "evaluator": setup.problem.backend,
         "resumed": resumed,
-        "left_out": list(ground.left_out),
+        "left_out": list(setup.left_out),
         "joint_steps": {each.joint: each.parameter or "several parameters" for each in steps.joints},
         "joint_steps_not_followed": list(steps.unfollowed),
         "sensor_motions": {name: list(which) for name, (_, which) in steps.sensors.items()},
@@ -51,20 +51,20 @@ def ignored(incoming: Incoming, state: State, why: str) -> dict[str, Any]:
 
 
 def judged(
-    incoming: Incoming, state: State, recent: Recent, first: Linearised, limit: float, ground: Footing
+    incoming: Incoming, state: State, recent: Recent, first: Linearised, limit: float, setup: FilterSetup
 ) -> dict[str, Any]:
     """A record that was accepted or rejected."""
     verdict = "rejected" if recent.rejected else "accepted"
     relation = "above" if recent.rejected else "within"
     told = {
         **_record(incoming, state, verdict),
-        "why": f"Its surprise {recent.nis:.3g} is {relation} the limit {limit:.3g}.",
+        "why": f"Its NIS {recent.nis:.3g} is {relation} the limit {limit:.3g}.",
         "nis": recent.nis,
         "limit": limit,
         "dof": recent.dof,
-        "measurement": ground.problem.kernels[recent.readings[0].factor].factor.name,
+        "measurement": setup.problem.kernels[recent.readings[0].factor].factor.name,
     }
-    position = _position(incoming, recent, first, ground)
+    position = _position(incoming, recent, first, setup)
     return {**told, **position}
 
 
@@ -123,9 +123,9 @@ def _record(incoming: Incoming, state: State, verdict: str) -> dict[str, Any]:
     }
 
 
-def _position(incoming: Incoming, recent: Recent, first: Linearised, ground: Footing) -> dict[str, Any]:
+def _position(incoming: Incoming, recent: Recent, first: Linearised, setup: FilterSetup) -> dict[str, Any]:
     """Residual, measured and predicted position in mm, where a single instrument read one."""
-    name = ground.problem.kernels[recent.readings[0].factor].factor.name
+    name = setup.problem.kernels[recent.readings[0].factor].factor.name
     measured = [incoming.channels.get(f"{name}.{axis}", math.nan) for axis in "xyz"]
     if len(recent.readings) != 1 or len(first.innovation) < 3 or not np.isfinite(measured).all():
         return {}

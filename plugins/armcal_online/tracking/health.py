@@ -45,7 +45,7 @@ class Health:
         return Health(level, 0, f"{after} records in a row agree with the calibration.")
 
 
-def surprise_limit(dof: int, probability: float, freedom: float = math.inf) -> float:
+def nis_limit(dof: int, probability: float, freedom: float = math.inf) -> float:
     """What NIS stays below with a probability, where all is as believed.
 
     ``freedom``: degrees of freedom with which the noise is known. Where they are few, NIS by ``dof`` has an F
@@ -61,16 +61,16 @@ def many_outliers(count: int, records: int, fraction: float) -> float:
     return float(bdtrc(count - 1, records, fraction)) if count > 0 else 1.0
 
 
-def improbability(surprises: Sequence[tuple[float, int]], known: float = math.inf) -> float:
-    """How probable surprises (NIS and its degrees of freedom, in order) at least as large in sum are by chance.
+def improbability(nis_window: Sequence[tuple[float, int]], known: float = math.inf) -> float:
+    """How probable NIS (each with its degrees of freedom, in order) at least as large in sum are by chance.
 
     Neighbours that resemble each other count for less than their number: by their first serial correlation. ``known``:
     degrees of freedom with which the noise is known, which all of them share.
     """
-    if len(surprises) < 3:
+    if len(nis_window) < 3:
         return 1.0
-    total, freedom = (float(sum(column)) for column in zip(*surprises, strict=True))
-    relative = np.array([nis / dof for nis, dof in surprises])
+    total, freedom = (float(sum(column)) for column in zip(*nis_window, strict=True))
+    relative = np.array([nis / dof for nis, dof in nis_window])
     centred = relative - relative.mean()
     power = float(centred @ centred)
     serial = float(centred[1:] @ centred[:-1]) / power if power > 0 else 0.0

@@ -16,11 +16,11 @@ from armcal.base.domains import Array
 from armcal.errors import ArmcalError
 from armcal.estimate.online import OnlineEstimator, log_likelihood
 
-from armcal_online.tracking.belief import Belief, Fading, reopened, widened
-from armcal_online.tracking.chart import Chart
+from armcal_online.tracking.belief import Belief, ProcessNoise, reopened, widened
 from armcal_online.tracking.directions import Steps
 from armcal_online.tracking.observer import Observer, Reading, Seen
 from armcal_online.tracking.settings import ChangeSettings, OutlierSettings
+from armcal_online.tracking.state_space import StateSpace
 from armcal_online.tracking.window_evidence import RecordsSince
 
 _SCALES = (1.0, 0.1)
@@ -55,7 +55,7 @@ class Recent:
         passed: how far it is from the one before.
         before: what was believed when it came.
         rejected: whether it was.
-        nis: its surprise.
+        nis: its normalised innovation squared.
         dof: of it.
     """
 
@@ -77,7 +77,7 @@ class Explained:
         hypothesis: what it is.
         onset: the first record after the change.
         log_odds: of it against no change, its prior probability included.
-        explained: share of the records' surprise that it takes away.
+        explained: share of the records' NIS that it takes away.
     """
 
     hypothesis: Hypothesis
@@ -95,9 +95,9 @@ class Candidate:
     belief: Belief
 
 
-def hypotheses(chart: Chart, steps: Steps, settings: ChangeSettings, size: int) -> tuple[Hypothesis, ...]:
+def hypotheses(space: StateSpace, steps: Steps, settings: ChangeSettings, size: int) -> tuple[Hypothesis, ...]:
     """All changes that are looked for; ``size`` is that of beliefs."""
-    n = len(chart.scales)
+    n = len(space.scales)
     found: list[tuple[Kind, str, Array, Array, float]] = []
     for each in steps.joints:
         deviation = settings.joint if each.dimension == "angle" else settings.slide
@@ -125,13 +125,18 @@ def _columns(columns: Sequence[Array], size: int) -> Array:
     return whole
 
 
-class Follower:
+class HypothesisFilter:
     """Weighs hypotheses by the last records, and follows them."""
 
     def __init__(
-        self, observer: Observer, estimator: OnlineEstimator, fading: Fading, outliers: OutlierSettings
+        self, observer: Observer, estimator: OnlineEstimator, process_noise: ProcessNoise, outliers: OutlierSettings
     ) -> None:
-        self._observer, self._estimator, self._fading, self._outliers = observer, estimator, fading, outliers
+        self._observer, self._estimator, self._process_noise, self._outliers = (
+            observer,
+            estimator,
+            process_noise,
+            outliers,
+        )
 
     def compare(self, recent: Sequence[Recent], onsets: Sequence[int], each: Sequence[Hypothesis]) -> list[Explained]:
         """Every hypothesis from its likeliest onset, the likeliest first."""
@@ -139,7 +144,7 @@ class Follower:
         for onset in onsets:
             since = self._since(recent[onset:])
             none = since.weigh(np.zeros((self._observer.size, 0)))
-            surprise = sum(record.nis for record in recent[onset:])
+            nis = sum(record.nis for record in recent[onset:])
             for place, hypothesis in enumerate(each):
                 try:
                     weighed = since.weigh(hypothesis.directions, hypothesis.factor)
@@ -147,25 +152,25 @@ class Follower:
                     continue
                 odds = weighed.log_likelihood - none.log_likelihood + hypothesis.log_prior
                 kept = sum(r.nis for r, fits in zip(recent[onset:], weighed.fits, strict=True) if fits)
-                share = max(0.0, kept - weighed.surprise) / surprise if surprise > 0 else 0.0
+                share = max(0.0, kept - weighed.nis) / nis if nis > 0 else 0.0
                 if place not in found or odds > found[place].log_odds:
                     found[place] = Explained(hypothesis, onset, odds, share)
         return sorted(found.values(), key=lambda one: -one.log_odds)
 
     def follow(self, recent: Sequence[Recent], directions: Array, factor: float) -> tuple[float, Belief]:
         """What is believed after some records if before the first ``directions`` were reopened; and the evidence."""
-        belief = widened(reopened(recent[0].before, directions), len(self._fading.rates), factor)
+        belief = widened(reopened(recent[0].before, directions), len(self._process_noise.rates), factor)
         total = 0.0
         for place, record in enumerate(recent):
             if place:
-                belief = self._fading.faded(belief, record.passed)
+                belief = self._process_noise.faded(belief, record.passed)
             gained, belief = self.step(belief, record)
             total += gained
         return total, belief
 
     def fade(self, belief: Belief, record: Recent) -> Belief:
         """A belief at the next record."""
-        return self._fading.faded(belief, record.passed)
+        return self._process_noise.faded(belief, record.passed)
 
     def step(self, belief: Belief, record: Recent) -> tuple[float, Belief]:
         """The log likelihood of a record, as a good one or an outlier, and what is believed after it."""
@@ -182,7 +187,7 @@ class Follower:
         within = np.log(1 - share) + log_likelihood(update.innovation, update.covariance, freedom)
         if within < outside:
             return float(outside), belief
-        return float(within), belief.updated(self._observer.chart, update.posterior)
+        return float(within), belief.updated(self._observer.space, update.posterior)
 
     def _since(self, recent: Sequence[Recent]) -> RecordsSince:
         before = recent[0].before
@@ -190,7 +195,7 @@ class Follower:
         outlying = [self._outlying(each) for each in recent]
         passed = [each.passed for each in recent]
         known = min(map(self.freedom, recent))
-        return RecordsSince(before, seen, passed, self._fading, outlying, self._outliers.fraction, known)
+        return RecordsSince(before, seen, passed, self._process_noise, outlying, self._outliers.fraction, known)
 
     def freedom(self, record: Recent) -> float:
         """Degrees of freedom with which the noise of a record is known."""

@@ -11,21 +11,21 @@ from scipy.special import logsumexp
 
 from armcal_online.tracking import sentences
 from armcal_online.tracking.belief import Belief, widened
-from armcal_online.tracking.chart import Chart
 from armcal_online.tracking.directions import Steps
-from armcal_online.tracking.health import improbability, many_outliers, surprise_limit
-from armcal_online.tracking.hypotheses import Candidate, Explained, Follower, Hypothesis, Recent
+from armcal_online.tracking.health import improbability, many_outliers, nis_limit
+from armcal_online.tracking.hypotheses import Candidate, Explained, Hypothesis, HypothesisFilter, Recent
 from armcal_online.tracking.sentences import Decision
 from armcal_online.tracking.settings import RecalibrateSettings
 from armcal_online.tracking.state import State
+from armcal_online.tracking.state_space import StateSpace
 
 _SURPRISING = 0.01
-"""A record as surprising as this is one in a hundred: two of them near each other are looked into."""
+"""A record with an NIS as large as this is one in a hundred: two of them near each other are looked into."""
 _MOST_ONSETS = 5
-"""So many of the last surprising records are tried as the first after a change."""
+"""So many of the last records with a large NIS are tried as the first after a change."""
 _MOST_WIDENING = 3.0
 _UNEXPLAINED = 3
-"""So many changes that nothing explains, or windows of too large surprise: the model no longer fits."""
+"""So many changes that nothing explains, or windows of too large NIS: the model no longer fits."""
 _LONGEST_NAMING = 100
 """After so many records joints that could not be told apart are left so."""
 
@@ -35,13 +35,13 @@ class Judge:
 
     def __init__(
         self,
-        chart: Chart,
+        space: StateSpace,
         steps: Steps,
-        follower: Follower,
+        hypothesis_filter: HypothesisFilter,
         changes: Sequence[Hypothesis],
         settings: RecalibrateSettings,
     ) -> None:
-        self._chart, self._steps, self._follower = chart, steps, follower
+        self._space, self._steps, self._filter = space, steps, hypothesis_filter
         self._changes, self._settings = changes, settings
 
     def after(self, state: State) -> tuple[State, tuple[Decision, ...]]:
@@ -54,10 +54,10 @@ class Judge:
 
     def _changed(self, state: State) -> tuple[State, Decision | None]:
         """Whether the last records tell of a change."""
-        odd = [i for i, each in enumerate(state.recent) if self._surprising(each)]
+        odd = [i for i, each in enumerate(state.recent) if self._improbable(each)]
         if len(odd) < 2 or not (state.wary or odd[-1] == len(state.recent) - 1):
             return (replace(state, wary=False) if len(odd) < 2 else state), None
-        found = self._follower.compare(state.recent, odd[-_MOST_ONSETS:], self._changes)
+        found = self._filter.compare(state.recent, odd[-_MOST_ONSETS:], self._changes)
         if not found:
             return state, None
         best = found[0]
@@ -87,8 +87,8 @@ class Judge:
                     near[each.hypothesis.subject] = each
         return list(near.values())
 
-    def _surprising(self, record: Recent) -> bool:
-        limit = surprise_limit(record.dof, 1 - _SURPRISING, self._follower.freedom(record))
+    def _improbable(self, record: Recent) -> bool:
+        limit = nis_limit(record.dof, 1 - _SURPRISING, self._filter.freedom(record))
         return record.rejected or record.nis > limit
 
     def _kinds(self, joints: Sequence[Explained]) -> list[Hypothesis]:
@@ -105,11 +105,11 @@ class Judge:
         others = [each for each in found if each.hypothesis.subject not in {a.hypothesis.subject for a in alike}]
         since = state.recent[best.onset :]
         directions = np.hstack([each.hypothesis.directions for each in alike])
-        _, belief = self._follower.follow(since, directions, best.hypothesis.factor)
+        _, belief = self._filter.follow(since, directions, best.hypothesis.factor)
         suspects: tuple[Candidate, ...] = ()
         if best.hypothesis.kind.startswith("joint"):
             kinds = self._kinds(alike)
-            followed = [(self._place(each), *self._follower.follow(since, each.directions, 1.0)) for each in kinds]
+            followed = [(self._place(each), *self._filter.follow(since, each.directions, 1.0)) for each in kinds]
             suspects = tuple(Candidate(*each) for each in followed)
         after = replace(
             state,
@@ -117,7 +117,7 @@ class Judge:
             anchor=belief,
             held=(),
             recent=(),
-            surprises=(),
+            nis_window=(),
             drifted=0,
             wary=False,
             suspects=suspects,
@@ -164,7 +164,7 @@ class Judge:
         return self._taken(state, best, ()), self._told(state, best, (), margin)
 
     def _stepped(self, each: Candidate, record: Recent) -> Candidate:
-        gained, belief = self._follower.step(self._follower.fade(each.belief, record), record)
+        gained, belief = self._filter.step(self._filter.fade(each.belief, record), record)
         return Candidate(each.place, each.log_evidence + gained, belief)
 
     def _taken(self, state: State, best: Candidate, left: tuple[Candidate, ...]) -> State:
@@ -181,21 +181,21 @@ class Judge:
         return sentences.replaced(state, self._steps, hypothesis, margin, size)
 
     def _drifted(self, state: State) -> tuple[State, Decision | None]:
-        """Whether surprise as a whole is too large, though no record's is."""
+        """Whether the NIS as a whole is too large, though no record's is."""
         settings = self._settings.levels
-        if len(state.surprises) < settings.window:
+        if len(state.nis_window) < settings.window:
             return state, None
-        known = min(map(self._follower.freedom, state.recent), default=math.inf)
-        if improbability(state.surprises, known) >= settings.probability:
-            return replace(state, drifted=0, surprises=state.surprises[settings.window // 2 :]), None
-        total, freedom = (float(sum(column)) for column in zip(*state.surprises, strict=True))
-        ratio, count = total / freedom, len(state.surprises)
-        state = replace(state, surprises=(), drifted=state.drifted + 1)
+        known = min(map(self._filter.freedom, state.recent), default=math.inf)
+        if improbability(state.nis_window, known) >= settings.probability:
+            return replace(state, drifted=0, nis_window=state.nis_window[settings.window // 2 :]), None
+        total, freedom = (float(sum(column)) for column in zip(*state.nis_window, strict=True))
+        ratio, count = total / freedom, len(state.nis_window)
+        state = replace(state, nis_window=(), drifted=state.drifted + 1)
         if state.drifted >= _UNEXPLAINED:
-            text = f"the surprise of {count} records is {ratio:.1f} times what chance makes it, again and again"
+            text = f"the NIS of {count} records is {ratio:.1f} times what chance makes it, again and again"
             return state, sentences.no_longer_fits(state, self._steps, text)
         factor = min(math.sqrt(ratio), _MOST_WIDENING)
-        belief = widened(state.belief, len(self._chart.scales), factor)
+        belief = widened(state.belief, len(self._space.scales), factor)
         return replace(state, belief=belief, anchor=belief, held=()), sentences.drift(state, count, ratio, factor)
 
     def _unexplained(self, state: State, found: Sequence[Explained]) -> Decision | None:
@@ -213,10 +213,10 @@ class Judge:
 
     def _size(self, before: Belief, after: Belief, hypothesis: Hypothesis) -> tuple[float, float]:
         """How far a joint stepped (rad or m), and its standard deviation."""
-        step, n = hypothesis.step, len(self._chart.scales)
+        step, n = hypothesis.step, len(self._space.scales)
         if not step.any():
             return 0.0, 0.0
-        moved = self._chart.between(before.values(self._chart), after.values(self._chart))
+        moved = self._space.between(before.values(self._space), after.values(self._space))
         along = step / float(step @ step)
         covariance = after.gaussian.covariance[:n, :n]
         return float(along @ moved), math.sqrt(max(float(along @ covariance @ along), 0.0))

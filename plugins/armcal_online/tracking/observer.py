@@ -19,8 +19,8 @@ from armcal.problem.one_record import OneRecord
 from armcal.problem.problem import Problem
 from numpy.typing import NDArray
 
-from armcal_online.tracking.chart import Chart
-from armcal_online.tracking.companions import Companions
+from armcal_online.tracking.gauss_markov import GaussMarkovStates
+from armcal_online.tracking.state_space import StateSpace
 
 
 @dataclass(frozen=True)
@@ -45,8 +45,8 @@ class Observer:
 
     Args:
         problem: compiled; its free parameters are the chart's.
-        chart: of the parameters.
-        companions: what moves beside them.
+        space: of the parameters.
+        gauss_markov: what moves beside them.
         noisy: drifts that are not followed: each record has its own.
         noise: covariance of each measurement's error (n_r x n_r), where a record does not say its own.
         freedoms: degrees of freedom with which each of these is known.
@@ -58,31 +58,31 @@ class Observer:
     def __init__(
         self,
         problem: Problem,
-        chart: Chart,
-        companions: Companions,
-        noisy: Companions,
+        space: StateSpace,
+        gauss_markov: GaussMarkovStates,
+        noisy: GaussMarkovStates,
         noise: Mapping[str, Array],
         freedoms: Mapping[str, float],
         defaults: Mapping[str, float],
         unfound: Collection[str] = (),
         joint_scale: float = 1.0,
     ) -> None:
-        self.problem, self.chart, self.companions = problem, chart, companions
+        self.problem, self.space, self.gauss_markov = problem, space, gauss_markov
         self._noise, self._defaults, self._unfound = noise, defaults, frozenset(unfound)
         self._freedoms = [freedoms[kernel.factor.name] for kernel in problem.kernels]
         self._factors = [OneRecord(kernel) for kernel in problem.kernels]
         self._plain = [slots.entries[0] if slots.is_plain else None for slots in problem.slots]
         rows = [kernel.factor.residual.numel() for kernel in problem.kernels]
         names = [kernel.factor.name for kernel in problem.kernels]
-        self._shifts = [companions.shifts(name, count) for name, count in zip(names, rows, strict=True)]
-        self.drifts, self.noisy_drifts = companions.drifts, noisy.drifts
+        self._shifts = [gauss_markov.shifts(name, count) for name, count in zip(names, rows, strict=True)]
+        self.drifts, self.noisy_drifts = gauss_markov.drifts, noisy.drifts
         self._noisy_joints = {
             f"{arm.name}.{joint}": joint_scale * arm.joint_noise
             for arm in problem.blueprint.arms.values()
             for joint, dimension in arm.commanded.items()
             if arm.joint_noise and dimension == "angle"
         }
-        self.size = len(chart.scales) + len(companions)
+        self.size = len(space.scales) + len(gauss_markov)
 
     def readings(self, channels: Mapping[str, float], labels: Mapping[str, str]) -> tuple[Reading, ...]:
         """What the measurements read of a record; empty if none applies, as when its group is not known."""
@@ -168,13 +168,13 @@ class Observer:
         )
         if entries is not None:
             residual, jacobian = one.linearise(values[entries], reading.record)
-            return residual, -self.chart.by_coordinates(values, jacobian)
+            return residual, -self.space.by_coordinates(values, jacobian)
         residual, own = one.linearise(slots.values(values, reading.group), reading.record)
         free = slots.free[reading.group]
         seen: NDArray[np.intp] = np.flatnonzero(free != HELD)
         jacobian = np.zeros((len(residual), slots.width))
         jacobian[:, free[seen]] = own[:, seen]
-        return residual, -self.chart.by_coordinates(values, jacobian)
+        return residual, -self.space.by_coordinates(values, jacobian)
 
     def joint_noise(self, values: Array, readings: tuple[Reading, ...]) -> tuple[Array | None, ...]:
         """What noise of the joints' own readings adds to the covariance of each residual, at values; None for nothing.
@@ -232,16 +232,16 @@ class Seen:
         return self._last[key]
 
     def _linearised(self, place: Array) -> Linearised:
-        observer, chart = self.observer, self.observer.chart
-        n = len(chart.scales)
+        observer, space = self.observer, self.observer.space
+        n = len(space.scales)
         beside = place[n:]
         which, coordinate, size = observer.drifts
         wanted = place[:n] - self.base[:n]
         if len(which):
             np.add.at(wanted, coordinate, size * beside[which])
-        values = chart.moved(self.origin, wanted)
-        inside = chart.inside(values)
-        outside = self.base[:n] if (inside == values).all() else self.base[:n] + chart.between(inside, values)
+        values = space.moved(self.origin, wanted)
+        inside = space.inside(values)
+        outside = self.base[:n] if (inside == values).all() else self.base[:n] + space.between(inside, values)
         innovations, slopes, scattered = [], [], []
         for reading in self.readings:
             innovation, slope = observer.look(inside, reading)

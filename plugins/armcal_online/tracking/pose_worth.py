@@ -10,7 +10,7 @@ from armcal.errors import ConfigError, NotConvergedError
 from armcal.estimate.online import Linearised
 
 from armcal_online.tracking.observer import Seen
-from armcal_online.tracking.start import Footing
+from armcal_online.tracking.start import FilterSetup
 from armcal_online.tracking.what_if import Worth, of_errors, worth
 
 
@@ -22,7 +22,7 @@ class PoseWorth:
     worth: Worth
 
 
-def ranked(ground: Footing, commands: Dataset) -> tuple[tuple[PoseWorth, ...], tuple[int, ...]]:
+def ranked(setup: FilterSetup, commands: Dataset) -> tuple[tuple[PoseWorth, ...], tuple[int, ...]]:
     """All poses, the one that would tell most first, and those at which the arm finds no equilibrium.
 
     Each is seen by itself: a second record at the best pose tells less. The error that the calibration's residuals
@@ -34,19 +34,19 @@ def ranked(ground: Footing, commands: Dataset) -> tuple[tuple[PoseWorth, ...], t
     found, lost = [], []
     for place in range(len(commands)):
         try:
-            seen, counted = _seen(ground, {name: float(values[place]) for name, values in commands.channels.items()})
+            seen, counted = _seen(setup, {name: float(values[place]) for name, values in commands.channels.items()})
         except NotConvergedError:
             lost.append(place)
             continue
-        own = worth(ground.chart, ground.belief, seen)
-        deviation = worth(ground.chart, ground.belief, counted).deviation
+        own = worth(setup.space, setup.belief, seen)
+        deviation = worth(setup.space, setup.belief, counted).deviation
         found.append(PoseWorth(place, replace(own, deviation=deviation)))
     return tuple(sorted(found, key=lambda each: -each.worth.bits)), tuple(lost)
 
 
-def _seen(ground: Footing, channels: dict[str, float]) -> tuple[Linearised, Linearised]:
+def _seen(setup: FilterSetup, channels: dict[str, float]) -> tuple[Linearised, Linearised]:
     """A record with these commands that reads what the calibration predicts, and the part of it that errors count."""
-    observer, belief = ground.observer, ground.belief
+    observer, belief = setup.observer, setup.belief
     known = {name: value for name, value in channels.items() if np.isfinite(value)}
     readings = observer.predicted(belief.origin, known)
     if not readings:
@@ -57,4 +57,4 @@ def _seen(ground: Footing, channels: dict[str, float]) -> tuple[Linearised, Line
     noise = observer.joint_noise(belief.origin, readings)
     mean = belief.gaussian.mean
     seen = Seen(observer, belief.origin, mean, readings, noise).at(mean)
-    return seen, of_errors(ground.problem, readings, seen)
+    return seen, of_errors(setup.problem, readings, seen)

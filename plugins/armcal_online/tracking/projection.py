@@ -12,41 +12,41 @@ from armcal.base.domains import Array
 from scipy.optimize import lsq_linear
 
 from armcal_online.tracking.belief import Belief
-from armcal_online.tracking.chart import Chart
+from armcal_online.tracking.state_space import StateSpace
 
 _FLOOR = 1e-14
 
 
-def most_likely(chart: Chart, belief: Belief) -> Array:
+def most_likely(space: StateSpace, belief: Belief) -> Array:
     """The most likely value vector within all domains."""
-    values = belief.values(chart)
-    if np.array_equal(chart.inside(values), values):
+    values = belief.values(space)
+    if np.array_equal(space.inside(values), values):
         return values
-    n = len(chart.scales)
-    limited = _limited(chart)
+    n = len(space.scales)
+    limited = _limited(space)
     covariance = belief.gaussian.covariance[:n, :n]
     own = covariance[np.ix_(limited, limited)]
-    shift = _nearest(chart, values, limited, own)
+    shift = _nearest(space, values, limited, own)
     moved: Array = np.asarray(covariance[:, limited] @ np.linalg.lstsq(own, shift, rcond=_FLOOR)[0])
     moved[limited] = shift
-    return chart.inside(chart.moved(values, moved))
+    return space.inside(space.moved(values, moved))
 
 
-def _limited(chart: Chart) -> Array:
+def _limited(space: StateSpace) -> Array:
     """Coordinates with bounds, then those of semidefinite matrices."""
-    _, coordinates, _, _ = chart.bounds
-    return np.concatenate([coordinates, *(np.arange(own.start, own.stop) for _, own in chart.cones)]).astype(np.intp)
+    _, coordinates, _, _ = space.bounds
+    return np.concatenate([coordinates, *(np.arange(own.start, own.stop) for _, own in space.cones)]).astype(np.intp)
 
 
-def _nearest(chart: Chart, values: Array, limited: Array, covariance: Array) -> Array:
+def _nearest(space: StateSpace, values: Array, limited: Array, covariance: Array) -> Array:
     """How far the limited coordinates move to the nearest point within the domains, in the metric of the belief."""
-    place, _, lower, upper = chart.bounds
-    scales = chart.scales[limited]
+    place, _, lower, upper = space.bounds
+    scales = space.scales[limited]
     size, directions = np.linalg.eigh(covariance)
     root = (directions / np.sqrt(np.maximum(size, _FLOOR * size[-1]))).T
-    given = np.concatenate([values[place], *(values[entries] for entries, _ in chart.cones)]) / scales
+    given = np.concatenate([values[place], *(values[entries] for entries, _ in space.cones)]) / scales
     ends = lower / scales[: len(place)], upper / scales[: len(place)]
-    if chart.cones:
+    if space.cones:
         nearest = _in_cones(root, given, ends, scales[len(place) :])
     else:
         nearest = np.array(lsq_linear(root, root @ given, ends, tol=1e-12).x, dtype=float)

@@ -18,7 +18,7 @@ from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.calibration.calibration import Calibration
 from armcal.errors import ArmcalError, ConfigError, DataError, Location
-from armcal.estimate.online import Linearised, OnlineEstimator, surprise
+from armcal.estimate.online import Linearised, OnlineEstimator, normalised_innovation_squared
 from armcal.estimate.validation import error_unit
 from armcal.measure.reader import ReadRequest
 from armcal.plugins import PluginRegistry, discover
@@ -30,14 +30,14 @@ from armcal_online.tracking.advance import Advance
 from armcal_online.tracking.clock import Tick, ticked
 from armcal_online.tracking.directions import Steps, find_steps, probing_poses
 from armcal_online.tracking.evaluator import identity
-from armcal_online.tracking.health import Health, many_outliers, surprise_limit
-from armcal_online.tracking.hypotheses import Follower, Recent, hypotheses
+from armcal_online.tracking.health import Health, many_outliers, nis_limit
+from armcal_online.tracking.hypotheses import HypothesisFilter, Recent, hypotheses
 from armcal_online.tracking.judge import Judge
 from armcal_online.tracking.observer import Reading
 from armcal_online.tracking.projection import most_likely
 from armcal_online.tracking.sentences import EXPLAINED, Decision
 from armcal_online.tracking.settings import RecalibrateSettings
-from armcal_online.tracking.start import Footing, footing
+from armcal_online.tracking.start import FilterSetup, filter_setup
 from armcal_online.tracking.state import REMEMBERED, State
 from armcal_online.tracking.updated import calibration_text, deviations
 from armcal_online.tracking.what_if import of_errors, worth
@@ -56,16 +56,16 @@ class Recalibrator:
         calibration: Calibration,
         settings: RecalibrateSettings,
         estimator: OnlineEstimator,
-        ground: Footing,
+        setup: FilterSetup,
         steps: Steps,
     ) -> None:
         self._calibration, self._settings, self._estimator = calibration, settings, estimator
-        self._ground, self.steps = ground, steps
-        follower = Follower(ground.observer, estimator, ground.fading, settings.outliers)
-        changes = hypotheses(ground.chart, steps, settings.changes, ground.observer.size)
-        self._judge = Judge(ground.chart, steps, follower, changes, settings)
-        self._advance = Advance(ground, estimator, settings.levels.window)
-        self.state = State(ground.belief, ground.belief)
+        self._setup, self.steps = setup, steps
+        hypothesis_filter = HypothesisFilter(setup.observer, estimator, setup.process_noise, settings.outliers)
+        changes = hypotheses(setup.space, steps, settings.changes, setup.observer.size)
+        self._judge = Judge(setup.space, steps, hypothesis_filter, changes, settings)
+        self._advance = Advance(setup, estimator, settings.levels.window)
+        self.state = State(setup.belief, setup.belief)
 
     @classmethod
     def begin(
@@ -78,34 +78,34 @@ class Recalibrator:
             PluginError: no such estimator.
         """
         estimator = _estimator(settings, registry or discover())
-        ground = footing(calibration, settings, shares=estimator.window == 1)
-        if estimator.window > 1 and ground.chart.cones:
+        setup = filter_setup(calibration, settings, shares=estimator.window == 1)
+        if estimator.window > 1 and setup.space.cones:
             raise ConfigError(
                 "found an estimator that holds records back, and 3x3 compliances: together they may come to no answer.",
                 where=Location("estimator.type"),
                 hint="Take extended, which looks at each record again from where it leads.",
             )
-        return cls(calibration, settings, estimator, ground, _steps(calibration, ground))
+        return cls(calibration, settings, estimator, setup, _steps(calibration, setup))
 
     @property
-    def ground(self) -> Footing:
+    def setup(self) -> FilterSetup:
         """What it stands on."""
-        return self._ground
+        return self._setup
 
     @property
     def request(self) -> ReadRequest:
         """What its records may hold."""
-        return self._ground.request
+        return self._setup.request
 
     @property
     def evaluator(self) -> dict[str, Any]:
         """What evaluates it: with the same, a replay gives the same bits."""
-        return identity(self._ground.problem, self._estimator)
+        return identity(self._setup.problem, self._estimator)
 
     @property
     def values(self) -> Array:
         """The most likely values within all bounds (all canonical entries)."""
-        return most_likely(self._ground.chart, self.state.belief)
+        return most_likely(self._setup.space, self.state.belief)
 
     def take(self, incoming: Incoming, sequence: int) -> tuple[dict[str, Any], ...]:
         """Take one record; what came of it, as events.
@@ -114,7 +114,7 @@ class Recalibrator:
             ProblemError: the numbers of the belief are no longer sound.
         """
         state, tick, why = self._admitted(incoming, sequence)
-        readings = () if why else self._ground.observer.readings(incoming.channels, incoming.labels)
+        readings = () if why else self._setup.observer.readings(incoming.channels, incoming.labels)
         if not why and not readings:
             why = "no measurement can use it: numbers are missing, or its group is none that the calibration found"
         if why:
@@ -163,20 +163,20 @@ class Recalibrator:
     def _judged(
         self, incoming: Incoming, state: State, readings: tuple[Reading, ...], passed: Mapping[str, float]
     ) -> tuple[dict[str, Any], ...]:
-        fading, chart = self._ground.fading, self._ground.chart
-        before = fading.faded(state.belief, passed)
-        anchor = fading.faded(state.anchor, passed) if state.held else before
+        process_noise, space = self._setup.process_noise, self._setup.space
+        before = process_noise.faded(state.belief, passed)
+        anchor = process_noise.faded(state.anchor, passed) if state.held else before
         place = incoming.channels.get("sequence", math.nan)
         state = replace(state, place=place if math.isfinite(place) else state.place)
         try:
-            noise = self._ground.observer.joint_noise(chart.inside(before.values(chart)), readings)
+            noise = self._setup.observer.joint_noise(space.inside(before.values(space)), readings)
             first = self._advance.seen(before, readings, noise).at(before.gaussian.mean)
         except ArmcalError as fault:
             self.state = _counted(replace(state, belief=before, anchor=anchor), "ignored")
             return (events.ignored(incoming, self.state, fault.message.rstrip(".")),)
         covariance = first.slope @ before.gaussian.covariance @ first.slope.T + first.noise
-        nis, dof = surprise(first.innovation, covariance), len(first.innovation)
-        limit = surprise_limit(dof, self._settings.gate.probability, self._ground.observer.freedom(readings))
+        nis, dof = normalised_innovation_squared(first.innovation, covariance), len(first.innovation)
+        limit = nis_limit(dof, self._settings.gate.probability, self._setup.observer.freedom(readings))
         rejected = self._settings.gating == "on" and not nis <= limit
         recent = Recent(state.sequence, readings, noise, passed, before, rejected, nis, dof)
         if rejected:
@@ -200,7 +200,7 @@ class Recalibrator:
         if self._settings.gating == "on":
             state, decisions = self._judge.after(state)
         health = self._health(state.health, recent, odd, first, decisions)
-        told = [events.judged(incoming, state, recent, first, limit, self._ground)]
+        told = [events.judged(incoming, state, recent, first, limit, self._setup)]
         told += [events.decided(state, each) for each in decisions if self._is_news(each)]
         if health.level != self.state.health.level:
             told.append(events.level_changed(state, self.state.health.level, health))
@@ -236,23 +236,23 @@ class Recalibrator:
             )
         limit = self._settings.levels.tip_sd
         if limit is not None:
-            foretold = first.slope @ recent.before.gaussian.covariance @ first.slope.T
-            sd = math.sqrt(max(float(np.linalg.eigvalsh(foretold)[-1]), 0.0))
+            forecast = first.slope @ recent.before.gaussian.covariance @ first.slope.T
+            sd = math.sqrt(max(float(np.linalg.eigvalsh(forecast)[-1]), 0.0))
             if sd > limit:
                 text = f"What is predicted is known to {1000 * sd:.2f} mm only; {1000 * limit:.2f} mm are tolerable."
                 return health.troubled("watch", text)
         return health.calmed(self._settings.levels.calm)
 
     def _estimate(self) -> dict[str, Any]:
-        chart, belief = self._ground.chart, self.state.belief
-        names = [chart.parameters.entry_names[i] for i in chart.entries]
-        numbers = zip(names, self.values[chart.entries], deviations(chart, belief), strict=True)
+        space, belief = self._setup.space, self.state.belief
+        names = [space.parameters.entry_names[i] for i in space.entries]
+        numbers = zip(names, self.values[space.entries], deviations(space, belief), strict=True)
         return events.estimated(self.state, {name: [float(v), float(sd)] for name, v, sd in numbers})
 
     def started_event(self, resumed: bool) -> dict[str, Any]:
         """What there is to tell at the beginning."""
         parameters = self._estimate()["parameters"]
-        return events.started(self.state, self._ground, self._settings, parameters, resumed, self.steps)
+        return events.started(self.state, self._setup, self._settings, parameters, resumed, self.steps)
 
     def status(self) -> dict[str, Any]:
         """What there is to say now."""
@@ -263,7 +263,7 @@ class Recalibrator:
             "counts": dict(state.counts),
             "record_time": state.at,
             "parameters": self._estimate()["parameters"],
-            "evaluator": self._ground.problem.backend,
+            "evaluator": self._setup.problem.backend,
         }
 
     def what_if(self, joints: Mapping[str, float]) -> dict[str, Any]:
@@ -272,7 +272,7 @@ class Recalibrator:
         Raises:
             DataError: joints are missing, or no measurement reads a single pose.
         """
-        observer = self._ground.observer
+        observer = self._setup.observer
         wanted = [f"{a.name}.{j}" for a in self._calibration.system.arms.values() for j in a.commanded]
         missing = [name for name in wanted if name not in joints]
         if missing:
@@ -284,8 +284,8 @@ class Recalibrator:
                 "no measurement reads a single pose.", hint="Only instruments foretell what they would tell."
             )
         seen = self._advance.seen(belief, readings, ()).at(belief.gaussian.mean)
-        told = worth(self._ground.chart, belief, seen)
-        known = worth(self._ground.chart, belief, of_errors(observer.problem, readings, seen)).deviation
+        told = worth(self._setup.space, belief, seen)
+        known = worth(self._setup.space, belief, of_errors(observer.problem, readings, seen)).deviation
         return {
             "bits": told.bits,
             f"prediction_sd_{error_unit(observer.problem)}": 1000 * known,
@@ -306,10 +306,10 @@ class Recalibrator:
             state = State.of(snapshot)
         except (KeyError, TypeError, ValueError, AttributeError, IndexError) as fault:
             raise DataError(f"what the journal keeps is no state of a recalibration ({fault}).") from fault
-        if len(state.belief.gaussian.mean) != self._ground.observer.size:
+        if len(state.belief.gaussian.mean) != self._setup.observer.size:
             raise DataError(
                 f"the journal's state has {len(state.belief.gaussian.mean)} numbers, the calibration and its settings "
-                f"ask for {self._ground.observer.size}.",
+                f"ask for {self._setup.observer.size}.",
                 hint="Replay with the calibration and settings of the journal.",
             )
         self.state = state
@@ -328,7 +328,7 @@ class Recalibrator:
             "level": state.health.level,
             "why": state.health.sentence,
         }
-        return calibration_text(self._calibration, self._ground.chart, state.belief, told)
+        return calibration_text(self._calibration, self._setup.space, state.belief, told)
 
 
 def _estimator(settings: RecalibrateSettings, registry: PluginRegistry) -> OnlineEstimator:
@@ -346,14 +346,14 @@ def _estimator(settings: RecalibrateSettings, registry: PluginRegistry) -> Onlin
     return built
 
 
-def _steps(calibration: Calibration, ground: Footing) -> Steps:
+def _steps(calibration: Calibration, setup: FilterSetup) -> Steps:
     """What the parameters can follow; nothing where no instrument reads a single pose."""
     poses = probing_poses(calibration.system.arms)
     conditions = {name: np.zeros(len(poses)) for arm in calibration.system.arms.values() for name in arm.conditions}
     commands = Dataset(poses.ids, {**poses.channels, **conditions, "payload": np.zeros(len(poses))})
     try:
         read, _ = calibration.predict(commands)
-        return find_steps(ground.observer, ground.belief.origin, read, poses)
+        return find_steps(setup.observer, setup.belief.origin, read, poses)
     except ArmcalError:
         return Steps((), (), {})
 

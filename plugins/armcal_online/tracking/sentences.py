@@ -107,10 +107,11 @@ def replaced(state: State, steps: Steps, hypothesis: Hypothesis, margin: float, 
 
 
 def drift(state: State, count: int, ratio: float, factor: float) -> Decision:
-    """Surprise as a whole is too large."""
+    """The NIS as a whole is too large."""
     text = (
-        f"The surprise of the last {count} records is {ratio:.1f} times what chance makes it: parameters move faster "
-        f"than stated, or the instrument is worse. All standard deviations are made {factor:.1f} times larger."
+        f"The normalised innovation squared of the last {count} records is {ratio:.1f} times what chance makes it: "
+        f"parameters move faster than stated, or the instrument is worse. "
+        f"All standard deviations are made {factor:.1f} times larger."
     )
     return Decision("drift", text, "watch", since=state.sequence)
 

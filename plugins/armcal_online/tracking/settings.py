@@ -19,7 +19,9 @@ Probability = Annotated[float, Field(gt=0, lt=1)]
 
 
 class GateSettings(Settings):
-    """Which records are believed: those whose surprise would be exceeded with a probability of ``1 - probability``.
+    """Which records are believed.
+
+    Those are not whose normalised innovation squared (NIS) chance exceeds with less than ``1 - probability``.
 
     Of the last ``window`` records ``rejected`` have to be rejected before an unexplained change is suspected.
     """
@@ -65,7 +67,7 @@ class ChangeSettings(Settings):
 class LevelSettings(Settings):
     """When health changes: after ``calm`` records without trouble it gets better by a level.
 
-    The mean surprise of the last ``window`` records is watched; it is trouble where chance would make it so large
+    The mean NIS of the last ``window`` records is watched; it is trouble where chance would make it so large
     with a probability below ``probability``. ``tip_sd`` is the largest tolerable standard deviation of a predicted tip.
     """
 

@@ -20,40 +20,40 @@ from armcal.measure.partners import PairedMeasurement
 from armcal.measure.reader import ReadRequest, wanted_channels
 from armcal.problem.problem import Problem
 
-from armcal_online.tracking.belief import Belief, Fading
-from armcal_online.tracking.chart import Chart
-from armcal_online.tracking.companions import Companion, Companions, shared_error
+from armcal_online.tracking.belief import Belief, ProcessNoise
+from armcal_online.tracking.gauss_markov import GaussMarkovState, GaussMarkovStates, shared_error
 from armcal_online.tracking.observer import Observer
 from armcal_online.tracking.process import variance_rates
 from armcal_online.tracking.settings import RecalibrateSettings
+from armcal_online.tracking.state_space import StateSpace
 
 _VECTORS = ("gravity", "payload", "force", "torque")
 
 
 @dataclass(frozen=True)
-class Footing:
+class FilterSetup:
     """What a recalibration stands on.
 
     Attributes:
         problem: compiled once.
-        chart: of its free parameters.
+        space: of its free parameters.
         observer: makes observations of records.
         belief: that of the calibration.
-        fading: how beliefs fade between records.
+        process_noise: how beliefs fade between records.
         request: what a source should look for.
         left_out: measurements that cannot be taken one record at a time.
     """
 
     problem: Problem
-    chart: Chart
+    space: StateSpace
     observer: Observer
     belief: Belief
-    fading: Fading
+    process_noise: ProcessNoise
     request: ReadRequest
     left_out: tuple[str, ...]
 
 
-def footing(calibration: Calibration, settings: RecalibrateSettings, shares: bool) -> Footing:
+def filter_setup(calibration: Calibration, settings: RecalibrateSettings, shares: bool) -> FilterSetup:
     """What a recalibration starts with.
 
     Args:
@@ -66,7 +66,7 @@ def footing(calibration: Calibration, settings: RecalibrateSettings, shares: boo
     """
     measurements = {n: m for n, m in calibration.system.measurements.items() if not isinstance(m, PairedMeasurement)}
     parameters, opened = _parameters(calibration, settings)
-    chart = Chart(parameters)
+    space = StateSpace(parameters)
     problem = Problem.build(
         calibration.system.arms,
         measurements,
@@ -76,18 +76,18 @@ def footing(calibration: Calibration, settings: RecalibrateSettings, shares: boo
         settings.evaluator,
         groups=calibration.record.groups,
     )
-    covariance = _covariance(calibration, chart, opened)
-    white, companions, noisy = _errors(calibration, measurements, chart, settings, shares)
-    size = len(chart.scales) + len(companions)
+    covariance = _covariance(calibration, space, opened)
+    white, gauss_markov, noisy = _errors(calibration, measurements, space, settings, shares)
+    size = len(space.scales) + len(gauss_markov)
     mean, start = np.zeros(size), np.eye(size)
-    mean[: len(chart.scales)] = _unconstrained(calibration, chart)
-    start[: len(chart.scales), : len(chart.scales)] = covariance
-    return Footing(
+    mean[: len(space.scales)] = _unconstrained(calibration, space)
+    start[: len(space.scales), : len(space.scales)] = covariance
+    return FilterSetup(
         problem,
-        chart,
-        _observer(calibration, problem, chart, (companions, noisy), white),
+        space,
+        _observer(calibration, problem, space, (gauss_markov, noisy), white),
         Belief(parameters.nominal(), Gaussian(mean, start)),
-        Fading(variance_rates(parameters, settings.process_noise), companions),
+        ProcessNoise(variance_rates(parameters, settings.process_noise), gauss_markov),
         ReadRequest(
             calibration.system.arms, measurements, wanted_channels(calibration.system.arms, measurements, measured=True)
         ),
@@ -113,7 +113,7 @@ def _parameters(calibration: Calibration, settings: RecalibrateSettings) -> tupl
     return parameters.replaced(beyond).with_free([n for n in parameters.names if n in found or n in opened]), opened
 
 
-def _covariance(calibration: Calibration, chart: Chart, opened: Mapping[str, float]) -> Array:
+def _covariance(calibration: Calibration, space: StateSpace, opened: Mapping[str, float]) -> Array:
     """Of the scaled coordinates; parameters opened now are known to nobody."""
     known = calibration.uncertainty.record
     own = known.entries
@@ -121,13 +121,13 @@ def _covariance(calibration: Calibration, chart: Chart, opened: Mapping[str, flo
     for i, row in enumerate(known.covariance):
         lower[i, : len(row)] = row
     of_entries = lower + np.tril(lower, -1).T
-    names = [chart.parameters.entry_names[i] for i in chart.entries]
+    names = [space.parameters.entry_names[i] for i in space.entries]
     place = [names.index(name) for name in own]
     whole = np.zeros((len(names), len(names)))
     whole[np.ix_(place, place)] = of_entries
-    covariance = chart.of_entries(chart.parameters.nominal(), whole)
+    covariance = space.of_entries(space.parameters.nominal(), whole)
     start = 0
-    for block in chart.parameters.free:
+    for block in space.parameters.free:
         if block.name in opened:
             at = np.arange(start, start + block.domain.dof)
             covariance[at, at] = (opened[block.name] / block.scale) ** 2
@@ -135,29 +135,29 @@ def _covariance(calibration: Calibration, chart: Chart, opened: Mapping[str, flo
     return 0.5 * (covariance + covariance.T)
 
 
-def _unconstrained(calibration: Calibration, chart: Chart) -> Array:
+def _unconstrained(calibration: Calibration, space: StateSpace) -> Array:
     """Where the calibration's records would have the coordinates if no bound held any (n)."""
-    values = chart.parameters.nominal()
+    values = space.parameters.nominal()
     free = values.copy()
     for position, entry in enumerate(calibration.record.parameters):
         if entry.unconstrained is not None:
             free[position] = entry.unconstrained
-    return chart.between(values, free)
+    return space.between(values, free)
 
 
 def _errors(
     calibration: Calibration,
     measurements: Mapping[str, Measurement],
-    chart: Chart,
+    space: StateSpace,
     settings: RecalibrateSettings,
     shares: bool,
-) -> tuple[dict[str, Array], Companions, Companions]:
+) -> tuple[dict[str, Array], GaussMarkovStates, GaussMarkovStates]:
     """Each measurement's own error from record to record, what moves beside the parameters, and drifts
     that count as noise."""
     kept: Mapping[str, Any] = calibration.record.noise.get("scatter") or {}
     scale = _scale(calibration)
     followed = shares and settings.model_error == "calibrated"
-    companions: list[Companion] = []
+    gauss_markov: list[GaussMarkovState] = []
     white = {}
     for name, measurement in measurements.items():
         # Where joints are noisy the residuals scatter with the pose: their noise is carried over to each record.
@@ -167,27 +167,27 @@ def _errors(
         if told is not None:
             covariance = np.array(told["covariance"])
             if followed and told["share"] > 0:
-                companions += shared_error(
+                gauss_markov += shared_error(
                     name, told["share"] * covariance, told["over"], told.get("channel", "record")
                 )
                 covariance = (1 - told["share"]) * covariance
         white[name] = covariance
-    drifts = tuple(_drifts(calibration, chart))
+    drifts = tuple(_drifts(calibration, space))
     if followed:
-        return white, Companions((*drifts, *companions)), Companions()
-    return white, Companions(tuple(companions)), Companions(drifts)
+        return white, GaussMarkovStates((*drifts, *gauss_markov)), GaussMarkovStates()
+    return white, GaussMarkovStates(tuple(gauss_markov)), GaussMarkovStates(drifts)
 
 
 def _observer(
     calibration: Calibration,
     problem: Problem,
-    chart: Chart,
-    beside: tuple[Companions, Companions],
+    space: StateSpace,
+    beside: tuple[GaussMarkovStates, GaussMarkovStates],
     white: Mapping[str, Array],
 ) -> Observer:
     freedoms = {name: _freedom(calibration, name) for name in white}
     defaults, unfound = _defaults(calibration), _unfound(calibration)
-    return Observer(problem, chart, *beside, white, freedoms, defaults, unfound, _scale(calibration))
+    return Observer(problem, space, *beside, white, freedoms, defaults, unfound, _scale(calibration))
 
 
 def _freedom(calibration: Calibration, name: str) -> float:
@@ -196,14 +196,14 @@ def _freedom(calibration: Calibration, name: str) -> float:
     return float(kept.get("freedom") or max(calibration.record.noise["degrees_of_freedom"], 1))
 
 
-def _drifts(calibration: Calibration, chart: Chart) -> list[Companion]:
+def _drifts(calibration: Calibration, space: StateSpace) -> list[GaussMarkovState]:
     """The parameters that drifted in the calibration drift anew."""
     recording = calibration.uncertainty.record.recording
     if recording is None:
         return []
-    place = {name: i for i, name in enumerate(chart.names)}
+    place = {name: i for i, name in enumerate(space.names)}
     return [
-        Companion(f"drift of {name}", d.over, d.channel, place[name], d.sd / float(chart.scales[place[name]]))
+        GaussMarkovState(f"drift of {name}", d.over, d.channel, place[name], d.sd / float(space.scales[place[name]]))
         for name, d in recording.drifts.items()
     ]
 

@@ -30,14 +30,14 @@ class State:
         clock: by records.
         place: the last record's ``sequence``; None before the first.
         health: and why.
-        surprises: NIS and degrees of freedom of the last good records.
+        nis_window: NIS and degrees of freedom of the last good records.
         counts: of accepted, rejected and ignored records.
         ids: of the last records, with a hash of what they said.
         wary: whether the last records look like a change, which is not certain yet.
         suspects: joints that could not be told apart when one of them stepped, each followed by itself.
         suspected: the record at which that was decided.
         before_change: what was believed before it.
-        drifted: how often in a row surprise as a whole was too large.
+        drifted: how often in a row the NIS as a whole was too large.
         changes: sequence numbers of the last changes that nothing explained.
         sequence: of the last entry.
         at: time of the last record (unix seconds, or as records count it).
@@ -50,7 +50,7 @@ class State:
     clock: Clock = field(default_factory=Clock)
     place: float | None = None
     health: Health = field(default_factory=Health)
-    surprises: tuple[tuple[float, int], ...] = ()
+    nis_window: tuple[tuple[float, int], ...] = ()
     counts: Mapping[str, int] = field(default_factory=lambda: {"accepted": 0, "rejected": 0, "ignored": 0})
     ids: tuple[tuple[str, str], ...] = ()
     wary: bool = False
@@ -72,7 +72,7 @@ class State:
             "clock": asdict(self.clock),
             "place": self.place,
             "health": asdict(self.health),
-            "surprises": [list(each) for each in self.surprises],
+            "nis": [list(each) for each in self.nis_window],
             "counts": dict(self.counts),
             "ids": [list(each) for each in self.ids],
             "wary": self.wary,
@@ -97,7 +97,7 @@ class State:
             clock=Clock.of(**kept["clock"]),
             place=None if kept["place"] is None else float(kept["place"]),
             health=Health.of(**kept["health"]),
-            surprises=tuple((float(nis), int(dof)) for nis, dof in kept["surprises"]),
+            nis_window=tuple((float(nis), int(dof)) for nis, dof in kept["nis"]),
             counts={what: int(kept["counts"][what]) for what in ("accepted", "rejected", "ignored")},
             ids=tuple((str(name), str(said)) for name, said in kept["ids"]),
             wary=bool(kept["wary"]),

@@ -14,28 +14,28 @@ from armcal.calibration.intervals import covariance_rows
 from scipy.special import ndtri
 
 from armcal_online.tracking.belief import Belief
-from armcal_online.tracking.chart import Chart
 from armcal_online.tracking.projection import most_likely
+from armcal_online.tracking.state_space import StateSpace
 
 _QUANTILE = float(ndtri(0.975))
 _FLOOR = 1e-12
 
 
-def deviations(chart: Chart, belief: Belief) -> Array:
+def deviations(space: StateSpace, belief: Belief) -> Array:
     """Standard deviations of the free entries."""
-    n = len(chart.scales)
-    covariance = chart.to_entries(belief.values(chart), belief.gaussian.covariance[:n, :n])
+    n = len(space.scales)
+    covariance = space.to_entries(belief.values(space), belief.gaussian.covariance[:n, :n])
     return np.sqrt(np.maximum(np.diag(covariance), 0.0))
 
 
-def calibration_text(calibration: Calibration, chart: Chart, belief: Belief, told: Mapping[str, Any]) -> str:
+def calibration_text(calibration: Calibration, space: StateSpace, belief: Belief, told: Mapping[str, Any]) -> str:
     """The text of calibration.yaml; ``told`` says by what it has become so (records, health, last record)."""
-    n, values, free = len(chart.scales), most_likely(chart, belief), belief.values(chart)
+    n, values, free = len(space.scales), most_likely(space, belief), belief.values(space)
     covariance = belief.gaussian.covariance[:n, :n]
-    entries = chart.to_entries(values, covariance)
+    entries = space.to_entries(values, covariance)
     sd = np.sqrt(np.maximum(np.diag(entries), 0.0))
-    place = {int(entry): i for i, entry in enumerate(chart.entries)}
-    bounds = _bounds(chart)
+    place = {int(entry): i for i, entry in enumerate(space.entries)}
+    bounds = _bounds(space)
     parameters = []
     for position, record in enumerate(calibration.record.parameters):
         i = place.get(position)
@@ -54,7 +54,7 @@ def calibration_text(calibration: Calibration, chart: Chart, belief: Belief, tol
                 else None,
             }
         parameters.append(record.model_copy(update=changed))
-    names = tuple(chart.parameters.entry_names[i] for i in chart.entries)
+    names = tuple(space.parameters.entry_names[i] for i in space.entries)
     prediction = calibration.uncertainty.record.model_copy(
         update={"entries": names, "covariance": covariance_rows(entries)}
     )
@@ -63,7 +63,7 @@ def calibration_text(calibration: Calibration, chart: Chart, belief: Belief, tol
             "created": datetime.now(UTC).isoformat(timespec="seconds"),
             "parameters": tuple(parameters),
             "prediction": prediction,
-            "information": InformationRecord(increments=chart.names, square_root=_root(chart, covariance)),
+            "information": InformationRecord(increments=space.names, square_root=_root(space, covariance)),
             "verdict": _verdict(calibration.record.verdict, told),
             "recalibrated": dict(told),
         }
@@ -78,18 +78,18 @@ def _verdict(before: Mapping[str, Any], recalibrated: Mapping[str, Any]) -> dict
     return {**before, "headline": f"Lost, do not use: {recalibrated['why']}"}
 
 
-def _bounds(chart: Chart) -> dict[int, tuple[float, float]]:
+def _bounds(space: StateSpace) -> dict[int, tuple[float, float]]:
     return {
-        chart.parameters.entries_of(block.name).start: (block.domain.lower, block.domain.upper)
-        for block in chart.parameters.free
+        space.parameters.entries_of(block.name).start: (block.domain.lower, block.domain.upper)
+        for block in space.parameters.free
         if isinstance(block.domain, Interval)
     }
 
 
-def _root(chart: Chart, covariance: Array) -> tuple[tuple[float, ...], ...]:
+def _root(space: StateSpace, covariance: Array) -> tuple[tuple[float, ...], ...]:
     """R with R'R the information on the coordinates; directions that are known exactly are left out."""
     size, directions = np.linalg.eigh(covariance)
     known = size > _FLOOR * max(float(size[-1]), _FLOOR)
     inverse = np.where(known, 1 / np.sqrt(np.where(known, size, 1.0)), 0.0)
-    root = inverse[:, None] * directions.T / chart.scales
+    root = inverse[:, None] * directions.T / space.scales
     return tuple(tuple(row) for row in root.tolist())

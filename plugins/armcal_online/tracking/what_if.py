@@ -12,8 +12,8 @@ from armcal.estimate.validation import error_dimension
 from armcal.problem.problem import Problem
 
 from armcal_online.tracking.belief import Belief
-from armcal_online.tracking.chart import Chart
 from armcal_online.tracking.observer import Reading
+from armcal_online.tracking.state_space import StateSpace
 
 
 @dataclass(frozen=True)
@@ -43,21 +43,21 @@ def of_errors(problem: Problem, readings: Sequence[Reading], seen: Linearised) -
     return seen
 
 
-def worth(chart: Chart, belief: Belief, seen: Linearised, most: int = 3) -> Worth:
+def worth(space: StateSpace, belief: Belief, seen: Linearised, most: int = 3) -> Worth:
     """Of a record as it would be seen from the belief."""
     covariance = belief.gaussian.covariance
     across = covariance @ seen.slope.T
-    foretold = seen.slope @ across
-    expected = foretold + seen.noise
+    forecast = seen.slope @ across
+    expected = forecast + seen.noise
     _, wider = np.linalg.slogdet(expected)
     _, own = np.linalg.slogdet(seen.noise)
-    n = len(chart.scales)
+    n = len(space.scales)
     gain = np.sum(np.linalg.solve(expected, across.T).T * across, axis=1)[:n]
     before = np.diag(covariance)[:n]
     left = np.sqrt(np.clip(1 - gain / np.where(before > 0, before, 1.0), 0.0, 1.0))
     order = np.argsort(left, kind="stable")[:most]
     return Worth(
         0.5 * float(wider - own) / math.log(2),
-        float(np.sqrt(max(np.linalg.eigvalsh(foretold)[-1], 0.0))),
-        tuple((chart.names[i], float(left[i])) for i in order),
+        float(np.sqrt(max(np.linalg.eigvalsh(forecast)[-1], 0.0))),
+        tuple((space.names[i], float(left[i])) for i in order),
     )

@@ -16,7 +16,7 @@ from armcal.base.domains import Array
 from armcal.estimate.online import Linearised, Observation, log_density
 from numpy.typing import NDArray
 
-from armcal_online.tracking.belief import Belief, Fading
+from armcal_online.tracking.belief import Belief, ProcessNoise
 
 _ROUNDS = 3
 _STEPS = 8
@@ -27,13 +27,13 @@ _SETTLED = 0.02
 class Weighed:
     """A change, weighed: log likelihood of the records, where it leads (k; in standard deviations), which fit.
 
-    ``surprise`` is the squared Mahalanobis distance of those that fit.
+    ``nis`` is the squared Mahalanobis distance of those that fit.
     """
 
     log_likelihood: float
     shift: Array
     fits: NDArray[np.bool_]
-    surprise: float
+    nis: float
 
 
 class RecordsSince:
@@ -43,7 +43,7 @@ class RecordsSince:
         before: the belief when the first of them came.
         seen: the records, about the belief's origin.
         passed: how far each is from the one before; the first one's is not used.
-        fading: how beliefs fade.
+        process_noise: how beliefs fade.
         outlying: covariance of an outlier's error, a record each.
         share: of outliers.
         freedom: degrees of freedom with which the records' noise is known.
@@ -54,20 +54,20 @@ class RecordsSince:
         before: Belief,
         seen: Sequence[Observation],
         passed: Sequence[Mapping[str, float]],
-        fading: Fading,
+        process_noise: ProcessNoise,
         outlying: Sequence[Array],
         share: float,
         freedom: float,
     ) -> None:
         self._mean, self._seen, self._freedom = before.gaussian.mean, seen, freedom
         self._outlying, self._logs = outlying, (np.log(share), np.log(1 - share))
-        self._n = len(fading.rates)
+        self._n = len(process_noise.rates)
         self._kept, self._means, self._priors = [np.ones(len(self._mean))], [self._mean], [before.gaussian.covariance]
         belief = before
         for step in passed[1:]:
-            belief = fading.faded(belief, step)
+            belief = process_noise.faded(belief, step)
             kept = np.ones(len(self._mean))
-            kept[self._n :] = fading.companions.kept(step)
+            kept[self._n :] = process_noise.gauss_markov.kept(step)
             self._kept.append(kept)
             self._means.append(belief.gaussian.mean)
             self._priors.append(belief.gaussian.covariance)
@@ -126,8 +126,8 @@ class RecordsSince:
             whole = covariance.copy()
             for i in np.flatnonzero(~chosen).tolist():
                 whole[rows[i], rows[i]] += self._outlying[i]
-            total, surprise = _density(innovation, whole, self._freedom)
-            return total + float(chosen.sum() * self._logs[1] + (~chosen).sum() * self._logs[0]), surprise
+            total, nis = _density(innovation, whole, self._freedom)
+            return total + float(chosen.sum() * self._logs[1] + (~chosen).sum() * self._logs[0]), nis
 
         chosen, (best, _) = fits.copy(), judged(fits)
         for _ in range(len(views)):
@@ -142,8 +142,8 @@ class RecordsSince:
             best, chosen[i] = top, not chosen[i]
         inside = np.concatenate([np.full(rows[i].stop - rows[i].start, fit) for i, fit in enumerate(chosen.tolist())])
         fitting = innovation[inside], covariance[np.ix_(inside, inside)]
-        surprise = _density(*fitting, self._freedom)[1] if inside.any() else 0.0
-        return Weighed(best, shift, chosen, surprise)
+        nis = _density(*fitting, self._freedom)[1] if inside.any() else 0.0
+        return Weighed(best, shift, chosen, nis)
 
     def _stacked(
         self, views: Sequence[Linearised], chosen: NDArray[np.bool_], factor: float
@@ -182,6 +182,6 @@ def _density(innovation: Array, covariance: Array, freedom: float) -> tuple[floa
     """Log density, and squared Mahalanobis distance."""
     root = np.linalg.cholesky(covariance)
     whitened = np.linalg.solve(root, innovation)
-    surprise = float(whitened @ whitened)
+    nis = float(whitened @ whitened)
     logarithm = 2 * float(np.sum(np.log(np.diag(root))))
-    return log_density(surprise, logarithm, len(innovation), freedom), surprise
+    return log_density(nis, logarithm, len(innovation), freedom), nis

@@ -37,7 +37,7 @@ def shortened(record: Message) -> Message:
     return {key: record[key] for key in keys if key in record}
 
 
-def told_of(event: Mapping[str, Any]) -> Message | None:
+def message_of(event: Mapping[str, Any]) -> Message | None:
     """An event that is listed, with a sentence in any case; None for other kinds."""
     kind = event.get("event")
     if kind not in TOLD:

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from armcal_online.watch.estimates import Estimates
-from armcal_online.watch.events import LEVELS, VERDICTS, Message, record_of, shortened, told_of
+from armcal_online.watch.events import LEVELS, VERDICTS, Message, message_of, record_of, shortened
 from armcal_online.watch.lenient import number, text, whole
 from armcal_online.watch.thinned import Thinned
 
@@ -104,7 +104,7 @@ class History:
         return [{**record, "counts": dict(self._counts), **standing}]
 
     def _started(self, event: Mapping[str, Any]) -> list[Message]:
-        told = told_of(event)
+        told = message_of(event)
         messages: list[Message] = []
         if event.get("resumed") is not True and (self.last or self._told):
             self._forget()
@@ -122,7 +122,7 @@ class History:
         return [*messages, *([row] if row else [])]
 
     def _other(self, event: Mapping[str, Any]) -> list[Message]:
-        told = told_of(event)
+        told = message_of(event)
         if told is None:
             self.unknown += 1
             return []

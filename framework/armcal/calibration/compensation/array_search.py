@@ -104,12 +104,12 @@ class _Search:
     def inputs(self) -> tuple[Array, ...]:
         """Of the step function."""
         goal = self._goal
-        wish = np.zeros_like(self._free)
+        preference = np.zeros_like(self._free)
         if goal.towards is not None:
-            wish = goal.towards - goal.record[: self._joints]
+            preference = goal.towards - goal.record[: self._joints]
             # Shortened as a whole: joint by joint it would point elsewhere.
-            wish *= np.minimum(1.0, LONGEST / np.maximum(np.abs(wish).max(axis=0), LONGEST))
-        return goal.record, goal.target, wish, self._free, self._damping[None], goal.state
+            preference *= np.minimum(1.0, LONGEST / np.maximum(np.abs(preference).max(axis=0), LONGEST))
+        return goal.record, goal.target, preference, self._free, self._damping[None], goal.state
 
     def judge(self, away: Array, turn: Array, step: Array, length: float, there: Mask) -> None:
         """Keep what is there, else the best, and see whether it still becomes better.

@@ -150,10 +150,10 @@ class Finder:
             rows, first = np.repeat(todo, wide), np.arange(len(todo)) * wide
             attempts = Found.nothing(len(self._solver.limits), self.states, len(rows))
             picks = self._picked_for(target[:, todo], at[:, todo], wide).ravel()[:, None]
-            records, targets, wished = (chosen_of(each, rows) for each in (record, target, at))
-            self._round(records, targets, np.arange(len(rows)), picks, attempts, None, wished)
-            self.towards(records, targets, wished, attempts)
-            apart = np.where(attempts.there, _apart(attempts.commands, wished), np.inf)
+            records, targets, preferred = (chosen_of(each, rows) for each in (record, target, at))
+            self._round(records, targets, np.arange(len(rows)), picks, attempts, None, preferred)
+            self.towards(records, targets, preferred, attempts)
+            apart = np.where(attempts.there, _apart(attempts.commands, preferred), np.inf)
             found.replace(todo, attempts.subset(apart.reshape(-1, wide).argmin(axis=1) + first))
         lost = np.flatnonzero(~found.there)
         if lost.size:
@@ -176,12 +176,14 @@ class Finder:
             found.replace(lost, self.straight(record[:, lost], target[:, lost], at[:, lost]))
         return found
 
-    def towards(self, record: Array, target: Array, wished: Array, found: Found) -> None:
+    def towards(self, record: Array, target: Array, preferred: Array, found: Found) -> None:
         """As near to wished commands (n x N) as the targets allow, in place; only those that are had."""
         at = np.flatnonzero(found.there)
-        goal = Goal(_at(record, found.commands)[:, at], found.states[:, at], target[:, at], wished[:, at], self._held)
+        goal = Goal(
+            _at(record, found.commands)[:, at], found.states[:, at], target[:, at], preferred[:, at], self._held
+        )
         attempt = self._solver(goal, WISHED)
-        nearer = _apart(attempt.commands, wished[:, at]) < _apart(found.commands[:, at], wished[:, at])
+        nearer = _apart(attempt.commands, preferred[:, at]) < _apart(found.commands[:, at], preferred[:, at])
         good = np.flatnonzero(attempt.there & nearer & self._may(attempt.commands))
         found.put(at[good], attempt, good)
 

@@ -77,20 +77,20 @@ def tool_error(found: Slopes, position: Expression, rotation: Expression | None)
 def step_function(expression: ToolExpression, found: Slopes, turns: bool, length: float) -> ca.Function:
     """(record, target, wish, free, damping, state) -> (step, state left, state moved, error, pull).
 
-    ``target`` is a position (3; m) and, where the tool ``turns`` to one, a rotation (9, column by column); ``wish`` (n)
-    moves the arm where the target does not care; ``free`` (n) is one for joints that may move; ``damping`` (1; m^2).
-    The error is in m and rad; ``pull`` (n) is where each joint would go if it were free: of a joint that is held at a
-    limit its sign tells whether target and wish pull it back.
+    ``target`` is a position (3; m) and, where the tool ``turns`` to one, a rotation (9, column by column);
+    ``preference`` (n) moves the arm where the target does not care; ``free`` (n) is one for joints
+    that may move; ``damping`` (1; m^2). The error is in m and rad; ``pull`` (n) is where each joint would go if it were
+    free: of a joint that is held at a limit its sign says whether target and preference pull it back.
     """
     count = len(expression.joints)
     target = ca.SX.sym("target", 12 if turns else 3)
-    wish, free, damping = ca.SX.sym("wish", count), ca.SX.sym("free", count), ca.SX.sym("damping")
+    preference, free, damping = ca.SX.sym("wish", count), ca.SX.sym("free", count), ca.SX.sym("damping")
     error, slope = tool_error(found, target[:3], ca.reshape(target[3:], 3, 3) if turns else None)
     weight = ca.SX([1.0] * 3 + [length] * (error.numel() - 3))
     weighted = ca.diag(weight) @ slope
-    step, pull = _step(weighted, weight * error, wish, free, damping)
+    step, pull = _step(weighted, weight * error, preference, free, damping)
     outputs = [step, found.left, ca.mtimes(found.state, step), error, pull]
-    inputs = [expression.record, target, wish, free, damping, expression.state]
+    inputs = [expression.record, target, preference, free, damping, expression.state]
     return ca.Function("compensation_step", inputs, [ca.densify(each) for each in outputs], {"cse": True})
 
 
@@ -112,7 +112,7 @@ def sample_inputs(expression: ToolExpression) -> list[Array]:
 
 
 def _step(
-    slope: Expression, error: Expression, wish: Expression, free: Expression, damping: Expression
+    slope: Expression, error: Expression, preference: Expression, free: Expression, damping: Expression
 ) -> tuple[Expression, Expression]:
     """Damped least squares over the free joints, in the form that has fewer unknowns; and where all joints are pulled.
 
@@ -120,13 +120,13 @@ def _step(
     """
     rows, count = slope.shape
     held = slope @ ca.diag(free)
-    wished = free * wish
-    left = error - held @ wished
+    preferred = free * preference
+    left = error - held @ preferred
     if rows <= count:
         lever = se3.solve_near_identity(held @ held.T + damping * ca.SX.eye(rows), left)
-        return wished + held.T @ lever, wish + slope.T @ lever
-    step = wished + se3.solve_near_identity(held.T @ held + damping * ca.SX.eye(count), held.T @ left)
-    return step, damping * wish + slope.T @ (error - held @ step)
+        return preferred + held.T @ lever, preference + slope.T @ lever
+    step = preferred + se3.solve_near_identity(held.T @ held + damping * ca.SX.eye(count), held.T @ left)
+    return step, damping * preference + slope.T @ (error - held @ step)
 
 
 def _rotation_vector(here: Expression, there: Expression) -> Expression:

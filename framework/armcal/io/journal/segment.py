@@ -135,7 +135,7 @@ def read_segment(path: Path, number: int, data: bytes, before: Link | None) -> S
         JournalDamagedError: what does not check cannot be a torn end.
         DataError: another format.
     """
-    walk = _Walk(path, number, data, before or Link())
+    walk = _SegmentReader(path, number, data, before or Link())
     header = walk.step(None if before is None else before.sequence + 1, 0)
     if header is None:
         return Stub(path, number, walk.torn())
@@ -159,7 +159,7 @@ def read_segment(path: Path, number: int, data: bytes, before: Link | None) -> S
     )
 
 
-class _Walk:
+class _SegmentReader:
     """A way through the bytes of one segment."""
 
     def __init__(self, path: Path, number: int, data: bytes, link: Link) -> None:
@@ -194,7 +194,7 @@ class _Walk:
         return JournalDamagedError(self.path, self.line, self.offset, reason, self.link)
 
 
-def _check_header(walk: _Walk, frame: Frame, before: Link | None) -> None:
+def _check_header(walk: _SegmentReader, frame: Frame, before: Link | None) -> None:
     payload = frame.payload
     if payload["kind"] != HEADER:
         raise walk.damaged(f"found {payload['kind']!r} as the first entry, expected a header")

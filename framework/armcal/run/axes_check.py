@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from armcal.base.dataset import Dataset
-from armcal.diagnose.mixups import find_mixup
+from armcal.diagnose.permuted_axes import find_permuted_servos
 from armcal.errors import DataError, Location
 from armcal.problem.problem import FactorRecords, Problem
 
@@ -15,13 +15,13 @@ _MEND = {
 }
 
 
-def check_mixups(problem: Problem, records: Sequence[FactorRecords], dataset: Dataset) -> None:
+def check_permuted_axes(problem: Problem, records: Sequence[FactorRecords], dataset: Dataset) -> None:
     """Positions that do not fit the model, but do once one mix-up is undone.
 
     Raises:
         DataError: they are such; it names what looks mixed up.
     """
-    found = find_mixup(problem, records, dataset)
+    found = find_permuted_servos(problem, records, dataset)
     if found is None:
         return
     raise DataError(

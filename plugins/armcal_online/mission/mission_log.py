@@ -27,7 +27,7 @@ class Decision:
 
 
 @dataclass(frozen=True)
-class Story:
+class MissionLog:
     """What became of the records, and what was estimated and decided when (s since the mission began).
 
     Attributes:
@@ -55,7 +55,7 @@ class Story:
         return tuple(self.levels[max(int(i) - 1, 0)][1] for i in np.searchsorted(known, times, side="right"))
 
 
-def read_story(events: Iterable[Mapping[str, Any]], mission: Mission) -> Story:
+def read_mission_log(events: Iterable[Mapping[str, Any]], mission: Mission) -> MissionLog:
     """The story of a mission from the events that a recalibration wrote, in order.
 
     An event without a record of its own has the time of the last record before it.
@@ -82,4 +82,6 @@ def read_story(events: Iterable[Mapping[str, Any]], mission: Mission) -> Story:
         elif kind == "decision":
             said = (str(event.get(key) or "") for key in ("kind", "joint", "sentence"))
             decisions.append(Decision(now, *said))
-    return Story(verdicts, tuple(estimates.items()), tuple(levels or [(0.0, "nominal")]), tuple(decisions), resumed)
+    return MissionLog(
+        verdicts, tuple(estimates.items()), tuple(levels or [(0.0, "nominal")]), tuple(decisions), resumed
+    )

@@ -15,9 +15,9 @@ from armcal.devices.faults import DeviceError
 from armcal_bench.acquisition import progress as entry
 from armcal_bench.acquisition.arrival import Arrival
 from armcal_bench.acquisition.drive import Drive
-from armcal_bench.acquisition.endings import Ending, OutOfSight, ParkWish, TooHot
+from armcal_bench.acquisition.endings import Ending, ParkRequested, ThermalLimit, TrackerLost
 from armcal_bench.acquisition.progress import Progress
-from armcal_bench.acquisition.recovery import Recovery, StaysLost
+from armcal_bench.acquisition.recovery import DeviceLost, Recovery
 from armcal_bench.acquisition.schedule import LeaveOut, Measure, Rest, Scheduler
 from armcal_bench.acquisition.settings import AcquisitionSettings
 from armcal_bench.acquisition.watch import Blind, Patient, Watch
@@ -35,7 +35,7 @@ class Log(Protocol):
         """Write an entry that outlasts a power loss."""
 
 
-class Eyes(Protocol):
+class TrackerMonitor(Protocol):
     """The tracker, as a run uses it."""
 
     def look(self) -> None:
@@ -62,7 +62,7 @@ class Parts:
     drive: Drive
     recovery: Recovery
     scheduler: Scheduler
-    eyes: Eyes
+    monitor: TrackerMonitor
     clock: Clock
     settings: AcquisitionSettings
     log: Log
@@ -73,7 +73,7 @@ class Parts:
     waits: Waits = field(default_factory=Waits)
 
 
-class Conduct:
+class AcquisitionRun:
     """One run over one plan, from its progress on."""
 
     def __init__(self, parts: Parts, progress: Progress) -> None:
@@ -105,9 +105,9 @@ class Conduct:
             while self._left:
                 self._persist(self._step)
             return self._home("done", "all poses are measured" if not self.progress.left_out else self._left_out())
-        except ParkWish as wish:
+        except ParkRequested as wish:
             return self._home("parked", str(wish))
-        except StaysLost as loss:
+        except DeviceLost as loss:
             return self._end(Ending("held", str(loss)))
 
     def _energised(self) -> None:
@@ -128,7 +128,7 @@ class Conduct:
 
     def _step(self) -> None:
         drive = self._parts.drive
-        step = self._parts.scheduler.next(drive.at, drive.warmth, self._left)
+        step = self._parts.scheduler.next(drive.at, drive.thermal_state, self._left)
         if isinstance(step, LeaveOut):
             self._leave_out(step.pose, step.why)
         elif isinstance(step, Rest):
@@ -141,11 +141,11 @@ class Conduct:
         until, why = now() + step.seconds, f"the servos rest where the arm parks: {drive.hottest}"
         self._told("rest", f"the servos rest for {step.seconds / 60:.1f} min")
         waits.goes_on("rest", why, step.seconds, now())
-        drive.go(step.way, self._parts.patient)
+        drive.go(step.path, self._parts.patient)
         drive.note()
         while True:  # a second at least: whoever comes to rest here again and again must let time pass
             drive.stand(1.0, self._parts.patient)
-            if not drive.hotter_than(step.warmth):
+            if not drive.hotter_than(step.thermal_state):
                 waits.over("rest", now())
                 return
             waits.goes_on("rest", why, max(until - now(), 1.0), now())
@@ -154,19 +154,19 @@ class Conduct:
         drive, name = self._parts.drive, self._parts.scheduler.ids[step.pose]
         self._record(entry.GOING, {"pose": name, **self._here()})
         try:
-            drive.go(step.way, self._parts.watch)
-            drive.take_up_play(self._parts.watch)
+            drive.go(step.path, self._parts.watch)
+            drive.preload_backlash(self._parts.watch)
             drive.note()
             capture = self._capture()
-        except TooHot as heat:
+        except ThermalLimit as heat:
             self._try_later(step.pose, str(heat))
             return
-        except OutOfSight as wish:
+        except TrackerLost as wish:
             self._seen_again(wish)
             self._try_later(step.pose, str(wish))
             return
         if capture is None:
-            self._try_later(step.pose, self._parts.eyes.why or "the arm did not come to stand")
+            self._try_later(step.pose, self._parts.monitor.why or "the arm did not come to stand")
             return
         content = self._written(capture)
         doubt = self._doubt(step.pose, capture)
@@ -174,31 +174,31 @@ class Conduct:
             self._astray += 1
             self._try_later(step.pose, doubt)
             if self._astray >= self._parts.settings.arrival.in_a_row:
-                raise ParkWish(f"{doubt}, {self._astray} times in a row; look at servos, gears and bodies")
+                raise ParkRequested(f"{doubt}, {self._astray} times in a row; look at servos, gears and bodies")
             return
         self._astray = 0
         self._record(entry.MEASURED, {"pose": name, **self._here(), **content})
         self._left.remove(step.pose)
         self._parts.told(self.progress)
 
-    def _seen_again(self, wish: OutOfSight) -> None:
+    def _seen_again(self, wish: TrackerLost) -> None:
         """Park, and look whether the tracker is well there: then it was the pose, or the way to it, that hid the body.
 
         Raises:
-            ParkWish: it is not.
+            ParkRequested: it is not.
         """
         if not self._persist(self._parked):
             raise wish
         until = self._parts.clock.now() + self._parts.settings.settle.longest
         while self._parts.clock.now() < until:
             self._parts.drive.tick(self._parts.patient)
-            if not self._parts.eyes.trouble()[0]:
+            if not self._parts.monitor.trouble()[0]:
                 return
         raise wish
 
     def _capture(self) -> Settled | None:
-        drive, eyes, settle = self._parts.drive, self._parts.eyes, self._parts.settings.settle
-        eyes.begin()
+        drive, monitor, settle = self._parts.drive, self._parts.monitor, self._parts.settings.settle
+        monitor.begin()
         now = self._parts.clock.now
         until, last = now() + settle.longest, now() + settle.longest + self._parts.settings.lost.park
         while now() < min(until, last):
@@ -206,9 +206,9 @@ class Conduct:
             drive.check_heat()
             if not goes_on:  # a tracker that comes and goes must not keep the arm here for ever: hence the last
                 until = now() + settle.longest
-                eyes.begin()
+                monitor.begin()
                 continue
-            capture = eyes.settled()
+            capture = monitor.settled()
             if capture is not None:
                 return capture
         return None
@@ -237,7 +237,7 @@ class Conduct:
 
     def _here(self) -> dict[str, Any]:
         drive = self._parts.drive
-        return {"angles": drive.angles, "warmth": drive.named_warmth(), "at": self._parts.clock.wall()}
+        return {"angles": drive.angles, "warmth": drive.named_thermal_state(), "at": self._parts.clock.wall()}
 
     def _try_later(self, pose: int, why: str) -> None:
         """At the end of what is left; after the last try it is left out."""
@@ -268,13 +268,13 @@ class Conduct:
                 return self._end(Ending("held", f"{why}; no clear way to where it parks was found"))
             if self._parts.settings.at_end == "release":
                 self._persist(self._parts.recovery.release, self._parts.recovery.reopened)
-        except StaysLost as loss:
+        except DeviceLost as loss:
             return self._end(Ending("held", f"{why}; then {loss}"))
         return self._end(Ending("done" if how == "done" else "parked", why))
 
     def _parked(self) -> bool:
         drive = self._parts.drive
-        way = drive.way_home(drive.at)
+        way = drive.path_home(drive.at)
         if way is None:
             return False
         drive.go(way, Blind())

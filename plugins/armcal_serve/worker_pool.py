@@ -23,7 +23,7 @@ _PAUSE_S = 1.0
 """Before a worker is started again that did not come."""
 
 
-class Crew:
+class WorkerPool:
     """Workers for a file that may be replaced: requests go to those of the newest calibration that is ready.
 
     A new file gets workers of its own, made ready one after another beside those that answer. When all of them are,
@@ -91,7 +91,7 @@ class Crew:
         if self._making is None and now >= self._may_start_at:
             self._go_on(now, looking)
         if self._active:
-            self._dispatcher.hand_out(self._active)
+            self._dispatcher.dispatch(self._active)
         elif self._served is not None and now - self._without_since > LONGEST_S:
             hint = "Ask again; the status says what is known."
             self._dispatcher.give_up(ArmcalError("no process answers at present.", hint=hint))
@@ -227,7 +227,7 @@ class Crew:
             if worker.gone and worker.given is not None:
                 fault = ArmcalError("it ended the process that answers, twice.", hint="Do not send it again.")
                 given, worker.given = worker.given, None
-                self._dispatcher.take_back(given, fault)
+                self._dispatcher.requeue(given, fault)
             if not worker.gone and worker.given is None:
                 worker.leave()
             if worker.gone and worker.ended():

@@ -11,14 +11,14 @@ from armcal.base.config_text import finite
 from armcal.errors import DataError
 from armcal.io.journal.segment import CHECKPOINT, Entry, Segment
 
-from armcal_online.running.course import DECISION, RECORD, ROLLBACK, Course, Event, JournalEntry, parsing
+from armcal_online.running.state_replayer import DECISION, RECORD, ROLLBACK, Event, JournalEntry, StateReplayer, parsing
 from armcal_online.tracking.recalibrator import Recalibrator
 
 TOLD = ("decision", "level")
 """Events that a journal notes."""
 
 
-class Witness(Protocol):
+class ReplayVerifier(Protocol):
     """Compares what a walk makes with what the journal notes of it."""
 
     def begins(self, segment: Segment) -> None:
@@ -37,7 +37,7 @@ class Witness(Protocol):
         """Of a record, these events were found now and none was noted, though the writer went on."""
 
 
-class NoWitness:
+class NoVerifier:
     """Nothing is compared: the session has other settings than the journal."""
 
     def begins(self, segment: Segment) -> None:
@@ -65,7 +65,7 @@ class Judged:
     residual_m: float
 
 
-class Walk:
+class JournalReplayer:
     """Moves a session on by entries; mutable.
 
     Attributes:
@@ -75,10 +75,12 @@ class Walk:
         decisions: events of the kinds that a journal notes, and rollbacks.
     """
 
-    def __init__(self, session: Recalibrator, targets: Iterable[int], witness: Witness, until: int | None) -> None:
+    def __init__(
+        self, session: Recalibrator, targets: Iterable[int], verifier: ReplayVerifier, until: int | None
+    ) -> None:
         self.session = session
-        self._targets, self._witness, self._until = sorted(set(targets)), witness, until
-        self._course = Course(session, self._reach, "the journal")
+        self._targets, self._verifier, self._until = sorted(set(targets)), verifier, until
+        self._state_replayer = StateReplayer(session, self._reach, "the journal")
         self._held: dict[int, Entry] = {}
         self._pending: list[Event] = []
         self._pending_after = 0
@@ -94,12 +96,12 @@ class Walk:
 
     def segment(self, segment: Segment) -> None:
         """Go through a segment."""
-        self._witness.begins(segment)
+        self._verifier.begins(segment)
         if self._passes(segment.checkpoint.sequence):
             return
         if not self.first:
             self.first = segment.checkpoint.sequence
-            self._course.restore(segment.checkpoint.content, self.first)
+            self._state_replayer.restore(segment.checkpoint.content, self.first)
         else:
             self._checkpoint(segment.checkpoint)
         self.last = segment.checkpoint.sequence
@@ -120,11 +122,11 @@ class Walk:
 
     def _checkpoint(self, checkpoint: Entry) -> None:
         if self._is_lost:
-            self._course.restore(checkpoint.content, checkpoint.sequence)
+            self._state_replayer.restore(checkpoint.content, checkpoint.sequence)
             self._is_lost = False
         else:
             self._hold_before(checkpoint.sequence)
-            self._witness.checkpoint(checkpoint, self.session)
+            self._verifier.checkpoint(checkpoint, self.session)
 
     def _entry(self, entry: Entry) -> None:
         with parsing(entry.sequence):
@@ -139,17 +141,19 @@ class Walk:
         if entry.kind == ROLLBACK:
             self._rollback(entry.sequence, to)
         elif not self._is_lost:
-            events = self._course.apply(entry.sequence, entry.kind, {k: v for k, v in content.items() if k != "digest"})
+            events = self._state_replayer.apply(
+                entry.sequence, entry.kind, {k: v for k, v in content.items() if k != "digest"}
+            )
             self._keep(entry, events)
         if noted and not self._is_lost:
-            self._witness.digest(entry.sequence, noted, self.session)
+            self._verifier.digest(entry.sequence, noted, self.session)
 
     def _rollback(self, sequence: int, to: int) -> None:
         told = {"event": "decision", "sequence": sequence, "kind": "rollback", "to": to}
         self.decisions.append({**told, "sentence": f"The estimate was set back to what it was after entry {to}."})
         if to not in self._held:
             # What it went back to is no longer kept; the checkpoint that follows a rollback has it.
-            if isinstance(self._witness, NoWitness):
+            if isinstance(self._verifier, NoVerifier):
                 raise DataError(
                     f"entry {sequence} goes back to entry {to}, which the journal no longer holds: what other settings "
                     "would have made of it cannot be found.",
@@ -157,7 +161,7 @@ class Walk:
                 )
             self._is_lost = True
             return
-        self._course.apply(sequence, ROLLBACK, {"to": to})
+        self._state_replayer.apply(sequence, ROLLBACK, {"to": to})
 
     def _keep(self, entry: Entry, events: tuple[Event, ...]) -> None:
         if entry.kind != RECORD:
@@ -179,13 +183,13 @@ class Walk:
             after, events, digest = int(content["after"]), [dict(e) for e in content["events"]], str(content["digest"])
         found = self._pending if after == self._pending_after else []
         self._pending = []
-        self._witness.told(after, events, found)
-        self._witness.digest(sequence, digest, self.session)
+        self._verifier.told(after, events, found)
+        self._verifier.digest(sequence, digest, self.session)
 
     def _close_pending(self, kind: str) -> None:
         """A note is written right after its record, unless the writer was stopped between the two."""
         if self._pending and kind == RECORD:
-            self._witness.unnoted(self._pending_after, self._pending)
+            self._verifier.unnoted(self._pending_after, self._pending)
         self._pending = []
 
     def _hold_before(self, sequence: int) -> None:
@@ -193,7 +197,7 @@ class Walk:
         while self._targets and self._targets[0] < sequence:
             target = self._targets.pop(0)
             if target >= self.first and not self._is_lost:
-                self._held[target] = Entry(target, CHECKPOINT, self._course.checkpoint(), 0, 0)
+                self._held[target] = Entry(target, CHECKPOINT, self._state_replayer.checkpoint(), 0, 0)
 
     def _reach(self, sequence: int) -> tuple[JournalEntry, tuple[JournalEntry, ...]]:
         return self._held[sequence], ()

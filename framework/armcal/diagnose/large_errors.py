@@ -46,7 +46,7 @@ class Miss:
 
 
 @dataclass(frozen=True)
-class Misses:
+class LargeErrors:
     """All records beyond the limit, the farthest first; at most ``MOST_EXPLAINED`` of them are explained.
 
     Attributes:
@@ -83,7 +83,7 @@ class Judged:
     position: NDArray[np.intp]
 
 
-def misses(
+def large_errors(
     problem: Problem,
     records: Sequence[FactorRecords],
     estimate: Estimate,
@@ -91,7 +91,7 @@ def misses(
     motion: Motion,
     judged: Judged,
     limit_mm: float | None = None,
-) -> Misses | None:
+) -> LargeErrors | None:
     """Which judged records lie beyond the limit, and what is unusual about them; None if none was judged."""
     errors = judged.errors_mm
     known = np.isfinite(errors)
@@ -107,7 +107,7 @@ def misses(
         explained = tuple(
             _miss(int(i), problem, dataset, motion, judged, leverage, efforts) for i in beyond[:MOST_EXPLAINED]
         )
-    return Misses(limit, limit_mm is not None, int(known.sum()), len(beyond), explained)
+    return LargeErrors(limit, limit_mm is not None, int(known.sum()), len(beyond), explained)
 
 
 def _miss(

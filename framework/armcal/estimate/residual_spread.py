@@ -32,7 +32,7 @@ _WEIGHTS = np.geomspace(1.0, 1e5, 51)
 
 
 @dataclass(frozen=True)
-class Scatter:
+class ResidualSpread:
     """Of one measurement.
 
     Attributes:
@@ -50,9 +50,9 @@ class Scatter:
     freedom: float = math.inf
 
 
-def scatter_of(
+def residual_spread(
     problem: Problem, estimate: Estimate, records: Sequence[FactorRecords], dataset: Dataset
-) -> dict[str, Scatter]:
+) -> dict[str, ResidualSpread]:
     """The scatter of the residuals that an estimate leaves, by measurement.
 
     Where parameters drift, what neighbours share is the drift: what is left is the declared noise, scaled to the
@@ -67,7 +67,7 @@ def scatter_of(
     known = max(float(estimate.degrees_of_freedom), 1.0)
     if correlation_of(records) is not None:
         noise = {k.factor.name: np.array(k.factor.noise) * estimate.noise_scale for k in problem.kernels}
-        return {name: Scatter(np.diag(sd**2), 0.0, 1.0, freedom=known) for name, sd in noise.items()}
+        return {name: ResidualSpread(np.diag(sd**2), 0.0, 1.0, freedom=known) for name, sd in noise.items()}
     # Parameters that were fitted make residuals too small.
     freedom = known / max(problem.equations(records), 1)
     found, residuals = {}, problem.residuals(estimate.values, records)
@@ -81,7 +81,7 @@ def scatter_of(
         covariance, weighed = _shrunk(roots @ roots.T, count, np.array(kernel.factor.noise), estimate.noise_scale)
         whitened = _whitened(covariance, residual[:, kept])
         share, over = _shared(whitened, _places(dataset)[kept])
-        found[kernel.factor.name] = Scatter(
+        found[kernel.factor.name] = ResidualSpread(
             covariance, share, over, "sequence" if dataset.has("sequence") else "record", min(weighed, known)
         )
     return found

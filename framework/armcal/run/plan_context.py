@@ -22,7 +22,7 @@ from armcal.run.plan_settings import PlanSettings, RobustSettings
 
 
 @dataclass(frozen=True)
-class Ground:
+class PlanContext:
     """What all steps of one plan stand on.
 
     Attributes:
@@ -40,7 +40,7 @@ class Ground:
     draws: tuple[Array, ...] = ()
     base: Array = field(default_factory=lambda: np.zeros((0, 0, 0)))
 
-    def about(self, draws: tuple[Array, ...]) -> Ground:
+    def about(self, draws: tuple[Array, ...]) -> PlanContext:
         """The same at these value vectors."""
         here = replace(self, draws=draws)
         if self.given is None:
@@ -97,13 +97,13 @@ def as_if_measured(experiment: Experiment, dataset: Dataset) -> Dataset:
     return with_channels(dataset, {channel: np.zeros(len(dataset)) for channel in missing})
 
 
-def ground_of(
+def plan_context(
     experiment: Experiment, settings: PlanSettings, space: JointSpace, parameters: Parameters, given: Dataset | None
-) -> Ground:
+) -> PlanContext:
     """Priors and given records as information, at the nominal values."""
     scales, prior = parameters.scales(), parameters.prior_information()
     held = np.diag(scales * np.sqrt(prior))[prior > 0]
-    return Ground(experiment, settings, space, parameters, given, held).about((parameters.nominal(),))
+    return PlanContext(experiment, settings, space, parameters, given, held).about((parameters.nominal(),))
 
 
 def draws_of(experiment: Experiment, robust: RobustSettings, parameters: Parameters) -> tuple[Array, ...]:

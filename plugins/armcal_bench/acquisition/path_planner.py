@@ -16,11 +16,11 @@ _TRIED_AT_ONCE = 24
 _ESCAPES = 32
 _NEARER_M = 1e-6
 
-Way = tuple[Array, ...]
+JointPath = tuple[Array, ...]
 """Joint angles to go through in turn, in straight lines of joint space; the start is the first."""
 
 
-class Ways:
+class PathPlanner:
     """Straight lines where they are clear; else the shortest way through known poses and poses spread over joint space.
 
     A lazy roadmap: a line is checked only when a shortest way would use it. [Bohlin2000]
@@ -67,7 +67,7 @@ class Ways:
         count = int(np.ceil(np.max(np.abs(goal - start)) / self._step)) + 1
         return np.asarray(start[:, None] + np.linspace(0.0, 1.0, max(count, 2)) * (goal - start)[:, None])
 
-    def find(self, start: Array, goal: Array) -> Way | None:
+    def find(self, start: Array, goal: Array) -> JointPath | None:
         """A clear way, or None if there is none that was found.
 
         An arm that stands too near to something, by a board's rounding or after a fault, goes away from it first.
@@ -79,7 +79,7 @@ class Ways:
         nodes = np.vstack([start[None], goal[None], self._roadmap])
         return self._shortest(nodes)
 
-    def _escape(self, start: Array, goal: Array) -> Way | None:
+    def _escape(self, start: Array, goal: Array) -> JointPath | None:
         """Straight to a pose that is clear, on a line that comes nowhere nearer than where the arm stands."""
         nodes = np.vstack([goal[None], self._roadmap])
         away = np.max(np.abs(nodes - start), axis=1)
@@ -107,7 +107,7 @@ class Ways:
             nodes = nodes[self._check(np.ascontiguousarray(nodes.T)).allowed]
         return np.unique(nodes, axis=0)
 
-    def _shortest(self, nodes: Array) -> Way | None:
+    def _shortest(self, nodes: Array) -> JointPath | None:
         """A* from the first node to the second; the length of a line is that of the joint that turns most."""
         left = np.max(np.abs(nodes - nodes[1]), axis=1)
         best, came, done = {0: 0.0}, {0: 0}, set()
@@ -135,13 +135,13 @@ def _nearest(away: Array, count: int) -> list[int]:
     return order if 1 in order else [*order, 1]
 
 
-def _traced(nodes: Array, came: dict[int, int]) -> Way:
+def _traced(nodes: Array, came: dict[int, int]) -> JointPath:
     path = [1]
     while path[-1] != 0:
         path.append(came[path[-1]])
     return tuple(nodes[i] for i in reversed(path))
 
 
-def travel(way: Sequence[Array]) -> float:
+def travel(path: Sequence[Array]) -> float:
     """How far a way goes: of each leg, the joint that turns most (rad)."""
-    return float(sum(np.max(np.abs(b - a)) for a, b in pairwise(way)))
+    return float(sum(np.max(np.abs(b - a)) for a, b in pairwise(path)))

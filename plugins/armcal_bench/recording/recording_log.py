@@ -20,7 +20,7 @@ CAPTURED, UNDONE = "captured", "undone"
 Start = Literal["anew", "resume"]
 
 
-class Book:
+class RecordingLog:
     """An open journal and the postures in it, in order.
 
     Attributes:
@@ -67,7 +67,9 @@ class Book:
 
 
 @contextmanager
-def opened_book(folder: Path, start: Start, channels: Sequence[str], labels: Sequence[str]) -> Iterator[Book]:
+def opened_recording_log(
+    folder: Path, start: Start, channels: Sequence[str], labels: Sequence[str]
+) -> Iterator[RecordingLog]:
     """The journal in a recording's folder.
 
     Raises:
@@ -92,4 +94,4 @@ def opened_book(folder: Path, start: Start, channels: Sequence[str], labels: Seq
                     where=where,
                     hint="Give the configuration that it was begun with, or another --out.",
                 )
-        yield Book(journal)
+        yield RecordingLog(journal)

@@ -8,7 +8,7 @@ from typing import Any
 from armcal.io.journal.segment import Entry, Segment
 
 from armcal_online.replaying.state_distance import BOUND, Distance, distance
-from armcal_online.running.course import Event, parsing
+from armcal_online.running.state_replayer import Event, parsing
 from armcal_online.tracking.evaluator import differences
 from armcal_online.tracking.recalibrator import Recalibrator
 from armcal_online.tracking.state import State
@@ -31,7 +31,7 @@ class DiffersError(Exception):
 
 
 class Comparer:
-    """A ``Witness`` that compares states and decisions; mutable.
+    """A ``ReplayVerifier`` that compares states and decisions; mutable.
 
     Attributes:
         states, equal: how many states were noted, and how many of them came out to the last bit.
@@ -68,7 +68,7 @@ class Comparer:
                 self.equal += 1
                 return
             written = State.of(noted["state"])
-        apart = distance(session.ground.chart, written, session.state)
+        apart = distance(session.setup.space, written, session.state)
         self.measured += 1
         self.widest = self.widest.widest(apart)
         text = f"The state differs by {apart.values:.3g} sd ({apart.covariance:.3g} in its covariance)"

@@ -12,8 +12,8 @@ from armcal.arm.holding import holding_efforts
 from armcal.arm.loading import LOAD_CHANNELS, site_loads
 from armcal.base.dataset import Dataset
 from armcal.diagnose.evidence import priors_alone, unseen_poses
-from armcal.diagnose.leftover import LEVEL, MOST_RECORDS, leftover
-from armcal.diagnose.misses import Judged, misses
+from armcal.diagnose.large_errors import Judged, misses
+from armcal.diagnose.residual_structure import LEVEL, MOST_RECORDS, structure
 from armcal.diagnose.score_tests import DRAWS, family_test, linear_fit, own_basis
 from armcal.estimate.weighing import fit
 from armcal.problem.motion import Motion, recorded_position
@@ -58,7 +58,7 @@ def looked_at(problem, records, start, dataset, **more):
     assert found.estimate.verdict.converged
     motion = Motion.of(problem, found.estimate.values, records, dataset)
     acting = problem.weighted(found.records, found.weights)
-    return leftover(problem, acting, found.estimate, dataset, motion, recorded_position(dataset), **more)
+    return structure(problem, acting, found.estimate, dataset, motion, recorded_position(dataset), **more)
 
 
 def on_joint(number, turn):
@@ -196,7 +196,7 @@ def test_what_the_model_has_is_told_to_be_loosened_not_added(lrm):
 
 @pytest.mark.parametrize("most", [200, pytest.param(MOST_RECORDS, marks=pytest.mark.slow)])
 def test_very_many_records_are_looked_at_in_part_and_few_not_at_all(lrm, monkeypatch, most):
-    monkeypatch.setattr("armcal.diagnose.leftover.MOST_RECORDS", most)
+    monkeypatch.setattr("armcal.diagnose.residual_structure.MOST_RECORDS", most)
     problem, records, start, dataset = recording(
         lrm, 8 * most // 5, 8, lambda q, came: on_joint(4, -0.6 * DEG * came[:, 3])
     )
@@ -277,7 +277,7 @@ def test_loads_and_levers_against_plain_numbers(lrm):
         assert loaded.efforts[joint] - bare.efforts[joint] == pytest.approx(about, abs=1e-12)
 
 
-def found_misses(lrm, spoil, limit=None, seed=11):
+def large_errors_of(lrm, spoil, limit=None, seed=11):
     """Misses among all records of a fit to the sound ones."""
     problem, records, start, dataset = recording(lrm, 120, seed)
     found = fit(problem, records, IPOPT, start).estimate
@@ -297,7 +297,7 @@ def test_a_single_wrong_record_is_to_be_measured_again(lrm):
         for axis, value in zip("xyz", turned, strict=True):
             columns[f"tracker.{axis}"][40] = value
 
-    found = found_misses(lrm, spoil)
+    found = large_errors_of(lrm, spoil)
     assert found.beyond == 1 and not found.configured and found.explained[0].record_id == "40"
     told = "; ".join(found.explained[0].reasons)
     assert "along q2's own motion, as if 3.0 deg off" in told
@@ -308,7 +308,7 @@ def test_records_that_miss_with_their_neighbours_say_so(lrm):
     def spoil(columns, q):
         columns["tracker.y"][60:66] += 0.008
 
-    found = found_misses(lrm, spoil)
+    found = large_errors_of(lrm, spoil)
     inner = [m for m in found.explained if m.record_id in ("61", "62", "63", "64")]
     assert len(inner) == 4
     assert all("its neighbours in the recording miss in the same direction" in m.reasons for m in inner)
@@ -319,7 +319,7 @@ def test_the_limit_can_be_stated(lrm):
     def nothing(columns, q):
         pass
 
-    by_default, strict = found_misses(lrm, nothing), found_misses(lrm, nothing, 0.5)
+    by_default, strict = large_errors_of(lrm, nothing), large_errors_of(lrm, nothing, 0.5)
     assert by_default.beyond <= 1 and strict.configured
     assert strict.beyond > 40 and len(strict.explained) == min(strict.beyond, 50)
     errors = [m.error_mm for m in strict.explained]

@@ -9,7 +9,7 @@ from armcal_bench.settling import Settled, Settling
 from armcal_bench.tracker_health import TrackerHealth
 
 
-class TrackerEyes:
+class BenchTrackerMonitor:
     """Feeds every frame to what judges whether the arm stands, and to what judges the tracker."""
 
     def __init__(self, bench: Bench, clock: Clock) -> None:

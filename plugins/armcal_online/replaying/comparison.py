@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from armcal_online.replaying.walk import Walk
-from armcal_online.running.course import Event
+from armcal_online.replaying.journal_replayer import JournalReplayer
+from armcal_online.running.state_replayer import Event
 from armcal_online.tracking.recalibrator import Recalibrator
 from armcal_online.tracking.updated import deviations
 
@@ -34,7 +34,7 @@ class Comparison:
     parameter: str
 
 
-def compared(one: Walk, other: Walk) -> Comparison:
+def compared(one: JournalReplayer, other: JournalReplayer) -> Comparison:
     """Two walks through one journal."""
     theirs = {each.sequence: each for each in other.judged}
     pairs = [(each, theirs[each.sequence]) for each in one.judged[WARM_UP:] if each.sequence in theirs]
@@ -49,7 +49,7 @@ def compared(one: Walk, other: Walk) -> Comparison:
     return Comparison((means[0], means[1]), len(known), apart.get(farthest, 0.0), farthest)
 
 
-def side_by_side(one: Walk, other: Walk) -> list[tuple[int, str, str]]:
+def side_by_side(one: JournalReplayer, other: JournalReplayer) -> list[tuple[int, str, str]]:
     """Decisions by entry: the sequence number, and what each course said there."""
     said = [_said(one.decisions), _said(other.decisions)]
     return [(n, said[0].get(n, ""), said[1].get(n, "")) for n in sorted({*said[0], *said[1]})]
@@ -65,7 +65,7 @@ def _said(events: list[Event]) -> Mapping[int, str]:
 
 def _numbers(session: Recalibrator) -> dict[str, tuple[float, float]]:
     """Free entries with their standard deviations."""
-    chart, values = session.ground.chart, session.values
-    names = [chart.parameters.entry_names[i] for i in chart.entries]
-    numbers = zip(values[chart.entries].tolist(), deviations(chart, session.state.belief).tolist(), strict=True)
+    space, values = session.setup.space, session.values
+    names = [space.parameters.entry_names[i] for i in space.entries]
+    numbers = zip(values[space.entries].tolist(), deviations(space, session.state.belief).tolist(), strict=True)
     return dict(zip(names, numbers, strict=True))

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from armcal.arm.assembly import Arm
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
-from armcal.diagnose.column_mixups import Wires, axes_words, several_joints, single_joints
+from armcal.diagnose.permuted_columns import Wires, axes_words, several_joints, single_joints
 from armcal.errors import NotConvergedError
 from armcal.measure.partners import OTHER
 from armcal.problem.factor_records import subset
@@ -45,7 +45,7 @@ _MM = 1000.0
 
 
 @dataclass(frozen=True)
-class Mixup:
+class PermutedAxes:
     """A reading of the data that fits much better than the data as they stand.
 
     Attributes:
@@ -127,7 +127,7 @@ def _within(along: Array, sizes: Array, radius: float) -> Array:
     return np.asarray(steps)
 
 
-def find_mixup(problem: Problem, records: Sequence[FactorRecords], dataset: Dataset) -> Mixup | None:
+def find_permuted_servos(problem: Problem, records: Sequence[FactorRecords], dataset: Dataset) -> PermutedAxes | None:
     """The first measurement whose positions, as they stand, do not fit, but do with one mix-up undone.
 
     ``records`` are those of the dataset, their noise as declared.
@@ -161,7 +161,7 @@ def _seen(problem: Problem, records: Sequence[FactorRecords], dataset: Dataset, 
     return _Seen(number, own, measured) if np.allclose(residual, measured - shown, atol=_SAME_M) else None
 
 
-def _of(problem: Problem, seen: _Seen, arm: Arm) -> Mixup | None:
+def _of(problem: Problem, seen: _Seen, arm: Arm) -> PermutedAxes | None:
     straight = _positions(problem, seen, {})
     if straight is None:
         return None
@@ -182,7 +182,7 @@ def _of(problem: Problem, seen: _Seen, arm: Arm) -> Mixup | None:
     alike = [r for r in found if r.left <= _ALIKE * best.left and r.of_joints == best.of_joints]
     words = tuple(reading.words for reading in sorted(alike, key=lambda reading: reading.left)[:_MOST_NAMED])
     name = problem.kernels[seen.kernel].factor.name
-    return Mixup(name, words, as_given * _MM, best.left * _MM, best.of_joints)
+    return PermutedAxes(name, words, as_given * _MM, best.left * _MM, best.of_joints)
 
 
 def _positions(problem: Problem, seen: _Seen, read_as: Wires) -> _Positions | None:

@@ -15,7 +15,7 @@ _ENOUGH = 0.8
 _COOLED_TO = 0.5
 
 
-class Warmth:
+class ThermalState:
     """Followed from cold on, or from where another run left it.
 
     Args:
@@ -29,7 +29,7 @@ class Warmth:
         self, heat: tuple[HeatModel, Torques], joints: tuple[str, ...], base: Mapping[str, float], clock: Clock
     ) -> None:
         (self._model, self._torques), self._joints, self._clock = heat, joints, clock
-        self._warmth, self._since = self._model.cold, clock.now()
+        self._state, self._since = self._model.cold, clock.now()
         self._base = self._pose(base)
 
     def go_on(self, before: Mapping[str, Sequence[float]], standing: Mapping[str, float], seconds: float) -> None:
@@ -37,30 +37,30 @@ class Warmth:
 
         Joints that are not among these angles hang free, and cool.
         """
-        self._warmth = np.array([before.get(joint, (0.0, 0.0)) for joint in self._joints], dtype=float)
+        self._state = np.array([before.get(joint, (0.0, 0.0)) for joint in self._joints], dtype=float)
         held = np.array([joint in standing for joint in self._joints])
-        self._warmth = self._model.after(self._warmth, self._torques(self._pose(standing)) * held, max(seconds, 0.0))
+        self._state = self._model.after(self._state, self._torques(self._pose(standing)) * held, max(seconds, 0.0))
 
     @property
     def by_joint(self) -> dict[str, list[float]]:
         """Of winding and case, by joint."""
-        return dict(zip(self._joints, self._warmth.tolist(), strict=True))
+        return dict(zip(self._joints, self._state.tolist(), strict=True))
 
     def pass_to_now(self, angles: Mapping[str, float]) -> None:
         """The servos have stood at these angles (rad) since the last call."""
         now = self._clock.now()
-        self._warmth = self._model.after(self._warmth, self._torques(self._pose(angles)), now - self._since)
+        self._state = self._model.after(self._state, self._torques(self._pose(angles)), now - self._since)
         self._since = now
 
     @property
     def must_rest(self) -> bool:
         """Whether a servo is near its budget."""
-        return bool(np.any(self._model.heat(self._warmth) > _ENOUGH * self._model.budget))
+        return bool(np.any(self._model.heat(self._state) > _ENOUGH * self._model.budget))
 
     @property
     def rest_s(self) -> float:
         """How long to rest in the base pose; infinite where that pose is itself too heavy."""
-        return self._model.cooled_in(self._warmth, self._torques(self._base), _COOLED_TO * self._model.budget)
+        return self._model.cooled_in(self._state, self._torques(self._base), _COOLED_TO * self._model.budget)
 
     @property
     def base_is_too_heavy(self) -> str:

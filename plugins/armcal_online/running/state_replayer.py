@@ -1,6 +1,6 @@
 """What the entries of a journal make of a recalibration: the same in the field, after a restart, and in a replay.
 
-Everything that changes the estimate goes through ``Course.apply``, with what was journalled and nothing else.
+Everything that changes the estimate goes through ``StateReplayer.apply``, with what was journalled and nothing else.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ def parsing(sequence: int, journal: str = "the journal") -> Iterator[None]:
         ) from fault
 
 
-class Course:
+class StateReplayer:
     """An estimate and how far its source was taken, moved on by journal entries."""
 
     def __init__(self, estimation: Estimation, reach: Reach, journal_name: str = "") -> None:
@@ -146,7 +146,7 @@ class Course:
         before = self._estimation.snapshot()
         try:
             checkpoint, entries = self._reach(sequence)
-            earlier = Course(self._estimation, self._reach, self._name)
+            earlier = StateReplayer(self._estimation, self._reach, self._name)
             earlier._initial = self._initial
             earlier.restore(checkpoint.content, checkpoint.sequence)
             for entry in entries:

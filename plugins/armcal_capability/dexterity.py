@@ -38,7 +38,7 @@ def moves(values: Array) -> int:
     return int(np.sum(values.max(axis=0) > _NOTHING * values.max()))
 
 
-def nimbleness(values: Array, directions: int) -> Mapping[str, Array]:
+def dexterity(values: Array, directions: int) -> Mapping[str, Array]:
     """Of the first ``directions``: Yoshikawa's measure [Yoshikawa1985], smallest singular value, 1/condition (N each).
 
     The condition itself has no mean: it is infinite at a singular posture.

@@ -5,7 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from armcal_bench.acquisition.ways import Ways, travel
+from armcal_bench.acquisition.path_planner import PathPlanner, travel
 
 LIMITS = np.array([[-2.0, 2.0], [-2.0, 2.0]])
 
@@ -27,8 +27,8 @@ class Wall:
         return Found((np.abs(q1) > 0.15) | (q2 > self.open_above))
 
 
-def ways(wall: Wall | None, seed: int = 0) -> Ways:
-    return Ways(wall, LIMITS, np.array([[1.0, 0.0], [-1.0, 0.0]]), 0.01, seed)  # type: ignore[arg-type]
+def ways(wall: Wall | None, seed: int = 0) -> PathPlanner:
+    return PathPlanner(wall, LIMITS, np.array([[1.0, 0.0], [-1.0, 0.0]]), 0.01, seed)  # type: ignore[arg-type]
 
 
 def test_a_clear_line_is_taken_as_it_is() -> None:

@@ -19,7 +19,7 @@ _ENTRIES = np.triu_indices(3)
 
 
 @dataclass(frozen=True)
-class Chart:
+class StateSpace:
     """The free parameters of a problem as scaled coordinates (n)."""
 
     parameters: Parameters

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 
 @dataclass(frozen=True)
-class Companion:
+class GaussMarkovState:
     """One process.
 
     Attributes:
@@ -40,10 +40,10 @@ class Companion:
 
 
 @dataclass(frozen=True)
-class Companions:
+class GaussMarkovStates:
     """All of them (m)."""
 
-    each: tuple[Companion, ...] = ()
+    each: tuple[GaussMarkovState, ...] = ()
 
     def __len__(self) -> int:
         return len(self.each)
@@ -65,12 +65,12 @@ class Companions:
         return kept(np.array([max(passed.get(c.channel, 0.0), 0.0) / c.over for c in self.each]))
 
 
-def shared_error(instance: str, covariance: Array, over: float, channel: str) -> Sequence[Companion]:
+def shared_error(instance: str, covariance: Array, over: float, channel: str) -> Sequence[GaussMarkovState]:
     """Companions that make up a covariance of an instrument's readings (n_r x n_r) that neighbours share."""
     size, directions = np.linalg.eigh(covariance)
     roots = directions * np.sqrt(np.maximum(size, 0.0))
     return [
-        Companion(f"{instance}.shared{i + 1}", over, channel, instance=instance, shift=tuple(column.tolist()))
+        GaussMarkovState(f"{instance}.shared{i + 1}", over, channel, instance=instance, shift=tuple(column.tolist()))
         for i, column in enumerate(roots.T)
         if float(column @ column) > 0
     ]

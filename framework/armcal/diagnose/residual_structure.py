@@ -73,7 +73,7 @@ class Structure:
 
 
 @dataclass(frozen=True)
-class Leftover:
+class ResidualStructure:
     """What the residuals of a fit still depend on.
 
     Attributes:
@@ -117,7 +117,7 @@ class Leftover:
         return asdict(self)
 
 
-def leftover(
+def structure(
     problem: Problem,
     records: Sequence[FactorRecords],
     estimate: Estimate,
@@ -125,7 +125,7 @@ def leftover(
     motion: Motion,
     position: NDArray[np.intp],
     modelled: frozenset[str] = frozenset(),
-) -> Leftover | None:
+) -> ResidualStructure | None:
     """Test the residuals of a fit to records, with the weights they had; None where there are too few to tell.
 
     ``motion`` is how the arm stands in them, ``position`` how many of all records were recorded before each (N),
@@ -147,7 +147,7 @@ def leftover(
     contest = Contest(causes, columns, fit.residual, basis, rows.by_record, fit.block * _FOLDS // fit.blocks, *kernels)
     found = _search(rows, fit, contest, modelled)
     residual, whole = contest.beside(found.chosen)
-    return Leftover(
+    return ResidualStructure(
         found.structures,
         found.more,
         found.first.lag_one,
