@@ -9,7 +9,7 @@ from pathlib import Path
 
 from armcal.errors import DataError
 from armcal.io.standard_output import StandardOutput
-from armcal.measure.reader import ReadRequest, WantedChannel
+from armcal.measure.reader import ReadRequest, RequestedChannel
 from armcal_online.running.loop import Pace
 from armcal_online.running.session import Setup, opened
 from armcal_online.sources.opening import open_source
@@ -20,10 +20,15 @@ CALIBRATION = "armcal_calibration: 0\n"
 
 def request():
     """Two joints and a tracker."""
-    joints = [WantedChannel(f"arm.q{i}", (f"arm.q{i}", f"q{i}"), "angle", True, parts=("tracker",)) for i in (1, 2)]
-    ways = [WantedChannel(f"arm.approach.q{i}", (f"approach{i}",), "dimensionless", False) for i in (1, 2)]
-    place = [WantedChannel("time", ("time",), "time", False), WantedChannel("payload", ("payload",), "mass", False)]
-    measured = [WantedChannel(f"tracker.{a}", (f"tracker.{a}", a), "length", True, parts=("tracker",)) for a in "xyz"]
+    joints = [RequestedChannel(f"arm.q{i}", (f"arm.q{i}", f"q{i}"), "angle", True, parts=("tracker",)) for i in (1, 2)]
+    ways = [RequestedChannel(f"arm.approach.q{i}", (f"approach{i}",), "dimensionless", False) for i in (1, 2)]
+    place = [
+        RequestedChannel("time", ("time",), "time", False),
+        RequestedChannel("payload", ("payload",), "mass", False),
+    ]
+    measured = [
+        RequestedChannel(f"tracker.{a}", (f"tracker.{a}", a), "length", True, parts=("tracker",)) for a in "xyz"
+    ]
     return ReadRequest({}, {}, (*joints, *ways, *place, *measured))
 
 

@@ -16,7 +16,7 @@ from armcal.cli.main import cli
 from armcal.errors import ArmcalError, NotConvergedError
 from armcal.estimate.simulation import SimulationRequest, measured_without_noise
 from armcal.measure.csv_writer import write_csv
-from armcal.measure.reader import wanted_channels
+from armcal.measure.reader import requested_channels
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import calibrate
 from click.testing import CliRunner
@@ -84,7 +84,7 @@ class PlantedArm:
 
     def write(self, dataset: Dataset, path: Path) -> Path:
         system = self.experiment.system
-        write_csv(path, dataset, list(wanted_channels(system.arms, system.measurements, measured=True)))
+        write_csv(path, dataset, list(requested_channels(system.arms, system.measurements, measured=True)))
         return path
 
 

@@ -53,16 +53,16 @@ class HookTrace:
         Raises:
             ConfigError: the file that it names cannot be written.
         """
-        asked = os.environ.get(VARIABLE, "").strip()
-        if asked in _OFF or asked == _STANDARD_ERROR:
-            return cls(None, asked == _STANDARD_ERROR)
-        trace = cls(Path(asked).expanduser().absolute())
+        text = os.environ.get(VARIABLE, "").strip()
+        if text in _OFF or text == _STANDARD_ERROR:
+            return cls(None, text == _STANDARD_ERROR)
+        trace = cls(Path(text).expanduser().absolute())
         try:
             trace._append("")
         except (OSError, ValueError) as fault:
             reason = fault.strerror if isinstance(fault, OSError) else str(fault)
             raise ConfigError(
-                f"found {asked!r}, which cannot be written ({reason}).",
+                f"found {text!r}, which cannot be written ({reason}).",
                 where=Location(VARIABLE),
                 hint="Give 1 for standard error, or a file that can be written.",
             ) from fault

@@ -51,14 +51,14 @@ def files() -> dict[str, Path]:
     Raises:
         PluginError: a file or folder is not there or holds no plugin, or two files make plugins of one name.
     """
-    found: dict[str, Path] = {}
+    paths: dict[str, Path] = {}
     for place in map(Path, _listed(CHOSEN)):
         for file in _files_of(place):
-            other = found.setdefault(file.stem, file)
+            other = paths.setdefault(file.stem, file)
             if other != file:
                 text = f"two plugins are called {file.stem!r}: {other} and {file}."
                 raise PluginError(text, hint="Rename one of the files.")
-    return found
+    return paths
 
 
 def digest(file: Path) -> str:
@@ -128,14 +128,14 @@ def _files_of(place: Path) -> Iterator[Path]:
     """A file itself, or those of a folder that are no tests and do not begin with an underscore."""
     where, asked = Location(str(place)), "as --plugin asks"
     if place.is_dir():
-        found = sorted(file for file in place.glob("*.py") if not file.name.startswith(_NO_PLUGINS))
-        if not found:
+        paths = sorted(file for file in place.glob("*.py") if not file.name.startswith(_NO_PLUGINS))
+        if not paths:
             raise PluginError(f"found no plugin in this folder, {asked}.", where=where, hint="Put NAME.py there.")
     elif place.is_file():
-        found = [place]
+        paths = [place]
     else:
         raise PluginError(f"found no such file or folder, {asked}.", where=where, hint="Correct the path.")
-    for file in found:
+    for file in paths:
         if file.suffix != ".py" or not _NAME.fullmatch(file.stem):
             text = "expected the name of a plugin's file, letters, digits, - and _ with .py after them."
             raise PluginError(text, where=Location(str(file)), hint="Rename it.")

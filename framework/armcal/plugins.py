@@ -104,13 +104,13 @@ class PluginRegistry:
         Raises:
             PluginError: there is none (the nearest and the failed plugins are named), or two offer it.
         """
-        found = self._by_name.get((kind, name), [])
-        if len(found) > 1:
-            offered = " and ".join(f"{c.plugin} ({c.target})" for c in found)
+        components = self._by_name.get((kind, name), [])
+        if len(components) > 1:
+            offered = " and ".join(f"{c.plugin} ({c.target})" for c in components)
             hint = "Leave one of them out: --disable-plugin NAME."
             raise PluginError(f"the {kind} {name!r} is offered twice, by {offered}.", hint=hint)
-        if found:
-            return found[0]
+        if components:
+            return components[0]
         known = sorted(n for k, n in self._by_name if k == kind)
         near = difflib.get_close_matches(name, known, n=1)
         hint = f"Did you mean {near[0]!r}?" if near else f"Known: {', '.join(known) or 'none'}."
@@ -163,8 +163,10 @@ def discover(found: Iterable[EntryPoint] | None = None) -> PluginRegistry:
             raise PluginError(text, where=None if str(point.file) in text else Location(str(point.file)))
         plugins.append(PluginInfo(point.name, point.value, *_release(point), outcome.fault))
         components += [
-            Component(each.kind, each.name, each.target, each.summary, point.name, point.value)
-            for each in outcome.announced
+            Component(
+                announcement.kind, announcement.name, announcement.target, announcement.summary, point.name, point.value
+            )
+            for announcement in outcome.announced
         ]
     return PluginRegistry(tuple(plugins), tuple(components), manager, trace)
 
@@ -178,8 +180,8 @@ def _chosen(installed: Iterable[EntryPoint]) -> list[EntryPoint]:
     points, out = {(p.name, p.value): p for p in installed}, plugin_files.disabled()
     for name, file in plugin_files.files().items():
         for other in (p for p in points.values() if p.name == name and name not in out):
-            found = " ".join((other.value, *_release(other))).strip()
-            raise PluginError(f"two plugins are called {name!r}: {file} and {found}.", hint="Rename the file.")
+            text = " ".join((other.value, *_release(other))).strip()
+            raise PluginError(f"two plugins are called {name!r}: {file} and {text}.", hint="Rename the file.")
         point = plugin_files.FilePoint.of(name)
         points[point.name, point.value] = point
     names = sorted({name for name, _ in points})

@@ -111,10 +111,10 @@ def _reference(frames: Sequence[TrackerFrame], settings: BodySettings) -> Array:
     """``world_T_reference`` of each frame (N x 4 x 4)."""
     if not settings.has_base:
         return np.tile(np.eye(4), (len(frames), 1, 1))
-    found = _stacked(frames, settings.base)
-    seen = found[~np.isnan(found).any(axis=(1, 2))]
+    stacked = _stacked(frames, settings.base)
+    seen = stacked[~np.isnan(stacked).any(axis=(1, 2))]
     if settings.base_motion == "moving" or not len(seen):
-        return found
+        return stacked
     kept = seen[~far_off(seen[:, None, :3, 3], _LEAST_OUTLIER_M)]
     mean = np.eye(4)
     mean[:3, :3], mean[:3, 3] = mean_rotation(kept[:, :3, :3]), kept[:, :3, 3].mean(axis=0)

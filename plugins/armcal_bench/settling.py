@@ -90,12 +90,12 @@ class Settling:
         if why:
             return Unsettled(why)
         poses = capture.poses[usable]
-        found = judged(poses, self._settings.spread)
-        if found.why_not:
-            return Unsettled(found.why_not)
+        stillness = judged(poses, self._settings.spread)
+        if stillness.why_not:
+            return Unsettled(stillness.why_not)
         kept = [frame for frame, use in zip(frames, usable, strict=True) if use]
-        kept = [frame for frame, keep in zip(kept, found.kept, strict=True) if keep]
-        return self._settled(poses[found.kept], kept, int((~found.kept).sum()))
+        kept = [frame for frame, keep in zip(kept, stillness.kept, strict=True) if keep]
+        return self._settled(poses[stillness.kept], kept, int((~stillness.kept).sum()))
 
     def _settled(self, poses: Array, kept: list[TrackerFrame], rejected: int) -> Settled:
         mean = mean_pose(poses)

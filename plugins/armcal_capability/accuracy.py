@@ -65,7 +65,7 @@ def with_accuracy(postures: Postures, subject: Subject, choice: EvaluatorChoice)
     more = dict(parts)
     if "known_to_mm" in parts and calibration is not None:
         beyond = _beyond(calibration, subject, parts.get("quantisation_mm"))
-        more["expected_mm"] = np.sqrt(sum(np.square(each) for each in parts.values()) + beyond)
+        more["expected_mm"] = np.sqrt(sum(np.square(part) for part in parts.values()) + beyond)
     if subject.nominal is not None:
         more["nominal_mm"] = _nominal(subject, postures.commands, choice) * _MM
     return postures.with_values(more)
@@ -107,7 +107,8 @@ def _nominal(subject: Subject, commands: Array, choice: EvaluatorChoice) -> Arra
     if subject.nominal is None:
         raise TypeError("a configured arm has no other nominal model")
     tools = [
-        _tools(Equilibrium(each, choice), each.defaults, commands) for each in (subject.expression, subject.nominal)
+        _tools(Equilibrium(tool_expression, choice), tool_expression.defaults, commands)
+        for tool_expression in (subject.expression, subject.nominal)
     ]
     return np.asarray(np.linalg.norm(tools[0] - tools[1], axis=1))
 

@@ -71,10 +71,10 @@ class AreaSearch:
         pointing = Pointing.of(area.tool) if area.tool is not None else None
         starts = self._starts(centres, ways, pointing)
         cell = np.repeat(np.arange(len(centres)), starts.shape[1] // len(centres))
-        found = reach_for(self.function, centres[cell].T, starts, self.limits, self.weights.length, pointing)
-        good = np.flatnonzero(found.arrived)
-        good = good[self.allowed(found.commands[:, good])] if len(good) else good
-        postures = postures_at(self.function, found.commands[:, good], self.weights)
+        arrivals = reach_for(self.function, centres[cell].T, starts, self.limits, self.weights.length, pointing)
+        good = np.flatnonzero(arrivals.arrived)
+        good = good[self.allowed(arrivals.commands[:, good])] if len(good) else good
+        postures = postures_at(self.function, arrivals.commands[:, good], self.weights)
         counts = np.bincount(cell[good], minlength=len(centres)).astype(np.int64)
         values = grouped(postures.values, cell[good], len(centres))
         held = None

@@ -45,44 +45,44 @@ class _Section:
     at: float
 
 
-def sections_of(found: Survey, settings: CapabilitySettings) -> tuple[_Section, _Section]:
+def sections_of(survey: Survey, settings: CapabilitySettings) -> tuple[_Section, _Section]:
     """The x-z section and the x-y section; where no z is given, through the middle of what is reached."""
     z = settings.sections.z
-    level = float(np.median(found.postures.positions[:, 2])) if z is None else z
+    level = float(np.median(survey.postures.positions[:, 2])) if z is None else z
     return _Section(0, 2, 1, settings.sections.y), _Section(0, 1, 2, level)
 
 
-def reach_figure(found: Survey, settings: CapabilitySettings) -> bytes:
+def reach_figure(survey: Survey, settings: CapabilitySettings) -> bytes:
     """Where the tool comes, and in how many of the postures drawn (PNG)."""
     from matplotlib.colors import LogNorm
 
-    counts = found.voxels.counts.astype(float)
+    counts = survey.voxels.counts.astype(float)
     how = {"cmap": _COUNTS, "norm": LogNorm(1, max(float(counts.max()), 2.0))}
-    return _figure(found, settings, counts, how, "postures of the sample in a cell", "Reach")
+    return _figure(survey, settings, counts, how, "postures of the sample in a cell", "Reach")
 
 
-def quantity_figure(found: Survey, settings: CapabilitySettings, name: str) -> bytes:
+def quantity_figure(survey: Survey, settings: CapabilitySettings, name: str) -> bytes:
     """A quantity's mean over the postures of each cell (PNG)."""
-    quantity, cells = BY_NAME[name], found.voxels.of(name)
+    quantity, cells = BY_NAME[name], survey.voxels.of(name)
     low, high = np.percentile(cells, [2, 98]) if quantity.good == "high" else (0.0, np.percentile(cells, 98))
     how = {"cmap": _GOOD_LOW if quantity.good == "low" else _GOOD_HIGH, "vmin": low, "vmax": max(high, low + 1e-12)}
     unit = f", {quantity.unit}" if quantity.unit else ""
     title = quantity.words[0].upper() + quantity.words[1:]
-    return _figure(found, settings, cells, how, f"mean of the postures{unit}", title)
+    return _figure(survey, settings, cells, how, f"mean of the postures{unit}", title)
 
 
 def _figure(
-    found: Survey, settings: CapabilitySettings, cells: Array, how: Mapping[str, Any], label: str, title: str
+    survey: Survey, settings: CapabilitySettings, cells: Array, how: Mapping[str, Any], label: str, title: str
 ) -> bytes:
     figure = _empty((11.0, 5.0))
     axes = figure.subplots(1, 2)
     mesh = None
-    for each, section in zip(axes, sections_of(found, settings), strict=True):
-        mesh = _map(each, found.voxels, cells, section, how)
-        _limits(each, found.voxels, section)
-        _areas(each, settings.areas, section)
-        _arm(each, found.outline, section)
-        _label(each, section, found.voxels.size)
+    for axis, section in zip(axes, sections_of(survey, settings), strict=True):
+        mesh = _map(axis, survey.voxels, cells, section, how)
+        _limits(axis, survey.voxels, section)
+        _areas(axis, settings.areas, section)
+        _arm(axis, survey.outline, section)
+        _label(axis, section, survey.voxels.size)
     bar = figure.colorbar(mesh, ax=list(axes), shrink=0.85, pad=0.02, extend="max" if "vmax" in how else "neither")
     bar.set_label(label, fontsize=9.5, color=_INK)
     bar.ax.tick_params(labelsize=8.5, colors=_INK)
@@ -94,20 +94,20 @@ def _figure(
     return _png(figure)
 
 
-def designs_figure(found: Mapping[str, Survey], tables: Mapping[str, Any], settings: CapabilitySettings) -> bytes:
+def designs_figure(surveys: Mapping[str, Survey], tables: Mapping[str, Any], settings: CapabilitySettings) -> bytes:
     """Limits of the designs' tools in the x-z plane, and how much of each area each reaches and holds (PNG)."""
     figure = _empty((11.0, 5.2))
     side, bars = figure.subplots(1, 2, width_ratios=(1.15, 1.0))
     section = _Section(0, 2, 1, settings.sections.y)
-    for (_, each), colour in zip(found.items(), _colours(len(found)), strict=True):
-        _limits(side, each.voxels, section, colour, 1.4)
-        points = each.outline * _MM
+    for (_, survey), colour in zip(surveys.items(), _colours(len(surveys)), strict=True):
+        _limits(side, survey.voxels, section, colour, 1.4)
+        points = survey.outline * _MM
         side.plot(points[:, 0], points[:, 2], "-o", color=colour, lw=1.2, ms=2.5, zorder=6)
     _areas(side, settings.areas, section)
     side.set_title("limits of the tool, and the arms at mid travel", fontsize=9.5, color=_INK)
     _plain_axes(side, section)
     _bars(bars, tables, list(settings.areas))
-    handles = [_line(c, "-", name) for name, c in zip(found, _colours(len(found)), strict=True)]
+    handles = [_line(c, "-", name) for name, c in zip(surveys, _colours(len(surveys)), strict=True)]
     figure.legend(handles=handles, loc="outside lower left", ncols=4, fontsize=8.5, frameon=False)
     return _png(figure)
 
@@ -126,7 +126,7 @@ def _bars(axes: Any, tables: Mapping[str, Any], areas: Sequence[str]) -> None:
     axes.set_xticks(range(len(areas)), labels=list(areas))
     axes.set_ylim(0, 108)
     axes.set_ylabel("share of the area, %", fontsize=9.5, color=_INK)
-    held_text = any(area["held"] is not None for each in tables.values() for area in each.values())
+    held_text = any(area["held"] is not None for table in tables.values() for area in table.values())
     words = "reached" + ("; the dark part: held by the servos too" if held_text else "")
     axes.set_title(words, fontsize=9.5, color=_INK)
     _style(axes)

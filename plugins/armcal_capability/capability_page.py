@@ -33,24 +33,24 @@ class Picture:
 def conclusions(name: str, summary: Mapping[str, Any], designs: Mapping[str, Any]) -> list[str]:
     """What a survey says, in sentences."""
     reach, postures, cells = summary["reach"], summary["postures"], summary["cells"]
-    found = [
+    texts = [
         f"{name} reaches {reach['volume_litres']:.1f} litres, in {count(reach['cells'])} cells of "
         f"{reach['cell_mm']:g} mm, by {count(postures['mapped'])} postures between its limits."
     ]
     if postures["too_little_clearance"] or postures["no_equilibrium"]:
-        found.append(
+        texts.append(
             f"Of {count(postures['drawn'])} postures {count(postures['too_little_clearance'])} have too little "
             f"clearance and {count(postures['no_equilibrium'])} no equilibrium under the load."
         )
     if "expected_mm" in cells:
-        found.append(
+        texts.append(
             f"Expected error of the calibrated arm {number(cells['expected_mm']['mean'])} mm, of the nominal model "
             f"{number(cells['nominal_mm']['mean'])} mm (root mean square in the mean cell)."
         )
-    areas = [area for each in designs.values() for area in each] or list(summary["areas"])
+    areas = [area for design in designs.values() for area in design] or list(summary["areas"])
     for area in dict.fromkeys(areas):
-        found.append(_of_area(area, {d: each[area] for d, each in designs.items()} or {"": summary["areas"][area]}))
-    return found
+        texts.append(_of_area(area, {d: design[area] for d, design in designs.items()} or {"": summary["areas"][area]}))
+    return texts
 
 
 def _of_area(area: str, designs: Mapping[str, Any]) -> str:
@@ -58,7 +58,7 @@ def _of_area(area: str, designs: Mapping[str, Any]) -> str:
         return f"{area}: {share(designs['']['reached'])} of it is reached."
     most = max(designs, key=lambda d: designs[d]["reached"])
     text = f"{area}: most is reached by {most}, {share(designs[most]['reached'])}"
-    sags = {d: each["quantities"].get("sag_mm", {}).get("mean") for d, each in designs.items()}
+    sags = {d: design["quantities"].get("sag_mm", {}).get("mean") for d, design in designs.items()}
     known = {d: sag for d, sag in sags.items() if sag is not None}
     if known:
         least = min(known, key=lambda d: known[d])

@@ -54,18 +54,18 @@ def capability(console: Console, source: Path, out: Path, settings: Path | None,
         with watch.stage("designs"):
             for name, subject in task.designs.items():
                 designs[name] = survey(subject, task.settings, partial(_of_design, progress, name))
-    told = {"source": str(source), **summary_of(found, task.settings)}
+    content = {"source": str(source), **summary_of(found, task.settings)}
     compared = design_summaries(designs)
-    told["designs"] = {n: {**summary_of(d, task.settings), "areas": compared[n]} for n, d in designs.items()}
+    content["designs"] = {n: {**summary_of(d, task.settings), "areas": compared[n]} for n, d in designs.items()}
     with watch.stage("figures"):
-        pictures = _pictures(task, found, designs, told)
-    tables = _tables(told)
-    sentences = conclusions(task.subject.name, told, _by_design(told))
+        pictures = _pictures(task, found, designs, content)
+    tables = _tables(content)
+    sentences = conclusions(task.subject.name, content, _by_design(content))
     facts = {"command": command_line(), "files": ", ".join(sorted({str(file) for file in task.files}))}
     facts |= {"samples": str(task.settings.samples), "seed": str(task.settings.seed)}
     page = render_capability(task.subject.name, sentences, tables, pictures, facts)
-    _write(kept, found, designs, told, page, pictures)
-    console.result({**told, "folder": str(out)})
+    _write(kept, found, designs, content, page, pictures)
+    console.result({**content, "folder": str(out)})
     for table in tables:
         console.out.print(_screen(table))
     for text in sentences:
@@ -79,24 +79,26 @@ def _of_design(progress: Any, name: str, _: str, fraction: float) -> None:
     progress(name, fraction)
 
 
-def _by_design(told: Mapping[str, Any]) -> dict[str, Any]:
-    return {name: each["areas"] for name, each in told["designs"].items()}
+def _by_design(content: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: each["areas"] for name, each in content["designs"].items()}
 
 
-def _tables(told: Mapping[str, Any]) -> list[Table]:
+def _tables(content: Mapping[str, Any]) -> list[Table]:
     made = []
-    if any(_by_design(told).values()):
-        made.append(design_table(_by_design(told)))
-    elif told["areas"]:
-        made.append(area_table(told["areas"]))
-    return [*made, quantity_table(told)]
+    if any(_by_design(content).values()):
+        made.append(design_table(_by_design(content)))
+    elif content["areas"]:
+        made.append(area_table(content["areas"]))
+    return [*made, quantity_table(content)]
 
 
-def _pictures(task: Task, found: Survey, designs: Mapping[str, Survey], told: Mapping[str, Any]) -> tuple[Picture, ...]:
+def _pictures(
+    task: Task, found: Survey, designs: Mapping[str, Survey], content: Mapping[str, Any]
+) -> tuple[Picture, ...]:
     made = []
     if designs:
         said = "Left: how far each design's tool comes, seen from the side. Right: how much of each area it reaches."
-        made.append(Picture("designs", "Designs", designs_figure(designs, _by_design(told), task.settings), said))
+        made.append(Picture("designs", "Designs", designs_figure(designs, _by_design(content), task.settings), said))
     said = "Two sections through the workspace; the darker, the more postures of the sample bring the tool there."
     made.append(Picture("reach", "Reach", reach_figure(found, task.settings), said))
     for name in DRAWN:
@@ -113,7 +115,7 @@ def _write(
     kept: Reservation,
     found: Survey,
     designs: Mapping[str, Survey],
-    told: Mapping[str, Any],
+    content: Mapping[str, Any],
     page: str,
     pictures: tuple[Picture, ...],
 ) -> None:
@@ -123,8 +125,8 @@ def _write(
     if found.areas:
         texts["areas.csv"] = outputs.areas_text(designs or {found.subject.name: found})
     if designs:
-        texts["designs.csv"] = outputs.table_text(*outputs.design_rows(_by_design(told)))
-    texts["capability.json"] = as_json(told) + "\n"
+        texts["designs.csv"] = outputs.table_text(*outputs.design_rows(_by_design(content)))
+    texts["capability.json"] = as_json(content) + "\n"
     texts["capability.html"] = page
     kept.place(texts)
 

@@ -29,13 +29,13 @@ def load_designs(path: str | Path, overrides: Sequence[str] = ()) -> dict[str, C
         tree = override(tree, text)
     section = entries_of(tree).get(SECTION)
     listed = entries_of(section).get(DESIGNS) if section else None
-    found = {}
+    config_sources = {}
     for name, node in entries_of(listed).items() if listed else ():
         made = tree
         for steps, value in _values(node, (SECTION, DESIGNS, str(name)), tree):
             made = set_at(made, steps, value)
-        found[str(name)] = as_source(made, path, reader)
-    return found
+        config_sources[str(name)] = as_source(made, path, reader)
+    return config_sources
 
 
 def _values(node: Node, at: tuple[str, ...], tree: Node) -> Iterator[tuple[tuple[str, ...], Node]]:

@@ -71,15 +71,17 @@ def reach_for(
     left, states = np.arange(starts.shape[1]), None
     nearest, stalled = np.full(starts.shape[1], np.inf), np.zeros(starts.shape[1], dtype=int)
     for _ in range(_MOST_STEPS):
-        found = function(commands[:, left], states)
-        error, slope = _equations(found.positions, found.rotations, found.slopes, targets[:, left], length, pointing)
+        mechanics = function(commands[:, left], states)
+        error, slope = _equations(
+            mechanics.positions, mechanics.rotations, mechanics.slopes, targets[:, left], length, pointing
+        )
         away = np.linalg.norm(error, axis=1)
-        there = found.settled & (away < ARRIVED_M)
+        there = mechanics.settled & (away < ARRIVED_M)
         arrived[left[there]] = True
         stalled[left] = np.where(away < _PROGRESS * nearest[left], 0, stalled[left] + 1)
         nearest[left] = np.minimum(nearest[left], away)
-        going = found.settled & ~there & (stalled[left] < _PATIENCE)
-        left, error, slope, states = left[going], error[going], slope[going], found.states[:, going]
+        going = mechanics.settled & ~there & (stalled[left] < _PATIENCE)
+        left, error, slope, states = left[going], error[going], slope[going], mechanics.states[:, going]
         if not len(left):
             break
         commands[:, left] = _moved(commands[:, left], error, slope, limits)

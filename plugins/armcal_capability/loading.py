@@ -59,25 +59,25 @@ def load_task(
     given = load_config(path)
     is_calibration = "armcal_calibration" in given.data
     if rules is not None:
-        told = load_config(rules, overrides)
+        config = load_config(rules, overrides)
     elif is_calibration:
-        told = _nothing_but(overrides, path)
+        config = _nothing_but(overrides, path)
     else:
-        told = load_config(path, overrides)
-    settings = _settings(told)
+        config = load_config(path, overrides)
+    settings = _settings(config)
     if is_calibration:
-        subject = of_calibration(Calibration.load(path, registry), told, path.name)
-        corrections: Corrections | None = Corrections.read(path, told, registry)
+        subject = of_calibration(Calibration.load(path, registry), config, path.name)
+        corrections: Corrections | None = Corrections.read(path, config, registry)
     else:
-        base = _with_rules(load_config(path) if rules else told, told)
+        base = _with_rules(load_config(path) if rules else config, config)
         corrections = _corrections(settings, base, registry)
         subject = of_config(base, registry, path.name, corrections)
     designs = {}
     if settings.designs:
-        _require_arms(told)
-        for name, source in load_designs(told.path, overrides).items():
-            designs[name] = replace(_design(name, _with_rules(source, told), registry, corrections), name=name)
-    return Task(settings, _with_servos(subject, settings), designs, (path, *given.files, *told.files))
+        _require_arms(config)
+        for name, source in load_designs(config.path, overrides).items():
+            designs[name] = replace(_design(name, _with_rules(source, config), registry, corrections), name=name)
+    return Task(settings, _with_servos(subject, settings), designs, (path, *given.files, *config.files))
 
 
 def _design(name: str, source: ConfigSource, registry: PluginRegistry, corrections: Corrections | None) -> Subject:
@@ -92,10 +92,10 @@ def _settings(source: ConfigSource) -> CapabilitySettings:
     return validate(_CapabilityPart, part).capability
 
 
-def _with_rules(source: ConfigSource, told: ConfigSource) -> ConfigSource:
+def _with_rules(source: ConfigSource, config_source: ConfigSource) -> ConfigSource:
     """A configuration with the sections of another that say how it is surveyed."""
-    data = {**source.data, **{key: told.data[key] for key in _RULES if key in told.data}}
-    marks = {**source.marks, **{place: at for place, at in told.marks.items() if place and place[0] in _RULES}}
+    data = {**source.data, **{key: config_source.data[key] for key in _RULES if key in config_source.data}}
+    marks = {**source.marks, **{place: at for place, at in config_source.marks.items() if place and place[0] in _RULES}}
     return replace(source, data=data, marks=marks)
 
 
@@ -135,6 +135,9 @@ def _with_servos(subject: Subject, settings: CapabilitySettings) -> Subject:
             where=Location(str(settings.servos)),
             hint=f"The joints are {', '.join(subject.arm.commanded)}.",
         )
-    found = {joint: file.calibrated(joint) for joint in file.servos}
-    servos = {j: (PulseTable(s.angles, s.pulses), PulseClock(s.oscillator_hz, s.prescale)) for j, s in found.items()}
+    calibrated_servos = {joint: file.calibrated(joint) for joint in file.servos}
+    servos = {
+        j: (PulseTable(s.angles, s.pulses), PulseClock(s.oscillator_hz, s.prescale))
+        for j, s in calibrated_servos.items()
+    }
     return replace(subject, expression=replace(subject.expression, servos=servos))

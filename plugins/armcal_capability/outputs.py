@@ -17,16 +17,16 @@ _STATISTICS = ("best", "mean", "worst")
 _PLACES = ("x_mm", "y_mm", "z_mm")
 
 
-def map_columns(found: Survey) -> dict[str, Array]:
+def map_columns(survey: Survey) -> dict[str, Array]:
     """The map as columns (cells each): centre, postures, and best, mean and worst of each quantity."""
-    columns: dict[str, Array] = _centres(found.voxels.centres)
-    return {**columns, "postures": found.voxels.counts.astype(float), **_statistics(found.voxels.values)}
+    columns: dict[str, Array] = _centres(survey.voxels.centres)
+    return {**columns, "postures": survey.voxels.counts.astype(float), **_statistics(survey.voxels.values)}
 
 
-def area_columns(found: Survey) -> dict[str, dict[str, Array]]:
+def area_columns(survey: Survey) -> dict[str, dict[str, Array]]:
     """Each area as columns (cells each)."""
     areas = {}
-    for name, area in found.areas.items():
+    for name, area in survey.areas.items():
         held = {} if area.held is None else {"held": area.held.astype(float)}
         areas[name] = {
             **_centres(area.centres),
@@ -46,11 +46,11 @@ def csv_text(columns: Mapping[str, Array], before: Mapping[str, str] | None = No
     return text.getvalue()
 
 
-def areas_text(found: Mapping[str, Survey]) -> str:
+def areas_text(surveys: Mapping[str, Survey]) -> str:
     """The areas of all designs in one CSV: a row a cell."""
     parts: list[str] = []
-    for design, each in found.items():
-        for area, columns in area_columns(each).items():
+    for design, survey in surveys.items():
+        for area, columns in area_columns(survey).items():
             text = csv_text(columns, {"design": design, "area": area})
             parts.append(text if not parts else text.partition("\n")[2])
     return "".join(parts)
@@ -84,7 +84,7 @@ def design_rows(designs: Mapping[str, Mapping[str, Any]]) -> tuple[list[str], li
 def npz_bytes(columns: Mapping[str, Array]) -> bytes:
     """Columns as a compressed npz; the same columns give the same bytes' content."""
     stream = io.BytesIO()
-    np.savez_compressed(stream, **{name: np.asarray(each) for name, each in columns.items()})  # type: ignore[arg-type]
+    np.savez_compressed(stream, **{name: np.asarray(column) for name, column in columns.items()})  # type: ignore[arg-type]
     return stream.getvalue()
 
 
@@ -93,11 +93,11 @@ def _centres(centres: Array) -> dict[str, Array]:
 
 
 def _statistics(values: Mapping[str, Array]) -> dict[str, Array]:
-    return {f"{name}_{each}": rows[i] for name, rows in values.items() for i, each in enumerate(_STATISTICS)}
+    return {f"{name}_{text}": rows[i] for name, rows in values.items() for i, text in enumerate(_STATISTICS)}
 
 
 def _rows(columns: Mapping[str, Array], before: tuple[str, ...]) -> Iterator[list[str]]:
-    texts = [_texts(np.asarray(each)) for each in columns.values()]
+    texts = [_texts(np.asarray(column)) for column in columns.values()]
     for row in zip(*texts, strict=True):
         yield [*before, *row]
 

@@ -54,7 +54,7 @@ CATALOGUE = (
 )
 """All that there may be, in the order in which it is shown."""
 
-BY_NAME: Mapping[str, Quantity] = {each.name: each for each in CATALOGUE}
+BY_NAME: Mapping[str, Quantity] = {quantity.name: quantity for quantity in CATALOGUE}
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ class Postures:
             self.positions[chosen],
             self.rotations[:, :, chosen],
             self.efforts[:, chosen],
-            {name: each[chosen] for name, each in self.values.items()},
+            {name: value[chosen] for name, value in self.values.items()},
             self.levers[:, chosen],
         )
 
@@ -133,24 +133,26 @@ def postures_at(
 
 def _part(function: MechanicsFunction, commands: Array, weights: Weights) -> tuple[Postures, Array, Array]:
     """Some postures, and singular values of the position's and the pose's Jacobian."""
-    found = function(commands)
-    kept = found.settled
-    values = _elastic(function, commands, found) if function.is_elastic else {}
+    mechanics = function(commands)
+    kept = mechanics.settled
+    values = _elastic(function, commands, mechanics) if function.is_elastic else {}
     if np.isfinite(weights.holding).any():
-        values["effort_ratio"] = np.max(np.abs(found.efforts) / weights.holding[:, None], axis=0)
-    slopes = weighted(found.slopes, weights.slides, weights.length)[kept]
-    levers = np.linalg.norm(found.slopes[:, :3], axis=1).T
-    postures = Postures(commands, found.positions.T, found.rotations, found.efforts, values, levers).subset(kept)
+        values["effort_ratio"] = np.max(np.abs(mechanics.efforts) / weights.holding[:, None], axis=0)
+    slopes = weighted(mechanics.slopes, weights.slides, weights.length)[kept]
+    levers = np.linalg.norm(mechanics.slopes[:, :3], axis=1).T
+    postures = Postures(commands, mechanics.positions.T, mechanics.rotations, mechanics.efforts, values, levers).subset(
+        kept
+    )
     return postures, singular_values(slopes[:, :3]), singular_values(slopes)
 
 
-def _elastic(function: MechanicsFunction, commands: Array, found: Mechanics) -> dict[str, Array]:
+def _elastic(function: MechanicsFunction, commands: Array, mechanics: Mechanics) -> dict[str, Array]:
     """What the springs give (mm, mm/N)."""
-    unloaded = function.without_load(commands, found.states)
+    unloaded = function.without_load(commands, mechanics.states)
     values = {"sag_mm": np.linalg.norm(unloaded - function.weightless(commands), axis=0) * _MM}
     if function.is_loaded:
-        values["deflection_mm"] = np.linalg.norm(found.positions - unloaded, axis=0) * _MM
-    return {**values, "give_mm_per_N": singular_values(found.compliances)[:, 0] * _MM}
+        values["deflection_mm"] = np.linalg.norm(mechanics.positions - unloaded, axis=0) * _MM
+    return {**values, "give_mm_per_N": singular_values(mechanics.compliances)[:, 0] * _MM}
 
 
 def _joined(parts: Sequence[Postures]) -> Postures:

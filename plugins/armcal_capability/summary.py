@@ -18,21 +18,21 @@ _MM = 1000.0
 _LITRE = 1000.0
 
 
-def summary_of(found: Survey, settings: CapabilitySettings) -> dict[str, Any]:
+def summary_of(survey: Survey, settings: CapabilitySettings) -> dict[str, Any]:
     """Of one arm."""
-    expression, corner = found.subject.expression, found.postures.positions
+    expression, corner = survey.subject.expression, survey.postures.positions
     return {
-        "arm": found.subject.arm.name,
+        "arm": survey.subject.arm.name,
         "postures": {
-            "drawn": found.drawn,
-            "too_little_clearance": found.drawn - found.clear,
-            "no_equilibrium": found.unsettled,
-            "mapped": len(found.postures),
+            "drawn": survey.drawn,
+            "too_little_clearance": survey.drawn - survey.clear,
+            "no_equilibrium": survey.unsettled,
+            "mapped": len(survey.postures),
         },
         "reach": {
-            "cells": len(found.voxels.counts),
-            "cell_mm": found.voxels.size * _MM,
-            "volume_litres": len(found.voxels.counts) * found.voxels.size**3 * _LITRE,
+            "cells": len(survey.voxels.counts),
+            "cell_mm": survey.voxels.size * _MM,
+            "volume_litres": len(survey.voxels.counts) * survey.voxels.size**3 * _LITRE,
             "low_mm": (corner.min(axis=0) * _MM).tolist(),
             "high_mm": (corner.max(axis=0) * _MM).tolist(),
         },
@@ -41,11 +41,11 @@ def summary_of(found: Survey, settings: CapabilitySettings) -> dict[str, Any]:
         "holding_Nm": dict(settings.holding),
         "servos": sorted(expression.servos),
         "unexplained_mm": None
-        if found.unexplained is None
-        else {"left": found.unexplained.left * _MM, "instrument": found.unexplained.instrument * _MM},
-        "cells": told(found.voxels.values),
-        "joints_Nm": _joints(found),
-        "areas": {name: area_summary(area) for name, area in found.areas.items()},
+        if survey.unexplained is None
+        else {"left": survey.unexplained.left * _MM, "instrument": survey.unexplained.instrument * _MM},
+        "cells": told(survey.voxels.values),
+        "joints_Nm": _joints(survey),
+        "areas": {name: area_summary(area) for name, area in survey.areas.items()},
     }
 
 
@@ -71,11 +71,11 @@ def told(values: Mapping[str, Array]) -> dict[str, dict[str, float | None]]:
 
 def design_summaries(designs: Mapping[str, Survey]) -> dict[str, dict[str, Any]]:
     """Areas by design; quantities over the cells that all designs reach, so that none is blamed for reaching more."""
-    names = next((list(each.areas) for each in designs.values()), [])
-    shared = {name: np.all([each.areas[name].reached for each in designs.values()], axis=0) for name in names}
+    names = next((list(design.areas) for design in designs.values()), [])
+    shared = {name: np.all([design.areas[name].reached for design in designs.values()], axis=0) for name in names}
     return {
-        design: {name: area_summary(each.areas[name], shared[name]) for name in names}
-        for design, each in designs.items()
+        design: {name: area_summary(survey.areas[name], shared[name]) for name in names}
+        for design, survey in designs.items()
     }
 
 
@@ -92,9 +92,9 @@ def area_summary(area: AreaMap, among: Mask | None = None) -> dict[str, Any]:
     }
 
 
-def _joints(found: Survey) -> dict[str, dict[str, float]]:
+def _joints(survey: Survey) -> dict[str, dict[str, float]]:
     """The torque (N m; N on sliding joints) that each joint carries over all postures,."""
-    names, efforts = found.subject.arm.joint_names, np.abs(found.postures.efforts)
+    names, efforts = survey.subject.arm.joint_names, np.abs(survey.postures.efforts)
     return {
         name: {"median": float(np.median(row)), "p95": float(np.percentile(row, 95)), "most": float(row.max())}
         for name, row in zip(names, efforts, strict=True)

@@ -34,7 +34,7 @@ def quantity_table(summary: Mapping[str, Any]) -> Table:
     )
     caption = "Over all cells that are reached; 95 % of them are better than the second column"
     headings = ("Mean of postures", "95 %", "Best posture", "Worst")
-    return Table(caption, (("Quantity", False), *((each, True) for each in headings)), rows)
+    return Table(caption, (("Quantity", False), *((heading, True) for heading in headings)), rows)
 
 
 def area_table(areas: Mapping[str, Mapping[str, Any]]) -> Table:
@@ -60,7 +60,7 @@ def _of_areas(designs: Mapping[str, Mapping[str, Any]], caption: str) -> Table:
         for name, area in areas.items():
             row = [design] if named else []
             row += [name, share(area["reached"]), *([share(area["held"])] if held else [])]
-            row += [_pair(area["quantities"].get(each)) for each in shown]
+            row += [_pair(area["quantities"].get(text)) for text in shown]
             rows.append(tuple(row))
     words = (
         f"{caption}: the postures of a cell averaged; the mean cell, and what 95 % of them are better than. Sag: by "

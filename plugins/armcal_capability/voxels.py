@@ -56,10 +56,10 @@ def grouped(values: Mapping[str, Array], group: NDArray[np.intp], count: int) ->
     filled = np.flatnonzero(members)
     starts = np.concatenate([[0], np.cumsum(members[filled])[:-1]]).astype(np.intp)
     found = {}
-    for name, each in values.items():
+    for name, value in values.items():
         rows = np.full((3, count), np.nan)
         if len(filled):
-            ordered = each[order]
+            ordered = value[order]
             low, high = np.minimum.reduceat(ordered, starts), np.maximum.reduceat(ordered, starts)
             best, worst = (low, high) if BY_NAME[name].good == "low" else (high, low)
             rows[:, filled] = best, np.add.reduceat(ordered, starts) / members[filled], worst

@@ -24,7 +24,7 @@ from armcal.measure.checks import check_dataset, layout_of
 from armcal.measure.contact import named_arm
 from armcal.measure.measurement import GroupedMeasurement, Measurement, noise_channels
 from armcal.measure.missing import with_absent
-from armcal.measure.reader import ReadRequest, WantedChannel
+from armcal.measure.reader import ReadRequest, RequestedChannel
 
 from armcal_contact.mukca_folder import POSITION, SOCKET, SocketFile, found_files, hash_of
 
@@ -74,13 +74,15 @@ class MukcaReader:
         folder = self._settings.path
         files, warnings = found_files(folder)
         arm = self._arm(request)
-        wanted = [w for w in request.wanted if w.channel in {f"{arm.name}.{joint}" for joint in arm.commanded}]
-        tables = [_rows(file, wanted) for file in files]
+        requested_channels = [
+            w for w in request.wanted if w.channel in {f"{arm.name}.{joint}" for joint in arm.commanded}
+        ]
+        tables = [_rows(file, requested_channels) for file in files]
         names = [(file, line) for file, rows in zip(files, tables, strict=True) for line in rows.lines]
         joints = np.concatenate([rows.joints for rows in tables])
         dataset = Dataset(
             tuple(f"{file.position}/{file.socket}/{line}" for file, line in names),
-            {w.channel: joints[:, i] for i, w in enumerate(wanted)},
+            {w.channel: joints[:, i] for i, w in enumerate(requested_channels)},
             {POSITION: tuple(f.position for f, _ in names), SOCKET: tuple(f.socket for f, _ in names)},
             tuple(line for _, line in names),
             str(folder),
@@ -100,7 +102,7 @@ class MukcaReader:
             raise DataError(f"{fault}.", where=Location(str(self._settings.path), field="arm"), hint=hint) from fault
 
 
-def _rows(file: SocketFile, wanted: Sequence[WantedChannel]) -> _Rows:
+def _rows(file: SocketFile, requested_channels: Sequence[RequestedChannel]) -> _Rows:
     """A file's rows as numbers, of as many columns as the arm has joints."""
     path, lines, numbers, first = file.path, [], [], 0
     for line, text in enumerate(file.content.split("\n"), start=1):
@@ -111,20 +113,22 @@ def _rows(file: SocketFile, wanted: Sequence[WantedChannel]) -> _Rows:
         if len(cells) != first:
             mend = "Complete the row, or remove it."
             _refuse(path, f"found {len(cells)} numbers, expected {first} as in the first row.", mend, line)
-        if len(cells) != len(wanted):
-            arm = wanted[0].channel.partition(".")[0] if wanted else "arm"
-            found = f"found {len(cells)} columns, expected {len(wanted)}: a joint angle of the arm {arm} each."
+        if len(cells) != len(requested_channels):
+            arm = requested_channels[0].channel.partition(".")[0] if requested_channels else "arm"
+            found = (
+                f"found {len(cells)} columns, expected {len(requested_channels)}: a joint angle of the arm {arm} each."
+            )
             _refuse(path, found, "Give this arm's recordings, comma separated.", line)
         lines.append(line)
-        numbers.append([_number(path, line, i, cell, wanted) for i, cell in enumerate(cells)])
+        numbers.append([_number(path, line, i, cell, requested_channels) for i, cell in enumerate(cells)])
     if not lines:
         _refuse(path, "it is empty.", "Give a row a posture, or remove the file.")
     return _Rows(tuple(lines), np.array(numbers))
 
 
-def _number(path: Path, line: int, index: int, cell: str, wanted: Sequence[WantedChannel]) -> float:
+def _number(path: Path, line: int, index: int, cell: str, requested_channels: Sequence[RequestedChannel]) -> float:
     """One cell (rad, or m for a sliding joint)."""
-    text, joint = cell.strip(), wanted[index]
+    text, joint = cell.strip(), requested_channels[index]
     column = f"column {index + 1} ({joint.channel.partition('.')[2]})"
     if is_missing(text):
         return math.nan

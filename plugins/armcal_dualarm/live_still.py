@@ -45,23 +45,23 @@ class LiveRests:
 
     def add(self, rows: Rows) -> list[Rows]:
         """The rests that these rows end."""
-        found: list[Rows] = []
+        parts: list[Rows] = []
         if self._later and len(rows):
             stop = self._lasts_until(rows)
             if stop == len(rows):
                 self._later.append(rows)
                 return []
-            found.append(self._whole(rows.part(0, stop)))
+            parts.append(self._whole(rows.part(0, stop)))
             self._rows, self._later = None, []
             rows = rows.part(stop, len(rows))
         self._rows = rows if self._rows is None else self._rows.followed_by(rows)
-        return found + self._searched()
+        return parts + self._searched()
 
     def lasting(self) -> list[Rows]:
         """The rest that lasts, as if it were over; it is forgotten."""
-        found = [self._whole(None)] if self._later else []
+        parts = [self._whole(None)] if self._later else []
         self._rows, self._later = None, []
-        return found
+        return parts
 
     def _searched(self) -> list[Rows]:
         rows = self._rows

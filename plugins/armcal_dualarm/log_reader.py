@@ -77,8 +77,8 @@ class TwoArmLogReader:
             self._refuse(f"no arm is called {name!r}; the arms are {', '.join(request.arms)}.", "Correct the name.")
         arm, count = request.arms[name], len(self._settings.arms[name].columns)
         if count != len(arm.commanded):
-            found = f"found {count} columns for the arm {name}, which has {len(arm.commanded)} joints."
-            self._refuse(found, f"Give arms: {{{name}: {{columns: [...]}}}} a column for each joint.")
+            text = f"found {count} columns for the arm {name}, which has {len(arm.commanded)} joints."
+            self._refuse(text, f"Give arms: {{{name}: {{columns: [...]}}}} a column for each joint.")
         return arm
 
     def _log(self, arms: Mapping[str, Arm]) -> _Log:
@@ -97,9 +97,9 @@ class TwoArmLogReader:
             over = np.flatnonzero((np.abs(values) > _FULL_TURN * (1 + 1e-9)) & np.isfinite(values))
             if channel in turning and over.size:
                 first = int(over[0])
-                found = f"{channel} would stand at {values[first]:.6g} rad there, more than one turn (2 pi rad)."
+                text = f"{channel} would stand at {values[first]:.6g} rad there, more than one turn (2 pi rad)."
                 hint = "Check order and gear_ratios, both from the base, and that the log is in radians."
-                self._refuse(found, hint, log.table.lines[first], name)
+                self._refuse(text, hint, log.table.lines[first], name)
 
     def _dataset(self, log: _Log) -> Dataset:
         """All rows, or the rests among them."""
@@ -109,8 +109,8 @@ class TwoArmLogReader:
         if s.still is not None:
             still = rests(log.joints, table.texts, log.time, s.still)
             if not still:
-                found = f"found no moment at which no joint moves by more than {np.degrees(s.still.spread):.3g} deg."
-                self._refuse(found, "Give a wider spread_deg or a shorter window under still.")
+                text = f"found no moment at which no joint moves by more than {np.degrees(s.still.spread):.3g} deg."
+                self._refuse(text, "Give a wider spread_deg or a shorter window under still.")
             used = sum(rest.stop - rest.start for rest in still)
             rows = f"{used} of {len(table.lines)} rows"
             warnings = (f"{s.path}: the log was reduced to {len(still)} still moments, the means of {rows}.",)

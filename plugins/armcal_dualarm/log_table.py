@@ -125,13 +125,13 @@ def place_of(path: Path, line: int | None, header: Sequence[str], count: int, co
             _refuse(path, f"found {count} columns, expected a column {column}.", "Columns count from 1.", line)
         return column - 1
     if not header:
-        found = f"found no header, expected one with the column {column}."
-        _refuse(path, found, "Add it, or give the columns' numbers, from 1.", line)
+        text = f"found no header, expected one with the column {column}."
+        _refuse(path, text, "Add it, or give the columns' numbers, from 1.", line)
     if header.count(column) != 1:
         near = difflib.get_close_matches(column, header, n=2)
-        found = f"found the column {column} {header.count(column)} times" if column in header else f"no column {column}"
+        text = f"found the column {column} {header.count(column)} times" if column in header else f"no column {column}"
         hint = f"The nearest is {' or '.join(near)}." if near else f"The columns are {', '.join(header[:20])[:200]}."
-        _refuse(path, f"{found}, expected it once.", hint, line, column)
+        _refuse(path, f"{text}, expected it once.", hint, line, column)
     return header.index(column)
 
 

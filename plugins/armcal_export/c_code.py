@@ -95,14 +95,14 @@ def _names(out: str) -> FileNames:
 
 def _remarks(request: ExportRequest, told: Sequence[str]) -> list[str]:
     """What the code takes for granted."""
-    found = []
+    texts = []
     if request.arm.deflection_size and not request.payload_stated:
-        found.append("the calibration does not say what hangs on the tool: the default payload is 0 kg")
+        texts.append("the calibration does not say what hangs on the tool: the default payload is 0 kg")
     untold = [name for name in request.arm.conditions if name not in told]
     if untold:
         ask = f"--option conditions=[{', '.join(request.arm.conditions)}]"
-        found.append(f"the code takes {', '.join(untold)} as the calibration does where it is not recorded; {ask} asks")
-    return found
+        texts.append(f"the code takes {', '.join(untold)} as the calibration does where it is not recorded; {ask} asks")
+    return texts
 
 
 def _places(request: ExportRequest, e: ToolExpression, files: FileNames, prefix: str) -> dict[str, str]:

@@ -39,7 +39,7 @@ def arm_functions(e: ToolExpression, prefix: str) -> ArmFunctions:
     twist, direction = _twist(e)
     state_slope = _function(inputs, [e.next_state, _rows(e.slope())])
     slopes = [ca.jacobian(twist, e.commands), ca.jacobian(twist, e.state), ca.jacobian(e.next_state, e.commands)]
-    tool_slope = _function(inputs, [_rows(_at_tool(e, each, direction)) for each in slopes])
+    tool_slope = _function(inputs, [_rows(_at_tool(e, slope, direction)) for slope in slopes])
     whole = state_slope.n_instructions() + tool_slope.n_instructions()
     if whole <= MOST_WHOLE:
         written.append(c_function(state_slope, "state_slope", ["record", "state"], ["next", "slope"]))
@@ -53,10 +53,10 @@ def arm_functions(e: ToolExpression, prefix: str) -> ArmFunctions:
 
 def _tangent(e: ToolExpression, twist: Expression, direction: Expression) -> str:
     """How state and tool follow one direction of commands and state."""
-    told, along = ca.SX.sym("told", len(e.joints)), ca.SX.sym("along", e.state.numel())
-    both, ways = ca.vertcat(e.commands, e.state), ca.vertcat(told, along)
+    expression, along = ca.SX.sym("told", len(e.joints)), ca.SX.sym("along", e.state.numel())
+    both, ways = ca.vertcat(e.commands, e.state), ca.vertcat(expression, along)
     moved = [ca.densify(ca.jtimes(each, both, ways)) for each in (e.next_state, twist)]
-    function = _function([e.record, e.state, told, along], [moved[0], _at_tool(e, moved[1], direction)])
+    function = _function([e.record, e.state, expression, along], [moved[0], _at_tool(e, moved[1], direction)])
     return c_function(function, "tangent", ["record", "state", "told", "along"], ["next", "twist"])
 
 

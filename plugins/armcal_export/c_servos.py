@@ -38,7 +38,7 @@ def servo_parts(e: ToolExpression, prefix: str) -> dict[str, str]:
     """The parts of header, source and test that serve pulse tables; empty without any."""
     if not e.servos:
         return {"servo_declarations": "", "servos": "", "servo_test": ""}
-    tables, rows, told = [], [], []
+    tables, rows, texts = [], [], []
     for name, (table, clock) in e.servos.items():
         joint = e.joints.index(name)
         for kind, numbers in (("angles", table.angles), ("pulses", table.pulses)):
@@ -49,10 +49,10 @@ def servo_parts(e: ToolExpression, prefix: str) -> dict[str, str]:
         for angle in np.linspace(min(table.angles), max(table.angles), _TOLD):
             counts = float(ca.evalf(clock.counts(table.pulse(ca.SX(float(angle))))))
             turned = float(ca.evalf(table.angle(ca.SX(counts * clock.tick))))
-            told.append(f"      {{{joint}, {c_number(float(angle))}, {int(counts)}L, {c_number(turned)}}}")
+            texts.append(f"      {{{joint}, {c_number(float(angle))}, {int(counts)}L, {c_number(turned)}}}")
     filling = {"tables": "\n".join(tables), "rows": ",\n".join(rows), "count": str(len(rows))}
     return {
         "servo_declarations": with_prefix(_DECLARATIONS, prefix),
         "servos": filled("servos.c.in", prefix, **filling),
-        "servo_test": with_prefix(_TEST.format(rows=",\n".join(told), count=len(told)), prefix),
+        "servo_test": with_prefix(_TEST.format(rows=",\n".join(texts), count=len(texts)), prefix),
     }

@@ -53,7 +53,7 @@ def c_function(function: ca.Function, name: str, inputs: Sequence[str], outputs:
         ConfigError: an operation has no form in C99.
     """
     values: dict[int, str] = {}
-    lines = [f"(void){each};" for each in (*inputs, *outputs)]
+    lines = [f"(void){text};" for text in (*inputs, *outputs)]
     for k in range(function.n_instructions()):
         operation = _operations()[function.instruction_id(k)]
         i, o = function.instruction_input(k), function.instruction_output(k)
@@ -67,7 +67,7 @@ def c_function(function: ca.Function, name: str, inputs: Sequence[str], outputs:
         else:
             lines.append(f"const double w{k} = {_written(operation, [values[slot] for slot in i])};")
             values[o[0]] = f"w{k}"
-    arguments = [*(f"const double *{each}" for each in inputs), *(f"double *{each}" for each in outputs)]
+    arguments = [*(f"const double *{text}" for text in inputs), *(f"double *{output}" for output in outputs)]
     body = "\n".join(f"  {line}" for line in lines)
     return f"static void {name}({', '.join(arguments)})\n{{\n{body}\n}}\n"
 

@@ -68,19 +68,19 @@ def describe(request: ExportRequest) -> ArmDescription:
     )
 
 
-def rebuilt_tools(told: ArmDescription, commands: Array) -> Array:
+def rebuilt_tools(arm_description: ArmDescription, commands: Array) -> Array:
     """base_T_tool (N x 4 x 4) of the rigid arm that a description tells of, at commands (commanded joints x N).
 
     The product of exponentials of the joints' screws [Murray1994], from the description alone.
     """
-    given = dict(zip([joint.name for joint in told.joints if joint.follows is None], commands, strict=True))
+    given = dict(zip([joint.name for joint in arm_description.joints if joint.follows is None], commands, strict=True))
     tools = np.tile(np.eye(4), (commands.shape[1], 1, 1))
-    for joint in told.joints:
+    for joint in arm_description.joints:
         follows = joint.follows
         q = given[joint.name] if follows is None else follows.multiplier * given[follows.joint] + follows.offset
         at = _matrix(joint.base_T_joint)
         tools = tools @ at @ _motion(joint, q) @ np.linalg.inv(at)
-    return np.asarray(tools @ _matrix(told.base_T_tool))
+    return np.asarray(tools @ _matrix(arm_description.base_T_tool))
 
 
 def _motion(joint: Joint, q: Array) -> Array:
@@ -152,7 +152,7 @@ def _springs(request: ExportRequest, chain: Chain) -> list[SpringEntry]:
 
 def _masses(request: ExportRequest, chain: Chain) -> list[MassEntry]:
     frames = forward(chain, [joint.offset for joint in chain.joints], {})
-    moved_by, found = frame_names(chain), []
+    moved_by, mass_entries = frame_names(chain), []
     for mass in request.arm.masses:
         local = scoped(request.values, f"{request.name}.links.{mass.name}.")
         com = ca.SX([float(local[f"com_{axis}"][0]) for axis in "xyz"])
@@ -163,7 +163,7 @@ def _masses(request: ExportRequest, chain: Chain) -> list[MassEntry]:
         else:
             place = frames.named[mass.frame].apply(com)
         last = moved_by[mass.frame]
-        found.append(
+        mass_entries.append(
             MassEntry(
                 name=mass.name,
                 mass_kg=float(local["mass"][0]),
@@ -172,7 +172,7 @@ def _masses(request: ExportRequest, chain: Chain) -> list[MassEntry]:
                 loads_up_to=last if mass.loads_up_to is None else mass.loads_up_to,
             )
         )
-    return found
+    return mass_entries
 
 
 def _statics(request: ExportRequest) -> Statics:

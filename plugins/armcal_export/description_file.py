@@ -48,8 +48,8 @@ class YamlExporter:
         Raises:
             ProblemError: the tool hangs on a joint before the last, or what reads back is another arm.
         """
-        told = describe(request)
-        return _checked(request, told, _yaml(told), self._settings)
+        arm_description = describe(request)
+        return _checked(request, arm_description, _yaml(arm_description), self._settings)
 
 
 class JsonExporter(YamlExporter):
@@ -61,9 +61,9 @@ class JsonExporter(YamlExporter):
         Raises:
             ProblemError: the tool hangs on a joint before the last, or what reads back is another arm.
         """
-        told = describe(request)
-        text = json.dumps(told.model_dump(mode="json"), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
-        return _checked(request, told, text.encode("utf-8"), self._settings)
+        arm_description = describe(request)
+        text = json.dumps(arm_description.model_dump(mode="json"), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+        return _checked(request, arm_description, text.encode("utf-8"), self._settings)
 
 
 def read_description(content: bytes) -> ArmDescription:
@@ -88,9 +88,9 @@ def schema() -> bytes:
     return resources.files("armcal_export").joinpath(SCHEMA_FILE).read_bytes()
 
 
-def _yaml(told: ArmDescription) -> bytes:
+def _yaml(arm_description: ArmDescription) -> bytes:
     text = yaml.dump(
-        told.model_dump(mode="json"), Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=110,
+        arm_description.model_dump(mode="json"), Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=110,
         default_flow_style=None,
     )  # fmt: skip
     return (_HEAD.format(file=SCHEMA_FILE) + text).encode("utf-8")
@@ -107,7 +107,9 @@ def _quoted(dumper: yaml.SafeDumper, text: str) -> yaml.ScalarNode:
 _Dumper.add_representer(str, _quoted)
 
 
-def _checked(request: ExportRequest, told: ArmDescription, content: bytes, settings: DescriptionSettings) -> Exported:
+def _checked(
+    request: ExportRequest, arm_description: ArmDescription, content: bytes, settings: DescriptionSettings
+) -> Exported:
     try:
         again = read_description(content)
     except (ValueError, ValidationError) as fault:
@@ -116,7 +118,7 @@ def _checked(request: ExportRequest, told: ArmDescription, content: bytes, setti
     tools = rebuilt_tools(again, commands), rigid_tools(request.arm, request.values, commands)
     apart = float(np.abs(tools[0] - tools[1]).max())
     allowed = TOLERANCE * max(1.0, float(np.abs(tools[1]).max()), float(np.abs(commands).max(initial=0.0)))
-    if again != told or not apart <= allowed:
+    if again != arm_description or not apart <= allowed:
         raise ProblemError(f"what reads back is {apart:.3g} m or 1 off the calibrated arm.", hint=_REPORT)
     beside = {SCHEMA_FILE: schema()} if settings.beside == "schema" else {}
     return Exported(content, changed_numbers(request), companions=beside)

@@ -40,27 +40,29 @@ class Drive:
     armature: float
 
 
-def mjcf(told: ArmDescription, rigid: RigidChain, springs: Mapping[int, Sequence[Hinge]], drive: Drive) -> bytes:
+def mjcf(
+    arm_description: ArmDescription, rigid: RigidChain, springs: Mapping[int, Sequence[Hinge]], drive: Drive
+) -> bytes:
     """The model; ``springs`` by site (0: the mount)."""
-    root = ElementTree.Element("mujoco", model=told.arm)
+    root = ElementTree.Element("mujoco", model=arm_description.arm)
     ElementTree.SubElement(
         root, "compiler", angle="radian", autolimits="true", boundmass=_n(NO_MASS_KG), boundinertia=_n(NO_MASS_KG)
     )
-    gravity = told.statics.gravity_m_s2
+    gravity = arm_description.statics.gravity_m_s2
     ElementTree.SubElement(root, "option", gravity=_row(gravity), integrator="implicitfast", timestep="0.001")
     world = ElementTree.SubElement(root, "worldbody")
-    body = _body(world, f"{told.arm}_mount", rigid.base_T_mount)
+    body = _body(world, f"{arm_description.arm}_mount", rigid.base_T_mount)
     _add_springs(body, "mount", springs.get(0, ()))
-    _inertial(body, told, 0, rigid.base_T_mount)
+    _inertial(body, arm_description, 0, rigid.base_T_mount)
     here = rigid.base_T_mount
     for number, joint in enumerate(rigid.joints, start=1):
-        body = _body(body, f"{told.arm}_{joint.name}", np.linalg.inv(here) @ joint.base_T_joint)
+        body = _body(body, f"{arm_description.arm}_{joint.name}", np.linalg.inv(here) @ joint.base_T_joint)
         _joint(body, joint, drive)
         _add_springs(body, joint.name, springs.get(number, ()))
-        _inertial(body, told, number, joint.base_T_joint)
+        _inertial(body, arm_description, number, joint.base_T_joint)
         here = joint.base_T_joint
     at_tool = np.linalg.inv(here) @ rigid.base_T_tool
-    _tool(body, told, at_tool)
+    _tool(body, arm_description, at_tool)
     _couplings(root, rigid)
     _actuators(root, rigid, drive)
     ElementTree.indent(root)
@@ -107,9 +109,9 @@ def _add_springs(body: ElementTree.Element, site: str, hinges: Sequence[Hinge]) 
         )
 
 
-def _inertial(body: ElementTree.Element, told: ArmDescription, number: int, base_T_body: Array) -> None:
+def _inertial(body: ElementTree.Element, arm_description: ArmDescription, number: int, base_T_body: Array) -> None:
     """All masses that a joint moves as one."""
-    masses = [mass for mass in told.masses if mass.moved_by == number and mass.mass_kg > 0]
+    masses = [mass for mass in arm_description.masses if mass.moved_by == number and mass.mass_kg > 0]
     if not masses:
         return
     back = np.linalg.inv(base_T_body)
@@ -125,11 +127,11 @@ def _inertial(body: ElementTree.Element, told: ArmDescription, number: int, base
     body.insert(place, element)
 
 
-def _tool(body: ElementTree.Element, told: ArmDescription, pose: Array) -> None:
+def _tool(body: ElementTree.Element, arm_description: ArmDescription, pose: Array) -> None:
     ElementTree.SubElement(body, "site", name="tool", size="0.005", **_placed(pose))
-    payload = told.statics.payload_kg or 0.0
+    payload = arm_description.statics.payload_kg or 0.0
     if payload > 0:
-        at = (pose @ [*told.statics.payload_com_m, 1.0])[:3]
+        at = (pose @ [*arm_description.statics.payload_com_m, 1.0])[:3]
         carried = ElementTree.SubElement(body, "body", name="payload", pos=_row(at))
         ball = _row([0.4 * payload * _RADIUS_M**2] * 3)
         ElementTree.SubElement(carried, "inertial", pos="0 0 0", mass=_n(payload), diaginertia=ball)

@@ -72,11 +72,11 @@ class MujocoExporter:
             ProblemError: MuJoCo's arm is another one.
         """
         chain = chain_of(request)
-        rigid, told = rigid_chain(chain), describe(request)
+        rigid, arm_description = rigid_chain(chain), describe(request)
         require_plain_axes(rigid, "mujoco")
-        found = _sorted(request, spring_numbers(request, chain), told)
+        found = _sorted(request, spring_numbers(request, chain), arm_description)
         drive = Drive(self._settings.gain, self._settings.damping, self._settings.armature)
-        content = mjcf(told, rigid, found.hinges, drive)
+        content = mjcf(arm_description, rigid, found.hinges, drive)
         loaded = _loaded(content, rigid)
         commands = random_commands(request.arm, POSES)
         _compare(loaded, rigid_tools(request.arm, request.values, commands), commands)
@@ -96,7 +96,7 @@ def _loaded(content: bytes, rigid: RigidChain) -> LoadedModel:
         raise ProblemError(f"MuJoCo does not take the model: {str(fault)[:300]}.", hint=_REPORT) from fault
 
 
-def _sorted(request: ExportRequest, springs: Sequence[SpringNumbers], told: ArmDescription) -> _Sorted:
+def _sorted(request: ExportRequest, springs: Sequence[SpringNumbers], arm_description: ArmDescription) -> _Sorted:
     """Linear springs as hinges along principal axes; the rest by name."""
     turning: dict[int, Array] = defaultdict(lambda: np.zeros((3, 3)))
     sliding: dict[int, float] = defaultdict(float)
@@ -115,7 +115,7 @@ def _sorted(request: ExportRequest, springs: Sequence[SpringNumbers], told: ArmD
     for site, matrix in turning.items():
         sizes, directions = np.linalg.eigh(0.5 * (matrix + matrix.T))
         hinges[site] += _kept([(_snapped(directions[:, i]), sizes[i]) for i in range(3)], slides=False)
-    return _Sorted(hinges, _left_out(request, springs, told))
+    return _Sorted(hinges, _left_out(request, springs, arm_description))
 
 
 def _kept(found: Sequence[tuple[Array, float]], slides: bool) -> list[Hinge]:
@@ -130,11 +130,13 @@ def _snapped(axis: Array) -> Array:
     return near if np.allclose(axis, near, rtol=0, atol=1e-12) else axis
 
 
-def _left_out(request: ExportRequest, springs: Sequence[SpringNumbers], told: ArmDescription) -> tuple[str, ...]:
+def _left_out(
+    request: ExportRequest, springs: Sequence[SpringNumbers], arm_description: ArmDescription
+) -> tuple[str, ...]:
     """What no passive hinge and no mass does."""
     bent = {spring.effect for spring in springs if not spring.linear}
     effects = [name for name in request.arm.effects if name in bent or _displaces(request, name)]
-    masses = [mass.name for mass in told.masses if mass.loads_up_to != mass.moved_by and mass.mass_kg > 0]
+    masses = [mass.name for mass in arm_description.masses if mass.loads_up_to != mass.moved_by and mass.mass_kg > 0]
     counted = [f"what {', '.join(masses)} load beyond the joints that carry them"] if masses else []
     acting = np.any(request.environment.force) or np.any(request.environment.torque)
     wrench = ["the force and torque on the tool"] if acting else []
@@ -148,12 +150,12 @@ def _displaces(request: ExportRequest, name: str) -> bool:
         return True
     values = {full: ca.SX(list(map(float, value))) for full, value in request.values.items()}
     local = scoped(values, f"{request.name}.{name}.")
-    told = [
+    joint_commands = [
         JointCommand(i, ca.SX(command), ca.SX(1.0))
         for i in range(len(request.arm.joint_names))
         for command in _COMMANDS
     ]
-    return any(float(ca.evalf(ca.SX(effect.displacement(command, local)))) != 0.0 for command in told)
+    return any(float(ca.evalf(ca.SX(effect.displacement(command, local)))) != 0.0 for command in joint_commands)
 
 
 def _compare(loaded: LoadedModel, expected: Array, commands: Array) -> None:

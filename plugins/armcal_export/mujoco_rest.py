@@ -56,10 +56,10 @@ class LoadedModel:
         return self._tool()
 
     def _set(self, command: Array) -> None:
-        told = dict(zip([j.name for j in self._rigid.joints if j.mimic is None], command, strict=True))
+        content = dict(zip([j.name for j in self._rigid.joints if j.mimic is None], command, strict=True))
         self._data.qpos[:] = 0.0
         for joint in self._rigid.joints:
-            q = told[joint.name] if joint.mimic is None else told[joint.mimic.master] * joint.mimic.multiplier
+            q = content[joint.name] if joint.mimic is None else content[joint.mimic.master] * joint.mimic.multiplier
             self._data.qpos[self._places[joint.name]] = q + (joint.mimic.offset if joint.mimic else 0.0)
         self._data.qvel[:] = 0.0
 

@@ -77,7 +77,7 @@ class Equilibrium:
             self._newton = ca.Function("slope", [e.record, e.state], [e.next_state, e.slope()], {"cse": True})
         state, length = np.zeros(self._size), np.inf
         for _ in range(_STEPS):
-            following, slope = (each.full() for each in self._newton(record, state))
+            following, slope = (dm.full() for dm in self._newton(record, state))
             step = np.linalg.solve(np.eye(self._size) - slope, following.ravel() - state)
             length = float(np.abs(step).max())
             if not np.isfinite(length):

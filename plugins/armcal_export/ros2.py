@@ -66,26 +66,26 @@ class Ros2Exporter:
             ConfigError: two joints or parameters come to the same name.
             ProblemError: a joint is none that an axis describes, or what reads back differs.
         """
-        told, rigid = describe(request), rigid_chain(chain_of(request))
+        arm_description, rigid = describe(request), rigid_chain(chain_of(request))
         before = f"{self._settings.namespace}." if self._settings.namespace else ""
-        parameters = {before + name: value for name, value in _parameters(request, told, rigid).items()}
+        parameters = {before + name: value for name, value in _parameters(request, arm_description, rigid).items()}
         comment = in_comment(f"The arm {request.name} as calibrated: {request.origin.experiment}.")
         text = ros2_text(self._settings.node, parameters, comment)
         _compare(request, read_ros2(text), {self._settings.node: parameters}, before)
-        return Exported(text.encode("utf-8"), changed_numbers(request), _left_out(request, told))
+        return Exported(text.encode("utf-8"), changed_numbers(request), _left_out(request, arm_description))
 
 
-def _parameters(request: ExportRequest, told: ArmDescription, rigid: RigidChain) -> dict[str, Value]:
+def _parameters(request: ExportRequest, arm_description: ArmDescription, rigid: RigidChain) -> dict[str, Value]:
     """By dotted name: what is known, then the chain, then the numbers of effects and masses."""
     found: dict[str, Value] = {
         "arm": request.name,
-        "digest": told.calibration.digest,
-        "calibrated": told.calibration.created or "unknown",
-        "joint_names": [joint.name for joint in told.joints],
-        "commanded_joint_names": [joint.name for joint in told.joints if joint.follows is None],
+        "digest": arm_description.calibration.digest,
+        "calibrated": arm_description.calibration.created or "unknown",
+        "joint_names": [joint.name for joint in arm_description.joints],
+        "commanded_joint_names": [joint.name for joint in arm_description.joints if joint.follows is None],
     }
     here = np.eye(4)
-    for number, (joint, placed) in enumerate(zip(told.joints, rigid.joints, strict=True), start=1):
+    for number, (joint, placed) in enumerate(zip(arm_description.joints, rigid.joints, strict=True), start=1):
         name = _word(joint.name)
         entries = {"type": joint.kind, **_placed(np.linalg.inv(here) @ placed.base_T_joint), "axis": joint.axis}
         if joint.lower is not None and joint.upper is not None:
@@ -95,14 +95,20 @@ def _parameters(request: ExportRequest, told: ArmDescription, rigid: RigidChain)
             entries |= {"mimic.joint": mimic.joint, "mimic.multiplier": mimic.multiplier, "mimic.offset": mimic.offset}
         if abs(joint.pitch) > NEGLIGIBLE or abs(joint.scale - 1) > NEGLIGIBLE:
             entries |= {"pitch": joint.pitch, "scale": joint.scale}
-        compliance = _own_compliance(told, number, joint.axis)
+        compliance = _own_compliance(arm_description, number, joint.axis)
         if compliance:
             entries["compliance"] = compliance
         _add(found, f"joints.{name}", entries)
         here = placed.base_T_joint
     _add(found, "tool", _placed(np.linalg.inv(here) @ rigid.base_T_tool))
-    _add(found, "gravity", {"base": told.statics.gravity_m_s2})
-    return found | _of_servos(told) | _of_masses(told) | _of_settings(told) | _of_effects(request)
+    _add(found, "gravity", {"base": arm_description.statics.gravity_m_s2})
+    return (
+        found
+        | _of_servos(arm_description)
+        | _of_masses(arm_description)
+        | _of_settings(arm_description)
+        | _of_effects(request)
+    )
 
 
 def _add(found: dict[str, Value], where: str, entries: Mapping[str, Any]) -> None:
@@ -117,29 +123,29 @@ def _placed(matrix: Array) -> dict[str, list[float]]:
     return {"xyz": [float(x) for x in matrix[:3, 3]], "rpy": [float(each) for each in rpy_of(matrix[:3, :3])]}
 
 
-def _own_compliance(told: ArmDescription, number: int, axis: list[float]) -> float:
+def _own_compliance(arm_description: ArmDescription, number: int, axis: list[float]) -> float:
     """What the linear springs of a joint give about its own axis (rad/(N m)), or along it (m/N)."""
     total = 0.0
-    for spring in told.springs:
+    for spring in arm_description.springs:
         if spring.site == number and spring.linear:
             lever = np.array(spring.axes) @ np.array(axis)
             total += float(lever @ np.array(spring.compliance) @ lever)
     return total
 
 
-def _of_servos(told: ArmDescription) -> dict[str, Value]:
+def _of_servos(arm_description: ArmDescription) -> dict[str, Value]:
     """``joints.q2.servo.angles`` (rad), ``.pulses`` (s), ``.tick`` (s)."""
     found: dict[str, Value] = {}
-    for servo in told.servos:
+    for servo in arm_description.servos:
         table = {"angles": servo.angles_rad, "pulses": servo.pulses_s, "tick": servo.tick_s}
         _add(found, f"joints.{_word(servo.joint)}.servo", table)
     return found
 
 
-def _of_settings(told: ArmDescription) -> dict[str, Value]:
+def _of_settings(arm_description: ArmDescription) -> dict[str, Value]:
     """``effects.servo.type``, ``effects.servo.settings.gains``: what ROS 2 has a type for."""
     found: dict[str, Value] = {}
-    for effect in told.effects:
+    for effect in arm_description.effects:
         where = f"effects.{_word(effect.name)}"
         _add(found, where, {"type": effect.type or "unknown"})
         flat = {_word(name): value for name, value in effect.settings.items() if _is_flat(value)}
@@ -149,14 +155,14 @@ def _of_settings(told: ArmDescription) -> dict[str, Value]:
 
 def _is_flat(value: Any) -> bool:
     entries = value if isinstance(value, list) else [value]
-    return len({type(each) for each in entries}) == 1 and isinstance(entries[0], (bool, int, float, str))
+    return len({type(entry) for entry in entries}) == 1 and isinstance(entries[0], (bool, int, float, str))
 
 
-def _of_masses(told: ArmDescription) -> dict[str, Value]:
+def _of_masses(arm_description: ArmDescription) -> dict[str, Value]:
     """``links.hand.mass``, its centre in the base frame at zero commands, and the joint that moves it."""
     found: dict[str, Value] = {}
-    for mass in told.masses:
-        moved_by = told.joints[mass.moved_by - 1].name if mass.moved_by else "mount"
+    for mass in arm_description.masses:
+        moved_by = arm_description.joints[mass.moved_by - 1].name if mass.moved_by else "mount"
         _add(found, f"links.{_word(mass.name)}", {"mass": mass.mass_kg, "base_com": mass.com_m, "moved_by": moved_by})
     return found
 
@@ -179,11 +185,11 @@ def _word(name: str) -> str:
     return re.sub(r"[^A-Za-z0-9_]", "_", name)
 
 
-def _left_out(request: ExportRequest, told: ArmDescription) -> tuple[str, ...]:
+def _left_out(request: ExportRequest, arm_description: ArmDescription) -> tuple[str, ...]:
     """Settings that ROS 2 has no type for; pulse tables are told joint by joint."""
     return tuple(
         f"{setting} of {effect.name}"
-        for effect in told.effects
+        for effect in arm_description.effects
         if not isinstance(request.arm.effects[effect.name], SteppedEffect)
         for setting, value in effect.settings.items()
         if value not in (None, [], {}) and not _is_flat(value)

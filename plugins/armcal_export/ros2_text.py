@@ -52,16 +52,16 @@ def read_ros2(text: str) -> dict[str, dict[str, Value]]:
 
 
 def _lines(tree: Mapping[str, Any], depth: int) -> list[str]:
-    found = []
+    texts = []
     for key, value in tree.items():
         start = "  " * depth + f"{_key(key)}:"
         if isinstance(value, dict):
-            found += [start, *_lines(value, depth + 1)]
+            texts += [start, *_lines(value, depth + 1)]
         elif isinstance(value, list):
-            found.append(f"{start} [{', '.join(_scalar(each) for each in value)}]")
+            texts.append(f"{start} [{', '.join(_scalar(each) for each in value)}]")
         else:
-            found.append(f"{start} {_scalar(value)}")
-    return found
+            texts.append(f"{start} {_scalar(value)}")
+    return texts
 
 
 def _key(name: str) -> str:
@@ -116,7 +116,7 @@ def _list(node: Any, name: str) -> Any:
     if any(not isinstance(each, yaml.ScalarNode) for each in node.value):
         raise ValueError(f"{name} is a list of lists or of mappings")
     entries = [_typed(each, name) for each in node.value]
-    if len({type(each) for each in entries}) != 1:
+    if len({type(entry) for entry in entries}) != 1:
         raise ValueError(f"{name} is an empty list, or one of several types")
     return entries
 

@@ -44,11 +44,11 @@ class SpringNumbers:
 def spring_numbers(request: ExportRequest, chain: Chain) -> tuple[SpringNumbers, ...]:
     """Every spring of an arm at its calibrated values; ``chain`` is the arm's."""
     values = {name: ca.SX(list(map(float, value))) for name, value in request.values.items()}
-    found = []
+    numbers = []
     for name, effect in request.arm.effects.items():
         for spring in effect.springs(scoped(values, f"{request.name}.{name}.")):
-            found.append(_numbers(name, spring, chain))
-    return tuple(found)
+            numbers.append(_numbers(name, spring, chain))
+    return tuple(numbers)
 
 
 def _numbers(effect: str, spring: Spring, chain: Chain) -> SpringNumbers:

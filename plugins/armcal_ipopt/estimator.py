@@ -73,9 +73,9 @@ class IpoptEstimator:
         posed, random = PosedProblem(problem, records), np.random.default_rng(self._settings.seed)
         starts = [_start(posed, start, random, number) for number in range(self._settings.starts)]
         tasks = [_Start(self._settings, problem, tuple(records), x) for x in starts]
-        found = self._executor.map(_solve_once, tasks, lambda done: progress("fit", done))
-        converged = [run for run in found if run.converged]
-        best = min(converged or found, key=lambda run: run.cost)
+        runs = self._executor.map(_solve_once, tasks, lambda done: progress("fit", done))
+        converged = [run for run in runs if run.converged]
+        best = min(converged or runs, key=lambda run: run.cost)
         agreeing = sum(abs(run.cost - best.cost) <= _SAME_COST * max(1.0, best.cost) for run in converged)
         x = polish(posed, best.x) if best.converged else best.x
         verdict = SolverVerdict(
@@ -84,7 +84,7 @@ class IpoptEstimator:
             best.converged,
             best.iterations,
             time.perf_counter() - began,
-            len(found),
+            len(runs),
             agreeing,
         )
         return Solution(posed.values(x), verdict)

@@ -59,8 +59,8 @@ class QuantisationSettings(Settings):
     @model_validator(mode="after")
     def _one(self) -> QuantisationSettings:
         if bool(self.servos) == bool(self.tables):
-            found = "both servos and tables" if self.tables else "neither servos nor tables"
-            raise ValueError(f"found {found}, expected one of them: write servos: servos.yaml")
+            text = "both servos and tables" if self.tables else "neither servos nor tables"
+            raise ValueError(f"found {text}, expected one of them: write servos: servos.yaml")
         if self.servos and (self.oscillator_hz, self.rate_hz, self.prescale) != (25e6, 50.0, None):
             raise ValueError("found a clock beside servos, expected none: the servo file has each board's clock")
         return self

@@ -111,8 +111,8 @@ class Seen:
 
 def _together(observations: Sequence[Observation], place: Array) -> Seen:
     slopes, innovations = [], []
-    for each in observations:
-        one = each.at(place)
+    for observation in observations:
+        one = observation.at(place)
         whitened = np.linalg.solve(np.linalg.cholesky(one.noise), np.column_stack([one.slope, one.innovation]))
         slopes.append(whitened[:, :-1])
         innovations.append(whitened[:, -1])

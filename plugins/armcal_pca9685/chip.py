@@ -60,9 +60,9 @@ class Chip:
         """
         mode1 = self._read(MODE1, 1)[0]
         if mode1 & EXTCLK:
-            found = "it counts an external clock, expected its own oscillator."
+            text = "it counts an external clock, expected its own oscillator."
             hint = "Switch the board's power off and on: nothing less undoes this."
-            raise DeviceRefusedError(found, where=self.where, hint=hint)
+            raise DeviceRefusedError(text, where=self.where, hint=hint)
         if not mode1 & AUTO_INCREMENT:  # without it neither several registers can be read, nor a channel be written
             self._write(MODE1, mode1 & (SLEEP | SUB_ADDRESSES | ALL_CALL) | AUTO_INCREMENT)
         is_running = not mode1 & (SLEEP | RESTART)
@@ -123,13 +123,13 @@ class Chip:
         )
 
     def _channels(self, chosen: list[int]) -> dict[int, Channel]:
-        found: dict[int, Channel] = {}
+        channels: dict[int, Channel] = {}
         block = _AT_ONCE // CHANNEL_BYTES
         for first in sorted({channel // block * block for channel in chosen}):
             data = self._read(channel_register(first), _AT_ONCE)
             for channel in range(first, first + block):
-                found[channel] = Channel.unpack(data[CHANNEL_BYTES * (channel - first) :])
-        return {channel: found[channel] for channel in chosen}
+                channels[channel] = Channel.unpack(data[CHANNEL_BYTES * (channel - first) :])
+        return {channel: channels[channel] for channel in chosen}
 
     def _refuse_pulses(self, prescale: int, mode2: int) -> None:
         """Refuse if there are pulses: to set it up anew would let go of what they hold."""
@@ -137,9 +137,9 @@ class Chip:
         if not pulsed:
             return
         listed = ", ".join(map(str, pulsed))
-        found = f"found prescale {prescale} and MODE2 0x{mode2:02x} with pulses on channels {listed}"
+        text = f"found prescale {prescale} and MODE2 0x{mode2:02x} with pulses on channels {listed}"
         raise DeviceRefusedError(
-            f"{found}, expected prescale {self._prescale} and MODE2 0x{OUTDRV:02x}.",
+            f"{text}, expected prescale {self._prescale} and MODE2 0x{OUTDRV:02x}.",
             where=self.where,
             hint="Hold the arm, and switch the servos' power and the board off and on; or set foreign_pulses: end, "
             "which lets go of the arm.",

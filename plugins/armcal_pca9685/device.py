@@ -91,8 +91,8 @@ class Pca9685Device(JointDevice, PulseDevice):
         targets = {joint: self._counts_of(joint, angle) for joint, angle in angles.items()}
         limp = [joint for joint in targets if joint not in self._counts]
         if limp:
-            found = f"found commands for {', '.join(limp)}, which hang free."
-            raise DeviceRefusedError(found, where=self._where, hint="Energise them first, one at a time.")
+            text = f"found commands for {', '.join(limp)}, which hang free."
+            raise DeviceRefusedError(text, where=self._where, hint="Energise them first, one at a time.")
         if isinstance(self._link, GuardedLink):
             places = {joint: self._servos[joint].place for joint in targets}
             self._link.set_counts({places[joint]: pulse_on(places[joint][1], n) for joint, n in targets.items()})
@@ -155,10 +155,10 @@ class Pca9685Device(JointDevice, PulseDevice):
 
     def _check_identity(self, identity: LinkIdentity) -> None:
         for name in {self._file.servos[joint].board for joint in self._servos}:
-            wanted = self._file.boards[name].id
-            if wanted and identity.adapter and wanted != identity.adapter:
+            text = self._file.boards[name].id
+            if text and identity.adapter and text != identity.adapter:
                 raise DeviceRefusedError(
-                    f"found the adapter {identity.adapter!r}, expected {wanted!r}, with which the board {name!r} was "
+                    f"found the adapter {identity.adapter!r}, expected {text!r}, with which the board {name!r} was "
                     "calibrated.",
                     where=Location(str(self._settings.servos), field=f"boards.{name}.id"),
                     hint="Connect the calibrated one, or calibrate this one: armcal servo.",
@@ -176,8 +176,8 @@ class Pca9685Device(JointDevice, PulseDevice):
 
     def _known(self, joint: str) -> Servo:
         if joint not in self._servos:
-            found = f"found the joint {joint!r}, expected one of {', '.join(self._servos)}."
-            raise DeviceRefusedError(found, where=self._where, hint="Name a joint of the arm.")
+            text = f"found the joint {joint!r}, expected one of {', '.join(self._servos)}."
+            raise DeviceRefusedError(text, where=self._where, hint="Name a joint of the arm.")
         return self._servos[joint]
 
     def _begin(self, joint: str, counts: int) -> None:

@@ -133,10 +133,10 @@ class FirmataLink(Link):
                         firmware = f"{firmata.text_of(message.data[2:])} {'.'.join(map(str, message.data[:2]))}"
             if not (version and firmware):
                 if clock.now() >= until:
-                    found = "it tells no version of Firmata, expected a board with the sketch StandardFirmata."
-                    raise DeviceLostError(found, where=self._where, hint="Load the sketch, and check port and baud.")
+                    text = "it tells no version of Firmata, expected a board with the sketch StandardFirmata."
+                    raise DeviceLostError(text, where=self._where, hint="Load the sketch, and check port and baud.")
                 clock.sleep(_REPLY_S)
         if version[0] != _PROTOCOL:
-            found = f"found version {version[0]}.{version[1]} of Firmata, expected {_PROTOCOL}.x."
-            raise DeviceRefusedError(found, where=self._where, hint="Load a newer StandardFirmata.")
+            text = f"found version {version[0]}.{version[1]} of Firmata, expected {_PROTOCOL}.x."
+            raise DeviceRefusedError(text, where=self._where, hint="Load a newer StandardFirmata.")
         return f"{firmware}, Firmata {version[0]}.{version[1]}"

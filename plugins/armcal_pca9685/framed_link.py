@@ -61,8 +61,8 @@ class FramedLink(GuardedLink, Link):
         try:
             hello = self._greet_starting(clock)
             if hello.version != messages.VERSION:
-                found = f"found version {hello.version} of the protocol, expected {messages.VERSION}."
-                raise DeviceRefusedError(found, where=self._where, hint="Load the board's firmware anew.")
+                text = f"found version {hello.version} of the protocol, expected {messages.VERSION}."
+                raise DeviceRefusedError(text, where=self._where, hint="Load the board's firmware anew.")
             if self._took_over:
                 self._ask(Kind.TAKE, messages.Take(self._boots or 0).pack())
         except BaseException:
@@ -78,8 +78,8 @@ class FramedLink(GuardedLink, Link):
     def read(self, address: int, register: int, count: int) -> bytes:
         data = self._ask(Kind.READ, messages.Read(address, register, count).pack())
         if len(data) != count:
-            found = f"found {len(data)} bytes of 0x{address:02x}, expected {count}."
-            raise DeviceError(found, where=self._where, hint="Load the board's firmware anew.")
+            text = f"found {len(data)} bytes of 0x{address:02x}, expected {count}."
+            raise DeviceError(text, where=self._where, hint="Load the board's firmware anew.")
         return data
 
     @override
@@ -99,8 +99,8 @@ class FramedLink(GuardedLink, Link):
         places = list(counts_per_s)
         most = (MAX_PAYLOAD - 4 - 4 * len(places)) // (2 * len(places)) if places else 0
         if places and len(waypoints) > most:
-            found = f"found {len(waypoints)} waypoints of {len(places)} joints, expected at most {most}."
-            raise DeviceRefusedError(found, where=self._where, hint="Leave out waypoints.")
+            text = f"found {len(waypoints)} waypoints of {len(places)} joints, expected at most {most}."
+            raise DeviceRefusedError(text, where=self._where, hint="Leave out waypoints.")
         channels = tuple(
             messages.GuardedChannel(*place, min(max(int(counts_per_s[place] * _RATE_STEPS), 1), _LARGEST))
             for place in places
@@ -129,9 +129,9 @@ class FramedLink(GuardedLink, Link):
             if hello is not None:
                 return hello
             if clock.now() >= until:
-                found = "nobody answers in the framed protocol."
+                text = "nobody answers in the framed protocol."
                 hint = "Check port and baud, and that the board runs the framed firmware."
-                raise DeviceLostError(found, where=self._where, hint=hint)
+                raise DeviceLostError(text, where=self._where, hint=hint)
             clock.sleep(_REPLY_S)
 
     def _greet(self) -> messages.HelloReply | None:
@@ -142,8 +142,8 @@ class FramedLink(GuardedLink, Link):
         try:
             return messages.HelloReply.read(reply)
         except ValueError as fault:
-            found = f"the board's greeting cannot be read ({fault})."
-            raise DeviceRefusedError(found, where=self._where, hint="Load the board's firmware anew.") from fault
+            text = f"the board's greeting cannot be read ({fault})."
+            raise DeviceRefusedError(text, where=self._where, hint="Load the board's firmware anew.") from fault
 
     def _ask(self, kind: Kind, payload: bytes) -> bytes:
         """The answer to a request, without its head.
@@ -209,5 +209,5 @@ class FramedLink(GuardedLink, Link):
 
     def _lose_to_board(self) -> NoReturn:
         self._port.close()
-        found = "the board has heard nothing for too long and drives the arm by itself."
-        raise DeviceLostError(found, where=self._where, hint="Open it again, and read where the arm is.")
+        text = "the board has heard nothing for too long and drives the arm by itself."
+        raise DeviceLostError(text, where=self._where, hint="Open it again, and read where the arm is.")

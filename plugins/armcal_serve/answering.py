@@ -102,9 +102,9 @@ class Answerer:
     @staticmethod
     def _postures(arm: ServedArm, request: ForwardRequest) -> Array:
         if (request.joint_angles is None) == (request.joints is None):
-            found = "found neither joint_angles nor joints" if request.joints is None else "found both of them"
+            text = "found neither joint_angles nor joints" if request.joints is None else "found both of them"
             hint = f"Give joint_angles_deg: {len(arm.joints)} numbers, or several such rows."
-            raise DataError(f"{found}, expected one.", where=Location(field="joint_angles_deg"), hint=hint)
+            raise DataError(f"{text}, expected one.", where=Location(field="joint_angles_deg"), hint=hint)
         if request.joint_angles is not None:
             return arm.angles(request.joint_angles, "joint_angles")
         return arm.named(request.joints or (), "joints")
@@ -130,9 +130,9 @@ class Answerer:
             return self.arms[name]
         known = ", ".join(self.arms)
         near = difflib.get_close_matches(name or "", self.arms, n=1)
-        found = "the calibration has several arms" if name is None else "the calibration has no such arm"
+        text = "the calibration has several arms" if name is None else "the calibration has no such arm"
         hint = f"Did you mean {near[0]}?" if near else f"Say which: {known}."
-        raise DataError(f"{found}.", where=Location(field="arm"), hint=hint)
+        raise DataError(f"{text}.", where=Location(field="arm"), hint=hint)
 
 
 def _commands(arm: ServedArm, request: CompensateRequest) -> list[Command]:

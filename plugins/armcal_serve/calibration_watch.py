@@ -73,8 +73,8 @@ class CalibrationWatch:
         where = Location(str(self.path))
         try:
             if not self.path.is_file():
-                found = "this is no file" if self.path.exists() else "there is no such file"
-                raise ConfigError(f"{found}.", where=where, hint="Give the calibration.yaml of a run.")
+                text = "this is no file" if self.path.exists() else "there is no such file"
+                raise ConfigError(f"{text}.", where=where, hint="Give the calibration.yaml of a run.")
             snapshot = self._read()
         except (OSError, ValueError) as fault:
             hint = "Check the path and its permissions."
@@ -90,22 +90,22 @@ class CalibrationWatch:
     def look(self) -> Snapshot | None:
         """Another content that came to rest and may be tried; None while there is none."""
         now = self._clock()
-        found = _stat(self.path)
-        if found is None:
+        status = _stat(self.path)
+        if status is None:
             self._seen = None
             self._say("missing", "there is no such file; the calibration before is used on.")
             return None
         if self._again_at is not None and now >= self._again_at:
             self._tried, self._tried_sha256, self._again_at = None, "", None
-        if found == self._tried:
-            self._seen = found
+        if status == self._tried:
+            self._seen = status
             if self.state == "missing":
                 self._say("taken" if self._tried_sha256 == self._taken_sha256 else "refused", self._refusal)
             return None
-        if found != self._seen:
-            in_place = self._seen is not None and found[:2] == self._seen[:2]
+        if status != self._seen:
+            in_place = self._seen is not None and status[:2] == self._seen[:2]
             self._rests_at = now + (QUIET_S if in_place else 0.0)
-            self._seen = found
+            self._seen = status
             if in_place:
                 self._say(
                     "settling", f"the file is being written in place; it is read {QUIET_S:g} s after the last byte."

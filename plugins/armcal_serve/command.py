@@ -90,8 +90,8 @@ def serve(
 def _standard_streams() -> Opening:
     incoming, outgoing = sys.__stdin__, sys.__stdout__
     if incoming is None or outgoing is None:
-        found = "standard input or output is closed, expected requests by the one and a reader of the other."
-        raise InputError(found, hint="Open both, or give --socket or --udp.")
+        text = "standard input or output is closed, expected requests by the one and a reader of the other."
+        raise InputError(text, hint="Open both, or give --socket or --udp.")
     return partial(StandardStreams, incoming.fileno(), outgoing.fileno())
 
 

@@ -37,7 +37,7 @@ class Dispatcher:
     @property
     def waiting(self) -> int:
         """Requests that no worker has."""
-        return len(self._again) + sum(len(each.waiting) for each in self._round)
+        return len(self._again) + sum(len(conversation.waiting) for conversation in self._round)
 
     def ask(self, conversation: Conversation, line: bytes) -> Ticket:
         """A request from a client."""

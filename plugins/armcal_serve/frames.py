@@ -38,13 +38,13 @@ class Unpacker:
     def feed(self, data: bytes) -> list[Message]:
         """The messages that are complete now."""
         self._open += data
-        found, at = [], 0
+        messages, at = [], 0
         while len(self._open) - at >= _HEAD.size:
             length, ticket, arrived = _HEAD.unpack_from(self._open, at)
             end = at + _HEAD.size + length
             if len(self._open) < end:
                 break
-            found.append(Message(ticket, bytes(self._open[at + _HEAD.size : end]), arrived))
+            messages.append(Message(ticket, bytes(self._open[at + _HEAD.size : end]), arrived))
             at = end
         del self._open[:at]
-        return found
+        return messages

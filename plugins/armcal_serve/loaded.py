@@ -64,29 +64,29 @@ def loaded(order: Order, data: bytes) -> Answerer:
         ArmcalError: they are no calibration, one of another arm, or one that cannot be used.
     """
     calibration = _read(order, data)
-    found = calibration.record
-    identity = found.identity.get("arm", "")
+    calibration_file = calibration.record
+    identity = calibration_file.identity.get("arm", "")
     if order.arm and identity != order.arm:
         raise ConfigError(
             f"it is of another arm ({identity[:12]}, expected {order.arm[:12]}).",
             where=Location(order.shown),
             hint="Put a calibration of the same arm there, or start a server of its own for this one.",
         )
-    kept = (found.recalibrated or {}).get("sequence")
+    kept = (calibration_file.recalibrated or {}).get("sequence")
     tag: CalibrationTag = {
         "sequence": order.sequence,
-        "created": found.created,
+        "created": calibration_file.created,
         "sha256": order.sha256,
         "arm": identity,
         "recalibrated": kept if isinstance(kept, int) else None,
-        "level": found.level,
+        "level": calibration_file.level,
     }
     answerer = Answerer(_arms(calibration, order), tag)
     _tried(answerer)
     gc.collect()
     gc.freeze()
-    lost = found.level == "lost" and not order.accept
-    return replace(answerer, fault=lost_calibration(found, order.shown)) if lost else answerer
+    lost = calibration_file.level == "lost" and not order.accept
+    return replace(answerer, fault=lost_calibration(calibration_file, order.shown)) if lost else answerer
 
 
 def _read(order: Order, data: bytes) -> Calibration:
@@ -115,7 +115,11 @@ def _arms(calibration: Calibration, order: Order) -> Mapping[str, ServedArm]:
 def _arm(calibration: Calibration, name: str, order: Order) -> ServedArm:
     arm, statics = calibration.system.arms[name], calibration.system.statics
     joints = tuple(arm.commanded)
-    unserved = [f"{each.name} (effect {name}.{effect})" for effect, each in arm.declared if each.name != TEMPERATURE]
+    unserved = [
+        f"{condition.name} (effect {name}.{effect})"
+        for effect, condition in arm.declared
+        if condition.name != TEMPERATURE
+    ]
     if unserved:
         raise ConfigError(
             f"the arm {name} changes with {', '.join(unserved)}, which a request cannot state.",
@@ -163,10 +167,10 @@ def _tried_with(answerer: Answerer, arm: ServedArm, said: Mapping[str, float]) -
     began = time.monotonic()
     for i in range(_TRIES):
         posture = {"joints": arm.written([0.05 * (k + 1) + 0.01 * i for k in range(len(arm.joints))], "rad")}
-        told = _asked(answerer, arm, {"do": "forward", **posture, **said})
-        if not told["ok"]:
-            raise InputError(f"the arm {arm.name} cannot be predicted: {told['error']}", hint=told["hint"])
-        tool = told["tools"][0]
+        content = _asked(answerer, arm, {"do": "forward", **posture, **said})
+        if not content["ok"]:
+            raise InputError(f"the arm {arm.name} cannot be predicted: {content['error']}", hint=content["hint"])
+        tool = content["tools"][0]
         for target in (tool, {"position_mm": tool["position_mm"]}):
             for path in (False, True):
                 _asked(answerer, arm, {"do": "compensate", "targets": target, "path": path, **said})

@@ -30,8 +30,8 @@ def parsed(line: bytes) -> Any:
     except RecursionError as fault:
         raise DataError("the request is nested too deeply.", hint=f"Send an object such as {_EXAMPLE}.") from fault
     except ValueError as fault:
-        found = f"the request is not JSON ({_short(str(fault))})."
-        raise DataError(found, hint=f"Send an object a line, such as {_EXAMPLE}.") from fault
+        text = f"the request is not JSON ({_short(str(fault))})."
+        raise DataError(text, hint=f"Send an object a line, such as {_EXAMPLE}.") from fault
 
 
 def request_of(content: Any) -> Request:
@@ -42,18 +42,18 @@ def request_of(content: Any) -> Request:
     """
     words = ", ".join(REQUESTS)
     if not isinstance(content, dict):
-        found = _short(json.dumps(content))
-        raise DataError(f"found {found}, expected an object.", hint=f"Send an object such as {_EXAMPLE}.")
+        short = _short(json.dumps(content))
+        raise DataError(f"found {short}, expected an object.", hint=f"Send an object such as {_EXAMPLE}.")
     word = content.get("do")
     if not isinstance(word, str) or word not in REQUESTS:
         near = difflib.get_close_matches(word, REQUESTS, n=1) if isinstance(word, str) else []
-        found = f"found {_short(json.dumps(word))}" if "do" in content else "found nothing"
+        short = f"found {_short(json.dumps(word))}" if "do" in content else "found nothing"
         hint = f"Did you mean {near[0]}?" if near else f"For example {_EXAMPLE}."
-        raise DataError(f"{found}, expected one of {words}.", where=Location(field="do"), hint=hint)
+        raise DataError(f"{short}, expected one of {words}.", where=Location(field="do"), hint=hint)
     if content.get("armcal_serve", VERSION) != VERSION:
-        found = _short(json.dumps(content["armcal_serve"]))
+        short = _short(json.dumps(content["armcal_serve"]))
         where = Location(field="armcal_serve")
-        raise DataError(f"found version {found}, expected {VERSION}.", where=where, hint="Leave it out, or say 1.")
+        raise DataError(f"found version {short}, expected {VERSION}.", where=where, hint="Leave it out, or say 1.")
     try:
         return REQUESTS[word].model_validate(content)
     except ValueError:

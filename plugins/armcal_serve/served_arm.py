@@ -150,8 +150,8 @@ class ServedArm:
                 _refuse(f"found no {', '.join(missing)}.", field, f"Give all of {', '.join(self.joints)}.")
             return [float(row[name]) for name in self.joints]
         if len(row) != len(self.joints):
-            found = f"found {len(row)} values, expected {len(self.joints)}: {', '.join(self.joints)}."
-            _refuse(found, field, "Give one for each joint, in this order, or give them by name.")
+            text = f"found {len(row)} values, expected {len(self.joints)}: {', '.join(self.joints)}."
+            _refuse(text, field, "Give one for each joint, in this order, or give them by name.")
         return [float(value) for value in row]
 
     def _read(self, key: str, value: float, field: str) -> tuple[str, float]:

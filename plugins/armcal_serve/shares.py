@@ -35,7 +35,7 @@ def shares(arm: ServedArm, request: CompensateRequest, targets: Targets) -> list
     Raises:
         DataError: the arm does not change with the temperature; or some targets of a path tell it and others do not.
     """
-    told = [request.temperature if each.temperature is None else each.temperature for each in request.targets]
+    told = [request.temperature if target.temperature is None else target.temperature for target in request.targets]
     warm = [place for place, value in enumerate(told) if value is not None]
     if not warm:
         return [Share(arm.compensator, targets, range(len(told)))]

@@ -55,7 +55,7 @@ def _prepared(order: dict[str, Any], data: bytes, link: socket.socket) -> Answer
         with ThreadPoolExecutor(1) as aside:
             answerer, notices = aside.submit(_made, order, data).result()
     except ArmcalError as fault:
-        told: dict[str, Any] = {
+        content: dict[str, Any] = {
             "fault": {
                 "message": fault.message,
                 "file": fault.where.file if fault.where else None,
@@ -65,16 +65,16 @@ def _prepared(order: dict[str, Any], data: bytes, link: socket.socket) -> Answer
                 "exit_code": fault.exit_code,
             }
         }
-        link.sendall(Message(ABOUT_ITSELF, json.dumps(told).encode()).packed())
+        link.sendall(Message(ABOUT_ITSELF, json.dumps(content).encode()).packed())
         return None
     except Exception as fault:
         text = f"it cannot be used ({type(fault).__name__}: {fault})."
-        told = {"fault": {"message": text, "file": order["shown"], "exit_code": EXIT_FAULT}}
-        link.sendall(Message(ABOUT_ITSELF, json.dumps(told).encode()).packed())
+        content = {"fault": {"message": text, "file": order["shown"], "exit_code": EXIT_FAULT}}
+        link.sendall(Message(ABOUT_ITSELF, json.dumps(content).encode()).packed())
         return None
     arms = {name: arm.shown for name, arm in answerer.arms.items()}
-    told = {"ready": answerer.tag, "arms": arms, "notices": notices}
-    link.sendall(Message(ABOUT_ITSELF, json.dumps(told).encode()).packed())
+    content = {"ready": answerer.tag, "arms": arms, "notices": notices}
+    link.sendall(Message(ABOUT_ITSELF, json.dumps(content).encode()).packed())
     return answerer
 
 

@@ -153,19 +153,19 @@ class WorkerPool:
                 self._start(gently=False, again=self._made_of is self._served)
                 return
         self._making = None
-        told = making.told or {"fault": {"message": "the process that was to load it ended or hangs."}}
-        tag = told.get("ready")
+        content = making.told or {"fault": {"message": "the process that was to load it ended or hangs."}}
+        tag = content.get("ready")
         if tag is None or making.gone:
             making.kill()
             self._leaving.append(making)
-            fault = _fault(told.get("fault", {"message": "its process ended."}))
+            fault = _fault(content.get("fault", {"message": "its process ended."}))
             self._not_made(self._made_of, fault, passing="fault" not in (making.told or {}))
         elif self.tag is not None and tag["sequence"] == self.tag["sequence"]:
             self._active.append(making)
         else:
             self._next_ready.append(making)
             if len(self._next_ready) == self._size or not self._active:
-                self._promote(told)
+                self._promote(content)
 
     def _promote(self, told: Mapping[str, Any]) -> None:
         """From now on requests go to the workers of the next calibration."""
@@ -234,7 +234,7 @@ class WorkerPool:
                 self._leaving.remove(worker)
 
 
-def _fault(told: Mapping[str, Any]) -> ArmcalError:
-    where = Location(told.get("file"), told.get("line"), told.get("field"))
-    kind = InputError if told.get("exit_code") == EXIT_BAD_INPUT else ArmcalError
-    return kind(told["message"], where=where, hint=told.get("hint", ""))
+def _fault(content: Mapping[str, Any]) -> ArmcalError:
+    where = Location(content.get("file"), content.get("line"), content.get("field"))
+    kind = InputError if content.get("exit_code") == EXIT_BAD_INPUT else ArmcalError
+    return kind(content["message"], where=where, hint=content.get("hint", ""))

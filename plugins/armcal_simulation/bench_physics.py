@@ -156,8 +156,8 @@ class BenchPhysics:
         )
 
     def _look_up_torques(self) -> None:
-        found = self._find_torques([servo.angle for _, servo in self._all])
-        self.torques = dict(zip(self.servos, found, strict=True))
+        torques = self._find_torques([servo.angle for _, servo in self._all])
+        self.torques = dict(zip(self.servos, torques, strict=True))
         self._yielding = self._gives_way()
 
     def _slowly(self) -> None:

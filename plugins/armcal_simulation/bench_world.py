@@ -109,8 +109,8 @@ class BenchWorld:
             self.stopped = True
         elif not request.get("state"):
             raise ValueError("found none of advance, state, fault and stop")
-        told = self._state() if request.get("state") else {}
-        return {"now": self.now, "wall": WALL_AT_START + self.now, **told}
+        content = self._state() if request.get("state") else {}
+        return {"now": self.now, "wall": WALL_AT_START + self.now, **content}
 
     def _clock(self) -> float:
         return self.now

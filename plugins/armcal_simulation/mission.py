@@ -152,7 +152,7 @@ def _spans(arm: Arm, records: RecordSettings) -> list[tuple[float, float]]:
     limits = {joint.name: joint.limits for joint in arm.nominal_chain.joints}
     spans: list[tuple[float, float]] = []
     for given, kind in ((records.ranges, "angle"), (records.travel, "length")):
-        unknown = sorted(set(given) - {joint for joint, found in arm.commanded.items() if found == kind})
+        unknown = sorted(set(given) - {joint for joint, text in arm.commanded.items() if text == kind})
         if unknown:
             raise ConfigError(
                 f"simulation.records: {arm.name} has no joint {unknown[0]} whose command is of {kind}.",

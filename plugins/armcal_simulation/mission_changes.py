@@ -84,8 +84,8 @@ class MovingTruth:
         for step in self.steps:
             values[:, step.entry] += np.where(times >= step.time, step.change, 0.0)
         warmth = self.temperature_at(times)
-        for each in self.warmings:
-            values[:, each.entry] += each.per_kelvin * (warmth - each.reference)
+        for warming in self.warmings:
+            values[:, warming.entry] += warming.per_kelvin * (warmth - warming.reference)
         return values
 
     def camera_T_base_at(self, times: Array) -> Array:  # noqa: N802
@@ -121,8 +121,8 @@ def moving_truth(parameters: Parameters, settings: MissionSettings, random: np.r
 
 def scheduled(settings: MissionSettings) -> tuple[MissionEvent, ...]:
     """The events within the mission, in order."""
-    found = [MissionEvent(e.kind, e.day * DAY_S, getattr(e, "joint", ""), _label(e)) for e in settings.events]
-    return tuple(sorted((e for e in found if e.time < settings.days * DAY_S), key=lambda each: each.time))
+    mission_events = [MissionEvent(e.kind, e.day * DAY_S, getattr(e, "joint", ""), _label(e)) for e in settings.events]
+    return tuple(sorted((e for e in mission_events if e.time < settings.days * DAY_S), key=lambda each: each.time))
 
 
 def _label(event: Event) -> str:

@@ -171,10 +171,10 @@ def parsed_creep(text: str) -> tuple[str, float, bool]:
     Raises:
         ValueError: it is not written so.
     """
-    found = _CREEP.fullmatch(text)
-    if found is None or not float(found["over"]) > 0:
+    match = _CREEP.fullmatch(text)
+    if match is None or not float(match["over"]) > 0:
         raise ValueError(f"found {text!r}, expected an amount and a time, such as 0.05 deg in 30 d")
-    return found["amount"], float(found["over"]) * _SECONDS[found["unit"]], found["walk"] is not None
+    return match["amount"], float(match["over"]) * _SECONDS[match["unit"]], match["walk"] is not None
 
 
 def began_at(start: str | None) -> float:

@@ -63,7 +63,7 @@ def _settled(function: ca.Function, values: Array, record: Array) -> Array:
     """Outputs of a block of records at rest."""
     block, state = function.map(record.shape[1]), np.zeros((function.numel_in(2), record.shape[1]))
     for _ in range(MOST_PASSES):
-        following, shown = (np.asarray(each) for each in block(values, record, state))
+        following, shown = (np.asarray(dm) for dm in block(values, record, state))
         moved = np.abs(following - state).max(initial=0.0)
         state = following.reshape(state.shape)
         if moved <= REST_RAD:

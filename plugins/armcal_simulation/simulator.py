@@ -46,12 +46,12 @@ class PoseSettings(Settings):
         """
         turning = {j for j, kind in arm.commanded.items() if kind == "angle"}
         sliding = set(arm.commanded) - turning
-        for given, wanted, key in ((self.levels, turning, "levels"), (self.travel, sliding, "travel")):
-            missing, unknown = sorted(wanted - set(given)), sorted(set(given) - wanted)
+        for given, texts, key in ((self.levels, turning, "levels"), (self.travel, sliding, "travel")):
+            missing, unknown = sorted(texts - set(given)), sorted(set(given) - texts)
             if missing or unknown:
                 raise ConfigError(
                     f"simulation.poses.{key}: missing {missing or 'none'}, unknown {unknown or 'none'}.",
-                    hint=f"Give one list for each of {', '.join(sorted(wanted)) or 'no joint'}.",
+                    hint=f"Give one list for each of {', '.join(sorted(texts)) or 'no joint'}.",
                 )
         return [np.array(self.levels.get(j) or self.travel[j]) for j in arm.commanded]
 

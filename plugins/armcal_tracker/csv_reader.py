@@ -142,13 +142,13 @@ def _refuse_delimiter(header: Header, delimiter: str, rows: Iterator[tuple[int, 
     _, cells = next(rows, (0, []))
     parts = [part.strip('" ') for part in delimiter.join(cells).split(other)]
     comma = next((part for part in parts if DECIMAL_COMMA.fullmatch(part)), None)
-    found = f"found {other!r} between the columns, expected {delimiter!r}"
+    text = f"found {other!r} between the columns, expected {delimiter!r}"
     written = other.replace("\t", "\\t")
     mend = f'Set delimiter: "{written}" in the data section'
     if comma is None:
-        header.refuse(f"{found}.", f"{mend}.")
-    found = f"{found}, and numbers with a decimal comma ({comma})."
-    header.refuse(found, f"{mend}, and write decimal points ({with_point(comma)}).")
+        header.refuse(f"{text}.", f"{mend}.")
+    text = f"{text}, and numbers with a decimal comma ({comma})."
+    header.refuse(text, f"{mend}, and write decimal points ({with_point(comma)}).")
 
 
 def _load(rows: Iterator[tuple[int, list[str]]], header: Header, plan: Plan) -> Dataset:
@@ -206,7 +206,9 @@ def _numbers(cells: Sequence[str], lines: Sequence[int], column: Column, header:
 
 def _number(cell: str, line: int, column: Column, header: Header) -> float:
     """One cell; NaN if its value is missing."""
-    found = read_cell(cell)
-    if isinstance(found, CellFault):
-        raise DataError(found.found, where=Location(header.source, line=line, field=column.name), hint=found.hint)
-    return found
+    cell_fault = read_cell(cell)
+    if isinstance(cell_fault, CellFault):
+        raise DataError(
+            cell_fault.found, where=Location(header.source, line=line, field=column.name), hint=cell_fault.hint
+        )
+    return cell_fault

@@ -109,16 +109,16 @@ class DTrackTracker(Tracker):
     @override
     def frames(self) -> list[TrackerFrame]:
         """Call it every few seconds at least: what the system cannot hold is lost, and ``missing``."""
-        found: list[TrackerFrame] = []
+        tracker_frames: list[TrackerFrame] = []
         if self._port is None or self._clock is None:
-            return found
+            return tracker_frames
         now, wall = self._clock.now(), self._clock.wall()
         for data in self._port.datagrams():
             if data is None:
                 self._refused["a datagram from another sender"] += 1
                 continue
-            found += self._read(data, now, wall)
-        return found
+            tracker_frames += self._read(data, now, wall)
+        return tracker_frames
 
     @override
     def close(self) -> None:
@@ -132,15 +132,15 @@ class DTrackTracker(Tracker):
         except UnreadableError as fault:
             self._refused[str(fault)] += 1
             return []
-        found = []
+        tracker_frames = []
         for message in frames:
             passed_over = self._counter.fault(message.counter)
             if passed_over:
                 self._refused[passed_over] += 1
                 continue
             self._refused.update(message.wrong)
-            found.append(TrackerFrame(message.counter, now, self._stamped(message, wall), message.bodies))
-        return found
+            tracker_frames.append(TrackerFrame(message.counter, now, self._stamped(message, wall), message.bodies))
+        return tracker_frames
 
     def _stamped(self, message: Message, wall: float) -> float | None:
         """The moment on a clock that does not fall back at midnight (s, from the midnight before the first frame)."""

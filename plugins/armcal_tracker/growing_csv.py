@@ -66,11 +66,11 @@ class GrowingCsvTracker(Tracker):
         if self._file is None or self._clock is None:
             return []
         now = self._clock.now()
-        found = [self._read(line, now) for line in self._file.lines()]
+        tracker_frames = [self._read(line, now) for line in self._file.lines()]
         if self._file.renewed != self._renewed:  # its lines come with the next call, after a header of its own
             self._renewed, self._table = self._file.renewed, None
             self._counter.begin_anew()
-        return [frame for frame in found if frame is not None]
+        return [frame for frame in tracker_frames if frame is not None]
 
     @override
     def close(self) -> None:

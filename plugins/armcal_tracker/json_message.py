@@ -104,7 +104,7 @@ def _not_finite(_: str) -> NoReturn:
 
 
 def _without_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    found = dict(pairs)
-    if len(found) != len(pairs):
+    content = dict(pairs)
+    if len(content) != len(pairs):
         raise UnreadableError("a name that is given twice")
-    return found
+    return content

@@ -48,8 +48,8 @@ class TipPoseSettings(InstrumentSettings):
     def _positive_angle(cls, value: float | tuple[float, ...]) -> float | tuple[float, ...]:
         worst = min(_three(value))
         if worst <= 0:
-            found = f"an orientation noise of {np.degrees(worst):g} deg is not above zero"
-            raise ValueError(f"{found}: give the tracker's standard deviation")
+            text = f"an orientation noise of {np.degrees(worst):g} deg is not above zero"
+            raise ValueError(f"{text}: give the tracker's standard deviation")
         return value
 
     @field_validator("target_rotation")

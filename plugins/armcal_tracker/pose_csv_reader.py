@@ -13,7 +13,7 @@ from armcal.base.units import DIMENSIONLESS
 from armcal.errors import DataError, Location
 from armcal.measure.checks import Layout, require_records
 from armcal.measure.layout import set_aside, warned
-from armcal.measure.reader import ReadRequest, WantedChannel
+from armcal.measure.reader import ReadRequest, RequestedChannel
 from pydantic import model_validator
 
 from armcal_tracker.csv_reader import CsvReader, CsvSettings
@@ -64,7 +64,7 @@ class PoseCsvSettings(CsvSettings):
     @property
     def orientation(self) -> Orientation:
         """Whichever is given."""
-        return next(found for found in self._given() if found is not None)
+        return next(orientation for orientation in self._given() if orientation is not None)
 
 
 class PoseCsvReader:
@@ -99,11 +99,11 @@ class PoseCsvReader:
 
     def _instance(self, request: ReadRequest) -> str:
         reading = [name for name, m in request.measurements.items() if {c.name for c in m.channels()} >= {*QUATERNION}]
-        asked = self._settings.measurement
-        if asked in reading or (asked is None and len(reading) == 1):
-            return asked or reading[0]
+        text = self._settings.measurement
+        if text in reading or (text is None and len(reading) == 1):
+            return text or reading[0]
         self._refuse(
-            f"found {', '.join(reading) or 'no measurement'} to read orientations, expected {asked or 'one'}.",
+            f"found {', '.join(reading) or 'no measurement'} to read orientations, expected {text or 'one'}.",
             "Add a measurement tip_pose, or set measurement: NAME in the data section.",
         )
 
@@ -115,9 +115,9 @@ class PoseCsvReader:
         zero, wrong = made & (size < _ZERO), made & (size >= _ZERO) & (off > TOLERANCE)
         if wrong.sum() > MOST_FAULTY * made.sum():
             first = int(np.flatnonzero(wrong)[0])
-            found = f"found {wrong.sum()} of {made.sum()} orientations that are no {kind}, the first off by"
+            text = f"found {wrong.sum()} of {made.sum()} orientations that are no {kind}, the first off by"
             hint = "Check that the columns are those of the orientation, and in this order."
-            self._refuse(f"{found} {off[first]:.3g} (more than {TOLERANCE:g}).", hint, dataset.rows[first])
+            self._refuse(f"{text} {off[first]:.3g} (more than {TOLERANCE:g}).", hint, dataset.rows[first])
         faulty = {int(i): f"its {kind} is zero" for i in np.flatnonzero(zero)}
         faulty |= {int(i): f"its {kind} is off by {off[i]:.3g}" for i in np.flatnonzero(wrong)}
         return require_records(
@@ -127,9 +127,9 @@ class PoseCsvReader:
     def _refuse_reflections(self, dataset: Dataset, values: Array, made: Array) -> None:
         mirrored = reflections(values[made])
         if mirrored.size:
-            found = f"found {mirrored.size} of {len(made)} rotation matrices that are reflections (determinant -1)."
+            text = f"found {mirrored.size} of {len(made)} rotation matrices that are reflections (determinant -1)."
             hint = "Check the order and signs of the columns, and that the frames are right-handed."
-            self._refuse(found, hint, dataset.rows[made[mirrored[0]]])
+            self._refuse(text, hint, dataset.rows[made[mirrored[0]]])
 
     def _refuse_other_meaning(self, dataset: Dataset, request: ReadRequest, instance: str, values: Array) -> None:
         """Refuse orientations that turn unlike the nominal arm, where another reading of the columns turns like it."""
@@ -168,8 +168,8 @@ class PoseCsvReader:
         raise DataError(message, where=Location(str(self._settings.path), line=line), hint=hint)
 
 
-def _wanted(request: ReadRequest, instance: str, channels: tuple[str, ...]) -> tuple[WantedChannel, ...]:
+def _wanted(request: ReadRequest, instance: str, channels: tuple[str, ...]) -> tuple[RequestedChannel, ...]:
     """The request with the file's numbers in place of the quaternion; they cannot be absent."""
     quaternion = {f"{instance}.{name}" for name in QUATERNION}
     rest = tuple(w for w in request.wanted if w.channel not in quaternion)
-    return (*rest, *(WantedChannel(name, (name,), DIMENSIONLESS, True, parts=(instance,)) for name in channels))
+    return (*rest, *(RequestedChannel(name, (name,), DIMENSIONLESS, True, parts=(instance,)) for name in channels))

@@ -128,7 +128,7 @@ def _independent(joint: UrdfJoint, path: tuple[UrdfJoint, ...], names: Mapping[s
     """The joint that this one follows in the end, through others that follow too."""
     if joint.mimic is None:
         return None
-    moving = {each.name: each for each in path if each.kind in MOVING}
+    moving = {urdf_joint.name: urdf_joint for urdf_joint in path if urdf_joint.kind in MOVING}
     result, passed = joint.mimic, [joint.name]
     while True:
         master = moving.get(result.master)

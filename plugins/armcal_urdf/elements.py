@@ -47,10 +47,10 @@ class Element:
         Raises:
             ConfigError: it stands twice.
         """
-        found = list(self.all(tag))
-        if len(found) > 1:
-            found[1].refuse(f"found <{tag}> twice in one <{self.tag}>.", f"The first is at line {found[0].line}.")
-        return found[0] if found else None
+        elements = list(self.all(tag))
+        if len(elements) > 1:
+            elements[1].refuse(f"found <{tag}> twice in one <{self.tag}>.", f"The first is at line {elements[0].line}.")
+        return elements[0] if elements else None
 
     def text(self, name: str) -> str:
         """An attribute that has to be there and hold something.

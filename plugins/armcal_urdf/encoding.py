@@ -74,15 +74,15 @@ def declared(text: str, label: str) -> Encoding | None:
     Raises:
         ConfigError: it is not one of those known.
     """
-    found = _DECLARED.match(text)
-    if found is None:
+    match = _DECLARED.match(text)
+    if match is None:
         return None
-    name = found[1].lower()
+    name = match[1].lower()
     name = _OTHER_NAMES.get(name, name)
     known = {each: each for each in get_args(Encoding)}
     if name not in known or name.startswith("utf-16"):
         raise ConfigError(
-            f"found the encoding {found[1]!r}, expected UTF-8, UTF-16, ISO-8859-1 or US-ASCII and a text in it.",
+            f"found the encoding {match[1]!r}, expected UTF-8, UTF-16, ISO-8859-1 or US-ASCII and a text in it.",
             where=Location(label, 1),
             hint="Save the file as UTF-8.",
         )

@@ -78,8 +78,8 @@ def _three(joint: str, names: tuple[str, ...], values: Mapping[str, float]) -> T
 
 
 def _read_again(old: UrdfSettings, text: str) -> UrdfModel:
-    told = {**old.to_config(), "text": text}
-    return UrdfModel(UrdfSettings.model_validate(told))
+    content = {**old.to_config(), "text": text}
+    return UrdfModel(UrdfSettings.model_validate(content))
 
 
 def _nominal(model: UrdfModel) -> dict[str, float]:
@@ -113,11 +113,13 @@ def _compare(request: ExportRequest, model: UrdfModel, written: UrdfModel, value
 def _frames(arm: Arm, model: UrdfModel, values: Mapping[str, float], commands: Array) -> Array:
     """The tool and every link in the base frame (N x frames x 4 x 4), at commands (joints x N)."""
     chain = model.chain({name: ca.SX(value) for name, value in values.items()})
-    told = ca.SX.sym("commands", commands.shape[0])
-    frames = forward(chain, arm.joint_commands(ca.vertsplit(told)), {})
+    expression = ca.SX.sym("commands", commands.shape[0])
+    frames = forward(chain, arm.joint_commands(ca.vertsplit(expression)), {})
     poses = [frames.base_T_tool, *frames.named.values()]
     stacked = ca.vertcat(*[ca.vec(ca.densify(pose.matrix())) for pose in poses])
-    found = np.asarray(ca.Function("frames", [told], [stacked], {"cse": True}).map(commands.shape[1])(commands).full())
+    found = np.asarray(
+        ca.Function("frames", [expression], [stacked], {"cse": True}).map(commands.shape[1])(commands).full()
+    )
     return found.T.reshape(commands.shape[1], len(poses), 4, 4).swapaxes(-1, -2)
 
 

@@ -71,23 +71,23 @@ class UrdfSettings(Settings):
     def _read(self) -> UrdfSettings:
         """The content of the file takes the place of its path; ends and encoding are written out."""
         if (self.path is None) == (not self.text):
-            found = "both path and text" if self.text else "neither path nor text"
-            raise ValueError(f"found {found}; give path: FILE, or text: the URDF itself")
+            text = "both path and text" if self.text else "neither path nor text"
+            raise ValueError(f"found {text}; give path: FILE, or text: the URDF itself")
         if self.path is not None and (self.encoding or self.file):
             raise ValueError("encoding and file belong to a text; a file's own are read from it")
         if len(self.text.encode("utf-8", "replace")) > MAX_BYTES:
             raise ValueError(f"the text is larger than {MAX_BYTES // 1024} KiB")
         label = self.file if self.path is None else str(self.path)
-        told: dict[str, Any] = {"path": None, "text": str(self.text)}
+        content: dict[str, Any] = {"path": None, "text": str(self.text)}
         if self.path is not None:
-            told["text"], told["encoding"] = read_text(self.path)
-            told["file"] = self.path.name
+            content["text"], content["encoding"] = read_text(self.path)
+            content["file"] = self.path.name
         elif self.encoding is None:
-            told["encoding"] = declared(self.text, label) or "utf-8"
-        robot = read_robot(told["text"], label)
-        encode(told["text"], told.get("encoding") or self.encoding or "utf-8")
-        told["root"], told["tip"] = ends(robot, self.root, self.tip)
-        for name, value in told.items():
+            content["encoding"] = declared(self.text, label) or "utf-8"
+        robot = read_robot(content["text"], label)
+        encode(content["text"], content.get("encoding") or self.encoding or "utf-8")
+        content["root"], content["tip"] = ends(robot, self.root, self.tip)
+        for name, value in content.items():
             object.__setattr__(self, name, value)
         chain_of(robot, self.root, self.tip)
         return self

@@ -79,10 +79,10 @@ class Robot:
     @cached_property
     def below(self) -> Mapping[str, tuple[UrdfJoint, ...]]:
         """The joints that stand on each link, in the order of the file."""
-        found: dict[str, list[UrdfJoint]] = {name: [] for name in self.links}
+        children: dict[str, list[UrdfJoint]] = {name: [] for name in self.links}
         for joint in self.joints.values():
-            found[joint.parent].append(joint)
-        return {name: tuple(joints) for name, joints in found.items()}
+            children[joint.parent].append(joint)
+        return {name: tuple(joints) for name, joints in children.items()}
 
     @property
     def root(self) -> str:
@@ -102,12 +102,12 @@ class Robot:
 
     def leaves(self, root: str) -> tuple[str, ...]:
         """The links beyond a link, or itself, that carry no joint."""
-        found, waiting = [], [root]
+        texts, waiting = [], [root]
         while waiting:
             link = waiting.pop(0)
             waiting += [joint.child for joint in self.below[link]]
-            found += [] if self.below[link] else [link]
-        return tuple(found)
+            texts += [] if self.below[link] else [link]
+        return tuple(texts)
 
 
 def read_robot(text: str, label: str) -> Robot:
@@ -227,10 +227,10 @@ def _refuse_misspelt(element: Element, known: tuple[str, ...]) -> None:
         _refuse_alike(child, f"<{child.tag}>", child.tag, known)
 
 
-def _refuse_alike(element: Element, found: str, name: str, known: tuple[str, ...]) -> None:
+def _refuse_alike(element: Element, text: str, name: str, known: tuple[str, ...]) -> None:
     near = [] if name in known else difflib.get_close_matches(name.lower(), known, n=1, cutoff=_ALIKE)
     if near:
-        element.refuse(f"found {found}, which nothing reads.", f"Did you mean {near[0]}?")
+        element.refuse(f"found {text}, which nothing reads.", f"Did you mean {near[0]}?")
 
 
 def _require_tree(robot: Robot, top: Element) -> None:

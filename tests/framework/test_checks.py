@@ -14,13 +14,13 @@ from armcal.errors import EXIT_BAD_INPUT, DataError, Location
 from armcal.measure import checks
 from armcal.measure.checks import Layout, check_dataset, layout_of, refuse_joint_count
 from armcal.measure.csv_writer import column_names, write_csv
-from armcal.measure.reader import WantedChannel
+from armcal.measure.reader import RequestedChannel
 from numpy.typing import NDArray
 
 Values = NDArray[np.float64]
 JOINTS = ("arm.q1", "arm.q2")
 POSITION = ("tracker.x", "tracker.y", "tracker.z")
-WANTED = [WantedChannel("arm.q1", ("arm.q1", "q1"), "angle", True)]
+WANTED = [RequestedChannel("arm.q1", ("arm.q1", "q1"), "angle", True)]
 
 
 def layout(unit: str = "deg", by_line: bool = True) -> Layout:
@@ -73,12 +73,12 @@ def test_good_records_pass_unchanged() -> None:
 
 def test_layout_of_wanted_channels() -> None:
     wanted = (
-        WantedChannel("arm.q1", ("q1",), "angle", True),
-        WantedChannel("arm.approach.q1", ("approach1",), "1", False),
-        WantedChannel("arm.q2", ("q2",), "length", True),
-        WantedChannel("arm.approach.q2", ("approach2",), "1", False),
-        WantedChannel("payload", ("payload",), "mass", False),
-        *(WantedChannel(name, (name,), "length", True) for name in POSITION),
+        RequestedChannel("arm.q1", ("q1",), "angle", True),
+        RequestedChannel("arm.approach.q1", ("approach1",), "1", False),
+        RequestedChannel("arm.q2", ("q2",), "length", True),
+        RequestedChannel("arm.approach.q2", ("approach2",), "1", False),
+        RequestedChannel("payload", ("payload",), "mass", False),
+        *(RequestedChannel(name, (name,), "length", True) for name in POSITION),
     )
     found = layout_of(wanted, records(), {"arm.q1": "q1_deg"}, {"arm.q1": "deg"}, by_line=False)
     assert found == Layout(
@@ -257,8 +257,8 @@ def test_repeated_poses_count_once() -> None:
     ],
 )
 def test_joint_counts(names: list[str], counts: str | None, field: str | None) -> None:
-    wanted = [WantedChannel(name, (name, name[4:]), "angle", True) for name in JOINTS]
-    wanted += [WantedChannel(f"arm.approach.q{i}", (f"approach{i}",), "1", False) for i in (1, 2)]
+    wanted = [RequestedChannel(name, (name, name[4:]), "angle", True) for name in JOINTS]
+    wanted += [RequestedChannel(f"arm.approach.q{i}", (f"approach{i}",), "1", False) for i in (1, 2)]
     where = Location("poses.csv", line=1)
     if counts is None or field is None:
         refuse_joint_count(names, wanted, where)
@@ -286,5 +286,5 @@ def test_writing_replaces_whole_or_not_at_all(tmp_path: Path) -> None:
 
 
 def test_two_arms_keep_their_own_names() -> None:
-    both = [WantedChannel(f"{arm}.q1", (f"{arm}.q1", "q1"), "angle", True) for arm in ("left", "right")]
+    both = [RequestedChannel(f"{arm}.q1", (f"{arm}.q1", "q1"), "angle", True) for arm in ("left", "right")]
     assert column_names(both) == {"left.q1": ("left.q1_deg", "deg"), "right.q1": ("right.q1_deg", "deg")}

@@ -10,7 +10,7 @@ import pytest
 from armcal.arm.servo import quantised
 from armcal.calibration.compensation.compensator import SEEDS, Compensator
 from armcal.calibration.compensation.equilibrium import Equilibrium
-from armcal.calibration.compensation.finder import Found
+from armcal.calibration.compensation.finder import Solutions
 from armcal.calibration.compensation.request import Commands, Options, Targets
 from armcal.calibration.compensation.seeds import Seeds
 from armcal.calibration.compensation.sides import with_sides
@@ -469,9 +469,9 @@ def test_the_side_from_which_joints_come_follows_from_the_motion() -> None:
     assert np.abs(tools[:, :3, 3] - exact).max() < 2 * NEAR_M
 
 
-def found_at(commands: np.ndarray) -> Found:
+def found_at(commands: np.ndarray) -> Solutions:
     """As a search would find them."""
-    return replace(Found.nothing(len(commands), 0, commands.shape[1]), commands=commands)
+    return replace(Solutions.nothing(len(commands), 0, commands.shape[1]), commands=commands)
 
 
 def test_sides_are_told_as_the_joints_move() -> None:
@@ -487,7 +487,7 @@ def test_a_joint_that_can_come_from_neither_side_has_none() -> None:
     """Told that it comes from below it must come from above, and the other way round; the other joint is sure."""
     record = np.zeros((4, 2))
 
-    def search(told: np.ndarray) -> Found:
+    def search(told: np.ndarray) -> Solutions:
         moved = np.stack([np.where(told[2] > 0, -0.1, 0.1), np.array([0.3, -0.3])])
         moved[0, 1] = 0.2
         return found_at(moved)

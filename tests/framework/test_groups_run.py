@@ -10,7 +10,7 @@ import pytest
 import yaml
 from armcal.cli.main import cli
 from armcal.measure.csv_writer import write_csv
-from armcal.measure.reader import wanted_channels
+from armcal.measure.reader import requested_channels
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import calibrate
 from armcal_mdh.model import MdhModel
@@ -54,7 +54,7 @@ def written(place, data, instrument=None, **sections):
     path.write_text(yaml.safe_dump(config, sort_keys=False), encoding="utf-8")
     made = bench()
     measurements = {"balls": made.measurements["balls"]}
-    write_csv(place / "touches.csv", data, wanted_channels({"left": made.arms["left"]}, measurements, measured=True))
+    write_csv(place / "touches.csv", data, requested_channels({"left": made.arms["left"]}, measurements, measured=True))
     return path
 
 

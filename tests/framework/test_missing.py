@@ -14,7 +14,7 @@ from armcal.measure import checks
 from armcal.measure.checks import Layout, check_dataset, layout_of
 from armcal.measure.limits import warn_beyond_limits
 from armcal.measure.missing import set_aside_not_finite, with_absent
-from armcal.measure.reader import ReadRequest, WantedChannel, wanted_channels
+from armcal.measure.reader import ReadRequest, RequestedChannel, requested_channels
 from armcal.testing.planar import Tip, planar_arms
 from armcal_contact.ball import BallInSocket, BallInSocketSettings
 from armcal_tracker.csv_reader import CsvReader, CsvSettings
@@ -28,8 +28,8 @@ def two_arms() -> tuple[dict[str, Arm], dict[str, Tip]]:
     return planar_arms(["left", "right"]), {"lt": Tip("left"), "rt": Tip("right")}
 
 
-def wanted() -> tuple[WantedChannel, ...]:
-    return wanted_channels(*two_arms(), measured=True)  # type: ignore[arg-type]
+def wanted() -> tuple[RequestedChannel, ...]:
+    return requested_channels(*two_arms(), measured=True)  # type: ignore[arg-type]
 
 
 def records(count: int = 8, **changed: list[float]) -> Dataset:
@@ -54,7 +54,7 @@ def test_which_measurement_needs_which_channel() -> None:
     assert parts["left.approach.q1"] == parts["gravity_x"] == parts["time"] == ()
     arms = planar_arms(["arm"])
     both = {"one": Tip(), "two": TipPosition(TipPositionSettings.si(noise=1e-3), ("arm",))}
-    found = {w.channel: w.parts for w in wanted_channels(arms, both, measured=True)}
+    found = {w.channel: w.parts for w in requested_channels(arms, both, measured=True)}
     assert found["arm.q1"] == ("one", "two")
     assert found["two.noise_x"] == ("two",)
 
@@ -100,7 +100,7 @@ def test_what_belongs_to_no_measurement_costs_the_record(channel: str) -> None:
 def test_with_one_measurement_any_missing_value_costs_the_record() -> None:
     random = np.random.default_rng(2)
     arms, tip = planar_arms(["arm"]), {"t": Tip()}
-    needed = [w for w in wanted_channels(arms, tip, measured=True) if w.required]
+    needed = [w for w in requested_channels(arms, tip, measured=True) if w.required]
     for w in needed:
         channels = {each.channel: random.uniform(-1, 1, 6) for each in needed}
         channels[w.channel][3] = NAN
@@ -174,7 +174,7 @@ def read(folder: Path, text: str) -> Dataset:
     ball = BallInSocket(BallInSocketSettings.si(noise=1e-4), ("arm",))
     both = {"tracker": TipPosition(TipPositionSettings.si(noise=1e-3), ("arm",)), "sockets": ball}
     (folder / "poses.csv").write_text(text)
-    request = ReadRequest(arms, both, wanted_channels(arms, both, measured=True))
+    request = ReadRequest(arms, both, requested_channels(arms, both, measured=True))
     return CsvReader(CsvSettings(path=folder / "poses.csv")).read(request)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from armcal.base.dataset import Dataset
 from armcal.cli.main import cli
-from armcal.diagnose.permuted_axes import _within, find_permuted_servos
+from armcal.diagnose.permuted_axes import _within, find_permuted_axes
 from armcal.errors import NotConvergedError
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import Prepared, Stopwatch, assemble, calibrate
@@ -37,7 +37,7 @@ def changed(dataset: Dataset, **columns: str) -> Dataset:
 
 
 def told(ready: Prepared, dataset: Dataset) -> tuple[str, ...]:
-    found = find_permuted_servos(ready.problem, ready.problem.records(dataset), dataset)
+    found = find_permuted_axes(ready.problem, ready.problem.records(dataset), dataset)
     return () if found is None else found.told
 
 

@@ -32,7 +32,7 @@ from armcal.estimate.prediction import LEVELS, Spread
 from armcal.estimate.simulation import SimulationRequest, measured_without_noise, with_channels
 from armcal.estimate.validation import folds
 from armcal.estimate.weighing import fit
-from armcal.measure.reader import ReadRequest, wanted_channels
+from armcal.measure.reader import ReadRequest, requested_channels
 from armcal.problem.drift import with_drift
 from armcal.problem.motion import recorded_position
 from armcal.run.experiment import Experiment
@@ -443,7 +443,7 @@ def test_a_dataset_without_places_is_refused_in_the_same_recording(recording: Pa
     loaded = Experiment.load(DEMO, [FREE])
     arms = loaded.system.arms
     commands = loaded.read().subset(np.arange(3))
-    assert ReadRequest(arms, {}, wanted_channels(arms, {}, measured=False)).wanted
+    assert ReadRequest(arms, {}, requested_channels(arms, {}, measured=False)).wanted
     with pytest.raises(DataError, match="drifts over sequence"):
         calibration.plus_minus(commands, "same")
     assert np.isfinite(calibration.plus_minus(commands).radii["tracker"]).all()

@@ -13,7 +13,7 @@ from armcal.estimate.estimator import estimate
 from armcal.estimate.nuisance import started
 from armcal.estimate.simulation import SimulationRequest
 from armcal.measure.csv_writer import write_csv
-from armcal.measure.reader import ReadRequest, wanted_channels
+from armcal.measure.reader import ReadRequest, requested_channels
 from armcal.problem.joint_noise import with_joint_noise
 from armcal_contact.clamp import ClampedTool
 from armcal_contact.plane import PlaneContact
@@ -158,7 +158,7 @@ def test_planes_clamps_and_closed_chains_hold_too(tmp_path):
 def test_records_and_labels_come_back_from_a_csv(tmp_path):
     made = shared_sockets()
     data = simulated(tmp_path, made, {"balls": KEYS[:1], "others": KEYS}, TRUTH_OF_KEYS, joint_noise=1e-3)
-    wanted = wanted_channels(made.arms, made.measurements, measured=True)
+    wanted = requested_channels(made.arms, made.measurements, measured=True)
     path = tmp_path / "touches.csv"
     write_csv(path, data, wanted)
     back = CsvReader(CsvSettings.si(path=str(path))).read(ReadRequest(made.arms, made.measurements, wanted))

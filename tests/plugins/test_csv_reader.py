@@ -17,7 +17,7 @@ from armcal.config.validate import validate
 from armcal.config.yaml_source import load_config
 from armcal.errors import EXIT_BAD_INPUT, DataError
 from armcal.measure.csv_writer import write_csv
-from armcal.measure.reader import ENVIRONMENT, ReadRequest, WantedChannel, wanted_channels
+from armcal.measure.reader import ENVIRONMENT, ReadRequest, RequestedChannel, requested_channels
 from armcal_mdh.model import MdhModel, MdhSettings, Row
 from armcal_tracker import csv_reader
 from armcal_tracker.csv_reader import CsvReader, CsvSettings
@@ -27,14 +27,14 @@ LRM_POSES = Path(__file__).parents[2].parent / "shared" / "data" / "lrm_arm" / "
 HEADER = "pose_id,q1_deg,q2_deg,approach1,approach2,x_mm,y_mm,z_mm"
 
 
-def wanted(joints: int = 2, measured: bool = True) -> tuple[WantedChannel, ...]:
+def wanted(joints: int = 2, measured: bool = True) -> tuple[RequestedChannel, ...]:
     found = []
     for i in range(1, joints + 1):
-        found.append(WantedChannel(f"arm.q{i}", (f"arm.q{i}", f"q{i}"), "angle", True))
+        found.append(RequestedChannel(f"arm.q{i}", (f"arm.q{i}", f"q{i}"), "angle", True))
         names = (f"arm.approach{i}", f"approach{i}", f"approach_q{i}")
-        found.append(WantedChannel(f"arm.approach.q{i}", names, "1", False))
-    found += [WantedChannel(name, (name,), dimension, False) for name, dimension in ENVIRONMENT]
-    found += [WantedChannel(f"tracker.{a}", (f"tracker.{a}", a), "length", measured) for a in "xyz"]
+        found.append(RequestedChannel(f"arm.approach.q{i}", names, "1", False))
+    found += [RequestedChannel(name, (name,), dimension, False) for name, dimension in ENVIRONMENT]
+    found += [RequestedChannel(f"tracker.{a}", (f"tracker.{a}", a), "length", measured) for a in "xyz"]
     return tuple(found)
 
 
@@ -59,7 +59,7 @@ def table(*rows: str, header: str = HEADER, count: int = 4) -> str:
 
 
 def read(
-    folder: Path, content: str | bytes, want: Sequence[WantedChannel] | None = None, **settings: object
+    folder: Path, content: str | bytes, want: Sequence[RequestedChannel] | None = None, **settings: object
 ) -> Dataset:
     path = folder / "poses.csv"
     path.write_bytes(content if isinstance(content, bytes) else content.encode())
@@ -67,7 +67,9 @@ def read(
     return reader.read(ReadRequest({}, {}, tuple(want or wanted())))
 
 
-def refusal(folder: Path, content: str | bytes, want: Sequence[WantedChannel] | None = None, **settings: object) -> str:
+def refusal(
+    folder: Path, content: str | bytes, want: Sequence[RequestedChannel] | None = None, **settings: object
+) -> str:
     with pytest.raises(DataError) as caught:
         read(folder, content, want, **settings)
     assert caught.value.exit_code == EXIT_BAD_INPUT
@@ -387,7 +389,7 @@ def test_the_measured_arm() -> None:
     model = MdhModel(MdhSettings(convention="standard", rows=(Row(),) * 6))
     arms = {"arm": Arm("arm", "mdh", model, {}, ())}
     measurements = {"tracker": TipPosition(TipPositionSettings.si(noise=5e-4), ["arm"])}
-    request = ReadRequest(arms, measurements, wanted_channels(arms, measurements, True))
+    request = ReadRequest(arms, measurements, requested_channels(arms, measurements, True))
     dataset = CsvReader(CsvSettings(path=LRM_POSES)).read(request)
     assert len(dataset) == 313 and dataset.ids[-1] == "393" and dataset.rows[0] == 2
     assert not dataset.warnings and not dataset.set_aside and not dataset.extra

@@ -13,7 +13,7 @@ import pytest
 from armcal.arm.assembly import Arm
 from armcal.devices.rest_stream import RestStream
 from armcal.errors import ConfigError, InputError
-from armcal.measure.reader import ReadRequest, wanted_channels
+from armcal.measure.reader import ReadRequest, requested_channels
 from armcal_contact.json_joints import JsonLinesJoints, JsonLinesJointSettings
 from armcal_dualarm.closure import ClosedChain, ClosedChainSettings
 from armcal_dualarm.live import TwoArmLogStream, TwoArmStreamSettings
@@ -238,7 +238,7 @@ def two_arms():
     model = MdhSettings.si(convention="standard", rows=[{"a": 0.1, "alpha": 1.0}] * 7)
     arms = {name: Arm(name, "mdh", MdhModel(model), {}, ()) for name in ("left", "right")}
     clamp = {"clamp": ClosedChain(ClosedChainSettings.si(noise=1e-4, orientation_noise=1e-3), tuple(arms))}
-    return ReadRequest(arms, clamp, wanted_channels(arms, clamp, measured=True))
+    return ReadRequest(arms, clamp, requested_channels(arms, clamp, measured=True))
 
 
 @pytest.mark.parametrize("still", [{"samples": 15}, {"window_s": 0.3, "spread_deg": 0.01}])

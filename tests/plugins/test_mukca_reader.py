@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from armcal.arm.assembly import Arm
 from armcal.errors import ArmcalError, DataError
-from armcal.measure.reader import ReadRequest, wanted_channels
+from armcal.measure.reader import ReadRequest, requested_channels
 from armcal_contact.ball import BallInSocket, BallInSocketSettings
 from armcal_contact.mukca_reader import MukcaReader, MukcaSettings
 from armcal_mdh.model import MdhModel, MdhSettings
@@ -29,7 +29,7 @@ def request(arms=None, measured=True, **measurements):
     arms = arms or {"arm": arm()}
     ball = BallInSocket(BallInSocketSettings.si(noise=NOISE_M, arm=next(iter(arms))), tuple(arms))
     found = {"sockets": ball, **measurements}
-    return ReadRequest(arms, found, wanted_channels(arms, found, measured))
+    return ReadRequest(arms, found, requested_channels(arms, found, measured))
 
 
 def postures(count, seed=0, joints=JOINTS):

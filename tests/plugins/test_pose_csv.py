@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from armcal.arm.assembly import Arm
 from armcal.errors import DataError
-from armcal.measure.reader import ReadRequest, wanted_channels
+from armcal.measure.reader import ReadRequest, requested_channels
 from armcal_mdh.model import MdhModel, MdhSettings
 from armcal_tracker.pose import TipPose, TipPoseSettings
 from armcal_tracker.pose_csv_reader import PoseCsvReader, PoseCsvSettings
@@ -28,7 +28,7 @@ def arm(name="arm"):
 def request(measured=True, **others):
     arms = {"arm": arm()}
     found = {"tracker": TipPose(TipPoseSettings.si(noise=1e-3, orientation_noise=1e-3), ("arm",)), **others}
-    return ReadRequest(arms, found, wanted_channels(arms, found, measured))
+    return ReadRequest(arms, found, requested_channels(arms, found, measured))
 
 
 def joints(count, seed=1):

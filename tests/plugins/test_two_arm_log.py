@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from armcal.arm.assembly import Arm
 from armcal.errors import ArmcalError, DataError
-from armcal.measure.reader import ReadRequest, wanted_channels
+from armcal.measure.reader import ReadRequest, requested_channels
 from armcal_contact.ball import BallInSocket, BallInSocketSettings
 from armcal_dualarm.closure import ClosedChain, ClosedChainSettings
 from armcal_dualarm.log_reader import TwoArmLogReader, TwoArmLogSettings
@@ -31,7 +31,7 @@ def arm(name):
 def request(**arms):
     arms = arms or {"left": arm("left"), "right": arm("right")}
     clamp = ClosedChain(ClosedChainSettings.si(noise=1e-4, orientation_noise=1e-3), tuple(arms))
-    return ReadRequest(arms, {"clamp": clamp}, wanted_channels(arms, {"clamp": clamp}, measured=True))
+    return ReadRequest(arms, {"clamp": clamp}, requested_channels(arms, {"clamp": clamp}, measured=True))
 
 
 def joints(count, seed=1):
@@ -120,7 +120,7 @@ def test_an_arm_without_columns_or_with_empty_cells_is_not_recorded(tmp_path):
     assert "found no usable record" in refusal(tmp_path, left_only, arms={"left": LEFT})
     arms = {"left": arm("left"), "right": arm("right")}
     apart = {side: BallInSocket(BallInSocketSettings.si(noise=1e-3, arm=side), tuple(arms)) for side in arms}
-    asked = ReadRequest(arms, apart, wanted_channels(arms, apart, measured=True))
+    asked = ReadRequest(arms, apart, requested_channels(arms, apart, measured=True))
     dataset = read(tmp_path, left_only, asked, arms={"left": LEFT})
     assert len(dataset) == 3 and np.isnan(dataset.column("right.q1")).all()
     rows = text(motors(joints(3))).splitlines()

@@ -17,7 +17,7 @@ from armcal.errors import ConfigError, DataError
 from armcal.measure.checks import refuse_joint_units
 from armcal.measure.layout import layout_of
 from armcal.measure.limits import warn_beyond_limits
-from armcal.measure.reader import wanted_channels
+from armcal.measure.reader import requested_channels
 from armcal.plugins import discover
 from armcal.run.experiment import Experiment
 from armcal_urdf.encoding import MAX_BYTES, decode, encode
@@ -250,7 +250,7 @@ parameters: {free: [arm.spring.k2, arm.urdf.bend_z]}
 
 
 def test_records_have_no_column_of_a_joint_that_follows():
-    wanted = [channel.channel for channel in wanted_channels({"arm": arm_of()}, {}, measured=False)]
+    wanted = [channel.channel for channel in requested_channels({"arm": arm_of()}, {}, measured=False)]
     assert "arm.bend" in wanted
     assert "arm.level" not in wanted
     assert arm_of().joint_commands([0.1, 0.2, 0.3]) == [0.1, 0.2, 0.3, -1.5 * 0.2 + 0.25]
@@ -279,7 +279,7 @@ def test_records_beyond_limits_are_warned_of_by_joint_count_and_worst():
 
 
 def test_only_endless_joints_may_be_recorded_beyond_one_turn():
-    wanted = wanted_channels({"arm": arm_of()}, {}, measured=False)
+    wanted = requested_channels({"arm": arm_of()}, {}, measured=False)
     data = Dataset(("1",), {"arm.turn": np.array([40.0]), "arm.bend": np.zeros(1), "arm.slide": np.zeros(1)})
     layout = layout_of(wanted, data, {}, {}, by_line=False)
     refuse_joint_units(data, layout)

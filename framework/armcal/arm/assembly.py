@@ -107,21 +107,21 @@ class Arm:
 
     def joint_commands(self, commands: Sequence[Any]) -> list[Any]:
         """What every joint is told (rad or m), from the ``commanded`` ones' commands."""
-        told = dict(zip(self.commanded, commands, strict=True))
+        content = dict(zip(self.commanded, commands, strict=True))
         return [
-            told[joint.name]
+            content[joint.name]
             if joint.mimic is None
-            else joint.mimic.multiplier * told[joint.mimic.master] + joint.mimic.offset
+            else joint.mimic.multiplier * content[joint.mimic.master] + joint.mimic.offset
             for joint in self.nominal_chain.joints
         ]
 
     def joint_approaches(self, approaches: Sequence[Any]) -> list[Any]:
         """From where every joint came (-1, 0, 1), from the ``commanded`` ones' approaches."""
-        told = dict(zip(self.commanded, approaches, strict=True))
+        content = dict(zip(self.commanded, approaches, strict=True))
         return [
-            told[joint.name]
+            content[joint.name]
             if joint.mimic is None
-            else math.copysign(joint.mimic.multiplier != 0, joint.mimic.multiplier) * told[joint.mimic.master]
+            else math.copysign(joint.mimic.multiplier != 0, joint.mimic.multiplier) * content[joint.mimic.master]
             for joint in self.nominal_chain.joints
         ]
 
@@ -202,9 +202,9 @@ class Arm:
     def declared(self) -> tuple[tuple[str, Condition], ...]:
         """The columns that its effects read of the surroundings, each with the name of the effect."""
         return tuple(
-            (name, each if isinstance(each, Condition) else Condition(each))
+            (name, condition if isinstance(condition, Condition) else Condition(condition))
             for name, effect in self.effects.items()
-            for each in effect.conditions
+            for condition in effect.conditions
         )
 
     def _shaped(self, values: Mapping[str, Expression], inputs: ArmInputs) -> Chain:

@@ -128,13 +128,13 @@ def reshapes(effect: JointEffect) -> bool:
     return type(effect).shaped is not JointEffect.shaped
 
 
-def chosen(wanted: JointChoice, joint_names: Sequence[str]) -> tuple[int, ...]:
+def chosen(texts: JointChoice, joint_names: Sequence[str]) -> tuple[int, ...]:
     """The numbers (from 1) of the joints wanted, in the order of the chain.
 
     Raises:
         ValueError: a name is not one of the joints'.
     """
-    names = joint_names if wanted == "all" else wanted
+    names = joint_names if texts == "all" else texts
     unknown = [name for name in names if name not in joint_names]
     if unknown:
         raise ValueError(f"no joint is called {unknown[0]!r}; the joints are {', '.join(joint_names)}")

@@ -38,8 +38,8 @@ class PulseTable:
 
     def __post_init__(self) -> None:
         if len(self.angles) != len(self.pulses) or len(self.angles) < 2:
-            found = f"{len(self.angles)} angles and {len(self.pulses)} pulses"
-            raise ValueError(f"found {found}, expected as many of both, two at least")
+            text = f"{len(self.angles)} angles and {len(self.pulses)} pulses"
+            raise ValueError(f"found {text}, expected as many of both, two at least")
         if not _rising(self.angles):
             raise ValueError("the angles do not rise from each to the next")
         if not (_rising(self.pulses) or _rising(tuple(-pulse for pulse in self.pulses))):

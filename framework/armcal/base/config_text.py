@@ -88,7 +88,7 @@ def resolve_path(text: ConfigText | str) -> Path:
             hint="Name the file, or leave the key out.",
         )
     try:
-        found = (base / text).resolve()
+        path = (base / text).resolve()
         limit = root.resolve() if root is not None else None
     except (OSError, RuntimeError, ValueError) as fault:
         raise ConfigError(
@@ -96,13 +96,13 @@ def resolve_path(text: ConfigText | str) -> Path:
             where=where,
             hint="Check its spelling and its symbolic links.",
         ) from fault
-    if limit is not None and not found.is_relative_to(limit):
+    if limit is not None and not path.is_relative_to(limit):
         raise ConfigError(
-            f"the path {str(text)!r} leads to {found}, outside the root {limit}.",
+            f"the path {str(text)!r} leads to {path}, outside the root {limit}.",
             where=where,
             hint="Move the file below the root, or give its path on the command line.",
         )
-    return found
+    return path
 
 
 def as_line(content: Mapping[str, Any]) -> str:

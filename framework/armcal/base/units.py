@@ -99,11 +99,11 @@ def unit(name: str) -> Unit:
 
 def units_of(dimension: str) -> tuple[Unit, ...]:
     """The units of a dimension, the SI unit first; ValueError for an unknown dimension."""
-    found = tuple(u for u in _ALL if u.dimension == dimension)
-    if not found:
+    units = tuple(u for u in _ALL if u.dimension == dimension)
+    if not units:
         known = ", ".join(dict.fromkeys(u.dimension for u in _ALL))
         raise ValueError(f"dimension {dimension!r} is not known; expected one of {known}.")
-    return found
+    return units
 
 
 def si_unit(dimension: str) -> Unit:
@@ -164,12 +164,12 @@ def parse_quantity(text: str, dimension: str) -> float:
     return value
 
 
-def _expected(found: str, dimension: str) -> str:
+def _expected(text: str, dimension: str) -> str:
     names = [u.name for u in units_of(dimension)]
     if dimension == DIMENSIONLESS:
-        return f'{found}; expected a number without a unit, for example "0.5".'
+        return f'{text}; expected a number without a unit, for example "0.5".'
     kind = f"{dimension} in {'one of ' if len(names) > 1 else ''}{', '.join(names)}"
-    return f'{found}; expected a number and a unit of {kind}, for example "5 {display_unit(dimension).name}".'
+    return f'{text}; expected a number and a unit of {kind}, for example "5 {display_unit(dimension).name}".'
 
 
 @overload

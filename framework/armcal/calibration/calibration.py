@@ -142,17 +142,17 @@ class Calibration:
         Raises:
             ConfigError: the physics is not that which it was made with: its check poses are predicted elsewhere.
         """
-        found, record = [], self.record
+        texts, record = [], self.record
         if record.level == "lost":
-            found.append(f"is lost: {(record.recalibrated or {}).get('why')}")
+            texts.append(f"is lost: {(record.recalibrated or {}).get('why')}")
         if not record.verdict.get("usable", True):
-            found.append(f"is used although its verdict is bad: {record.verdict['findings'][0]}")
+            texts.append(f"is used although its verdict is bad: {record.verdict['findings'][0]}")
         if record.accepted:
-            found.append(f"was {record.accepted}: no records stand behind what it predicts now.")
+            texts.append(f"was {record.accepted}: no records stand behind what it predicts now.")
         changed = differences(record.components, components(self.system, registry))
         made_with = f" It was made with {'; '.join(changed)}." if changed else ""
         if record.checks is None:
-            return [*found, f"keeps no check poses.{made_with}"] if changed else found
+            return [*texts, f"keeps no check poses.{made_with}"] if changed else texts
         try:
             moved = movement(self.system, self.parameters, record.checks)
         except (ArmcalError, ValueError) as fault:
@@ -170,8 +170,8 @@ class Calibration:
             )
         if changed:
             agree = f"predictions at its {len(record.checks.records)} check poses agree to {moved.tool_m * 1000:.1g} mm"
-            found.append(f"was made with {'; '.join(changed)}; {agree}.")
-        return found
+            texts.append(f"was made with {'; '.join(changed)}; {agree}.")
+        return texts
 
     @property
     def readable(self) -> Mapping[str, Measurement]:
@@ -275,8 +275,8 @@ class Calibration:
             ConfigError: no measurement reads the target.
         """
         system, name = self.system, self._named(arm)
-        found = arm_expression(system.arms[name], self.parameters, system.environment, conditions)
-        return pointed(found, point, system, self.parameters)
+        tool_expression = arm_expression(system.arms[name], self.parameters, system.environment, conditions)
+        return pointed(tool_expression, point, system, self.parameters)
 
     def compensator(
         self,

@@ -171,10 +171,10 @@ def random_commands(arm: Arm, count: int = POSES, seed: int = 1) -> Array:
 def rigid_tools(arm: Arm, values: Mapping[str, Array], commands: Array) -> Array:
     """base_T_tool (N x 4 x 4) without effects, at commands (joints x N) and parameters by full name."""
     chain = arm.chain({name: ca.SX(list(value)) for name, value in values.items()})
-    told = ca.SX.sym("commands", commands.shape[0])
-    moved = arm.joint_commands(ca.vertsplit(told))
+    sx = ca.SX.sym("commands", commands.shape[0])
+    moved = arm.joint_commands(ca.vertsplit(sx))
     frames = forward(chain, [joint.offset + moved[i] for i, joint in enumerate(chain.joints)], {})
-    function = ca.Function("tool", [told], [ca.vec(ca.densify(frames.base_T_tool.matrix()))], {"cse": True})
+    function = ca.Function("tool", [sx], [ca.vec(ca.densify(frames.base_T_tool.matrix()))], {"cse": True})
     found = np.asarray(function.map(commands.shape[1])(commands).full())
     return found.T.reshape(-1, 4, 4).transpose(0, 2, 1)
 

@@ -96,9 +96,10 @@ def stretch_records(stretches: Mapping[Recording, Stretch]) -> dict[Literal["sam
     """As they are kept."""
     return {
         name: StretchRecord(
-            coordinates={level_name(p): x for p, x in zip(LEVELS, each.coordinates, strict=True)}, radius=each.radius
+            coordinates={level_name(p): x for p, x in zip(LEVELS, stretch.coordinates, strict=True)},
+            radius=stretch.radius,
         )
-        for name, each in stretches.items()
+        for name, stretch in stretches.items()
     }
 
 
@@ -112,7 +113,7 @@ def recording_record(problem: Problem, dataset: Dataset, fitted: Sequence[Factor
     drifts = {b.name: b.drift for b in problem.parameters.free if b.drift is not None}
     if not drifts:
         return None
-    weights = [each.weight[: each.count] for each in fitted]
+    weights = [factor_records.weight[: factor_records.count] for factor_records in fitted]
     weighed = any(np.any(weight != 1) for weight in weights)
     return RecordingRecord(
         drifts={name: DriftRecord(sd=d.sd, over=d.over, channel=d.channel) for name, d in drifts.items()},
@@ -183,7 +184,7 @@ class Uncertainty:
         """In the recording, which tells of a drift."""
         records = self._drifted(problem, commands, along)
         spreads = self._predictor(problem, drift).in_recording(records)
-        moved = [each.correlation.shift(i, drift.states) for i, each in enumerate(records) if each.correlation]
+        moved = [record.correlation.shift(i, drift.states) for i, record in enumerate(records) if record.correlation]
         off = tuple(m[:, : len(places), 0] for m in moved)
         return _Part(places, "same", off, spreads, reading_slopes(problem, self.values, records))
 
@@ -196,10 +197,10 @@ class Uncertainty:
         records = self._drifted(problem, dataset, along)
         if told.weights:
             records = problem.weighted(records, [np.array(row) for row in told.weights])
-        found = KnownDrift.by(problem, self.values, records)
-        if found is None:
+        known_drift = KnownDrift.by(problem, self.values, records)
+        if known_drift is None:
             raise TypeError("a recording is kept only where something drifts")
-        return found
+        return known_drift
 
     def _drifted(self, problem: Problem, dataset: Dataset, along: Chain | None) -> tuple[FactorRecords, ...]:
         return with_drift(problem, problem.records(dataset), dataset, self.parameters.nominal(), along)
@@ -242,8 +243,8 @@ class Uncertainty:
             return records
         instruments = [c.name for c in self.components if c.kind == "instrument"]
         axes: Axes = "together" if set(instruments) <= set(self.system.measurements) else "apart"
-        found = VarianceComponents(self.components, (), (), 0.0)
-        return apply_components(problem, self.values, records, found, axes)
+        variance_components = VarianceComponents(self.components, (), (), 0.0)
+        return apply_components(problem, self.values, records, variance_components, axes)
 
     def _near(self, told: RecordingRecord, commands: Dataset) -> Array:
         """Whether the recording says anything of each record's drift (N)."""
@@ -292,7 +293,7 @@ class _Part:
 def _joined(
     problem: Problem, parts: Sequence[_Part], count: int, stretches: Mapping[Literal["same", "new"], StretchRecord]
 ) -> PlusMinus:
-    found = PlusMinus({}, {}, {}, {})
+    plus_minus = PlusMinus({}, {}, {}, {})
     for place, kernel in enumerate(problem.kernels):
         channels, name = kernel.factor.output_channels, kernel.factor.name
         known = [part.of_readings(place) for part in parts]
@@ -307,10 +308,10 @@ def _joined(
             covariance[part.places] = stretch**2 * spread.covariance
             radius[part.places] = spread.radius() * (own.radius if own and own.radius is not None else 1.0)
         for i, channel in enumerate(channels):
-            found.shift[channel], found.deviations[channel], found.half_widths[channel] = rows[:, i]
+            plus_minus.shift[channel], plus_minus.deviations[channel], plus_minus.half_widths[channel] = rows[:, i]
         if is_position(kernel):
-            found.radii[name], found.covariances[name] = radius, covariance
-    return found
+            plus_minus.radii[name], plus_minus.covariances[name] = radius, covariance
+    return plus_minus
 
 
 def _chunks(places: Indices) -> list[Indices]:

@@ -91,7 +91,7 @@ def _on_tool(
     state = ArmState(frames.base_T_tool, frames.named, ca.SX(0, 1), ca.SX.zeros(len(chain.joints)))
     read = measurement.outputs({arm.name: state}, own)
     names = ("x", "y", "z", *(_QUATERNION if set(_QUATERNION) <= set(read) else ()))
-    numbers = np.array([float(ca.evalf(ca.SX(read[each]))) for each in names])
+    numbers = np.array([float(ca.evalf(ca.SX(read[name]))) for name in names])
     base_T_tool = np.asarray(ca.evalf(ca.densify(frames.base_T_tool.matrix())).full())
     base_T_target = base_T_tool.copy()
     base_T_target[:3, 3] = numbers[:3]

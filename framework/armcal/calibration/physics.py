@@ -27,7 +27,7 @@ from armcal.estimate.validation import Indices
 from armcal.measure.contact import ArmsAlone
 from armcal.measure.measurement import Measurement
 from armcal.measure.partners import PairedMeasurement
-from armcal.measure.reader import wanted_channels
+from armcal.measure.reader import requested_channels
 from armcal.plugins import PluginRegistry
 from armcal.problem.problem import Problem
 from armcal.version import __version__
@@ -142,13 +142,20 @@ def components(system: System, registry: PluginRegistry) -> tuple[ComponentRecor
 def absent(kept: tuple[ComponentRecord, ...], registry: PluginRegistry) -> ComponentRecord | None:
     """The first component that no plugin offers."""
     offered = {(component.kind, component.name) for component in registry.components} | {("core", "arm")}
-    return next((each for each in kept if (each.kind, each.name) not in offered), None)
+    return next(
+        (
+            component_record
+            for component_record in kept
+            if (component_record.kind, component_record.name) not in offered
+        ),
+        None,
+    )
 
 
 def differences(kept: tuple[ComponentRecord, ...], now: tuple[ComponentRecord, ...]) -> list[str]:
     """What is another than it was, a phrase each: versions, and sources of the same version."""
     found: dict[str, None] = {}
-    present = {(each.kind, each.name): each for each in now}
+    present = {(component_record.kind, component_record.name): component_record for component_record in now}
     for old in kept:
         new = present.get((old.kind, old.name))
         if new is None or new == old:
@@ -164,7 +171,9 @@ def differences(kept: tuple[ComponentRecord, ...], now: tuple[ComponentRecord, .
 
 def check_poses(system: System, dataset: Dataset, candidates: Indices) -> Dataset | None:
     """Some of the candidates (rows of a dataset) as commands; None where no record has all joints."""
-    names = {wanted.channel for wanted in wanted_channels(system.arms, {}, measured=False)} & set(dataset.channels)
+    names = {requested.channel for requested in requested_channels(system.arms, {}, measured=False)} & set(
+        dataset.channels
+    )
     joints = [f"{arm.name}.{joint}" for arm in system.arms.values() for joint in arm.commanded]
     if not set(joints) <= names:
         return None

@@ -122,7 +122,7 @@ def arm_expression(
         deflection,
         {name: said[name] for name in conditions},
     )
-    found = smooth.state(values, inputs)
+    arm_state = smooth.state(values, inputs)
     return ToolExpression(
         name=arm.name,
         arm=smooth,
@@ -131,9 +131,9 @@ def arm_expression(
         defaults=_defaults(channels, environment),
         record=record,
         state=deflection,
-        next_state=ca.densify(found.next_deflection),
-        base_T_tool=found.base_T_tool,
-        efforts=ca.densify(found.efforts),
+        next_state=ca.densify(arm_state.next_deflection),
+        base_T_tool=arm_state.base_T_tool,
+        efforts=ca.densify(arm_state.efforts),
         servos=servos,
     )
 
@@ -145,7 +145,7 @@ def _load(said: Mapping[str, Expression]) -> Load:
 
 def _without_steps(arm: Arm) -> tuple[Arm, dict[str, tuple[PulseTable, PulseClock]]]:
     stepped = {name: effect for name, effect in arm.effects.items() if isinstance(effect, SteppedEffect)}
-    servos = {arm.joint_names[i]: found for effect in stepped.values() for i, found in effect.servos().items()}
+    servos = {arm.joint_names[i]: servo for effect in stepped.values() for i, servo in effect.servos().items()}
     kept = {name: effect for name, effect in arm.effects.items() if name not in stepped}
     return replace(arm, effects=kept), servos
 

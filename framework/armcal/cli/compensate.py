@@ -128,9 +128,9 @@ def _tell(console: Console, file: TargetFile, assessed: Assessed, bench: Bench, 
 
 
 def _accuracy(found: Any) -> str:
-    told = f"{found['error_mm']:.3g} mm by the calibration's model (at most {found['largest_error_mm']:.3g} mm)"
+    text = f"{found['error_mm']:.3g} mm by the calibration's model (at most {found['largest_error_mm']:.3g} mm)"
     if found["nominal_error_mm"] is not None:
-        told += f"; nominal commands: {found['nominal_error_mm']:.3g} mm"
+        text += f"; nominal commands: {found['nominal_error_mm']:.3g} mm"
     if found["radius_95_mm"] is not None:
-        told += f"; measured places lie within {found['radius_95_mm']:.3g} mm (95 %, median)"
-    return told
+        text += f"; measured places lie within {found['radius_95_mm']:.3g} mm (95 %, median)"
+    return text

@@ -51,14 +51,14 @@ def convert(
     """
     registry = discover()
     console.plugin_faults(registry)
-    found = load_source(source, arm, registry)
-    text, section = _converted(found, target, convention)
-    off = _compared(found, section, target, registry)
-    _tell_left(console, found, target, off)
+    convert_source = load_source(source, arm, registry)
+    text, section = _converted(convert_source, target, convention)
+    off = _compared(convert_source, section, target, registry)
+    _tell_left(console, convert_source, target, off)
     apart = f"{off.position_m:.1e} m in position, {off.angle_rad:.1e} rad in angle"
     said = f"largest difference over {off.poses} poses: {apart}"
     content = {
-        "arm": found.arm,
+        "arm": convert_source.arm,
         "to": target,
         "poses": off.poses,
         "largest_position_m": off.position_m,
@@ -72,15 +72,15 @@ def convert(
         return
     _write(out, source, text)
     console.result({**content, "out": str(out)})
-    console.out.print(f"{found.arm} as {target} written: {out}", markup=False, soft_wrap=True)
+    console.out.print(f"{convert_source.arm} as {target} written: {out}", markup=False, soft_wrap=True)
     console.out.print(said, markup=False, soft_wrap=True)
 
 
-def _converted(found: ConvertSource, target: str, convention: Convention) -> tuple[str, str]:
+def _converted(convert_source: ConvertSource, target: str, convention: Convention) -> tuple[str, str]:
     """What to write, and the section ``model:`` that reads it."""
-    chain = rigid_chain(found.chain)
+    chain = rigid_chain(convert_source.chain)
     if target == "urdf":
-        text = urdf_text(chain, found.arm)
+        text = urdf_text(chain, convert_source.arm)
         return text, _yaml({"type": "urdf", "text": text})
     section = _yaml(poe_section(chain) if target == "poe" else mdh_section(chain, convention))
     return section, section
@@ -91,9 +91,9 @@ def _yaml(section: Mapping[str, Any]) -> str:
     return yaml.safe_dump({"model": section}, sort_keys=False, allow_unicode=True, width=110, default_flow_style=None)
 
 
-def _compared(found: ConvertSource, section: str, target: str, registry: PluginRegistry) -> Difference:
+def _compared(convert_source: ConvertSource, section: str, target: str, registry: PluginRegistry) -> Difference:
     try:
-        off = difference(found.chain, reload(section, registry))
+        off = difference(convert_source.chain, reload(section, registry))
     except PluginError as fault:
         hint = f"Install the plugin that offers the model {target}."
         raise PluginError(f"what would be written cannot be checked: {fault.message}", hint=hint) from fault
@@ -106,16 +106,16 @@ def _compared(found: ConvertSource, section: str, target: str, registry: PluginR
     return off
 
 
-def _tell_left(console: Console, found: ConvertSource, target: str, off: Difference) -> None:
-    left = list(found.left)
-    known = [joint.name for joint in found.chain.joints if joint.limits]
+def _tell_left(console: Console, convert_source: ConvertSource, target: str, off: Difference) -> None:
+    left = list(convert_source.left)
+    known = [joint.name for joint in convert_source.chain.joints if joint.limits]
     if known and target != "urdf":
         left.append(f"limits ({', '.join(known)})")
     if left and not off.same_mount:
         left.append("the mount, about which springs at the base deflect")
     if left:
         console.err.print(f"not converted: {'; '.join(left)}", markup=False, soft_wrap=True)
-    unknown = [joint.name for joint in found.chain.joints if not joint.is_revolute and not joint.limits]
+    unknown = [joint.name for joint in convert_source.chain.joints if not joint.is_revolute and not joint.limits]
     if target == "urdf" and unknown:
         console.warn(f"the travel of {', '.join(unknown)} is not known; the URDF states none.")
 

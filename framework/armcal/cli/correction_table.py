@@ -62,7 +62,7 @@ def correction_table(
     if not with_table.size:
         console.warn("no cell has all its corners: nothing between the nodes could be tried")
         return
-    told = f"between nodes {found['error_mm']:.3g} mm (95 %: {found['error_95_mm']:.3g} mm)"
+    text = f"between nodes {found['error_mm']:.3g} mm (95 %: {found['error_95_mm']:.3g} mm)"
     if found["nominal_error_mm"] is not None:
-        told += f", without the table {found['nominal_error_mm']:.3g} mm"
-    console.out.print(told, markup=False, soft_wrap=True)
+        text += f", without the table {found['nominal_error_mm']:.3g} mm"
+    console.out.print(text, markup=False, soft_wrap=True)

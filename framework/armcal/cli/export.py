@@ -47,12 +47,12 @@ def export(
     _check_place(out, calibration, force)
     loaded = Calibration.load(calibration, registry, accept)
     request = request_of(loaded, arm, out.name)
-    found = exporter.export(request)
-    reach = _reach(loaded, request, found)
-    files = _files(out, found, calibration)
+    exported = exporter.export(request)
+    reach = _reach(loaded, request, exported)
+    files = _files(out, exported, calibration)
     new = {file: content for file, content in files.items() if not _holds(file, content)}
     (write_over if force else write_new)(new)
-    _tell(console, request, found, reach, list(files), kind)
+    _tell(console, request, exported, reach, list(files), kind)
 
 
 def _exporter(registry: PluginRegistry, kind: str, options: tuple[str, ...]) -> Exporter:
@@ -67,11 +67,11 @@ def _exporter(registry: PluginRegistry, kind: str, options: tuple[str, ...]) -> 
     return exporter
 
 
-def _reach(loaded: Calibration, request: ExportRequest, found: Exported) -> float | None:
+def _reach(loaded: Calibration, request: ExportRequest, exported: Exported) -> float | None:
     """How far what is left out moves the tool (m); None where the arm does not settle."""
-    if not found.left_out:
+    if not exported.left_out:
         return 0.0
-    return effects_reach(loaded, request) if found.reach is None else found.reach
+    return effects_reach(loaded, request) if exported.reach is None else exported.reach
 
 
 def _check_place(out: Path, calibration: Path, force: bool) -> None:
@@ -93,10 +93,10 @@ def _not_the_calibration(out: Path, calibration: Path) -> None:
         raise InputError("it is the calibration itself.", where=Location(str(out)), hint="Give another --out.")
 
 
-def _files(out: Path, found: Exported, calibration: Path) -> dict[Path, bytes]:
+def _files(out: Path, exported: Exported, calibration: Path) -> dict[Path, bytes]:
     """Every file to be written, by its path."""
-    files = {out: found.content}
-    for name, content in found.companions.items():
+    files = {out: exported.content}
+    for name, content in exported.companions.items():
         beside = out.with_name(name)
         if beside.is_dir():
             hint = "Move it, or give --out another name."
@@ -116,7 +116,7 @@ def _holds(file: Path, content: bytes) -> bool:
 
 
 def _tell(
-    console: Console, request: ExportRequest, found: Exported, reach: float | None, files: list[Path], kind: str
+    console: Console, request: ExportRequest, exported: Exported, reach: float | None, files: list[Path], kind: str
 ) -> None:
     apart = None if reach is None else reach * 1000
     console.result(
@@ -125,20 +125,21 @@ def _tell(
             "files": [str(file) for file in files],
             "format": kind,
             "arm": request.name,
-            "changed": found.changed,
-            "left_out": list(found.left_out),
+            "changed": exported.changed,
+            "left_out": list(exported.left_out),
             "left_out_mm": apart,
-            "remarks": list(found.remarks),
+            "remarks": list(exported.remarks),
         }
     )
     listed = ", ".join(str(file) for file in files)
-    console.out.print(f"{request.name}: {found.changed} numbers changed: {listed}", markup=False, soft_wrap=True)
-    for remark in found.remarks:
+    console.out.print(f"{request.name}: {exported.changed} numbers changed: {listed}", markup=False, soft_wrap=True)
+    for remark in exported.remarks:
         console.warn(f"{remark}.")
-    if found.left_out:
+    if exported.left_out:
         words = "the calibrated arm does not settle in all poses" if apart is None else _up_to(apart)
         console.warn(
-            f"left out, a {kind} file cannot hold it: {', '.join(found.left_out)} ({words}, in {POSES} random poses)."
+            f"left out, a {kind} file cannot hold it: {', '.join(exported.left_out)} "
+            f"({words}, in {POSES} random poses)."
         )
 
 

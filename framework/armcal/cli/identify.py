@@ -98,10 +98,13 @@ def _content(experiment: Experiment, ready: Prepared, triangle: Array, known: Id
         "scaled_condition": known.condition if np.isfinite(known.condition) else None,
         "observability_of_the_determined": indices,
         "undetermined": [
-            {**_told(each.combination), "cause": each.cause, "priors": list(each.priors)} for each in explained
+            {**_told(undetermined.combination), "cause": undetermined.cause, "priors": list(undetermined.priors)}
+            for undetermined in explained
         ],
-        "held_by_nothing": [_told(each) for each in held_by_nothing(parameters, known)],
-        "hardly_determined": [{**_told(each), "sd_ordinary_sizes": _finite(sd)} for each, sd in known.hardly],
+        "held_by_nothing": [_told(combination) for combination in held_by_nothing(parameters, known)],
+        "hardly_determined": [
+            {**_told(combination), "sd_ordinary_sizes": _finite(sd)} for combination, sd in known.hardly
+        ],
         "correlated": [
             {"one": one, "other": other, "correlation": r}
             for one, other, r in correlated_pairs(covariance, parameters.coordinate_names)
@@ -128,8 +131,8 @@ def _finite(number: float) -> float | None:
 def _minimal_content(found: MinimalSet) -> dict[str, Any]:
     return {
         "kept": list(found.kept),
-        "redundant": [_dropped(each) for each in found.redundant],
-        "left_out": [_dropped(each) for each in found.left_out],
+        "redundant": [_dropped(dropped) for dropped in found.redundant],
+        "left_out": [_dropped(dropped) for dropped in found.left_out],
         "sd_ordinary_sizes": {name: _finite(sd) for name, sd in found.deviations.items()},
     }
 
@@ -147,8 +150,8 @@ def _show(console: Console, content: dict[str, Any]) -> None:
         f"parameters.",
     )
     by_qr = f" ({content['rank_by_qr']} by QR)" if content["rank_by_qr"] != rank else ""
-    told = f", scaled condition {condition:.3g}" if condition is not None else ""
-    _line(console, f"rank {rank} of {free}{by_qr}{told}.")
+    text = f", scaled condition {condition:.3g}" if condition is not None else ""
+    _line(console, f"rank {rank} of {free}{by_qr}{text}.")
     if content["observability_of_the_determined"]:
         shown = ", ".join(f"{n.upper()} {v:.3g}" for n, v in content["observability_of_the_determined"].items())
         _line(
@@ -187,17 +190,17 @@ def _show_undetermined(console: Console, content: dict[str, Any]) -> None:
         )
 
 
-def _show_minimal(console: Console, found: dict[str, Any]) -> None:
-    redundant = [each["text"] for each in found["redundant"]]
+def _show_minimal(console: Console, content: dict[str, Any]) -> None:
+    redundant = [each["text"] for each in content["redundant"]]
     _section(console, f"Not needed, the kept ones do the same ({len(redundant)}):", redundant)
     left_out = [
-        f"{each['name']} ({100 * each['effect_left']:.0f} % of its effect is its own)" for each in found["left_out"]
+        f"{each['name']} ({100 * each['effect_left']:.0f} % of its effect is its own)" for each in content["left_out"]
     ]
     _section(console, f"Left out as asked, though determined ({len(left_out)}):", left_out)
-    within = sorted({name for name, sd in found["sd_ordinary_sizes"].items() if sd is None})
+    within = sorted({name for name, sd in content["sd_ordinary_sizes"].items() if sd is None})
     _section(console, "Kept, and undetermined in part (these need priors):", within)
-    _line(console, f"A minimal set of {len(found['kept'])}:", "bold")
-    for text in ("parameters:", "  free:", *(f"    - {name}" for name in found["kept"])):
+    _line(console, f"A minimal set of {len(content['kept'])}:", "bold")
+    for text in ("parameters:", "  free:", *(f"    - {name}" for name in content["kept"])):
         _line(console, text)
 
 

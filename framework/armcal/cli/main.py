@@ -112,8 +112,8 @@ def _plugin_commands() -> dict[str, tuple[str, str]]:
     """
     registry = discover()
     names = dict.fromkeys(c.name for c in registry.components if c.kind == "command" and c.name not in COMMANDS)
-    found = [registry.find("command", name) for name in names]
-    return {command.name: (command.target, command.summary) for command in found}
+    components = [registry.find("command", name) for name in names]
+    return {command.name: (command.target, command.summary) for command in components}
 
 
 @click.command(cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})
@@ -154,13 +154,13 @@ def main() -> None:
 def _global_first(args: list[str]) -> list[str]:
     """The same arguments, those about plugins before the others; what stands after ``--`` stays."""
     first, rest, waiting = list[str](), list[str](), iter(args)
-    for each in waiting:
-        if each == "--":
-            rest += [each, *waiting]
-        elif each in _GLOBAL:
-            first += [each, *itertools.islice(waiting, 1)]
+    for text in waiting:
+        if text == "--":
+            rest += [text, *waiting]
+        elif text in _GLOBAL:
+            first += [text, *itertools.islice(waiting, 1)]
         else:
-            (first if each.startswith(tuple(f"{name}=" for name in _GLOBAL)) else rest).append(each)
+            (first if text.startswith(tuple(f"{name}=" for name in _GLOBAL)) else rest).append(text)
     return first + rest
 
 
@@ -191,9 +191,9 @@ def _missing(fault: ImportError) -> ArmcalError:
     absent = isinstance(fault, ModuleNotFoundError)
     if (fault.name or ("armcal" if absent else "")).partition(".")[0] == "armcal":
         raise fault
-    found = f"the library {fault.name} is missing." if absent else f"a library cannot be loaded ({fault})."
+    text = f"the library {fault.name} is missing." if absent else f"a library cannot be loaded ({fault})."
     return ArmcalError(
-        found, hint="Install armcal anew with all it needs: pip install armcal. `armcal doctor` names what is broken."
+        text, hint="Install armcal anew with all it needs: pip install armcal. `armcal doctor` names what is broken."
     )
 
 

@@ -36,8 +36,12 @@ def new_plugin(console: Console, name: str, kind: str, package: bool, out: Path 
         console.detail(str(folder / file))
     check = f"armcal plugins check {chosen} -v"
     after = ("pip install -e '.[test]'", check, "pytest") if package else (f"{check} --plugin {chosen}.py", "pytest")
-    told = (f"the {kind} {chosen}: {len(files)} files in {folder}", "next, in that folder:", *(f"  {c}" for c in after))
-    for text in told:
+    texts = (
+        f"the {kind} {chosen}: {len(files)} files in {folder}",
+        "next, in that folder:",
+        *(f"  {c}" for c in after),
+    )
+    for text in texts:
         console.out.print(text, markup=False, soft_wrap=True)
 
 

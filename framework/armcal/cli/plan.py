@@ -60,8 +60,8 @@ def plan(console: Console, config: Path, count: int, out: Path, overrides: tuple
 
 def _check_out(out: Path) -> None:
     if out.is_dir() or not out.absolute().parent.is_dir():
-        found = "it is a directory" if out.is_dir() else "its directory is not there"
-        raise ConfigError(f"--out {out}: {found}.", hint="Give the path of a CSV in a directory that is there.")
+        text = "it is a directory" if out.is_dir() else "its directory is not there"
+        raise ConfigError(f"--out {out}: {text}.", hint="Give the path of a CSV in a directory that is there.")
 
 
 def _content(experiment: Experiment, result: PlanResult) -> dict[str, Any]:

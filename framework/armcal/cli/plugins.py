@@ -146,10 +146,10 @@ def _reports(registry: PluginRegistry, name: str | None) -> Sequence[_Report]:
         known = ", ".join(p.name for p in registry.plugins)
         raise PluginError(f"no plugin is called {name!r}.", hint=f"Installed: {known}.")
     reports = []
-    for each in names:
-        chosen = tuple(plugin for plugin in registry.plugins if plugin.name == each)
+    for text in names:
+        chosen = tuple(plugin for plugin in registry.plugins if plugin.name == text)
         results = [result for plugin in chosen for result in checks_of(plugin, registry)]
-        reports.append(_Report(each, chosen, tuple(results)))
+        reports.append(_Report(text, chosen, tuple(results)))
     return reports
 
 

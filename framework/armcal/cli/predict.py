@@ -23,7 +23,7 @@ from armcal.errors import DataError, InputError, Location
 from armcal.io.plain_files import input_file
 from armcal.measure.csv_writer import column_names, write_csv
 from armcal.measure.environment import noticed
-from armcal.measure.reader import ReadRequest, WantedChannel, wanted_channels
+from armcal.measure.reader import ReadRequest, RequestedChannel, requested_channels
 from armcal.plugins import PluginRegistry, discover
 
 _MOST_BYTES, _LONGEST_HEADER = 1 << 31, 1 << 20
@@ -55,25 +55,25 @@ def predict(
     commands = read_commands(registry, loaded, poses, columns)
     _tell_missing(console, loaded, commands, recording)
     channels, placed = loaded.predict(commands)
-    found = None
+    plus_minus = None
     if not loaded.readable:
         channels = _tools(placed, tuple(system.arms))
     elif loaded.record.prediction is None:
         console.warn("the calibration keeps nothing about the errors of predictions: run it again to have them.")
     else:
-        found = loaded.plus_minus(commands, _RECORDINGS[recording])
-        channels = {name: values + found.shift.get(name, 0.0) for name, values in channels.items()}
-        if unknown := [name for name in channels if not np.isfinite(found.half_widths.get(name, np.nan)).any()]:
+        plus_minus = loaded.plus_minus(commands, _RECORDINGS[recording])
+        channels = {name: values + plus_minus.shift.get(name, 0.0) for name, values in channels.items()}
+        if unknown := [name for name in channels if not np.isfinite(plus_minus.half_widths.get(name, np.nan)).any()]:
             console.warn(f"how far {', '.join(unknown)} may be off is not known: no residual determines it.")
     if out.resolve() == poses.resolve():
         raise DataError("it is the file of poses itself.", where=Location(str(out)), hint="Give another --out.")
-    wanted = wanted_channels(system.arms, loaded.readable, measured=False)
+    wanted = requested_channels(system.arms, loaded.readable, measured=False)
     if not loaded.readable:
         wanted = (*wanted, *_tool_channels(tuple(system.arms)))
     shown = [channel for channel in wanted if channel.channel in channels]
-    extra, medians = (_columns(found, shown), _medians(found, shown)) if found else ({}, {})
+    extra, medians = (_columns(plus_minus, shown), _medians(plus_minus, shown)) if plus_minus else ({}, {})
     write_csv(out, replace(commands, channels=channels, extra=extra), shown)
-    _report(console, commands, out, recording, found, medians)
+    _report(console, commands, out, recording, plus_minus, medians)
 
 
 def _report(
@@ -81,7 +81,7 @@ def _report(
     commands: Dataset,
     out: Path,
     recording: str,
-    found: PlusMinus | None,
+    plus_minus: PlusMinus | None,
     medians: Mapping[str, float],
 ) -> None:
     console.result(
@@ -90,12 +90,12 @@ def _report(
             "set_aside": len(commands.set_aside),
             "out": str(out),
             "recording": recording,
-            **_typical(found),
+            **_typical(plus_minus),
             "half_width_90": medians,
         }
     )
     console.out.print(f"{len(commands)} poses predicted: {out}", markup=False)
-    _show_typical(console, _typical(found), medians)
+    _show_typical(console, _typical(plus_minus), medians)
 
 
 def _show_typical(console: Console, typical: Mapping[str, Any], medians: Mapping[str, float]) -> None:
@@ -121,25 +121,25 @@ def _tools(placed: Array, arms: Sequence[str]) -> dict[str, Array]:
     return channels
 
 
-def _tool_channels(arms: Sequence[str]) -> Iterator[WantedChannel]:
+def _tool_channels(arms: Sequence[str]) -> Iterator[RequestedChannel]:
     for arm in arms:
         names = [(f"tool_{axis}", "length") for axis in "xyz"] + [(f"tool_q{axis}", DIMENSIONLESS) for axis in "wxyz"]
         for name, dimension in names:
             own = f"{arm}.{name}"
-            yield WantedChannel(own, (own, name) if len(arms) == 1 else (own,), dimension, required=False)
+            yield RequestedChannel(own, (own, name) if len(arms) == 1 else (own,), dimension, required=False)
 
 
 def read_commands(registry: PluginRegistry, loaded: Calibration, poses: Path, columns: Sequence[str]) -> Dataset:
     """The commands. Measured columns, if there are any, are not read: every row gets its prediction."""
     arms = loaded.system.arms
-    wanted = wanted_channels(arms, {}, measured=False)
+    wanted = requested_channels(arms, {}, measured=False)
     reader_class = registry.find("reader", "csv").load()
     named = {**_kept(loaded, poses, wanted), **_given(columns)}
     reader = reader_class(reader_class.Settings(path=ConfigText(str(poses)), columns=named))
     return noticed(reader.read(ReadRequest(arms, {}, wanted)))
 
 
-def _kept(loaded: Calibration, poses: Path, wanted: Sequence[WantedChannel]) -> dict[str, str]:
+def _kept(loaded: Calibration, poses: Path, wanted: Sequence[RequestedChannel]) -> dict[str, str]:
     """What the calibration's data called the columns that a prediction uses, as far as the file has them."""
     kept = loaded.record.prediction
     used = {name for channel in wanted for name in channel.columns}
@@ -190,21 +190,23 @@ def _tell_missing(console: Console, loaded: Calibration, commands: Dataset, reco
         console.warn(f"{text}; if they belong to it, say --recording calibrated.")
 
 
-def _columns(found: PlusMinus, shown: Sequence[WantedChannel]) -> dict[str, tuple[str, ...]]:
+def _columns(plus_minus: PlusMinus, shown: Sequence[RequestedChannel]) -> dict[str, tuple[str, ...]]:
     """Half widths of 90 % intervals beside each channel, and 95 % radii in mm."""
     columns = {}
     for channel, (column, unit) in column_names(shown).items():
-        if channel in found.half_widths:
-            columns[f"plus_minus_{column}"] = _texts(to_unit(found.half_widths[channel], unit))
-    for name, radius in found.radii.items():
-        columns["radius95_mm" if len(found.radii) == 1 else f"{name}.radius95_mm"] = _texts(to_unit(radius, "mm"))
+        if channel in plus_minus.half_widths:
+            columns[f"plus_minus_{column}"] = _texts(to_unit(plus_minus.half_widths[channel], unit))
+    for name, radius in plus_minus.radii.items():
+        columns["radius95_mm" if len(plus_minus.radii) == 1 else f"{name}.radius95_mm"] = _texts(to_unit(radius, "mm"))
     return columns
 
 
-def _medians(found: PlusMinus, shown: Sequence[WantedChannel]) -> dict[str, float]:
+def _medians(plus_minus: PlusMinus, shown: Sequence[RequestedChannel]) -> dict[str, float]:
     """Half widths of 90 % intervals by column, in its unit: medians over the poses."""
     columns = column_names(shown).items()
-    half = {column: to_unit(found.half_widths[c], unit) for c, (column, unit) in columns if c in found.half_widths}
+    half = {
+        column: to_unit(plus_minus.half_widths[c], unit) for c, (column, unit) in columns if c in plus_minus.half_widths
+    }
     return {column: float(np.nanmedian(each)) for column, each in half.items() if np.isfinite(each).any()}
 
 
@@ -212,12 +214,12 @@ def _texts(values: Array) -> tuple[str, ...]:
     return tuple(f"{value:.6g}" if np.isfinite(value) else "" for value in values.tolist())
 
 
-def _typical(found: PlusMinus | None) -> dict[str, Any]:
+def _typical(plus_minus: PlusMinus | None) -> dict[str, Any]:
     """Medians over the poses (mm)."""
-    if found is None or not found.radii:
+    if plus_minus is None or not plus_minus.radii:
         return {}
-    half = [found.half_widths[f"{name}.{axis}"] for name in found.radii for axis in "xyz"]
+    half = [plus_minus.half_widths[f"{name}.{axis}"] for name in plus_minus.radii for axis in "xyz"]
     return {
         "half_width_90_mm": float(np.median(np.concatenate(half))) * 1000,
-        "radius_95_mm": float(np.median(np.concatenate(list(found.radii.values())))) * 1000,
+        "radius_95_mm": float(np.median(np.concatenate(list(plus_minus.radii.values())))) * 1000,
     }

@@ -139,10 +139,10 @@ def _ask(
     """A number, in SI; asked in ``unit``, and taken in another one that is written behind it."""
 
     def read(text: Any) -> float:
-        found = _quantity(str(text), unit, dimension)
-        if found < lowest or (above is not None and found <= above):
+        quantity = _quantity(str(text), unit, dimension)
+        if quantity < lowest or (above is not None and quantity <= above):
             raise click.BadParameter(f"found {text}, expected more.")
-        return found
+        return quantity
 
     return float(click.prompt(f"{words}, {unit}", default=str(default), value_proc=read))
 

@@ -134,16 +134,16 @@ def _matrices(result: RunResult) -> Table:
     return table
 
 
-def _bootstrap(result: RunResult, found: Bootstrap) -> Table:
+def _bootstrap(result: RunResult, bootstrap: Bootstrap) -> Table:
     """How sure each parameter is, in SI, by curvature and by refits."""
-    how = f"blocks of {found.block}" if found.method == "blocks" else "parametric"
-    failed = f", {found.failed} more did not converge" if found.failed else ""
-    table = Table(title=f"Bootstrap, {len(found.values)} refits{failed}; {how}", title_justify="left")
+    how = f"blocks of {bootstrap.block}" if bootstrap.method == "blocks" else "parametric"
+    failed = f", {bootstrap.failed} more did not converge" if bootstrap.failed else ""
+    table = Table(title=f"Bootstrap, {len(bootstrap.values)} refits{failed}; {how}", title_justify="left")
     for column in ("parameter", "value", "sd", "bootstrap sd", "bootstrap 95 % interval"):
         table.add_column(column, justify="left" if column == "parameter" else "right")
     estimate = result.estimate
-    for i, name in enumerate(found.names):
-        sd, low, high = (float(x) for x in (found.deviations[i], *found.intervals[i]))
+    for i, name in enumerate(bootstrap.names):
+        sd, low, high = (float(x) for x in (bootstrap.deviations[i], *bootstrap.intervals[i]))
         digits = decimals_for(sd) or 5
         numbers = [estimate.values[estimate.free_entries[i]], estimate.deviations[i], sd]
         table.add_row(name, *(f"{x:.{digits}f}" for x in numbers), f"{low:.{digits}f} to {high:.{digits}f}")

@@ -165,18 +165,18 @@ class ServoFile:
         for name, board in self.boards.items():
             first = addresses.setdefault(board.address, name)
             if first != name:
-                found = f"found 0x{board.address:02x}, the address of the board {first!r} too, expected its own"
-                raise ServoFileError(found, ("boards", name, "address"))
+                text = f"found 0x{board.address:02x}, the address of the board {first!r} too, expected its own"
+                raise ServoFileError(text, ("boards", name, "address"))
         channels: dict[tuple[str, int], str] = {}
         for joint, servo in self.servos.items():
             if servo.board not in self.boards:
                 known = ", ".join(self.boards) or "none"
-                found = f"found the board {str(servo.board)!r}, expected one of the boards: {known}"
-                raise ServoFileError(found, ("servos", joint, "board"))
+                text = f"found the board {str(servo.board)!r}, expected one of the boards: {known}"
+                raise ServoFileError(text, ("servos", joint, "board"))
             first = channels.setdefault((servo.board, servo.channel), joint)
             if first != joint:
-                found = f"found channel {servo.channel}, which {first!r} has, expected its own"
-                raise ServoFileError(found, ("servos", joint, "channel"))
+                text = f"found channel {servo.channel}, which {first!r} has, expected its own"
+                raise ServoFileError(text, ("servos", joint, "channel"))
             try:
                 _check_borne(servo, self.boards[servo.board].clock)
                 _check_longest(servo.table, self.boards[servo.board].clock)

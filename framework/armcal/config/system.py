@@ -263,8 +263,8 @@ def _part_names(source: ConfigSource, at: Path, kind: str, names: Collection[str
     for name in names:
         where = source.where((*at, name))
         if not FIT_NAME.fullmatch(name) or not name.isprintable():
-            found = f"found the {kind} name {name!r}, expected letters, digits, underscores and dashes."
-            raise ConfigError(found, where=where, hint="It becomes a part of parameters' names; patterns address them.")
+            text = f"found the {kind} name {name!r}, expected letters, digits, underscores and dashes."
+            raise ConfigError(text, where=where, hint="It becomes a part of parameters' names; patterns address them.")
         if name in taken or list(names).count(name) > 1:
             raise ConfigError(f"found the {kind} name {name!r}, which is taken.", where=where, hint="Rename one.")
 

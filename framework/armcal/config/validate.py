@@ -146,9 +146,9 @@ def _explained(made: _Finding, error: Mapping[str, Any]) -> _Finding:
         return replace(made, expected=expected, mend=mend)
     if made.kind == "union_tag_invalid":
         tags = str(context.get("expected_tags"))
-        found = f"the {context.get('discriminator')} {context.get('tag')!r}"
+        text = f"the {context.get('discriminator')} {context.get('tag')!r}"
         mend = _nearest(context.get("tag"), tags)
-        return replace(made, found=found, expected=f"one of {tags}", mend=mend)
+        return replace(made, found=text, expected=f"one of {tags}", mend=mend)
     if made.kind == "union_tag_not_found":
         key = str(context.get("discriminator")).strip("'")
         return replace(made, message=f"found nothing, expected the key {key!r}: write '{key}: ...'.")
@@ -209,9 +209,9 @@ def _is_other_type(finding: _Finding) -> bool:
 
 
 def _merged(same: Sequence[_Finding]) -> Iterable[_Finding]:
-    told = list({f.message: f for f in same if f.message}.values())
-    if told or len(same) == 1:
-        return told or same
+    findings = list({f.message: f for f in same if f.message}.values())
+    if findings or len(same) == 1:
+        return findings or same
     expected = " or ".join(dict.fromkeys(f.expected for f in same))
     mends = list(dict.fromkeys(f.mend for f in same))
     return [replace(same[0], expected=expected, mend=mends[0] if len(mends) == 1 else "write one of these")]

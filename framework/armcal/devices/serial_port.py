@@ -138,16 +138,16 @@ class SerialPort:
         """The port's path now, and the adapter's serial number."""
         from serial.tools import list_ports
 
-        wanted = self._settings.serial_number
+        text = self._settings.serial_number
         if self._settings.port is not None:
             path = str(self._settings.port)
             actual = os.path.realpath(path)
             numbers = [port.serial_number for port in list_ports.comports() if os.path.realpath(port.device) == actual]
             return path, (numbers[0] or "") if numbers else ""
         ports = list_ports.comports()
-        found = [port.device for port in ports if port.serial_number == wanted]
+        found = [port.device for port in ports if port.serial_number == text]
         if len(found) == 1:
-            return str(found[0]), str(wanted)
+            return str(found[0]), str(text)
         if not found and self._was_open:
             self._lose("no adapter with this serial number is plugged in")
         seen = ", ".join(f"{port.device} ({port.serial_number})" for port in ports if port.serial_number)

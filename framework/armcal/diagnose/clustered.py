@@ -41,7 +41,7 @@ def widened(
         estimate: what it found.
         position: how many of all records were recorded before each (N).
     """
-    taking_part = np.any([each.weight[: each.count] > 0 for each in records], axis=0)
+    taking_part = np.any([record.weight[: record.count] > 0 for record in records], axis=0)
     chosen = np.flatnonzero(taking_part)
     chosen = chosen[np.argsort(position[chosen], kind="stable")][:_MOST_RECORDS]
     if len(chosen) < FEWEST_RECORDS or not estimate.names or not estimate.verdict.converged:

@@ -147,9 +147,11 @@ def level_name(level: float) -> str:
 
 def predictor(problem: Problem, fitted: WeighedFit) -> Predictor:
     """What a fit predicts."""
-    found = fitted.estimate
-    drift = KnownDrift.by(problem, found.values, fitted.records)
-    return Predictor(problem, found.values, found.covariance, found.noise_scale, found.degrees_of_freedom, drift)
+    estimate = fitted.estimate
+    drift = KnownDrift.by(problem, estimate.values, fitted.records)
+    return Predictor(
+        problem, estimate.values, estimate.covariance, estimate.noise_scale, estimate.degrees_of_freedom, drift
+    )
 
 
 def missed(by: Predictor, held: Sequence[FactorRecords]) -> dict[Recording, LargeErrors]:
@@ -158,7 +160,10 @@ def missed(by: Predictor, held: Sequence[FactorRecords]) -> dict[Recording, Larg
     if by.drifts:
         found["new"] = by.problem.residuals(by.values, held)
     return {
-        name: tuple(np.where(each.measured, own, np.nan) for each, own in zip(held, large_errors, strict=True))
+        name: tuple(
+            np.where(factor_records.measured, own, np.nan)
+            for factor_records, own in zip(held, large_errors, strict=True)
+        )
         for name, large_errors in found.items()
     }
 

@@ -99,26 +99,26 @@ def worse_than_nominal(judged_mm: Array, nominal_mm: Array, unit: str = _MM) -> 
     return [Finding("bad", f"Worse than the nominal arm {which}", test, action)]
 
 
-def structure_findings(found: ResidualStructure | None, unit: str = _MM) -> list[Finding]:
+def structure_findings(structure: ResidualStructure | None, unit: str = _MM) -> list[Finding]:
     """What residuals still depend on."""
-    if found is None:
+    if structure is None:
         return []
-    test = _test_of(found)
-    kept = found.worthwhile
-    findings = [_structure_finding(s, found, unit, test) for s in kept] + _unlisted(found)
+    test = _test_of(structure)
+    kept = structure.worthwhile
+    findings = [_structure_finding(s, structure, unit, test) for s in kept] + _unlisted(structure)
     if not findings:
-        slight = f" {_plural(len(found.structures), 'dependence', 'dependences')} found would not lower it by 1 %."
-        text = f"Of {found.tested} things that residuals might depend on none explains the error left."
-        findings.append(Finding("good", text + (slight if found.structures else ""), test))
-    if kept and found.more:
+        slight = f" {_plural(len(structure.structures), 'dependence', 'dependences')} found would not lower it by 1 %."
+        text = f"Of {structure.tested} things that residuals might depend on none explains the error left."
+        findings.append(Finding("good", text + (slight if structure.structures else ""), test))
+    if kept and structure.more:
         text = "Residuals depend on more than these; model them first, then look again."
         findings.append(Finding("note", text, test))
-    return [*findings, *_scatter(found)]
+    return [*findings, *_scatter(structure)]
 
 
-def _structure_finding(s: Structure, found: ResidualStructure, unit: str, test: str) -> Finding:
+def _structure_finding(s: Structure, structure: ResidualStructure, unit: str, test: str) -> Finding:
     """One cause if it is clearly the likeliest, else all that it does not beat."""
-    falls = f"the mean training residual of {found.mean_mm:.2f} {unit} would fall by {s.falls_mm:.2f} {unit}"
+    falls = f"the mean training residual of {structure.mean_mm:.2f} {unit} would fall by {s.falls_mm:.2f} {unit}"
     what = s.words + (f" ({s.size})" if s.size else "")
     test = f"p {_p(s.p_value)}, {test}; odds among all of them and what is none of them"
     if not s.alternatives:
@@ -138,19 +138,21 @@ def _share(odds: float) -> str:
     return "over 99 %" if odds > 0.99 else "less than 1 %" if odds < 0.01 else f"{100 * odds:.0f} %"
 
 
-def _unlisted(found: ResidualStructure) -> list[Finding]:
+def _unlisted(structure: ResidualStructure) -> list[Finding]:
     """What follows the pose, and is none of the causes; those that may stand for it say so themselves."""
-    if found.unlisted <= CLEAR or any(UNLISTED in s.alternatives for s in found.worthwhile):
+    if structure.unlisted <= CLEAR or any(UNLISTED in s.alternatives for s in structure.worthwhile):
         return []
-    text = f"Residuals follow the pose smoothly in a way that none of the {found.tested} causes tried explains: the "
+    text = (
+        f"Residuals follow the pose smoothly in a way that none of the {structure.tested} causes tried explains: the "
+    )
     text += "model lacks something that is not among them."
     test = f"marginal likelihood of a Gaussian process over the poses, odds of {np.exp(CLEAR):.0f} to 1"
     return [Finding("warning", text, test, "Free more of the geometry; repeat some poses with a second payload.")]
 
 
-def _scatter(found: ResidualStructure) -> list[Finding]:
+def _scatter(structure: ResidualStructure) -> list[Finding]:
     """What the size of residuals depends on."""
-    noise = found.noise
+    noise = structure.noise
     if noise is None:
         return []
     text = f"The scatter of the residuals depends on {'; or on '.join([noise.words, *noise.alternatives[:MOST_TOLD]])}:"
@@ -163,24 +165,24 @@ def _scatter(found: ResidualStructure) -> list[Finding]:
     return [Finding("warning", text, test, action)]
 
 
-def _test_of(found: ResidualStructure) -> str:
-    blocks = f", blocks of {found.block} records" if found.block > 1 else ""
-    level = f"{100 * found.level:g} % over all {found.tested} dependences{blocks}"
+def _test_of(structure: ResidualStructure) -> str:
+    blocks = f", blocks of {structure.block} records" if structure.block > 1 else ""
+    level = f"{100 * structure.level:g} % over all {structure.tested} dependences{blocks}"
     return f"score test, {level}, and likelier than chance"
 
 
-def neighbour_findings(found: ResidualStructure | None, estimate: Estimate, unit: str = _MM) -> list[Finding]:
+def neighbour_findings(structure: ResidualStructure | None, estimate: Estimate, unit: str = _MM) -> list[Finding]:
     """Whether records that follow one another miss alike, why, and whether that made intervals wider."""
-    if found is None:
+    if structure is None:
         return []
-    test = f"lag-one correlation, {100 * found.level:g} % over all dependences and this"
-    if found.lag_p > found.level:
+    test = f"lag-one correlation, {100 * structure.level:g} % over all dependences and this"
+    if structure.lag_p > structure.level:
         return [Finding("good", "Residuals of neighbouring records do not correlate.", test)]
-    text = f"Residuals of neighbouring records correlate by {found.lag_one:.2f}"
-    if found.lag_after_p > found.level:
+    text = f"Residuals of neighbouring records correlate by {structure.lag_one:.2f}"
+    if structure.lag_after_p > structure.level:
         return [Finding("note", f"{text}; what was found above explains it.", test)]
-    after = f", by {found.lag_after:.2f} still beside what was found" if found.structures else ""
-    why, cause = ("", "open") if found.alike is None else (f" {_why(found.alike, unit)}", found.alike.cause)
+    after = f", by {structure.lag_after:.2f} still beside what was found" if structure.structures else ""
+    why, cause = ("", "open") if structure.alike is None else (f" {_why(structure.alike, unit)}", structure.alike.cause)
     text += f"{after}: they are no noise. {what_neighbours_cost(estimate)}{why}"
     return [Finding("warning", text, test, _TELL_APART[cause])]
 
@@ -220,21 +222,22 @@ def _why(alike: TimeOrPose, unit: str) -> str:
     return text + "."
 
 
-def large_error_findings(found: LargeErrors | None, unit: str = _MM) -> list[Finding]:
+def large_error_findings(large_errors: LargeErrors | None, unit: str = _MM) -> list[Finding]:
     """Records beyond the limit, each with what is unusual about it."""
-    if found is None:
+    if large_errors is None:
         return []
-    limit = "validation.limit_mm" if found.configured else f"{MEDIANS:g} times the median"
-    test = f"errors of {found.judged} records by fits that did not see them, limit {limit}"
-    if not found.beyond:
-        return [Finding("good", f"No judged record is missed by more than {found.limit_mm:.2f} {unit}.", test)]
+    limit = "validation.limit_mm" if large_errors.configured else f"{MEDIANS:g} times the median"
+    test = f"errors of {large_errors.judged} records by fits that did not see them, limit {limit}"
+    if not large_errors.beyond:
+        return [Finding("good", f"No judged record is missed by more than {large_errors.limit_mm:.2f} {unit}.", test)]
     listed = "; ".join(
         f"{miss.record_id} ({miss.error_mm:.2f} {unit}: {', '.join(miss.reasons)})"
-        for miss in found.explained[:MOST_TOLD]
+        for miss in large_errors.explained[:MOST_TOLD]
     )
-    more = f"; and {found.beyond - MOST_TOLD} more, in the report" if found.beyond > MOST_TOLD else ""
-    text = f"{_plural(found.beyond, 'record is', 'records are')} missed by more than {found.limit_mm:.2f} {unit}: "
-    advice = _shared_advice([miss.advice for miss in found.explained[:MOST_TOLD]])
+    more = f"; and {large_errors.beyond - MOST_TOLD} more, in the report" if large_errors.beyond > MOST_TOLD else ""
+    records = _plural(large_errors.beyond, "record is", "records are")
+    text = f"{records} missed by more than {large_errors.limit_mm:.2f} {unit}: "
+    advice = _shared_advice([miss.advice for miss in large_errors.explained[:MOST_TOLD]])
     return [Finding("warning", f"{text}{listed}{more}.", test, advice)]
 
 

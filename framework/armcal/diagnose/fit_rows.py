@@ -60,7 +60,7 @@ class FitRows:
             np.concatenate([*data, moved[held], drift]),
             np.tile(np.arange(count), sum(sizes)),
             numbers.T,
-            tuple(_whitening(k.factor.noise, each) for k, each in zip(problem.kernels, records, strict=True)),
+            tuple(_whitening(k.factor.noise, record) for k, record in zip(problem.kernels, records, strict=True)),
         )
 
     def columns(self, raw: Sequence[Array]) -> Array:
@@ -98,11 +98,11 @@ class FitRows:
 def _by_factor(problem: Problem, values: Array, records: Sequence[FactorRecords]) -> list[Array]:
     """Whitened, weighted Jacobians by free entries, one (n_r x n_v x N) a factor."""
     blocks, whole = problem.jacobians(values, records), []
-    for each in records:
+    for record in records:
         parts: list[Array] = []
-        while sum(part.shape[2] for part in parts) < each.record.shape[1]:
+        while sum(part.shape[2] for part in parts) < record.record.shape[1]:
             parts.append(next(blocks))
-        whole.append(np.concatenate(parts, axis=2)[:, :, : each.count])
+        whole.append(np.concatenate(parts, axis=2)[:, :, : record.count])
     return whole
 
 

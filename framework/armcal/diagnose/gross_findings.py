@@ -56,21 +56,21 @@ def gross_error(
     return [Finding("bad", text, test, f"The cause is not known. {CHECK_THE_DATA}")]
 
 
-def contradicting(found: Minority | None, ids: Sequence[str]) -> list[Finding]:
+def contradicting(minority: Minority | None, ids: Sequence[str]) -> list[Finding]:
     """Records that contradict the others; ``ids`` are those of the records looked at, in the order of the fit."""
-    if found is None:
+    if minority is None:
         return []
-    count, total = len(found.far), len(ids)
+    count, total = len(minority.far), len(ids)
     text = (
         f"{count} of {total} training records ({100 * count / total:.0f} %) contradict the others: a fit to the "
-        f"majority is off by {found.typical_mm:.2g} mm there, and by {found.far_mm:.3g} mm in these"
+        f"majority is off by {minority.typical_mm:.2g} mm there, and by {minority.far_mm:.3g} mm in these"
     )
-    listed = f"{', '.join(ids[i] for i in found.far[:MOST_NAMED])}{', ...' if count > MOST_NAMED else ''}"
+    listed = f"{', '.join(ids[i] for i in minority.far[:MOST_NAMED])}{', ...' if count > MOST_NAMED else ''}"
     test = "sum of residual lengths minimised; far is beyond 8 times the lower quartile"
-    if found.since is None:
+    if minority.since is None:
         action = f"Find out what is different about them ({listed}): units, joints, the target, reflections."
         return [Finding("bad", f"{text}.", test, action)]
-    text += f": nearly all from record {ids[found.far[0]]} on"
+    text += f": nearly all from record {ids[minority.far[0]]} on"
     action = "Something moved there, or slipped: the base, the tracker, the target or a joint. Measure again, or split."
     return [Finding("bad", f"{text}.", test, action)]
 
@@ -88,10 +88,12 @@ def size_findings(figure: Figure) -> list[Finding]:
 
 def displacement_findings(figure: Figure) -> list[Finding]:
     """Parameters that contradict their priors, or are implausibly far from their nominal values."""
-    geometry = [each for each in figure.displaced if each.by_prior or not each.placement]
-    gross = [each for each in geometry if each.times > FAR_BEYOND]
-    beyond = [each for each in geometry if each.times <= FAR_BEYOND]
-    elsewhere = [each for each in figure.displaced if each not in geometry and each.times > FAR_BEYOND]
+    geometry = [displaced for displaced in figure.displaced if displaced.by_prior or not displaced.placement]
+    gross = [displaced for displaced in geometry if displaced.times > FAR_BEYOND]
+    beyond = [displaced for displaced in geometry if displaced.times <= FAR_BEYOND]
+    elsewhere = [
+        displaced for displaced in figure.displaced if displaced not in geometry and displaced.times > FAR_BEYOND
+    ]
     test = f"limits {BEYOND:g} and {FAR_BEYOND:g} standard deviations of the prior, or typical corrections"
     action = "If the arm is so, correct the nominal values; else look for a joint's zero, sign, or unit."
     findings = []
@@ -114,9 +116,9 @@ def _listed(group: Sequence[Displaced]) -> str:
     return f"{', '.join(map(_displacement, group[:MOST_NAMED]))}{more}"
 
 
-def _displacement(each: Displaced) -> str:
-    measure = "its prior" if each.by_prior else "a typical correction"
-    return f"{each.name} by {each.amount:.3g} {each.unit} ({each.times:.0f} times {measure})"
+def _displacement(displaced: Displaced) -> str:
+    measure = "its prior" if displaced.by_prior else "a typical correction"
+    return f"{displaced.name} by {displaced.amount:.3g} {displaced.unit} ({displaced.times:.0f} times {measure})"
 
 
 def limit_findings(figure: Figure, scale_sd: float | None) -> list[Finding]:

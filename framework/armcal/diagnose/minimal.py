@@ -129,11 +129,11 @@ def _described(
         vector[i], vector[inside] = 1.0, -imitation[:, i]
         left, length = float(np.linalg.norm(columns @ vector)), float(np.linalg.norm(columns[:, i]))
         share = left / length if length > tolerance else 0.0
-        told = named(np.where(np.arange(len(names)) == i, 0.0, vector), names, measures, _NAMED)
+        combination = named(np.where(np.arange(len(names)) == i, 0.0, vector), names, measures, _NAMED)
         own = named(np.eye(len(names))[i], names, measures, _NAMED)
         whole = Combination(
-            own.terms + tuple((n, float(vector[names.index(n)])) for n in told.names if length > tolerance),
-            own.measures + tuple(m for m in told.measures if length > tolerance),
+            own.terms + tuple((n, float(vector[names.index(n)])) for n in combination.names if length > tolerance),
+            own.measures + tuple(m for m in combination.measures if length > tolerance),
         )
         dropped = Dropped(names[i], whole, share)
         (left_out if left > max(tolerance, _NEW * length) else redundant).append(dropped)

@@ -45,11 +45,11 @@ def moved_groups(problem: Problem, values: Array, records: Sequence[FactorRecord
     """Groups among weighted records that seem to have moved once, by the split that tells most."""
     found, plan = [], problem.blueprint
     residuals = problem.residuals(values, records)
-    for kernel, each, residual in zip(problem.kernels, records, residuals, strict=True):
-        if each.group is None:
+    for kernel, record, residual in zip(problem.kernels, records, residuals, strict=True):
+        if record.group is None:
             continue
         lengths = np.array([dimension == "length" for dimension in kernel.factor.dimensions], dtype=bool)
-        group, weighted = each.group[: each.count], each.weight[: each.count] > 0
+        group, weighted = record.group[: record.count], record.weight[: record.count] > 0
         for number in np.unique(group[weighted & (group >= 0)]):
             own = residual[lengths][:, weighted & (group == number)]
             if own.shape[1] >= FEWEST and lengths.any():

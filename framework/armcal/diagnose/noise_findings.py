@@ -57,10 +57,10 @@ def _distance(suspect: Suspect) -> str:
     return f"{suspect.distance:.1f} sd{weight}"
 
 
-def component_findings(found: VarianceComponents) -> list[Finding]:
+def component_findings(variance_components: VarianceComponents) -> list[Finding]:
     """Is it the tracker or the model?"""
-    joints = found.share("joint")
-    parts = sorted(found.components, key=lambda c: -c.share)
+    joints = variance_components.share("joint")
+    parts = sorted(variance_components.components, key=lambda c: -c.share)
     listed = "; ".join(f"{c.name} {100 * c.share:.0f} % ({_size(c)})" for c in parts)
     whose = "the joints'" if joints > 0.5 else "the instruments'"
     share = joints if joints > 0.5 else 1 - joints
@@ -70,11 +70,13 @@ def component_findings(found: VarianceComponents) -> list[Finding]:
     )
     text = f"The scatter is mostly {whose} ({100 * share:.0f} % of the variance): {listed}."
     findings = [Finding("note", text + (meaning if joints > 0.5 else ""))]
-    if found.inseparable:
-        pairs = ", ".join(f"{a} and {b} ({r:+.2f})" for a, b, r in found.inseparable)
+    if variance_components.inseparable:
+        pairs = ", ".join(f"{a} and {b} ({r:+.2f})" for a, b, r in variance_components.inseparable)
         findings.append(Finding("warning", f"These poses hardly tell apart whose the scatter is: {pairs}."))
-    if found.unseen:
-        findings.append(Finding("note", f"No residual shows what these joints do: {', '.join(found.unseen)}."))
+    if variance_components.unseen:
+        findings.append(
+            Finding("note", f"No residual shows what these joints do: {', '.join(variance_components.unseen)}.")
+        )
     return findings
 
 

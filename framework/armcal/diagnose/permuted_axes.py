@@ -127,7 +127,7 @@ def _within(along: Array, sizes: Array, radius: float) -> Array:
     return np.asarray(steps)
 
 
-def find_permuted_servos(problem: Problem, records: Sequence[FactorRecords], dataset: Dataset) -> PermutedAxes | None:
+def find_permuted_axes(problem: Problem, records: Sequence[FactorRecords], dataset: Dataset) -> PermutedAxes | None:
     """The first measurement whose positions, as they stand, do not fit, but do with one mix-up undone.
 
     ``records`` are those of the dataset, their noise as declared.
@@ -135,9 +135,9 @@ def find_permuted_servos(problem: Problem, records: Sequence[FactorRecords], dat
     for number, kernel in enumerate(problem.kernels):
         seen = _seen(problem, records, dataset, number)
         arms = problem.blueprint.measurements[kernel.factor.name].arms
-        found = None if seen is None or len(arms) != 1 else _of(problem, seen, problem.blueprint.arms[arms[0]])
-        if found is not None:
-            return found
+        permuted_axes = None if seen is None or len(arms) != 1 else _of(problem, seen, problem.blueprint.arms[arms[0]])
+        if permuted_axes is not None:
+            return permuted_axes
     return None
 
 
@@ -170,16 +170,16 @@ def _of(problem: Problem, seen: _Seen, arm: Arm) -> PermutedAxes | None:
     if as_given <= MISSES * spread:
         return None
     enough = min(FITS * spread, as_given / MUCH_BETTER)
-    found = list(_single(problem, seen, arm, straight))
-    if min(reading.left for reading in found) > enough:
+    readings = list(_single(problem, seen, arm, straight))
+    if min(reading.left for reading in readings) > enough:
         elsewhere, reachable = _elsewhere(straight, seen.measured)
         if elsewhere.left <= enough and reachable:
             return None
-        found = [elsewhere] if elsewhere.left <= enough else list(_several(problem, seen, arm, enough))
-    best = min(found, key=lambda reading: reading.left, default=None)
+        readings = [elsewhere] if elsewhere.left <= enough else list(_several(problem, seen, arm, enough))
+    best = min(readings, key=lambda reading: reading.left, default=None)
     if best is None or best.left > enough:
         return None
-    alike = [r for r in found if r.left <= _ALIKE * best.left and r.of_joints == best.of_joints]
+    alike = [r for r in readings if r.left <= _ALIKE * best.left and r.of_joints == best.of_joints]
     words = tuple(reading.words for reading in sorted(alike, key=lambda reading: reading.left)[:_MOST_NAMED])
     name = problem.kernels[seen.kernel].factor.name
     return PermutedAxes(name, words, as_given * _MM, best.left * _MM, best.of_joints)
@@ -243,16 +243,16 @@ def _several(problem: Problem, seen: _Seen, arm: Arm, enough: float) -> Iterator
     straight = _positions(problem, seen, {})
     axes = [] if straight is None else _of_axes(straight, seen.measured)
     for words, read_as in [*single_joints(arm), *several_joints(arm)]:
-        found = _positions(problem, seen, read_as)
-        if found is not None:
-            yield _Reading(found.left(seen.measured, enough), words, True)
-            yield from (_Reading(found.left(moved, enough), f"{words} and {own}", True) for own, moved in axes)
+        positions = _positions(problem, seen, read_as)
+        if positions is not None:
+            yield _Reading(positions.left(seen.measured, enough), words, True)
+            yield from (_Reading(positions.left(moved, enough), f"{words} and {own}", True) for own, moved in axes)
 
 
 def _single(problem: Problem, seen: _Seen, arm: Arm, straight: _Positions) -> Iterator[_Reading]:
     for words, measured in _of_axes(straight, seen.measured):
         yield _Reading(straight.left(measured), words, False)
     for words, read_as in single_joints(arm):
-        found = _positions(problem, seen, read_as)
-        if found is not None:
-            yield _Reading(found.left(seen.measured), words, True)
+        positions = _positions(problem, seen, read_as)
+        if positions is not None:
+            yield _Reading(positions.left(seen.measured), words, True)

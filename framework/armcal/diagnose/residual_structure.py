@@ -131,7 +131,7 @@ def structure(
     ``motion`` is how the arm stands in them, ``position`` how many of all records were recorded before each (N),
     ``modelled`` the types of the effects that the model has.
     """
-    taking_part = np.any([each.weight[: each.count] > 0 for each in records], axis=0)
+    taking_part = np.any([record.weight[: record.count] > 0 for record in records], axis=0)
     chosen = _looked_at(np.flatnonzero(taking_part), position)
     if len(chosen) < FEWEST_RECORDS:
         return None
@@ -145,20 +145,20 @@ def structure(
     columns = [rows.columns(one.columns) for one in causes]
     kernels = pose_kernels(problem, dataset), time_kernels(len(dataset))
     contest = Contest(causes, columns, fit.residual, basis, rows.by_record, fit.block * _FOLDS // fit.blocks, *kernels)
-    found = _search(rows, fit, contest, modelled)
-    residual, whole = contest.beside(found.chosen)
+    search = _search(rows, fit, contest, modelled)
+    residual, whole = contest.beside(search.chosen)
     return ResidualStructure(
-        found.structures,
-        found.more,
-        found.first.lag_one,
-        found.first.lag_adjusted,
-        found.last.lag_one,
-        found.last.lag_adjusted,
-        _alike(residual, whole, rows, contest) if found.last.lag_adjusted <= LEVEL else None,
+        search.structures,
+        search.more,
+        search.first.lag_one,
+        search.first.lag_adjusted,
+        search.last.lag_one,
+        search.last.lag_adjusted,
+        _alike(residual, whole, rows, contest) if search.last.lag_adjusted <= LEVEL else None,
         smooth(residual, whole, rows.by_record, contest.pose).evidence,
         noise_trend(residual, whole, rows.by_record, Records(dataset, motion), _first(read, len(dataset))),
         rows.mean_error(fit.residual) * _MM,
-        found.tested,
+        search.tested,
         len(dataset),
         int(np.bincount(block).max()),
     )
@@ -220,7 +220,9 @@ class _Search:
 
 def _search(rows: FitRows, fit: Fit, contest: Contest, modelled: frozenset[str]) -> _Search:
     """Causes one after another as long as one is significant, then each set against all others and chance."""
-    left = [(i, own) for i, each in enumerate(contest.columns) if (own := own_basis(each, contest.basis)[0]).shape[1]]
+    left = [
+        (i, own) for i, column in enumerate(contest.columns) if (own := own_basis(column, contest.basis)[0]).shape[1]
+    ]
     first = test = family_test(fit, [own for _, own in left])
     tested, chosen, p_values, whole = len(left), list[int](), list[float](), float(fit.residual @ fit.residual)
     while len(chosen) < MOST_FOUND:
@@ -257,7 +259,7 @@ def _settled(contest: Contest, found: Mapping[int, float], worth: float) -> dict
         if settled == before:
             break
     odds = [contest.odds(each, [o for o in settled if o != each], worth) for each in settled]
-    whole = {i: (p, each) for i, p, each in zip(settled, p_values, odds, strict=True)}
+    whole = {i: (p, odd) for i, p, odd in zip(settled, p_values, odds, strict=True)}
     least = max(whole, key=lambda i: whole[i][1].chance, default=None)
     if least is None or whole[least][1].chance <= _LIKELIER:
         return whole

@@ -39,8 +39,8 @@ def ask(probe: str, *arguments: str, longest_s: float = LONGEST_S) -> Mapping[st
         return {"fault": f"no process could be started ({one_line(fault)})"}
     for line in reversed(done.stdout.split("\n")):
         if line.startswith(_MARK):
-            told: dict[str, Any] = json.loads(line.removeprefix(_MARK))
-            return told
+            content: dict[str, Any] = json.loads(line.removeprefix(_MARK))
+            return content
     return {"fault": _ending(done.returncode, done.stderr)}
 
 

@@ -41,20 +41,20 @@ def itself() -> Iterator[Finding]:
 def library(requirement: Requirement, ask: Ask) -> Finding:
     """One library that armcal declares: whether it imports, in what time, and whether its version is in the range."""
     purpose = LIBRARIES.get(requirement.key) or Purpose(requirement.key.replace("-", "_"), "a part of armcal")
-    version, told = installed(requirement.name), ask("imported", purpose.module)
-    facts = {"version": version, "range": requirement.range, "needed": purpose.needed, **told}
+    version, content = installed(requirement.name), ask("imported", purpose.module)
+    facts = {"version": version, "range": requirement.range, "needed": purpose.needed, **content}
     pip = f"pip install '{requirement.name}{requirement.range}'."
 
     def found(state: State, text: str, hint: str = "") -> Finding:
         return Finding("libraries", requirement.name, state, text, hint, facts)
 
     broken: State = "fault" if purpose.needed else "warning"
-    if "fault" in told:
+    if "fault" in content:
         if version is None:
             return found(broken, f"not installed: {purpose.lost}", f"Install it: {pip}")
-        text = f"{version} does not load{_origin(purpose.module)} ({told['fault']}): {purpose.lost}"
+        text = f"{version} does not load{_origin(purpose.module)} ({content['fault']}): {purpose.lost}"
         return found(broken, text, f"{_ANEW} '{requirement.name}{requirement.range}'.")
-    shown = f"{version or 'of no known version'}, loads in {told['import_s']:.2f} s"
+    shown = f"{version or 'of no known version'}, loads in {content['import_s']:.2f} s"
     if version and not requirement.admits(version):
         return found("warning", f"{shown}, but armcal asks for {requirement.range}", f"Change it: {pip}")
     return found("ok", shown)
@@ -63,10 +63,10 @@ def library(requirement: Requirement, ask: Ask) -> Finding:
 def _origin(module: str) -> str:
     """Where a module is taken from: another file may stand in a library's way."""
     try:
-        found = find_spec(module.partition(".")[0])
+        spec = find_spec(module.partition(".")[0])
     except (ImportError, ValueError):
         return ""
-    return f" from {found.origin}" if found and found.origin else ""
+    return f" from {spec.origin}" if spec and spec.origin else ""
 
 
 def extra(name: str, needed: tuple[Requirement, ...], ask: Ask) -> Finding:
@@ -79,9 +79,9 @@ def extra(name: str, needed: tuple[Requirement, ...], ask: Ask) -> Finding:
         return Finding("extras", name, "note", f"not here: {', '.join(missing)}; for {use}", hint, facts)
     for requirement in needed:
         module = EXTRA_MODULES.get(requirement.key)
-        told = ask("imported", module) if module else {}
-        if "fault" in told:
-            text = f"{requirement.name} does not load ({told['fault']}); for {use}"
+        content = ask("imported", module) if module else {}
+        if "fault" in content:
+            text = f"{requirement.name} does not load ({content['fault']}); for {use}"
             return Finding("extras", name, "warning", text, f"{_ANEW} '{requirement.name}'.", facts)
     old = [f"{r.name} {installed(r.name)} ({r.range})" for r in needed if not r.admits(installed(r.name) or "")]
     if old:

@@ -15,15 +15,15 @@ _CORE = "Install armcal anew: pip install --force-reinstall armcal (or pip insta
 
 def plugins(ask: Ask) -> Iterator[Finding]:
     """Each plugin: whether its registration loads, then whether its components do."""
-    told = ask("components")
-    if "fault" in told:
-        text = f"cannot be tried together: {told['fault']}"
-        yield Finding("plugins", "all plugins", "warning", text, "What stands above and below says more.", told)
+    content = ask("components")
+    if "fault" in content:
+        text = f"cannot be tried together: {content['fault']}"
+        yield Finding("plugins", "all plugins", "warning", text, "What stands above and below says more.", content)
         yield from _one_by_one(ask)
         return
-    if not told["plugins"]:
+    if not content["plugins"]:
         yield Finding("plugins", "plugins", "fault", "found none, not even armcal's own", _CORE)
-    for plugin in told["plugins"]:
+    for plugin in content["plugins"]:
         yield _plugin(plugin)
 
 
@@ -43,31 +43,33 @@ def _plugin(facts: Mapping[str, Any]) -> Finding:
 def _one_by_one(ask: Ask) -> Iterator[Finding]:
     """Registrations that fail on their own: one of them may end the whole process."""
     for point in sorted(entry_points(group=DISTRIBUTION), key=lambda p: p.name):
-        told = ask("imported", point.module)
-        if "fault" in told:
-            yield Finding("plugins", point.name, "warning", f"does not load: {told['fault']}", "Uninstall it.", told)
+        content = ask("imported", point.module)
+        if "fault" in content:
+            yield Finding(
+                "plugins", point.name, "warning", f"does not load: {content['fault']}", "Uninstall it.", content
+            )
 
 
 def solvers(ask: Ask) -> Iterator[Finding]:
     """A tiny problem for each."""
-    told = ask("ipopt")
-    if "fault" in told:
-        text = f"does not solve ({told['fault']}): the estimator ipopt, which is the usual one, does not work"
+    content = ask("ipopt")
+    if "fault" in content:
+        text = f"does not solve ({content['fault']}): the estimator ipopt, which is the usual one, does not work"
         hint = "Install casadi anew: pip install --force-reinstall casadi."
-        yield Finding("solvers", "IPOPT (in casadi)", "warning", text, hint, told)
+        yield Finding("solvers", "IPOPT (in casadi)", "warning", text, hint, content)
     else:
-        yield Finding("solvers", "IPOPT (in casadi)", "ok", "solves", detail=told)
+        yield Finding("solvers", "IPOPT (in casadi)", "ok", "solves", detail=content)
     yield from _convex(ask)
-    told = ask("kalman")
-    if "fault" in told:
-        text = f"does not work ({told['fault']}): armcal recalibrate cannot use ekf or ukf"
+    content = ask("kalman")
+    if "fault" in content:
+        text = f"does not work ({content['fault']}): armcal recalibrate cannot use ekf or ukf"
         yield Finding(
             "solvers",
             "Kalman filters (filterpy)",
             "warning",
             text,
             "Install it anew: pip install --force-reinstall filterpy.",
-            told,
+            content,
         )
     else:
         yield Finding("solvers", "Kalman filters (filterpy)", "ok", "work")
@@ -75,9 +77,9 @@ def solvers(ask: Ask) -> Iterator[Finding]:
 
 def _convex(ask: Ask) -> Iterator[Finding]:
     """The solver that armcal asks for, then the others of cvxpy."""
-    told = ask("convex")
-    faults = dict(told.get("solvers", {}))
-    fault = told.get("fault") or faults.pop("CLARABEL", "")
+    content = ask("convex")
+    faults = dict(content.get("solvers", {}))
+    fault = content.get("fault") or faults.pop("CLARABEL", "")
     if fault:
         text = f"does not solve ({fault}): no estimator cvxpy, no certified bound of a plan, no cones"
         hint = "Install them anew: pip install --force-reinstall cvxpy clarabel."
@@ -98,24 +100,24 @@ def compiler(ask: Ask) -> Finding:
     if path is None:
         hint = "If fits are slow: install gcc or clang."
         return Finding("compiler", "C compiler", "note", f"none found, and none is needed; {slower}", hint)
-    told = ask("kernel")
-    facts = {"path": path, **told}
-    if "fault" in told:
-        text = f"{path} does not serve ({told['fault']}); {slower}"
+    content = ask("kernel")
+    facts = {"path": path, **content}
+    if "fault" in content:
+        text = f"{path} does not serve ({content['fault']}); {slower}"
         hint = "Name another with ARMCAL_CC, or turn it off with ARMCAL_CC=none."
         return Finding("compiler", "C compiler", "warning", text, hint, facts)
     text = (
-        f"{path} makes a kernel with the same numbers in {told['compile_s']:.1f} s, "
-        f"{told['times_faster']:.0f} times as fast as without it (optional)"
+        f"{path} makes a kernel with the same numbers in {content['compile_s']:.1f} s, "
+        f"{content['times_faster']:.0f} times as fast as without it (optional)"
     )
     return Finding("compiler", "C compiler", "ok", text, detail=facts)
 
 
 def main_job(ask: Ask) -> Finding:
     """Calibrate a small made-up arm, report and all."""
-    told = ask("calibration")
-    if "fault" in told:
-        text = f"a made-up arm cannot be calibrated: {told['fault']}"
-        return Finding("main job", "calibrate", "fault", text, "Mend what is marked above first.", told)
-    text = f"a made-up arm of two links came out right to {told['off_mm']:.3f} mm, with report and calibration file"
-    return Finding("main job", "calibrate", "ok", text, detail=told)
+    content = ask("calibration")
+    if "fault" in content:
+        text = f"a made-up arm cannot be calibrated: {content['fault']}"
+        return Finding("main job", "calibrate", "fault", text, "Mend what is marked above first.", content)
+    text = f"a made-up arm of two links came out right to {content['off_mm']:.3f} mm, with report and calibration file"
+    return Finding("main job", "calibrate", "ok", text, detail=content)

@@ -93,7 +93,7 @@ def bootstrap(
     problem: Problem,
     records: Sequence[FactorRecords],
     estimator: Estimator,
-    found: Estimate,
+    estimate: Estimate,
     settings: BootstrapSettings,
     executor: Executor | None = None,
     progress: Progress = no_progress,
@@ -109,27 +109,27 @@ def bootstrap(
     count, random = records[0].count, np.random.default_rng(settings.seed)
     poses = np.arange(count) if poses is None else poses
     parametric = settings.method == "parametric"
-    block = 1 if parametric else _block(problem, records, found, settings.blocks)
+    block = 1 if parametric else _block(problem, records, estimate, settings.blocks)
     if parametric:
-        _require_measured(problem, records, found.values)
+        _require_measured(problem, records, estimate.values)
     tasks = []
     for _ in range(settings.bootstrap):
         weights = np.ones(count) if parametric else draw_weights(int(poses.max()) + 1, block, random)[poses]
         chosen = np.flatnonzero(weights).astype(np.intp)
         seed = int(random.integers(2**63)) if parametric else None
-        part = (tuple(records), chosen, weights[chosen], seed, found.noise_scale)
-        tasks.append(_Refit(problem, estimator, found.values, *part))
+        part = (tuple(records), chosen, weights[chosen], seed, estimate.noise_scale)
+        tasks.append(_Refit(problem, estimator, estimate.values, *part))
     refits = (executor or Sequential()).map(_refit, tasks, lambda done: progress("bootstrap", done))
-    free = list(found.free_entries)
+    free = list(estimate.free_entries)
     values = np.array([values[free] for values in refits if values is not None]).reshape(-1, len(free))
-    return Bootstrap(found.names, values, settings.method, block, sum(values is None for values in refits))
+    return Bootstrap(estimate.names, values, settings.method, block, sum(values is None for values in refits))
 
 
-def _block(problem: Problem, records: Sequence[FactorRecords], found: Estimate, asked: BlockLength) -> int:
+def _block(problem: Problem, records: Sequence[FactorRecords], estimate: Estimate, asked: BlockLength) -> int:
     """The longest block that any residual component asks for."""
     if asked != "auto":
         return min(asked, records[0].count)
-    whitened = problem.whitened_residuals(found.values, records)
+    whitened = problem.whitened_residuals(estimate.values, records)
     return max(automatic_block_length(each) for each in whitened)
 
 
@@ -157,20 +157,20 @@ def _made_up(
     """The records with measured values of the model, and noise as it was declared and found."""
     predicted = predicted_records(problem, values, records)
     noise = []
-    for kernel, each in zip(problem.kernels, records, strict=True):
-        white = noise_scale * random.normal(size=(len(kernel.factor.noise), each.count))
-        if each.whitening is None:
+    for kernel, record in zip(problem.kernels, records, strict=True):
+        white = noise_scale * random.normal(size=(len(kernel.factor.noise), record.count))
+        if record.whitening is None:
             noise.append(white * np.array(kernel.factor.noise)[:, None])
         else:
-            inverse = np.linalg.inv(np.moveaxis(each.whitening[:, :, : each.count], 2, 0))
+            inverse = np.linalg.inv(np.moveaxis(record.whitening[:, :, : record.count], 2, 0))
             noise.append(np.einsum("wrs,sw->rw", inverse, white))
     return disturbed_records(problem, values, predicted, noise)
 
 
 def _require_measured(problem: Problem, records: Sequence[FactorRecords], values: Array) -> None:
     slopes = reading_slopes(problem, values, predicted_records(problem, values, records))
-    for kernel, each, slope in zip(problem.kernels, records, slopes, strict=True):
-        if slope is None or each.correlation is not None:
+    for kernel, record, slope in zip(problem.kernels, records, slopes, strict=True):
+        if slope is None or record.correlation is not None:
             raise ProblemError(
                 f"{kernel.factor.name} has no measured values of its own noise to make up.",
                 hint="Use uncertainty.method: blocks.",

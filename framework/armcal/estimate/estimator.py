@@ -314,7 +314,7 @@ def require_solvable(problem: Problem, records: Sequence[FactorRecords], start: 
     known = identify(problem, start, records)
     if known.undetermined:
         explained = explain(problem, start, records, known)
-        listed = "; ".join(str(each) for each in explained[:MOST_TOLD])
+        listed = "; ".join(str(undetermined) for undetermined in explained[:MOST_TOLD])
         more = len(explained) - MOST_TOLD
         listed += f"; and {more} more, which armcal identify lists" if more > 0 else ""
         text = f"the data does not determine {len(explained)} combinations"
@@ -348,7 +348,7 @@ def _mend(undetermined: Sequence[Undetermined]) -> str:
 
 
 def _poses(records: Sequence[FactorRecords]) -> int:
-    return max((each.count for each in records), default=0)
+    return max((record.count for record in records), default=0)
 
 
 def _interval(value: float, unconstrained: float, sd: float, lower: float, upper: float, quantile: float) -> Interval95:

@@ -94,8 +94,8 @@ class Identifiability:
             value = float(self.singular_values[i])
             doubtful = i >= min(self.rank_by_qr, _count_above(self.singular_values))
             if value < HARDLY or value * POOR_CONDITION < self.singular_values[0] or doubtful:
-                told = named(self.directions[i], self.names, self.measures, _LARGE_SHARE)
-                found.append((told, 1 / value if value > 0 else float("inf")))
+                combination = named(self.directions[i], self.names, self.measures, _LARGE_SHARE)
+                found.append((combination, 1 / value if value > 0 else float("inf")))
         return tuple(found)
 
 

@@ -98,11 +98,11 @@ def _raised(
     for halving in range(_MOST_HALVINGS):
         there = theta + step * 0.5**halving
         try:
-            found = _evaluate(terms, prior, there)
+            evaluate = _evaluate(terms, prior, there)
         except np.linalg.LinAlgError:
             continue
-        if found.value >= here.value:
-            return there, found
+        if evaluate.value >= here.value:
+            return there, evaluate
     return None
 
 

@@ -32,7 +32,11 @@ def started(problem: Problem, records: Sequence[FactorRecords]) -> Problem:
         for local in dict.fromkeys(problem.kernels[factor].factor.nuisance_names):
             name = group_name(owner, key, local)
             if problem.parameters[name].free and problem.parameters[name].prior_sd is None:
-                rows = [i for i, told in enumerate(problem.kernels[factor].factor.nuisance_names) if told == local]
+                rows = [
+                    i
+                    for i, nuisance_name in enumerate(problem.kernels[factor].factor.nuisance_names)
+                    if nuisance_name == local
+                ]
                 nominal[problem.parameters.entries_of(name)] = said[rows]
     return replace(problem, parameters=problem.parameters.with_nominal(nominal))
 
@@ -86,10 +90,10 @@ def _present(problem: Problem, records: Sequence[FactorRecords]) -> set[str]:
     """Full names of the parameters of all groups with a weighted record."""
     names = set()
     plan = problem.blueprint
-    for (instance, measurement), each in zip(plan.measurements.items(), records, strict=True):
-        if isinstance(measurement, GroupedMeasurement) and each.group is not None:
+    for (instance, measurement), record in zip(plan.measurements.items(), records, strict=True):
+        if isinstance(measurement, GroupedMeasurement) and record.group is not None:
             owner = owner_of(instance, measurement)
-            for number in np.unique(each.group[each.weight > 0]):
+            for number in np.unique(record.group[record.weight > 0]):
                 if number >= 0:
                     key = plan.groups[owner][number]
                     names |= {group_name(owner, key, block.name) for block in measurement.group_parameters(key)}
@@ -102,11 +106,13 @@ def _sayings(
     """Owner, key, factor and what the record nearest the median says, of each group; the first factor wins."""
     found: dict[tuple[str, str], tuple[str, str, int, Array]] = {}
     plan = problem.blueprint
-    for factor, ((instance, measurement), each) in enumerate(zip(plan.measurements.items(), records, strict=True)):
-        if not isinstance(measurement, GroupedMeasurement) or each.group is None or not len(told[factor]):
+    for factor, ((instance, measurement), factor_records) in enumerate(
+        zip(plan.measurements.items(), records, strict=True)
+    ):
+        if not isinstance(measurement, GroupedMeasurement) or factor_records.group is None or not len(told[factor]):
             continue
         owner = owner_of(instance, measurement)
-        group, weight = each.group[: each.count], each.weight[: each.count]
+        group, weight = factor_records.group[: factor_records.count], factor_records.weight[: factor_records.count]
         for number in np.unique(group[(group >= 0) & (weight > 0)]):
             members = np.flatnonzero((group == number) & (weight > 0))
             said = np.median(told[factor][:, members], axis=1)

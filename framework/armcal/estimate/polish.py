@@ -101,6 +101,10 @@ def bounded_step(model: NormalEquations, lower: Array, upper: Array) -> Array | 
     except np.linalg.LinAlgError:
         return None
     target = -np.linalg.solve(root.T, model.gradient / size)
-    found = lsq_linear(root, target, (lower * size, upper * size), method="bvls", tol=1e-14)
-    step = np.where(found.active_mask < 0, lower, np.where(found.active_mask > 0, upper, found.x / size))
+    solution = lsq_linear(root, target, (lower * size, upper * size), method="bvls", tol=1e-14)
+    step = np.where(
+        solution.active_mask < 0,
+        lower,
+        np.where(solution.active_mask > 0, upper, solution.x / size),
+    )
     return np.asarray(np.clip(step, lower, upper))

@@ -91,7 +91,7 @@ class KnownDrift:
         if shared is None:
             return None
         blocks = problem.jacobians(values, records)
-        jacobians = [np.moveaxis(_whole(blocks, each.record.shape[1]), 1, 2) for each in records]
+        jacobians = [np.moveaxis(_whole(blocks, record.record.shape[1]), 1, 2) for record in records]
         told = shared.states([r[:, :, None] for r in problem.weighted_residuals(values, records)])
         return cls(told, shared.states(jacobians), shared.covariance)
 
@@ -144,7 +144,8 @@ class Predictor:
         """As ``in_recording`` of the fit's own records, each as if the fit had done without it."""
         parts = zip(fitted, self._told(fitted), strict=True)
         return tuple(
-            Spread(_without_itself(noise, values + drift, each), self.freedom) for each, (noise, values, drift) in parts
+            Spread(_without_itself(noise, values + drift, factor_records), self.freedom)
+            for factor_records, (noise, values, drift) in parts
         )
 
     def left_out_of_new_recording(self, fitted: Sequence[FactorRecords]) -> tuple[Spread, ...]:
@@ -154,7 +155,8 @@ class Predictor:
         """
         parts = zip(fitted, self._unknown(fitted), strict=True)
         return tuple(
-            Spread(_without_itself(noise + drift, values, each), self.freedom) for each, (noise, values, drift) in parts
+            Spread(_without_itself(noise + drift, values, factor_records), self.freedom)
+            for factor_records, (noise, values, drift) in parts
         )
 
     def _unknown(self, records: Sequence[FactorRecords]) -> list[_Parts]:
@@ -181,18 +183,20 @@ class Predictor:
     def _parts(self, records: Sequence[FactorRecords], slopes: Sequence[Array], drift: Sequence[Array]) -> list[_Parts]:
         """Covariances by noise, by values and by drift (N x n_r x n_r each), one of each a factor."""
         found = []
-        for kernel, each, slope, moved in zip(self.problem.kernels, records, slopes, drift, strict=True):
+        for kernel, record, slope, moved in zip(self.problem.kernels, records, slopes, drift, strict=True):
             values = np.einsum("rvn,vw,swn->nrs", slope, self.covariance, slope, optimize=True)
-            found.append((self.noise_scale**2 * _noise(kernel, each), values, moved))
+            found.append((self.noise_scale**2 * _noise(kernel, record), values, moved))
         return found
 
     def _slopes(self, records: Sequence[FactorRecords]) -> list[Array]:
         """Residuals by free canonical entries, raw, one (n_r x n_v x N) a factor."""
-        bare = [replace(each, weight=np.ones_like(each.weight), whitening=None, correlation=None) for each in records]
+        bare = [
+            replace(record, weight=np.ones_like(record.weight), whitening=None, correlation=None) for record in records
+        ]
         blocks = self.problem.jacobians(self.values, bare)
         return [
-            _whole(blocks, each.record.shape[1])[:, :, : each.count] * np.array(kernel.factor.noise)[:, None, None]
-            for kernel, each in zip(self.problem.kernels, records, strict=True)
+            _whole(blocks, record.record.shape[1])[:, :, : record.count] * np.array(kernel.factor.noise)[:, None, None]
+            for kernel, record in zip(self.problem.kernels, records, strict=True)
         ]
 
     def _drift_variances(self) -> Array:
@@ -207,7 +211,7 @@ def is_position(kernel: Kernel) -> bool:
     return channels == _POSITION and kernel.factor.residual.numel() == len(_POSITION)
 
 
-def _without_itself(noise: Array, known: Array, each: FactorRecords) -> Array:
+def _without_itself(noise: Array, known: Array, factor_records: FactorRecords) -> Array:
     """Covariance of each record's residual (N x n_r x n_r) had the fit not had the record.
 
     ``known`` is that of what the fit predicts, which the record helped to know: of information it added its weight
@@ -216,7 +220,7 @@ def _without_itself(noise: Array, known: Array, each: FactorRecords) -> Array:
     root = np.linalg.cholesky(noise)
     inverse = np.linalg.inv(root)
     sizes, axes = np.linalg.eigh(inverse @ known @ inverse.transpose(0, 2, 1))
-    left = np.maximum(1.0 - each.weight[: each.count, None] * sizes, _LEAST_LEFT)
+    left = np.maximum(1.0 - factor_records.weight[: factor_records.count, None] * sizes, _LEAST_LEFT)
     turned = root @ axes
     return np.asarray(noise + np.einsum("nrk,nk,nsk->nrs", turned, sizes / left, turned))
 
@@ -229,9 +233,11 @@ def _whole(blocks: Iterator[Array], width: int) -> Array:
     return np.concatenate(parts, axis=2)
 
 
-def _noise(kernel: Kernel, each: FactorRecords) -> Array:
+def _noise(kernel: Kernel, factor_records: FactorRecords) -> Array:
     """Declared covariance of each record's residual (N x n_r x n_r)."""
-    if each.whitening is None:
-        return np.broadcast_to(np.diag(np.square(kernel.factor.noise)), (each.count, *(len(kernel.factor.noise),) * 2))
-    inverse = np.linalg.inv(np.moveaxis(each.whitening[:, :, : each.count], 2, 0))
+    if factor_records.whitening is None:
+        return np.broadcast_to(
+            np.diag(np.square(kernel.factor.noise)), (factor_records.count, *(len(kernel.factor.noise),) * 2)
+        )
+    inverse = np.linalg.inv(np.moveaxis(factor_records.whitening[:, :, : factor_records.count], 2, 0))
     return np.asarray(inverse @ inverse.transpose(0, 2, 1))

@@ -55,7 +55,7 @@ def studentised_distances(
     counted = problem.weighted(records, weights)
     inverse = InverseInformation.of(problem.triangular_factor(values, counted), problem.parameters)
     residuals = remaining(problem, values, records, weights)
-    lengths = [np.zeros(each.count) for each in records]
+    lengths = [np.zeros(record.count) for record in records]
     for factor, part, reached in _reached(problem, values, records, inverse.root):
         hat = np.einsum("avn,bvn->nab", reached, reached)
         spread = np.eye(len(reached)) - (2 * weights[factor][part, None, None] - 1) * hat
@@ -80,10 +80,10 @@ def remaining(
     """
     found, shared = problem.weighted_residuals(values, records), records[0].correlation
     told_by = problem.weighted(records, weights) if shared is not None else records
-    told = told_by[0].correlation
-    if shared is None or told is None:
+    correlation = told_by[0].correlation
+    if shared is None or correlation is None:
         return found
-    states = told.states([r[:, :, None] for r in problem.weighted_residuals(values, told_by)])
+    states = correlation.states([r[:, :, None] for r in problem.weighted_residuals(values, told_by)])
     return tuple(r - shared.taken_up(i, states)[:, : r.shape[1], 0] for i, r in enumerate(found))
 
 
@@ -93,11 +93,11 @@ def _reached(
     """J B of each block of records (n_r x k x B), with its factor and place; records are those of weight one."""
     to_directions = problem.parameters.entries_jacobian(values) @ half
     blocks = problem.jacobians(values, records)
-    for factor, each in enumerate(records):
+    for factor, record in enumerate(records):
         start = 0
-        while start < each.record.shape[1]:
+        while start < record.record.shape[1]:
             jacobian = next(blocks)
-            stop = min(start + jacobian.shape[2], each.count)
+            stop = min(start + jacobian.shape[2], record.count)
             yield factor, slice(start, stop), np.einsum("avn,vk->akn", jacobian[:, :, : stop - start], to_directions)
             start += jacobian.shape[2]
 

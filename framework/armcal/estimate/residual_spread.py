@@ -70,9 +70,9 @@ def residual_spread(
         return {name: ResidualSpread(np.diag(sd**2), 0.0, 1.0, freedom=known) for name, sd in noise.items()}
     # Parameters that were fitted make residuals too small.
     freedom = known / max(problem.equations(records), 1)
-    found, residuals = {}, problem.residuals(estimate.values, records)
-    for kernel, each, residual in zip(problem.kernels, records, residuals, strict=True):
-        weight = np.minimum(each.weight[: each.count], 1.0) * each.measured
+    residual_spreads, residuals = {}, problem.residuals(estimate.values, records)
+    for kernel, record, residual in zip(problem.kernels, records, residuals, strict=True):
+        weight = np.minimum(record.weight[: record.count], 1.0) * record.measured
         kept = np.flatnonzero(weight > 0)
         if len(kept) < 2:
             continue
@@ -81,10 +81,10 @@ def residual_spread(
         covariance, weighed = _shrunk(roots @ roots.T, count, np.array(kernel.factor.noise), estimate.noise_scale)
         whitened = _whitened(covariance, residual[:, kept])
         share, over = _shared(whitened, _places(dataset)[kept])
-        found[kernel.factor.name] = ResidualSpread(
+        residual_spreads[kernel.factor.name] = ResidualSpread(
             covariance, share, over, "sequence" if dataset.has("sequence") else "record", min(weighed, known)
         )
-    return found
+    return residual_spreads
 
 
 def _shrunk(products: Array, count: float, noise: Array, scale: float) -> tuple[Array, float]:

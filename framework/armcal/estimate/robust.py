@@ -67,7 +67,7 @@ def losses(problem: Problem, name: LossName) -> tuple[Loss, ...]:
 
 def ones(records: Sequence[FactorRecords]) -> Weights:
     """Every record at full weight."""
-    return tuple(np.ones(each.count) for each in records)
+    return tuple(np.ones(record.count) for record in records)
 
 
 def norms(problem: Problem, values: Array, records: Sequence[FactorRecords], weights: Weights) -> Weights:
@@ -87,8 +87,8 @@ def scales_of(
     if freedom < 1:
         return (1.0,) * len(records)
     found: list[float] = []
-    for kernel, each, length in zip(problem.kernels, records, lengths, strict=True):
-        counted = length[each.weight[: each.count] > 0]
+    for kernel, record, length in zip(problem.kernels, records, lengths, strict=True):
+        counted = length[record.weight[: record.count] > 0]
         typical = float(np.median(counted)) / median_norm(kernel.factor.residual.numel()) if len(counted) else 1.0
         found.append(max(typical * float(np.sqrt(count / freedom)), SMALLEST_SCALE))
     return tuple(found)
@@ -238,11 +238,17 @@ def _continued(before: Solution, problem: Problem, records: Sequence[FactorRecor
     A solver that starts at its answer may find no direction to go; if no step would gain anything, it is there.
     """
     after, past = estimator.solve(problem, records, before.values), before.verdict
-    told = after.verdict
-    if not told.converged and _at_rest(problem, records, after.values):
-        told = replace(told, converged=True, status=f"{told.status} (no step gains anything)")
-    told = replace(told, iterations=past.iterations + told.iterations, seconds=past.seconds + told.seconds)
-    return Solution(after.values, told)
+    solver_verdict = after.verdict
+    if not solver_verdict.converged and _at_rest(problem, records, after.values):
+        solver_verdict = replace(
+            solver_verdict, converged=True, status=f"{solver_verdict.status} (no step gains anything)"
+        )
+    solver_verdict = replace(
+        solver_verdict,
+        iterations=past.iterations + solver_verdict.iterations,
+        seconds=past.seconds + solver_verdict.seconds,
+    )
+    return Solution(after.values, solver_verdict)
 
 
 def _at_rest(problem: Problem, records: Sequence[FactorRecords], values: Array) -> bool:

@@ -50,8 +50,8 @@ def hopeless(problem: Problem, records: Sequence[FactorRecords], dataset: Datase
 def _off(problem: Problem, records: Sequence[FactorRecords], dataset: Dataset, values: Array) -> float:
     """Median residual by the spread of the measured positions, the worst of all measurements that read positions."""
     worst = 0.0
-    for kernel, each, residual in zip(problem.kernels, records, problem.residuals(values, records), strict=True):
-        channels, seen = kernel.factor.output_channels[:3], each.measured[: len(dataset)]
+    for kernel, record, residual in zip(problem.kernels, records, problem.residuals(values, records), strict=True):
+        channels, seen = kernel.factor.output_channels[:3], record.measured[: len(dataset)]
         positions = [channel.rpartition(".")[2] for channel in channels] == list("xyz")
         if not positions or any(OTHER in name for name in kernel.factor.channels) or np.count_nonzero(seen) < _FEWEST:
             continue

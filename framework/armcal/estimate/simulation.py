@@ -78,13 +78,13 @@ def measured_with_noise(
         sizes = [sd if length_noise is None or kind != "length" else length_noise for sd, kind in declared]
         rows = [random.normal(0.0, size, len(commands)) for size in sizes if factor.output_channels]
         noise.append(np.array(rows) if rows else np.zeros((len(sizes), len(commands))))
-    found = disturbed_records(problem, fixed.nominal(), problem.records(read), noise)
-    disturbed = {
-        channel: each.record[kernel.factor.channels.index(channel), : each.count]
-        for kernel, each in zip(problem.kernels, found, strict=True)
+    disturbed = disturbed_records(problem, fixed.nominal(), problem.records(read), noise)
+    measurements = {
+        channel: factor_records.record[kernel.factor.channels.index(channel), : factor_records.count]
+        for kernel, factor_records in zip(problem.kernels, disturbed, strict=True)
         for channel in set(kernel.factor.output_channels) & set(kernel.factor.channels)
     }
-    return {channel: disturbed.get(channel, values) for channel, values in exact.items()}
+    return {channel: measurements.get(channel, values) for channel, values in exact.items()}
 
 
 def with_channels(dataset: Dataset, channels: Mapping[str, Array]) -> Dataset:

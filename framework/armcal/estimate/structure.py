@@ -76,10 +76,10 @@ def explain(
     held = problem.parameters.prior_information() > 0
     priors = {name for name, has in zip(known.names, held, strict=True) if has}
     vectors, causes = _by_cause(problem, values, records, null)
-    told = [named(vector, known.names, known.measures, _NAMED) for vector in vectors]
+    combinations = [named(vector, known.names, known.measures, _NAMED) for vector in vectors]
     return tuple(
         Undetermined(combination, cause, tuple(name for name in combination.names if name in priors))
-        for combination, cause in zip(told, causes, strict=True)
+        for combination, cause in zip(combinations, causes, strict=True)
     )
 
 
@@ -107,20 +107,20 @@ def random_records(problem: Problem, records: Sequence[FactorRecords], seed: int
     """Random poses about the recorded ones and beyond them, under the recorded loads, from either side."""
     count = int(np.clip(3 * problem.increments, 60, 600))
     result = []
-    for kernel, each in zip(problem.kernels, records, strict=True):
+    for kernel, factor_records in zip(problem.kernels, records, strict=True):
         random = np.random.default_rng(seed)
-        rows = np.flatnonzero(each.weight[: each.count])
-        chosen = random.choice(rows if len(rows) else np.arange(each.count), count)
-        (drawn,) = Problem.subset([each], chosen.astype(np.intp))
-        record = _spread(kernel.factor, each, drawn.record.copy(), random)
+        rows = np.flatnonzero(factor_records.weight[: factor_records.count])
+        chosen = random.choice(rows if len(rows) else np.arange(factor_records.count), count)
+        (drawn,) = Problem.subset([factor_records], chosen.astype(np.intp))
+        record = _spread(kernel.factor, factor_records, drawn.record.copy(), random)
         weight = (np.arange(record.shape[1]) < count).astype(float)
         result.append(replace(drawn, record=record, weight=weight, state=np.zeros_like(drawn.state)))
     return tuple(result)
 
 
-def _spread(factor: Factor, each: FactorRecords, record: Array, random: np.random.Generator) -> Array:
+def _spread(factor: Factor, factor_records: FactorRecords, record: Array, random: np.random.Generator) -> Array:
     joints, approaches = list(joint_channels(factor)), list(approach_channels(factor))
-    seen = each.record[joints, : each.count]
+    seen = factor_records.record[joints, : factor_records.count]
     lowest, highest = seen.min(axis=1) - _BEYOND, seen.max(axis=1) + _BEYOND
     record[joints] = random.uniform(lowest[:, None], highest[:, None], (len(joints), record.shape[1]))
     record[approaches] = random.choice([-1.0, 1.0], (len(approaches), record.shape[1]))
@@ -131,7 +131,7 @@ def _by_cause(
     problem: Problem, values: Array, records: Sequence[FactorRecords], null: Array
 ) -> tuple[Array, list[Cause]]:
     causes: list[Cause] = ["unknown"] * len(null)
-    if not all(each.count for each in records):
+    if not all(record.count for record in records):
         return sparse_basis(null), causes
     try:
         gauge, here = _nested(problem, values, records, null)
@@ -164,10 +164,10 @@ def _scaled(problem: Problem, values: Array, poses: Sequence[FactorRecords]) -> 
     fitting = projected(problem, values, poses)
     can = fits(problem, values, fitting)
     weighed = []
-    for each, mask in zip(fitting, can, strict=True):
-        weight = each.weight.copy()
-        weight[: each.count] *= mask
-        weighed.append(replace(each, weight=weight))
+    for factor_records, mask in zip(fitting, can, strict=True):
+        weight = factor_records.weight.copy()
+        weight[: factor_records.count] *= mask
+        weighed.append(replace(factor_records, weight=weight))
     return problem.triangular_factor(values, weighed) * problem.parameters.scales()
 
 

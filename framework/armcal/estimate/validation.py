@@ -74,11 +74,11 @@ def record_errors(
     found = problem.residuals(values, records) if told_by is None else residuals(problem, values, records, told_by)
     squares, count = np.zeros((2, records[0].count))
     counted = error_dimension(problem)
-    for kernel, each, residual in zip(problem.kernels, records, found, strict=True):
+    for kernel, record, residual in zip(problem.kernels, records, found, strict=True):
         rows = np.array([dimension == counted for dimension in kernel.factor.dimensions], dtype=bool)
         if rows.any():
-            squares += np.where(each.measured, np.sum(residual[rows] ** 2, axis=0), 0.0)
-            count += each.measured
+            squares += np.where(record.measured, np.sum(residual[rows] ** 2, axis=0), 0.0)
+            count += record.measured
     with np.errstate(invalid="ignore"):
         return np.asarray(np.sqrt(squares / count))
 
@@ -123,14 +123,14 @@ def split_by_id(ids: Sequence[str], train_ids: Sequence[str]) -> Split:
     Raises:
         ProblemError: an id is not among the records, or none is left to train on.
     """
-    wanted = set(train_ids)
-    missing = sorted(wanted - set(ids))
+    texts = set(train_ids)
+    missing = sorted(texts - set(ids))
     if missing:
         raise ProblemError(
-            f"{len(missing)} of {len(wanted)} training ids are not in the data, the first: {missing[0]}.",
+            f"{len(missing)} of {len(texts)} training ids are not in the data, the first: {missing[0]}.",
             hint="Check that the list belongs to this dataset; records set aside on reading cannot train.",
         )
-    inside = np.array([record in wanted for record in ids], dtype=bool)
+    inside = np.array([record in texts for record in ids], dtype=bool)
     return Split(np.flatnonzero(inside), np.flatnonzero(~inside))
 
 

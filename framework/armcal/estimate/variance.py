@@ -97,7 +97,7 @@ def estimate_components(
         ProblemError: there are not more equations than parameters and components, or parameters drift.
     """
     names, kinds, bases = _bases(problem, values, records, axes)
-    sizes = np.array([_mean_variance(each, records) for each in bases])
+    sizes = np.array([_mean_variance(base, records) for base in bases])
     joints = np.array([kind == "joint" for kind in kinds])
     largest = float(sizes[joints].max(initial=0.0))
     seen = ~joints | (sizes > SMALLEST_SHARE * largest)
@@ -105,48 +105,52 @@ def estimate_components(
     chosen = [i for i in range(len(names)) if seen[i]]
     terms = _terms(problem, values, records, [bases[i] for i in chosen], sizes[chosen])
     prior = problem.parameters.prior_information()
-    found = maximise(terms, prior, ~joints[chosen])
-    shares = found.theta / found.theta.sum()
-    rms = np.sqrt(found.theta) * _typical_noise(problem, records)
+    likelihood_maximum = maximise(terms, prior, ~joints[chosen])
+    shares = likelihood_maximum.theta / likelihood_maximum.theta.sum()
+    rms = np.sqrt(likelihood_maximum.theta) * _typical_noise(problem, records)
     components = tuple(
         _component(
             names[i],
             kinds[i],
             problem,
-            float(found.theta[n] / sizes[i]),
-            float(_deviation(found.covariance, n) / sizes[i]),
+            float(likelihood_maximum.theta[n] / sizes[i]),
+            float(_deviation(likelihood_maximum.covariance, n) / sizes[i]),
         )
         for n, i in enumerate(chosen)
     )
     return VarianceComponents(
         tuple(replace(c, share=float(s), rms=float(r)) for c, s, r in zip(components, shares, rms, strict=True)),
-        _inseparable(found.covariance, found.theta, [names[i] for i in chosen]),
+        _inseparable(likelihood_maximum.covariance, likelihood_maximum.theta, [names[i] for i in chosen]),
         tuple(names[i] for i in range(len(names)) if not seen[i]),
-        found.log_likelihood,
+        likelihood_maximum.log_likelihood,
     )
 
 
 def apply_components(
-    problem: Problem, values: Array, records: Sequence[FactorRecords], found: VarianceComponents, axes: Axes
+    problem: Problem,
+    values: Array,
+    records: Sequence[FactorRecords],
+    variance_components: VarianceComponents,
+    axes: Axes,
 ) -> tuple[FactorRecords, ...]:
     """The same records (which carry the declared noise), whitened by the estimated covariances."""
     names, _, bases = _bases(problem, values, records, axes)
-    variance = {c.name: c.sd**2 for c in found.components}
+    variance = {c.name: c.sd**2 for c in variance_components.components}
     result = []
-    for place, (kernel, each) in enumerate(zip(problem.kernels, records, strict=True)):
-        width = each.record.shape[1]
+    for place, (kernel, factor_records) in enumerate(zip(problem.kernels, records, strict=True)):
+        width = factor_records.record.shape[1]
         total = sum((variance.get(n, 0.0) * basis[place] for n, basis in zip(names, bases, strict=True)), np.array(0.0))
-        padded = np.concatenate([total, np.repeat(total[:, :, -1:], width - each.count, axis=2)], axis=2)
-        base = _declared(kernel.factor.noise, each)
-        result.append(replace(each, whitening=transformed(by_covariance(padded), base)))
+        padded = np.concatenate([total, np.repeat(total[:, :, -1:], width - factor_records.count, axis=2)], axis=2)
+        base = _declared(kernel.factor.noise, factor_records)
+        result.append(replace(factor_records, whitening=transformed(by_covariance(padded), base)))
     return tuple(result)
 
 
-def _declared(noise: Sequence[float], each: FactorRecords) -> Array:
+def _declared(noise: Sequence[float], factor_records: FactorRecords) -> Array:
     """Whitening by the declared noise (n_r x n_r x width)."""
-    if each.whitening is not None:
-        return each.whitening
-    return np.repeat(declared(noise)[:, :, None], each.record.shape[1], axis=2)
+    if factor_records.whitening is not None:
+        return factor_records.whitening
+    return np.repeat(declared(noise)[:, :, None], factor_records.record.shape[1], axis=2)
 
 
 def _bases(
@@ -166,8 +170,8 @@ def _bases(
     joints = _joints(problem)
     slopes = problem.channel_slopes(values, records, joints)
     whitened = [
-        transformed(_declared(kernel.factor.noise, each)[:, :, : each.count], slope)
-        for (kernel, each), slope in zip(_pairs(problem, records), slopes, strict=True)
+        transformed(_declared(kernel.factor.noise, factor_records)[:, :, : factor_records.count], slope)
+        for (kernel, factor_records), slope in zip(_pairs(problem, records), slopes, strict=True)
     ]
     for number, joint in enumerate(joints):
         names.append(joint)
@@ -203,8 +207,8 @@ def _joint_unit(problem: Problem, channel: str) -> str:
 def _mean_variance(basis: Sequence[Array], records: Sequence[FactorRecords]) -> float:
     """Mean diagonal entry over the residual numbers that count."""
     total, count = 0.0, 0
-    for each, own in zip(records, basis, strict=True):
-        used = each.weight[: each.count] > 0
+    for record, own in zip(records, basis, strict=True):
+        used = record.weight[: record.count] > 0
         total += float(np.einsum("aan->n", own)[used].sum())
         count += int(used.sum()) * len(own)
     return total / max(count, 1)
@@ -217,11 +221,11 @@ def _terms(
     parameters = problem.parameters
     chain, moved = parameters.entries_jacobian(values), parameters.coordinates(parameters.local(values))
     residuals, blocks, terms = problem.whitened_residuals(values, records), problem.jacobians(values, records), []
-    for place, each in enumerate(records):
+    for place, record in enumerate(records):
         parts: list[Array] = []
-        while sum(part.shape[2] for part in parts) < each.record.shape[1]:
+        while sum(part.shape[2] for part in parts) < record.record.shape[1]:
             parts.append(next(blocks))
-        used = np.flatnonzero(each.weight[: each.count] > 0)
+        used = np.flatnonzero(record.weight[: record.count] > 0)
         jacobian = np.einsum("avn,vc->nac", np.concatenate(parts, axis=2)[:, :, used], chain, optimize=True)
         own = np.stack([basis[place][:, :, used] / size for basis, size in zip(bases, sizes, strict=True)])
         target = residuals[place][:, used].T + jacobian @ moved
@@ -246,8 +250,10 @@ def _require_freedom(problem: Problem, values: Array, records: Sequence[FactorRe
 
 def _typical_noise(problem: Problem, records: Sequence[FactorRecords]) -> float:
     """Root mean square of the declared noise of the first measurement."""
-    kernel, each = problem.kernels[0], records[0]
-    inverse = np.linalg.inv(np.moveaxis(_declared(kernel.factor.noise, each)[:, :, : each.count], 2, 0))
+    kernel, factor_records = problem.kernels[0], records[0]
+    inverse = np.linalg.inv(
+        np.moveaxis(_declared(kernel.factor.noise, factor_records)[:, :, : factor_records.count], 2, 0)
+    )
     return float(np.sqrt(np.mean(np.sum(inverse**2, axis=2))))
 
 

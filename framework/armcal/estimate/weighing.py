@@ -180,14 +180,18 @@ class Weighing:
                 return robust, whitened, before
             progress("variance components", number / MOST_ESTIMATES)
             counted = problem.weighted(records, self._trusted(problem, whitened, robust))
-            found = estimate_components(problem, robust.solution.values, counted, axes)
-            found = VarianceComponents(
-                found.components, found.inseparable, found.unseen, found.log_likelihood, number + 1
+            variance_components = estimate_components(problem, robust.solution.values, counted, axes)
+            variance_components = VarianceComponents(
+                variance_components.components,
+                variance_components.inseparable,
+                variance_components.unseen,
+                variance_components.log_likelihood,
+                number + 1,
             )
-            if before is not None and found.close_to(before):
-                return robust, whitened, found
-            before = found
-            whitened = apply_components(problem, robust.solution.values, records, found, axes)
+            if before is not None and variance_components.close_to(before):
+                return robust, whitened, variance_components
+            before = variance_components
+            whitened = apply_components(problem, robust.solution.values, records, variance_components, axes)
             again = self.inner.solve(problem, whitened, robust.solution.values)
             robust = self._robust(problem, whitened, again, progress)
         return robust, whitened, before
@@ -236,10 +240,10 @@ def _estimate(
 def _suspects(problem: Problem, robust: RobustFit, records: tuple[FactorRecords, ...]) -> tuple[Suspect, ...]:
     """All records beyond their limit, and all that were set aside."""
     distances = studentised_distances(problem, robust.solution.values, records, robust.weights)
-    found = []
+    suspects = []
     rows = zip(problem.kernels, distances.studentised, distances.limits, robust.weights, strict=True)
     for kernel, lengths, limit, weights in rows:
         for i in np.flatnonzero((lengths > limit) | (weights == 0)):
             suspect = Suspect(int(i), kernel.factor.name, float(lengths[i]), limit, float(weights[i]))
-            found.append(suspect)
-    return tuple(sorted(found, key=lambda s: -s.distance))
+            suspects.append(suspect)
+    return tuple(sorted(suspects, key=lambda s: -s.distance))

@@ -21,11 +21,11 @@ _NAME = re.compile(
 
 def parsed(text: str) -> tuple[str, int, tuple[str, ...]] | None:
     """Host, port and senders of ``udp:PORT`` or ``udp:HOST:PORT?from=SENDER``; None if it is neither."""
-    found = _NAME.fullmatch(text)
-    if found is None or int(found["port"]) > 65535:
+    match = _NAME.fullmatch(text)
+    if match is None or int(match["port"]) > 65535:
         return None
-    senders = tuple(found["senders"].split(",")) if found["senders"] else ()
-    return (found["host"] or LOOPBACK).strip("[]"), int(found["port"]), senders
+    senders = tuple(match["senders"].split(",")) if match["senders"] else ()
+    return (match["host"] or LOOPBACK).strip("[]"), int(match["port"]), senders
 
 
 def listening(host: str, port: int, senders: Sequence[str]) -> tuple[socket.socket, Callable[[str], bool]]:

@@ -19,7 +19,7 @@ from armcal.errors import DataError, Location
 from armcal.measure.layout import Layout, joints_by_arm, layout_of, set_aside, warned
 from armcal.measure.missing import set_aside_not_finite
 from armcal.measure.poses import first_of_pose
-from armcal.measure.reader import WantedChannel
+from armcal.measure.reader import RequestedChannel
 
 __all__ = [
     "Layout",
@@ -69,18 +69,18 @@ def check_dataset(dataset: Dataset, layout: Layout) -> Dataset:
     return warn_repeated_poses(require_records(dataset), layout)
 
 
-def refuse_joint_count(names: Sequence[str], wanted: Sequence[WantedChannel], where: Location) -> None:
+def refuse_joint_count(names: Sequence[str], requested_channels: Sequence[RequestedChannel], where: Location) -> None:
     """Columns of another arm: it has more or fewer joints than the one that is wanted.
 
     Args:
         names: every column of the source, with its unit suffix if it has one.
-        wanted: the channels; each arm's joints are those with an approach.
+        requested_channels: the channels; each arm's joints are those with an approach.
         where: the header.
 
     Raises:
         DataError: with both counts; not if no column at all is a joint's, which is a matter of names.
     """
-    for arm, joints in joints_by_arm(wanted).items():
+    for arm, joints in joints_by_arm(requested_channels).items():
         own = {name for joint in joints for name in joint.columns}
         prefixes = {name.rstrip(_DIGITS) for name in own if name[-1:].isdigit()} - {""}
         found: dict[str, str] = {}

@@ -14,7 +14,7 @@ from armcal.base.units import DIMENSIONLESS, UNITS, units_of
 from armcal.errors import DataError, Location
 from armcal.io.cells import is_number
 from armcal.measure.checks import refuse_joint_count
-from armcal.measure.reader import ID_NAMES, WantedChannel
+from armcal.measure.reader import ID_NAMES, RequestedChannel
 
 MAX_COLUMNS = 1000
 
@@ -103,7 +103,7 @@ def renamed(header: Header, columns: Mapping[str, str]) -> Header:
     return replace(header, columns=known)
 
 
-def match_columns(header: Header, wanted: Sequence[WantedChannel]) -> Plan:
+def match_columns(header: Header, requested_channels: Sequence[RequestedChannel]) -> Plan:
     """Find every wanted channel's column.
 
     Raises:
@@ -112,7 +112,7 @@ def match_columns(header: Header, wanted: Sequence[WantedChannel]) -> Plan:
     by_name = {column.known_as: column for column in header.columns}
     channels: dict[str, tuple[Column, str]] = {}
     claimed: dict[str, str] = {}
-    for w in wanted:
+    for w in requested_channels:
         found = [(by_name[name], unit) for name, unit in spellings(w).items() if name in by_name]
         if len(found) > 1:
             both = " and ".join(column.name for column, _ in found)
@@ -123,12 +123,12 @@ def match_columns(header: Header, wanted: Sequence[WantedChannel]) -> Plan:
                 hint = f"Name two columns, beginning with {w.columns[0]} and {other}."
                 header.refuse(f"{column.name} could be {other} or {w.channel}.", hint, column.name)
             channels[w.channel] = (column, unit)
-    refuse_joint_count([*by_name], wanted, Location(header.source, line=header.line))
+    refuse_joint_count([*by_name], requested_channels, Location(header.source, line=header.line))
     unused = {name: column for name, column in by_name.items() if name not in claimed}
-    for w in wanted:
+    for w in requested_channels:
         if w.channel not in channels:
             _refuse_unit(header, w, unused)
-    for w in wanted:
+    for w in requested_channels:
         if w.required and w.channel not in channels:
             refuse_missing(header, w, list(unused))
     # An id that counts the records in order may serve as a channel as well: columns: {sequence: pose_id}.
@@ -138,26 +138,26 @@ def match_columns(header: Header, wanted: Sequence[WantedChannel]) -> Plan:
     extra = tuple(column for column in unused.values() if column is not record_id)
     vain = next((column for column in extra if column.known_as != column.name), None)
     if vain is not None:
-        names = [name for w in wanted if w.channel not in channels for name in spellings(w)]
+        names = [name for w in requested_channels if w.channel not in channels for name in spellings(w)]
         hint = f"Correct {vain.known_as} under columns in the data section{_nearest([vain.known_as], names)}."
         header.refuse(f"{vain.name} is mapped to {vain.known_as}, which nothing here uses.", hint, vain.name)
     return Plan(channels, record_id, extra)
 
 
-def spellings(w: WantedChannel) -> dict[str, str]:
+def spellings(w: RequestedChannel) -> dict[str, str]:
     """Each name a channel's column may have, and the unit it declares."""
     if w.dimension in ("1", DIMENSIONLESS):
         return dict.fromkeys(w.columns, "1")
     return {f"{name}_{u.name}": u.name for name in w.columns for u in units_of(w.dimension)}
 
 
-def _written(w: WantedChannel) -> str:
+def _written(w: RequestedChannel) -> str:
     """How to name a channel's column, for a message."""
     short = replace(w, columns=(min(w.columns, key=len),))
     return " or ".join(spellings(short))
 
 
-def _refuse_unit(header: Header, w: WantedChannel, unused: Mapping[str, Column]) -> None:
+def _refuse_unit(header: Header, w: RequestedChannel, unused: Mapping[str, Column]) -> None:
     """A column that would be the channel's if it had a unit of its dimension."""
     for name in w.columns:
         hint = f"Write {' or '.join(spellings(replace(w, columns=(name,))))}."
@@ -167,11 +167,11 @@ def _refuse_unit(header: Header, w: WantedChannel, unused: Mapping[str, Column])
             wrong = unused.get(f"{name}_{unit.name}")
             if wrong is not None:
                 kind = "no unit" if w.dimension in ("1", DIMENSIONLESS) else f"a unit of {w.dimension}"
-                found = f"{wrong.name} has a unit of {unit.dimension}, expected {kind}."
-                header.refuse(found, hint, wrong.name)
+                text = f"{wrong.name} has a unit of {unit.dimension}, expected {kind}."
+                header.refuse(text, hint, wrong.name)
 
 
-def refuse_missing(header: Header, w: WantedChannel, unused: Sequence[str]) -> NoReturn:
+def refuse_missing(header: Header, w: RequestedChannel, unused: Sequence[str]) -> NoReturn:
     """Raise a DataError: no column is this channel's; ``unused`` names come near it, perhaps."""
     written = _written(w)
     header.refuse(
@@ -181,10 +181,10 @@ def refuse_missing(header: Header, w: WantedChannel, unused: Sequence[str]) -> N
     )
 
 
-def _nearest(names: Iterable[str], found: Sequence[str]) -> str:
+def _nearest(names: Iterable[str], texts: Sequence[str]) -> str:
     """The names in the file that come nearest, for a message."""
-    shown = {name.lower()[:64]: name[:64] for name in found}
+    shown = {name.lower()[:64]: name[:64] for name in texts}
     near = [shown[n] for name in names for n in difflib.get_close_matches(name.lower()[:64], shown, n=2)]
     if near:
         return f"; the nearest is {' or '.join(dict.fromkeys(near))}"
-    return f"; found {', '.join(name[:64] for name in found[:8]) or 'no other'}"
+    return f"; found {', '.join(name[:64] for name in texts[:8]) or 'no other'}"

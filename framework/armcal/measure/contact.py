@@ -77,15 +77,15 @@ class ArmsAlone(Contact):
         return (1.0,) * (3 * len(self.arms))
 
 
-def named_arm(asked: str | None, arm_names: Sequence[str]) -> str:
+def named_arm(text: str | None, arm_names: Sequence[str]) -> str:
     """The arm that a configuration names, or the only one.
 
     Raises:
         ValueError: there is no such arm, or several and none is named.
     """
-    if asked is None and len(arm_names) != 1:
+    if text is None and len(arm_names) != 1:
         raise ValueError(f"there are {len(arm_names)} arms ({', '.join(arm_names)}); say which by arm: NAME")
-    name = asked or arm_names[0]
+    name = text or arm_names[0]
     if name not in arm_names:
         raise ValueError(f"no arm is called {name!r}; the arms are {', '.join(arm_names)}")
     return name

@@ -17,7 +17,7 @@ from armcal.base.domains import Array
 from armcal.base.units import DIMENSIONLESS, display_unit, to_unit, units_of
 from armcal.errors import DataError, Location
 from armcal.io.plain_files import check_output
-from armcal.measure.reader import WantedChannel
+from armcal.measure.reader import RequestedChannel
 
 ID_COLUMN = "pose_id"
 _CUSTOMARY: Mapping[str, str] = MappingProxyType({})
@@ -26,10 +26,10 @@ _CUSTOMARY: Mapping[str, str] = MappingProxyType({})
 def write_csv(
     path: str | Path,
     dataset: Dataset,
-    wanted: Sequence[WantedChannel],
+    requested_channels: Sequence[RequestedChannel],
     units: Mapping[str, str] = _CUSTOMARY,
 ) -> None:
-    """Write all records: ``pose_id``, the channels in the order of ``wanted``, then the extra columns.
+    """Write all records: ``pose_id``, the channels in the order of ``requested_channels``, then the extra columns.
 
     The file appears whole or not at all; one that is there already is replaced, but no link and no device. Numbers are
     written in full, so that reading them back gives the same SI values within one unit in the last place.
@@ -37,16 +37,16 @@ def write_csv(
     Args:
         path: where to; its folder must exist.
         dataset: SI values; records set aside on reading are not in it and so are not written.
-        wanted: what the columns of each channel may be called; the shortest name that only one has is used.
+        requested_channels: what the columns of each channel may be called; the shortest name that only one has is used.
         units: of a column by its dimension; by default deg, mm, g, and otherwise the SI unit.
 
     Raises:
-        DataError: a channel of the dataset is not in ``wanted``, two columns would have one name, or the file
-            cannot be written.
+        DataError: a channel of the dataset is not in ``requested_channels``, two columns would have one name, or the
+            file cannot be written.
         ValueError: a unit is not one of its dimension.
     """
     path = Path(path)
-    columns = _columns(path, dataset, wanted, units)
+    columns = _columns(path, dataset, requested_channels, units)
     with _replacing(path) as stream:
         writer = csv.writer(stream, lineterminator="\n")
         writer.writerow(columns)
@@ -54,9 +54,9 @@ def write_csv(
 
 
 def _columns(
-    path: Path, dataset: Dataset, wanted: Sequence[WantedChannel], units: Mapping[str, str]
+    path: Path, dataset: Dataset, requested_channels: Sequence[RequestedChannel], units: Mapping[str, str]
 ) -> dict[str, Sequence[str]]:
-    unknown = sorted(set(dataset.channels) - {w.channel for w in wanted})
+    unknown = sorted(set(dataset.channels) - {w.channel for w in requested_channels})
     if unknown:
         raise DataError(
             f"no column is known for the channel {unknown[0]}.",
@@ -64,7 +64,7 @@ def _columns(
             hint="Name it among the wanted channels, or leave it out of the dataset.",
         )
     columns: dict[str, Sequence[str]] = {ID_COLUMN: dataset.ids}
-    names = column_names([w for w in wanted if dataset.has(w.channel)], units)
+    names = column_names([w for w in requested_channels if dataset.has(w.channel)], units)
     written = [(column, _texts(dataset.channels[channel], unit)) for channel, (column, unit) in names.items()]
     for name, texts in [*written, *dataset.extra.items()]:
         if name in columns:
@@ -77,15 +77,17 @@ def _columns(
     return columns
 
 
-def column_names(wanted: Sequence[WantedChannel], units: Mapping[str, str] = _CUSTOMARY) -> dict[str, tuple[str, str]]:
+def column_names(
+    requested_channels: Sequence[RequestedChannel], units: Mapping[str, str] = _CUSTOMARY
+) -> dict[str, tuple[str, str]]:
     """The column of each channel, with its unit as suffix, and the unit (``"1"``: none).
 
     Raises:
         ValueError: a unit is not one of its dimension.
     """
-    taken = [name for w in wanted for name in set(w.columns)]
+    taken = [name for w in requested_channels for name in set(w.columns)]
     found = {}
-    for w in wanted:
+    for w in requested_channels:
         own = [name for name in w.columns if taken.count(name) == 1] or [w.columns[0]]
         unit = _unit(w.dimension, units)
         name = min(own, key=len)

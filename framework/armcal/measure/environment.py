@@ -11,19 +11,19 @@ import numpy as np
 from armcal.base.dataset import Dataset
 from armcal.base.units import split_suffix
 from armcal.errors import DataError, Location
-from armcal.measure.reader import ENVIRONMENT, WantedChannel
+from armcal.measure.reader import ENVIRONMENT, RequestedChannel
 
 JUMP_RATIO = 50.0
 SHORTEST_JUMP_S = 600.0
 
 
-def require_conditions(dataset: Dataset, wanted: Sequence[WantedChannel]) -> None:
+def require_conditions(dataset: Dataset, requested_channels: Sequence[RequestedChannel]) -> None:
     """Refuse records without a column that an effect reads, whatever reader they come from.
 
     Raises:
         DataError: with effect, column and source.
     """
-    for channel in wanted:
+    for channel in requested_channels:
         if channel.effects and channel.required and not dataset.has(channel.channel):
             raise DataError(
                 f"found no {channel.what}.",
@@ -48,13 +48,13 @@ def noticed(dataset: Dataset) -> Dataset:
                 hint="Give all three components, 0 where there is none.",
             )
     known = [name for name, _ in ENVIRONMENT]
-    found = []
+    texts = []
     for column in dataset.extra:
         split = split_suffix(column)
         near = difflib.get_close_matches(split[0], known, n=1, cutoff=0.8) if split else []
         if near:
-            found.append(f"the column {column} is kept but not used: was {near[0]} meant?")
-    return replace(dataset, warnings=(*dataset.warnings, *found, *_jumps(dataset)))
+            texts.append(f"the column {column} is kept but not used: was {near[0]} meant?")
+    return replace(dataset, warnings=(*dataset.warnings, *texts, *_jumps(dataset)))
 
 
 def _jumps(dataset: Dataset) -> list[str]:

@@ -58,17 +58,17 @@ def groups_of(dataset: Dataset, measurements: Mapping[str, Measurement]) -> dict
 
 def unmatched(measurements: Mapping[str, Measurement], groups: Groups) -> list[str]:
     """What settings say of groups that no record belongs to, in sentences."""
-    found = []
+    texts = []
     for instance, measurement in measurements.items():
         if isinstance(measurement, GroupedMeasurement) and isinstance(measurement, NamesGroups):
             keys = groups.get(owner_of(instance, measurement), ())
             for pattern in dict.fromkeys(measurement.named_groups()):
                 if not fnmatch.filter(keys, pattern):
                     listed = ", ".join(keys[:4]) + (", ..." if len(keys) > 4 else "")
-                    found.append(
+                    texts.append(
                         f"{instance} states something of {pattern}, to which no record belongs: there are {listed}."
                     )
-    return found
+    return texts
 
 
 def record_keys(dataset: Dataset, measurement: GroupedMeasurement) -> tuple[str, ...]:
@@ -163,14 +163,14 @@ def group_name(owner: str, key: str, local: str) -> str:
 
 def ties_of(measurements: Mapping[str, Measurement], groups: Groups) -> tuple[OwnedTie, ...]:
     """All that is known between groups."""
-    found = []
+    owned_ties = []
     for instance, measurement in measurements.items():
         if isinstance(measurement, GroupedMeasurement):
             owner = owner_of(instance, measurement)
             for tie in measurement.ties(groups.get(owner, ())):
                 first, second = (_names(owner, measurement, key) for key in tie.groups)
-                found.append(OwnedTie((first, second), tie))
-    return tuple(found)
+                owned_ties.append(OwnedTie((first, second), tie))
+    return tuple(owned_ties)
 
 
 def _check_owner(instance: str, measurement: GroupedMeasurement, measurements: Mapping[str, Measurement]) -> None:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from armcal.base.dataset import Dataset
 from armcal.base.units import UNITS, to_unit
 from armcal.errors import Location
-from armcal.measure.reader import WantedChannel
+from armcal.measure.reader import RequestedChannel
 
 _APPROACH = ".approach."
 
@@ -71,7 +71,7 @@ class Layout:
 
 
 def layout_of(
-    wanted: Sequence[WantedChannel],
+    requested_channels: Sequence[RequestedChannel],
     dataset: Dataset,
     columns: Mapping[str, str],
     units: Mapping[str, str],
@@ -83,11 +83,13 @@ def layout_of(
     A channel that has an approach (``arm.approach.q1``) is a joint (``arm.q1``); any other channel that belongs
     to an instance is measured; one that belongs to none (``payload``) describes the surroundings.
     """
-    approach = [w.channel for w in wanted if _APPROACH in w.channel]
-    moved = {joint.channel for joints in joints_by_arm(wanted).values() for joint in joints}
-    joints = [w for w in wanted if w.channel in moved and dataset.has(w.channel)]
-    deviations = [w.channel for w in wanted if w.is_deviation]
-    measured = [w.channel for w in wanted if "." in w.channel and w.channel not in {*moved, *approach, *deviations}]
+    approach = [w.channel for w in requested_channels if _APPROACH in w.channel]
+    moved = {joint.channel for joints in joints_by_arm(requested_channels).values() for joint in joints}
+    joints = [w for w in requested_channels if w.channel in moved and dataset.has(w.channel)]
+    deviations = [w.channel for w in requested_channels if w.is_deviation]
+    measured = [
+        w.channel for w in requested_channels if "." in w.channel and w.channel not in {*moved, *approach, *deviations}
+    ]
     return Layout(
         joints=tuple(w.channel for w in joints),
         revolute=tuple(w.channel for w in joints if w.dimension == "angle" and not w.is_endless),
@@ -97,15 +99,15 @@ def layout_of(
         units=units,
         by_line=by_line,
         deviations=tuple(name for name in deviations if dataset.has(name)),
-        parts={w.channel: w.parts for w in wanted if w.parts and dataset.has(w.channel)},
+        parts={w.channel: w.parts for w in requested_channels if w.parts and dataset.has(w.channel)},
     )
 
 
-def joints_by_arm(wanted: Sequence[WantedChannel]) -> dict[str, list[WantedChannel]]:
+def joints_by_arm(requested_channels: Sequence[RequestedChannel]) -> dict[str, list[RequestedChannel]]:
     """The channels of each arm's joints: those that have an approach."""
-    moved = {w.channel.replace(_APPROACH, ".", 1) for w in wanted if _APPROACH in w.channel}
-    arms: dict[str, list[WantedChannel]] = {}
-    for w in wanted:
+    moved = {w.channel.replace(_APPROACH, ".", 1) for w in requested_channels if _APPROACH in w.channel}
+    arms: dict[str, list[RequestedChannel]] = {}
+    for w in requested_channels:
         if w.channel in moved:
             arms.setdefault(w.channel.rpartition(".")[0], []).append(w)
     return arms

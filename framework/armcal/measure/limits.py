@@ -19,10 +19,10 @@ TOLERANCE = {"angle": 1e-3, "length": 1e-4}
 
 def warn_beyond_limits(dataset: Dataset, arms: Mapping[str, Arm]) -> Dataset:
     """The dataset, with a warning for all joints that were commanded beyond their limits."""
-    told = [text for name, arm in arms.items() for text in _beyond(dataset, name, arm, len(arms) == 1)]
-    if not told:
+    texts = [text for name, arm in arms.items() for text in _beyond(dataset, name, arm, len(arms) == 1)]
+    if not texts:
         return dataset
-    text = f"{'; '.join(told)}: check the joints' order, signs and units."
+    text = f"{'; '.join(texts)}: check the joints' order, signs and units."
     return replace(dataset, warnings=(*dataset.warnings, text))
 
 
@@ -31,7 +31,7 @@ def _beyond(dataset: Dataset, name: str, arm: Arm, alone: bool) -> list[str]:
     if not len(dataset) or not all(map(dataset.has, channels)):
         return []
     commands = arm.joint_commands([dataset.column(channel) for channel in channels])
-    told = []
+    texts = []
     for joint, dimension, angles in zip(arm.nominal_chain.joints, arm.joint_dimensions, commands, strict=True):
         over = np.nan_to_num(_over(joint, np.asarray(angles)), nan=-np.inf, neginf=-np.inf)
         count = int(np.sum(over > TOLERANCE[dimension]))
@@ -40,8 +40,8 @@ def _beyond(dataset: Dataset, name: str, arm: Arm, alone: bool) -> list[str]:
             low, high, worst = (to_unit(x, unit) for x in (*joint.limits, float(angles[int(np.argmax(over))])))
             shown = joint.name if alone else f"{name}.{joint.name}"
             limits = f"limits {low:.4g} to {high:.4g} {unit}"
-            told.append(f"{shown} is beyond its {limits} in {count} of {len(dataset)} records, at worst {worst:.4g}")
-    return told
+            texts.append(f"{shown} is beyond its {limits} in {count} of {len(dataset)} records, at worst {worst:.4g}")
+    return texts
 
 
 def _over(joint: Joint, angles: Array) -> Array:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.measure.layout import Layout, set_aside, warned
-from armcal.measure.reader import WantedChannel
+from armcal.measure.reader import RequestedChannel
 
 Mask = NDArray[np.bool_]
 
@@ -48,12 +48,12 @@ def _complete(dataset: Dataset, layout: Layout) -> dict[str, Mask]:
 
 def _reason(dataset: Dataset, layout: Layout, index: int) -> str:
     """Everything that a record lacks."""
-    found = []
+    texts = []
     for channel, values in dataset.channels.items():
         if not np.isfinite(values[index]):
             kind = "is empty or NaN" if np.isnan(values[index]) else "is infinite"
-            found.append(f"{layout.column(channel)} {kind}")
-    return ", ".join(found)
+            texts.append(f"{layout.column(channel)} {kind}")
+    return ", ".join(texts)
 
 
 def _without_incomplete(dataset: Dataset, layout: Layout, complete: Mapping[str, Mask]) -> Dataset:
@@ -98,8 +98,8 @@ def _with_deviations(dataset: Dataset, layout: Layout, channel: str) -> Dataset:
     return warned(found, f"{text}there, the largest one stated counts ({layout.shown(channel, largest)}).")
 
 
-def with_absent(dataset: Dataset, wanted: Sequence[WantedChannel]) -> Dataset:
+def with_absent(dataset: Dataset, requested_channels: Sequence[RequestedChannel]) -> Dataset:
     """The dataset with all that measurements require: what its source cannot have is missing in all records."""
-    absent = [w.channel for w in wanted if w.required and w.parts and not dataset.has(w.channel)]
+    absent = [w.channel for w in requested_channels if w.required and w.parts and not dataset.has(w.channel)]
     none = np.full(len(dataset), np.nan)
     return replace(dataset, channels={**dataset.channels, **dict.fromkeys(absent, none)}) if absent else dataset

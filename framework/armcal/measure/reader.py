@@ -13,7 +13,7 @@ from armcal.measure.measurement import Measurement, noise_channels
 
 
 @dataclass(frozen=True)
-class WantedChannel:
+class RequestedChannel:
     """One number a record may carry.
 
     Attributes:
@@ -49,7 +49,7 @@ class ReadRequest:
 
     arms: Mapping[str, Arm]
     measurements: Mapping[str, Measurement]
-    wanted: tuple[WantedChannel, ...]
+    wanted: tuple[RequestedChannel, ...]
 
 
 class Reader(Protocol):
@@ -90,29 +90,29 @@ def surroundings(arms: Mapping[str, Arm]) -> dict[str, str]:
     for arm in arms.values():
         for effect, condition in arm.declared:
             name, dimension = condition.name, condition.dimension or known.get(condition.name)
-            found = f"the effect {arm.name}.{effect} reads the column {name!r}"
+            text = f"the effect {arm.name}.{effect} reads the column {name!r}"
             if not name.isidentifier() or name in joints or name in ID_NAMES:
-                raise ValueError(f"{found}, expected letters, digits and underscores, and no name of a joint or id")
+                raise ValueError(f"{text}, expected letters, digits and underscores, and no name of a joint or id")
             if dimension is None:
                 raise ValueError(
-                    f"{found} without its dimension, expected Condition({name!r}, DIMENSION), or a column that any "
+                    f"{text} without its dimension, expected Condition({name!r}, DIMENSION), or a column that any "
                     f"record may carry: {', '.join(name for name, _ in ENVIRONMENT)}"
                 )
             if dimension != DIMENSIONLESS:
                 units_of(dimension)
             if known.setdefault(name, dimension) != dimension:
-                raise ValueError(f"{found} as {dimension}, and it is known as {known[name]}: use another name")
+                raise ValueError(f"{text} as {dimension}, and it is known as {known[name]}: use another name")
     return known
 
 
-def wanted_channels(
+def requested_channels(
     arms: Mapping[str, Arm], measurements: Mapping[str, Measurement], measured: bool
-) -> tuple[WantedChannel, ...]:
+) -> tuple[RequestedChannel, ...]:
     """Every channel a problem of these arms and measurements can use.
 
     ``measured`` says whether measured values are required (a calibration) or may be absent (a prediction).
     """
-    wanted: list[WantedChannel] = []
+    wanted: list[RequestedChannel] = []
     for arm in arms.values():
         parts = tuple(name for name, measurement in measurements.items() if arm.name in measurement.arms)
         wanted += _arm_channels(arm, len(arms) == 1, parts)
@@ -121,7 +121,7 @@ def wanted_channels(
         for effect, condition in arm.declared:
             read.setdefault(condition.name, []).append(f"{arm.name}.{effect}")
     wanted += [
-        WantedChannel(name, (name,), dimension, measured and name in read, effects=tuple(read.get(name, ())))
+        RequestedChannel(name, (name,), dimension, measured and name in read, effects=tuple(read.get(name, ())))
         for name, dimension in surroundings(arms).items()
     ]
     local = [c.name for m in measurements.values() for c in m.channels()]
@@ -129,11 +129,11 @@ def wanted_channels(
         for channel in measurement.channels():
             own = f"{instance}.{channel.name}"
             names = (own, channel.name) if local.count(channel.name) == 1 else (own,)
-            wanted.append(WantedChannel(own, names, channel.dimension, measured, parts=(instance,)))
+            wanted.append(RequestedChannel(own, names, channel.dimension, measured, parts=(instance,)))
     return (*wanted, *_deviations(measurements)) if measured else tuple(wanted)
 
 
-def _deviations(measurements: Mapping[str, Measurement]) -> Iterator[WantedChannel]:
+def _deviations(measurements: Mapping[str, Measurement]) -> Iterator[RequestedChannel]:
     """What records may say of their own noise; a prediction has no use for it."""
     by_instance = {
         instance: {channel.name: channel for own in noise_channels(measurement) for channel in own}
@@ -144,17 +144,17 @@ def _deviations(measurements: Mapping[str, Measurement]) -> Iterator[WantedChann
         for channel in channels.values():
             own = f"{instance}.{channel.name}"
             names = (own, channel.name) if local.count(channel.name) == 1 else (own,)
-            yield WantedChannel(own, names, channel.dimension, False, is_deviation=True, parts=(instance,))
+            yield RequestedChannel(own, names, channel.dimension, False, is_deviation=True, parts=(instance,))
 
 
-def _arm_channels(arm: Arm, alone: bool, parts: tuple[str, ...]) -> Iterator[WantedChannel]:
+def _arm_channels(arm: Arm, alone: bool, parts: tuple[str, ...]) -> Iterator[RequestedChannel]:
     endless = {joint.name for joint in arm.nominal_chain.joints if joint.endless}
     for index, (joint, dimension) in enumerate(arm.commanded.items(), start=1):
         own = f"{arm.name}.{joint}"
         names = _names(own, (joint,), alone)
-        yield WantedChannel(own, names, dimension, True, is_endless=joint in endless, parts=parts)
+        yield RequestedChannel(own, names, dimension, True, is_endless=joint in endless, parts=parts)
         approach = (f"approach{index}", f"approach_{joint}")
-        yield WantedChannel(
+        yield RequestedChannel(
             f"{arm.name}.approach.{joint}", _names(f"{arm.name}.{approach[0]}", approach, alone), DIMENSIONLESS, False
         )
 

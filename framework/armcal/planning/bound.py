@@ -26,12 +26,12 @@ _MOST_COORDINATES = 60
 _AT_ONCE_E = 600
 
 
-def bounded(task: Task, solver: BoundSolver = "auto", found: Relaxation | None = None) -> Relaxation | None:
+def bounded(task: Task, solver: BoundSolver = "auto", relaxation: Relaxation | None = None) -> Relaxation | None:
     """A certified upper bound on the criterion of any plan; None where there is none.
 
     ``auto``: cvxpy for up to 2000 candidates and 60 coordinates, beyond them an interior-point method on the
     candidates that matter, certified on all by the equivalence theorem. E is always cvxpy's. O2 and O4 are not
-    concave; E over several draws is not posed. ``found`` is the interior-point answer, where it is known already.
+    concave; E over several draws is not posed. ``relaxation`` is the interior-point answer, where it is known already.
     """
     name = task.criterion.name
     if solver == "none" or name in ("O2", "O4") or (name == "E" and task.candidates.draws > 1):
@@ -47,7 +47,7 @@ def bounded(task: Task, solver: BoundSolver = "auto", found: Relaxation | None =
                 return None
     if name == "E":
         return None
-    return found or relax(task, interior_point, INTERIOR_POINT)
+    return relaxation or relax(task, interior_point, INTERIOR_POINT)
 
 
 def by_cvxpy(task: Task) -> tuple[Array, Tangent]:
@@ -70,8 +70,8 @@ def by_cvxpy(task: Task) -> tuple[Array, Tangent]:
         return _smallest(cp, task, (weights, information, constraints), basis)
     objective = -cp.log_det(information) if task.criterion.name == "D" else cp.matrix_frac(basis.T, information)
     _solve(cp, cp.Problem(cp.Minimize(objective), constraints), ("SCS", "CLARABEL"))
-    found = _feasible(task, weights.value)
-    return found, tangent(task, found)
+    feasible = _feasible(task, weights.value)
+    return feasible, tangent(task, feasible)
 
 
 def _information(cp: Any, candidates: Candidates, basis: Array, weights: Any) -> Any:

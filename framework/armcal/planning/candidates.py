@@ -111,14 +111,14 @@ def whitened_rows(problem: Problem, values: Array, dataset: Dataset) -> Array:
     records = as_predicted(problem, values, problem.records(dataset))
     blocks = problem.jacobians(values, records)
     parts: list[Array] = []
-    for each in records:
-        width = each.record.shape[1]
+    for record in records:
+        width = record.record.shape[1]
         whole: Array | None = None
         for start in range(0, width, BLOCK_RECORDS):
             block = next(blocks)
             if whole is None:
-                whole = np.empty((block.shape[0], each.count, len(scales)))
-            end = min(start + block.shape[2], each.count)
+                whole = np.empty((block.shape[0], record.count, len(scales)))
+            end = min(start + block.shape[2], record.count)
             for row, jacobian in zip(whole, block, strict=True):
                 row[start:end] = jacobian[:, : max(0, end - start)].T @ chain
         if whole is not None:

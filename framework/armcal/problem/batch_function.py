@@ -113,9 +113,9 @@ class BatchFunction:
         outputs = [np.empty((size, count)) for size in self._sizes_out]
         whole = count - count % _BLOCK
         if whole:
-            self._mapped(np.zeros(0), [each[:, :whole] for each in inputs], [each[:, :whole] for each in outputs])
+            self._mapped(np.zeros(0), [each[:, :whole] for each in inputs], [output[:, :whole] for output in outputs])
         if whole < count:
-            self._single(np.zeros(0), [each[:, whole:] for each in inputs], [each[:, whole:] for each in outputs])
+            self._single(np.zeros(0), [each[:, whole:] for each in inputs], [output[:, whole:] for output in outputs])
         return outputs
 
     def _count(self, records: int) -> None:

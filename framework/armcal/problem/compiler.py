@@ -45,17 +45,17 @@ def find_compiler() -> str | None:
     if asked == "none":
         return None
     for name in [asked] if asked else [os.environ.get("CC", ""), "cc", "gcc", "clang"]:
-        found = shutil.which(name) if name else None
-        if found:
-            return found
+        text = shutil.which(name) if name else None
+        if text:
+            return text
     return None
 
 
 def cache_directory() -> Path:
     """Where compiled kernels are kept."""
-    asked = os.environ.get("ARMCAL_CACHE_DIR")
-    if asked:
-        return Path(asked).absolute()
+    text = os.environ.get("ARMCAL_CACHE_DIR")
+    if text:
+        return Path(text).absolute()
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "armcal"
 
 
@@ -160,7 +160,9 @@ def _prepare(key: str, source: Callable[[], str], trial: Callable[[], Trial] | N
 
 
 def _as_json(trial: Trial) -> dict[str, object]:
-    arguments = [each.ravel().tolist() if isinstance(each, np.ndarray) else each for each in trial.arguments]
+    arguments = [
+        argument.ravel().tolist() if isinstance(argument, np.ndarray) else argument for argument in trial.arguments
+    ]
     expected = {str(place): numbers.ravel().tolist() for place, numbers in trial.expected.items()}
     return {"entry": trial.entry, "arguments": arguments, "expected": expected, "tolerance": trial.tolerance}
 

@@ -164,7 +164,7 @@ class Correlation:
     def _stacked(self, rows: Sequence[Array]) -> Array:
         """Rows of all factors, a record's together (width x R x k); zero where they end before the records."""
         width = len(self.node)
-        padded = [np.pad(each, ((0, 0), (0, width - each.shape[1]), (0, 0))) for each in rows]
+        padded = [np.pad(row, ((0, 0), (0, width - row.shape[1]), (0, 0))) for row in rows]
         return np.concatenate(padded).transpose(1, 0, 2)
 
     @staticmethod

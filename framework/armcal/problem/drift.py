@@ -106,14 +106,17 @@ def with_drift(
     if along is None:
         return tuple(records)
     drifting = _drifting(problem)
-    shared = [replace(each, weight=np.ones_like(each.weight), correlation=None) for each in records]
+    shared = [replace(record, weight=np.ones_like(record.weight), correlation=None) for record in records]
     slopes = _slopes(problem, shared, values, drifting)
-    raw = [_raw(kernel.factor.noise, each, s) for kernel, each, s in zip(problem.kernels, shared, slopes, strict=True)]
+    raw = [
+        _raw(kernel.factor.noise, factor_records, s)
+        for kernel, factor_records, s in zip(problem.kernels, shared, slopes, strict=True)
+    ]
     node = along.nodes(dataset)
     node = np.pad(node, (0, len(records[0].weight) - len(node)), mode="edge")
     correlation = Correlation(tuple(slopes), tuple(raw), node, along.apart(drifting))
-    correlation = correlation.weighted([each.weight for each in records])
-    return tuple(replace(each, correlation=correlation) for each in records)
+    correlation = correlation.weighted([record.weight for record in records])
+    return tuple(replace(record, correlation=correlation) for record in records)
 
 
 def residuals(
@@ -135,9 +138,9 @@ def _slopes(
     place = {name: i for i, name in enumerate(problem.free_names)}
     chosen, sizes = [place[block.name] for block in drifting], [drift.sd for drift in _drifts(drifting)]
     blocks, slopes = problem.jacobians(values, records), []
-    for each in records:
-        slope = np.moveaxis(_whole(blocks, each.record.shape[1])[:, chosen], 1, 2) * np.array(sizes)
-        slope[:, each.count :] = 0.0
+    for record in records:
+        slope = np.moveaxis(_whole(blocks, record.record.shape[1])[:, chosen], 1, 2) * np.array(sizes)
+        slope[:, record.count :] = 0.0
         slopes.append(slope)
     return slopes
 

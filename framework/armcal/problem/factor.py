@@ -277,10 +277,12 @@ def _told(
     """What a record says of its group's parameters, and whose entries these are."""
     if not isinstance(measurement, GroupedMeasurement):
         return ca.SX(0, 1), ()
-    told = {name: ca.SX(entries) for name, entries in measurement.told(states, local).items()}
-    if not told:
+    expressions = {name: ca.SX(entries) for name, entries in measurement.told(states, local).items()}
+    if not expressions:
         return ca.SX(0, 1), ()
-    return ca.densify(ca.vertcat(*told.values())), tuple(n for n, e in told.items() for _ in range(e.numel()))
+    return ca.densify(ca.vertcat(*expressions.values())), tuple(
+        n for n, e in expressions.items() for _ in range(e.numel())
+    )
 
 
 def _load(records: _Records, environment: Environment) -> Load:

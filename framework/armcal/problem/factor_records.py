@@ -97,18 +97,18 @@ def subset(records: Sequence[FactorRecords], chosen: Indices) -> tuple[FactorRec
         inside = (np.arange(len(fill)) < len(chosen)).astype(float)
         correlation = shared.subset(fill).weighted([inside] * len(records))
     parts = []
-    for each in records:
-        weight = each.weight[fill]
+    for record in records:
+        weight = record.weight[fill]
         weight[len(chosen) :] = 0
         part = FactorRecords(
             len(chosen),
-            np.take(each.record, fill, axis=1),
+            np.take(record.record, fill, axis=1),
             weight,
-            np.take(each.state, fill, axis=1),
-            None if each.whitening is None else np.take(each.whitening, fill, axis=2),
+            np.take(record.state, fill, axis=1),
+            None if record.whitening is None else np.take(record.whitening, fill, axis=2),
             correlation,
-            None if each.group is None else each.group[fill],
-            None if each.applies is None else each.applies[fill],
+            None if record.group is None else record.group[fill],
+            None if record.applies is None else record.applies[fill],
         )
         parts.append(part)
     return tuple(parts)
@@ -116,12 +116,12 @@ def subset(records: Sequence[FactorRecords], chosen: Indices) -> tuple[FactorRec
 
 def weighted(records: Sequence[FactorRecords], weights: Sequence[Array]) -> tuple[FactorRecords, ...]:
     """The same records with their weights multiplied, factor by factor (N each); equilibria stay shared."""
-    factors = [np.pad(w, (0, len(each.weight) - each.count)) for each, w in zip(records, weights, strict=True)]
+    factors = [np.pad(w, (0, len(record.weight) - record.count)) for record, w in zip(records, weights, strict=True)]
     shared = correlation_of(records)
     correlation = None if shared is None else shared.weighted(factors)
     return tuple(
-        replace(each, weight=each.weight * factor, correlation=correlation)
-        for each, factor in zip(records, factors, strict=True)
+        replace(record, weight=record.weight * factor, correlation=correlation)
+        for record, factor in zip(records, factors, strict=True)
     )
 
 

@@ -36,13 +36,13 @@ def with_joint_noise(problem: Problem, records: Sequence[FactorRecords], values:
     deviations = np.array(list(stated.values()))
     slopes = problem.channel_slopes(values, records, list(stated))
     result = []
-    for kernel, each, slope in zip(problem.kernels, records, slopes, strict=True):
-        width = each.record.shape[1]
-        own = each.whitening
+    for kernel, record, slope in zip(problem.kernels, records, slopes, strict=True):
+        width = record.record.shape[1]
+        own = record.whitening
         if own is None:
             own = np.repeat(declared(kernel.factor.noise)[:, :, None], width, axis=2)
-        padded = np.concatenate([slope, np.repeat(slope[:, :, -1:], width - each.count, axis=2)], axis=2)
+        padded = np.concatenate([slope, np.repeat(slope[:, :, -1:], width - record.count, axis=2)], axis=2)
         scaled = transformed(own, padded * deviations[:, None])
         covariance = np.einsum("ikn,jkn->ijn", scaled, scaled) + np.eye(len(own))[:, :, None]
-        result.append(replace(each, whitening=transformed(by_covariance(covariance), own)))
+        result.append(replace(record, whitening=transformed(by_covariance(covariance), own)))
     return tuple(result)

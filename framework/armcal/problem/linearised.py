@@ -23,12 +23,12 @@ Block = tuple[Array, Array]
 """Jacobian (n_r x n_v x B) and residual (n_r x B)."""
 
 
-def linearised(kernel: Kernel, slots: Slots, each: FactorRecords, values: Array) -> Iterator[Block]:
+def linearised(kernel: Kernel, slots: Slots, factor_records: FactorRecords, values: Array) -> Iterator[Block]:
     """Whitened, weighted blocks by the free entries, in order; two at a time in threads."""
-    starts = range(0, each.record.shape[1], BLOCK_RECORDS)
+    starts = range(0, factor_records.record.shape[1], BLOCK_RECORDS)
 
     def work(start: int) -> Block:
-        return _block(kernel, slots, each, values, slice(start, start + BLOCK_RECORDS))
+        return _block(kernel, slots, factor_records, values, slice(start, start + BLOCK_RECORDS))
 
     if len(starts) <= _THREADS or kernel.backend.name != "compiled":
         yield from map(work, starts)
@@ -37,44 +37,44 @@ def linearised(kernel: Kernel, slots: Slots, each: FactorRecords, values: Array)
         yield from _in_order(pool, work, starts)
 
 
-def mean_shares(factor: Factor, each: FactorRecords) -> list[Array]:
+def mean_shares(factor: Factor, factor_records: FactorRecords) -> list[Array]:
     """Of each group whose mean weighs more than its records say, what each record adds to a row (width).
 
     The shares go with residuals in units of the declared noise: the mean of a group is that of its records by their
     weights alone, whatever is known of their own noise. Records of total weight n whose residuals have the mean m give
     n |m|^2 to a sum of squares; with the row as many times more as the measurement says.
     """
-    if factor.mean_weight <= 1 or each.group is None:
+    if factor.mean_weight <= 1 or factor_records.group is None:
         return []
-    beyond, inside = np.sqrt(factor.mean_weight - 1), each.weight > 0
+    beyond, inside = np.sqrt(factor.mean_weight - 1), factor_records.weight > 0
     shares = []
-    for number in np.unique(each.group[inside & (each.group != NO_GROUP)]):
-        weight = np.where(each.group == number, each.weight, 0.0)
+    for number in np.unique(factor_records.group[inside & (factor_records.group != NO_GROUP)]):
+        weight = np.where(factor_records.group == number, factor_records.weight, 0.0)
         shares.append(beyond * weight / np.sqrt(weight.sum()))
     return shares
 
 
-def linearised_means(kernel: Kernel, slots: Slots, each: FactorRecords, values: Array) -> list[Block]:
+def linearised_means(kernel: Kernel, slots: Slots, factor_records: FactorRecords, values: Array) -> list[Block]:
     """Jacobian (n_r x n_v) and residual (n_r) of each group whose mean weighs more."""
-    shares = mean_shares(kernel.factor, each)
+    shares = mean_shares(kernel.factor, factor_records)
     if not shares:
         return []
-    alike = replace(each, whitening=None, weight=np.ones_like(each.weight))
+    alike = replace(factor_records, whitening=None, weight=np.ones_like(factor_records.weight))
     blocks = list(linearised(kernel, slots, alike, values))
     jacobian, residual = (np.concatenate(parts, axis=-1) for parts in zip(*blocks, strict=True))
     return [(jacobian @ share, residual @ share) for share in shares]
 
 
-def _block(kernel: Kernel, slots: Slots, each: FactorRecords, values: Array, part: slice) -> Block:
-    record, state, weight = each.record[:, part], each.state[:, part], each.weight[part]
-    group = None if each.group is None else each.group[part]
+def _block(kernel: Kernel, slots: Slots, factor_records: FactorRecords, values: Array, part: slice) -> Block:
+    record, state, weight = factor_records.record[:, part], factor_records.state[:, part], factor_records.weight[part]
+    group = None if factor_records.group is None else factor_records.group[part]
     n_residual, n_values, width = kernel.factor.residual.numel(), kernel.factor.values.numel(), record.shape[1]
     jacobian = np.empty((n_residual * n_values, width))
     residual = np.empty((n_residual, width))
     evaluated(slots, values, group, kernel.linearise, record, state, residual, jacobian)
     shaped = scattered(slots, group, jacobian.reshape(n_residual, n_values, width))
-    if each.whitening is not None:
-        whitening = each.whitening[:, :, part] * np.sqrt(weight)
+    if factor_records.whitening is not None:
+        whitening = factor_records.whitening[:, :, part] * np.sqrt(weight)
         return transformed(whitening, shaped), transformed(whitening, residual)
     scale = np.sqrt(weight) / np.array(kernel.factor.noise)[:, None]
     shaped *= scale[:, None, :]

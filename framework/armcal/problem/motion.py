@@ -44,14 +44,17 @@ class Motion:
         channels = tuple(f"{name}.{joint}" for name, arm in arms.items() for joint in arm.commanded)
         blocks = {b.name: values[problem.parameters.entries_of(b.name)] for b in problem.parameters.blocks}
         loads = {name: site_loads(arm, blocks, *_inputs(problem, arm, dataset)) for name, arm in arms.items()}
-        slopes, elastic = problem.channel_slopes(values, records, channels), any(len(each.state) for each in records)
+        slopes, elastic = (
+            problem.channel_slopes(values, records, channels),
+            any(len(record.state) for record in records),
+        )
         return cls(channels, slopes, loads, _by_load(problem, values, records, dataset) if elastic else ())
 
     def subset(self, chosen: NDArray[np.intp]) -> Motion:
         """Some records of all."""
         loads = {
-            name: SiteLoads(each.moments[..., chosen], each.efforts[..., chosen], each.levers[..., chosen])
-            for name, each in self.loads.items()
+            name: SiteLoads(load.moments[..., chosen], load.efforts[..., chosen], load.levers[..., chosen])
+            for name, load in self.loads.items()
         }
         by_load = tuple(slope[..., chosen] for slope in self.by_load)
         return Motion(self.channels, tuple(slope[..., chosen] for slope in self.slopes), loads, by_load)
@@ -102,7 +105,7 @@ def _by_load(problem: Problem, values: Array, records: Sequence[FactorRecords], 
 
     def slopes(of: Dataset) -> tuple[Array, ...]:
         here = zip(other.records(of), records, strict=True)
-        at_rest = [replace(each, state=before.state.copy()) for each, before in here]
+        at_rest = [replace(factor_records, state=before.state.copy()) for factor_records, before in here]
         return other.channel_slopes(values, at_rest, LOAD_CHANNELS[:4])
 
     g = np.array([acting[f"gravity_{axis}"] for axis in "xyz"])

@@ -53,8 +53,8 @@ class ExtraRows:
 
 def stacked(rows: Sequence[ExtraRows], width: int) -> ExtraRows:
     """Several as one."""
-    residual = np.concatenate([np.zeros(0), *(each.residual for each in rows)])
-    return ExtraRows(residual, np.vstack([np.zeros((0, width)), *(each.jacobian for each in rows)]))
+    residual = np.concatenate([np.zeros(0), *(row.residual for row in rows)])
+    return ExtraRows(residual, np.vstack([np.zeros((0, width)), *(row.jacobian for row in rows)]))
 
 
 @dataclass(frozen=True)
@@ -110,7 +110,7 @@ class TieFunction:
 
     def rows(self, values: Array, places: Mapping[int, int], width: int) -> ExtraRows:
         """Whitened; ``places`` are those of free entries by position in the value vector."""
-        residual, slope = (np.asarray(each) for each in self.function(values[self.entries]))
+        residual, slope = (np.asarray(dm) for dm in self.function(values[self.entries]))
         columns, free = self._free(places)
         jacobian = np.zeros((len(self.noise), width))
         jacobian[:, free] = slope[:, columns]

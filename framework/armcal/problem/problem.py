@@ -147,8 +147,8 @@ class Problem:
     def equations(self, records: Sequence[FactorRecords]) -> int:
         """How many residual numbers the records give; those of weight zero are no evidence."""
         return sum(
-            int(np.count_nonzero(each.weight)) * len(kernel.factor.noise)
-            for kernel, each in zip(self.kernels, records, strict=True)
+            int(np.count_nonzero(record.weight)) * len(kernel.factor.noise)
+            for kernel, record in zip(self.kernels, records, strict=True)
         ) + sum(len(tie.noise) for tie in self.ties)
 
     def residuals(self, values: Array, records: Sequence[FactorRecords]) -> tuple[Array, ...]:
@@ -159,10 +159,10 @@ class Problem:
         """
         self._check_fixed(values)
         result = []
-        for kernel, slots, each in zip(self.kernels, self.slots, records, strict=True):
-            residual = np.empty((kernel.factor.residual.numel(), each.record.shape[1]))
-            gather.evaluated(slots, values, each.group, kernel.residuals, each.record, each.state, residual)
-            result.append(residual[:, : each.count])
+        for kernel, slots, record in zip(self.kernels, self.slots, records, strict=True):
+            residual = np.empty((kernel.factor.residual.numel(), record.record.shape[1]))
+            gather.evaluated(slots, values, record.group, kernel.residuals, record.record, record.state, residual)
+            result.append(residual[:, : record.count])
         return tuple(result)
 
     def require_held(self, values: Array, records: Sequence[FactorRecords]) -> None:
@@ -172,8 +172,8 @@ class Problem:
             NotConvergedError: a record has no elastic equilibrium, or one that is not stable.
         """
         self.residuals(values, records)
-        for kernel, slots, each in zip(self.kernels, self.slots, records, strict=True):
-            gather.evaluated(slots, values, each.group, kernel.require_held, each.record, each.state)
+        for kernel, slots, record in zip(self.kernels, self.slots, records, strict=True):
+            gather.evaluated(slots, values, record.group, kernel.require_held, record.record, record.state)
 
     def cost(self, values: Array, records: Sequence[FactorRecords]) -> float:
         """Half the weighted squared whitened residuals."""
@@ -184,16 +184,16 @@ class Problem:
         if shared is not None:
             weighted = shared.independent([residual[:, :, None] for residual in weighted])
         total = sum(0.5 * float(np.sum(residual**2)) for residual in weighted)
-        for kernel, each, residual in zip(self.kernels, records, raw, strict=True):
+        for kernel, record, residual in zip(self.kernels, records, raw, strict=True):
             declared_ones = residual / np.array(kernel.factor.noise)[:, None]
-            for share in mean_shares(kernel.factor, each):
-                total += 0.5 * float(np.sum((declared_ones @ share[: each.count]) ** 2))
+            for share in mean_shares(kernel.factor, record):
+                total += 0.5 * float(np.sum((declared_ones @ share[: record.count]) ** 2))
         return total + sum(0.5 * float(np.sum((tie.residual(values) / tie.noise) ** 2)) for tie in self.ties)
 
     def weighted_residuals(self, values: Array, records: Sequence[FactorRecords]) -> tuple[Array, ...]:
         """Residuals in units of their noise, times the roots of their weights, one (n_r x N) matrix a factor."""
         whitened = self.whitened_residuals(values, records)
-        return tuple(w * np.sqrt(each.weight[: each.count]) for each, w in zip(records, whitened, strict=True))
+        return tuple(w * np.sqrt(record.weight[: record.count]) for record, w in zip(records, whitened, strict=True))
 
     def whitened_residuals(self, values: Array, records: Sequence[FactorRecords]) -> tuple[Array, ...]:
         """Residuals in units of their noise, weights left out, one (n_r x N) matrix a factor."""
@@ -202,10 +202,10 @@ class Problem:
     def whitened(self, residuals: Sequence[Array], records: Sequence[FactorRecords]) -> tuple[Array, ...]:
         """Raw residuals in units of their noise, one (n_r x N) matrix a factor."""
         return tuple(
-            transformed(each.whitening[:, :, : each.count], residual)
-            if each.whitening is not None
+            transformed(record.whitening[:, :, : record.count], residual)
+            if record.whitening is not None
             else residual / np.array(kernel.factor.noise)[:, None]
-            for kernel, each, residual in zip(self.kernels, records, residuals, strict=True)
+            for kernel, record, residual in zip(self.kernels, records, residuals, strict=True)
         )
 
     def normal_equations(self, values: Array, records: Sequence[FactorRecords]) -> NormalEquations:
@@ -244,14 +244,14 @@ class Problem:
         self.residuals(values, records)
         size = len(self.parameters.free_entries)
         total = np.zeros((size, size))
-        for kernel, slots, each in zip(self.kernels, self.slots, records, strict=True):
-            for number, columns in slots.parts(each.group, each.count):
+        for kernel, slots, record in zip(self.kernels, self.slots, records, strict=True):
+            for number, columns in slots.parts(record.group, record.count):
                 own, free = slots.values(values, number), slots.free[number]
                 seen = np.flatnonzero(free != gather.HELD)
                 for i in columns:
-                    whitening = declared(kernel.factor.noise) if each.whitening is None else each.whitening[:, :, i]
-                    one = kernel.hessian(own, each.record[:, i], each.state[:, i], whitening)
-                    total[np.ix_(free[seen], free[seen])] += each.weight[i] * np.asarray(one)[np.ix_(seen, seen)]
+                    whitening = declared(kernel.factor.noise) if record.whitening is None else record.whitening[:, :, i]
+                    one = kernel.hessian(own, record.record[:, i], record.state[:, i], whitening)
+                    total[np.ix_(free[seen], free[seen])] += record.weight[i] * np.asarray(one)[np.ix_(seen, seen)]
         beside, places = self._extra(values, records).jacobian, self._places
         bends = sum((tie.curvature(values, places, size) for tie in self.ties), np.zeros((size, size)))
         return total + beside.T @ beside + bends
@@ -262,39 +262,39 @@ class Problem:
         """d residual / d record channels in equilibrium, one (n_r x channels x N) array a factor; raw, not whitened."""
         self.residuals(values, records)
         result = []
-        for kernel, slots, each in zip(self.kernels, self.slots, records, strict=True):
-            slope = np.empty((kernel.factor.residual.numel() * len(channels), each.record.shape[1]))
+        for kernel, slots, record in zip(self.kernels, self.slots, records, strict=True):
+            slope = np.empty((kernel.factor.residual.numel() * len(channels), record.record.shape[1]))
             evaluate = partial(kernel.channel_slopes, channels=channels)
-            gather.evaluated(slots, values, each.group, evaluate, each.record, each.state, slope)
-            result.append(slope.reshape(-1, len(channels), each.record.shape[1])[:, :, : each.count])
+            gather.evaluated(slots, values, record.group, evaluate, record.record, record.state, slope)
+            result.append(slope.reshape(-1, len(channels), record.record.shape[1])[:, :, : record.count])
         return tuple(result)
 
     def predict(self, values: Array, records: Sequence[FactorRecords]) -> tuple[Array, ...]:
         """Outputs and tool positions in equilibrium, one (n_o + 12 an arm x N) matrix a factor."""
         self._check_fixed(values)
         result = []
-        for kernel, slots, each in zip(self.kernels, self.slots, records, strict=True):
-            shown = np.empty((kernel.outputs.numel_out(1), each.record.shape[1]))
-            gather.evaluated(slots, values, each.group, kernel.predict, each.record, each.state, shown)
-            result.append(shown[:, : each.count])
+        for kernel, slots, record in zip(self.kernels, self.slots, records, strict=True):
+            shown = np.empty((kernel.outputs.numel_out(1), record.record.shape[1]))
+            gather.evaluated(slots, values, record.group, kernel.predict, record.record, record.state, shown)
+            result.append(shown[:, : record.count])
         return tuple(result)
 
     def told(self, values: Array, records: Sequence[FactorRecords]) -> tuple[Array, ...]:
         """What each record alone says of its group's parameters, one (entries x N) matrix a factor."""
         result = []
-        for kernel, slots, each in zip(self.kernels, self.slots, records, strict=True):
-            said = np.empty((len(kernel.factor.nuisance_names), each.record.shape[1]))
+        for kernel, slots, record in zip(self.kernels, self.slots, records, strict=True):
+            said = np.empty((len(kernel.factor.nuisance_names), record.record.shape[1]))
             if len(said):
-                gather.evaluated(slots, values, each.group, kernel.tell, each.record, each.state, said)
-            result.append(said[:, : each.count])
+                gather.evaluated(slots, values, record.group, kernel.tell, record.record, record.state, said)
+            result.append(said[:, : record.count])
         return tuple(result)
 
     def _extra(self, values: Array, records: Sequence[FactorRecords]) -> ExtraRows:
         """The rows that belong to no single record."""
         places = self._places
         rows = [tie.rows(values, places, len(places)) for tie in self.ties]
-        for kernel, slots, each in zip(self.kernels, self.slots, records, strict=True):
-            means = linearised_means(kernel, slots, each, values)
+        for kernel, slots, record in zip(self.kernels, self.slots, records, strict=True):
+            means = linearised_means(kernel, slots, record, values)
             rows += [ExtraRows(residual, jacobian) for jacobian, residual in means]
         return stacked(rows, len(places))
 
@@ -311,8 +311,8 @@ class Problem:
             return
         self._check_fixed(values)
         rows = []
-        for kernel, slots, each in zip(self.kernels, self.slots, records, strict=True):
-            blocks = linearised(kernel, slots, each, values)
+        for kernel, slots, record in zip(self.kernels, self.slots, records, strict=True):
+            blocks = linearised(kernel, slots, record, values)
             rows.append(np.concatenate([np.concatenate([j, r[:, None]], axis=1) for j, r in blocks], axis=2))
         for made in shared.independent([np.moveaxis(row, 1, 2) for row in rows]):
             yield np.moveaxis(made[:, :, :-1], 1, 2), made[:, :, -1]
@@ -320,8 +320,8 @@ class Problem:
     def _blocks(self, values: Array, records: Sequence[FactorRecords]) -> Iterator[tuple[Array, Array]]:
         """Whitened, weighted Jacobians (n_r x n_v x B) and residuals (n_r x B), in order."""
         self._check_fixed(values)
-        for kernel, slots, each in zip(self.kernels, self.slots, records, strict=True):
-            yield from linearised(kernel, slots, each, values)
+        for kernel, slots, record in zip(self.kernels, self.slots, records, strict=True):
+            yield from linearised(kernel, slots, record, values)
 
     def _check_fixed(self, values: Array) -> None:
         fixed = self._compiled_in
@@ -345,7 +345,7 @@ def _from_bytes(written: bytes) -> Problem:
 
 def _ties(blueprint: Blueprint) -> tuple[TieFunction, ...]:
     owned = ties_of(blueprint.measurements, blueprint.groups)
-    return tuple(TieFunction.of(each, blueprint.parameters) for each in owned)
+    return tuple(TieFunction.of(owned_tie, blueprint.parameters) for owned_tie in owned)
 
 
 def triangular(rows: Array) -> Array:

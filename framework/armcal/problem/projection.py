@@ -37,8 +37,8 @@ def projected(problem: Problem, values: Array, records: Sequence[FactorRecords])
     """
     result = as_predicted(problem, values, records)
     return tuple(
-        _fitting_joints(kernel, slots, values, each) if _measures_nothing(kernel.factor) else each
-        for kernel, slots, each in zip(problem.kernels, problem.slots, result, strict=True)
+        _fitting_joints(kernel, slots, values, factor_records) if _measures_nothing(kernel.factor) else factor_records
+        for kernel, slots, factor_records in zip(problem.kernels, problem.slots, result, strict=True)
     )
 
 
@@ -65,8 +65,8 @@ def predicted_records(problem: Problem, values: Array, records: Sequence[FactorR
     """
     shown = problem.predict(values, records)
     return tuple(
-        _with_readings(kernel.factor, each, outputs)
-        for kernel, each, outputs in zip(problem.kernels, records, shown, strict=True)
+        _with_readings(kernel.factor, record, outputs)
+        for kernel, record, outputs in zip(problem.kernels, records, shown, strict=True)
     )
 
 
@@ -120,21 +120,21 @@ def _bilinear(factor: Factor) -> bool:
     return bool(ca.depends_on(by_measured, ca.vertcat(factor.values, factor.state)))
 
 
-def _with_readings(factor: Factor, each: FactorRecords, outputs: Array) -> FactorRecords:
-    record = each.record.copy()
+def _with_readings(factor: Factor, factor_records: FactorRecords, outputs: Array) -> FactorRecords:
+    record = factor_records.record.copy()
     for row in _measured(factor):
         predicted = outputs[factor.output_channels.index(factor.channels[row])]
-        record[row, : each.count] = predicted
-        record[row, each.count :] = predicted[-1] if each.count else 0.0
-    return replace(each, record=record)
+        record[row, : factor_records.count] = predicted
+        record[row, factor_records.count :] = predicted[-1] if factor_records.count else 0.0
+    return replace(factor_records, record=record)
 
 
-def _fitting_joints(kernel: Kernel, slots: Slots, values: Array, each: FactorRecords) -> FactorRecords:
+def _fitting_joints(kernel: Kernel, slots: Slots, values: Array, factor_records: FactorRecords) -> FactorRecords:
     """Joint angles moved by Gauss-Newton steps of least length until the residual is gone."""
     rows = joint_channels(kernel.factor)
-    if not rows or not each.count:
-        return each
-    moved = replace(each, record=each.record.copy(), state=each.state.copy())
+    if not rows or not factor_records.count:
+        return factor_records
+    moved = replace(factor_records, record=factor_records.record.copy(), state=factor_records.state.copy())
     for _ in range(_MOST_STEPS):
         residual = _residual(kernel, slots, values, moved)
         if (_whitened(kernel.factor, residual) < _AT_ZERO * 1e-3).all():
@@ -145,22 +145,26 @@ def _fitting_joints(kernel: Kernel, slots: Slots, values: Array, each: FactorRec
         longest = np.abs(step).max(axis=0)
         moved.record[list(rows)] -= step * np.minimum(1.0, 0.3 / np.maximum(longest, 1e-300))
     reached = _whitened(kernel.factor, _residual(kernel, slots, values, moved)) < _AT_ZERO
-    return replace(each, record=np.where(reached, moved.record, each.record))
+    return replace(factor_records, record=np.where(reached, moved.record, factor_records.record))
 
 
-def channel_slopes(kernel: Kernel, slots: Slots, values: Array, each: FactorRecords, channels: Sequence[str]) -> Array:
+def channel_slopes(
+    kernel: Kernel, slots: Slots, values: Array, factor_records: FactorRecords, channels: Sequence[str]
+) -> Array:
     """d residual / d channels at states in equilibrium (n_r x channels x N, filled up as the records are)."""
-    size, width = kernel.factor.residual.numel(), each.record.shape[1]
+    size, width = kernel.factor.residual.numel(), factor_records.record.shape[1]
     slopes = np.empty((size * len(channels), width))
     evaluate = partial(kernel.channel_slopes, channels=channels)
-    evaluated(slots, values, each.group, evaluate, each.record, each.state, slopes)
+    evaluated(slots, values, factor_records.group, evaluate, factor_records.record, factor_records.state, slopes)
     return slopes.reshape(size, len(channels), width)
 
 
-def _residual(kernel: Kernel, slots: Slots, values: Array, each: FactorRecords) -> Array:
+def _residual(kernel: Kernel, slots: Slots, values: Array, factor_records: FactorRecords) -> Array:
     """Raw (n_r x N); the state is left in equilibrium."""
-    residual = np.empty((kernel.factor.residual.numel(), each.record.shape[1]))
-    evaluated(slots, values, each.group, kernel.residuals, each.record, each.state, residual)
+    residual = np.empty((kernel.factor.residual.numel(), factor_records.record.shape[1]))
+    evaluated(
+        slots, values, factor_records.group, kernel.residuals, factor_records.record, factor_records.state, residual
+    )
     return residual
 
 

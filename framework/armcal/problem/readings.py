@@ -37,7 +37,7 @@ def reading_slopes(problem: Problem, values: Array, records: Sequence[FactorReco
     """
     problem.residuals(values, records)  # leaves the states in equilibrium
     parts = zip(problem.kernels, problem.slots, records, strict=True)
-    return tuple(_slopes(kernel, slots, values, each) for kernel, slots, each in parts)
+    return tuple(_slopes(kernel, slots, values, factor_records) for kernel, slots, factor_records in parts)
 
 
 def disturbed_records(
@@ -53,7 +53,7 @@ def disturbed_records(
     for _ in range(_STEPS):
         slopes = reading_slopes(problem, values, moved)
         parts = zip(problem.kernels, moved, slopes, missing, strict=True)
-        moved = tuple(_stepped(kernel, each, slope, off) for kernel, each, slope, off in parts)
+        moved = tuple(_stepped(kernel, factor_records, slope, off) for kernel, factor_records, slope, off in parts)
         found = zip(before, noise, problem.residuals(values, moved), strict=True)
         missing = [start + added - now for start, added, now in found]
         if all(_in_noise(k, off) < _EXACT for k, off in zip(problem.kernels, missing, strict=True)):
@@ -61,11 +61,11 @@ def disturbed_records(
     return moved
 
 
-def _stepped(kernel: Kernel, each: FactorRecords, slope: Array | None, residual: Array) -> FactorRecords:
+def _stepped(kernel: Kernel, factor_records: FactorRecords, slope: Array | None, residual: Array) -> FactorRecords:
     """The records of a factor with readings nearer to those that have another residual by so much."""
     factor = kernel.factor
     if not factor.output_channels:
-        return each
+        return factor_records
     if slope is None:
         readings = ", ".join(channel.rpartition(".")[2] for channel in factor.output_channels)
         raise ProblemError(
@@ -73,13 +73,13 @@ def _stepped(kernel: Kernel, each: FactorRecords, slope: Array | None, residual:
             f"{readings}, so their noise is not known.",
             hint="Give the residual no more numbers than there are readings, each of which depends on a reading.",
         )
-    record = each.record.copy()
+    record = factor_records.record.copy()
     for row, channel in zip(np.einsum("nor,rn->on", slope, residual), factor.output_channels, strict=True):
         if channel in factor.channels:
             place = factor.channels.index(channel)
-            record[place, : each.count] += row
-            record[place, each.count :] = record[place, max(each.count - 1, 0)]
-    return replace(each, record=record)
+            record[place, : factor_records.count] += row
+            record[place, factor_records.count :] = record[place, max(factor_records.count - 1, 0)]
+    return replace(factor_records, record=record)
 
 
 def _in_noise(kernel: Kernel, residual: Array) -> float:
@@ -89,11 +89,13 @@ def _in_noise(kernel: Kernel, residual: Array) -> float:
     return float(np.abs(residual / np.array(kernel.factor.noise)[:, None]).max(initial=0.0))
 
 
-def _slopes(kernel: Kernel, slots: Slots, values: Array, each: FactorRecords) -> Array | None:
+def _slopes(kernel: Kernel, slots: Slots, values: Array, factor_records: FactorRecords) -> Array | None:
     factor = kernel.factor
     if not factor.output_channels:
         return None
-    by_reading = channel_slopes(kernel, slots, values, each, factor.output_channels)[:, :, : each.count]
+    by_reading = channel_slopes(kernel, slots, values, factor_records, factor.output_channels)[
+        :, :, : factor_records.count
+    ]
     return readings_by_residual(by_reading.transpose(2, 0, 1), np.array(factor.noise))
 
 

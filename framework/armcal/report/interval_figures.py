@@ -44,21 +44,24 @@ class ProfileRow:
     remark: str
 
 
-def share_rows(found: IntervalResult) -> tuple[ShareRow, ...]:
+def share_rows(interval_result: IntervalResult) -> tuple[ShareRow, ...]:
     """Cross-validated and held-out records, each in the calibrated and in a new recording."""
-    sets = (("Cross-validated", found.crossed), ("Held out", found.holdout))
+    sets = (("Cross-validated", interval_result.crossed), ("Held out", interval_result.holdout))
     rows = []
     for words, shares in sets:
-        for name, each in shares.items():
+        for name, share in shares.items():
             label = f"{words}, {_RECORDINGS[name]}" if len(shares) > 1 else words
-            rows.append(_row(label, each))
+            rows.append(_row(label, share))
     return tuple(rows)
 
 
-def _row(label: str, each: Coverage) -> ShareRow:
-    radius = each.stretched_radius if each.stretched else each.raw_radius
+def _row(label: str, coverage: Coverage) -> ShareRow:
+    radius = coverage.stretched_radius if coverage.stretched else coverage.raw_radius
     return ShareRow(
-        label, count(each.records), _percent([*each.stated, radius]), _percent([*each.raw, each.raw_radius])
+        label,
+        count(coverage.records),
+        _percent([*coverage.stated, radius]),
+        _percent([*coverage.raw, coverage.raw_radius]),
     )
 
 
@@ -120,29 +123,29 @@ def _legend(crossed: Array, held: Array) -> list[tuple[str, str]]:
 def profile_rows(result: RunResult) -> tuple[ProfileRow, ...]:
     """Of the numbers asked for."""
     rows = []
-    for each in result.profiles:
-        factor, unit = _shown(result, each)
-        digits = max(2, 1 - int(np.floor(np.log10(max(factor * _width(each), 1e-12)))))
-        ends = f"{fixed(factor * each.lower, digits)} to {fixed(factor * each.upper, digits)}"
-        remarks = [f"{side} end {_ENDS[end]}" for side, end in _sides(each) if _ENDS[end]]
-        if each.better:
+    for profile in result.profiles:
+        factor, unit = _shown(result, profile)
+        digits = max(2, 1 - int(np.floor(np.log10(max(factor * _width(profile), 1e-12)))))
+        ends = f"{fixed(factor * profile.lower, digits)} to {fixed(factor * profile.upper, digits)}"
+        remarks = [f"{side} end {_ENDS[end]}" for side, end in _sides(profile) if _ENDS[end]]
+        if profile.better:
             remarks.append("a better fit was found on the way: try more starts")
-        rows.append(ProfileRow(each.name, fixed(factor * each.value, digits), ends, unit, "; ".join(remarks)))
+        rows.append(ProfileRow(profile.name, fixed(factor * profile.value, digits), ends, unit, "; ".join(remarks)))
     return tuple(rows)
 
 
 def profile_figures(result: RunResult) -> tuple[Figure, ...]:
     """The curve of each profile with the parabola of its standard deviation."""
-    return tuple(_curve(result, number, each) for number, each in enumerate(result.profiles))
+    return tuple(_curve(result, number, profile) for number, profile in enumerate(result.profiles))
 
 
-def _curve(result: RunResult, number: int, each: Profile) -> Figure:
-    factor, unit = _shown(result, each)
-    label = f"{each.name}, {unit}" if unit else each.name
-    places, rises = factor * each.curve[0], each.curve[1]
-    top = 1.6 * each.quantile
+def _curve(result: RunResult, number: int, profile: Profile) -> Figure:
+    factor, unit = _shown(result, profile)
+    label = f"{profile.name}, {unit}" if unit else profile.name
+    places, rises = factor * profile.curve[0], profile.curve[1]
+    top = 1.6 * profile.quantile
     caption = "The interval ends where the curve passes the level line. Dashed: the parabola of the standard deviation."
-    said = f"From {significant(factor * each.lower)} to {significant(factor * each.upper)} {unit}."
+    said = f"From {significant(factor * profile.lower)} to {significant(factor * profile.upper)} {unit}."
     entries = [('<path class="curve train" d="M0 0h22"/>', "profile")]
     entries.append(('<path class="curve before" d="M0 0h22"/>', "by the curvature"))
 
@@ -153,30 +156,30 @@ def _curve(result: RunResult, number: int, each: Profile) -> Figure:
         x = Axis(float(places.min()) - margin, float(places.max()) + margin, box.left, box.right)
         y = Axis(0, top, box.bottom, box.top)
         parts += svg.frame(box, x, y, (label, "twice the rise of the cost"), (5, 4))
-        parts.append(svg.line(box.left, y.of(each.quantile), box.right, y.of(each.quantile), "guide"))
-        if np.isfinite(each.deviation) and each.deviation > 0:
+        parts.append(svg.line(box.left, y.of(profile.quantile), box.right, y.of(profile.quantile), "guide"))
+        if np.isfinite(profile.deviation) and profile.deviation > 0:
             wide = np.linspace(x.low, x.high, 80)
-            curvature = ((wide / factor - each.value) / each.deviation) ** 2
+            curvature = ((wide / factor - profile.value) / profile.deviation) ** 2
             shown = curvature <= top
             parts.append(svg.polyline(x.at(wide[shown]), y.at(curvature[shown]), "curve before"))
         fine = np.linspace(float(places.min()), float(places.max()), 120)
         # Between fits the root of the rise is nearly straight.
-        root = np.interp(fine, places, np.sign(places - factor * each.value) * np.sqrt(np.maximum(rises, 0.0)))
+        root = np.interp(fine, places, np.sign(places - factor * profile.value) * np.sqrt(np.maximum(rises, 0.0)))
         parts.append(svg.polyline(x.at(fine), y.at(root**2), "curve train"))
         parts.append(svg.dots(x.at(places), y.at(rises), "dot train"))
         return box.bottom + 44, parts
 
-    return svg.both(f"profile{number}", (f"Profile of {each.name}", said, caption), draw, svg.HALF)
+    return svg.both(f"profile{number}", (f"Profile of {profile.name}", said, caption), draw, svg.HALF)
 
 
-def _sides(each: Profile) -> tuple[tuple[str, str], tuple[str, str]]:
-    return ("lower", each.lower_end), ("upper", each.upper_end)
+def _sides(profile: Profile) -> tuple[tuple[str, str], tuple[str, str]]:
+    return ("lower", profile.lower_end), ("upper", profile.upper_end)
 
 
-def _width(each: Profile) -> float:
-    return max(each.upper - each.lower, 1e-12)
+def _width(profile: Profile) -> float:
+    return max(profile.upper - profile.lower, 1e-12)
 
 
-def _shown(result: RunResult, each: Profile) -> tuple[float, str]:
+def _shown(result: RunResult, profile: Profile) -> tuple[float, str]:
     """Factor from SI to a customary unit, and the unit."""
-    return shown_unit(result.estimate.parameters[each.name].unit)
+    return shown_unit(result.estimate.parameters[profile.name].unit)

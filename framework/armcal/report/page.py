@@ -170,15 +170,19 @@ def _records(result: RunResult) -> dict[str, Any]:
 
 
 def _origin(result: RunResult) -> dict[str, Any]:
-    told, data = result.estimate.verdict, result.dataset
-    answer = "converged" if told.converged else "did not converge"
-    effort = f"{plural(told.iterations, 'iteration')}, {duration(told.seconds)}"
-    starts = f"{told.agreeing_starts} of {told.starts} came to the same answer" if told.starts > 1 else "one"
+    solver_verdict, data = result.estimate.verdict, result.dataset
+    answer = "converged" if solver_verdict.converged else "did not converge"
+    effort = f"{plural(solver_verdict.iterations, 'iteration')}, {duration(solver_verdict.seconds)}"
+    starts = (
+        f"{solver_verdict.agreeing_starts} of {solver_verdict.starts} came to the same answer"
+        if solver_verdict.starts > 1
+        else "one"
+    )
     facts = [
         Fact("data", data.source or NONE),
         Fact("data sha256", data.sha256 or NONE),
         Fact("records", f"{len(result.split.train)} train, {len(result.split.holdout)} holdout"),
-        Fact("solver", f"{told.name}: {told.status} ({answer}; {effort})"),
+        Fact("solver", f"{solver_verdict.name}: {solver_verdict.status} ({answer}; {effort})"),
         Fact("starts", starts),
         Fact("backend", result.backend or NONE),
         Fact("noise scale", f"{significant(result.estimate.noise_scale)} times the declared noise"),

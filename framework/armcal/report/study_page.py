@@ -71,20 +71,20 @@ def _render(
 def conclusions(result: StudyResult) -> list[str]:
     """What to conclude from a comparison."""
     best = result.variant(result.best)
-    found = [
+    texts = [
         f"Lowest cross-validated error: {best.name}, {_shown(best.crossed.mean, result.unit)} on average, 95 % below "
         f"{_shown(best.crossed.p95, result.unit)}."
     ]
     if result.simplest != result.best:
         simple = result.variant(result.simplest)
-        found.append(
+        texts.append(
             f"Simplest within one standard error of it: {simple.name}, {simple.free} free parameters, "
             f"{_shown(simple.crossed.mean, result.unit)}."
         )
-    found += _nested_words(result, best)
+    texts += _nested_words(result, best)
     for v in result.variants:
         if abs((v.at_rest.mean or 0.0) - (v.crossed.mean or 0.0)) > _SAME_MM:
-            found.append(
+            texts.append(
                 f"{v.name} knows the drift at a record from the training records near it; without that, "
                 f"{_shown(v.at_rest.mean, result.unit)} on average, 95 % below {_shown(v.at_rest.p95, result.unit)}."
             )
@@ -94,11 +94,11 @@ def conclusions(result: StudyResult) -> list[str]:
         words = f"against {compared[0].against}" if len(against) == 1 else "against the variant before"
         blocks = sorted({c.block for c in compared})
         span = f"{blocks[0]}" if len(blocks) == 1 else f"{blocks[0]} to {blocks[-1]}"
-        found.append(
+        texts.append(
             f"Change: the mean difference of each record's error {words}, ± one standard error from blocks of {span} "
             "neighbouring records; fits are taken as given."
         )
-    return found
+    return texts
 
 
 def _nested_words(result: StudyResult, best: VariantResult) -> list[str]:
@@ -118,7 +118,7 @@ def _nested_words(result: StudyResult, best: VariantResult) -> list[str]:
 
 def transfer_conclusions(result: TransferResult) -> list[str]:
     """How much an error grows from the load that trained to another."""
-    found = []
+    texts = []
     for name in dict.fromkeys(cell.variant for cell in result.cells):
         single = [c for c in result.cells if c.variant == name and len(c.trained_g) == 1 and c.errors.mean is not None]
         own = {c.judged_g: c.errors.mean for c in single if c.seen}
@@ -128,8 +128,8 @@ def transfer_conclusions(result: TransferResult) -> list[str]:
             for c in single
             if not c.seen
         ]
-        found.append(f"{name}: from {'; from '.join(pairs)}.")
-    return found
+        texts.append(f"{name}: from {'; from '.join(pairs)}.")
+    return texts
 
 
 def _variants(result: StudyResult) -> StudyTable:

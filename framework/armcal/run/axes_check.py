@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from armcal.base.dataset import Dataset
-from armcal.diagnose.permuted_axes import find_permuted_servos
+from armcal.diagnose.permuted_axes import find_permuted_axes
 from armcal.errors import DataError, Location
 from armcal.problem.problem import FactorRecords, Problem
 
@@ -21,13 +21,13 @@ def check_permuted_axes(problem: Problem, records: Sequence[FactorRecords], data
     Raises:
         DataError: they are such; it names what looks mixed up.
     """
-    found = find_permuted_servos(problem, records, dataset)
-    if found is None:
+    reading = find_permuted_axes(problem, records, dataset)
+    if reading is None:
         return
     raise DataError(
-        f"{found.measurement}: as they stand, the data are typically {found.as_given_mm:.3g} mm off the model, however "
-        f"its free parameters adapt; with {', or with '.join(found.told)}, they are {found.left_mm:.3g} mm off.",
+        f"{reading.measurement}: as they stand, the data are typically {reading.as_given_mm:.3g} mm off the model, "
+        f"however its free parameters adapt; with {', or with '.join(reading.told)}, they are {reading.left_mm:.3g} mm off.",
         where=Location(dataset.source),
-        hint=f"Mend these columns in the file or by data.columns, or {_MEND[found.of_joints]}. If the data are right, "
-        "the model's nominal values are far off: give better ones.",
+        hint=f"Mend these columns in the file or by data.columns, or {_MEND[reading.of_joints]}. "
+        "If the data are right, the model's nominal values are far off: give better ones.",
     )

@@ -19,7 +19,7 @@ from armcal.calibration.compensation.compensator import Compensator
 from armcal.calibration.compensation.request import Targets
 from armcal.calibration.tool_expression import APPROACH
 from armcal.measure.csv_writer import write_csv
-from armcal.measure.reader import WantedChannel, wanted_channels
+from armcal.measure.reader import RequestedChannel, requested_channels
 from armcal.run.compensate import Assessed, commanded
 
 _ENGLISH = {False: "no", True: "yes"}
@@ -37,7 +37,7 @@ def write_commands(
     told = commanded(compensator, targets, assessed.commands)
     said = {f"{name}.{joint}" for joint in compensator.joints} | _worth_saying(told, given)
     channels = {channel: values for channel, values in told.channels.items() if channel in said}
-    wanted = wanted_channels({name: arm}, {}, measured=False)
+    wanted = requested_channels({name: arm}, {}, measured=False)
     extra = dict(_extra(compensator, assessed))
     # A target file may be a pose file: its commands, in whatever unit, give way to those that were found.
     own = {f"{joint}_{unit}" for joint in compensator.joints for unit in UNITS}
@@ -46,15 +46,15 @@ def write_commands(
     write_csv(path, dataset, _shown(wanted, channels), {"angle": angle_unit})
 
 
-def _shown(wanted: Sequence[WantedChannel], channels: dict[str, Array]) -> list[WantedChannel]:
+def _shown(wanted: Sequence[RequestedChannel], channels: dict[str, Array]) -> list[RequestedChannel]:
     return [channel for channel in wanted if channel.channel in channels]
 
 
-def _worth_saying(told: Dataset, given: Dataset) -> set[str]:
+def _worth_saying(dataset: Dataset, given: Dataset) -> set[str]:
     """Loads and surroundings that the targets told, and approaches that are known."""
-    loads = {channel for channel in told.channels if channel in LOAD_CHANNELS and given.has(channel)}
-    others = {c for c in told.channels if APPROACH in c and told.channels[c].any()}
-    return loads | others | {c for c in told.channels if "." not in c and c not in LOAD_CHANNELS}
+    loads = {channel for channel in dataset.channels if channel in LOAD_CHANNELS and given.has(channel)}
+    others = {c for c in dataset.channels if APPROACH in c and dataset.channels[c].any()}
+    return loads | others | {c for c in dataset.channels if "." not in c and c not in LOAD_CHANNELS}
 
 
 def _extra(compensator: Compensator, assessed: Assessed) -> Iterator[tuple[str, tuple[str, ...]]]:
@@ -75,7 +75,7 @@ def _extra(compensator: Compensator, assessed: Assessed) -> Iterator[tuple[str, 
     if commands.moves is not None:
         kinds = [compensator.expression.arm.commanded[joint] for joint in compensator.joints]
         for kind, unit, scale in (("angle", "deg", 180 / np.pi), ("length", "mm", 1000.0)):
-            own = [i for i, each in enumerate(kinds) if each == kind]
+            own = [i for i, text in enumerate(kinds) if text == kind]
             if own:
                 yield f"longest_move_{unit}", _texts(scale * np.abs(commands.moves[:, own]).max(axis=1))
     yield "bound_mm", _texts(1000 * commands.bounds)

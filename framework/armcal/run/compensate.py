@@ -107,10 +107,10 @@ class Bench:
         Raises:
             ConfigError: the limits leave a joint no room, or no measurement reads the target that shall arrive.
         """
-        told = () if targets is None else tuple(targets.conditions)
+        texts = () if targets is None else tuple(targets.conditions)
         choice: EvaluatorChoice = "compiled" if targets is not None and len(targets) >= _WORTH_COMPILING else "auto"
         try:
-            expression = self.calibration.expression(self.arm, told, self.point)
+            expression = self.calibration.expression(self.arm, texts, self.point)
             return Compensator(expression, self.calibration.parameters, self.options, self.space.allowed, choice)
         except ValueError as fault:
             raise ConfigError(f"{fault}.", hint="Correct the limits in the plan.") from fault
@@ -170,12 +170,12 @@ def _radii(calibration: Calibration, compensator: Compensator, targets: Targets,
     if not settled.size:
         return radii
     try:
-        found = calibration.plus_minus(commanded(compensator, targets, commands).subset(settled))
+        plus_minus = calibration.plus_minus(commanded(compensator, targets, commands).subset(settled))
     except ArmcalError:  # what it tells beyond the commands themselves is not kept
         return None
-    if not found.radii:
+    if not plus_minus.radii:
         return None
-    radii[settled] = next(iter(found.radii.values()))
+    radii[settled] = next(iter(plus_minus.radii.values()))
     return radii
 
 

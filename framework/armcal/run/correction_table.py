@@ -27,7 +27,7 @@ from armcal.config.validate import validate
 from armcal.config.yaml_source import load_config
 from armcal.errors import ConfigError, Location, ProblemError
 from armcal.measure.csv_writer import write_csv
-from armcal.measure.reader import WantedChannel
+from armcal.measure.reader import RequestedChannel
 
 _MOST_NODES = 200_000
 
@@ -134,9 +134,9 @@ def write_table(path: Path, table: CorrectionTable) -> None:
     columns |= {f"d{axis}": table.shifts.reshape(-1, 3)[:, i] for i, axis in enumerate("xyz")}
     columns |= {f"turn_{axis}": table.turns.reshape(-1, 3)[:, i] for i, axis in enumerate("xyz")}
     kinds = {name: "angle" if name.startswith("turn") else "length" for name in columns}
-    wanted = [WantedChannel(name, (name,), kind, True) for name, kind in kinds.items()]
+    requested_channels = [RequestedChannel(name, (name,), kind, True) for name, kind in kinds.items()]
     ids = tuple(str(i) for i in range(1, len(nodes) + 1))
-    write_csv(path, Dataset(ids, columns), wanted, {"angle": "rad"})
+    write_csv(path, Dataset(ids, columns), requested_channels, {"angle": "rad"})
 
 
 def _tried(

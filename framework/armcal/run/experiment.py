@@ -26,7 +26,7 @@ from armcal.measure.environment import noticed, require_conditions
 from armcal.measure.groups import grouped_instances, groups_of, unmatched
 from armcal.measure.limits import warn_beyond_limits
 from armcal.measure.poses import pose_numbers
-from armcal.measure.reader import Reader, ReadRequest, wanted_channels
+from armcal.measure.reader import Reader, ReadRequest, requested_channels
 from armcal.plugins import PluginRegistry, discover
 from armcal.run.settings import ExperimentSettings
 
@@ -95,8 +95,8 @@ class Experiment:
         parameters = select(system.parameters(), known, source)
         estimator = weighed(_estimator(source, registry), settings.noise)
         name = settings.name or source.path.stem
-        found = tuple(_gravity_warnings(settings, np.array(system.environment.gravity)))
-        return cls(str(name), source, settings, system, parameters, estimator, registry, found)
+        texts = tuple(_gravity_warnings(settings, np.array(system.environment.gravity)))
+        return cls(str(name), source, settings, system, parameters, estimator, registry, texts)
 
     def read(self) -> Dataset:
         """The measured records.
@@ -121,8 +121,8 @@ class Experiment:
         if not dataset.has("gravity_z"):
             return dataset
         typical = np.median(dataset.stacked(["gravity_x", "gravity_y", "gravity_z"]), axis=1)
-        told = [f"by its columns, {text}" for text in _gravity_warnings(self.settings, typical)]
-        return replace(dataset, warnings=(*dataset.warnings, *told))
+        texts = [f"by its columns, {text}" for text in _gravity_warnings(self.settings, typical)]
+        return replace(dataset, warnings=(*dataset.warnings, *texts))
 
     def of_records(self, dataset: Dataset) -> Experiment:
         """The experiment with the parameters that the groups of these records bring.
@@ -135,8 +135,8 @@ class Experiment:
             return self
         groups = groups_of(dataset, self.system.measurements)
         chosen = select(self.system.parameters(groups), self.settings.parameters, self.source)
-        told = unmatched(self.system.measurements, groups)
-        return replace(self, parameters=chosen, warnings=(*self.warnings, *told))
+        texts = unmatched(self.system.measurements, groups)
+        return replace(self, parameters=chosen, warnings=(*self.warnings, *texts))
 
     def poses(self, dataset: Dataset) -> NDArray[np.intp]:
         """Which records are of one pose, by number (N): all arms near the same joint positions, under the same load."""
@@ -146,7 +146,7 @@ class Experiment:
     def request(self, *, measured: bool) -> ReadRequest:
         """What a reader should look for; with ``measured`` the measured values are required."""
         system = self.system
-        wanted = wanted_channels(system.arms, system.measurements, measured=measured)
+        wanted = requested_channels(system.arms, system.measurements, measured=measured)
         return ReadRequest(system.arms, system.measurements, wanted)
 
     def simulator(self) -> Simulator:
@@ -197,10 +197,10 @@ def _gravity_warnings(settings: ExperimentSettings, gravity: Array) -> list[str]
     """Is gravity (3, m/s^2) what the declared body has (or any known one, if none is), and does it pull down?"""
     size, body = float(np.linalg.norm(gravity)), settings.statics.body
     bodies = STANDARD_GRAVITY if body is None else {body: STANDARD_GRAVITY[body]}
-    found = []
+    texts = []
     if all(abs(size - expected) > _GRAVITY_TOLERANCE * expected for expected in bodies.values()):
         known = ", ".join(f"on the {name} {expected:.3f}" for name, expected in bodies.items())
-        found.append(f"gravity is {size:.3f} m/s^2; it is {known}.")
+        texts.append(f"gravity is {size:.3f} m/s^2; it is {known}.")
     if gravity[2] > 0:
-        found.append("gravity points up along the base frame's z axis: right only for an arm that hangs.")
-    return found
+        texts.append("gravity points up along the base frame's z axis: right only for an arm that hangs.")
+    return texts

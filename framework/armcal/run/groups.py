@@ -49,20 +49,20 @@ class RunGroups:
 
     def as_dict(self) -> dict[str, Any]:
         """For metrics.json."""
-        return {each.name: each.as_dict() for each in self.errors}
+        return {error.name: error.as_dict() for error in self.errors}
 
 
 def label_of(experiment: Experiment) -> str | None:
     """The text column that tells groups apart; None if there is none."""
-    asked = experiment.settings.validation.group_by
-    if asked is not None:
-        return asked
+    text = experiment.settings.validation.group_by
+    if text is not None:
+        return text
     labels = [
         measurement.group_labels
         for measurement in experiment.system.measurements.values()
         if isinstance(measurement, GroupedMeasurement)
     ]
-    return next((each[0] for each in labels if each), None)
+    return next((label[0] for label in labels if label), None)
 
 
 def labels_of(experiment: Experiment, dataset: Dataset) -> tuple[str, ...]:

@@ -62,9 +62,9 @@ class IntervalResult:
 
     def findings(self) -> list[Finding]:
         """Whether intervals hold their share."""
-        found, words = self.judged
+        coverages, words = self.judged
         typical = [Finding("note", self._typical())] if self.half_width_mm else []
-        return [*typical, *(told(each, words, name) for name, each in found.items())]
+        return [*typical, *(told(each, words, name) for name, each in coverages.items())]
 
     def _typical(self) -> str:
         """How wide the intervals are."""
@@ -119,7 +119,7 @@ def interval_result(
     if by.drifts:
         spreads["new"] = by.in_new_recording(alike)
     places = [i for i, kernel in enumerate(problem.kernels) if is_position(kernel)]
-    typical = {name: _typical([each[i] for i in places], stretches.get(name)) for name, each in spreads.items()}
+    typical = {name: _typical([spread[i] for i in places], stretches.get(name)) for name, spread in spreads.items()}
     return IntervalResult(
         stretches,
         shares,
@@ -144,9 +144,9 @@ def _crossed(
     fits = [fit if isinstance(fit, PredictedFit) else None for fit in judged.fits]
     large_errors = collected(splits, [fit.large_errors if fit else {} for fit in fits], len(split.train))
     ways = {"same": by.left_out_of_recording, "new": by.left_out_of_new_recording}
-    found = {name: scored(by.problem, own, ways[name](fitted.records)) for name, own in large_errors.items()}
+    scores = {name: scored(by.problem, own, ways[name](fitted.records)) for name, own in large_errors.items()}
     shares: dict[Recording, Coverage] = {}
-    for name, own in found.items():
+    for name, own in scores.items():
         others: list[Stretch | None] = [None] * len(split.train)
         for part in splits:
             apart = stretch(besides(own, part.holdout))
@@ -157,8 +157,8 @@ def _crossed(
             shares[name] = share
     # Nothing is stretched whose share was not judged.
     sure = [name for name, share in shares.items() if share.stretched is not None]
-    stretches = {name: s for name in sure if (s := stretch(found[name])) is not None}
-    return {n: _filled(None, own, split.train, count) for n, own in found.items()}, shares, stretches
+    stretches = {name: s for name in sure if (s := stretch(scores[name])) is not None}
+    return {n: _filled(None, own, split.train, count) for n, own in scores.items()}, shares, stretches
 
 
 def _filled(before: Scores | None, own: Scores, places: Indices, count: int) -> Scores:

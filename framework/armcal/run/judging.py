@@ -66,7 +66,7 @@ def verdict_of(
         system: the arms.
         limit: above which the error of a judged record is explained (m); None for the default.
     """
-    found, held = run.fitted.estimate, len(run.split.holdout)
+    estimate, held = run.fitted.estimate, len(run.split.holdout)
     judged = _judged(run, errors)
     evidence = gather(run, judged, system, limit)
     joints = {
@@ -74,14 +74,14 @@ def verdict_of(
     }
     training, gravity = run.dataset.subset(run.split.train), gravity_findings(system, run.dataset)
     verdict = judge(
-        found,
+        estimate,
         _whitened(run),
         errors.calibrated_mm,
         run.split.train,
         judged[np.isfinite(judged)],
         (f"{held} held-out records" if held else "cross-validation") + (_AT_REST if _drifts(run) else ""),
         run.dataset.ids,
-        suggest(run.problem, training, found, joints) if found.names and _can_be_helped(run) else (),
+        suggest(run.problem, training, estimate, joints) if estimate.names and _can_be_helped(run) else (),
         run.fitted,
         [
             *_gross(run, judged, evidence),
@@ -100,42 +100,42 @@ def gather(run: FittedRecords, judged_mm: Array, system: System, limit: float | 
 
     ``judged_mm`` are errors by fits that did not see the record (N; nan where there is none).
     """
-    problem, found, dataset = run.problem, run.fitted.estimate, run.dataset
-    if not found.verdict.converged:
+    problem, estimate, dataset = run.problem, run.fitted.estimate, run.dataset
+    if not estimate.verdict.converged:
         return Evidence(unit=error_unit(problem))
-    position, motion = recorded_position(dataset), Motion.of(problem, found.values, run.records, dataset)
-    judged = Judged(judged_mm, problem.residuals(found.values, run.records), position)
+    position, motion = recorded_position(dataset), Motion.of(problem, estimate.values, run.records, dataset)
+    judged = Judged(judged_mm, problem.residuals(estimate.values, run.records), position)
     limit_mm = None if limit is None else limit * _MM
-    missed = large_errors(problem, run.records, found, dataset, motion, judged, limit_mm)
+    missed = large_errors(problem, run.records, estimate, dataset, motion, judged, limit_mm)
     training, train = dataset.subset(run.split.train), run.split.train
     alone = None
-    if len(found.identifiability.null):
-        alone = priors_alone(problem, found, unseen_poses(training, motion.channels))
+    if len(estimate.identifiability.null):
+        alone = priors_alone(problem, estimate, unseen_poses(training, motion.channels))
     acting = problem.weighted(run.fitted.records, run.fitted.weights)
     own = (training, motion.subset(train), position[train])
-    left = structure(problem, acting, found, *own, modelled=effect_types(system))
+    left = structure(problem, acting, estimate, *own, modelled=effect_types(system))
     return Evidence(left, missed, alone, error_unit(problem))
 
 
 def _gross(run: FittedRecords, judged_mm: Array, evidence: Evidence) -> list[Finding]:
     """What is grossly wrong with a fit that converged, and what its data cannot show."""
-    problem, found, train = run.problem, run.fitted.estimate, run.split.train
-    if not found.verdict.converged:
+    problem, estimate, train = run.problem, run.fitted.estimate, run.split.train
+    if not estimate.verdict.converged:
         return []
     looked_at = thinned(train, MOST_RECORDS)
-    figure = figure_of(problem, found, problem.subset(run.records, looked_at))
+    figure = figure_of(problem, estimate, problem.subset(run.records, looked_at))
     own = thinned(np.arange(len(train)), MOST_RECORDS)
     acting = problem.subset(problem.weighted(run.fitted.records, run.fitted.weights), own)
-    rows = FitRows.of(problem, acting, found)
+    rows = FitRows.of(problem, acting, estimate)
     dataset = run.dataset.subset(looked_at)
     position = recorded_position(run.dataset)[looked_at]
-    read = predicted_positions(problem, found.values, acting, dataset)
+    read = predicted_positions(problem, estimate.values, acting, dataset)
     return [
-        *gross_error(judged_mm, figure, found, evidence.structure, evidence.unit),
-        *contradicting(minority(rows, found.noise_scale, position), dataset.ids),
+        *gross_error(judged_mm, figure, estimate, evidence.structure, evidence.unit),
+        *contradicting(minority(rows, estimate.noise_scale, position), dataset.ids),
         *size_findings(figure),
         *displacement_findings(figure),
-        *limit_findings(figure, scale_deviation(problem, rows, read, found.noise_scale)),
+        *limit_findings(figure, scale_deviation(problem, rows, read, estimate.noise_scale)),
     ]
 
 

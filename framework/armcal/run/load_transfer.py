@@ -87,7 +87,7 @@ def transfer(
         payloads_g=payloads,
         counts=tuple(len(group) for group in groups),
         cells=_all_cells(ready, errors, groups, payloads, unsolved),
-        errors_mm={(name, tuple(payloads[i] for i in trained)): each for (name, trained), each in errors.items()},
+        errors_mm={(name, tuple(payloads[i] for i in trained)): error for (name, trained), error in errors.items()},
         warnings=dataset.warnings,
         seconds=watch.seconds,
         provenance=provenance(first, dataset),

@@ -70,17 +70,17 @@ class NoiseResult:
 
     def as_dict(self) -> dict[str, Any]:
         """For metrics.json and calibration.yaml."""
-        told: dict[str, Any] = {"loss": self.loss}
+        content: dict[str, Any] = {"loss": self.loss}
         if self.loss != "none":
-            told["rounds"] = self.rounds
-            told["suspicious_records"] = [asdict(record) for record in self.suspicious]
+            content["rounds"] = self.rounds
+            content["suspicious_records"] = [asdict(record) for record in self.suspicious]
         if self.components is not None:
-            told["components"] = [
+            content["components"] = [
                 {key: _finite(value) for key, value in asdict(c).items()} for c in self.components.components
             ]
-            told["inseparable"] = [list(pair) for pair in self.components.inseparable]
-            told["unseen_joints"] = list(self.components.unseen)
-        told["scatter"] = {
+            content["inseparable"] = [list(pair) for pair in self.components.inseparable]
+            content["unseen_joints"] = list(self.components.unseen)
+        content["scatter"] = {
             name: {
                 "covariance": each.covariance.tolist(),
                 "share": each.share,
@@ -90,7 +90,7 @@ class NoiseResult:
             }
             for name, each in self.scatter.items()
         }
-        return told
+        return content
 
 
 def noise_result(problem: Problem, fit: WeighedFit, dataset: Dataset, split: Split, errors_mm: Array) -> NoiseResult:

@@ -140,7 +140,7 @@ def files(
 
 def metrics(result: RunResult) -> dict[str, Any]:
     """The numbers of a run for other programs."""
-    estimate, told, known = result.estimate, result.estimate.verdict, result.estimate.identifiability
+    estimate, solver_verdict, known = result.estimate, result.estimate.verdict, result.estimate.identifiability
     content = {
         "experiment": result.name,
         "error_mm": _errors(result),
@@ -164,13 +164,13 @@ def metrics(result: RunResult) -> dict[str, Any]:
         },
         "noise": _noise(result),
         "solver": {
-            "name": told.name,
-            "status": told.status,
-            "converged": told.converged,
-            "iterations": told.iterations,
-            "seconds": told.seconds,
-            "starts": told.starts,
-            "agreeing_starts": told.agreeing_starts,
+            "name": solver_verdict.name,
+            "status": solver_verdict.status,
+            "converged": solver_verdict.converged,
+            "iterations": solver_verdict.iterations,
+            "seconds": solver_verdict.seconds,
+            "starts": solver_verdict.starts,
+            "agreeing_starts": solver_verdict.agreeing_starts,
         },
         "verdict": {"usable": not result.verdict.bad, **asdict(result.verdict)},
         "structure": result.evidence.as_dict(),
@@ -312,9 +312,9 @@ def bootstrap_text(resampled: Bootstrap, result: RunResult) -> str:
     return text.getvalue()
 
 
-def profile_text(found: tuple[Profile, ...]) -> str:
+def profile_text(profiles: tuple[Profile, ...]) -> str:
     """Each profile by its parameter (SI), with its curve."""
-    return as_json({each.name: each.as_dict() for each in found}) + "\n"
+    return as_json({profile.name: profile.as_dict() for profile in profiles}) + "\n"
 
 
 def log_text(result: RunResult) -> str:
@@ -336,15 +336,15 @@ def log_text(result: RunResult) -> str:
 
 
 def _bootstrap_metrics(result: RunResult) -> dict[str, Any] | None:
-    found = result.bootstrap
-    if found is None:
+    bootstrap = result.bootstrap
+    if bootstrap is None:
         return None
-    rows = zip(found.names, found.deviations, found.intervals, strict=True)
+    rows = zip(bootstrap.names, bootstrap.deviations, bootstrap.intervals, strict=True)
     return {
-        "method": found.method,
-        "refits": len(found.values),
-        "failed": found.failed,
-        "block_records": found.block,
+        "method": bootstrap.method,
+        "refits": len(bootstrap.values),
+        "failed": bootstrap.failed,
+        "block_records": bootstrap.block,
         "parameters": {
             name: {"sd": _finite(sd), "lower": _finite(low), "upper": _finite(high)} for name, sd, (low, high) in rows
         },
@@ -353,8 +353,8 @@ def _bootstrap_metrics(result: RunResult) -> dict[str, Any] | None:
 
 def _profile_metrics(result: RunResult) -> dict[str, Any] | None:
     """Intervals without their curves."""
-    told = {each.name: each.as_dict() for each in result.profiles}
-    return {name: {k: v for k, v in each.items() if k != "curve"} for name, each in told.items()} or None
+    told = {profile.name: profile.as_dict() for profile in result.profiles}
+    return {name: {k: v for k, v in content.items() if k != "curve"} for name, content in told.items()} or None
 
 
 def _finite(number: float) -> float | None:

@@ -100,8 +100,8 @@ def prepare(experiment: Experiment, watch: Stopwatch) -> Prepared:
     """
     ready = assemble(experiment, watch)
     with watch.stage("check"):
-        found = require_solvable(ready.problem, ready.training, ready.problem.parameters.nominal())
-    return replace(ready, warnings=(*ready.warnings, *found))
+        texts = require_solvable(ready.problem, ready.training, ready.problem.parameters.nominal())
+    return replace(ready, warnings=(*ready.warnings, *texts))
 
 
 def assemble(experiment: Experiment, watch: Stopwatch) -> Prepared:
@@ -202,17 +202,19 @@ def _uncertainty(
     watch: Stopwatch,
 ) -> tuple[Bootstrap | None, tuple[Profile, ...]]:
     """What was asked for beyond the covariance, of a fit that converged."""
-    asked, estimate = experiment.settings.uncertainty, fitted.estimate
+    uncertainty_settings, estimate = experiment.settings.uncertainty, fitted.estimate
     resampled: Bootstrap | None = None
     found: tuple[Profile, ...] = ()
-    if asked.bootstrap and estimate.verdict.converged and estimate.names:
+    if uncertainty_settings.bootstrap and estimate.verdict.converged and estimate.names:
         with watch.stage("bootstrap"):
             poses = experiment.poses(ready.dataset.subset(ready.split.train))
-            parts = (ready.training, experiment.estimator, estimate, asked, executor, progress, poses)
+            parts = (ready.training, experiment.estimator, estimate, uncertainty_settings, executor, progress, poses)
             resampled = bootstrap(ready.problem, *parts)
-    if asked.profile and estimate.verdict.converged:
+    if uncertainty_settings.profile and estimate.verdict.converged:
         with watch.stage("profile"):
-            found = profiles(ready.problem, fitted, experiment.estimator, asked.profile, executor, progress)
+            found = profiles(
+                ready.problem, fitted, experiment.estimator, uncertainty_settings.profile, executor, progress
+            )
     return resampled, found
 
 
@@ -274,8 +276,8 @@ def _check_folds(experiment: Experiment, dataset: Dataset, split: Split) -> None
 
 def _folds(experiment: Experiment, dataset: Dataset, split: Split) -> tuple[Split, ...]:
     """Of the training records."""
-    asked, training = experiment.settings.validation, dataset.subset(split.train)
-    return folds(len(training), asked.folds, asked.seed, experiment.poses(training))
+    validation_settings, training = experiment.settings.validation, dataset.subset(split.train)
+    return folds(len(training), validation_settings.folds, validation_settings.seed, experiment.poses(training))
 
 
 def _crossed(
@@ -285,8 +287,8 @@ def _crossed(
 
     Nor of a fit that did not converge: its folds would not either, and each would take as long.
     """
-    asked, problem = experiment.settings.validation, ready.problem
-    if not (asked.folds and fitted.estimate.verdict.converged):
+    validation_settings, problem = experiment.settings.validation, ready.problem
+    if not (validation_settings.folds and fitted.estimate.verdict.converged):
         return None
     splits = _folds(experiment, ready.dataset, ready.split)
     start = problem.parameters.nominal()
@@ -340,9 +342,9 @@ def _errors_of(
     before, after = settled(unfitted, nominal, records), settled(problem, values, records)
     (crossed, at_rest), failed = np.full((2, len(ready.dataset)), np.nan), 0
     if judged is not None:
-        train, found = ready.split.train, judged[0]
-        crossed[train], at_rest[train] = found.errors * _MM, found.at_rest * _MM
-        failed = found.failed_folds
+        train, cross_validation = ready.split.train, judged[0]
+        crossed[train], at_rest[train] = cross_validation.errors * _MM, cross_validation.at_rest * _MM
+        failed = cross_validation.failed_folds
     drifts = any(block.drift for block in problem.parameters.free)
     shown = problem.predict(values, records)[0]
     first = len(problem.kernels[0].factor.output_channels)

@@ -154,7 +154,7 @@ def given_records(experiment: Experiment, path: Path) -> Dataset:
     """
     if not _is_id_list(path):
         return read_poses(experiment, path)
-    wanted = read_ids(path)
+    ids = read_ids(path)
     if experiment.settings.data is None:
         raise DataError(
             "it lists ids, and no data is configured that they could belong to.",
@@ -163,13 +163,13 @@ def given_records(experiment: Experiment, path: Path) -> Dataset:
         )
     recorded = read_poses(experiment, None)
     place = {record: i for i, record in enumerate(recorded.ids)}
-    if missing := [record for record in wanted if record not in place]:
+    if missing := [record for record in ids if record not in place]:
         raise DataError(
-            f"{len(missing)} of {len(wanted)} ids are not in the data, the first: {missing[0]}.",
+            f"{len(missing)} of {len(ids)} ids are not in the data, the first: {missing[0]}.",
             where=Location(str(path)),
             hint="Give the poses themselves, or the data (--data FILE) that the ids belong to.",
         )
-    return recorded.subset([place[record] for record in wanted])
+    return recorded.subset([place[record] for record in ids])
 
 
 def commands_of(dataset: Dataset, space: JointSpace) -> Dataset:

@@ -265,7 +265,7 @@ def _nested(
     chosen, errors = [], np.full(sum(len(split.holdout) for split in outer), np.nan)
     at = offset
     for number, (split, inside) in enumerate(zip(outer, inner, strict=True)):
-        seen = {name: np.concatenate([f.errors for f in each[at : at + len(inside)]]) for name, each in fits.items()}
+        seen = {name: np.concatenate([f.errors for f in fit[at : at + len(inside)]]) for name, fit in fits.items()}
         means = {name: float(np.mean(e)) if np.isfinite(e).all() else np.inf for name, e in seen.items()}
         best = min(means, key=lambda name: means[name])
         chosen.append(best)
@@ -277,13 +277,13 @@ def _nested(
 def _require_same_records(ready: Mapping[str, Prepared]) -> None:
     (first_name, first), *others = ready.items()
     outputs = [c for k in first.problem.kernels for c in k.factor.output_channels]
-    for name, each in others:
-        same = each.dataset.ids == first.dataset.ids and each.dataset.sha256 == first.dataset.sha256
-        measured = [c for k in each.problem.kernels for c in k.factor.output_channels]
+    for name, prepared in others:
+        same = prepared.dataset.ids == first.dataset.ids and prepared.dataset.sha256 == first.dataset.sha256
+        measured = [c for k in prepared.problem.kernels for c in k.factor.output_channels]
         if not same or measured != outputs:
             raise ProblemError(
                 f"the variants {first_name} and {name} are not judged on the same records: "
-                f"{len(first.dataset)} and {len(each.dataset)} are used, measured are {', '.join(outputs)} and "
+                f"{len(first.dataset)} and {len(prepared.dataset)} are used, measured are {', '.join(outputs)} and "
                 f"{', '.join(measured)}.",
                 hint="Give every variant the same data and measurements.",
             )
@@ -292,8 +292,8 @@ def _require_same_records(ready: Mapping[str, Prepared]) -> None:
 def _warnings(ready: Mapping[str, Prepared], variants: Sequence[VariantResult]) -> tuple[str, ...]:
     """Each once, with the variants it holds for unless these are all."""
     told: dict[str, list[str]] = {}
-    for name, each in ready.items():
-        for text in dict.fromkeys(each.warnings):
+    for name, prepared in ready.items():
+        for text in dict.fromkeys(prepared.warnings):
             told.setdefault(text, []).append(name)
     listed = [text if len(names) == len(ready) else f"{', '.join(names)}: {text}" for text, names in told.items()]
     for v in variants:

@@ -19,7 +19,7 @@ from armcal.calibration.compensation.request import FARTHEST_M, Targets
 from armcal.calibration.tool_expression import APPROACH, ToolExpression
 from armcal.errors import DataError, Location
 from armcal.measure.environment import noticed
-from armcal.measure.reader import ReadRequest, WantedChannel, surroundings
+from armcal.measure.reader import ReadRequest, RequestedChannel, surroundings
 from armcal.plugins import PluginRegistry
 
 QUATERNION = ("qw", "qx", "qy", "qz")
@@ -97,11 +97,11 @@ def check_units(path: Path, targets: Targets, reach: Reach) -> None:
 
 def _read(path: Path, expression: ToolExpression, registry: PluginRegistry) -> Dataset:
     """The columns that mean something to this arm; a warning names those with a unit that do not."""
-    wanted = _wanted(expression)
+    requested_channels = _wanted(expression)
     reader_class = registry.find("reader", "csv").load()
     reader = reader_class(reader_class.Settings(path=ConfigText(str(path))))
     try:
-        dataset = noticed(reader.read(ReadRequest({}, {}, wanted)))
+        dataset = noticed(reader.read(ReadRequest({}, {}, requested_channels)))
     except DataError as fault:
         # Measured data have a section in a configuration that describes them; targets have none.
         hint = _AS_DOCUMENTED if "data section" in fault.hint else fault.hint
@@ -111,20 +111,24 @@ def _read(path: Path, expression: ToolExpression, registry: PluginRegistry) -> D
     idle = [name for name, split in units.items() if split is not None and split[0] not in expression.joints]
     if not idle:
         return dataset
-    found = f"columns that mean nothing to this arm are not used: {', '.join(idle)}."
-    return replace(dataset, warnings=(*dataset.warnings, found))
+    text = f"columns that mean nothing to this arm are not used: {', '.join(idle)}."
+    return replace(dataset, warnings=(*dataset.warnings, text))
 
 
-def _wanted(expression: ToolExpression) -> tuple[WantedChannel, ...]:
+def _wanted(expression: ToolExpression) -> tuple[RequestedChannel, ...]:
     told: list[tuple[str, str, bool]] = [(axis, "length", True) for axis in "xyz"]
     told += [(name, DIMENSIONLESS, False) for name in QUATERNION] + [(name, "angle", False) for name in RPY]
     acting = surroundings({expression.name: expression.arm})
-    wanted = [WantedChannel(name, _names(name, expression), dimension, needed) for name, dimension, needed in told]
-    wanted += [WantedChannel(n, (n,), d, False) for n, d in acting.items() if n not in ("time", "sequence")]
+    requested_channels = [
+        RequestedChannel(name, _names(name, expression), dimension, needed) for name, dimension, needed in told
+    ]
+    requested_channels += [
+        RequestedChannel(n, (n,), d, False) for n, d in acting.items() if n not in ("time", "sequence")
+    ]
     for index, joint in enumerate(expression.joints, start=1):
         names = (f"approach{index}", f"approach_{joint}")
-        wanted.append(WantedChannel(f"{expression.name}.{APPROACH}{joint}", names, DIMENSIONLESS, False))
-    return tuple(wanted)
+        requested_channels.append(RequestedChannel(f"{expression.name}.{APPROACH}{joint}", names, DIMENSIONLESS, False))
+    return tuple(requested_channels)
 
 
 def _positions(path: Path, dataset: Dataset) -> Array:
@@ -162,7 +166,7 @@ def _names(name: str, expression: ToolExpression) -> tuple[str, ...]:
 
 def _rotations(path: Path, dataset: Dataset) -> Array | None:
     told = {kind: [name for name in names if dataset.has(name)] for kind, names in _KINDS.items()}
-    given = [kind for kind, found in told.items() if found]
+    given = [kind for kind, texts in told.items() if texts]
     if not given:
         return None
     if len(given) == 2:

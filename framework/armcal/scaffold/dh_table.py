@@ -60,12 +60,12 @@ class _Line:
         unit = self.columns[key][1] if text else None
         if unit is None:
             return None
-        found = read_cell(text)
-        if isinstance(found, CellFault):
-            self.refuse(key, found.found, "Correct it.")
-        if not math.isfinite(found):
+        cell = read_cell(text)
+        if isinstance(cell, CellFault):
+            self.refuse(key, cell.found, "Correct it.")
+        if not math.isfinite(cell):
             self.refuse(key, f"found {text!r}, expected a number.", "Correct it.")
-        value = from_unit(found, unit.name)
+        value = from_unit(cell, unit.name)
         if abs(value) > MOST[dimension]:
             self.refuse(key, f"found {text} {unit.name}, expected an arm's {dimension}.", "Check the column's unit.")
         return value
@@ -96,7 +96,7 @@ def read_rows(path: Path) -> tuple[Row, ...]:
             where=Location(str(path), line=lines[-1].line if lines else None),
             hint="Give one line a joint, from the base to the tip.",
         )
-    check_joint_names([row.joint.name for row in rows], [Location(str(path), line=each.line) for each in lines])
+    check_joint_names([row.joint.name for row in rows], [Location(str(path), line=line.line) for line in lines])
     return rows
 
 
@@ -116,7 +116,7 @@ def _text(path: Path) -> str:
 
 def _lines(path: Path, text: str) -> list[_Line]:
     reader = csv.reader(text.splitlines(keepends=True), strict=True)
-    found: list[_Line] = []
+    lines: list[_Line] = []
     columns: dict[Key, tuple[str, Unit | None]] = {}
     try:
         for cells in reader:
@@ -132,13 +132,13 @@ def _lines(path: Path, text: str) -> list[_Line]:
                     where=Location(str(path), line=line),
                     hint="Leave a cell empty if its value is not known, and write decimal points (12.5), no commas.",
                 )
-            found.append(_Line(str(path), line, dict(zip(columns, cells, strict=True)), columns))
+            lines.append(_Line(str(path), line, dict(zip(columns, cells, strict=True)), columns))
     except csv.Error as fault:
         where = Location(str(path), line=max(1, reader.line_num))
         raise DataError(f"found a line that is not CSV ({fault}).", where=where, hint="Close every quote.") from fault
     if not columns:
         raise DataError("it is empty.", where=Location(str(path)), hint=f"Begin with the header {_SHOWN}.")
-    return found
+    return lines
 
 
 def _header(path: Path, line: int, names: list[str]) -> dict[Key, tuple[str, Unit | None]]:
@@ -174,8 +174,8 @@ def _column(name: str, where: Location) -> tuple[Key, Unit | None]:
         return (stem, unit.dimension), unit
     if stem in known:
         expected = " or ".join(_spellings(stem, dimension) for dimension in known[stem])
-        found = "no unit" if unit is None else f"a unit of {unit.dimension}"
-        raise DataError(f"found {name!r} with {found}, expected {expected}.", where=where, hint="Rename the column.")
+        text = "no unit" if unit is None else f"a unit of {unit.dimension}"
+        raise DataError(f"found {name!r} with {text}, expected {expected}.", where=where, hint="Rename the column.")
     shown = [f"{s}_{display_unit(d).name}" for s, dimensions in known.items() for d in dimensions]
     choices = [*_NAME, *_TYPE, *shown]
     near = difflib.get_close_matches(name, choices, n=1)

@@ -35,5 +35,7 @@ def choose_free(experiment: Experiment, robot: Robot) -> FreeChoice:
     ]
     found = minimal_set(triangle, parameters, preferred, most_uncertain=MOST_UNCERTAIN)
     return FreeChoice(
-        found.kept, tuple(each.name for each in found.redundant), tuple(each.name for each in found.left_out)
+        found.kept,
+        tuple(dropped.name for dropped in found.redundant),
+        tuple(dropped.name for dropped in found.left_out),
     )

@@ -76,8 +76,8 @@ def _fill(place: Path, robot: Robot, registry: PluginRegistry) -> FreeChoice:
 
 def _of_robot(fault: InputError, robot: Robot, place: Path, folder: Path) -> InputError:
     """A refusal of files that nobody sees, since they are not kept."""
-    told = str(fault).replace(str(place.resolve()), str(folder)).replace(str(place), str(folder))
-    return InputError(f"the files of {robot.name} would be refused: {told}", hint="Correct what they are made from.")
+    text = str(fault).replace(str(place.resolve()), str(folder)).replace(str(place), str(folder))
+    return InputError(f"the files of {robot.name} would be refused: {text}", hint="Correct what they are made from.")
 
 
 def _write(place: Path, robot: Robot, choice: FreeChoice, true: Mapping[str, str]) -> None:

@@ -55,9 +55,9 @@ def _model(path: Path, tip: str | None, registry: PluginRegistry) -> Any:
     try:
         return made(made.Settings.model_validate({"path": str(path), **({"tip": tip} if tip else {})}))
     except ValidationError as fault:
-        told = "; ".join(str(error["msg"]).removeprefix("Value error, ") for error in fault.errors(include_url=False))
+        text = "; ".join(str(error["msg"]).removeprefix("Value error, ") for error in fault.errors(include_url=False))
         hint = "Correct the URDF, or choose --tip LINK."
-        raise ConfigError(f"{told}.", where=Location(str(path)), hint=hint) from fault
+        raise ConfigError(f"{text}.", where=Location(str(path)), hint=hint) from fault
 
 
 def _joint(joint: Joint, where: Location) -> RobotJoint:
@@ -66,8 +66,8 @@ def _joint(joint: Joint, where: Location) -> RobotJoint:
         return RobotJoint(joint.name, turns, ASSUMED_TURN if turns else ASSUMED_TRAVEL, assumed=True)
     low, high = joint.limits
     if not low < high:
-        found = f"joint {joint.name!r} has the limits {low:g} and {high:g}, and cannot move."
-        raise DataError(found, where=where, hint="Correct them, or make it a fixed joint.")
+        text = f"joint {joint.name!r} has the limits {low:g} and {high:g}, and cannot move."
+        raise DataError(text, where=where, hint="Correct them, or make it a fixed joint.")
     if turns and not joint.endless:
         low, high = max(low, -_MOST_TRAVEL_RAD), min(high, _MOST_TRAVEL_RAD)
     return RobotJoint(joint.name, turns, (low, high))

@@ -112,9 +112,9 @@ def _light(target: str) -> None:
     shown = " ".join(said.split())[:60]
     expect(not shown, f"found {shown!r} printed when {module} is imported, expected nothing")
     own = {module.partition(".")[0], "armcal"}
-    found = [name for name in imported.split() if name not in own and name not in sys.stdlib_module_names]
+    texts = [name for name in imported.split() if name not in own and name not in sys.stdlib_module_names]
     expect(
-        not found,
-        f"found {', '.join(found)} imported by {module}, expected only armcal.hooks: "
+        not texts,
+        f"found {', '.join(texts)} imported by {module}, expected only armcal.hooks: "
         "components are imported when they are used",
     )

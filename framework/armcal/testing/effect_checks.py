@@ -76,9 +76,11 @@ def check_effect(record: Recorder, subject: Subject) -> None:
         "laws branch neither on a parameter nor on a load",
         lambda: expect_no_choice(laws, recorded, stacked([loads, given])),
     )
-    told = [ca.substitute(laws, recorded, ca.SX(state * len(JOINTS))) for state in _STATES]
-    record.check("laws are finite and smooth, at zero load too", lambda: _smooth(blocks, given, loads, told))
-    record.check("deflections are in rad, of loads in N m", lambda: _law_gains(blocks, given, loads, stacked(told)))
+    expressions = [ca.substitute(laws, recorded, ca.SX(state * len(JOINTS))) for state in _STATES]
+    record.check("laws are finite and smooth, at zero load too", lambda: _smooth(blocks, given, loads, expressions))
+    record.check(
+        "deflections are in rad, of loads in N m", lambda: _law_gains(blocks, given, loads, stacked(expressions))
+    )
 
 
 def _derived(effect: JointEffect) -> bool:

@@ -53,8 +53,8 @@ def check_estimator(record: Recorder, subject: Subject) -> None:
     record.check("it keeps to the bounds", lambda: _inside(bounded, solution))
     record.check("it finds the truth, one bound active", lambda: _near(bounded, solution))
     record.check("it does the same twice", lambda: _repeats(estimator, bounded, solution))
-    told = _case(Interval(), PRIOR_SD_M, _with_prior())
-    record.check("it weighs priors", lambda: _near(told, _solve(estimator, told)))
+    case = _case(Interval(), PRIOR_SD_M, _with_prior())
+    record.check("it weighs priors", lambda: _near(case, _solve(estimator, case)))
     scattered = _scattered()
     record.check("it weighs records", lambda: _near(scattered, _solve(estimator, scattered), scattered.told))
     record.check("the order of records changes nothing", lambda: _any_order(estimator, scattered))
@@ -134,8 +134,8 @@ def _inside(case: _Case, solution: Solution) -> None:
     case.parameters.check(solution.values)
 
 
-def _near(case: _Case, solution: Solution, told: Sequence[str] | None = None) -> None:
-    known = [told is None or name in told for name in case.parameters.entry_names]
+def _near(case: _Case, solution: Solution, texts: Sequence[str] | None = None) -> None:
+    known = [texts is None or name in texts for name in case.parameters.entry_names]
     off = np.where(known, np.abs(solution.values - case.answer), 0.0)
     worst = int(np.argmax(off))
     expect(

@@ -98,8 +98,8 @@ def _in_si(blocks: tuple[ParameterBlock, ...]) -> None:
             block.unit in UNITS,
             f"{block.name}: found the unit {block.unit!r}, expected one of {', '.join(UNITS)}",
         )
-        wanted = si_unit(UNITS[block.unit].dimension).name
-        expect(block.unit == wanted, f"{block.name}: found the unit {block.unit}, expected SI: {wanted}")
+        text = si_unit(UNITS[block.unit].dimension).name
+        expect(block.unit == text, f"{block.name}: found the unit {block.unit}, expected SI: {text}")
 
 
 def _within(parameters: Parameters, delta: Array) -> Array:

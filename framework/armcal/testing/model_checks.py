@@ -96,8 +96,8 @@ def _joint_names(model: ArmModel) -> tuple[str, ...]:
 
 def _chain(chain: Chain, names: Sequence[str]) -> Chain:
     expect(isinstance(chain, Chain), f"found a chain of type {type(chain).__name__}, expected Chain")
-    found = tuple(joint.name for joint in chain.joints)
-    expect(found == tuple(names), f"found the joints {found}, expected {tuple(names)}")
+    texts = tuple(joint.name for joint in chain.joints)
+    expect(texts == tuple(names), f"found the joints {texts}, expected {tuple(names)}")
     for joint in chain.joints:
         _axis(joint)
     for name, at in {TOOL_FRAME: chain.tool, **chain.frames}.items():

@@ -51,14 +51,14 @@ def _has_read(reader: Any) -> None:
     expect(callable(found), f"found read = {found!r}, expected a method")
 
 
-def _read(subject: Subject, path: str, asked: ReadRequest | None = None) -> Dataset:
+def _read(subject: Subject, path: str, read_request: ReadRequest | None = None) -> Dataset:
     """What a reader makes of a path; its refusals pass, any other fault is one of its own."""
     if "path" not in type(subject.settings).model_fields:
         raise NotRun("its settings have no path")
     try:
         settings = subject.made.Settings.model_validate({**subject.example, "path": path})
         reader: Reader = subject.made(settings)
-        return reader.read(asked or request({TRACKER: Tip()}))
+        return reader.read(read_request or request({TRACKER: Tip()}))
     except (InputError, ValidationError):
         raise
     except Exception as fault:
@@ -88,10 +88,10 @@ def _confused(subject: Subject) -> None:
 
 def _no_records(subject: Subject, path: Path) -> None:
     try:
-        found = _read(subject, str(path))
+        dataset = _read(subject, str(path))
     except (InputError, ValidationError):
         return
-    expect(len(found) == 0, f"found {len(found)} records made of it, expected it refused")
+    expect(len(dataset) == 0, f"found {len(dataset)} records made of it, expected it refused")
 
 
 @contextmanager
@@ -113,16 +113,16 @@ def _known(subject: Subject) -> Source:
     refused = []
     for example in sources(subject.made):
         try:
-            found = _read_example(subject, example)
+            read_example = _read_example(subject, example)
         except (InputError, ValidationError) as refusal:
             refused.append(str(refusal))
             continue
-        told = f" and {len(found.set_aside)} set aside"
-        expect(len(found) == example.count, f"found {len(found)} records{told}, expected {example.count}")
-        for name, wanted in example.channels.items():
-            values = found.column(name)
-            off = float(np.abs(values - wanted).max())
-            expect(off <= _TOLERANCE, f"{name}: found {values}, expected {wanted} (SI)")
+        text = f" and {len(read_example.set_aside)} set aside"
+        expect(len(read_example) == example.count, f"found {len(read_example)} records{text}, expected {example.count}")
+        for name, channel in example.channels.items():
+            values = read_example.column(name)
+            off = float(np.abs(values - channel).max())
+            expect(off <= _TOLERANCE, f"{name}: found {values}, expected {channel} (SI)")
         return example
     if hasattr(subject.made, "EXAMPLE_SOURCE"):
         raise ContractError(f"it refuses its own EXAMPLE_SOURCE: {refused[0]}")
@@ -148,18 +148,18 @@ def _told(subject: Subject, example: Source | None) -> None:
         if damaged == dict(example.files):
             raise NotRun("its example is not a table of text separated by commas")
         try:
-            found = _read_example(subject, replace(example, files=damaged))
+            read_example = _read_example(subject, replace(example, files=damaged))
         except (InputError, ValidationError):
             continue
-        kept = len(found) + len(found.set_aside)
+        kept = len(read_example) + len(read_example.set_aside)
         expect(
-            kept == example.count or bool(found.warnings),
-            f"found {len(found)} records and {len(found.set_aside)} set aside of {example.count} rows, one of them "
-            f"with {cell or 'nothing'!r} in a cell; expected it refused, or set aside with a reason",
+            kept == example.count or bool(read_example.warnings),
+            f"found {len(read_example)} records and {len(read_example.set_aside)} set aside of {example.count} rows, "
+            f"one of them with {cell or 'nothing'!r} in a cell; expected it refused, or set aside with a reason",
         )
-        finite = all(np.isfinite(found.column(name)).all() for name in example.channels)
+        finite = all(np.isfinite(read_example.column(name)).all() for name in example.channels)
         expect(
-            len(found) < example.count or not finite,
+            len(read_example) < example.count or not finite,
             f"found {example.count} records of finite numbers, one of them read from {cell or 'nothing'!r}",
         )
 

@@ -12,7 +12,7 @@ from armcal.base.dataset import Dataset
 from armcal.errors import InputError
 from armcal.estimate.simulation import SimulationRequest, Simulator
 from armcal.measure.measurement import Measurement
-from armcal.measure.reader import wanted_channels
+from armcal.measure.reader import requested_channels
 from armcal.testing.planar import ARM, GRAVITY, TRACKER, WALLS, Tip, Walls, all_parameters, planar_arms
 from armcal.testing.results import NotRun, Recorder, expect
 from armcal.testing.settings_checks import Subject
@@ -37,10 +37,10 @@ def _repeats(subject: Subject, simulator: Simulator) -> None:
     arms = planar_arms([ARM])
     request, first = _suited(simulator, arms, ({TRACKER: Tip()}, {WALLS: Walls()}))
     measurements = request.measurements
-    for wanted in wanted_channels(arms, measurements, measured=True):
+    for requested in requested_channels(arms, measurements, measured=True):
         expect(
-            first.has(wanted.channel) or not wanted.required,
-            f"found no {wanted.channel} in the records, expected every required channel",
+            first.has(requested.channel) or not requested.required,
+            f"found no {requested.channel} in the records, expected every required channel",
         )
     _same(first, simulator.simulate(request), "the second time")
     _same(first, subject.made(subject.settings).simulate(request), "from a second simulator of equal settings")

@@ -11,7 +11,7 @@ import numpy as np
 
 from armcal.base.domains import Array
 from armcal.measure.measurement import Measurement
-from armcal.measure.reader import ReadRequest, wanted_channels
+from armcal.measure.reader import ReadRequest, requested_channels
 from armcal.testing.planar import ARM, QUATERNION, TRACKER, WALLS, Body, Tip, Walls, planar_arms
 from armcal.testing.results import expect
 
@@ -50,7 +50,7 @@ class Source:
 def request(measurements: Mapping[str, Measurement]) -> ReadRequest:
     """For a planar arm called ``arm``."""
     arms = planar_arms([ARM])
-    return ReadRequest(arms, measurements, wanted_channels(arms, measurements, measured=True))
+    return ReadRequest(arms, measurements, requested_channels(arms, measurements, measured=True))
 
 
 def sources(made: Any) -> Iterator[Source]:

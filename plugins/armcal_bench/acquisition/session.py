@@ -213,7 +213,7 @@ def _summary(prepared: Prepared, progress: Progress, ending: Ending, identity: D
         "poses": len(prepared.plan),
         "measured": len(progress.measured),
         "left_out": dict(progress.left_out),
-        "set_aside": {each.record_id: each.reason for each in prepared.plan.set_aside},
+        "set_aside": {set_aside.record_id: set_aside.reason for set_aside in prepared.plan.set_aside},
         "times": "written" if in_order(progress) else "left out: the clock was set back during the run",
         "board": identity.name,
         "digests": {"board": identity.digest[:16], "config": _config_digest(prepared)[:16]},

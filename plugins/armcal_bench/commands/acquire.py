@@ -112,8 +112,10 @@ def show_forecast(console: Console, prepared: Prepared, forecast: ScheduleForeca
         lines.append(f"hottest, of what each servo bears: {', '.join(hot)}.")
     for text in (*lines, *(f"left out: {why}." for why in left_out)):
         console.out.print(text, markup=False, soft_wrap=True)
-    for each in prepared.plan.set_aside:
-        console.warn(f"row {each.row} of the plan, pose {each.record_id}, is set aside and not driven: {each.reason}")
+    for skipped in prepared.plan.set_aside:
+        console.warn(
+            f"row {skipped.row} of the plan, pose {skipped.record_id}, is set aside and not driven: {skipped.reason}"
+        )
 
 
 def show_outcome(console: Console, outcome: Outcome, config: Path, out: Path) -> None:
@@ -174,7 +176,7 @@ def _forecasts(prepared: Prepared, forecast: ScheduleForecast) -> dict[str, Any]
         "resting_s": forecast.resting,
         "hottest": dict(zip(names, forecast.hottest.tolist(), strict=True)),
         "left_out": [step.why for step in forecast.steps if isinstance(step, LeaveOut)],
-        "set_aside": {each.record_id: each.reason for each in prepared.plan.set_aside},
+        "set_aside": {row.record_id: row.reason for row in prepared.plan.set_aside},
     }
 
 

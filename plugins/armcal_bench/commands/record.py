@@ -24,10 +24,10 @@ from armcal.run.experiment import Experiment
 
 from armcal_bench.bench import SECTION, Bench
 from armcal_bench.recording.keys import Keys, LineKeys, NoKeys, TerminalKeys
+from armcal_bench.recording.messages import Message
 from armcal_bench.recording.recorder import KEYS
 from armcal_bench.recording.recording_log import DATASET
 from armcal_bench.recording.session import RecordingOptions, record
-from armcal_bench.recording.told import Told
 
 _TERMINAL = Path("/dev/tty")
 
@@ -124,10 +124,10 @@ def _terminal() -> int | None:
         return None
 
 
-def _teller(console: Console) -> Callable[[Told], None]:
+def _teller(console: Console) -> Callable[[Message], None]:
     """JSON lines, or sentences; flushed, so that who reads them knows at once what is safe."""
 
-    def tell(told: Told) -> None:
+    def tell(told: Message) -> None:
         if console.json:
             click.echo(json.dumps({"event": told.kind, **told.content, "sentence": told.sentence}))
         elif not console.quiet:

@@ -43,17 +43,17 @@ def rehearse(console: Console, config: Path, plan: Path, out: Path, overrides: t
         show_forecast(console, prepared, schedule_forecast(prepared))
     with simulated_bench(config, overrides, bench):
         outcome = driven(console, prepared, plan, (out, "anew"), always, unchecked=True)
-        found = truth(bench)
-    outcome.summary["truth"] = found
+        content = truth(bench)
+    outcome.summary["truth"] = content
     show_outcome(console, outcome, config, out)
-    _show_truth(console, found)
+    _show_truth(console, content)
     code = exit_code_of(outcome)
-    sys.exit(EXIT_INCOMPLETE if code == EXIT_DONE and any(found.get("offences", {}).values()) else code)
+    sys.exit(EXIT_INCOMPLETE if code == EXIT_DONE and any(content.get("offences", {}).values()) else code)
 
 
-def _show_truth(console: Console, found: dict[str, Any]) -> None:
+def _show_truth(console: Console, content: dict[str, Any]) -> None:
     """What the simulated arm had to bear: how often, and the worst of each kind."""
-    offences, worst = found.get("offences", {}), found.get("worst", {})
+    offences, worst = content.get("offences", {}), content.get("worst", {})
     counted = [f"{kind} {count} times{_worst(kind, worst)}" for kind, count in offences.items() if count]
     console.out.print(
         f"on the simulated arm's side, unsafe was: {'; '.join(counted) or 'nothing'}.", markup=False, soft_wrap=True

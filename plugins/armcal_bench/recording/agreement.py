@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.stats import f as f_distribution
 
-from armcal_bench.recording.quick_fit import Fitted, QuickFitter, Told
+from armcal_bench.recording.quick_fit import Fitted, PredictedResidual, QuickFitter
 
 _CHANCE = 1e-4
 _CHANCE_LATER = 1e-5
@@ -78,9 +78,9 @@ class AgreementJudge:
         fitted = self._fitter.fit(before)
         newest = self._told(fitted, self._last)
         candidates = [*doubtful] if newest is None else [*doubtful, self._last]
-        found = {one for one in candidates if self._disagrees(fitted, one, _CHANCE)}
-        found = self._by_majority(found)
-        agreement = self._settled(found)
+        by_majority = {one for one in candidates if self._disagrees(fitted, one, _CHANCE)}
+        by_majority = self._by_majority(by_majority)
+        agreement = self._settled(by_majority)
         return replace(agreement, newest=None if newest is None else _offset(newest))
 
     def anew(self) -> Agreement:
@@ -92,7 +92,7 @@ class AgreementJudge:
         used[list(doubtful)] = False
         return used
 
-    def _told(self, fitted: Fitted, one: int) -> Told | None:
+    def _told(self, fitted: Fitted, one: int) -> PredictedResidual | None:
         """None for a posture in whose group nothing was fitted."""
         alike = (self._groups == self._groups[one]) & fitted.used
         return self._fitter.told(fitted, one) if alike.any() else None
@@ -126,7 +126,7 @@ class AgreementJudge:
                 break
             doubtful, fitted = doubtful | {worst}, tried
         offsets = {one: self._fitter.told(fitted, one) for one in sorted(doubtful)}
-        found = {one: _offset(told) for one, told in offsets.items()}
+        found = {one: _offset(offset) for one, offset in offsets.items()}
         return Agreement(found, values=self._fitter.free_values(fitted))
 
     def _farthest(self, fitted: Fitted) -> int | None:
@@ -149,7 +149,7 @@ def _limit(numbers: int, freedom: float, chance: float) -> float:
     return float(numbers * f_distribution.isf(chance, numbers, max(freedom, 1.0)))
 
 
-def _offset(told: Told) -> Offset:
+def _offset(told: PredictedResidual) -> Offset:
     deviations = np.diag(told.covariance)
     off, expected = [], []
     for which in (told.lengths, ~told.lengths):

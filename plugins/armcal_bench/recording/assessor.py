@@ -39,15 +39,15 @@ def contacts_of(experiment: Experiment) -> dict[str, Measurement]:
     Raises:
         ConfigError: there are none.
     """
-    found = {name: m for name, m in experiment.system.measurements.items() if not m.channels()}
-    if not found:
+    measurements = {name: m for name, m in experiment.system.measurements.items() if not m.channels()}
+    if not measurements:
         raise ConfigError(
             "found no measurement that joint angles alone make.",
             where=experiment.source.where(("measurements",)),
             hint="Configure what the arm touches: ball_in_socket, clamped_tool, plane_contact or closed_chain. "
             "What a tracker measures, armcal acquire measures.",
         )
-    return found
+    return measurements
 
 
 class Assessor:

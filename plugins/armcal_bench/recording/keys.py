@@ -100,15 +100,15 @@ class TerminalKeys:
     def commands(self) -> list[str]:
         """See ``Keys``."""
         keep_single_keys(self._descriptor)
-        found = []
+        texts = []
         while not self.ended and select.select([self._descriptor], [], [], 0)[0]:
             try:
                 data = os.read(self._descriptor, _LONGEST)
             except OSError:
                 data = b""
             self.ended = not data
-            found += [command for key in data.decode("utf-8", "replace") if (command := self._key(key)) is not None]
-        return found
+            texts += [command for key in data.decode("utf-8", "replace") if (command := self._key(key)) is not None]
+        return texts
 
     def _key(self, key: str) -> str | None:
         """The command that a key completes."""

@@ -94,21 +94,25 @@ def explained(
         return ()
     values = problem.parameters.nominal()
     known = identify_from(factor_at_zero(problem, values, training), problem.parameters)
-    lines = [str(each) for each in explain(problem, values, training, known)]
+    lines = [str(undetermined) for undetermined in explain(problem, values, training, known)]
     if scale_is_unseen(problem, values, training, known):
         lines.insert(0, f"{UNSEEN_SCALE}; {GIVE_A_LENGTH}")
-    hardly = [f"{each}: hardly determined (sd {sd:.2g} ordinary sizes)" for each, sd in known.hardly]
+    hardly = [f"{combination}: hardly determined (sd {sd:.2g} ordinary sizes)" for combination, sd in known.hardly]
     return (*lines, *hardly)
 
 
 def _training(experiment: Experiment, dataset: Dataset) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
     """The postures that a run would train on; all while none would be."""
-    asked, everything = experiment.settings.validation, np.arange(len(dataset), dtype=np.intp)
-    if asked.train_groups:
+    validation_settings, everything = experiment.settings.validation, np.arange(len(dataset), dtype=np.intp)
+    if validation_settings.train_groups:
         labels = labels_of(experiment, dataset)
-        chosen = np.array([i for i, label in enumerate(labels) if label in asked.train_groups], dtype=np.intp)
-    elif asked.holdout and asked.train_ids is None and len(dataset) > 2:
-        chosen = hold_out(len(dataset), asked.holdout, asked.seed, experiment.poses(dataset)).train
+        chosen = np.array(
+            [i for i, label in enumerate(labels) if label in validation_settings.train_groups], dtype=np.intp
+        )
+    elif validation_settings.holdout and validation_settings.train_ids is None and len(dataset) > 2:
+        chosen = hold_out(
+            len(dataset), validation_settings.holdout, validation_settings.seed, experiment.poses(dataset)
+        ).train
     else:
         chosen = everything
     return chosen if len(chosen) else everything

@@ -35,7 +35,7 @@ _LEAST_SCALE = 0.05
 
 
 @dataclass(frozen=True)
-class Told:
+class PredictedResidual:
     """What a fit says of one posture that it did not see.
 
     Attributes:
@@ -117,7 +117,7 @@ class QuickFitter:
         values = posed.values(self._x)
         return self._described(values, records, used)
 
-    def told(self, fitted: Fitted, one: int) -> Told:
+    def told(self, fitted: Fitted, one: int) -> PredictedResidual:
         """Of a posture that was not fitted."""
         records = self._weak.subset(self.records, np.array([one], dtype=np.intp))
         residual, jacobian, whitening, lengths = self._rows(fitted.values, records)
@@ -125,7 +125,7 @@ class QuickFitter:
         covariance = fitted.scale**2 * np.eye(len(residual)) + reach @ reach.T
         distance = float(residual @ np.linalg.solve(covariance, residual))
         back = np.linalg.inv(whitening)
-        return Told(back @ residual, back @ covariance @ back.T, distance, lengths)
+        return PredictedResidual(back @ residual, back @ covariance @ back.T, distance, lengths)
 
     def left_out(self, fitted: Fitted) -> dict[int, tuple[float, int]]:
         """Of each fitted posture how far it lies from a fit without it, to first order: the square in units of what is
@@ -134,11 +134,11 @@ class QuickFitter:
         residuals = self._weak.whitened_residuals(fitted.values, self.records)
         blocks = self._weak.jacobians(fitted.values, self.records)
         rows: dict[int, list[tuple[Array, Array]]] = {}
-        for each, residual in zip(self.records, residuals, strict=True):
-            for start in range(0, each.record.shape[1], BLOCK_RECORDS):
+        for record, residual in zip(self.records, residuals, strict=True):
+            for start in range(0, record.record.shape[1], BLOCK_RECORDS):
                 reach = np.einsum("rvb,vc->brc", next(blocks), chain @ fitted.half / fitted.scale)
                 for one in range(start, min(start + BLOCK_RECORDS, self.count)):
-                    if fitted.used[one] and each.weight[one] > 0:
+                    if fitted.used[one] and record.weight[one] > 0:
                         rows.setdefault(one, []).append((residual[:, one], reach[one - start]))
         return {one: _left_out(parts, fitted.scale) for one, parts in rows.items()}
 
@@ -162,9 +162,13 @@ class QuickFitter:
         residuals = self._weak.whitened_residuals(values, records)
         parts = zip(self._weak.kernels, records, residuals, self._weak.jacobians(values, records), strict=True)
         found = []
-        for kernel, each, residual, jacobian in parts:
-            if each.weight[0] > 0:
-                own = declared(kernel.factor.noise) if each.whitening is None else each.whitening[:, :, 0]
+        for kernel, factor_records, residual, jacobian in parts:
+            if factor_records.weight[0] > 0:
+                own = (
+                    declared(kernel.factor.noise)
+                    if factor_records.whitening is None
+                    else factor_records.whitening[:, :, 0]
+                )
                 lengths = np.array([kind == "length" for kind in kernel.factor.dimensions], dtype=bool)
                 found.append((residual[:, 0], jacobian[:, :, 0] @ chain, own, lengths))
         whole = [np.concatenate([entry[i] for entry in found]) for i in (0, 1, 3)]

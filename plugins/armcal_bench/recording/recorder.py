@@ -13,14 +13,14 @@ from armcal.devices.joint_stream import JointSample
 from armcal.measure.limits import warn_beyond_limits
 from armcal.run.experiment import Experiment
 
-from armcal_bench.recording import told
+from armcal_bench.recording import messages as messages_of
 from armcal_bench.recording.assessor import Assessment, Assessor
 from armcal_bench.recording.labels import Labels
+from armcal_bench.recording.messages import Message
 from armcal_bench.recording.outputs import dataset_of, write_dataset
 from armcal_bench.recording.posture import Posture
 from armcal_bench.recording.recording_log import RecordingLog
 from armcal_bench.recording.settings import RecordingSettings
-from armcal_bench.recording.told import Told
 from armcal_bench.recording.window import JointKinds, Mean, SampleWindow
 
 Capture = Literal["keys", "still", "rests"]
@@ -65,19 +65,19 @@ class Recorder:
         if log.last is not None:
             self.labels.present.update(log.last.labels)
 
-    def begin(self) -> list[Told]:
+    def begin(self) -> list[Message]:
         """Where an earlier part of the recording had come to."""
         postures = self._log.postures
         if not postures:
             return []
         self._assessment = self._assessor.anew(postures)
         self._write()
-        there = Told("status", f"{len(postures)} postures are there already.", {"postures": len(postures)})
+        there = Message("status", f"{len(postures)} postures are there already.", {"postures": len(postures)})
         return [there, *self._known()]
 
-    def take(self, samples: Sequence[JointSample]) -> list[Told]:
+    def take(self, samples: Sequence[JointSample]) -> list[Message]:
         """Readings that came."""
-        found: list[Told] = []
+        messages: list[Message] = []
         for sample in samples:
             self._fault = self.kinds.fault_of(sample.angles)
             if self._fault:
@@ -85,16 +85,16 @@ class Recorder:
                 self._window.clear()
                 continue
             if self._task.capture == "rests":
-                found += self._kept(Mean(sample.angles, 0.0, 1, sample.labels, sample.stamp))
+                messages += self._kept(Mean(sample.angles, 0.0, 1, sample.labels, sample.stamp))
                 continue
             self._window.add(sample)
             if self._task.capture == "still":
-                found += self._by_itself()
+                messages += self._by_itself()
         if samples and not self._fault:
             self._heard = self._clock.now()  # judging a posture takes a while, in which nobody listens
-        return found + self._hearing()
+        return messages + self._hearing()
 
-    def command(self, text: str) -> list[Told]:
+    def command(self, text: str) -> list[Message]:
         """Something that was typed."""
         word, _, rest = text.strip().partition(" ")
         if word in ("", "c"):
@@ -107,18 +107,18 @@ class Recorder:
             fault = self.labels.name(rest if word == "g" else word)
             self._complaint = ""
             shown = self.labels.shown
-            return [_refused(fault) if fault else Told("named", f"the arm touches {shown}.", {"name": shown})]
+            return [_refused(fault) if fault else Message("named", f"the arm touches {shown}.", {"name": shown})]
         return [_refused(f"found {text.strip()[:40]!r}: {KEYS}.")]
 
-    def finished(self) -> Told:
+    def finished(self) -> Message:
         """How it ended."""
         postures, assessment = self._log.postures, self._assessment
         doubts = sorted(assessment.doubts, key=int)
         sentence = f"{len(postures)} postures are recorded"
         sentence += f"; in doubt: {', '.join(doubts)}" if doubts else ""
-        return Told("finished", f"{sentence}.", {"postures": len(postures), "in_doubt": doubts})
+        return Message("finished", f"{sentence}.", {"postures": len(postures), "in_doubt": doubts})
 
-    def _captured(self) -> list[Told]:
+    def _captured(self) -> list[Message]:
         if self._task.capture == "rests":
             return [_refused("rests are captured by themselves, when they are over.")]
         if self._fault or self._silence() > self._task.settings.stale:
@@ -126,7 +126,7 @@ class Recorder:
         mean = self._window.mean()
         return [_refused(mean.why_not)] if mean.why_not else self._kept(mean)
 
-    def _by_itself(self) -> list[Told]:
+    def _by_itself(self) -> list[Message]:
         """Capture an arm that has come to rest somewhere else; what hinders that is told once."""
         mean = self._window.mean()
         if mean.why_not:
@@ -135,14 +135,14 @@ class Recorder:
         last = self._log.last
         if last is not None and self._apart(mean.angles, last.angles) < self._task.settings.moved:
             return []
-        found = self._kept(mean)
-        if found[0].kind == "refused":
-            repeated = found[0].sentence == self._complaint
-            self._complaint = found[0].sentence
-            return [] if repeated else found
-        return found
+        kept = self._kept(mean)
+        if kept[0].kind == "refused":
+            repeated = kept[0].sentence == self._complaint
+            self._complaint = kept[0].sentence
+            return [] if repeated else kept
+        return kept
 
-    def _kept(self, mean: Mean) -> list[Told]:
+    def _kept(self, mean: Mean) -> list[Message]:
         labels, fault = self.labels.of(mean.labels)
         if fault:
             return [_refused(fault)]
@@ -152,21 +152,21 @@ class Recorder:
         self._assessment = self._assessor.with_newest(postures)
         if set(before.doubts) != set(self._assessment.doubts):
             self._write()
-        found = [told.captured(posture, self._assessment)]
-        found += told.doubts_changed(before, self._assessment, postures)
-        return found + self._warnings(posture) + self._known()
+        messages = [messages_of.captured(posture, self._assessment)]
+        messages += messages_of.doubts_changed(before, self._assessment, postures)
+        return messages + self._warnings(posture) + self._known()
 
-    def _undone(self) -> list[Told]:
+    def _undone(self) -> list[Message]:
         posture = self._log.undo()
         if posture is None:
             return [_refused("there is no posture to take back.")]
         before = self._assessment
         self._assessment = self._assessor.anew(self._log.postures)
         self._write()
-        found = [Told("undone", f"posture {posture.name} is taken back.", {"posture": posture.name})]
-        return found + told.doubts_changed(before, self._assessment, self._log.postures) + self._known()
+        messages = [Message("undone", f"posture {posture.name} is taken back.", {"posture": posture.name})]
+        return messages + messages_of.doubts_changed(before, self._assessment, self._log.postures) + self._known()
 
-    def _status(self) -> list[Told]:
+    def _status(self) -> list[Message]:
         by_place: dict[str, int] = {}
         for posture in self._log.postures:
             by_place[posture.place] = by_place.get(posture.place, 0) + 1
@@ -180,34 +180,34 @@ class Recorder:
         missing = self._assessor.explained(self._log.postures)
         content = {"postures": len(self._log.postures), "groups": by_place, "name": self.labels.shown}
         content |= {"in_doubt": sorted(self._assessment.doubts, key=int), "missing": list(missing)}
-        return [Told("status", "\n".join((*lines, *missing)), content), *self._known()]
+        return [Message("status", "\n".join((*lines, *missing)), content), *self._known()]
 
-    def _warnings(self, posture: Posture) -> list[Told]:
+    def _warnings(self, posture: Posture) -> list[Message]:
         """A posture much like one before, or beyond the joints' limits."""
-        found = []
+        messages = []
         for other in self._log.postures[:-1]:
             apart = self._apart(posture.angles, other.angles)
             if other.labels == posture.labels and apart < self._task.settings.alike:
                 sentence = f"posture {posture.name} is nearly posture {other.name} again: it tells little that is new."
-                found.append(Told("warning", sentence, {"posture": posture.name, "alike": other.name}))
+                messages.append(Message("warning", sentence, {"posture": posture.name, "alike": other.name}))
                 break
         checked = warn_beyond_limits(dataset_of([posture], {}), self._task.experiment.system.arms)
-        return found + [Told("warning", text, {"posture": posture.name}) for text in checked.warnings]
+        return messages + [Message("warning", text, {"posture": posture.name}) for text in checked.warnings]
 
     def _apart(self, one: Mapping[str, float], other: Mapping[str, float]) -> float:
         """The largest difference of a joint (rad); a slide of a metre counts as a radian."""
         return float(np.max([abs(one[channel] - other[channel]) for channel in self.kinds.channels]))
 
-    def _known(self) -> list[Told]:
-        return [told.known(self._assessment.known)] if self._assessment.known else []
+    def _known(self) -> list[Message]:
+        return [messages_of.known(self._assessment.known)] if self._assessment.known else []
 
-    def _hearing(self) -> list[Told]:
+    def _hearing(self) -> list[Message]:
         """Tell once that nothing comes, and that it comes again."""
         is_silent = self._task.capture != "rests" and self._silence() > self._task.settings.stale
         changed, self._is_silent = is_silent != self._is_silent, is_silent
         if not changed:
             return []
-        return [Told("silent", self._silent()) if is_silent else Told("heard", "joint readings come again.")]
+        return [Message("silent", self._silent()) if is_silent else Message("heard", "joint readings come again.")]
 
     def _silence(self) -> float:
         return self._clock.now() - self._heard
@@ -224,5 +224,5 @@ class Recorder:
         write_dataset(self._task.folder, self._task.experiment, self._log.postures, doubts)
 
 
-def _refused(why: str) -> Told:
-    return Told("refused", why)
+def _refused(why: str) -> Message:
+    return Message("refused", why)

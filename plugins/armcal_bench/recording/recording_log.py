@@ -88,9 +88,9 @@ def opened_recording_log(
         begun = journal.recovered.header
         for key in header if begun else ():
             if list(begun.get(key, ())) != header[key]:
-                found, expected = (", ".join(map(str, each)) or "none" for each in (begun.get(key, ()), header[key]))
+                text, expected = (", ".join(map(str, each)) or "none" for each in (begun.get(key, ()), header[key]))
                 raise InputError(
-                    f"it was begun with the {key} {found}; the configuration has {expected}.",
+                    f"it was begun with the {key} {text}; the configuration has {expected}.",
                     where=where,
                     hint="Give the configuration that it was begun with, or another --out.",
                 )

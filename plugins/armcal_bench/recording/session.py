@@ -16,9 +16,9 @@ from armcal_bench.bench import SECTION, Bench
 from armcal_bench.recording.assessor import contacts_of
 from armcal_bench.recording.keys import END, Keys
 from armcal_bench.recording.labels import Labels
+from armcal_bench.recording.messages import Message
 from armcal_bench.recording.recorder import Capture, Recorder, Task
 from armcal_bench.recording.recording_log import Start, opened_recording_log
-from armcal_bench.recording.told import Told
 from armcal_bench.recording.window import JointKinds
 
 _PERIOD_S = 0.02
@@ -42,10 +42,10 @@ class RecordingOptions:
     asked: Capture
     keys: Keys
     asked_to_end: Callable[[], bool]
-    tell: Callable[[Told], None]
+    tell: Callable[[Message], None]
 
 
-def record(bench: Bench, options: RecordingOptions) -> Told:
+def record(bench: Bench, options: RecordingOptions) -> Message:
     """Record until somebody ends it, or the stream ends; how it ended.
 
     Raises:
@@ -107,13 +107,13 @@ def _goes_on(options: RecordingOptions, recorder: Recorder, stream: JointStream,
     return not options.asked_to_end() and (bool(typed) or not (has_ended or is_unattended))
 
 
-def _rest(recorder: Recorder, stream: JointStream) -> list[Told]:
+def _rest(recorder: Recorder, stream: JointStream) -> list[Message]:
     """What came to rest last."""
     if isinstance(stream, RestStream) and stream.gives_rests:
         return recorder.take(stream.lasting())
     return []
 
 
-def _tell(options: RecordingOptions, found: list[Told]) -> None:
-    for each in found:
+def _tell(options: RecordingOptions, messages: list[Message]) -> None:
+    for each in messages:
         options.tell(each)

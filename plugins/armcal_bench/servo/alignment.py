@@ -90,7 +90,7 @@ def aligned(
 
     None where no rotations were seen. Without a ``compliance_sd`` (rad/(N m)) compliances stay.
     """
-    tracked = {joint: each for joint, each in sweeps.items() if each.by == "rotation"}
+    tracked = {joint: sweep for joint, sweep in sweeps.items() if sweep.by == "rotation"}
     if not tracked:
         return alignment, None
     if alignment.seat is None:
@@ -167,8 +167,8 @@ def _seat(base: Array, sweeps: Mapping[str, Sweeps], springs: Mapping[str, Sprin
     """How the tracked body sits on the model's tool, on the average."""
     between = [
         (base @ springs[joint].about.turns(pose)[0]).T @ np.array(line["rotation"])
-        for joint, each in sweeps.items()
-        for line, pose in zip(each.lines, springs[joint].poses(each, joint), strict=True)
+        for joint, sweep in sweeps.items()
+        for line, pose in zip(sweep.lines, springs[joint].poses(sweep, joint), strict=True)
     ]
     return np.asarray(Rotation.from_matrix(np.array(between)).mean().as_matrix())
 

@@ -112,13 +112,13 @@ def told_by(sweeps: Sweeps, joint: str, nominal: NominalArm, springs: Springs | 
         return [Observation(joint, *row) for row in rows]
     about = springs.about
     changes = np.array([about.compliance(name) - nominal.compliance(name) for name in about.compliances])
-    found = []
+    observations = []
     for row, pose in zip(rows, springs.poses(sweeps, joint), strict=True):
         slopes = about.slopes(joint, pose, sweeps.by)
-        found.append(
+        observations.append(
             Observation(joint, *row, -float(slopes @ changes), dict(zip(about.compliances, slopes, strict=True)))
         )
-    return found
+    return observations
 
 
 def _by_rotations(

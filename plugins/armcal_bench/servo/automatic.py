@@ -94,15 +94,15 @@ class Automatic:
         until = self.mover.clock.now() + settings.settle.longest
         while self.mover.clock.now() < until:
             self.mover.tick()
-            found = self.monitor.settled()
-            if found is not None:
+            settled = self.monitor.settled()
+            if settled is not None:
                 self.mover.waits.over("tracker", self.mover.clock.now())
-                return found
+                return settled
             seconds, why = self.monitor.trouble()
             if seconds >= settings.lost.park:
                 self.mover.waits.given_up("tracker")
-                told = f"the tracker has told nothing for {seconds:.0f} s ({why})"
-                raise TrackerLostError(told, "the arm holds its base pose")
+                text = f"the tracker has told nothing for {seconds:.0f} s ({why})"
+                raise TrackerLostError(text, "the arm holds its base pose")
             if seconds >= settings.lost.hold:
                 left = settings.lost.park - seconds
                 self.mover.waits.goes_on("tracker", f"the arm holds: {why}", left, self.mover.clock.now())
@@ -142,8 +142,8 @@ class Automatic:
             self.record.append(LEFT_OUT, {**here, "why": found})
             self.restless += 1
             if self.restless >= _MOST_RESTLESS:
-                told = f"{point.joint} did not come to stand {self.restless} times in a row ({found})"
-                raise RestlessError(f"{told}: does a servo stall, or let go?", "the arm is told to hold its base pose")
+                text = f"{point.joint} did not come to stand {self.restless} times in a row ({found})"
+                raise RestlessError(f"{text}: does a servo stall, or let go?", "the arm is told to hold its base pose")
             return
         self.record.append(POSE, {**here, **pose_entry(found)})
         self.faults = self.restless = 0
@@ -161,13 +161,13 @@ class Automatic:
                 self.mover.recover(fault)
 
 
-def pose_entry(found: Settled) -> dict[str, Any]:
+def pose_entry(settled: Settled) -> dict[str, Any]:
     """A settled pose as a line of the record tells it."""
-    pose = found.base_T_target
+    pose = settled.base_T_target
     seen = not np.isnan(pose[:3, :3]).any()
     return {
         "position": pose[:3, 3].tolist(),
         "rotation": pose[:3, :3].tolist() if seen else None,
-        "deviations": [float(d) if np.isfinite(d) else None for d in found.deviations],
-        "frames": found.frames,
+        "deviations": [float(d) if np.isfinite(d) else None for d in settled.deviations],
+        "frames": settled.frames,
     }

@@ -27,14 +27,14 @@ def is_usable(servo: FittedServo) -> bool:
 
 def findings(outcome: Outcome) -> list[str]:
     """All of them."""
-    found = [f"{joint}: the table is left as it was: {why}." for joint, why in outcome.silent.items()]
+    texts = [f"{joint}: the table is left as it was: {why}." for joint, why in outcome.silent.items()]
     for servo in outcome.fit.servos.values():
-        found += list(_of_servo(servo, outcome))
+        texts += list(_of_servo(servo, outcome))
     if outcome.zero == "kept":
-        found.append("zeros: each servo's pulse at 0 deg was kept; the angles were measured from one another.")
-    found += _of_boards(outcome)
-    found += _of_springs(outcome)
-    return found
+        texts.append("zeros: each servo's pulse at 0 deg was kept; the angles were measured from one another.")
+    texts += _of_boards(outcome)
+    texts += _of_springs(outcome)
+    return texts
 
 
 def _of_servo(servo: FittedServo, outcome: Outcome) -> Iterator[str]:
@@ -72,9 +72,9 @@ def _of_servo(servo: FittedServo, outcome: Outcome) -> Iterator[str]:
             f"{joint}: the angles scatter by {math.degrees(servo.scatter):.2f} deg, {servo.scale:.0f} times more than "
             "stated; the deviations are enlarged by that."
         )
-    for each in servo.outliers:
-        angle = math.degrees(each.angle)
-        yield f"{joint}: the angle at {each.counts} counts ({angle:.1f} deg) lies far off and was set aside."
+    for outlier in servo.outliers:
+        angle = math.degrees(outlier.angle)
+        yield f"{joint}: the angle at {outlier.counts} counts ({angle:.1f} deg) lies far off and was set aside."
 
 
 def _gain_change(servo: FittedServo) -> float:
@@ -84,23 +84,23 @@ def _gain_change(servo: FittedServo) -> float:
 
 
 def _of_boards(outcome: Outcome) -> list[str]:
-    found = []
+    texts = []
     for board, clock in outcome.fit.clocks.items():
         if not any(servo.known.board == board for servo in outcome.fit.servos.values()):
             continue
         if board not in outcome.fit.oscillator_sds:
-            found.append(
+            texts.append(
                 f"{board}: the oscillator cannot be told from tables that are not known, so it is left at "
                 f"{clock.oscillator_hz / 1e6:.3f} MHz and the tables count by it. Angles are right all the same. To "
                 "know the oscillator, measure a pulse (bench.servo.measured_pulses) or trust a table "
                 "(bench.servo.trusted)."
             )
         if not _SENSIBLE_HZ[0] <= clock.oscillator_hz <= _SENSIBLE_HZ[1]:
-            found.append(
+            texts.append(
                 f"{board}: an oscillator of {clock.oscillator_hz / 1e6:.2f} MHz is outside "
                 f"{_SENSIBLE_HZ[0] / 1e6:.0f} to {_SENSIBLE_HZ[1] / 1e6:.0f} MHz: check what it was measured by."
             )
-    return found
+    return texts
 
 
 def _of_springs(outcome: Outcome) -> list[str]:

@@ -100,12 +100,12 @@ def fit_servos(task: FitTask) -> ServoFit:
         kept = _kept(unknowns, x)
         scales = _scales(unknowns, kept, x)
     residuals = Residuals(unknowns, kept, {joint: max(1.0, scale) for joint, scale in scales.items()}, x)
-    found = least_squares(
+    solution = least_squares(
         residuals, x, jac=residuals.jacobian, x_scale="jac", method="trf", xtol=1e-13, ftol=1e-13, gtol=1e-13
     )
-    slopes = np.asarray(found.jac)
+    slopes = np.asarray(solution.jac)
     covariance = np.linalg.pinv(slopes.T @ slopes, hermitian=True)
-    return _fit(unknowns, found.x, covariance, kept, scales)
+    return _fit(unknowns, solution.x, covariance, kept, scales)
 
 
 def _in_order(observations: Sequence[Observation]) -> tuple[Observation, ...]:
@@ -155,10 +155,10 @@ def _fit(
         name: FittedNumber(float(x[at[name, "compliance"]]), float(sds[at[name, "compliance"]]))
         for name in unknowns.compliances
     }
-    told = {name: number for name, number in numbers.items() if number.sd < _TOLD * task.compliance_sd}
-    untold = tuple(name for name in numbers if name not in told)
+    fitted_numbers = {name: number for name, number in numbers.items() if number.sd < _TOLD * task.compliance_sd}
+    untold = tuple(name for name in numbers if name not in fitted_numbers)
     changes = {name: number.value for name, number in numbers.items()}
-    return ServoFit(servos, clocks, oscillators, told, untold, changes)
+    return ServoFit(servos, clocks, oscillators, fitted_numbers, untold, changes)
 
 
 def _servo(

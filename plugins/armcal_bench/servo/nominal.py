@@ -87,7 +87,7 @@ class NominalArm:
 
     def axes(self, angles: Mapping[str, float]) -> dict[str, tuple[Array, Array]]:
         """The same of all joints."""
-        _, axes, origins = (np.asarray(each.full()) for each in self._rigid(self._commands(angles)))
+        _, axes, origins = (np.asarray(dm.full()) for dm in self._rigid(self._commands(angles)))
         return {name: (axes[:, i], origins[:, i]) for i, name in enumerate(self.arm.joint_names)}
 
     def angle_of_rotation(self, joint: str, angles: Mapping[str, float], rotation: Array) -> float:

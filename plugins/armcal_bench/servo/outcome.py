@@ -59,10 +59,10 @@ def outcome_of(
     """
     left_out = mixed_up(entries, [servo.joint for servo in servos], nominal)
     while True:
-        found = _fitted(entries, [s for s in servos if s.joint not in left_out], boards, nominal, settings)
-        worst = max(found.fit.servos.values(), key=lambda servo: servo.scatter, default=None)
+        fitted = _fitted(entries, [s for s in servos if s.joint not in left_out], boards, nominal, settings)
+        worst = max(fitted.fit.servos.values(), key=lambda servo: servo.scatter, default=None)
         if worst is None or worst.scatter <= _MOST_SCATTER:
-            return replace(found, silent={**found.silent, **left_out})
+            return replace(fitted, silent={**fitted.silent, **left_out})
         left_out[worst.known.joint] = (
             f"its angles scatter by {math.degrees(worst.scatter):.1f} deg, as if it slipped, or was too hot and let go"
         )
@@ -79,22 +79,22 @@ def _fitted(
     seen = tuple(servo for servo in servos if servo.joint in sweeps)
     zero: Zero = "kept" if settings.zero == "kept" and all(s.by is not None for s in sweeps.values()) else "measured"
     task = FitTask(seen, dict(boards), settings.knots, (), zero, settings.sag_sd)
-    found = _Found(sweeps, task, fit_servos(task), begin(nominal), {})
+    fitted = _Round(sweeps, task, fit_servos(task), begin(nominal), {})
     has_springs = settings.sag != "none" and bool(nominal.compliances)
     for _ in range(_ROUNDS if has_springs else 1):
-        before = found
-        found = _better(before, entries, nominal, settings, "bending" if has_springs else "stiff")
-        scatter = max((servo.scatter for servo in found.fit.servos.values()), default=0.0)
-        if _nearly_same(before.fit, found.fit) or (before.springs and scatter > _MOST_SCATTER):
+        before = fitted
+        fitted = _better(before, entries, nominal, settings, "bending" if has_springs else "stiff")
+        scatter = max((servo.scatter for servo in fitted.fit.servos.values()), default=0.0)
+        if _nearly_same(before.fit, fitted.fit) or (before.springs and scatter > _MOST_SCATTER):
             break
-    fit = found.fit
+    fit = fitted.fit
     values = {name: (nominal.compliance(name) + n.value, n.sd) for name, n in fit.compliances.items()}
-    spans = {joint: _span(joint, each, found.springs.get(joint)) for joint, each in found.sweeps.items()}
-    return Outcome(fit, found.task, found.sweeps, silent, values, zero, spans)
+    spans = {joint: _span(joint, sweep, fitted.springs.get(joint)) for joint, sweep in fitted.sweeps.items()}
+    return Outcome(fit, fitted.task, fitted.sweeps, silent, values, zero, spans)
 
 
 @dataclass(frozen=True, eq=False)
-class _Found:
+class _Round:
     """What is known after a round."""
 
     sweeps: Mapping[str, Sweeps]
@@ -105,12 +105,12 @@ class _Found:
 
 
 def _better(
-    found: _Found,
+    found: _Round,
     entries: Sequence[Entry],
     nominal: NominalArm,
     settings: ServoCalibrationSettings,
     arm: Literal["stiff", "bending"],
-) -> _Found:
+) -> _Round:
     """One round: where the joints stood, what the springs gave there, the angles without it, the fit to those."""
     servos, task, alignment = found.task.servos, found.task, found.alignment
     springs: dict[str, Springs] = {}
@@ -123,11 +123,11 @@ def _better(
         about = shifted(nominal, alignment)
         springs = {joint: Springs(about, each.angles, seat_of(alignment)) for joint, each in stood.items()}
     sweeps = {**found.sweeps, **_swept(entries, servos, nominal, settings, springs)[0]}
-    told = [o for s in servos for o in told_by(sweeps[s.joint], s.joint, nominal, springs.get(s.joint))]
+    observations = [o for s in servos for o in told_by(sweeps[s.joint], s.joint, nominal, springs.get(s.joint))]
     if settings.sag != "fitted":
-        told, rows = [replace(o, sag=0.0, sag_slopes={}) for o in told], None
-    task = replace(task, observations=tuple(told), springs=rows)
-    return _Found(sweeps, task, fit_servos(task), alignment, springs)
+        observations, rows = [replace(o, sag=0.0, sag_slopes={}) for o in observations], None
+    task = replace(task, observations=tuple(observations), springs=rows)
+    return _Round(sweeps, task, fit_servos(task), alignment, springs)
 
 
 def _nearly_same(one: ServoFit, other: ServoFit) -> bool:
@@ -144,7 +144,7 @@ def _swept(
 ) -> tuple[dict[str, Sweeps], dict[str, str]]:
     found = {s.joint: sweeps_of(entries, s.joint, nominal, settings, springs.get(s.joint)) for s in servos}
     sweeps = {joint: each for joint, each in found.items() if isinstance(each, Sweeps)}
-    return sweeps, {joint: each for joint, each in found.items() if isinstance(each, str)}
+    return sweeps, {joint: text for joint, text in found.items() if isinstance(text, str)}
 
 
 def _springs(sweeps: Sweeps, servo: KnownServo, task: FitTask, fit: ServoFit, about: NominalArm) -> Springs:

@@ -39,8 +39,8 @@ def improved(file: ServoFile, outcome: Outcome, adapter: str = "") -> ServoFile:
         boards[name] = _changed(boards[name], oscillator_hz=hz)
     servos: dict[str, ServoSettings] = {}
     for joint, servo in file.servos.items():
-        found = outcome.fit.servos.get(joint)
-        table = None if found is None else _fitted_table(found, servo, outcome, boards[servo.board])
+        fitted_servo = outcome.fit.servos.get(joint)
+        table = None if fitted_servo is None else _fitted_table(fitted_servo, servo, outcome, boards[servo.board])
         if table is None:
             longer = file.boards[servo.board].oscillator_hz / boards[servo.board].oscillator_hz
             same = PulseTable(servo.angles, tuple(pulse * longer for pulse in servo.pulses))
@@ -50,16 +50,18 @@ def improved(file: ServoFile, outcome: Outcome, adapter: str = "") -> ServoFile:
 
 
 def _fitted_table(
-    found: FittedServo, servo: ServoSettings, outcome: Outcome, board: BoardSettings
+    fitted_servo: FittedServo, servo: ServoSettings, outcome: Outcome, board: BoardSettings
 ) -> PulseTable | None:
     """The table that is written for a servo that was measured; None where none can be, and its own is kept."""
-    if found.known.trusted_sd is not None:
+    if fitted_servo.known.trusted_sd is not None:
         return servo.table
-    if not is_usable(found):
+    if not is_usable(fitted_servo):
         return None
     # Counts stay what they are: the file's board may have another oscillator than that of the record.
     same = outcome.fit.clocks[servo.board].oscillator_hz / board.oscillator_hz
-    return _borne_part(PulseTable(found.angles, tuple(round(p * same, 9) for p in found.pulses)), servo, board)
+    return _borne_part(
+        PulseTable(fitted_servo.angles, tuple(round(p * same, 9) for p in fitted_servo.pulses)), servo, board
+    )
 
 
 def _borne_part(table: PulseTable, servo: ServoSettings, board: BoardSettings) -> PulseTable | None:
@@ -139,25 +141,25 @@ def results(outcome: Outcome, changed: ServoFile) -> dict[str, Any]:
     }
 
 
-def _is_written(found: FittedServo, outcome: Outcome, changed: ServoFile) -> bool:
-    servo = changed.servos[found.known.joint]
-    return _fitted_table(found, servo, outcome, changed.boards[servo.board]) is not None
+def _is_written(fitted_servo: FittedServo, outcome: Outcome, changed: ServoFile) -> bool:
+    servo = changed.servos[fitted_servo.known.joint]
+    return _fitted_table(fitted_servo, servo, outcome, changed.boards[servo.board]) is not None
 
 
 def _narrowed(outcome: Outcome, changed: ServoFile) -> list[str]:
     """Of tables that reach less far than they were stated to, or than they were to be given for."""
     said = []
-    for joint, found in outcome.fit.servos.items():
-        servo, stated = changed.servos[joint], found.known.table.angles
-        meant = min(stated[0], found.angles[0]), max(stated[-1], found.angles[-1])
-        if not _is_written(found, outcome, changed):
-            if is_usable(found):
+    for joint, fitted_servo in outcome.fit.servos.items():
+        servo, stated = changed.servos[joint], fitted_servo.known.table.angles
+        meant = min(stated[0], fitted_servo.angles[0]), max(stated[-1], fitted_servo.angles[-1])
+        if not _is_written(fitted_servo, outcome, changed):
+            if is_usable(fitted_servo):
                 said.append(
                     f"{joint}: the table is left as it was: the servo bears none of the pulses that were found."
                 )
         elif servo.angles[0] > meant[0] + _APART or servo.angles[-1] < meant[1] - _APART:
             low, high = (1e6 * pulse for pulse in servo.pulse_range)
-            shortened = (found.angles[0], found.angles[-1]) != (servo.angles[0], servo.angles[-1])
+            shortened = (fitted_servo.angles[0], fitted_servo.angles[-1]) != (servo.angles[0], servo.angles[-1])
             why = f"the servo bears {low:g} to {high:g} us" if shortened else "bench.servo.knots ends there"
             said.append(
                 f"{joint}: its table reaches from {math.degrees(servo.angles[0]):.1f} to "

@@ -117,8 +117,8 @@ class Residuals:
                 if servo.trusted_sd is None:
                     yield self._kept_zero(x, servo)
         for name, board in task.boards.items():
-            for each in board.measured:
-                yield (each.counts * self._tick(x, name) - each.length) / each.sd
+            for measured_pulse in board.measured:
+                yield (measured_pulse.counts * self._tick(x, name) - measured_pulse.length) / measured_pulse.sd
         changes = [self._one(x, name, "compliance") for name in self._u.compliances]
         yield from (change / task.compliance_sd for change in changes)
         if task.springs is not None:

@@ -160,7 +160,7 @@ def _opened(
     servos = read_by
     if record is not None and record.is_measured:
         stated = stated_by(setup, record.of_kind(BEGUN)[0], tuple(setup.base))[0]
-        servos = {each.joint: (each, _clock(setup, each.joint)) for each in stated}
+        servos = {known_servo.joint: (known_servo, _clock(setup, known_servo.joint)) for known_servo in stated}
     mover = Mover(device, clock, servos, read_by, motion, talk.asked_to_stop, waits=talk.waits)
     try:
         identity = mover.open()

@@ -85,9 +85,9 @@ class Setup:
         check = clearance_of(experiment, arm)
         rest = np.array([base.get(joint, 0.0) for joint in arm.commanded])
         judge = HazardJudge(tuple(arm.commanded), moved, np.array(list(limits.values())), heat[1], rest)
-        found = cls(bench, settings, path, file, joints, base, {}, nominal, heat, check, judge)
-        found._check_base_pulses(experiment)
-        return replace(found, ranges=found.clear_ranges(experiment, limits))
+        setup = cls(bench, settings, path, file, joints, base, {}, nominal, heat, check, judge)
+        setup._check_base_pulses(experiment)
+        return replace(setup, ranges=setup.clear_ranges(experiment, limits))
 
     def known(self, joint: str) -> KnownServo:
         """A servo as the file states it."""
@@ -129,7 +129,7 @@ class Setup:
                 )
 
     def _measured(self, board: str) -> tuple[MeasuredPulse, ...]:
-        stated = [each for each in self.settings.measured_pulses if each.board == board]
+        stated = [measured_pulse for measured_pulse in self.settings.measured_pulses if measured_pulse.board == board]
         return tuple(MeasuredPulse(m.counts, 1e-6 * m.microseconds, 1e-6 * m.sd_microseconds) for m in stated)
 
     def clear_ranges(self, experiment: Experiment, limits: Mapping[str, Any]) -> dict[str, tuple[float, float]]:
@@ -178,14 +178,14 @@ class Setup:
 
 
 def _path_of_device(experiment: Experiment, bench: Bench) -> Path:
-    found = servo_file_of(bench)
-    if found is None:
+    servo_file = servo_file_of(bench)
+    if servo_file is None:
         raise ConfigError(
             "found no servo file.",
             where=experiment.source.where((SECTION, "device")),
             hint="Name it in bench.device.servos, or in bench.servo.servos.",
         )
-    return found
+    return servo_file
 
 
 def _check_names(

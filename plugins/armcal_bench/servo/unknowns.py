@@ -47,7 +47,7 @@ class FitTask:
 
     def of(self, joint: str) -> tuple[Observation, ...]:
         """A joint's observations."""
-        return tuple(each for each in self.observations if each.joint == joint)
+        return tuple(observation for observation in self.observations if observation.joint == joint)
 
     def knots_of(self, servo: KnownServo) -> Array:
         """A trusted table keeps its own."""
@@ -65,7 +65,7 @@ class Unknowns:
             self.names += [(servo.joint, f"pulse{k}") for k in range(len(task.knots_of(servo)))]
             if task.zero == "kept":
                 self.names.append((servo.joint, "zero"))
-            if {-1, 1} <= {each.approach for each in task.of(servo.joint)}:
+            if {-1, 1} <= {observation.approach for observation in task.of(servo.joint)}:
                 self.names.append((servo.joint, "lag"))
         self.names += [(board, "clock") for board in task.boards if self._told(board)]
         self.names += [(name, "compliance") for name in self.compliances]
@@ -78,7 +78,7 @@ class Unknowns:
     @cached_property
     def compliances(self) -> tuple[str, ...]:
         """Parameters of the arm that are found beside the tables."""
-        return tuple(dict.fromkeys(name for each in self.task.observations for name in each.sag_slopes))
+        return tuple(dict.fromkeys(name for observation in self.task.observations for name in observation.sag_slopes))
 
     def pulses(self, x: Array, servo: KnownServo) -> Array:
         """A servo's pulses at its knots (s)."""

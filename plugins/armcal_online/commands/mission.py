@@ -45,10 +45,10 @@ def mission(console: Console, config: Path, out: Path, overrides: tuple[str, ...
     kept.place({})
     with console.progress() as progress:
         result = run_mission(plan, out, loop_session(registry), registry, progress, watch)
-    told = {**figures(plan.experiment.name, result.mission, result.log, result.judgement), "seconds": watch.seconds}
-    _write(out, plan, result, told)
-    console.result({**told, "folder": str(out)})
-    _show(console, told)
+    content = {**figures(plan.experiment.name, result.mission, result.log, result.judgement), "seconds": watch.seconds}
+    _write(out, plan, result, content)
+    console.result({**content, "folder": str(out)})
+    _show(console, content)
     for stage, seconds in watch.seconds.items():
         console.detail(f"{stage}: {seconds:.1f} s")
     console.out.print(f"figure: {out / 'mission.png'}  ({watch.total():.1f} s)", markup=False, soft_wrap=True)
@@ -75,23 +75,24 @@ def _write(folder: Path, plan: MissionPlan, result: MissionResult, told: dict[st
         ) from fault
 
 
-def _show(console: Console, told: dict[str, Any]) -> None:
-    errors, counts = told["error_mm"], told["records"]
-    table = Table(title=f"Mean tip error over {told['days']:g} days, mm", title_justify="left")
+def _show(console: Console, content: dict[str, Any]) -> None:
+    errors, counts = content["error_mm"], content["records"]
+    table = Table(title=f"Mean tip error over {content['days']:g} days, mm", title_justify="left")
     table.add_column("calibration")
     for column in ("mean", "median", "p95", "max", "last"):
         table.add_column(column, justify="right")
     for name, figures_ in errors.items():
         table.add_row(name, *(f"{figures_[column]:.3f}" for column in ("mean", "median", "p95", "max", "last")))
     console.out.print(table)
-    for event in told["events"]:
+    for event in content["events"]:
         records = event["recovered_after_records"]
         back = "not recovered" if records is None else f"recovered after {records} records"
         _line(console, f"day {event['day']:.2f}: {event['label']}: {_NAMED[event['named']]}, {back}")
     _line(
         console,
-        f"available {told['availability']:.1%} of the time (frozen: within {told['limit_mm']:g} mm "
-        f"{told['frozen_within_limit']:.1%}); {len(told['false_alarms'])} false alarms, {told['missed']} events missed",
+        f"available {content['availability']:.1%} of the time (frozen: within {content['limit_mm']:g} mm "
+        f"{content['frozen_within_limit']:.1%}); {len(content['false_alarms'])} false alarms, "
+        f"{content['missed']} events missed",
     )
     _line(
         console,

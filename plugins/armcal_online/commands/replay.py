@@ -67,15 +67,15 @@ def replay_command(
     check_until(held, until)
     header = held.first.header
     settings = _evaluated(kept_settings(header), evaluator)
-    wanted = _wanted(header, config, overrides)
+    recalibrate_settings = _wanted(header, config, overrides)
     begun_from = kept_calibration(header, folder, registry)
     session = begun(begun_from, settings, registry)
     comparer = Comparer(session.evaluator)
     with console.progress() as progress:
         done = replay(held, session, comparer, until, progress)
         other = None
-        if wanted is not None:
-            others = begun(begun_from, _evaluated(wanted, evaluator), registry)
+        if recalibrate_settings is not None:
+            others = begun(begun_from, _evaluated(recalibrate_settings, evaluator), registry)
             replayer = replay(held, others, NoVerifier(), until, progress, "with other settings").replayer
             other = _Other(replayer, compared(done.replayer, replayer))
     chosen = other.replayer if other else done.replayer
@@ -160,7 +160,7 @@ def _tell(console: Console, held: Kept, done: Replayed, comparer: Comparer, othe
 
 def _table(replayer: JournalReplayer, other: _Other) -> Table:
     """Both courses."""
-    found = other.comparison
+    comparison = other.comparison
     table = Table(title="what was done, and what other settings would have done")
     for heading in ("", "done", "with other settings"):
         table.add_column(heading)
@@ -171,9 +171,9 @@ def _table(replayer: JournalReplayer, other: _Other) -> Table:
     for what in states[0].counts:
         table.add_row(what, *(str(state.counts[what]) for state in states))
     table.add_row("level at the end", *(state.health.level for state in states))
-    name = f"mean innovation of {found.records} records after the first {WARM_UP} that both accept"
-    table.add_row(name, *("-" if math.isnan(size) else f"{1000 * size:.3f} mm" for size in found.innovation_m))
-    table.add_row("largest difference of a parameter", "", f"{found.apart_sd:.3g} sd, {found.parameter}")
+    name = f"mean innovation of {comparison.records} records after the first {WARM_UP} that both accept"
+    table.add_row(name, *("-" if math.isnan(size) else f"{1000 * size:.3f} mm" for size in comparison.innovation_m))
+    table.add_row("largest difference of a parameter", "", f"{comparison.apart_sd:.3g} sd, {comparison.parameter}")
     return table
 
 
@@ -181,7 +181,7 @@ def _as_json(
     held: Kept, done: Replayed, comparer: Comparer, other: _Other | None, written: Path | None
 ) -> Mapping[str, Any]:
     difference, replayer = done.difference, done.replayer
-    found: dict[str, Any] = {
+    content: dict[str, Any] = {
         "journal": str(held.folder),
         "entries": replayer.entries,
         "first": replayer.first,
@@ -198,13 +198,13 @@ def _as_json(
     }
     if other is not None:
         comparison = other.comparison
-        found["other_settings"] = {
+        content["other_settings"] = {
             **_state_replayer(other.replayer),
             "mean_innovation_mm": [1000 * size for size in comparison.innovation_m],
             "innovations_compared": comparison.records,
             "largest_difference": {"parameter": comparison.parameter, "sd": comparison.apart_sd},
         }
-    return cast(Mapping[str, Any], finite(found))
+    return cast(Mapping[str, Any], finite(content))
 
 
 def _state_replayer(replayer: JournalReplayer) -> dict[str, Any]:

@@ -44,11 +44,11 @@ def what_if(console: Console, calibration: Path, poses: Path, out: Path | None, 
     if out is not None and (out.resolve() in (poses.resolve(), calibration.resolve()) or not out.parent.is_dir()):
         raise InputError("it cannot be written there.", where=Location(str(out)), hint="Give another --out.")
     setup = filter_setup(loaded, RecalibrateSettings(evaluator="auto"), shares=False)
-    found, lost = ranked(setup, commands)
+    pose_worths, lost = ranked(setup, commands)
     if lost:
         console.warn(f"{len(lost)} poses have no elastic equilibrium, the first is {commands.ids[lost[0]]}.")
     unit = error_unit(setup.problem)
-    rows = [_row(rank, each, commands, unit) for rank, each in enumerate(found, 1)]
+    rows = [_row(rank, pose_worth, commands, unit) for rank, pose_worth in enumerate(pose_worths, 1)]
     if out is not None:
         _write(out, rows, unit)
     console.result({"poses": rows, "no_equilibrium": [commands.ids[place] for place in lost]})
@@ -57,14 +57,14 @@ def what_if(console: Console, calibration: Path, poses: Path, out: Path | None, 
         console.out.print(f"{len(rows)} poses, best first: {out}", markup=False, soft_wrap=True)
 
 
-def _row(rank: int, each: PoseWorth, commands: Dataset, unit: str) -> dict[str, Any]:
+def _row(rank: int, pose_worth: PoseWorth, commands: Dataset, unit: str) -> dict[str, Any]:
     return {
         "rank": rank,
-        "id": commands.ids[each.place],
-        "row": commands.rows[each.place] if commands.rows else each.place + 1,
-        "bits": each.worth.bits,
-        f"prediction_sd_{unit}": 1000 * each.worth.deviation,
-        "tells_most": dict(each.worth.tells_most),
+        "id": commands.ids[pose_worth.place],
+        "row": commands.rows[pose_worth.place] if commands.rows else pose_worth.place + 1,
+        "bits": pose_worth.worth.bits,
+        f"prediction_sd_{unit}": 1000 * pose_worth.worth.deviation,
+        "tells_most": dict(pose_worth.worth.tells_most),
     }
 
 

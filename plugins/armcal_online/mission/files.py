@@ -48,7 +48,7 @@ def schedule(mission: Mission) -> dict[str, Any]:
         ],
         "power_cuts": [time / DAY_S for time in mission.power_cuts],
         "lost": mission.lost,
-        "outliers": [each for each, wrong in zip(mission.records.ids, mission.outliers, strict=True) if wrong],
+        "outliers": [text for text, wrong in zip(mission.records.ids, mission.outliers, strict=True) if wrong],
     }
 
 
@@ -81,7 +81,7 @@ def figures(name: str, mission: Mission, log: MissionLog, judged: Judgement) -> 
         "frozen_within_limit": judged.frozen_within,
         "events": [_event(report) for report in judged.events],
         "missed": judged.missed,
-        "false_alarms": [_decision(each) for each in judged.false_alarms],
+        "false_alarms": [_decision(false_alarm) for false_alarm in judged.false_alarms],
         "records": {key: getattr(counts, key) for key in counts.__dataclass_fields__},
         "power_cuts": [time / DAY_S for time in mission.power_cuts],
         "resumed": log.resumed,

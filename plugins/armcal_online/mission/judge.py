@@ -115,8 +115,8 @@ def judge(mission: Mission, log: MissionLog, curve: ErrorCurve, limit: float, re
     ends = [*(event.time for event in mission.events), mission.seconds][1:]
     reports = tuple(_report(event, end, log, curve, recovered) for event, end in zip(mission.events, ends, strict=True))
     windows = [(e.time, min(e.time + _WINDOW_S, end)) for e, end in zip(mission.events, ends, strict=True)]
-    alarms = [each for each in log.decisions if each.kind in ALARMS]
-    apart = tuple(each for each in alarms if not _within(each.time, windows))
+    alarms = [decision for decision in log.decisions if decision.kind in ALARMS]
+    apart = tuple(alarm for alarm in alarms if not _within(alarm.time, windows))
     usable = np.array([level in USABLE for level in curve.levels]) & (curve.recalibrated <= limit)
     return Judgement(
         curve=curve,
@@ -142,7 +142,7 @@ def _report(event: MissionEvent, end: float, log: MissionLog, curve: ErrorCurve,
     first = int(np.argmax(runs)) if runs.any() else None
     last = min(event.time + _WINDOW_S, end)
     alarms = [d for d in log.decisions if d.kind in ALARMS and event.time <= d.time < last]
-    decision = next((each for each in alarms if each.kind in NAMING), alarms[0] if alarms else None)
+    decision = next((alarm for alarm in alarms if alarm.kind in NAMING), alarms[0] if alarms else None)
     return EventReport(
         event=event,
         named=_named(event, decision),
@@ -169,7 +169,7 @@ def _named(event: MissionEvent, decision: Decision | None) -> str:
 
 
 def _counted(mission: Mission, log: MissionLog, windows: Sequence[tuple[float, float]]) -> RecordCount:
-    verdicts = np.array([log.verdicts.get(each, "ignored") for each in mission.records.ids])
+    verdicts = np.array([log.verdicts.get(text, "ignored") for text in mission.records.ids])
     apart = np.array([not _within(time, windows) for time in mission.times.tolist()], dtype=bool)
     good, rejected, accepted = ~mission.outliers, verdicts == "rejected", verdicts == "accepted"
     return RecordCount(

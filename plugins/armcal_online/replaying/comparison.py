@@ -36,8 +36,8 @@ class Comparison:
 
 def compared(one: JournalReplayer, other: JournalReplayer) -> Comparison:
     """Two walks through one journal."""
-    theirs = {each.sequence: each for each in other.judged}
-    pairs = [(each, theirs[each.sequence]) for each in one.judged[WARM_UP:] if each.sequence in theirs]
+    theirs = {judged.sequence: judged for judged in other.judged}
+    pairs = [(judged, theirs[judged.sequence]) for judged in one.judged[WARM_UP:] if judged.sequence in theirs]
     sizes = [(a.residual_m, b.residual_m) for a, b in pairs if a.verdict == b.verdict == "accepted"]
     known = np.array([size for size in sizes if np.isfinite(size).all()]).reshape(-1, 2)
     means = known.mean(axis=0).tolist() if len(known) else [np.nan, np.nan]

@@ -54,9 +54,9 @@ class Comparer:
         writer = segment.header.get("evaluator")
         self._is_new = self._writer is not None and writer != self._writer
         self._writer = writer
-        found = differences(self._evaluator, writer)
-        self._is_ours = not found
-        self.others = tuple(dict.fromkeys([*self.others, *found]))
+        texts = differences(self._evaluator, writer)
+        self._is_ours = not texts
+        self.others = tuple(dict.fromkeys([*self.others, *texts]))
 
     def checkpoint(self, checkpoint: Entry, session: Recalibrator) -> None:
         """As the protocol says. Where the journal's evaluator changes, the session goes on from its state."""
@@ -83,11 +83,11 @@ class Comparer:
 
     def digest(self, sequence: int, noted: str, session: Recalibrator) -> None:
         """As the protocol says."""
-        found = session.digest()
+        text = session.digest()
         self.states += 1
-        self.equal += found == noted
-        if self._is_ours and found != noted:
-            raise DiffersError(sequence, f"The state is {found}, {noted} was noted.")
+        self.equal += text == noted
+        if self._is_ours and text != noted:
+            raise DiffersError(sequence, f"The state is {text}, {noted} was noted.")
 
     def told(self, sequence: int, noted: list[Event], found: list[Event]) -> None:
         """As the protocol says."""

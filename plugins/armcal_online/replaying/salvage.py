@@ -36,9 +36,9 @@ def _before(damage: JournalDamagedError, folder: Path, last: Segment | None, fil
         path = segment_path(folder, number)
         is_damaged = damage.where is not None and damage.where.file == str(path)
         data = files.read(path)
-        found = read_segment(path, number, data[: damage.offset] if is_damaged else data, link)
-        if isinstance(found, Segment):
-            yield found
-            link = Link(found.link.sequence, found.link.crc, found.link.entries)
-        if is_damaged or not isinstance(found, Segment):
+        segment = read_segment(path, number, data[: damage.offset] if is_damaged else data, link)
+        if isinstance(segment, Segment):
+            yield segment
+            link = Link(segment.link.sequence, segment.link.crc, segment.link.entries)
+        if is_damaged or not isinstance(segment, Segment):
             return

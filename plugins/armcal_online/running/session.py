@@ -149,20 +149,20 @@ def _header(setup: Setup, session: Recalibrating) -> dict[str, Any]:
 
 def _recover(setup: Setup, journal: Journal, state_replayer: StateReplayer, header: Mapping[str, Any]) -> bool:
     """Take up the newest state; whether there was one."""
-    found = journal.recovered
-    if not found.header:
+    recovered = journal.recovered
+    if not recovered.header:
         journal.checkpoint(state_replayer.checkpoint())
         return False
     for key in _DECIDING:
-        if found.header.get(key) != header[key]:
+        if recovered.header.get(key) != header[key]:
             raise InputError(
                 f"it was begun with {'another calibration' if key == 'calibration' else 'other settings'}.",
                 where=Location(str(setup.folder)),
                 hint="Give what it was begun with, or a new --out (perhaps from a copy of its calibration.yaml).",
             )
-    state_replayer.restore(found.checkpoint, found.checkpoint_sequence)
-    same_evaluator = found.header.get("evaluator") == header["evaluator"]
-    for entry in found.entries:
+    state_replayer.restore(recovered.checkpoint, recovered.checkpoint_sequence)
+    same_evaluator = recovered.header.get("evaluator") == header["evaluator"]
+    for entry in recovered.entries:
         try:
             state_replayer.apply(entry.sequence, entry.kind, entry.content)
         except ReplayDiffersError:
@@ -178,8 +178,8 @@ def _tell_start(
     journal: Journal, outputs: Outputs, session: Recalibrating, header: Mapping[str, Any], resumed: bool
 ) -> None:
     sequence = journal.record(STARTED, {"at": time.time(), "resumed": resumed, "evaluator": header["evaluator"]})
-    told = {"sequence": sequence, "at": time.time(), "resumed": resumed, "calibration": header["path"]}
-    outputs.event({**session.started_event(resumed), **told})
+    content = {"sequence": sequence, "at": time.time(), "resumed": resumed, "calibration": header["path"]}
+    outputs.event({**session.started_event(resumed), **content})
     cut = journal.recovered.cut
     if cut is not None:
         outputs.alarm(cut.sentence)

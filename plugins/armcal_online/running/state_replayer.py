@@ -167,10 +167,10 @@ class StateReplayer:
         return ({**event, "verdict": "ignored", "why": why},)
 
     def _compare(self, noted: str, sequence: int) -> None:
-        found = self._estimation.digest()
-        if found != noted:
+        text = self._estimation.digest()
+        if text != noted:
             raise ReplayDiffersError(
-                f"after entry {sequence} the state is {found[:12]}, expected {noted[:12]} as was noted then.",
+                f"after entry {sequence} the state is {text[:12]}, expected {noted[:12]} as was noted then.",
                 where=Location(self._name or None),
                 hint="Use the version of armcal, the libraries and the evaluator that wrote it, or begin a new --out "
                 "from its calibration.yaml.",

@@ -83,9 +83,9 @@ class CsvFile(Source):
             self._reading = self._opened()
         if self._reading is None:
             return None
-        found = self._reading.next()
-        if found is not None:
-            return found
+        incoming = self._reading.next()
+        if incoming is not None:
+            return incoming
         if self._at_end == "stop":
             self._ended = True
             return self._reading.last()

@@ -127,19 +127,19 @@ class Folder(Source):
     def _next(self) -> Incoming | None:
         """A record of the first file that has one; a file that is still being written holds up those after it."""
         for name in [*self._watched]:
-            found = self._advance(name, self._watched[name]) if self._watched[name].reading else None
-            if found is not None:
-                return found
+            incoming = self._advance(name, self._watched[name]) if self._watched[name].reading else None
+            if incoming is not None:
+                return incoming
         while self._pending:
             name = self._pending[0]
             watched = self._watched.setdefault(name, _Watched(_GONE, time.monotonic()))
             if not self._is_settled(name, watched):
                 return None
             self._pending.pop(0)
-            found = self._begun(name, watched) or self._advance(name, watched)
+            incoming = self._begun(name, watched) or self._advance(name, watched)
             self._trim()
-            if found is not None:
-                return found
+            if incoming is not None:
+                return incoming
         return None
 
     def _is_settled(self, name: str, watched: _Watched) -> bool:
@@ -175,9 +175,9 @@ class Folder(Source):
         """The next record of a file that is being read."""
         if watched.reading is None:
             return None
-        found = watched.reading.next()
-        if found is not None:
-            return found
+        incoming = watched.reading.next()
+        if incoming is not None:
+            return incoming
         watched.look(self._path / name)
         if isinstance(watched.reading, WholeReading):
             if watched.size not in (_GONE, watched.reading.offset) and self._is_settled(name, watched):

@@ -69,9 +69,9 @@ class LineReading(Reading):
     def next(self) -> Incoming | None:
         while True:
             while self._lines:
-                found = self._record(self._lines.popleft())
-                if found is not None:
-                    return found
+                record = self._record(self._lines.popleft())
+                if record is not None:
+                    return record
             try:
                 data = self._file.read(_CHUNK)
             except OSError as fault:
@@ -93,8 +93,8 @@ class LineReading(Reading):
         self._row += 1
         if self._row <= self._through and not self._parser.needs_header:
             return None
-        found = self._parser.record(line, self._place())
-        return found if self._row > self._through else None
+        incoming = self._parser.record(line, self._place())
+        return incoming if self._row > self._through else None
 
     def _place(self) -> Place:
         return Place(self._clock(), self._key, self._row)

@@ -16,7 +16,7 @@ from armcal.base.units import from_unit
 from armcal.errors import DataError
 from armcal.io.cells import DELIMITERS, CellFault, is_missing, read_cell, split
 from armcal.measure.column_match import Header, Plan, header_of, match_columns, refuse_missing, renamed
-from armcal.measure.reader import ReadRequest, WantedChannel
+from armcal.measure.reader import ReadRequest, RequestedChannel
 
 from armcal_online.sources.incoming import Incoming, Place
 
@@ -90,8 +90,8 @@ class RowParser:
     def object(self, content: Any, place: Place) -> Incoming:
         """The record in a JSON object, name to number or text."""
         if not isinstance(content, dict):
-            found = "an array" if isinstance(content, list) else _short(json.dumps(content), 40)
-            return faulty(place, f"Found {found}, expected a JSON object.")
+            text = "an array" if isinstance(content, list) else _short(json.dumps(content), 40)
+            return faulty(place, f"Found {text}, expected a JSON object.")
         names = tuple(content)
         plan = self._plan(names)
         if isinstance(plan, str):
@@ -119,9 +119,9 @@ class RowParser:
             refuse_missing(header, lacking, [name for name in names if name not in known])
         return plan
 
-    def _lacking(self, present: set[str]) -> WantedChannel | None:
+    def _lacking(self, present: set[str]) -> RequestedChannel | None:
         """What a record lacks to be of use: to all, or to the measurement that comes nearest to having all."""
-        by_part: dict[str, list[WantedChannel]] = {}
+        by_part: dict[str, list[RequestedChannel]] = {}
         for channel in self._wanted:
             if channel.required and not channel.parts and channel.channel not in present:
                 return channel
@@ -144,13 +144,18 @@ class RowParser:
             return faulty(place, "Its id is empty.")
         channels: dict[str, float] = {}
         for channel, (column, unit) in plan.channels.items():
-            found = _number(cells[column.index])
-            if _APPROACH in channel and isinstance(found, float) and abs(found) not in (0.0, 1.0) and found == found:
-                found = CellFault(f"found the approach {found:g}, expected -1, 0 or 1.", "")
-            if isinstance(found, CellFault):
-                sentence = f"{_short(column.name, MAX_ID)}: {found.found} {found.hint}".rstrip()
+            number = _number(cells[column.index])
+            if (
+                _APPROACH in channel
+                and isinstance(number, float)
+                and abs(number) not in (0.0, 1.0)
+                and number == number
+            ):
+                number = CellFault(f"found the approach {number:g}, expected -1, 0 or 1.", "")
+            if isinstance(number, CellFault):
+                sentence = f"{_short(column.name, MAX_ID)}: {number.found} {number.hint}".rstrip()
                 return replace(faulty(place, sentence), record_id=record_id)
-            channels[channel] = from_unit(found, unit)
+            channels[channel] = from_unit(number, unit)
         return Incoming(record_id, channels, labels, place.arrived, place.source_key, place.row)
 
 
@@ -193,9 +198,9 @@ def _short(text: str, length: int) -> str:
 
 def _without_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     """An object, each of whose names is given once."""
-    found = dict(pairs)
-    if len(found) != len(pairs):
+    content = dict(pairs)
+    if len(content) != len(pairs):
         names = [name for name, _ in pairs]
         twice = next(name for name in names if names.count(name) > 1)
         raise ValueError(f"{_short(twice, 40)} is given twice")
-    return found
+    return content

@@ -39,7 +39,7 @@ def started(
         "evaluator": setup.problem.backend,
         "resumed": resumed,
         "left_out": list(setup.left_out),
-        "joint_steps": {each.joint: each.parameter or "several parameters" for each in steps.joints},
+        "joint_steps": {joint.joint: joint.parameter or "several parameters" for joint in steps.joints},
         "joint_steps_not_followed": list(steps.unfollowed),
         "sensor_motions": {name: list(which) for name, (_, which) in steps.sensors.items()},
     }
@@ -56,7 +56,7 @@ def judged(
     """A record that was accepted or rejected."""
     verdict = "rejected" if recent.rejected else "accepted"
     relation = "above" if recent.rejected else "within"
-    told = {
+    content = {
         **_record(incoming, state, verdict),
         "why": f"Its NIS {recent.nis:.3g} is {relation} the limit {limit:.3g}.",
         "nis": recent.nis,
@@ -65,7 +65,7 @@ def judged(
         "measurement": setup.problem.kernels[recent.readings[0].factor].factor.name,
     }
     position = _position(incoming, recent, first, setup)
-    return {**told, **position}
+    return {**content, **position}
 
 
 def decided(state: State, decision: Decision) -> dict[str, Any]:

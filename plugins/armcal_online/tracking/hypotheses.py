@@ -70,20 +70,20 @@ class Recent:
 
 
 @dataclass(frozen=True)
-class Explained:
+class Explanation:
     """A hypothesis from its likeliest onset (a place among the last records).
 
     Attributes:
         hypothesis: what it is.
         onset: the first record after the change.
         log_odds: of it against no change, its prior probability included.
-        explained: share of the records' NIS that it takes away.
+        explanation: share of the records' NIS that it takes away.
     """
 
     hypothesis: Hypothesis
     onset: int
     log_odds: float
-    explained: float
+    explanation: float
 
 
 @dataclass(frozen=True)
@@ -99,14 +99,14 @@ def hypotheses(space: StateSpace, steps: Steps, settings: ChangeSettings, size: 
     """All changes that are looked for; ``size`` is that of beliefs."""
     n = len(space.scales)
     found: list[tuple[Kind, str, Array, Array, float]] = []
-    for each in steps.joints:
-        deviation = settings.joint if each.dimension == "angle" else settings.slide
-        offset = _columns([each.direction * deviation], size)
-        found += [("joint_slipped", each.joint, offset * scale, each.direction, scale) for scale in _SCALES]
-        if each.local:
-            units = [np.eye(n)[i] for i in each.local]
+    for joint in steps.joints:
+        deviation = settings.joint if joint.dimension == "angle" else settings.slide
+        offset = _columns([joint.direction * deviation], size)
+        found += [("joint_slipped", joint.joint, offset * scale, joint.direction, scale) for scale in _SCALES]
+        if joint.local:
+            units = [np.eye(n)[i] for i in joint.local]
             both = np.hstack([offset, _columns(units, size)])
-            found.append(("joint_replaced", each.joint, both, each.direction, 1.0))
+            found.append(("joint_replaced", joint.joint, both, joint.direction, 1.0))
     for name, (columns, which) in steps.sensors.items():
         deviations = [settings.sensor_turn if axis.startswith("r") else settings.sensor_shift for axis in which]
         moved = _columns([c * d for c, d in zip(columns.T, deviations, strict=True)], size)
@@ -138,9 +138,9 @@ class HypothesisFilter:
             outliers,
         )
 
-    def compare(self, recent: Sequence[Recent], onsets: Sequence[int], each: Sequence[Hypothesis]) -> list[Explained]:
+    def compare(self, recent: Sequence[Recent], onsets: Sequence[int], each: Sequence[Hypothesis]) -> list[Explanation]:
         """Every hypothesis from its likeliest onset, the likeliest first."""
-        found: dict[int, Explained] = {}
+        found: dict[int, Explanation] = {}
         for onset in onsets:
             since = self._since(recent[onset:])
             none = since.weigh(np.zeros((self._observer.size, 0)))
@@ -154,7 +154,7 @@ class HypothesisFilter:
                 kept = sum(r.nis for r, fits in zip(recent[onset:], weighed.fits, strict=True) if fits)
                 share = max(0.0, kept - weighed.nis) / nis if nis > 0 else 0.0
                 if place not in found or odds > found[place].log_odds:
-                    found[place] = Explained(hypothesis, onset, odds, share)
+                    found[place] = Explanation(hypothesis, onset, odds, share)
         return sorted(found.values(), key=lambda one: -one.log_odds)
 
     def follow(self, recent: Sequence[Recent], directions: Array, factor: float) -> tuple[float, Belief]:

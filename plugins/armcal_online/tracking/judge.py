@@ -13,7 +13,7 @@ from armcal_online.tracking import sentences
 from armcal_online.tracking.belief import Belief, widened
 from armcal_online.tracking.directions import Steps
 from armcal_online.tracking.health import improbability, many_outliers, nis_limit
-from armcal_online.tracking.hypotheses import Candidate, Explained, Hypothesis, HypothesisFilter, Recent
+from armcal_online.tracking.hypotheses import Candidate, Explanation, Hypothesis, HypothesisFilter, Recent
 from armcal_online.tracking.sentences import Decision
 from armcal_online.tracking.settings import RecalibrateSettings
 from armcal_online.tracking.state import State
@@ -50,11 +50,11 @@ class Judge:
         state, changed = self._changed(state)
         if changed is None and state.recent and not state.recent[-1].rejected:
             state, changed = self._drifted(state)
-        return state, tuple(each for each in (named, changed) if each is not None)
+        return state, tuple(decision for decision in (named, changed) if decision is not None)
 
     def _changed(self, state: State) -> tuple[State, Decision | None]:
         """Whether the last records tell of a change."""
-        odd = [i for i, each in enumerate(state.recent) if self._improbable(each)]
+        odd = [i for i, recent in enumerate(state.recent) if self._improbable(recent)]
         if len(odd) < 2 or not (state.wary or odd[-1] == len(state.recent) - 1):
             return (replace(state, wary=False) if len(odd) < 2 else state), None
         found = self._filter.compare(state.recent, odd[-_MOST_ONSETS:], self._changes)
@@ -62,8 +62,12 @@ class Judge:
             return state, None
         best = found[0]
         alike = self._alike(found)
-        others = [each for each in found if each.hypothesis.subject not in {a.hypothesis.subject for a in alike}]
-        total = float(logsumexp([each.log_odds for each in alike]))
+        others = [
+            explanation
+            for explanation in found
+            if explanation.hypothesis.subject not in {a.hypothesis.subject for a in alike}
+        ]
+        total = float(logsumexp([explanation.log_odds for explanation in alike]))
         margin = best.log_odds - others[0].log_odds if others else math.inf
         full = len(odd) >= self._settings.gate.window - 1
         told = total > math.log(self._settings.changes.odds)
@@ -72,44 +76,48 @@ class Judge:
         state = replace(state, wary=bool(best.log_odds > 0))
         return state, self._unexplained(state, found)
 
-    def _alike(self, found: Sequence[Explained]) -> list[Explained]:
+    def _alike(self, found: Sequence[Explanation]) -> list[Explanation]:
         """The likeliest, and if it is a joint's the other joints that these records cannot tell from it."""
         best = found[0]
         if not best.hypothesis.kind.startswith("joint"):
             return [best]
-        near: dict[str, Explained] = {}
-        for each in found:
-            close = best.log_odds - each.log_odds < math.log(self._settings.changes.naming_odds)
-            if close and each.hypothesis.kind.startswith("joint"):
+        near: dict[str, Explanation] = {}
+        for explanation in found:
+            close = best.log_odds - explanation.log_odds < math.log(self._settings.changes.naming_odds)
+            if close and explanation.hypothesis.kind.startswith("joint"):
                 # A slip is the simpler tale; a new servo is told from it later, if it is one.
-                known = near.setdefault(each.hypothesis.subject, each)
-                if known.hypothesis.kind == "joint_replaced" and each.hypothesis.kind == "joint_slipped":
-                    near[each.hypothesis.subject] = each
+                known = near.setdefault(explanation.hypothesis.subject, explanation)
+                if known.hypothesis.kind == "joint_replaced" and explanation.hypothesis.kind == "joint_slipped":
+                    near[explanation.hypothesis.subject] = explanation
         return list(near.values())
 
     def _improbable(self, record: Recent) -> bool:
         limit = nis_limit(record.dof, 1 - _SURPRISING, self._filter.freedom(record))
         return record.rejected or record.nis > limit
 
-    def _kinds(self, joints: Sequence[Explained]) -> list[Hypothesis]:
+    def _kinds(self, joints: Sequence[Explanation]) -> list[Hypothesis]:
         """Of each joint, that it slipped, and that its servo was replaced."""
-        names = [each.hypothesis.subject for each in joints]
+        names = [joint.hypothesis.subject for joint in joints]
         kinds = ("joint_slipped", "joint_replaced")
         return [h for h in self._changes if h.subject in names and h.kind in kinds and h.scale == 1.0]
 
     def _followed(
-        self, state: State, alike: Sequence[Explained], margin: float, found: Sequence[Explained]
+        self, state: State, alike: Sequence[Explanation], margin: float, found: Sequence[Explanation]
     ) -> tuple[State, Decision]:
         """The state with what a change reopens, from before it on."""
         best = alike[0]
-        others = [each for each in found if each.hypothesis.subject not in {a.hypothesis.subject for a in alike}]
+        others = [
+            explanation
+            for explanation in found
+            if explanation.hypothesis.subject not in {a.hypothesis.subject for a in alike}
+        ]
         since = state.recent[best.onset :]
-        directions = np.hstack([each.hypothesis.directions for each in alike])
+        directions = np.hstack([explanation.hypothesis.directions for explanation in alike])
         _, belief = self._filter.follow(since, directions, best.hypothesis.factor)
         suspects: tuple[Candidate, ...] = ()
         if best.hypothesis.kind.startswith("joint"):
             kinds = self._kinds(alike)
-            followed = [(self._place(each), *self._filter.follow(since, each.directions, 1.0)) for each in kinds]
+            followed = [(self._place(kind), *self._filter.follow(since, kind.directions, 1.0)) for kind in kinds]
             suspects = tuple(Candidate(*each) for each in followed)
         after = replace(
             state,
@@ -136,15 +144,15 @@ class Judge:
         return after, decision
 
     def _place(self, hypothesis: Hypothesis) -> int:
-        return next(i for i, each in enumerate(self._changes) if each is hypothesis)
+        return next(i for i, change in enumerate(self._changes) if change is hypothesis)
 
     def _named(self, state: State) -> tuple[State, Decision | None]:
         """Which of several joints it was, and whether its servo is another one, once the records tell."""
         if not state.suspects or not state.recent:
             return state, None
-        followed = sorted((self._stepped(each, state.recent[-1]) for each in state.suspects), key=_evidence)
+        followed = sorted((self._stepped(suspect, state.recent[-1]) for suspect in state.suspects), key=_evidence)
         best, subject = followed[0], self._changes[followed[0].place].subject
-        others = [each for each in followed if self._changes[each.place].subject != subject]
+        others = [candidate for candidate in followed if self._changes[candidate.place].subject != subject]
         odds = math.log(self._settings.changes.naming_odds)
         if state.sequence - state.suspected > _LONGEST_NAMING:
             return replace(state, suspects=(), before_change=None), None
@@ -152,8 +160,8 @@ class Judge:
             margin = best.log_evidence - others[0].log_evidence
             if margin < odds:
                 return replace(state, suspects=tuple(followed)), None
-            names = tuple(dict.fromkeys(self._changes[each.place].subject for each in others))
-            left = tuple(each for each in followed if each not in others)
+            names = tuple(dict.fromkeys(self._changes[other.place].subject for other in others))
+            left = tuple(candidate for candidate in followed if candidate not in others)
             after = self._taken(state, best, left if len(left) > 1 else ())
             return after, self._told(state, best, names, margin)
         margin = best.log_evidence - followed[1].log_evidence if len(followed) > 1 else math.inf
@@ -198,8 +206,8 @@ class Judge:
         belief = widened(state.belief, len(self._space.scales), factor)
         return replace(state, belief=belief, anchor=belief, held=()), sentences.drift(state, count, ratio, factor)
 
-    def _unexplained(self, state: State, found: Sequence[Explained]) -> Decision | None:
-        rejected, gate = sum(each.rejected for each in state.recent), self._settings.gate
+    def _unexplained(self, state: State, found: Sequence[Explanation]) -> Decision | None:
+        rejected, gate = sum(recent.rejected for recent in state.recent), self._settings.gate
         if rejected >= gate.window - 1 and len(state.recent) >= gate.window:
             text = f"{rejected} of the last {len(state.recent)} records do not fit"
             return sentences.no_longer_fits(state, self._steps, text)

@@ -110,7 +110,7 @@ class Observer:
             NotConvergedError: no equilibrium there.
         """
         measured = {name: 0.0 for kernel in self.problem.kernels for name in kernel.factor.output_channels}
-        return tuple(self._as_predicted(values, each) for each in self.readings({**measured, **channels}, {}))
+        return tuple(self._as_predicted(values, reading) for reading in self.readings({**measured, **channels}, {}))
 
     def _as_predicted(self, values: Array, reading: Reading) -> Reading:
         kernel, slots = self.problem.kernels[reading.factor], self.problem.slots[reading.factor]

@@ -31,7 +31,7 @@ def ranked(setup: FilterSetup, commands: Dataset) -> tuple[tuple[PoseWorth, ...]
     Raises:
         ConfigError: no measurement reads a single pose.
     """
-    found, lost = [], []
+    pose_worths, lost = [], []
     for place in range(len(commands)):
         try:
             seen, counted = _seen(setup, {name: float(values[place]) for name, values in commands.channels.items()})
@@ -40,8 +40,8 @@ def ranked(setup: FilterSetup, commands: Dataset) -> tuple[tuple[PoseWorth, ...]
             continue
         own = worth(setup.space, setup.belief, seen)
         deviation = worth(setup.space, setup.belief, counted).deviation
-        found.append(PoseWorth(place, replace(own, deviation=deviation)))
-    return tuple(sorted(found, key=lambda each: -each.worth.bits)), tuple(lost)
+        pose_worths.append(PoseWorth(place, replace(own, deviation=deviation)))
+    return tuple(sorted(pose_worths, key=lambda each: -each.worth.bits)), tuple(lost)
 
 
 def _seen(setup: FilterSetup, channels: dict[str, float]) -> tuple[Linearised, Linearised]:

@@ -120,10 +120,10 @@ class Recalibrator:
         if why:
             self.state = _counted(state, "ignored")
             return (events.ignored(incoming, self.state, why),)
-        told = self._judged(incoming, replace(state, clock=tick.clock), readings, self._passed(incoming, tick))
+        judged = self._judged(incoming, replace(state, clock=tick.clock), readings, self._passed(incoming, tick))
         if tick.note:
-            told = (events.noted(self.state, "clock", tick.note), *told)
-        return told
+            judged = (events.noted(self.state, "clock", tick.note), *judged)
+        return judged
 
     def _admitted(self, incoming: Incoming, sequence: int) -> tuple[State, Tick, str]:
         """The state with the record known, what its time means, and why it is passed over, if it is."""
@@ -201,7 +201,7 @@ class Recalibrator:
             state, decisions = self._judge.after(state)
         health = self._health(state.health, recent, odd, first, decisions)
         told = [events.judged(incoming, state, recent, first, limit, self._setup)]
-        told += [events.decided(state, each) for each in decisions if self._is_news(each)]
+        told += [events.decided(state, decision) for decision in decisions if self._is_news(decision)]
         if health.level != self.state.health.level:
             told.append(events.level_changed(state, self.state.health.level, health))
         self.state = replace(state, health=health)
@@ -273,8 +273,8 @@ class Recalibrator:
             DataError: joints are missing, or no measurement reads a single pose.
         """
         observer = self._setup.observer
-        wanted = [f"{a.name}.{j}" for a in self._calibration.system.arms.values() for j in a.commanded]
-        missing = [name for name in wanted if name not in joints]
+        texts = [f"{a.name}.{j}" for a in self._calibration.system.arms.values() for j in a.commanded]
+        missing = [name for name in texts if name not in joints]
         if missing:
             raise DataError(f"found no angle for {', '.join(missing)}.", hint="Give one for each joint.")
         belief = self.state.belief

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from armcal_online.tracking.directions import Steps
 from armcal_online.tracking.health import Level
-from armcal_online.tracking.hypotheses import Explained, Hypothesis
+from armcal_online.tracking.hypotheses import Explanation, Hypothesis
 from armcal_online.tracking.state import State
 
 EXPLAINED = ("joint_slipped", "joint_replaced", "joint_stepped", "joint_named", "sensor_moved", "drift")
@@ -43,9 +43,9 @@ class Decision:
 def change(
     state: State,
     steps: Steps,
-    alike: Sequence[Explained],
+    alike: Sequence[Explanation],
     margin: float,
-    others: Sequence[Explained],
+    others: Sequence[Explanation],
     size: tuple[float, float],
 ) -> Decision:
     """A change that is followed from now on."""
@@ -55,7 +55,7 @@ def change(
     rival = f", {margin:.0f} above {_named(others[0].hypothesis)}" if others else ""
     because = (
         f"{sum(each.rejected for each in since)} of the {len(since)} records since do not fit what was believed; it "
-        f"explains {100 * best.explained:.0f} % of their misfit (log odds {best.log_odds:.1f}{rival})"
+        f"explains {100 * best.explanation:.0f} % of their misfit (log odds {best.log_odds:.1f}{rival})"
     )
     at = f"record {onset.sequence}"
     if hypothesis.kind == "general_change":
@@ -65,8 +65,8 @@ def change(
     if hypothesis.kind == "sensor_moved":
         text = f"What {hypothesis.subject} measures in has moved at {at}: {because}. Its place is found anew."
         return Decision("sensor_moved", text, "watch", hypothesis.subject, since=onset.sequence)
-    names = tuple(each.hypothesis.subject for each in alike)
-    dimension = next(each.dimension for each in steps.joints if each.joint == hypothesis.subject)
+    names = tuple(explanation.hypothesis.subject for explanation in alike)
+    dimension = next(joint.dimension for joint in steps.joints if joint.joint == hypothesis.subject)
     if len(names) > 1:
         text = f"Joint {' or '.join(names)} has stepped at {at}: {because}. Poses since do not tell which of them; "
         text += "the variance of their offsets alone was reopened, until a pose tells."
@@ -87,7 +87,7 @@ def named(
 ) -> Decision:
     """Which joint it was."""
     joint = hypothesis.subject
-    dimension = next(each.dimension for each in steps.joints if each.joint == joint)
+    dimension = next(joint_step.dimension for joint_step in steps.joints if joint_step.joint == joint)
     text = (
         f"It was joint {joint}, by {_shown(size, dimension)}: its step makes the records since {margin:.1f} in log "
         f"odds likelier than one of {' or '.join(others)}, which stand where they stood. Its variance alone stays open."
@@ -98,7 +98,7 @@ def named(
 def replaced(state: State, steps: Steps, hypothesis: Hypothesis, margin: float, size: tuple[float, float]) -> Decision:
     """A joint that stepped is another one."""
     joint = hypothesis.subject
-    dimension = next(each.dimension for each in steps.joints if each.joint == joint)
+    dimension = next(joint_step.dimension for joint_step in steps.joints if joint_step.joint == joint)
     text = (
         f"Joint {joint}, {_shown(size, dimension)} off since record {state.suspected}, acts like a new servo: that "
         f"makes the records since {margin:.1f} in log odds likelier than a slip alone. All of it was reopened."
@@ -116,7 +116,7 @@ def drift(state: State, count: int, ratio: float, factor: float) -> Decision:
     return Decision("drift", text, "watch", since=state.sequence)
 
 
-def unexplained(state: State, rejected: int, best: Explained) -> Decision:
+def unexplained(state: State, rejected: int, best: Explanation) -> Decision:
     """Records do not fit, and nothing is decided yet."""
     text = (
         f"{rejected} of the last {len(state.recent)} records do not fit, and nothing explains them yet; the likeliest "

@@ -17,7 +17,7 @@ from armcal.errors import ConfigError, Location
 from armcal.estimate.online import Gaussian
 from armcal.measure.measurement import Measurement
 from armcal.measure.partners import PairedMeasurement
-from armcal.measure.reader import ReadRequest, wanted_channels
+from armcal.measure.reader import ReadRequest, requested_channels
 from armcal.problem.problem import Problem
 
 from armcal_online.tracking.belief import Belief, ProcessNoise
@@ -89,7 +89,9 @@ def filter_setup(calibration: Calibration, settings: RecalibrateSettings, shares
         Belief(parameters.nominal(), Gaussian(mean, start)),
         ProcessNoise(variance_rates(parameters, settings.process_noise), gauss_markov),
         ReadRequest(
-            calibration.system.arms, measurements, wanted_channels(calibration.system.arms, measurements, measured=True)
+            calibration.system.arms,
+            measurements,
+            requested_channels(calibration.system.arms, measurements, measured=True),
         ),
         tuple(sorted(set(calibration.system.measurements) - set(measurements))),
     )
@@ -98,19 +100,19 @@ def filter_setup(calibration: Calibration, settings: RecalibrateSettings, shares
 def _parameters(calibration: Calibration, settings: RecalibrateSettings) -> tuple[Parameters, dict[str, float]]:
     """Blocks about the calibrated values, those found then free, and the deviations of those opened now."""
     parameters = calibration.parameters
-    found = {entry.name.partition("[")[0] for entry in calibration.record.parameters if entry.free}
+    texts = {entry.name.partition("[")[0] for entry in calibration.record.parameters if entry.free}
     opened: dict[str, float] = {}
     for glob, text in settings.free.items():
         names = fnmatch.filter(parameters.names, glob)
         if not names:
             raise ConfigError(f"no parameter is called {glob!r}.", where=Location(f"free.{glob}"))
-        opened |= {n: quantity(parameters[n], text, None, ()) for n in names if n not in found}
+        opened |= {n: quantity(parameters[n], text, None, ()) for n in names if n not in texts}
     beyond = {
         block.name: replace(block, domain=Interval())
         for block in parameters.blocks
         if isinstance(block.domain, Interval) and block.domain.check(np.array(block.nominal))
     }
-    return parameters.replaced(beyond).with_free([n for n in parameters.names if n in found or n in opened]), opened
+    return parameters.replaced(beyond).with_free([n for n in parameters.names if n in texts or n in opened]), opened
 
 
 def _covariance(calibration: Calibration, space: StateSpace, opened: Mapping[str, float]) -> Array:
@@ -210,8 +212,8 @@ def _drifts(calibration: Calibration, space: StateSpace) -> list[GaussMarkovStat
 
 def _unfound(calibration: Calibration) -> set[str]:
     """Parameters of groups that are not known and that no record of the calibration told of."""
-    found = {entry.name.partition("[")[0] for entry in calibration.record.parameters if entry.free}
-    return {block.name for block in calibration.parameters.nuisances if block.free} - found
+    texts = {entry.name.partition("[")[0] for entry in calibration.record.parameters if entry.free}
+    return {block.name for block in calibration.parameters.nuisances if block.free} - texts
 
 
 def _scale(calibration: Calibration) -> float:
@@ -222,7 +224,7 @@ def _scale(calibration: Calibration) -> float:
 def _channels(calibration: Calibration, measurements: Mapping[str, Measurement]) -> Dataset:
     """A record with everything that one may carry: functions are compiled for it."""
     arms = calibration.system.arms
-    names = [w.channel for w in wanted_channels(arms, measurements, measured=True) if "." in w.channel]
+    names = [w.channel for w in requested_channels(arms, measurements, measured=True) if "." in w.channel]
     names += [f"gravity_{axis}" for axis in "xyz"] + ["payload"]
     names += [name for name in calibration.record.environment_columns if name not in names]
     names += [name for arm in arms.values() for name in arm.conditions if name not in names]

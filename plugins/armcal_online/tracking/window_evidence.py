@@ -82,13 +82,13 @@ class RecordsSince:
         best: Weighed | None = None
         for _ in range(_ROUNDS):
             shift = self._led(directions, shift, fits, factor)
-            found = self._labelled(directions, shift, fits, factor)
-            if best is not None and found.log_likelihood <= best.log_likelihood:
+            labelled = self._labelled(directions, shift, fits, factor)
+            if best is not None and labelled.log_likelihood <= best.log_likelihood:
                 break
-            if best is not None and np.array_equal(found.fits, best.fits):
-                best = found
+            if best is not None and np.array_equal(labelled.fits, best.fits):
+                best = labelled
                 break
-            best, fits = found, found.fits
+            best, fits = labelled, labelled.fits
         if best is None:
             raise AssertionError("a round was made")
         return best

@@ -53,7 +53,7 @@ class Estimates:
     def start(self, event: Mapping[str, Any]) -> dict[str, Any] | None:
         """Where parameters stand at a start; where one started before is not changed by a later start."""
         listed = event.get("parameters")
-        entries = [each for each in listed if isinstance(each, Mapping)] if isinstance(listed, list) else []
+        entries = [content for content in listed if isinstance(content, Mapping)] if isinstance(listed, list) else []
         found = {}
         for entry in entries:
             name, value = text(entry.get("name")), number(entry.get("value"))
@@ -75,12 +75,12 @@ class Estimates:
 
     def told(self) -> dict[str, Any]:
         """As pages are told."""
-        return {"parameters": [each.told() for each in self._followed.values()], "rows": list(self._rows)}
+        return {"parameters": [followed.told() for followed in self._followed.values()], "rows": list(self._rows)}
 
     @property
     def without_unit(self) -> bool:
         """Whether there are parameters whose unit no event told: the start was rotated away."""
-        return any(not each.unit for each in self._followed.values())
+        return any(not followed.unit for followed in self._followed.values())
 
     def add_units(self, units: Mapping[str, str]) -> bool:
         """Units by name, where none is known yet; rows that are kept are told in them from now on.

@@ -52,16 +52,16 @@ def message_of(event: Mapping[str, Any]) -> Message | None:
     return kept
 
 
-def _sentence(told: Message) -> str:
-    if told["event"] == "started":
-        return "The recalibration went on." if "resumed" in told else "The recalibration started."
-    if told["event"] == "calibration":
-        return f"Wrote {told.get('path', 'a calibration')}."
-    if told["event"] == "level":
-        return f"From {told.get('from', 'unknown')} to {told.get('to', 'unknown')}."
-    parts = [told[key] for key in ("kind", "command", "joint", "measurement", "why") if key in told]
-    parts += [f"{told[key]:g} {key[5:]}" for key in ("size_deg", "size_mm") if key in told]
-    return ", ".join(parts) or str(told["event"])
+def _sentence(content: Message) -> str:
+    if content["event"] == "started":
+        return "The recalibration went on." if "resumed" in content else "The recalibration started."
+    if content["event"] == "calibration":
+        return f"Wrote {content.get('path', 'a calibration')}."
+    if content["event"] == "level":
+        return f"From {content.get('from', 'unknown')} to {content.get('to', 'unknown')}."
+    parts = [content[key] for key in ("kind", "command", "joint", "measurement", "why") if key in content]
+    parts += [f"{content[key]:g} {key[5:]}" for key in ("size_deg", "size_mm") if key in content]
+    return ", ".join(parts) or str(content["event"])
 
 
 def _rounded_all(values: list[float] | None) -> list[float | None] | None:

@@ -176,14 +176,14 @@ class Feed:
             written = path.stat().st_mtime_ns
             if written == self._status_time:
                 return []
-            found = parsed(path.read_bytes()[:_LONGEST_STATUS])
+            content = parsed(path.read_bytes()[:_LONGEST_STATUS])
         except OSError:
             return []
         self._status_time = written
-        if found is None:
+        if content is None:
             return []
-        self._status = {str(text(key)): value for key, each in found.items() if (value := scalar(each)) is not None}
-        counts = numbers(found.get("counts"))
+        self._status = {str(text(key)): value for key, each in content.items() if (value := scalar(each)) is not None}
+        counts = numbers(content.get("counts"))
         if all(verdict in counts for verdict in VERDICTS):
             self._status["counts"] = {verdict: counts[verdict] for verdict in VERDICTS}
         return [{"event": "status", "status": self._status}]

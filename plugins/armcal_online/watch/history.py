@@ -104,7 +104,7 @@ class History:
         return [{**record, "counts": dict(self._counts), **standing}]
 
     def _started(self, event: Mapping[str, Any]) -> list[Message]:
-        told = message_of(event)
+        message = message_of(event)
         messages: list[Message] = []
         if event.get("resumed") is not True and (self.last or self._told):
             self._forget()
@@ -116,23 +116,23 @@ class History:
         self._sequence = self._sequence if first is None else first - 1
         row = self.estimates.start(event)
         self._stand(text(event.get("level")), None)
-        if told:
-            self._told.append(told)
-            messages.append(told)
+        if message:
+            self._told.append(message)
+            messages.append(message)
         return [*messages, *([row] if row else [])]
 
     def _other(self, event: Mapping[str, Any]) -> list[Message]:
-        told = message_of(event)
-        if told is None:
+        message = message_of(event)
+        if message is None:
             self.unknown += 1
             return []
-        if told["event"] == "level":
-            self._stand(told.get("to"), told["sentence"])
-        if told["event"] == "calibration":
-            self.written = told
+        if message["event"] == "level":
+            self._stand(message.get("to"), message["sentence"])
+        if message["event"] == "calibration":
+            self.written = message
         else:
-            self._told.append(told)
-        return [told]
+            self._told.append(message)
+        return [message]
 
     def _stand(self, level: Any, sentence: str | None) -> None:
         if level not in LEVELS:

@@ -17,10 +17,10 @@ def parsed(line: bytes | str) -> Mapping[str, Any] | None:
     """One JSON object; None for anything else."""
     text = line.decode("utf-8", "replace") if isinstance(line, bytes) else line
     try:
-        found = json.loads(text)
+        content = json.loads(text)
     except (ValueError, RecursionError):
         return None
-    return found if isinstance(found, dict) else None
+    return content if isinstance(content, dict) else None
 
 
 def number(value: Any) -> float | None:

@@ -99,7 +99,7 @@ def _settled(function: ca.Function, commands: list[float]) -> np.ndarray[tuple[i
     rigid = np.zeros(function.size1_in(1))
     deflection = rigid
     for _ in range(_MOST_PASSES):
-        points, given = (np.asarray(each.full()) for each in function(commands, deflection))
+        points, given = (np.asarray(dm.full()) for dm in function(commands, deflection))
         before, deflection = deflection, given.ravel()
         if not np.all(np.abs(deflection) < _MOST_DEFLECTION):
             return np.asarray(function(commands, rigid)[0].full())

@@ -89,14 +89,14 @@ class Tail:
         self._position, self._partial, self._skipping = 0, b"", False
 
     def _read(self, file: BinaryIO) -> list[bytes]:
-        found: list[bytes] = []
+        completed: list[bytes] = []
         file.seek(self._position)
-        while not found and (data := file.read(_AT_ONCE)):
+        while not completed and (data := file.read(_AT_ONCE)):
             self._position += len(data)
-            found = self._completed(data)
+            completed = self._completed(data)
         head = os.pread(file.fileno(), min(_HEAD, self._position), 0)
         self._reading = _Mark(_place(file), head)
-        return found
+        return completed
 
     def _completed(self, data: bytes) -> list[bytes]:
         *whole, rest = (self._partial + data).split(b"\n")

@@ -130,8 +130,8 @@ def _kind(event: Mapping[str, Any]) -> str:
 def _judged(record: Mapping[str, Any]) -> str:
     parts = [f"NIS {record['nis']:.3g}"] if "nis" in record else []
     parts += [f"gate {record['limit']:.3g}"] if "limit" in record else []
-    told = f" ({', '.join(parts)})" if parts else ""
-    return f"{told}. {record['why']}" if "why" in record else told
+    text = f" ({', '.join(parts)})" if parts else ""
+    return f"{text}. {record['why']}" if "why" in record else text
 
 
 def _name(record: Mapping[str, Any]) -> str:

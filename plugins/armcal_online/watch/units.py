@@ -18,6 +18,6 @@ def units_of(path: Path) -> dict[str, str]:
         listed = load_config(path).data.get("parameters")
     except (ArmcalError, OSError):
         return {}
-    entries = [each for each in listed if isinstance(each, Mapping)] if isinstance(listed, list) else []
+    entries = [content for content in listed if isinstance(content, Mapping)] if isinstance(listed, list) else []
     known = [(text(entry.get("name")), text(entry.get("unit"))) for entry in entries]
     return {name: unit for name, unit in known if name and unit}

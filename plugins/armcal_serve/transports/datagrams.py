@@ -57,7 +57,7 @@ class Datagrams(Transport):
     @property
     @override
     def finished(self) -> bool:
-        return not any(each.open for each in self._senders.values())
+        return not any(sender.open for sender in self._senders.values())
 
     @override
     def open(self) -> None:

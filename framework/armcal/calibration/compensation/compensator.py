@@ -13,7 +13,7 @@ from armcal.base.domains import Array
 from armcal.base.parameters import Parameters
 from armcal.calibration.compensation.counts import Counts, ServoCounts
 from armcal.calibration.compensation.equilibrium import Equilibrium, Standing
-from armcal.calibration.compensation.finder import Allowed, Found, Rows
+from armcal.calibration.compensation.finder import Allowed, Rows, Solutions
 from armcal.calibration.compensation.limits import check_held, held_joints, joint_limits
 from armcal.calibration.compensation.path import PathFinder
 from armcal.calibration.compensation.reach import Reach, reach_of
@@ -234,7 +234,7 @@ class Compensator:
             return commands
         return self._counts.angles(self._counts.counts(commands), commands)
 
-    def _found(self, record: Array, targets: Targets, start: Array | None) -> Found:
+    def _found(self, record: Array, targets: Targets, start: Array | None) -> Solutions:
         """Exact commands, as redundancy asks."""
         goal, kind = _goal(targets), self._kind(targets)
         choice = len(self.joints) - len(self._held) > (3 if targets.rotations is None else 6)
@@ -249,7 +249,7 @@ class Compensator:
             kind.descent.improve(record, goal, found, self._allowed)
         return found
 
-    def _commands(self, record: Array, targets: Targets, found: Found) -> Commands:
+    def _commands(self, record: Array, targets: Targets, found: Solutions) -> Commands:
         """What is commanded: exact, or the best counts; and where that leads."""
         joints, counts = len(self.joints), None
         record[:joints] = found.commands
@@ -263,7 +263,7 @@ class Compensator:
         return self._answer(record, targets, found, standing, counts)
 
     def _answer(
-        self, record: Array, targets: Targets, found: Found, standing: Standing, counts: Counts | None
+        self, record: Array, targets: Targets, found: Solutions, standing: Standing, counts: Counts | None
     ) -> Commands:
         tools, had = standing.base_T_tool, found.there & standing.settled
         bounds = self.reach.bounds(targets.positions)
@@ -296,8 +296,8 @@ class Compensator:
         record[2 * joints : 2 * joints + len(LOAD_CHANNELS)] = targets.acting
         conditions = self.expression.channels[2 * joints + len(LOAD_CHANNELS) :]
         if set(targets.conditions) != set(conditions):
-            found, expected = (", ".join(names) or "nothing" for names in (targets.conditions, conditions))
-            raise ValueError(f"found targets that tell {found} of the surroundings, expected {expected}")
+            text, expected = (", ".join(names) or "nothing" for names in (targets.conditions, conditions))
+            raise ValueError(f"found targets that tell {text} of the surroundings, expected {expected}")
         for name, values in targets.conditions.items():
             record[self.expression.channels.index(name)] = values
         return record

@@ -34,7 +34,7 @@ _NEAREST_STARTS = 4
 
 
 @dataclass(frozen=True)
-class Found:
+class Solutions:
     """What was found of targets (N).
 
     Attributes:
@@ -54,7 +54,7 @@ class Found:
     forbidden: Mask
 
     @classmethod
-    def nothing(cls, joints: int, state: int, count: int) -> Found:
+    def nothing(cls, joints: int, state: int, count: int) -> Solutions:
         """Nothing found yet."""
         far = np.full((2, count), np.inf)
         no = np.zeros((2, count), dtype=bool)
@@ -65,11 +65,11 @@ class Found:
         self.commands[:, at], self.states[:, at] = attempt.commands[:, chosen], attempt.states[:, chosen]
         self.distances[at], self.turns[at] = attempt.distances[chosen], attempt.turns[chosen]
 
-    def subset(self, chosen: Mask | Rows) -> Found:
+    def subset(self, chosen: Mask | Rows) -> Solutions:
         """Some of them."""
-        return Found(*(getattr(self, name)[..., chosen] for name in PARTS))
+        return Solutions(*(getattr(self, name)[..., chosen] for name in PARTS))
 
-    def replace(self, at: Rows, other: Found) -> None:
+    def replace(self, at: Rows, other: Solutions) -> None:
         """Others' findings at their places."""
         for name in PARTS:
             getattr(self, name)[..., at] = getattr(other, name)
@@ -82,7 +82,9 @@ class Finder:
         """``held`` joints stay where searches start; every search then needs a start."""
         self._solver, self._seeds, self._allowed, self._held = solver, seeds, allowed, held
 
-    def __call__(self, record: Array, target: Array, start: Array | None = None, score: Score | None = None) -> Found:
+    def __call__(
+        self, record: Array, target: Array, start: Array | None = None, score: Score | None = None
+    ) -> Solutions:
         """Commands for targets (3 or 12 x N) under records (channels x N).
 
         Args:
@@ -92,7 +94,7 @@ class Finder:
             score: to choose by among several commands; without one the first that is found is taken.
         """
         count = record.shape[1]
-        found = Found.nothing(len(self._solver.limits), len(self._seeds.states), count)
+        found = Solutions.nothing(len(self._solver.limits), len(self._seeds.states), count)
         lost: Rows = np.arange(count)
         if start is not None and score is None:
             lost = self._from(record, target, start, found)
@@ -114,41 +116,41 @@ class Finder:
         """How many numbers an elastic state has."""
         return len(self._seeds.states)
 
-    def spread(self, record: Array, target: Array) -> Found:
+    def spread(self, record: Array, target: Array) -> Solutions:
         """Commands for the same target (columns alike), each from another seed, in whatever posture it leads to."""
-        found = Found.nothing(len(self._solver.limits), self.states, record.shape[1])
+        found = Solutions.nothing(len(self._solver.limits), self.states, record.shape[1])
         apart = self._seeds.apart(target[:, :1], self._solver.length)[0]
         picks = np.argsort(apart)[: record.shape[1]]
         rows = np.arange(len(picks))
         self._round(record, target, rows, picks[:, None], found, None, None)
         return found
 
-    def straight(self, record: Array, target: Array, at: Array) -> Found:
+    def straight(self, record: Array, target: Array, at: Array) -> Solutions:
         """Commands from others (n x N) straight on: no other posture is looked for."""
-        found = Found.nothing(len(self._solver.limits), self.states, record.shape[1])
+        found = Solutions.nothing(len(self._solver.limits), self.states, record.shape[1])
         found.commands[:] = at
         self._from(record, target, at, found)
         return found
 
-    def onward(self, record: Array, target: Array, at: Array) -> Found:
+    def onward(self, record: Array, target: Array, at: Array) -> Solutions:
         """The commands nearest to others (n x N): beside them, else in whatever posture is nearest of many."""
-        found = self._beside(record, target, at)
-        far = np.flatnonzero(~found.there | (np.abs(found.commands - at).max(axis=0) > _BESIDE))
+        beside = self._beside(record, target, at)
+        far = np.flatnonzero(~beside.there | (np.abs(beside.commands - at).max(axis=0) > _BESIDE))
         if not far.size:
-            return found
+            return beside
         other = self._of_many(record[:, far], target[:, far], at[:, far])
-        nearer = _apart(other.commands, at[:, far]) < _apart(found.commands[:, far], at[:, far])
-        better = ~found.there[far] | (other.there & nearer)
-        found.replace(far[better], other.subset(better))
-        return found
+        nearer = _apart(other.commands, at[:, far]) < _apart(beside.commands[:, far], at[:, far])
+        better = ~beside.there[far] | (other.there & nearer)
+        beside.replace(far[better], other.subset(better))
+        return beside
 
-    def _of_many(self, record: Array, target: Array, at: Array) -> Found:
+    def _of_many(self, record: Array, target: Array, at: Array) -> Solutions:
         """From many starts, each brought as near to commands (n x N) as its target allows: the nearest of them."""
-        found = Found.nothing(len(self._solver.limits), self.states, record.shape[1])
+        found = Solutions.nothing(len(self._solver.limits), self.states, record.shape[1])
         wide = min(_POSTURES, self._seeds.commands.shape[1])
         for todo in _chunks(np.arange(record.shape[1]), wide):
             rows, first = np.repeat(todo, wide), np.arange(len(todo)) * wide
-            attempts = Found.nothing(len(self._solver.limits), self.states, len(rows))
+            attempts = Solutions.nothing(len(self._solver.limits), self.states, len(rows))
             picks = self._picked_for(target[:, todo], at[:, todo], wide).ravel()[:, None]
             records, targets, preferred = (chosen_of(each, rows) for each in (record, target, at))
             self._round(records, targets, np.arange(len(rows)), picks, attempts, None, preferred)
@@ -163,9 +165,9 @@ class Finder:
             found.replace(lost, more)
         return found
 
-    def _beside(self, record: Array, target: Array, at: Array) -> Found:
+    def _beside(self, record: Array, target: Array, at: Array) -> Solutions:
         """Searches from commands that wish to stay there; what is not found so is sought without the wish."""
-        found = Found.nothing(len(self._solver.limits), self.states, record.shape[1])
+        found = Solutions.nothing(len(self._solver.limits), self.states, record.shape[1])
         goal = Goal(_at(record, at), np.zeros((self.states, record.shape[1])), target, at, self._held)
         attempt = self._solver(goal, WISHED)
         good = np.flatnonzero(attempt.there & self._may(attempt.commands))
@@ -176,7 +178,7 @@ class Finder:
             found.replace(lost, self.straight(record[:, lost], target[:, lost], at[:, lost]))
         return found
 
-    def towards(self, record: Array, target: Array, preferred: Array, found: Found) -> None:
+    def towards(self, record: Array, target: Array, preferred: Array, found: Solutions) -> None:
         """As near to wished commands (n x N) as the targets allow, in place; only those that are had."""
         at = np.flatnonzero(found.there)
         goal = Goal(
@@ -187,7 +189,7 @@ class Finder:
         good = np.flatnonzero(attempt.there & nearer & self._may(attempt.commands))
         found.put(at[good], attempt, good)
 
-    def _from(self, record: Array, target: Array, start: Array, found: Found) -> Rows:
+    def _from(self, record: Array, target: Array, start: Array, found: Solutions) -> Rows:
         goal = Goal(_at(record, start), np.zeros((len(found.states), record.shape[1])), target, None, self._held)
         attempt = self._solver(goal)
         good = attempt.there & self._may(attempt.commands)
@@ -219,7 +221,7 @@ class Finder:
         target: Array,
         todo: Rows,
         picks: NDArray[np.intp],
-        found: Found,
+        found: Solutions,
         score: Score | None,
         start: Array | None,
     ) -> None:
@@ -242,7 +244,7 @@ class Finder:
         closer = ~had & (left[near] < found.distances[todo] + self._solver.length * found.turns[todo])
         found.put(todo[closer], attempt, near[closer])
 
-    def _nearest(self, record: Array, target: Array, lost: Rows, found: Found, start: Array | None) -> None:
+    def _nearest(self, record: Array, target: Array, lost: Rows, found: Solutions, start: Array | None) -> None:
         """Of targets that cannot be had, the commands that come nearest."""
         wide = min(_NEAREST_STARTS, self._seeds.commands.shape[1] - 1)
         for todo in _chunks(lost, wide + 1):

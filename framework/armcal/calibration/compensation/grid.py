@@ -24,9 +24,9 @@ def over_grid(compensator: Compensator, targets: Targets, shape: Sequence[int]) 
     widest, most = np.full((len(targets), len(compensator.joints)), np.nan), 0
     for row in middle[first.found][:1]:
         for begun in compensator.postures(targets.subset(np.array([row]))).T[:_POSTURES]:
-            found = _outward(compensator, targets, tuple(shape), int(row), begun)
-            had = int(np.isfinite(found[:, 0]).sum())
-            widest, most = (found, had) if had > most else (widest, most)
+            outward = _outward(compensator, targets, tuple(shape), int(row), begun)
+            had = int(np.isfinite(outward[:, 0]).sum())
+            widest, most = (outward, had) if had > most else (widest, most)
     known = np.isfinite(widest[:, 0])
     answer = compensator.onward(targets, np.where(known[:, None], widest, 0.0))
     return replace(answer, found=answer.found & known)

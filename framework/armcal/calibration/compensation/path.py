@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from armcal.base.domains import Array
-from armcal.calibration.compensation.finder import PARTS, Finder, Found
+from armcal.calibration.compensation.finder import PARTS, Finder, Solutions
 from armcal.calibration.compensation.request import Mask
 from armcal.calibration.compensation.sides import sides_of, with_sides
 
@@ -32,7 +32,7 @@ class Path:
         moves: of each joint to each target from the one before it (n x N; rad or m; 0 for the first without a start).
     """
 
-    found: Found
+    found: Solutions
     approach: Array
     moves: Array
 
@@ -48,7 +48,7 @@ class PathFinder:
         """Follow targets (3 or 12 x N) under records (channels x N) from commands (n), or from wherever is best."""
         ways = self.beginnings(record, target) if start is None else start[:, None]
         count, wide = target.shape[1], ways.shape[1]
-        found: list[Found] = []
+        solutions: list[Solutions] = []
         sides = np.zeros((count, self._joints, wide))
         moves = np.zeros((count, self._joints, wide))
         at, side = ways, np.zeros_like(ways)
@@ -59,16 +59,16 @@ class PathFinder:
             else:
                 following, side = self._next(record[:, rows], target[:, rows], at, side)
                 moves[i], sides[i] = following.commands - at, side
-            found.append(following)
+            solutions.append(following)
             at = following.commands
-            kept = self._as_good_as_any([each.there for each in found], moves[: i + 1])
+            kept = self._as_good_as_any([each.there for each in solutions], moves[: i + 1])
             if not kept.all():
-                found = [each.subset(kept) for each in found]
+                solutions = [each.subset(kept) for each in solutions]
                 sides, moves, at, side = sides[:, :, kept], moves[:, :, kept], at[:, kept], side[:, kept]
                 wide = int(kept.sum())
         longest = np.abs(moves).max(axis=1)
         best = int((longest.max(axis=0) + longest.mean(axis=0)).argmin())
-        return Path(_joined(found, best), sides[:, :, best].T, moves[:, :, best].T)
+        return Path(_joined(solutions, best), sides[:, :, best].T, moves[:, :, best].T)
 
     def beginnings(self, record: Array, target: Array) -> Array:
         """Commands in different postures that have the first target (n x ways); the nearest if there are none."""
@@ -80,7 +80,7 @@ class PathFinder:
                 kept.append(commands)
         return np.stack(kept, axis=1) if kept else found.commands[:, :1]
 
-    def _next(self, record: Array, target: Array, at: Array, side: Array) -> tuple[Found, Array]:
+    def _next(self, record: Array, target: Array, at: Array, side: Array) -> tuple[Solutions, Array]:
         """The next target from each way's commands; the side from which joints come is told as they move."""
         if not self._tells_approach:
             found = self._finder.onward(record, target, at)
@@ -97,7 +97,7 @@ class PathFinder:
         return np.asarray(spoilt == spoilt.min())
 
 
-def _joined(found: list[Found], way: int) -> Found:
+def _joined(solutions: list[Solutions], way: int) -> Solutions:
     """One way's findings, target by target."""
-    parts = {name: np.stack([getattr(each, name)[..., way] for each in found], axis=-1) for name in PARTS}
-    return Found(**parts)
+    parts = {name: np.stack([getattr(each, name)[..., way] for each in solutions], axis=-1) for name in PARTS}
+    return Solutions(**parts)

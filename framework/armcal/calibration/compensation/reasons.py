@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from armcal.base.domains import Array
-from armcal.calibration.compensation.finder import Found, Rows
+from armcal.calibration.compensation.finder import Rows, Solutions
 from armcal.calibration.compensation.request import Mask, Targets
 
 _AT_LIMIT = 1e-6
@@ -18,7 +18,7 @@ def why_not(
     limits: Array,
     commands: Array,
     targets: Targets,
-    found: Found,
+    found: Solutions,
     had: Mask,
     bounds: Array,
     position_can_be_had: Callable[[Rows], Mask],
@@ -47,7 +47,7 @@ def why_not(
 
 
 def _sentence(
-    joints: Sequence[str], limits: Array, commands: Array, found: Found, bound: float, turned: bool, row: int
+    joints: Sequence[str], limits: Array, commands: Array, found: Solutions, bound: float, turned: bool, row: int
 ) -> str:
     if found.there[row]:
         return "the load is more than the springs hold there"

@@ -13,7 +13,7 @@ import numpy as np
 
 from armcal.base.domains import Array
 from armcal.base.se3 import Expression
-from armcal.calibration.compensation.finder import Allowed, Found
+from armcal.calibration.compensation.finder import Allowed, Solutions
 from armcal.calibration.compensation.goal import Goal
 from armcal.calibration.compensation.request import Redundancy
 from armcal.calibration.compensation.solver import Solver
@@ -88,7 +88,7 @@ class Descent:
         small = self._function(moved, states)[0]
         return np.asarray(0.5 * np.einsum("kn,kn->n", small, small))
 
-    def improve(self, record: Array, target: Array, found: Found, allowed: Allowed | None) -> None:
+    def improve(self, record: Array, target: Array, found: Solutions, allowed: Allowed | None) -> None:
         """Walk down from what was found, in place; only those that reach their target."""
         at = np.flatnonzero(found.there)
         record, target = record[:, at], target[:, at]

@@ -7,7 +7,7 @@ import numpy as np
 from armcal.base.domains import Array
 from armcal.calibration.compensation.counts import TRIED, Counts, ServoCounts
 from armcal.calibration.compensation.equilibrium import Equilibrium
-from armcal.calibration.compensation.finder import Allowed, Found
+from armcal.calibration.compensation.finder import Allowed, Solutions
 from armcal.calibration.compensation.request import Targets
 from armcal.calibration.compensation.solver import Solver
 from armcal.calibration.compensation.step import sample_inputs, slope_function
@@ -37,7 +37,9 @@ class Rounding:
         self._slope = BatchFunction(slope_function(expression, solver.turns), sample_inputs(expression), choice)
         self._weights = np.array([1.0] * 3 + [solver.length] * (3 if solver.turns else 0))
 
-    def __call__(self, record: Array, found: Found, targets: Targets, allowed: Allowed | None) -> tuple[Counts, Array]:
+    def __call__(
+        self, record: Array, found: Solutions, targets: Targets, allowed: Allowed | None
+    ) -> tuple[Counts, Array]:
         """Counts and what they make (n x N each) for records with the exact commands."""
         counts, commands = np.zeros(found.commands.shape, dtype=np.int64), np.zeros_like(found.commands)
         for start in range(0, record.shape[1], _AT_ONCE):
@@ -46,7 +48,7 @@ class Rounding:
         return counts, commands
 
     def _part(
-        self, record: Array, found: Found, targets: Targets, part: slice, allowed: Allowed | None
+        self, record: Array, found: Solutions, targets: Targets, part: slice, allowed: Allowed | None
     ) -> tuple[Counts, Array]:
         exact = found.commands[:, part]
         joints, count = exact.shape

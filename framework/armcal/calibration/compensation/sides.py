@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from armcal.base.domains import Array
-from armcal.calibration.compensation.finder import Found
+from armcal.calibration.compensation.finder import Solutions
 
 _ROUNDS = 3
 _STILL = 1e-9
@@ -19,7 +19,7 @@ def sides_of(moved: Array, before: Array) -> Array:
     return np.where(np.abs(moved) > _STILL, np.sign(moved), before)
 
 
-def with_sides(record: Array, at: Array, before: Array, search: Callable[[Array], Found]) -> Found:
+def with_sides(record: Array, at: Array, before: Array, search: Callable[[Array], Solutions]) -> Solutions:
     """Commands found under the sides from which they make the joints come; these are left in the record.
 
     A joint that comes from the one side only if it is told to come from the other has no side: it gets 0, and its play

@@ -91,7 +91,7 @@ def step_function(expression: ToolExpression, found: Slopes, turns: bool, length
     step, pull = _step(weighted, weight * error, preference, free, damping)
     outputs = [step, found.left, ca.mtimes(found.state, step), error, pull]
     inputs = [expression.record, target, preference, free, damping, expression.state]
-    return ca.Function("compensation_step", inputs, [ca.densify(each) for each in outputs], {"cse": True})
+    return ca.Function("compensation_step", inputs, [ca.densify(output) for output in outputs], {"cse": True})
 
 
 def slope_function(expression: ToolExpression, turns: bool) -> ca.Function:

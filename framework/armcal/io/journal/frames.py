@@ -56,10 +56,10 @@ def decode_frame(data: bytes, offset: int, sequence: int | None, previous_crc: i
     Raises:
         FrameError: it does not check.
     """
-    found = _HEADER.match(data, offset)
-    if not found:
+    match = _HEADER.match(data, offset)
+    if not match:
         raise FrameError("found no header of an entry, expected three hexadecimal numbers of 16, 8 and 8 digits")
-    number, length, crc = (int(digits, 16) for digits in found.groups())
+    number, length, crc = (int(digits, 16) for digits in match.groups())
     start, end = offset + HEADER_BYTES, offset + HEADER_BYTES + length
     if end >= len(data):
         raise FrameError(f"found {len(data) - start} bytes of an entry, expected {length} and a line end")
@@ -75,14 +75,14 @@ def decode_frame(data: bytes, offset: int, sequence: int | None, previous_crc: i
 
 def promised_end(data: bytes, offset: int) -> int | None:
     """Where the header at a byte says that its entry's line end stands; None if there is no header."""
-    found = _HEADER.match(data, offset)
-    return offset + HEADER_BYTES + int(found[2], 16) if found else None
+    match = _HEADER.match(data, offset)
+    return offset + HEADER_BYTES + int(match[2], 16) if match else None
 
 
 def was_acknowledged(line: bytes) -> bool:
     """Whether a line without its end looks like a whole entry that was made durable before the next was written."""
-    found = _HEADER.match(line)
-    if not found or len(line) != HEADER_BYTES + int(found[2], 16):
+    match = _HEADER.match(line)
+    if not match or len(line) != HEADER_BYTES + int(match[2], 16):
         return False
     try:
         return "note" not in _mapping(line[HEADER_BYTES:])
@@ -96,12 +96,12 @@ def _crc(sequence: int, payload: bytes, previous_crc: int) -> int:
 
 def _mapping(payload: bytes) -> Mapping[str, Any]:
     try:
-        found = json.loads(payload)
+        content = json.loads(payload)
     except (ValueError, RecursionError) as fault:
         raise FrameError(f"found an entry that is not JSON ({fault})") from fault
-    if not isinstance(found, dict) or not isinstance(found.get("kind"), str):
+    if not isinstance(content, dict) or not isinstance(content.get("kind"), str):
         raise FrameError("found an entry without a kind")
-    return found
+    return content
 
 
 def _check(content: Any, depth: int) -> None:

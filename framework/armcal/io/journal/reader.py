@@ -96,17 +96,17 @@ def read_segments(folder: Path, files: FileLayer = REAL_FILES) -> Iterator[Segme
         if held is not None and number != held.number + 1:
             raise _missing(folder, held.number + 1, held.link)
         try:
-            found = _read(folder, number, held.link if held else None, files)
+            stub = _read(folder, number, held.link if held else None, files)
         except FileNotFoundError:
             if held is not None and number != numbers[-1]:
                 raise _missing(folder, number, held.link) from None
             continue  # a writer has dropped the oldest, or taken back the newest, since they were listed
-        if isinstance(found, Stub) and number == numbers[-1] and (held or number == 1):
-            held = replace(_whole(held), cut=found.cut) if held else None
+        if isinstance(stub, Stub) and number == numbers[-1] and (held or number == 1):
+            held = replace(_whole(held), cut=stub.cut) if held else None
             break
         if held is not None:
             yield _whole(held)
-        held = _begun(found, held)
+        held = _begun(stub, held)
     if held is None:
         raise DataError(
             "there is no journal here, or it was never begun in whole.",

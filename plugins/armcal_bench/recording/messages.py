@@ -14,7 +14,7 @@ _MOST_MISSING = 1
 
 
 @dataclass(frozen=True)
-class Told:
+class Message:
     """One thing that is told.
 
     Attributes:
@@ -29,7 +29,7 @@ class Told:
     content: Mapping[str, Any] = field(default_factory=dict)
 
 
-def captured(posture: Posture, assessment: Assessment) -> Told:
+def captured(posture: Posture, assessment: Assessment) -> Message:
     """A posture is safe, and agrees or has nothing to be compared with."""
     where = f" in {posture.place}" if posture.place else ""
     offset, doubt = assessment.newest, assessment.doubts.get(posture.name)
@@ -44,29 +44,27 @@ def captured(posture: Posture, assessment: Assessment) -> Told:
         sentence = f"posture {posture.name}{where} is kept; there is none yet to compare it with."
     else:
         sentence = f"posture {posture.name}{where} is kept and agrees: off by {offset}."
-    return Told("captured", sentence, content)
+    return Message("captured", sentence, content)
 
 
-def doubts_changed(before: Assessment, after: Assessment, postures: Sequence[Posture]) -> list[Told]:
+def doubts_changed(before: Assessment, after: Assessment, postures: Sequence[Posture]) -> list[Message]:
     """Postures that disagree now and did not before, and the other way round."""
-    found, standing = [], {posture.name: posture for posture in postures}
+    messages, standing = [], {posture.name: posture for posture in postures}
     for name, offset in after.doubts.items():
         if name not in before.doubts:
             place = standing[name].place
-            asked = (
-                f"did it sit right in {place}, and is that its name?" if place else "was it held as the others were?"
-            )
-            sentence = f"posture {name} disagrees by {offset}: {asked}"
+            text = f"did it sit right in {place}, and is that its name?" if place else "was it held as the others were?"
+            sentence = f"posture {name} disagrees by {offset}: {text}"
             if name == postures[-1].name:
                 sentence += " u takes it back."
-            found.append(Told("disagrees", sentence, {"posture": name, "offset": offset.__dict__}))
+            messages.append(Message("disagrees", sentence, {"posture": name, "offset": offset.__dict__}))
     for name in before.doubts:
         if name in standing and name not in after.doubts and not after.why_not:
-            found.append(Told("agrees_again", f"posture {name} agrees after all.", {"posture": name}))
-    return found
+            messages.append(Message("agrees_again", f"posture {name} agrees after all.", {"posture": name}))
+    return messages
 
 
-def known(knowledge: Knowledge) -> Told:
+def known(knowledge: Knowledge) -> Message:
     """How much is determined, and what would help."""
     sentence = f"{knowledge.rank} of {knowledge.free} free numbers are determined"
     if knowledge.missing:
@@ -79,7 +77,7 @@ def known(knowledge: Knowledge) -> Told:
         sentence += (
             f". {_joined(knowledge.vary)} would tell most: vary {'it' if len(knowledge.vary) == 1 else 'them'} more"
         )
-    return Told("known", f"{sentence}.", knowledge.__dict__)
+    return Message("known", f"{sentence}.", knowledge.__dict__)
 
 
 def _joined(words: Sequence[str]) -> str:
