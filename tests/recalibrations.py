@@ -12,7 +12,7 @@ from typing import Any
 from armcal.io.journal.files import RealFiles
 from armcal.io.journal.reader import read_entries, read_until
 from armcal_online.running.session import Open, opened
-from armcal_online.running.state_replayer import Course
+from armcal_online.running.state_replayer import StateReplayer
 from armcal_online.sources.incoming import Incoming
 from fake_recalibrator import HEADER, FakeRecalibrator, row, setup
 
@@ -72,14 +72,14 @@ def taken(folder: Path) -> list[str]:
 def replayed(folder: Path) -> FakeRecalibrator:
     """What the journal makes of it from its first entry on, each noted state compared."""
     fake = FakeRecalibrator()
-    course = Course(fake, partial(read_until, folder / "journal"))
+    replayer = StateReplayer(fake, partial(read_until, folder / "journal"))
     first, *others = read_entries(folder / "journal")
-    course.restore(first.content, first.sequence)
+    replayer.restore(first.content, first.sequence)
     for entry in others:
         if entry.kind == "checkpoint":
             assert entry.content["digest"] == fake.digest(), entry.sequence
         else:
-            course.apply(entry.sequence, entry.kind, entry.content)
+            replayer.apply(entry.sequence, entry.kind, entry.content)
     return fake
 
 

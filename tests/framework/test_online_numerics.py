@@ -281,8 +281,8 @@ def test_the_unit_of_length_does_not_matter() -> None:
         observer=Observer(
             setup.problem,
             space,
-            old.companions,
-            type(old.companions)(),
+            old.gauss_markov,
+            type(old.gauss_markov)(),
             old._noise,
             {"tracker": 1000.0},
             {**old._defaults},
