@@ -17,7 +17,7 @@ from armcal.cli.main import cli
 from armcal.devices.faults import DeviceRefusedError
 from armcal.errors import InputError
 from armcal_bench.acquisition.rehearsal import overrides_for
-from armcal_bench.acquisition.session import Course, acquire
+from armcal_bench.acquisition.session import RunOptions, acquire
 from click.testing import CliRunner, Result
 
 from tests.bench_runs import CONFIG, BenchRun, free_port, positions, write_plan
@@ -52,10 +52,10 @@ def there(run: BenchRun) -> tuple[str, ...]:
     return (*overrides_for(run.bench), f"bench.tracker.port={tracker_port(run)}")
 
 
-def quiet_course(run: BenchRun, **changes: object) -> Course:
+def quiet_course(run: BenchRun, **changes: object) -> RunOptions:
     told = {"asked_to_end": lambda: False, "may_energise": lambda start: True, "told": lambda progress: None}
     told["unchecked"] = True
-    return Course(**{"folder": run.out, "start": "anew", **told, **changes})  # type: ignore[arg-type]
+    return RunOptions(**{"folder": run.out, "start": "anew", **told, **changes})  # type: ignore[arg-type]
 
 
 class TestDryRun:

@@ -26,7 +26,7 @@ from armcal_bench.acquisition.path_planner import PathPlanner
 from armcal_bench.acquisition.schedule import Rest
 from armcal_bench.acquisition.session import RunOptions, acquire
 from armcal_bench.acquisition.settings import AcquisitionSettings, ArrivalSettings, ServoHeatSettings
-from armcal_bench.acquisition.tracker_monitor import BenchTrackerMonitor
+from armcal_bench.acquisition.tracker_monitor import TrackerMonitor
 from armcal_bench.bench import Bench
 from armcal_bench.hazards import FirstMotion
 from armcal_pca9685.firmata_link import FirmataLink
@@ -85,13 +85,13 @@ class TestHostThatStalls:
         self, run: BenchRun, undisturbed: dict, seconds: float, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         begun = [0, 0]
-        begin = BenchTrackerMonitor.begin
+        begin = TrackerMonitor.begin
 
-        def counted(monitor: BenchTrackerMonitor) -> None:
+        def counted(monitor: TrackerMonitor) -> None:
             begun[0] += 1
             begin(monitor)
 
-        monkeypatch.setattr(BenchTrackerMonitor, "begin", counted)
+        monkeypatch.setattr(TrackerMonitor, "begin", counted)
         with run.simulated() as clock:
 
             def asked() -> bool:
@@ -347,7 +347,7 @@ class TestBoard:
     def test_the_board_is_never_left_with_the_way_home_of_another_leg(self) -> None:
         run = Run()
         made = run.acquisition()
-        made._parts.drive._ways.find = lambda start, goal: None  # type: ignore[method-assign]
+        made._parts.drive._planner.find = lambda start, goal: None  # type: ignore[method-assign]
         made._parts.drive.found({"q1": 0.4, "q2": 0.2})
         made._parts.drive.guard_here()
         assert run.device.guards[-1] == [{"q1": 0.4, "q2": 0.2}]
@@ -413,9 +413,9 @@ class TestNobodyFeelsWhereTheArmIs:
                 looks[0] += 1
                 return False
 
-            pose = BenchTrackerMonitor.settled
+            pose = TrackerMonitor.settled
 
-            def slipped(monitor: BenchTrackerMonitor) -> Any:
+            def slipped(monitor: TrackerMonitor) -> Any:
                 found = pose(monitor)
                 if found is not None and run_measured() >= 1:
                     found.base_T_target[:3, 3] += [0.0, 2.0, 2.0]
@@ -427,7 +427,7 @@ class TestNobodyFeelsWhereTheArmIs:
             seen: list[Any] = []
             options = RunOptions(run.out, "anew", asked, lambda start: True, seen.append, unchecked=True)
             with pytest.MonkeyPatch.context() as patch:
-                patch.setattr(BenchTrackerMonitor, "settled", slipped)
+                patch.setattr(TrackerMonitor, "settled", slipped)
                 outcome = acquire(run.prepared(), run.plan, options)
             assert outcome.ending.how == "parked" and "3 times in a row" in outcome.ending.sentence
             assert is_let_go(clock.ask({"state": True}))
@@ -461,10 +461,10 @@ class TestTracker:
     def test_lost_exactly_as_the_arm_settles(
         self, run: BenchRun, undisturbed: dict, kind: str, monkeypatch: Any
     ) -> None:
-        begin, begun = BenchTrackerMonitor.begin, [0]
+        begin, begun = TrackerMonitor.begin, [0]
         with run.simulated() as clock:
 
-            def counted(monitor: BenchTrackerMonitor) -> None:
+            def counted(monitor: TrackerMonitor) -> None:
                 begun[0] += 1
                 if begun[0] % 2:
                     now = clock.ask({"state": True})["now"]
@@ -472,7 +472,7 @@ class TestTracker:
                     clock.ask({"fault": {"kind": "seen", "at": now + 1.25}})
                 begin(monitor)
 
-            monkeypatch.setattr(BenchTrackerMonitor, "begin", counted)
+            monkeypatch.setattr(TrackerMonitor, "begin", counted)
             assert run.acquire().ending.how == "done"
         found = positions(run.measured())
         assert set(found) == set(undisturbed)
@@ -526,7 +526,7 @@ class TestTracker:
 
     def test_frames_from_before_are_not_taken_for_frames_of_now(self, run: BenchRun) -> None:
         with run.simulated() as clock:
-            monitor = BenchTrackerMonitor(Bench.of(run.experiment), clock)
+            monitor = TrackerMonitor(Bench.of(run.experiment), clock)
             monitor.open()
             try:
                 clock.sleep(0.5)

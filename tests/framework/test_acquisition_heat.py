@@ -100,7 +100,7 @@ def test_each_step_begins_where_the_one_before_ended() -> None:
     at = np.zeros(2)
     for step in forecast_schedule(scheduler(poses), at, HEAT.cold, list(range(16))).steps:
         assert not isinstance(step, LeaveOut)
-        assert np.array_equal(step.way[0], at)
-        at = step.way[-1]
-        expected = travel(step.way) / np.deg2rad(20)
+        assert np.array_equal(step.path[0], at)
+        at = step.path[-1]
+        expected = travel(step.path) / np.deg2rad(20)
         assert step.seconds >= expected

@@ -51,12 +51,12 @@ def truly(scheduler: Scheduler, forecast: ScheduleForecast) -> np.ndarray:
         if isinstance(step, LeaveOut):
             continue
         hottest = 0.0
-        for start, goal in pairwise(step.way):
+        for start, goal in pairwise(step.path):
             for part in (np.arange(6) + 0.5) / 6:
                 torque = scheduler.torques(start + part * (goal - start))[Q4]
                 servo.advance(travel((start, goal)) / scheduler.rate / 6, float(torque))
                 hottest = max(hottest, servo.winding)
-        servo.advance(step.seconds - travel(step.way) / scheduler.rate, float(scheduler.torques(step.way[-1])[Q4]))
+        servo.advance(step.seconds - travel(step.path) / scheduler.rate, float(scheduler.torques(step.path[-1])[Q4]))
         now += step.seconds
         heat.append((now, servo.winding, max(hottest, servo.winding)))
     return np.array(heat)

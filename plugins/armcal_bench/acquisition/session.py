@@ -15,7 +15,6 @@ from armcal.base.config_text import plain
 from armcal.calibration.calibration_file import identity_of
 from armcal.devices.clock import Clock
 from armcal.devices.device import DeviceIdentity, JointDevice
-from armcal.devices.faults import DeviceRefusedError
 from armcal.errors import InputError, Location
 
 from armcal_bench.acquisition import progress as entry
@@ -27,13 +26,11 @@ from armcal_bench.acquisition.preparation import Prepared
 from armcal_bench.acquisition.progress import Progress
 from armcal_bench.acquisition.recovery import Recovery
 from armcal_bench.acquisition.run_log import RunLog, Start, opened_log
-from armcal_bench.acquisition.tracker_monitor import BenchTrackerMonitor
+from armcal_bench.acquisition.tracker_monitor import TrackerMonitor
 from armcal_bench.acquisition.watch import Patient, Watch
 from armcal_bench.hazards import FirstMotion
 from armcal_bench.waiting import Waits
 from armcal_bench.wiring import check_wiring
-
-_FIRST_FRAME_S = 3.0
 
 
 @dataclass(frozen=True)
@@ -103,10 +100,10 @@ def _written(
 @contextmanager
 def _opened(
     prepared: Prepared, options: RunOptions, clock: Clock, log: RunLog
-) -> Iterator[tuple[JointDevice, BenchTrackerMonitor, DeviceIdentity]]:
+) -> Iterator[tuple[JointDevice, TrackerMonitor, DeviceIdentity]]:
     """Device and tracker, both alive; nothing moves."""
     device, settings = prepared.device, prepared.settings
-    monitor = BenchTrackerMonitor(prepared.bench, clock)
+    monitor = TrackerMonitor(prepared.bench, clock)
     try:
         identity = device.open(clock)
         if log.identity is not None and log.identity.digest != identity.digest:
@@ -117,16 +114,13 @@ def _opened(
         if not options.unchecked:
             check_wiring(prepared.bench, device.joint_names, identity.adapter)
         monitor.open()
-        until = clock.now() + _FIRST_FRAME_S
-        while monitor.trouble()[0] and clock.now() < until:
+
+        def pause() -> None:
             clock.sleep(settings.period)
             device.keep_alive()
-            monitor.look()
-        if monitor.trouble()[0]:
-            raise DeviceRefusedError(
-                f"the tracker tells nothing that could be used ({monitor.trouble()[1]}); nothing was moved.",
-                hint="Start it, check its address and the names of its bodies, and let it see them.",
-            )
+
+        hint = "Start it, check its address and the names of its bodies, and let it see them."
+        monitor.await_first_frame(pause, hint)
         yield device, monitor, identity
     finally:
         monitor.close()
@@ -138,7 +132,7 @@ def _carried_out(
     options: RunOptions,
     clock: Clock,
     log: RunLog,
-    opened: tuple[JointDevice, BenchTrackerMonitor, DeviceIdentity],
+    opened: tuple[JointDevice, TrackerMonitor, DeviceIdentity],
 ) -> tuple[Ending, Progress]:
     """The run itself; everything is written down as it goes."""
     settings, progress, (device, monitor, identity) = prepared.settings, log.progress, opened

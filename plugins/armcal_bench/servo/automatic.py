@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from armcal.devices.faults import DeviceError
 
-from armcal_bench.acquisition.tracker_monitor import BenchTrackerMonitor
+from armcal_bench.acquisition.tracker_monitor import TrackerMonitor
 from armcal_bench.servo.mover import Mover, StoppedError
 from armcal_bench.servo.record import LEFT_OUT, POSE, Record
 from armcal_bench.servo.setup import Setup
@@ -40,7 +40,7 @@ class Automatic:
 
     setup: Setup
     mover: Mover
-    monitor: BenchTrackerMonitor
+    monitor: TrackerMonitor
     record: Record
     told: Told
     thermal_state: ThermalState

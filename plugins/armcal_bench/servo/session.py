@@ -11,10 +11,9 @@ from typing import Any, cast
 
 from armcal.arm.servo import PulseClock
 from armcal.devices.clock import Clock
-from armcal.devices.faults import DeviceRefusedError
 from armcal.errors import InputError, Location
 
-from armcal_bench.acquisition.tracker_monitor import BenchTrackerMonitor
+from armcal_bench.acquisition.tracker_monitor import TrackerMonitor
 from armcal_bench.hazards import FirstMotion
 from armcal_bench.servo.automatic import Automatic, Told
 from armcal_bench.servo.beginning import begin, check_same, stated_by
@@ -30,7 +29,6 @@ from armcal_bench.servo.trial import Move, Verdict, answered, judged, wrapped
 from armcal_bench.waiting import Waits
 from armcal_bench.wiring import note_checked
 
-_FIRST_FRAME_S = 3.0
 _LOOK_S = 0.1
 _AS_IT_IS = "its pulses go on as they are, unless the board brings the arm to its base pose"
 
@@ -183,20 +181,14 @@ def _clock(setup: Setup, joint: str) -> PulseClock:
 
 
 @contextmanager
-def _monitor(setup: Setup, mover: Mover) -> Iterator[BenchTrackerMonitor]:
-    """The tracker, once it tells something of use."""
-    monitor = BenchTrackerMonitor(setup.bench, mover.clock)
+def _monitor(setup: Setup, mover: Mover) -> Iterator[TrackerMonitor]:
+    """The tracker, once it gives frames that can be used."""
+    monitor = TrackerMonitor(setup.bench, mover.clock)
     try:
         monitor.open()
         mover.look = monitor.look
-        until = mover.clock.now() + _FIRST_FRAME_S
-        while monitor.trouble()[0] and mover.clock.now() < until:
-            mover.tick()
-        if monitor.trouble()[0]:
-            raise DeviceRefusedError(
-                f"the tracker tells nothing that could be used ({monitor.trouble()[1]}); nothing was moved.",
-                hint="Start it, check its address and the names of its bodies; or calibrate with --guided.",
-            )
+        hint = "Start it, check its address and the names of its bodies; or calibrate with --guided."
+        monitor.await_first_frame(mover.tick, hint)
         yield monitor
     finally:
         mover.look = _nothing
@@ -230,7 +222,7 @@ def _wrapped(setup: Setup, joint: str) -> Verdict | None:
     return wrapped(joint, setup.file.servos[joint].angles, setup.ranges[joint])
 
 
-def _tracked(setup: Setup, mover: Mover, monitor: BenchTrackerMonitor) -> list[Verdict]:
+def _tracked(setup: Setup, mover: Mover, monitor: TrackerMonitor) -> list[Verdict]:
     look = Automatic(setup, mover, monitor, cast(Record, None), _silent, _thermal_state(setup, mover))
     base, moves, unseen = commanded_angles(mover), [], []
     for joint in setup.joints:
