@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from armcal.arm.joints import unknown_joint
 from armcal.arm.servo import PulseClock, PulseTable
 from armcal.base.settings import Settings
 from armcal.calibration.calibration import Calibration
@@ -128,13 +129,8 @@ def _with_servos(subject: Subject, settings: CapabilitySettings) -> Subject:
     if settings.servos is None:
         return subject
     file = load_servo_file(settings.servos)
-    unknown = sorted(set(file.servos) - set(subject.arm.commanded))
-    if unknown:
-        raise ConfigError(
-            f"no joint is called {unknown[0]!r}.",
-            where=Location(str(settings.servos)),
-            hint=f"The joints are {', '.join(subject.arm.commanded)}.",
-        )
+    if fault := unknown_joint(file.servos, subject.arm.commanded):
+        raise ConfigError(f"{fault}.", where=Location(str(settings.servos)))
     calibrated_servos = {joint: file.calibrated(joint) for joint in file.servos}
     servos = {
         j: (PulseTable(s.angles, s.pulses), PulseClock(s.oscillator_hz, s.prescale))

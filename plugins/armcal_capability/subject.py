@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from armcal.arm.assembly import Arm
 from armcal.arm.clearance import ClearanceCheck, Mask
+from armcal.arm.joints import by_dimension, joint_limits, unknown_joint
 from armcal.base.domains import Array
 from armcal.base.parameters import Parameters
 from armcal.base.settings import Settings
@@ -68,10 +68,8 @@ class Subject:
             ConfigError: no joint is called so.
         """
         names = self.arm.joint_names
-        if unknown := sorted(set(stated) - set(names)):
-            raise ConfigError(
-                f"holding: no joint is called {unknown[0]!r}.", hint=f"The joints are {', '.join(names)}."
-            )
+        if fault := unknown_joint(stated, names):
+            raise ConfigError(f"holding: {fault}.")
         return np.array([stated.get(name, np.inf) for name in names])
 
 
@@ -174,24 +172,9 @@ def _rules(arm: Arm, system: System, source: ConfigSource | None, name: str) -> 
 
 def _limits(arm: Arm, settings: PlanSettings, name: str) -> Array:
     """Those that are stated, or the model's own."""
-    given = {**settings.limits, **settings.travel_limits}
-    if unknown := sorted(set(given) - set(arm.commanded)):
-        raise ConfigError(
-            f"plan.limits: no such joint is called {unknown[0]!r}.",
-            where=Location(name),
-            hint=f"The joints are {', '.join(arm.commanded)}.",
-        )
-    for joints, dimension in ((settings.limits, "angle"), (settings.travel_limits, "length")):
-        if wrong := [joint for joint in joints if arm.commanded[joint] != dimension]:
-            raise ConfigError(
-                f"{wrong[0]} has its limits under the wrong key.",
-                where=Location(name),
-                hint="Turning joints have theirs under plan.limits, sliding ones under plan.travel_limits.",
-            )
-    own = {joint.name: joint.limits for joint in arm.nominal_chain.joints}
-    found = {joint: given.get(joint) or own[joint] for joint in arm.commanded}
-    missing: Sequence[str] = [joint for joint, limits in found.items() if limits is None]
-    if missing:
+    stated = by_dimension(arm.commanded, settings.limits, settings.travel_limits, where=Location(name))
+    found = joint_limits(arm.nominal_chain, stated)
+    if missing := [joint for joint, limits in found.items() if limits is None]:
         raise ConfigError(
             f"found no limits for {', '.join(missing)}.",
             where=Location(name),

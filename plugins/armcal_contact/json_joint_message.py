@@ -14,6 +14,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from armcal.arm.joints import unknown_joint
 from armcal.base.units import from_unit, split_suffix, units_of
 
 _DIGITS = "0123456789"
@@ -61,7 +62,7 @@ class JointMessages:
         for joint, name in names.items():
             channel = joint if joint in self._channels else short.get(joint)
             if channel is None:
-                raise ValueError(f"no joint is called {joint!r}; the joints are {', '.join(short or channels)}")
+                raise ValueError(unknown_joint([joint], short or channels))
             if channel in own:
                 raise ValueError(f"{channel} is named twice")
             own[channel] = name

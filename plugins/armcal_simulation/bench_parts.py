@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 from armcal.arm.assembly import Arm, MassSpec
 from armcal.arm.holding import holding_function
+from armcal.arm.joints import unknown_joint
 from armcal.base.domains import Array
 from armcal.base.pose_settings import PoseSettings
 from armcal.base.quaternions import rotation_matrix
@@ -33,21 +34,16 @@ def true_servos(settings: ServoBenchSettings, arm: Arm) -> ServoFile:
         ConfigError: the file is refused, or names other joints than the arm has.
     """
     file = load_servo_file(settings.servos)
-    known = set(arm.commanded)
-    missing, unknown = sorted(known - set(file.servos)), sorted(set(file.servos) - known)
-    if missing:
+    if missing := sorted(set(arm.commanded) - set(file.servos)):
         raise ConfigError(
             f"found no servo for {', '.join(missing)}.",
             where=Location(str(settings.servos)),
             hint="The bench needs the true pulse table of every joint.",
         )
-    named = sorted((set(settings.joints) - {ALL} | set(settings.start)) - known)
-    if unknown or named:
-        raise ConfigError(
-            f"no joint of {arm.name} is called {(unknown or named)[0]!r}.",
-            where=Location(str(settings.servos)) if unknown else None,
-            hint=f"The joints are {', '.join(arm.commanded)}.",
-        )
+    if fault := unknown_joint(file.servos, arm.commanded):
+        raise ConfigError(f"{fault}.", where=Location(str(settings.servos)))
+    if fault := unknown_joint([name for name in (*settings.joints, *settings.start) if name != ALL], arm.commanded):
+        raise ConfigError(f"bench.simulator: {fault}.")
     return file
 
 

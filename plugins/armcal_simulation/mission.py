@@ -7,6 +7,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 from armcal.arm.assembly import Arm
+from armcal.arm.joints import Limits, by_dimension, joint_limits, unknown_joint
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.config.selection import with_values
@@ -141,25 +142,17 @@ def _check(request: SimulationRequest, settings: MissionSettings) -> None:
     joints = [f"{arm.name}.{joint}" for arm in request.arms.values() for joint in arm.commanded]
     for event in settings.events:
         joint = getattr(event, "joint", joints[0])
-        if joint not in joints:
-            raise ConfigError(
-                f"simulation.events: no joint is called {joint!r}.", hint=f"The joints are {', '.join(joints)}."
-            )
+        if fault := unknown_joint([joint], joints):
+            raise ConfigError(f"simulation.events: {fault}.")
 
 
-def _spans(arm: Arm, records: RecordSettings) -> list[tuple[float, float]]:
+def _spans(arm: Arm, records: RecordSettings) -> list[Limits]:
     """From where to where each joint is driven (rad, or m)."""
-    limits = {joint.name: joint.limits for joint in arm.nominal_chain.joints}
-    spans: list[tuple[float, float]] = []
-    for given, kind in ((records.ranges, "angle"), (records.travel, "length")):
-        unknown = sorted(set(given) - {joint for joint, text in arm.commanded.items() if text == kind})
-        if unknown:
-            raise ConfigError(
-                f"simulation.records: {arm.name} has no joint {unknown[0]} whose command is of {kind}.",
-                hint=f"The joints are {', '.join(arm.commanded)}; ranges are of turning, travel of sliding ones.",
-            )
-    for joint in arm.commanded:
-        span = records.ranges.get(joint) or records.travel.get(joint) or limits.get(joint)
+    keys = ("simulation.records.ranges", "simulation.records.travel")
+    spans: list[Limits] = []
+    for joint, span in joint_limits(
+        arm.nominal_chain, by_dimension(arm.commanded, records.ranges, records.travel, keys)
+    ).items():
         if span is None:
             raise ConfigError(
                 f"simulation.records: nothing says how far {joint} is driven, and the arm states no limits of it.",

@@ -205,7 +205,7 @@ class TestRehearsal:
         ("change", "said"),
         [
             ("bench.link={type: linux_i2c}", "--set bench.link='{type: framed}'"),
-            ("bench.simulator.joints={q9: {backlash_deg: 1}}", "The joints are q1, q2, q3, q4, q5, q6."),
+            ("bench.simulator.joints={q9: {backlash_deg: 1}}", "the joints are q1, q2, q3, q4, q5, q6."),
             ("bench=null", "found no bench"),
         ],
     )

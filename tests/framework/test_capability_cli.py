@@ -144,7 +144,7 @@ def refused(folder: Path, source: object, *arguments: object, says: tuple[str, .
         ("capability.areas={a: {low_mm: [0, 0], high_mm: [0, 0, 0]}}", ("capability.areas.a.low",)),
         ("capability.basket=1", ("unknown key 'basket'",)),
         ("capability.values=nowhere.yaml", ("there is no such file",)),
-        ("plan.limits={q9: [0 deg, 1 deg]}", ("no such joint is called 'q9'",)),
+        ("plan.limits={q9: [0 deg, 1 deg]}", ("no turning joint is called 'q9'",)),
         ("capability.designs={a: {arms.arm.model.base.4.ry_degree: 45}}", ("design 'a'", "ry_degree")),
         ("capability.designs={a: 3}", ("capability.designs.a", "expected keys and values")),
     ],

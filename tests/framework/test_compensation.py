@@ -202,7 +202,7 @@ def test_a_rotation_that_cannot_be_had_is_told_from_a_position_that_cannot() -> 
         ({"q2": (1.0, -1.0)}, "the limits of q2, 1 to -1, leave it no room"),
         ({"q2": (1.0, 1.0)}, "leave it no room"),
         ({"q2": (np.nan, 1.0)}, "leave it no room"),
-        ({"elbow": (0.0, 1.0)}, "there is no joint elbow; the joints are q1, q2, q3"),
+        ({"elbow": (0.0, 1.0)}, "no joint is called 'elbow'; the joints are q1, q2, q3"),
     ],
 )
 def test_limits_that_are_none_are_refused(limits, said: str) -> None:
@@ -326,7 +326,7 @@ def test_held_joints_must_be_told_where_and_may_be_there() -> None:
     for ask in (found.solve, found.follow):
         with pytest.raises(ValueError, match="q2 shall stay where the start has it, and that is beyond its limits"):
             ask(targets, np.array([0.0, 1.5, 0.0]))
-    for held, said in ((("elbow",), "no joint elbow"), (("q1", "q2", "q3"), "none is left to move")):
+    for held, said in ((("elbow",), "no joint is called 'elbow'"), (("q1", "q2", "q3"), "none is left to move")):
         with pytest.raises(ValueError, match=said):
             with_options("rigid", Options(held=held))
 

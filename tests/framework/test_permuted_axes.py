@@ -38,7 +38,7 @@ def changed(dataset: Dataset, **columns: str) -> Dataset:
 
 def told(ready: Prepared, dataset: Dataset) -> tuple[str, ...]:
     found = find_permuted_axes(ready.problem, ready.problem.records(dataset), dataset)
-    return () if found is None else found.told
+    return () if found is None else found.readings
 
 
 def test_right_data_are_not_suspected(demo: Prepared) -> None:

@@ -577,7 +577,7 @@ class TestCommand:
     @pytest.mark.parametrize(
         ("change", "told"),
         [
-            ("bench.simulator.joints={q9: {speed_deg_per_s: 100}}", "no joint of arm is called 'q9'"),
+            ("bench.simulator.joints={q9: {speed_deg_per_s: 100}}", "no joint is called 'q9'"),
             ("bench.simulator.measurement=camera", "bench.simulator.measurement: found camera"),
             ("bench.simulator.without_effects=[quantum]", "no effect of arm is called 'quantum'"),
             ("bench.simulator.servos=missing.yaml", "missing.yaml"),

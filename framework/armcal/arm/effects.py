@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
+from armcal.arm.joints import unknown_joint
 from armcal.arm.model import Z_AXIS, Chain, Vector3
 from armcal.base.parameters import ParameterBlock
 from armcal.base.se3 import Expression
@@ -135,7 +136,6 @@ def chosen(texts: JointChoice, joint_names: Sequence[str]) -> tuple[int, ...]:
         ValueError: a name is not one of the joints'.
     """
     names = joint_names if texts == "all" else texts
-    unknown = [name for name in names if name not in joint_names]
-    if unknown:
-        raise ValueError(f"no joint is called {unknown[0]!r}; the joints are {', '.join(joint_names)}")
+    if fault := unknown_joint(names, joint_names):
+        raise ValueError(fault)
     return tuple(i for i, name in enumerate(joint_names, start=1) if name in names)

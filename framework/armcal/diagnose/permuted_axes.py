@@ -50,14 +50,14 @@ class PermutedAxes:
 
     Attributes:
         measurement: whose positions.
-        told: the readings that fit about as well as the best one, in words.
+        readings: those that fit about as well as the best one, in words.
         as_given_mm: what the data leave as they stand (root mean square, free parameters adapted).
         left_mm: what the best reading leaves.
         of_joints: whether it is joints that it reads otherwise; else axes.
     """
 
     measurement: str
-    told: tuple[str, ...]
+    readings: tuple[str, ...]
     as_given_mm: float
     left_mm: float
     of_joints: bool

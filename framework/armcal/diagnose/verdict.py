@@ -83,17 +83,14 @@ def judge(
     own, kept = [ids[i] for i in train], train if fitted is None else train[fitted.kept]
     suspicious = _suspicious(errors_mm[train], own, fitted)
     findings = [_convergence(estimate), determined, *_condition(estimate), *_bounds(estimate)]
-    findings += [
-        *shift_findings(estimate),
-        *_noise(estimate, fitted, seen),
-        *structure_findings(seen.structure, seen.unit),
-    ]
+    findings += [*shift_findings(estimate), *_noise(estimate, fitted, seen)]
+    findings += structure_findings(seen.structure, seen.unit)
     findings += neighbour_findings(seen.structure, estimate, seen.unit) or _neighbours(whitened, kept, estimate)
     findings += [*_correlated(estimate), *predicted, *large_error_findings(seen.large_errors, seen.unit)]
     findings += [*_outliers(suspicious, own, fitted), *_next(estimate, suggestions)]
     ranked = tuple(sorted(findings, key=lambda finding: _ORDER[finding.grade]))
-    first = _first(judged_mm, judged_on, ranked[0], seen.unit)
-    sentences = [first, *_in_short(estimate, determined, seen, suspicious, suggestions)]
+    sentences = [_first(judged_mm, judged_on, ranked[0], seen.unit)]
+    sentences += _in_short(estimate, determined, seen, suspicious, suggestions)
     if not estimate.verdict.converged:
         sentences = ["The solver did not converge: these values are no calibration."]
     return Verdict(_headline(judged_mm, judged_on, ranked[0], seen.unit), ranked, " ".join(sentences))

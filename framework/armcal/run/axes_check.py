@@ -26,7 +26,8 @@ def check_permuted_axes(problem: Problem, records: Sequence[FactorRecords], data
         return
     raise DataError(
         f"{reading.measurement}: as they stand, the data are typically {reading.as_given_mm:.3g} mm off the model, "
-        f"however its free parameters adapt; with {', or with '.join(reading.told)}, they are {reading.left_mm:.3g} mm off.",
+        f"however its free parameters adapt; with {', or with '.join(reading.readings)}, they are "
+        f"{reading.left_mm:.3g} mm off.",
         where=Location(dataset.source),
         hint=f"Mend these columns in the file or by data.columns, or {_MEND[reading.of_joints]}. "
         "If the data are right, the model's nominal values are far off: give better ones.",

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from armcal.arm.clearance import ClearanceCheck, Mask
+from armcal.arm.joints import by_dimension
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.config.system import build_component
@@ -57,14 +58,9 @@ class JointSpace:
         Raises:
             ConfigError: a name is not a joint's, or not one of that kind.
         """
-        for given, kind, key in ((turning, "angle", keys[0]), (sliding, "length", keys[1])):
-            known = [n for n, dimension in zip(self.names, self.dimensions, strict=True) if dimension == kind]
-            if unknown := sorted(set(given) - set(known)):
-                raise ConfigError(
-                    f"plan.{key}: no such joint is called {unknown[0]!r}.",
-                    hint=f"The joints are {', '.join(known) or 'none of this kind'}.",
-                )
-        return {name: np.array(values) for name, values in {**turning, **sliding}.items()}
+        dimensions = dict(zip(self.names, self.dimensions, strict=True))
+        stated = by_dimension(dimensions, turning, sliding, (f"plan.{keys[0]}", f"plan.{keys[1]}"))
+        return {name: np.array(values) for name, values in stated.items()}
 
     def limits(self, settings: PlanSettings) -> Array:
         """Lowest and highest command of each joint (joints x 2); infinite where none is given."""

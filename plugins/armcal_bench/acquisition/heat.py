@@ -9,6 +9,7 @@ import numpy as np
 from armcal.arm.assembly import Arm
 from armcal.arm.environment import Environment
 from armcal.arm.holding import holding_function
+from armcal.arm.joints import unknown_joint
 from armcal.base.domains import Array
 
 from armcal_bench.acquisition.settings import ServoHeatSettings
@@ -45,8 +46,8 @@ class HeatModel:
         Raises:
             ValueError: the settings name no such joint.
         """
-        if unknown := sorted(set(settings) - set(joints)):
-            raise ValueError(f"no joint is called {unknown[0]!r}; the joints are {', '.join(joints)}")
+        if fault := unknown_joint(settings, joints):
+            raise ValueError(fault)
         given = [settings.get(joint) for joint in joints]
         usual = ServoHeatSettings.si(continuous=1.0)
         return cls(

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from armcal.arm.assembly import Arm
 from armcal.arm.clearance import ClearanceCheck
+from armcal.arm.joints import joint_limits, unknown_joint
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.devices.device import JointDevice
@@ -70,7 +71,7 @@ def prepare(experiment: Experiment, plan: Path) -> Prepared:
     space = JointSpace.of(experiment)
     commands = commands_of(read_poses(experiment, plan), space)
     device = bench.device()
-    limits = joint_limits(experiment, settings, arm)
+    limits = run_limits(experiment, settings, arm)
     check = clearance_of(experiment, arm)
     asked = commands.stacked(space.channels).T
     _within(device.joint_names, asked, limits, plan, commands)
@@ -103,45 +104,37 @@ def prepare(experiment: Experiment, plan: Path) -> Prepared:
     return Prepared(bench, device, commands, scheduler, planner, heat, arrival, judge)
 
 
-def joint_limits(experiment: Experiment, settings: AcquisitionSettings, arm: Arm) -> Array:
+def run_limits(experiment: Experiment, settings: AcquisitionSettings, arm: Arm) -> Array:
     """The run's own, else the plan's, else the arm model's (joints x 2, rad).
 
     Raises:
         ConfigError: a joint has none, is no joint, or does not turn.
     """
-    source, given = experiment.source, dict(settings.limits)
-    plan = experiment.settings.plan
-    stated = {joint.name: joint.limits for joint in arm.nominal_chain.joints}
-    for joint, dimension in arm.commanded.items():
-        if dimension != "angle":
-            raise ConfigError(
-                f"the joint {joint} slides, expected joints that turn: servos move angles.",
-                where=source.where(("arms",)),
-                hint="Measure this arm with its own controller, and read its data.",
-            )
-        found = given.get(joint) or (plan.limits.get(joint) if plan else None) or stated.get(joint)
-        if found is None:
-            raise ConfigError(
-                f"found no limits of the joint {joint}.",
-                where=source.where((*_AT, "limits")),
-                hint=f"Give them: limits: {{{joint}: [-100 deg, 100 deg]}}.",
-            )
-        given[joint] = found
-    if unknown := sorted(set(given) - set(arm.commanded)):
+    source, plan = experiment.source, experiment.settings.plan
+    if sliding := [joint for joint, dimension in arm.commanded.items() if dimension != "angle"]:
         raise ConfigError(
-            f"no joint is called {unknown[0]!r}.",
-            where=source.where((*_AT, "limits")),
-            hint=f"The joints are {', '.join(arm.commanded)}.",
+            f"the joint {sliding[0]} slides, expected joints that turn: servos move angles.",
+            where=source.where(("arms",)),
+            hint="Measure this arm with its own controller, and read its data.",
         )
-    return np.array([given[joint] for joint in arm.commanded])
+    where = source.where((*_AT, "limits"))
+    try:
+        limits = joint_limits(arm.nominal_chain, settings.limits, plan.limits if plan else {})
+    except ValueError as fault:
+        raise ConfigError(f"{fault}.", where=where) from fault
+    if missing := [joint for joint, ends in limits.items() if ends is None]:
+        raise ConfigError(
+            f"found no limits of the joint {missing[0]}.",
+            where=where,
+            hint=f"Give them: limits: {{{missing[0]}: [-100 deg, 100 deg]}}.",
+        )
+    return np.array([ends for ends in limits.values() if ends is not None])
 
 
 def _park(experiment: Experiment, settings: AcquisitionSettings, device: JointDevice, limits: Array) -> Array:
     where, joints = experiment.source.where((*_AT, "park")), device.joint_names
-    if unknown := sorted(set(settings.park) - set(joints)):
-        raise ConfigError(
-            f"no joint is called {unknown[0]!r}.", where=where, hint=f"The joints are {', '.join(joints)}."
-        )
+    if fault := unknown_joint(settings.park, joints):
+        raise ConfigError(f"{fault}.", where=where)
     park = np.array([settings.park.get(joint, 0.0) for joint in joints])
     if (outside := _outside(park, limits)).any():
         joint = joints[int(np.argmax(outside))]

@@ -16,7 +16,7 @@ from armcal.errors import ConfigError
 from armcal.run.experiment import Experiment
 
 from armcal_bench.acquisition.heat import HeatModel, Torques
-from armcal_bench.acquisition.preparation import clearance_of, heat_of, joint_limits
+from armcal_bench.acquisition.preparation import clearance_of, heat_of, run_limits
 from armcal_bench.bench import SECTION, Bench
 from armcal_bench.hazards import HazardJudge
 from armcal_bench.servo.known import KnownBoard, KnownServo, MeasuredPulse
@@ -78,7 +78,7 @@ class Setup:
         base = {joint: stated.get(joint, 0.0) for joint in moved}
         limited = {**bench.settings.acquisition.limits, **settings.ranges}
         acquisition = bench.settings.acquisition.model_copy(update={"limits": limited})
-        limits = dict(zip(arm.commanded, joint_limits(experiment, acquisition, arm).tolist(), strict=True))
+        limits = dict(zip(arm.commanded, run_limits(experiment, acquisition, arm).tolist(), strict=True))
         nominal = NominalArm.of(arm, experiment.parameters, experiment.system.environment)
         joints = settings.joints or moved
         heat = heat_of(experiment, bench.settings.acquisition, arm)

@@ -14,7 +14,7 @@ from armcal.base.parameters import Parameters
 from armcal.calibration.compensation.counts import Counts, ServoCounts
 from armcal.calibration.compensation.equilibrium import Equilibrium, Standing
 from armcal.calibration.compensation.finder import Allowed, Rows, Solutions
-from armcal.calibration.compensation.limits import check_held, held_joints, joint_limits
+from armcal.calibration.compensation.limits import check_held, command_limits, held_joints
 from armcal.calibration.compensation.path import PathFinder
 from armcal.calibration.compensation.reach import Reach, reach_of
 from armcal.calibration.compensation.reasons import why_not
@@ -62,7 +62,7 @@ class Compensator:
         self.expression, self.options = expression, options or Options()
         self._allowed = allowed
         self._held = held_joints(expression, self.options.held)
-        self.limits = joint_limits(expression, self.options.limits)
+        self.limits = command_limits(expression, self.options.limits)
         self.reach: Reach = reach_of(expression.arm, parameters, self.limits, expression.tool_T_point)
         self._equilibrium = Equilibrium(expression, choice)
         self._counts = ServoCounts(expression.joints, expression.servos) if expression.servos else None

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from armcal.arm.joints import Limits, joint_limits, unknown_joint
 from armcal.base.domains import Array
 from armcal.calibration.tool_expression import ToolExpression
 
@@ -16,9 +17,8 @@ def held_joints(expression: ToolExpression, names: Sequence[str]) -> tuple[int, 
     Raises:
         ValueError: there is no such joint, or none is left to move.
     """
-    unknown = [name for name in names if name not in expression.joints]
-    if unknown:
-        raise ValueError(f"there is no joint {unknown[0]}; the joints are {', '.join(expression.joints)}")
+    if fault := unknown_joint(names, expression.joints):
+        raise ValueError(fault)
     if len(set(names)) == len(expression.joints):
         raise ValueError("all joints shall stay: none is left to move")
     return tuple(expression.joints.index(name) for name in dict.fromkeys(names))
@@ -40,7 +40,7 @@ def check_held(joints: Sequence[str], held: Sequence[int], limits: Array, start:
             raise ValueError(f"{joints[i]} shall stay where the start has it, and that is beyond its limits")
 
 
-def joint_limits(expression: ToolExpression, stated: Mapping[str, tuple[float, float]]) -> Array:
+def command_limits(expression: ToolExpression, stated: Mapping[str, Limits]) -> Array:
     """Lowest and highest command of each joint (n x 2; rad or m), infinite where nothing limits it.
 
     ``stated`` take the place of the model's. A servo's pulse table is known between its ends only, so a joint with one
@@ -49,15 +49,9 @@ def joint_limits(expression: ToolExpression, stated: Mapping[str, tuple[float, f
     Raises:
         ValueError: limits of a joint that is not there, or in falling order.
     """
-    unknown = [joint for joint in stated if joint not in expression.joints]
-    if unknown:
-        raise ValueError(f"there is no joint {unknown[0]}; the joints are {', '.join(expression.joints)}")
-    model = {joint.name: joint.limits for joint in expression.arm.nominal_chain.joints}
-    found = np.full((len(expression.joints), 2), (-np.inf, np.inf))
+    known = joint_limits(expression.arm.nominal_chain, stated)
+    found = np.array([known[joint] or (-np.inf, np.inf) for joint in expression.joints])
     for i, joint in enumerate(expression.joints):
-        known = stated.get(joint, model[joint])
-        if known is not None:
-            found[i] = known
         if joint in expression.servos:
             angles = expression.servos[joint][0].angles
             found[i] = max(found[i, 0], angles[0]), min(found[i, 1], angles[-1])

@@ -1,0 +1,63 @@
+"""Joints as a user names them, and their limits: stated by a configuration, else by the arm model."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Mapping
+from typing import TypeVar
+
+from armcal.arm.model import Chain
+from armcal.errors import ConfigError, Location
+
+V = TypeVar("V")
+Limits = tuple[float, float]
+"""Lowest and highest command of a joint (rad or m)."""
+_KINDS = {"angle": "turning ", "length": "sliding "}
+
+
+def unknown_joint(names: Iterable[str], joints: Collection[str], kind: str = "") -> str:
+    """What is wrong with the first name that no joint has; empty where all are joints."""
+    for name in names:
+        if name not in joints:
+            return f"no {kind}joint is called {name!r}; the {kind}joints are {', '.join(joints) or 'none'}"
+    return ""
+
+
+def by_dimension(
+    joints: Mapping[str, str],
+    turning: Mapping[str, V],
+    sliding: Mapping[str, V],
+    keys: tuple[str, str] = ("plan.limits", "plan.travel_limits"),
+    where: Location | None = None,
+) -> dict[str, V]:
+    """What is stated of turning and of sliding joints, each under its own key, together.
+
+    Args:
+        joints: ``angle`` or ``length`` of each.
+        turning: of joints that turn.
+        sliding: of joints that slide.
+        keys: of the two in the configuration.
+        where: it was stated.
+
+    Raises:
+        ConfigError: a name is no joint's, or of one of the other kind.
+    """
+    for stated, dimension, key in ((turning, "angle", keys[0]), (sliding, "length", keys[1])):
+        known = [joint for joint, own in joints.items() if own == dimension]
+        if fault := unknown_joint(stated, known, _KINDS[dimension]):
+            raise ConfigError(
+                f"{key}: {fault}.", where=where, hint=f"{keys[0]} is of turning joints, {keys[1]} of sliding ones."
+            )
+    return {**turning, **sliding}
+
+
+def joint_limits(chain: Chain, *stated: Mapping[str, Limits]) -> dict[str, Limits | None]:
+    """Limits of each commanded joint, in order: those stated first, else the model's; None where nothing limits it.
+
+    Raises:
+        ValueError: limits are stated of a joint that is not there.
+    """
+    model = {joint.name: joint.limits for joint in chain.joints if joint.mimic is None}
+    for limits in stated:
+        if fault := unknown_joint(limits, model):
+            raise ValueError(fault)
+    return {joint: next((limits[joint] for limits in stated if joint in limits), own) for joint, own in model.items()}
