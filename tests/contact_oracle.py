@@ -199,7 +199,7 @@ def by_name(parameters: Parameters, values: np.ndarray) -> dict[str, float]:
 
 
 def away(parameters: Parameters, size: float, seed: int) -> np.ndarray:
-    """A value vector beside the nominal one, by so many ordinary sizes of each free parameter."""
+    """A value vector beside the nominal one, by so many typical scales of each free parameter."""
     steps = size * np.random.default_rng(seed).normal(size=len(parameters.increment_scales()))
     return parameters.retract(steps * parameters.increment_scales())
 

@@ -205,12 +205,12 @@ def same_span(one: np.ndarray, other: np.ndarray) -> bool:
 
 
 def as_rows(combinations: Sequence[Mapping[str, float]], names: Sequence[str], scales: np.ndarray) -> np.ndarray:
-    """Combinations in SI as rows in ordinary sizes."""
+    """Combinations in SI as rows in typical scales."""
     return np.array([[each.get(name, 0.0) for name in names] for each in combinations]).reshape(-1, len(names)) / scales
 
 
 def oracle_null(case: Case, scales: Mapping[str, float]) -> np.ndarray:
-    """What plain numpy says is undetermined, in ordinary sizes of ``case.free``."""
+    """What plain numpy says is undetermined, in typical scales of ``case.free``."""
     q = case.poses()
     slopes = jacobian(lambda v: case.chain.tip(v, q), case.chain.nominal(), case.free)
     _, values, directions = np.linalg.svd(slopes * [scales[full(name)] for name in case.free])

@@ -1,4 +1,4 @@
-"""The documentation: pages that hang together, a site that needs no network, blocks that run or say they do not."""
+"""The documentation: pages that belong together, a site that needs no network, blocks that run or say they do not."""
 
 from __future__ import annotations
 

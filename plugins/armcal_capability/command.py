@@ -40,7 +40,7 @@ OURS = (*_DATA, *_FIGURES)
 @overrides
 @speaking
 def capability(console: Console, source: Path, out: Path, settings: Path | None, overrides: tuple[str, ...]) -> None:
-    """Map what an arm can do: its reach, sag, stiffness, accuracy and nimbleness, in all and in areas, for designs."""
+    """Map what an arm can do: its reach, sag, stiffness, accuracy and dexterity, in all and in areas, for designs."""
     watch = Stopwatch()
     kept = click.get_current_context().with_resource(reserved(out, OURS))
     import_module("matplotlib")  # if it is not here, that is said now and not after the survey

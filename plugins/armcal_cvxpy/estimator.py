@@ -149,14 +149,14 @@ class _Cone:
         return self._now + cp.bmat([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) >> 0
 
     def set(self, at: Array, units: Array) -> None:
-        """Where the block stands (coordinates in ordinary sizes), and what one of its step's units is."""
+        """Where the block stands (coordinates in typical scales), and what one of its step's units is."""
         unit = float(np.max(units[self._place]))
         self._now.value = symmetric(self._base + at[self._place]) / unit
         self._units.value = units[self._place] / unit
 
 
 def _semidefinite(posed: PosedProblem) -> list[tuple[Array, slice]]:
-    """Nominal entries (in ordinary sizes) and place of each semidefinite block."""
+    """Nominal entries (in typical scales) and place of each semidefinite block."""
     found, start = [], 0
     for block in posed.problem.parameters.free:
         place = slice(start, start + block.domain.dof)

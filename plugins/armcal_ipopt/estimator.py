@@ -30,7 +30,7 @@ _SAME_COST = 1e-6
 _BARRIER_START = 1e-8
 _SMALLEST_UNIT = 1e-9
 _LEAST_START = 2e-2
-"""Of a semidefinite matrix's ordinary size: its smallest eigenvalue at the start."""
+"""Of a semidefinite matrix's typical scale: its smallest eigenvalue at the start."""
 _MOST_REFUSED = 110
 """Trial points in a row without an equilibrium, which is two whole line searches down to a step of rounding errors: the
 fit stands where no way leads on, and IPOPT would search again in each iteration."""

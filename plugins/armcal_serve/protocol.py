@@ -132,7 +132,7 @@ class CompensateRequest(Request, Acting):
         targets: one or several.
         start: where the arm comes from (rad), for an arm without sliding joints.
         start_joints: the same by name with the unit.
-        path: whether the targets are a path, to be followed in order; otherwise each is had from ``start``.
+        path: whether the targets are a path, to be followed in order; otherwise each is reached from ``start``.
         units: of the commands in the answer.
     """
 
@@ -219,7 +219,7 @@ class Command(TypedDict):
         joint_angles_rad, joint_angles_deg: the commands; of an arm with sliding joints ``joints`` in their place, by
             name with the unit.
         counts, pulse_us: what the servo board is told; null for a joint without a pulse table.
-        found: whether the target is had; ``why_not`` says why not, and the command is the nearest that was found.
+        found: whether the target is reached; ``why_not`` says why not, and the command is the nearest that was found.
         error_mm, error_deg: what remains.
         nearest_mm: no command comes nearer than this, as far as is known.
         approach: from where each joint is taken to come: -1, 0 (not known), 1.

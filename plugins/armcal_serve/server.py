@@ -36,7 +36,7 @@ class Server:
         tell: is told what whoever started it should know.
 
     Raises:
-        InputError: a transport cannot be had.
+        InputError: a transport cannot be opened.
     """
 
     def __init__(

@@ -23,7 +23,7 @@ class UdpPort:
         sender: the only address from which datagrams count, if any.
 
     Raises:
-        DeviceRefusedError: it cannot be had.
+        DeviceRefusedError: it cannot be opened.
     """
 
     def __init__(self, host: str, port: int, group: str | None = None, sender: str | None = None) -> None:
@@ -41,7 +41,7 @@ class UdpPort:
             self._socket.close()
             hint = "Is another program listening there? Give a free port, and an address of this machine."
             raise DeviceRefusedError(
-                f"the port cannot be had ({fault.strerror or fault}).", where=where, hint=hint
+                f"the port cannot be opened ({fault.strerror or fault}).", where=where, hint=hint
             ) from fault
 
     @property

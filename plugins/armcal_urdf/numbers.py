@@ -46,7 +46,7 @@ def numbers(element: Element, name: str, default: tuple[float, ...], largest: fl
     """As many numbers as the default has.
 
     Raises:
-        ConfigError: another count, or what is no finite decimal number of ordinary size.
+        ConfigError: another count, or what is no finite decimal number of typical size.
     """
     if name not in element.attributes:
         return default

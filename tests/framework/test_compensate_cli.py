@@ -150,7 +150,7 @@ def test_json_is_json_and_says_which_are_missed(desk: Desk) -> None:
     result = desk.ask(desk.file("pose_id,x_mm,y_mm,z_mm", rows), "--json")
     told(result)
     found = json.loads(result.stdout, parse_constant=pytest.fail)
-    assert (found["targets"], found["had"]) == (3, 1)
+    assert (found["targets"], found["reached"]) == (3, 1)
     assert [each["id"] for each in found["missed"]] == ["far", "lost"]
     assert found["missed"][0]["nearest_mm"] == pytest.approx(2590, abs=10)
     assert "out of reach" in found["missed"][0]["reason"]
@@ -414,7 +414,7 @@ def test_a_table_corrects_at_its_nodes_and_between_them(tmp_path: Path, arms) ->
     result = armcal("correction-table", path, "--grid", grid(tmp_path), "--out", out, "--json")
     told(result)
     found = json.loads(result.stdout, parse_constant=pytest.fail)
-    assert found["nodes"] == found["had"] == 27
+    assert found["nodes"] == found["reached"] == 27
     assert found["error_mm"] < 0.2 * found["nominal_error_mm"]
     rows = list(csv.DictReader(out.open(encoding="utf-8")))
     table = np.array([[float(row[name]) for name in list(row)[1:]] for row in rows])
@@ -453,7 +453,7 @@ def test_nodes_that_cannot_be_had_are_left_empty(tmp_path: Path, arms) -> None:
     rows = list(csv.DictReader(out.open(encoding="utf-8")))
     empty = [row["dx_mm"] == "" for row in rows]
     assert 0 < sum(empty) < len(rows) == 16
-    assert f"{16 - sum(empty)} of 16 nodes are had" in text
+    assert f"{16 - sum(empty)} of 16 nodes are reached" in text
 
 
 @pytest.mark.parametrize(
@@ -468,7 +468,7 @@ def test_nodes_that_cannot_be_had_are_left_empty(tmp_path: Path, arms) -> None:
         ({"rpy_deg": None}, "table.rpy"),
         ({"rpy_deg": [0, 90]}, "table.rpy_deg"),
         ({"colour": "red"}, "unknown key 'colour'"),
-        ({"low_mm": [1500, 0, 0], "high_mm": [1600, 10, 10], "nodes": [2, 2, 2]}, "no node of the grid can be had"),
+        ({"low_mm": [1500, 0, 0], "high_mm": [1600, 10, 10], "nodes": [2, 2, 2]}, "no node of the grid can be reached"),
     ],
 )
 def test_grids_that_make_no_table(tmp_path: Path, arms, changed, said: str) -> None:

@@ -1,4 +1,4 @@
-"""Commands for targets: had where they can be had, nearest where not, as redundancy asks, on paths, and in counts."""
+"""Commands for targets: exact where they can be reached, else nearest, as redundancy asks, on paths, and in counts."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def acting(found: Compensator, count: int, **told) -> np.ndarray:
 
 
 def arrives(found: Compensator, targets: Targets, commands: Commands, name: str) -> None:
-    """All are had, within the limits, and the calibration's own prediction agrees."""
+    """All are reached, within the limits, and the calibration's own prediction agrees."""
     assert commands.found.mean() >= 0.999
     assert set(commands.reasons) == {""}
     assert commands.distances.max() <= NEAR_M
@@ -126,7 +126,7 @@ def test_c_and_the_virtual_machine_find_the_same() -> None:
     assert np.abs(interpreted.solve(targets).joint_angles - compiled.solve(targets).joint_angles).max() < 1e-7
 
 
-# -- what cannot be had --------------------------------------------------------------------------------------------
+# -- what cannot be reached --------------------------------------------------------------------------------------------
 
 
 def nearest_by_scipy(found: Compensator, position: np.ndarray, known: np.ndarray) -> float:
@@ -193,7 +193,7 @@ def test_a_rotation_that_cannot_be_had_is_told_from_a_position_that_cannot() -> 
     place = found.forward(np.array([[0.3, 0.5, -0.4]]))[:, :3, 3]
     commands = found.solve(found.targets(place, Rotation.from_euler("x", [1.0]).as_matrix()))
     assert not commands.found[0]
-    assert "the position can be had, not with this rotation" in commands.reasons[0]
+    assert "the position can be reached, but not with this rotation" in commands.reasons[0]
 
 
 @pytest.mark.parametrize(
@@ -338,7 +338,7 @@ def test_a_held_joint_is_held_too_where_a_position_alone_is_asked() -> None:
     tools = found.forward(np.array([[1.2, 0.5, -0.4]]))
     commands = found.solve(found.targets(tools[:, :3, 3], tools[:, :3, :3]), start)
     assert not commands.found[0]
-    assert "the position can be had" not in commands.reasons[0]
+    assert "the position can be reached" not in commands.reasons[0]
 
 
 # -- which of many -------------------------------------------------------------------------------------------------

@@ -50,7 +50,7 @@ class Pair:
         return Goal(record, np.zeros((self.found.expression.state.numel(), count)), target)
 
     def alike(self, goal: Goal, manner: Manner) -> float:
-        """The share of targets that are had; everything else must agree."""
+        """The share of targets that are reached; everything else must agree."""
         one, two = self.compiled(goal, manner, NEAR), self.arrays(goal, manner, NEAR)
         # Rounding grows where a search wanders: a few may end elsewhere.
         same = np.abs(one.commands - two.commands).max(axis=0) < 1e-7

@@ -21,7 +21,7 @@ def test_the_order_of_records_and_the_unit_of_a_parameter_do_not_matter() -> Non
     np.testing.assert_allclose(again.singular_values, known.singular_values, atol=1e-9 * known.singular_values[0])
     triangle = problem.triangular_factor(start, records)
     for factor in (1e-3, 1e3):
-        # Parameters in mm instead of m: columns and ordinary sizes change against each other.
+        # Parameters in mm instead of m: columns and typical scales change against each other.
         other = analyse(triangle * factor, problem.parameters.scales() / factor, known.names)
         assert other.rank == known.rank
         np.testing.assert_allclose(other.singular_values, known.singular_values, atol=1e-9 * known.singular_values[0])

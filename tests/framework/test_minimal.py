@@ -95,7 +95,7 @@ def test_no_more_than_asked_the_preferred_first_and_what_is_lost_is_told() -> No
 
 
 def test_the_uncertain_are_left_out_one_by_one_the_worst_first() -> None:
-    # Standard deviations in ordinary sizes: 1/sigma.
+    # Standard deviations in typical scales: 1/sigma.
     columns = np.diag([100.0, 0.5, 0.2]) / 0.01
     found = minimal_set(columns, free("a", "b", "c"), most_uncertain=3.0)
     assert found.kept == ("a", "b")

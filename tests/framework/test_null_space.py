@@ -67,7 +67,7 @@ def test_nothing_has_no_basis() -> None:
 
 def test_amounts_are_in_the_units_people_are_shown() -> None:
     told = named(np.array([1.0, -0.5, 0.0]), ("yaw", "base", "other"), (DEG, MM, MM), 1e-4)
-    # 1 ordinary size is 0.05 rad, 0.5 of the other are 5 mm: a degree goes with 1.745 mm.
+    # 1 typical scale is 0.05 rad, 0.5 of the other are 5 mm: a degree goes with 1.745 mm.
     assert str(told) == "yaw trades with base (+1 deg with -1.75 mm)"
     assert told.names == ("yaw", "base")
 

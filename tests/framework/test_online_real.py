@@ -211,7 +211,7 @@ def test_the_window_is_refused_for_matrices(poses: Path, tmp_path: Path) -> None
 
 
 def from_nominal(batch: Calibration, experiment: Experiment, estimator: dict | None = None) -> Recalibrator:
-    """A session that knows nothing but nominal values and priors, five times the ordinary size where none is stated."""
+    """A session that knows nothing but nominal values and priors, five times the typical scale where none is stated."""
     settings = RecalibrateSettings(gating="off", model_error="white", estimator=estimator or {"type": "extended"})
     session = Recalibrator.begin(batch, settings)
     free = session.setup.space.parameters.free

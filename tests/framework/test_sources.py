@@ -377,7 +377,7 @@ def test_datagrams_are_acknowledged_to_their_sender() -> None:
             assert reply["acknowledged"] == 12 and reply["id"] == incoming.record_id
             assert reply.get("fault", "") == incoming.fault
         assert source.incoming(0.0) is None
-    with pytest.raises(InputError, match="cannot be had"):
+    with pytest.raises(InputError, match="cannot be opened"):
         Udp("127.0.0.1", source.address[1], rows())
     source.close()
     assert source.ended and source.incoming(0.0) is None

@@ -138,7 +138,7 @@ def test_it_never_waits_and_says_nothing_when_nothing_comes(listener: Listener) 
 
 def test_a_taken_port_is_refused(listener: Listener) -> None:
     port = listener.tracker.address[1]
-    with pytest.raises(DeviceRefusedError, match=f"udp:127.0.0.1:{port}.*cannot be had"):
+    with pytest.raises(DeviceRefusedError, match=f"udp:127.0.0.1:{port}.*cannot be opened"):
         DTrackTracker(DTrackSettings(port=port, host="127.0.0.1")).open(FakeClock())
 
 

@@ -60,7 +60,7 @@ def deviations(problem, records, solution):
 
 
 def with_priors(deviation_in_scales):
-    """Every free parameter with a prior of so many ordinary sizes."""
+    """Every free parameter with a prior of so many typical scales."""
 
     def change(parameters):
         return parameters.replaced(

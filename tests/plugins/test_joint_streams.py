@@ -183,7 +183,7 @@ def test_datagrams_and_a_port_that_is_taken(tmp_path):
         sender.sendto(b'{"j1": 1, "j2": 2}\n{"j1": 3, "j2": 4}', ("127.0.0.1", port))
         sender.sendto(b"x" * 65_000, ("127.0.0.1", port))
         assert [sample.angles["arm.j1"] for sample in stream.samples()] == [1, 3]
-    with pytest.raises(InputError, match="the socket cannot be had"):
+    with pytest.raises(InputError, match="the socket cannot be opened"):
         JsonLinesJoints(JsonLinesJointSettings(source=f"udp:{port}")).open(Stopped(), CHANNELS)
     stream.close()
     stream.close()

@@ -46,7 +46,7 @@ def problem_for(loaded: Experiment, dataset) -> Problem:
 
 @pytest.mark.parametrize("solver", ["ipopt", "cvxpy"])
 def test_without_noise_the_truth_comes_back(solver: str) -> None:
-    """Every parameter to 1e-6 of its ordinary size."""
+    """Every parameter to 1e-6 of its typical scale."""
     loaded = experiment(f"estimator.type={solver}")
     dataset = simulated(loaded, noise=0.0)
     problem = problem_for(loaded, dataset)

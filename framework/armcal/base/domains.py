@@ -59,7 +59,7 @@ class Domain(Protocol):
         """d retract / d delta at ``delta`` (entries x dof)."""
 
     def increment_scale(self, scale: float) -> float:
-        """The ordinary size of an increment, from that of a coordinate."""
+        """The typical scale of an increment, from that of a coordinate."""
 
     def coordinates(self, base: Array, delta: Array) -> Array:
         """Where ``delta`` leads, in the coordinates of priors and covariances (dof)."""

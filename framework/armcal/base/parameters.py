@@ -196,11 +196,11 @@ class Parameters:
         return np.array([of[block.name] for block in self.free for _ in range(block.domain.dof)])
 
     def scales(self) -> Array:
-        """The ordinary size of each coordinate."""
+        """The typical scale of each coordinate."""
         return self._per_increment({block.name: block.scale for block in self.free})
 
     def increment_scales(self) -> Array:
-        """The ordinary size of each increment."""
+        """The typical scale of each increment."""
         return self._per_increment({b.name: b.domain.increment_scale(b.scale) for b in self.free})
 
     def prior_information(self) -> Array:

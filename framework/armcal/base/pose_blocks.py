@@ -20,7 +20,7 @@ def pose_blocks(
 ) -> tuple[ParameterBlock, ...]:
     """``name_x``, ``name_y``, ``name_z`` (m) and ``name_rotation`` (unit quaternion w, x, y, z; increments in rad).
 
-    Position and rotation are blocks of their own, so that each has its unit, its ordinary size and its prior.
+    Position and rotation are blocks of their own, so that each has its unit, its typical scale and its prior.
     """
     turned = ParameterBlock(f"{name}_rotation", "rad", tuple(map(float, quaternion)), Rotation(), ANGLE_SCALE_RAD)
     placed = [scalar(f"{name}_{axis}", "m", x, LENGTH_SCALE_M) for axis, x in zip("xyz", position, strict=True)]

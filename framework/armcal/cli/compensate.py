@@ -119,11 +119,11 @@ def _tell(console: Console, file: TargetFile, assessed: Assessed, bench: Bench, 
     for cell in set_aside[:_SHOWN]:
         console.warn(f"row {cell['row']} is set aside: {cell['reason']}")
     console.out.print(
-        f"{found['had']} of {found['targets']} targets are reached, {_ARRIVES[bench.point]}: {out}",
+        f"{found['reached']} of {found['targets']} targets are reached, {_ARRIVES[bench.point]}: {out}",
         markup=False,
         soft_wrap=True,
     )
-    if found["had"]:
+    if found["reached"]:
         console.out.print(f"error {_accuracy(found)}", markup=False, soft_wrap=True)
 
 

@@ -50,7 +50,7 @@ def correction_table(
     with_table, without = (1000 * column[np.isfinite(column)] for column in table.tried.T)
     found = {
         "nodes": table.had.size,
-        "had": int(table.had.sum()),
+        "reached": int(table.had.sum()),
         "tried": len(table.tried),
         "largest_shift_mm": 1000 * float(np.nanmax(np.linalg.norm(table.shifts, axis=-1))),
         "error_mm": float(with_table.mean()) if with_table.size else None,
@@ -58,7 +58,7 @@ def correction_table(
         "nominal_error_mm": float(without.mean()) if without.size else None,
     }
     console.result({**found, "point": bench.point, "out": str(out)})
-    console.out.print(f"{found['had']} of {found['nodes']} nodes are had: {out}", markup=False, soft_wrap=True)
+    console.out.print(f"{found['reached']} of {found['nodes']} nodes are reached: {out}", markup=False, soft_wrap=True)
     if not with_table.size:
         console.warn("no cell has all its corners: nothing between the nodes could be tried")
         return

@@ -32,7 +32,7 @@ from armcal.run.pipeline import Prepared, Stopwatch, assemble
 @click.option(
     "--max-sd",
     type=click.FloatRange(min=0, min_open=True),
-    help="Leave out of the minimal set what stays more uncertain than so many ordinary sizes.",
+    help="Leave out of the minimal set what stays more uncertain than so many typical scales.",
 )
 @overrides
 @speaking
@@ -159,10 +159,10 @@ def _show(console: Console, content: dict[str, Any]) -> None:
         )
     _show_undetermined(console, content)
     hardly = [
-        f"{each['text']}: sd {each['sd_ordinary_sizes'] or np.inf:.3g} ordinary sizes"
+        f"{each['text']}: sd {each['sd_ordinary_sizes'] or np.inf:.3g} typical scales"
         for each in content["hardly_determined"]
     ]
-    _section(console, "Hardly determined (worse than an ordinary size of correction, by the declared noise):", hardly)
+    _section(console, "Hardly determined (worse than a typical scale of correction, by the declared noise):", hardly)
     pairs = [f"{each['one']} and {each['other']} ({each['correlation']:+.3f})" for each in content["correlated"]]
     _section(console, f"Correlated above {CORRELATED:g}:", pairs)
     if console.verbose:

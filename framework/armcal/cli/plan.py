@@ -158,7 +158,7 @@ def _bound_text(content: dict[str, Any]) -> str:
 
 
 def _table(parameters: list[dict[str, Any]]) -> Table:
-    """The least determined parameters, in their ordinary sizes."""
+    """The least determined parameters, in their typical scales."""
     table = Table(title="Predicted standard deviations, the largest first", title_justify="left")
     for column in ("parameter", "before", "after", "unit"):
         table.add_column(column, justify="left" if column in ("parameter", "unit") else "right")

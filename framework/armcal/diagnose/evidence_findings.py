@@ -32,7 +32,7 @@ _MM = "mm"
 def determined_finding(estimate: Estimate, alone: PriorsAlone | None, typical_mm: float | None) -> Finding:
     """What the data determines, and whether what it does not matters to the tip."""
     known = estimate.identifiability
-    test = "rank of the Jacobian in ordinary sizes"
+    test = "rank of the Jacobian in typical scales"
     if not len(known):
         text = "No parameter was free: the nominal model was judged, nothing was calibrated."
         return Finding("warning", text, test, "Free parameters: parameters.free.")

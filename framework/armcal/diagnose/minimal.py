@@ -44,7 +44,7 @@ class MinimalSet:
         kept: block names, in the order of the parameters.
         redundant: coordinates that the kept ones absorb entirely.
         left_out: coordinates that would add something, but were not wanted (too many, or too uncertain).
-        deviations: of the kept coordinates, in ordinary sizes, by the declared noise; infinite where a kept block
+        deviations: of the kept coordinates, in typical scales, by the declared noise; infinite where a kept block
             has an undetermined combination within it.
     """
 
@@ -68,7 +68,7 @@ def minimal_set(
         parameters: whose free blocks are chosen from.
         preferred: block names; those of the first group are tried first, then those of the second, and so on.
         most: no more blocks than this.
-        most_uncertain: leave out, the most uncertain first, what stays uncertain by more than so many ordinary sizes.
+        most_uncertain: leave out, the most uncertain first, what stays uncertain by more than so many typical scales.
     """
     columns = triangle * parameters.scales()
     places = _places(parameters)
@@ -147,7 +147,7 @@ def _described(
 
 
 def _deviations(columns: Array, places: dict[str, slice], kept: Sequence[str]) -> Array:
-    """Standard deviations in ordinary sizes (n) if these blocks are free; infinite where undetermined, or not kept."""
+    """Standard deviations in typical scales (n) if these blocks are free; infinite where undetermined, or not kept."""
     inside = np.concatenate([np.arange(columns.shape[1])[places[name]] for name in kept]) if kept else np.zeros(0, int)
     deviation = np.full(columns.shape[1], np.inf)
     if not len(inside):

@@ -1,8 +1,8 @@
 """Whether measured positions fit the model far better with axes or joints exchanged or reversed, or in other units.
 
-Single mix-ups are tried first; where none explains the data, the base elsewhere, then several at once. Each way of
-reading the data is given the same chance: what is left of its residuals once all free parameters have adapted to first
-order. A right reading leaves little, a wrong one cannot be mended by any parameters.
+Single exchanges and sign changes are tried first; where none explains the data, the base elsewhere, then several at
+once. Each reading of the data is given the same chance: what is left of its residuals once all free parameters have
+adapted to first order. A right reading leaves little, a wrong one cannot be mended by any parameters.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from armcal.problem.problem import FactorRecords, Problem
 from armcal.problem.rigid import rigid_fit, spread_of
 
 MUCH_BETTER = 3.0
-"""A mix-up leaves so many times less than the data as they stand."""
+"""A permutation leaves so many times less than the data as they stand."""
 FITS, MISSES = 0.1, 0.03
 """Of the spread of the positions: what a right reading leaves at most, what is worth a look."""
 _MOST_RECORDS = 300
@@ -88,7 +88,7 @@ class _Seen:
 
 @dataclass(frozen=True)
 class _Positions:
-    """Predicted positions (3 x N, m), and how the free parameters, in ordinary sizes, move them: U S V' (3N x n)."""
+    """Predicted positions (3 x N, m), and how the free parameters, in typical scales, move them: U S V' (3N x n)."""
 
     predicted: Array
     ways: Array
@@ -128,7 +128,7 @@ def _within(along: Array, sizes: Array, radius: float) -> Array:
 
 
 def find_permuted_axes(problem: Problem, records: Sequence[FactorRecords], dataset: Dataset) -> PermutedAxes | None:
-    """The first measurement whose positions, as they stand, do not fit, but do with one mix-up undone.
+    """The first measurement whose positions, as they stand, do not fit, but do with one exchange undone.
 
     ``records`` are those of the dataset, their noise as declared.
     """
@@ -238,7 +238,7 @@ def _elsewhere(straight: _Positions, measured: Array) -> tuple[_Reading, bool]:
 
 
 def _several(problem: Problem, seen: _Seen, arm: Arm, enough: float) -> Iterator[_Reading]:
-    """Signs of several joints, joints in another order, and either or one joint's mix-up beside one of axes."""
+    """Signs of several joints, joints in another order, and either or one joint's permutation beside one of axes."""
     seen = seen.thinned(_SEVERAL_RECORDS)
     straight = _positions(problem, seen, {})
     axes = [] if straight is None else _of_axes(straight, seen.measured)

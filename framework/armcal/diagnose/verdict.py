@@ -284,12 +284,12 @@ def _outliers(suspicious: Sequence[str], ids: Sequence[str], fitted: WeighedFit 
 
 
 def _next(estimate: Estimate, suggestions: Sequence[Suggestion]) -> list[Finding]:
-    """The parameter whose uncertainty is largest in its own ordinary size, and the poses that would tell most."""
+    """The parameter whose uncertainty is largest in its own typical scale, and the poses that would tell most."""
     if not estimate.names:
         return []
     scales = [b.scale for b in estimate.parameters.free for _ in range(b.size)]
     relative = np.nan_to_num(estimate.deviations / np.array(scales), nan=np.inf)
-    text = f"Least certain, in its ordinary size: {estimate.names[int(np.argmax(relative))]}."
+    text = f"Least certain, in its typical scale: {estimate.names[int(np.argmax(relative))]}."
     if not suggestions:
         return [Finding("note", text)]
     shrink = 100 * (1 - suggestions[-1].shrink)

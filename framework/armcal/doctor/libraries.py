@@ -90,7 +90,7 @@ def extra(name: str, needed: tuple[Requirement, ...], ask: Ask) -> Finding:
 
 
 def requirements() -> tuple[tuple[Requirement, ...], Mapping[str, tuple[Requirement, ...]]]:
-    """What armcal always needs, and each extra's own; what this list knows where metadata is not to be had."""
+    """What armcal always needs, and each extra's own; what this list knows where metadata is missing."""
     try:
         everything = declared()
     except metadata.PackageNotFoundError:

@@ -16,13 +16,13 @@ MOST_NAMES = 6
 
 @dataclass(frozen=True)
 class Measure:
-    """How one parameter is told: its SI unit, and its ordinary size in it."""
+    """How one parameter is told: its SI unit, and its typical scale in it."""
 
     unit: str
     scale: float
 
     def shown(self, ordinary: float) -> tuple[float, str]:
-        """So many ordinary sizes in the unit that people are shown."""
+        """So many typical scales in the unit that people are shown."""
         known = UNITS.get(self.unit)
         if known is None or known.dimension == DIMENSIONLESS:
             return ordinary * self.scale, "" if known else self.unit
@@ -35,8 +35,8 @@ class Combination:
     """A direction in parameter space.
 
     Attributes:
-        terms: (name, coefficient in ordinary sizes of the parameter), the largest first.
-        measures: one a term; empty to tell coefficients in ordinary sizes.
+        terms: (name, coefficient in typical scales of the parameter), the largest first.
+        measures: one a term; empty to tell coefficients in typical scales.
     """
 
     terms: tuple[tuple[str, float], ...]
@@ -68,7 +68,7 @@ class Combination:
 
 
 def named(vector: Array, names: Sequence[str], measures: Sequence[Measure], at_least: float) -> Combination:
-    """A vector in ordinary sizes (n) as a combination, entries below ``at_least`` times the largest left out.
+    """A vector in typical scales (n) as a combination, entries below ``at_least`` times the largest left out.
 
     The first term is positive: the vector's own sign means nothing.
     """

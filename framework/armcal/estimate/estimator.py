@@ -29,7 +29,7 @@ FEW_HELD = 2
 """Combinations under priors that are told in full: they do no harm, and more of them bury the rest."""
 SMALLEST_SPREAD = 1e-12
 AT_BOUND = 1e-6
-"""In ordinary sizes of the parameter: closer than this, a parameter lies on its bound."""
+"""In typical scales of the parameter: closer than this, a parameter lies on its bound."""
 
 CHECK_THE_DATA = (
     "Check the axes, units and frame of the measurements, the order and signs of the joints, and the start values; "
@@ -255,7 +255,7 @@ def estimate(
 
 
 def _identified_by_data(chain: Array, scales: Array, known: Identifiability) -> tuple[bool, ...]:
-    """Of each entry, whether it takes part in no undetermined combination (by more than 1e-6 of its ordinary size)."""
+    """Of each entry, whether it takes part in no undetermined combination (by more than 1e-6 of its typical scale)."""
     if not len(known.null):
         return (True,) * len(chain)
     moves = np.linalg.norm(chain @ (known.null * scales).T, axis=1)

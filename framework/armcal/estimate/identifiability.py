@@ -1,6 +1,6 @@
 """Which parameter combinations the data determines, by name.
 
-Rank is judged on the whitened Jacobian with each column scaled by the ordinary size of its parameter, by singular
+Rank is judged on the whitened Jacobian with each column scaled by the typical scale of its parameter, by singular
 values and by QR with pivoting [Golub2013]; undetermined combinations are reduced to as few parameters each as
 possible.
 """
@@ -23,7 +23,7 @@ RANK_TOLERANCE = 1e-9
 """Relative to the largest singular value: far above rounding, far below anything a real experiment determines."""
 POOR_CONDITION = 1e6
 HARDLY = 1.0
-"""A singular value below this: the declared noise leaves the combination more than its ordinary size uncertain."""
+"""A singular value below this: the declared noise leaves the combination more than its typical scale uncertain."""
 CORRELATED = 0.95
 _NEGLIGIBLE = 1e-6
 _NAMED = 1e-4
@@ -41,7 +41,7 @@ class Identifiability:
         rank: how many are determined.
         undetermined: combinations the data does not see.
         rank_by_qr: how many are determined by the diagonal of a QR decomposition with pivoting.
-        measures: how each coordinate is told; empty for coefficients in ordinary sizes.
+        measures: how each coordinate is told; empty for coefficients in typical scales.
     """
 
     names: tuple[str, ...]
@@ -63,7 +63,7 @@ class Identifiability:
 
     @property
     def null(self) -> Array:
-        """Orthonormal rows that span the undetermined combinations (in ordinary sizes)."""
+        """Orthonormal rows that span the undetermined combinations (in typical scales)."""
         return self.directions[self.rank :]
 
     @property
@@ -84,9 +84,9 @@ class Identifiability:
 
     @cached_property
     def hardly(self) -> tuple[tuple[Combination, float], ...]:
-        """Combinations that are determined, but poorly, and the standard deviation of each in ordinary sizes.
+        """Combinations that are determined, but poorly, and the standard deviation of each in typical scales.
 
-        Those that stay uncertain by more than an ordinary size, lie beyond a poor condition, or are determined by
+        Those that stay uncertain by more than a typical scale, lie beyond a poor condition, or are determined by
         one of the two rank decisions alone; the worst first.
         """
         found = []
@@ -130,7 +130,7 @@ class InverseInformation:
 
     Attributes:
         root: B (n x k) with B B' the inverse, in the k directions that data and priors determine together.
-        null: orthonormal rows, in ordinary sizes, that neither determines.
+        null: orthonormal rows, in typical scales, that neither determines.
         spent: how many of the data's numbers the fit takes up, tr J B B' J', the trace of its hat matrix: one for a
             direction that the data alone determines, none for one that its prior alone holds [Hastie2009].
     """
@@ -179,7 +179,7 @@ def correlated_pairs(
 
 
 def bound_together(parameters: Parameters) -> Callable[[str, str], bool]:
-    """Whether two entries hang together by what they are: those of one rotation, or two sockets of one plate."""
+    """Whether two entries are correlated by what they are: those of one rotation, or two sockets of one plate."""
     fewer = {block.name for block in parameters.free if block.domain.dof < block.size}
     of_groups = {block.name for block in parameters.nuisances}
 

@@ -1,6 +1,6 @@
 """Online estimators: what is believed of a problem, and how one more record changes it.
 
-Beliefs are Gaussian in scaled coordinates about an origin: each number of a block's increment in its ordinary size,
+Beliefs are Gaussian in scaled coordinates about an origin: each number of a block's increment in its typical scale,
 then the companions (drifts, a correlated model error) in their standard deviations. Scaled, a covariance keeps its
 small eigenvalues when angles stand beside compliances. [BarShalom2001]
 """

@@ -30,7 +30,7 @@ SAID: dict[Cause, str] = {
     "unknown": "whether other poses would tell could not be found out",
 }
 _AWAY = 0.1
-"""How far from the values at hand a point lies where the rank is taken, in ordinary sizes."""
+"""How far from the values at hand a point lies where the rank is taken, in typical scales."""
 _HARDLY_AWAY = 1e-3
 """And one where undetermined directions are taken: they turn along with the values."""
 _BEYOND = 0.7
@@ -94,7 +94,7 @@ def held_by_nothing(parameters: Parameters, known: Identifiability) -> tuple[Com
 
 
 def nearby(parameters: Parameters, values: Array, away: float = _AWAY, seed: int = 0) -> Array:
-    """A value vector so many ordinary sizes away, within bounds."""
+    """A value vector so many typical scales away, within bounds."""
     random = np.random.default_rng(seed)
     at, scale = parameters.local(values), parameters.increment_scales()
     lower, upper = parameters.increment_bounds()
@@ -160,7 +160,7 @@ def _nested(problem: Problem, values: Array, records: Sequence[FactorRecords], n
 
 
 def _scaled(problem: Problem, values: Array, poses: Sequence[FactorRecords]) -> Array:
-    """R by coordinates in ordinary sizes, at zero residual, of the poses that can be taken up."""
+    """R by coordinates in typical scales, at zero residual, of the poses that can be taken up."""
     fitting = projected(problem, values, poses)
     can = fits(problem, values, fitting)
     weighed = []

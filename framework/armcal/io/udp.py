@@ -34,7 +34,7 @@ def listening(host: str, port: int, senders: Sequence[str]) -> tuple[socket.sock
     ``senders`` are the addresses whose datagrams are taken, or ``any``; those of this machine by default.
 
     Raises:
-        InputError: the port cannot be had, or other machines reach it and no sender is named.
+        InputError: the port cannot be opened, or other machines reach it and no sender is named.
     """
     known = None if tuple(senders) == (ANYBODY,) else _addresses(senders)
     opened = bound(host, port)
@@ -76,7 +76,7 @@ def bound(host: str, port: int) -> socket.socket:
     """A socket that does not block.
 
     Raises:
-        InputError: the port cannot be had.
+        InputError: the port cannot be opened.
     """
     where = Location(f"udp:{host}:{port}")
     try:
@@ -89,6 +89,6 @@ def bound(host: str, port: int) -> socket.socket:
             raise
     except (OSError, UnicodeError) as fault:
         hint = "Give a free port, and an address of this machine."
-        raise InputError(f"the socket cannot be had ({fault}).", where=where, hint=hint) from fault
+        raise InputError(f"the socket cannot be opened ({fault}).", where=where, hint=hint) from fault
     found.setblocking(False)
     return found

@@ -17,7 +17,7 @@ Mask = NDArray[np.bool_]
 
 
 def set_aside_not_finite(dataset: Dataset, layout: Layout) -> Dataset:
-    """Set aside records with an infinite value, and those from which nothing can be had.
+    """Set aside records with an infinite value, and those from which nothing can be read.
 
     A missing value (NaN) in a channel that no measurement owns costs the record. One in a channel of measurements
     (``Layout.parts``) costs it only if no measurement has all it needs; else those that lack something are left out

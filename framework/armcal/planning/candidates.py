@@ -17,7 +17,7 @@ from armcal.problem.projection import as_predicted
 
 Indices = NDArray[np.intp]
 RIDGE = 1e-9
-"""Information in ordinary sizes that stands in for what nothing determines yet, relative to the candidates' mean:
+"""Information in typical scales that stands in for what nothing determines yet, relative to the candidates' mean:
 below what any real measurement tells, far above rounding."""
 _ROWS_AT_ONCE = 8192
 _SEEN = 1e-9
@@ -26,7 +26,7 @@ _TAKES_PART = 1e-6
 
 @dataclass(frozen=True)
 class Candidates:
-    """Candidates by coordinates in ordinary sizes, at one value vector or at several draws of it.
+    """Candidates by coordinates in typical scales, at one value vector or at several draws of it.
 
     Attributes:
         base: what is known before, as R with R'R the information (draws x rows x n).
@@ -102,7 +102,7 @@ def deviations(triangle: Array) -> Array:
 
 
 def whitened_rows(problem: Problem, values: Array, dataset: Dataset) -> Array:
-    """Whitened Jacobians by coordinates in ordinary sizes, all factors stacked (n_r x N x n).
+    """Whitened Jacobians by coordinates in typical scales, all factors stacked (n_r x N x n).
 
     Of poses that are only thought of nothing was measured: what the model predicts stands in for it.
     """

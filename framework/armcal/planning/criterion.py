@@ -2,7 +2,7 @@
 
 ``D`` maximises the determinant, ``A`` minimises the mean variance, ``E`` maximises the information of the
 least determined direction [Pukelsheim2006]; ``O1`` to ``O5`` are the observability indices [Sun2008]. The
-information is by coordinates in their ordinary sizes, so that metres and radians can be compared.
+information is by coordinates in their typical scales, so that metres and radians can be compared.
 """
 
 from __future__ import annotations

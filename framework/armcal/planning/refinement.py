@@ -28,7 +28,7 @@ def refine(
     Args:
         poses: the plan (joints x N; rad or m).
         limits: of each joint (joints x 2).
-        known: information before the plan, by coordinates in ordinary sizes (draws x n x n).
+        known: information before the plan, by coordinates in typical scales (draws x n x n).
         by: what is to grow.
         rows: Jacobians of poses.
         allowed: clearance.

@@ -1,4 +1,4 @@
-"""Residuals that hang together across records, because a drift moves them together.
+"""Residuals that are correlated across records, because a drift moves them together.
 
 What drifts are states of unit variance along a chain of nodes (the places of the records); each forgets from node to
 node by itself (Ornstein-Uhlenbeck). With A, the whitened residuals by the states at their nodes, and K, the covariance

@@ -18,7 +18,7 @@ def with_joint_noise(problem: Problem, records: Sequence[FactorRecords], values:
 
     The covariance of a residual is its own plus S diag(sd^2) S', with S its derivative by the joints at these values,
     those of the other record where a measurement lies between two. Records that name the same other one share its
-    noise; that they hang together is left out.
+    noise; that they are correlated is left out.
 
     Raises:
         NotConvergedError: a record has no elastic equilibrium at these values.

@@ -1,7 +1,7 @@
 """A problem as solvers see it: residuals and priors over scaled increments from the nominal values.
 
-A solver of smooth problems moves ``x`` (n), increments in their ordinary sizes. A cone solver moves ``c`` (n),
-coordinates in their ordinary sizes, in which priors are quadratic and a semidefinite block is a cone.
+A solver of smooth problems moves ``x`` (n), increments in their typical scales. A cone solver moves ``c`` (n),
+coordinates in their typical scales, in which priors are quadratic and a semidefinite block is a cone.
 """
 
 from __future__ import annotations

@@ -211,7 +211,7 @@ class Problem:
     def normal_equations(self, values: Array, records: Sequence[FactorRecords]) -> NormalEquations:
         """Cost, gradient and Gauss-Newton Hessian, accumulated in blocks: memory does not grow with the records.
 
-        But where they hang together, all are made independent at once.
+        But where they are correlated, all are made independent at once.
         """
         blocks = [_block_sums(*block) for block in self._independent_blocks(values, records)]
         entries = len(self.parameters.free_entries)
@@ -236,7 +236,7 @@ class Problem:
     def exact_hessian(self, values: Array, records: Sequence[FactorRecords]) -> Array:
         """The Hessian of ``cost`` by free canonical entries with the curvature of the residuals (n x n).
 
-        Of records that hang together the Gauss-Newton one: their curvature would couple all of them. Nor has it the
+        Of records that are correlated the Gauss-Newton one: their curvature would couple all of them. Nor has it the
         curvature of groups' means, where these weigh more than their records say.
         """
         if correlation_of(records) is not None:
@@ -304,7 +304,7 @@ class Problem:
         return {entry: i for i, entry in enumerate(self.parameters.free_entries)}
 
     def _independent_blocks(self, values: Array, records: Sequence[FactorRecords]) -> Iterator[tuple[Array, Array]]:
-        """Blocks whose rows are independent: as they are, or made so where records hang together."""
+        """Blocks whose rows are independent: as they are, or made so where records are correlated."""
         shared = correlation_of(records)
         if shared is None:
             yield from self._blocks(values, records)

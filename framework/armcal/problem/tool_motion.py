@@ -13,7 +13,7 @@ _STEP = 1e-4
 
 
 def along(problem: Problem, values: Array, poses: Sequence[FactorRecords], direction: Array) -> Array:
-    """How tools move along a direction of the parameters in ordinary sizes (tools x 3 x N), by differences."""
+    """How tools move along a direction of the parameters in typical scales (tools x 3 x N), by differences."""
     parameters = problem.parameters
     here = parameters.coordinates(parameters.local(values))
     step = _STEP * direction * parameters.scales()

@@ -153,7 +153,7 @@ def singular_values(known: Identifiability) -> Figure | None:
     low, high = 10.0 ** math.floor(math.log10(low) - 0.01), 10.0 ** math.ceil(math.log10(largest) + 0.01)
     smallest = significant(float(values.min()))
     said = f"{plural(len(values), 'singular value')} from {significant(largest)} down to {smallest}."
-    caption = "How sharply the data sees each combination of parameters, in ordinary sizes of each."
+    caption = "How sharply the data sees each combination of parameters, in typical scales of each."
     if known.rank < len(values):
         caption += f" Hollow: the {plural(len(values) - known.rank, 'combination')} that it does not see."
 

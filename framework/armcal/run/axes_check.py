@@ -16,7 +16,7 @@ _MEND = {
 
 
 def check_permuted_axes(problem: Problem, records: Sequence[FactorRecords], dataset: Dataset) -> None:
-    """Positions that do not fit the model, but do once one mix-up is undone.
+    """Positions that do not fit the model, but do once one exchange is undone.
 
     Raises:
         DataError: they are such; it names what looks mixed up.

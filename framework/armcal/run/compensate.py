@@ -180,14 +180,14 @@ def _radii(calibration: Calibration, compensator: Compensator, targets: Targets,
 
 
 def summary(assessed: Assessed) -> Mapping[str, float | int | None]:
-    """In mm, over the targets that are had."""
+    """In mm, over the targets that are reached."""
     had = assessed.commands.found
     away = 1000 * assessed.commands.distances[had]
     nominal = 1000 * assessed.nominal_distances[had & np.isfinite(assessed.nominal_distances)]
     radii = None if assessed.radii is None else 1000 * assessed.radii[had]
     return {
         "targets": len(had),
-        "had": int(had.sum()),
+        "reached": int(had.sum()),
         "error_mm": float(away.mean()) if away.size else None,
         "largest_error_mm": float(away.max()) if away.size else None,
         "nominal_error_mm": float(nominal.mean()) if nominal.size else None,

@@ -68,10 +68,10 @@ class CorrectionTable:
 
     Attributes:
         axes: the nodes' coordinates along x, y and z (m).
-        had: whether a node's pose can be had (grid).
-        shifts: what to add to a position (grid x 3; m); nan where the pose cannot be had.
+        had: whether a node's pose can be reached (grid).
+        shifts: what to add to a position (grid x 3; m); nan where the pose cannot be reached.
         turns: by what to turn a rotation, a rotation vector in the base frame (grid x 3; rad).
-        tried: errors at random points between nodes that can be had: with the table, and without it (N x 2; m).
+        tried: errors at random points between nodes that can be reached: with the table, and without it (N x 2; m).
     """
 
     axes: tuple[Array, Array, Array]
@@ -95,7 +95,7 @@ def correction_table(compensator: Compensator, nominal: Compensator, settings: T
 
     Raises:
         ConfigError: the arm has too few joints to keep a rotation.
-        ProblemError: no node can be had.
+        ProblemError: no node can be reached.
     """
     if len(compensator.joints) < 6:
         raise ConfigError(
@@ -107,7 +107,7 @@ def correction_table(compensator: Compensator, nominal: Compensator, settings: T
     nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     commands = over_grid(compensator, _targets(compensator, nodes, settings), settings.nodes)
     if not commands.found.any():
-        raise ProblemError("no node of the grid can be had.", hint="Move the grid, or change the rotation.")
+        raise ProblemError("no node of the grid can be reached.", hint="Move the grid, or change the rotation.")
     told = nominal.forward(commands.joint_angles)
     shape = settings.nodes
     nothing = np.where(commands.found, 1.0, np.nan)[:, None]
@@ -142,7 +142,7 @@ def write_table(path: Path, table: CorrectionTable) -> None:
 def _tried(
     compensator: Compensator, nominal: Compensator, settings: TableSettings, table: CorrectionTable, starts: Array
 ) -> CorrectionTable:
-    """The table, tried at random points of cells whose corners can all be had."""
+    """The table, tried at random points of cells whose corners can all be reached."""
     random = np.random.default_rng(settings.seed)
     points = random.uniform(settings.low, settings.high, (settings.tried, 3))
     shift, turn, near = (_between(table.axes, grid)(points) for grid in (table.shifts, table.turns, starts))

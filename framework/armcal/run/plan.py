@@ -59,7 +59,7 @@ class PlanResult:
         given: how many records were there before.
         equations: how many residual numbers the plan and the records before give.
         value: of the criterion.
-        log_det: log determinant of the information by coordinates in their ordinary sizes, at the nominal values.
+        log_det: log determinant of the information by coordinates in their typical scales, at the nominal values.
         certificate: None where the goal has none.
         observability: O1 to O5, of plan, records before and priors.
         names: of the coordinates.

@@ -26,7 +26,7 @@ class PlanContext:
     """What all steps of one plan stand on.
 
     Attributes:
-        priors: as rows of information by coordinates in ordinary sizes.
+        priors: as rows of information by coordinates in typical scales.
         draws: the value vectors at which information is taken.
         base: priors and given records at each draw, as R with R'R their information.
     """

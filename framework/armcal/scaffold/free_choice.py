@@ -12,7 +12,7 @@ from armcal.run.pipeline import Stopwatch, assemble
 from armcal.scaffold.robot import Robot
 
 MOST_UNCERTAIN = 0.5
-"""In ordinary sizes: what the declared noise leaves less certain than this is held."""
+"""In typical scales: what the declared noise leaves less certain than this is held."""
 
 
 @dataclass(frozen=True)

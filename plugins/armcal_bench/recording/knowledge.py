@@ -97,7 +97,7 @@ def explained(
     lines = [str(undetermined) for undetermined in explain(problem, values, training, known)]
     if scale_is_unseen(problem, values, training, known):
         lines.insert(0, f"{UNSEEN_SCALE}; {GIVE_A_LENGTH}")
-    hardly = [f"{combination}: hardly determined (sd {sd:.2g} ordinary sizes)" for combination, sd in known.hardly]
+    hardly = [f"{combination}: hardly determined (sd {sd:.2g} typical scales)" for combination, sd in known.hardly]
     return (*lines, *hardly)
 
 

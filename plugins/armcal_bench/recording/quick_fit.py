@@ -1,6 +1,6 @@
 """A quick fit of the postures so far, whatever they determine, and what it says of a posture that it did not see.
 
-Where postures do not tell, weak priors of an ordinary size about the nominal values do: an unknown that is not
+Where postures do not tell, weak priors of a typical scale about the nominal values do: an unknown that is not
 determined yet makes the expected error large, not the answer impossible.
 """
 

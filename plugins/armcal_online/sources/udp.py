@@ -30,7 +30,7 @@ class Udp(Source):
     no reply; of the first of them there is a fault.
 
     Raises:
-        InputError: the port cannot be had, or other machines reach it and no sender is named.
+        InputError: the port cannot be opened, or other machines reach it and no sender is named.
     """
 
     keeps_records = False

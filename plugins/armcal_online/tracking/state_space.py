@@ -26,7 +26,7 @@ class StateSpace:
 
     @cached_property
     def scales(self) -> Array:
-        """The ordinary size of each coordinate (n)."""
+        """The typical scale of each coordinate (n)."""
         return self.parameters.scales()
 
     @cached_property

@@ -28,7 +28,7 @@ class Datagrams(Transport):
     """Serves a port of the loopback address; what is lost on the way, or comes when too much waits, is asked again.
 
     Raises:
-        InputError: the port cannot be had.
+        InputError: the port cannot be opened.
     """
 
     ended = False

@@ -42,7 +42,7 @@ class Solutions:
         states: n_d x N.
         distances: what is left (m).
         turns: what is left (rad).
-        there: whether it is had.
+        there: whether it is reached.
         forbidden: of those that are not had, whether only clearance forbids it.
     """
 
@@ -179,7 +179,7 @@ class Finder:
         return found
 
     def towards(self, record: Array, target: Array, preferred: Array, found: Solutions) -> None:
-        """As near to wished commands (n x N) as the targets allow, in place; only those that are had."""
+        """As near to wished commands (n x N) as the targets allow, in place; only those that are reached."""
         at = np.flatnonzero(found.there)
         goal = Goal(
             _at(record, found.commands)[:, at], found.states[:, at], target[:, at], preferred[:, at], self._held
@@ -245,7 +245,7 @@ class Finder:
         found.put(todo[closer], attempt, near[closer])
 
     def _nearest(self, record: Array, target: Array, lost: Rows, found: Solutions, start: Array | None) -> None:
-        """Of targets that cannot be had, the commands that come nearest."""
+        """Of targets that cannot be reached, the commands that come nearest."""
         wide = min(_NEAREST_STARTS, self._seeds.commands.shape[1] - 1)
         for todo in _chunks(lost, wide + 1):
             picks = self._picked(target[:, todo], 0, wide)

@@ -94,7 +94,7 @@ class Near:
 
 
 QUICK = Manner(damping=1e-2, patience=5, steps=40)
-"""To a target that can be had."""
+"""To a target that can be reached."""
 NEAREST = Manner(damping=1.0, patience=25, steps=100)
 """To the nearest where it cannot: what is left must not throw the arm about."""
 

@@ -1,4 +1,4 @@
-"""Commands over a grid of targets in one posture: outward from its middle, each node from a neighbour that is had."""
+"""Commands over a grid of targets in one posture: outward from its middle, node by reached neighbour."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def over_grid(compensator: Compensator, targets: Targets, shape: Sequence[int]) 
 
 
 def _outward(compensator: Compensator, targets: Targets, shape: tuple[int, ...], begin: int, posture: Array) -> Array:
-    """Commands (N x n) of the nodes that can be had from a beginning, nan elsewhere."""
+    """Commands (N x n) of the nodes that can be reached from a beginning, nan elsewhere."""
     commands = np.full((len(targets), len(compensator.joints)), np.nan)
     commands[begin] = posture
     tried: set[tuple[int, int]] = set()
@@ -47,7 +47,7 @@ def _outward(compensator: Compensator, targets: Targets, shape: tuple[int, ...],
 
 
 def _edge(had: Mask, tried: set[tuple[int, int]]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Nodes beside such as are had, each with one neighbour that it was not yet tried from."""
+    """Nodes beside such as are reached, each with one neighbour that it was not yet tried from."""
     index = np.arange(had.size).reshape(had.shape)
     pairs: dict[int, int] = {}
     for axis in range(had.ndim):

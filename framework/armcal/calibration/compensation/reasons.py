@@ -1,4 +1,4 @@
-"""Why a target cannot be had, in a sentence."""
+"""Why a target cannot be reached, in a sentence."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ def why_not(
         commands: the nearest ones (n x N).
         targets: what was asked.
         found: what was found.
-        had: which are had.
+        had: which are reached.
         bounds: how near the arm can come at most (N; m).
-        position_can_be_had: from targets' rows to whether their positions can be had with any rotation.
+        position_can_be_had: from targets' rows to whether their positions can be reached with any rotation.
     """
     lost = np.flatnonzero(~had)
     turned = np.zeros(len(had), dtype=bool)
@@ -62,5 +62,5 @@ def _sentence(
     ]
     at_limits = f"; the nearest has {', '.join(held)} at the limit" if held else ""
     if turned:
-        return f"the position can be had, not with this rotation{at_limits}"
+        return f"the position can be reached, but not with this rotation{at_limits}"
     return f"no command was found that reaches it{at_limits}"

@@ -71,14 +71,14 @@ class Commands:
 
     Attributes:
         joints: the commanded joints (n).
-        joint_angles: what to command (N x n; rad, or m on sliding joints); of a target that cannot be had, the
+        joint_angles: what to command (N x n; rad, or m on sliding joints); of a target that cannot be reached, the
             nearest that was found.
         counts: what a servo board is told (N x n; 0 of joints without a pulse table); None for an arm without one.
         base_T_tool: where the calibrated arm then is (N x 4 x 4), quantisation and elasticity included.
         distances: from there to the target (N; m).
         turns: from there to the target's rotation (N; rad); zeros where only positions count.
-        found: whether the target is had, up to what the counts leave (N).
-        reasons: why not; empty for those that are had (N).
+        found: whether the target is reached, up to what the counts leave (N).
+        reasons: why not; empty for those that are reached (N).
         bounds: no command brings the arm nearer than this (N; m); zero where nothing is known.
         moves: along a path, of each joint from the target before (N x n; rad or m); None for single targets.
         approach: from where each joint comes (N x n; -1, 0, 1), as far as that was told or follows from the path.
