@@ -18,7 +18,7 @@ from armcal.calibration.compensation.request import Commands, Options, Targets
 from armcal.calibration.tool_expression import arm_expression
 from armcal.config.selection import with_values
 from armcal.config.yaml_source import load_config
-from armcal.problem.kernel import EvaluatorChoice
+from armcal.functions.batch_function import EvaluatorChoice
 from armcal.run.experiment import Experiment
 
 from benchmarks.lrm import CONFIGS

@@ -17,8 +17,8 @@ from armcal.calibration.exporter import ExportRequest, rigid_tools
 from armcal.calibration.rigid_chain import numeric_chain
 from armcal.config.selection import with_values
 from armcal.config.yaml_source import load_config
+from armcal.functions.compiler import find_compiler
 from armcal.plugins import discover
-from armcal.problem.compiler import find_compiler
 from armcal.run.experiment import Experiment
 
 from benchmarks.pinocchio_loop import compiled

@@ -7,7 +7,7 @@ from functools import partial
 
 import numpy as np
 from armcal.base.domains import Array
-from armcal.problem.kernel import EvaluatorChoice
+from armcal.functions.batch_function import EvaluatorChoice
 from armcal.problem.problem import Problem
 from scipy.optimize import least_squares
 

@@ -13,7 +13,7 @@ from armcal.config.selection import with_values
 from armcal.config.yaml_source import load_config
 from armcal.estimate.estimator import Solution
 from armcal.estimate.simulation import SimulationRequest
-from armcal.problem.kernel import EvaluatorChoice
+from armcal.functions.batch_function import EvaluatorChoice
 from armcal.problem.problem import Problem
 from armcal.run.experiment import Experiment
 

@@ -13,7 +13,8 @@ from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.base.parameters import Parameters
 from armcal.estimate.online import Gaussian
-from armcal.problem.kernel import NEAR_REST_RAD, EvaluatorChoice
+from armcal.functions.batch_function import EvaluatorChoice
+from armcal.problem.kernel import NEAR_REST_RAD
 from armcal.problem.problem import Problem
 from armcal.run.experiment import Experiment
 from armcal_kalman.extended import ExtendedFilter, ExtendedSettings

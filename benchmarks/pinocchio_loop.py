@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 from armcal.base.domains import Array
-from armcal.problem.compiler import cache_directory
+from armcal.functions.compiler import cache_directory
 
 SOURCE, ARM = (Path(__file__).with_name(name) for name in ("pinocchio_loop.cpp", "pinocchio_arm.hpp"))
 FLAGS = [

@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
+from armcal.functions.batch_function import EvaluatorChoice
 from armcal.planning.bound import bounded
 from armcal.planning.candidates import Candidates, Indices, whitened_rows
 from armcal.planning.criterion import criterion
 from armcal.planning.planning import Plan, choose, detmax, value_of
 from armcal.planning.relaxation import Task
-from armcal.problem.kernel import EvaluatorChoice
 from armcal.problem.problem import Problem
 from armcal.run.experiment import Experiment
 

@@ -83,7 +83,7 @@ def _call(command: Sequence[str], environment: Mapping[str, str] | None = None) 
 
 def _settle(cache: Path | None = None) -> None:
     """Wait until no compiler works in the background."""
-    from armcal.problem.compiler import cache_directory
+    from armcal.functions.compiler import cache_directory
 
     directory = cache or cache_directory()
     until = time.monotonic() + _COMPILER_LIMIT_S

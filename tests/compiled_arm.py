@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 from armcal.calibration.exporter import Exported, ExportRequest
-from armcal.problem.compiler import find_compiler
+from armcal.functions.compiler import find_compiler
 from armcal_export.c_code import CExporter, CExportSettings
 
 FLAGS = ["-std=c99", "-O0", "-Wall", "-Wextra", "-Werror", "-pedantic"]

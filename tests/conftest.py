@@ -61,7 +61,7 @@ def _own_cache(of_this_run: Path) -> Iterator[None]:
 @pytest.fixture(scope="session", autouse=True)
 def _no_compiling_for_later() -> Iterator[None]:
     """Where a command goes on with the interpreter, none compiles for a next run that would have it by chance."""
-    from armcal.problem import compiler
+    from armcal.functions import compiler
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(compiler, "compile_in_background", lambda *given: None)

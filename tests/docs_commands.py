@@ -276,8 +276,8 @@ def _send_outcome(page: Path, pipe: Connection) -> None:
 def load_everything() -> None:
     """What each command would load anew; none compiles for a next run, which would be no page's."""
     import matplotlib.pyplot  # noqa: F401
+    from armcal.functions import compiler
     from armcal.plugins import discover
-    from armcal.problem import compiler
     from armcal.report import page  # noqa: F401
     from armcal.run import pipeline  # noqa: F401
 

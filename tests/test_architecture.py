@@ -17,6 +17,7 @@ ROOMS = (
     ("version", "errors", "hooks", "hook_trace", "plugin_files", "registration", "plugins"),
     ("base",),
     ("io",),
+    ("functions",),
     ("arm",),
     ("measure",),
     ("config",),

@@ -82,7 +82,7 @@ def test_the_wheel_holds_every_file_of_the_sources_and_nothing_else(tree: Path, 
         names = {name for name in wheel.namelist() if ".dist-info/" not in name}
     assert names == held_by(tree)
     needed = {
-        "armcal/problem/kernel_support.h",
+        "armcal/functions/kernel_support.h",
         "armcal/calibration/compensation/search_loop.h",
         "armcal/testing/truth.yaml",
         "armcal/report/template.html.j2",

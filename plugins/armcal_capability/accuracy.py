@@ -10,9 +10,9 @@ from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.calibration.calibration import Calibration
 from armcal.calibration.compensation.equilibrium import Equilibrium
+from armcal.functions.batch_function import EvaluatorChoice
 from armcal.measure.contact import ArmsAlone
 from armcal.measure.measurement import residual_dimensions
-from armcal.problem.kernel import EvaluatorChoice
 from armcal.problem.problem import Problem
 
 from armcal_capability.quantities import AT_ONCE, Postures

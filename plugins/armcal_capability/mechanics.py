@@ -12,8 +12,7 @@ from armcal.base.domains import Array
 from armcal.base.se3 import Expression
 from armcal.calibration.compensation.equilibrium import Equilibrium
 from armcal.calibration.tool_expression import ToolExpression
-from armcal.problem.batch_function import BatchFunction
-from armcal.problem.kernel import EvaluatorChoice
+from armcal.functions.batch_function import BatchFunction, EvaluatorChoice
 
 from armcal_capability.settings import LoadSettings
 

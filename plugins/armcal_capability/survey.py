@@ -11,7 +11,7 @@ from armcal.arm.model import forward
 from armcal.base.domains import Array
 from armcal.errors import ProblemError
 from armcal.estimate.estimator import Progress, no_progress
-from armcal.problem.kernel import EvaluatorChoice
+from armcal.functions.batch_function import EvaluatorChoice
 
 from armcal_capability.accuracy import Unexplained, unexplained, with_accuracy
 from armcal_capability.areas import AreaMap, AreaSearch

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from armcal.errors import ProblemError
-from armcal.problem.compiler import find_compiler
+from armcal.functions.compiler import find_compiler
 
 FLAGS = ("-std=c99", "-O1", "-Wall", "-Wextra", "-Werror", "-pedantic")
 _LIMIT_S = 300

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
+from armcal.arm.equilibrium import lowest
 from armcal.base.domains import Array
 from armcal.calibration.exporter import random_commands
 from armcal.calibration.tool_expression import ToolExpression
 from armcal.errors import NotConvergedError
-from armcal.problem.stability import lowest
 
 AT_REST = 1e-14
 """rad or m; rounding leaves about as much."""

@@ -16,9 +16,9 @@ from armcal.calibration.compensation.request import Redundancy
 from armcal.calibration.measured_point import Point
 from armcal.cli.common import Console, accept, point, speaking
 from armcal.errors import InputError
+from armcal.functions.batch_function import EvaluatorChoice
 from armcal.io.signals import Signals
 from armcal.io.standard_output import StandardOutput
-from armcal.problem.kernel import EvaluatorChoice
 
 from armcal_serve.server import Opening, Server
 from armcal_serve.transports.datagrams import Datagrams

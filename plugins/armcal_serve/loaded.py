@@ -17,7 +17,7 @@ from armcal.calibration.calibration_file import lost_calibration
 from armcal.calibration.compensation.request import Options, Redundancy
 from armcal.calibration.measured_point import Point
 from armcal.errors import ArmcalError, ConfigError, InputError, Location
-from armcal.problem.kernel import EvaluatorChoice
+from armcal.functions.batch_function import EvaluatorChoice
 
 from armcal_serve.answering import Answerer
 from armcal_serve.protocol import CalibrationTag

@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 from armcal.base.domains import Array
 from armcal.errors import NotConvergedError
-from armcal.problem.kernel import direct_access
+from armcal.functions.interpreted import BoundFunction
 
 from armcal_simulation.elastic_pose import ElasticPose
 from armcal_simulation.servo_heat import HeatPath, ServoHeat
@@ -39,16 +39,13 @@ class Torques:
     """Holding torques (joints, N m) of a rigid arm at joint angles (joints, rad), warm."""
 
     def __init__(self, function: ca.Function) -> None:
-        self._buffer, self._evaluate = direct_access(function)
-        self._given, self._taken = np.zeros(function.numel_in(0)), np.zeros(function.numel_out(0))
-        self._buffer.set_arg(0, self._given.data)
-        self._buffer.set_res(0, self._taken.data)
+        self._function = BoundFunction(function)
 
     def __call__(self, angles: Sequence[float]) -> list[float]:
         """See above."""
-        self._given[:] = angles
-        self._evaluate()
-        return [float(torque) for torque in self._taken]
+        self._function.inputs[0][:] = angles
+        self._function.evaluate()
+        return [float(torque) for torque in self._function.outputs[0][0]]
 
 
 class BenchPhysics:

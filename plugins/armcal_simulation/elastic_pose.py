@@ -9,15 +9,15 @@ import casadi as ca
 import numpy as np
 from armcal.arm.assembly import Arm, ArmInputs, ArmState
 from armcal.arm.environment import STATICS, Environment
+from armcal.arm.equilibrium import MOST_PASSES
 from armcal.arm.statics import Load
 from armcal.base import se3
 from armcal.base.domains import Array
 from armcal.base.parameters import Parameters
 from armcal.base.pose_blocks import rotation_of
 from armcal.errors import ConfigError, NotConvergedError
+from armcal.functions.interpreted import BoundFunction
 from armcal.measure.measurement import Measurement
-from armcal.problem.kernel import direct_access
-from armcal.problem.stability import MOST_PASSES
 
 REST_RAD = 1e-8
 """A spring that moves less in a pass is at rest: far below what a tracker sees."""
@@ -49,16 +49,7 @@ class ElasticPose:
                 f"effects of {arm.name} ask for {', '.join(arm.conditions)}, which a bench does not simulate.",
                 hint="Name them under bench.simulator.without_effects.",
             )
-        function = _function(tracked)
-        self._buffer, self._evaluate = direct_access(function)
-        self._given = [np.zeros(function.numel_in(i)) for i in range(3)]
-        self._taken = [np.zeros(function.numel_out(i)) for i in range(2)]
-        for place, array in enumerate(self._given):
-            if array.size:
-                self._buffer.set_arg(place, array.data)
-        for place, array in enumerate(self._taken):
-            if array.size:
-                self._buffer.set_res(place, array.data)
+        self._function = BoundFunction(_function(tracked))
 
     def __call__(self, joint_angles: Array, approaches: Array) -> Array:
         """The pose (4x4, m) at joint angles (joints, rad) that were reached from these sides (-1, 0, 1).
@@ -66,11 +57,11 @@ class ElasticPose:
         Raises:
             NotConvergedError: the springs do not hold the arm there.
         """
-        commands, approach, state = self._given
-        following, shown = self._taken
+        commands, approach, state = (array[0] for array in self._function.inputs)
+        following, shown = (array[0] for array in self._function.outputs)
         commands[:], approach[:] = joint_angles, approaches
         for _ in range(MOST_PASSES):
-            self._evaluate()
+            self._function.evaluate()
             moved = (following - state).tolist()
             state[:] = following
             if all(-REST_RAD <= step <= REST_RAD for step in moved):

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import casadi as ca
 import numpy as np
+from armcal.arm.equilibrium import MOST_PASSES, REST_RAD
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.errors import NotConvergedError
 from armcal.estimate.simulation import SimulationRequest
 from armcal.problem.factor import Factor
 from armcal.problem.problem import Problem
-from armcal.problem.stability import MOST_PASSES, REST_RAD
 
 _BLOCK = 256
 

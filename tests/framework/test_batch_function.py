@@ -5,8 +5,8 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 import pytest
-from armcal.problem import batch_function, c_source, compiler
-from armcal.problem.batch_function import BatchFunction
+from armcal.functions import batch_function, c_source, compiler
+from armcal.functions.batch_function import BatchFunction
 
 needs_a_compiler = pytest.mark.skipif(compiler.find_compiler() is None, reason="no C compiler is here")
 

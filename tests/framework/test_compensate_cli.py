@@ -32,7 +32,7 @@ NODES = (3, 3, 3)
 @pytest.fixture(autouse=True)
 def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing is compiled, not even behind the scenes."""
-    monkeypatch.setattr("armcal.problem.compiler.find_compiler", lambda: None)
+    monkeypatch.setattr("armcal.functions.compiler.find_compiler", lambda: None)
 
 
 def armcal(*arguments: object) -> Result:

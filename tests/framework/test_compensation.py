@@ -14,7 +14,7 @@ from armcal.calibration.compensation.finder import Solutions
 from armcal.calibration.compensation.request import Commands, Options, Targets
 from armcal.calibration.compensation.seeds import Seeds
 from armcal.calibration.compensation.sides import with_sides
-from armcal.problem.compiler import find_compiler
+from armcal.functions.compiler import find_compiler
 from scipy.optimize import least_squares, minimize
 from scipy.spatial.transform import Rotation
 from small_arms import LRM_LIMITS, calibration, compensator, drawn, predicted, with_options

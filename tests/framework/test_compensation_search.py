@@ -11,8 +11,8 @@ from armcal.calibration.compensation.array_search import ArraySearch
 from armcal.calibration.compensation.compiled_search import CompiledSearch, loop_source
 from armcal.calibration.compensation.goal import NEAREST, QUICK, WISHED, Goal, Manner, Near
 from armcal.calibration.compensation.step import sample_inputs, slopes, step_function
-from armcal.problem.batch_function import BatchFunction
-from armcal.problem.compiler import find_compiler
+from armcal.functions.batch_function import BatchFunction
+from armcal.functions.compiler import find_compiler
 from small_arms import compensator, drawn
 
 pytestmark = pytest.mark.skipif(find_compiler() is None, reason="there is no C compiler")

@@ -13,7 +13,7 @@ import pytest
 from armcal.errors import DataError, InputError, ProblemError
 from armcal.estimate.estimator import Solution, SolverVerdict, estimate, require_solvable
 from armcal.estimate.nuisance import restricted, started
-from armcal.problem import compiler
+from armcal.functions import compiler
 from armcal_tracker.position import TipPosition, TipPositionSettings
 from contact_oracle import (
     BALL,

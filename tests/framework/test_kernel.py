@@ -18,7 +18,8 @@ import numpy as np
 import oracle
 import pytest
 from armcal.errors import NotConvergedError
-from armcal.problem import c_source, compiler, kernel
+from armcal.functions import c_source, compiler
+from armcal.problem import kernel
 from armcal.problem.factor import Factor
 from armcal.problem.kernel import build_kernel, kernel_source
 from armcal.problem.linearised import BLOCK_RECORDS
@@ -766,7 +767,7 @@ def test_a_miscompiled_kernel_of_the_arm_is_not_used(lrm, tmp_path, monkeypatch)
     """A compiler that gets one function wrong: the arm is evaluated by the virtual machine, with the right numbers."""
     monkeypatch.setenv("ARMCAL_CACHE_DIR", str(tmp_path))
     tmp_path.chmod(0o700)
-    whole = c_source.driver_source()
+    whole = kernel.driver_source()
     wrong = whole.replace("N_RESIDUAL * N_VALUES);", "N_RESIDUAL * N_VALUES - 1);")
     assert wrong != whole
     monkeypatch.setattr(c_source, "driver_source", lambda: wrong)

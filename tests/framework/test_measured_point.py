@@ -33,7 +33,7 @@ BODY = (
 
 @pytest.fixture(autouse=True)
 def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("armcal.problem.compiler.find_compiler", lambda: None)
+    monkeypatch.setattr("armcal.functions.compiler.find_compiler", lambda: None)
 
 
 def armcal(*arguments: object) -> Result:

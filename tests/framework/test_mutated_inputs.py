@@ -87,7 +87,7 @@ CASES = (
 def desk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder with a file of each kind, none of them at fault."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("armcal.problem.compiler.find_compiler", lambda: None)
+    monkeypatch.setattr("armcal.functions.compiler.find_compiler", lambda: None)
     written(calibration("three"), tmp_path / "calibration.yaml")
     urdf = ARM.replace(ARM.splitlines()[2].strip() + "\n", IN_URDF).replace(", q3: [-60, 60]", "")
     urdf = urdf.replace("links: {hand: {mass_g: 50, com_mm: [0, 0, 0], frame: tool}}", "links: {}")

@@ -10,8 +10,8 @@ from armcal.base.domains import Array
 from armcal.errors import NotConvergedError
 from armcal.estimate.online import normalised_innovation_squared as nis
 from armcal.estimate.online import weighed
-from armcal.problem.compiler import find_compiler
-from armcal.problem.kernel import EvaluatorChoice
+from armcal.functions.batch_function import EvaluatorChoice
+from armcal.functions.compiler import find_compiler
 from armcal.problem.one_record import OneRecord
 from armcal.problem.problem import Problem
 from armcal.run.experiment import Experiment

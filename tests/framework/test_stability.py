@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from armcal.arm.equilibrium import MOST_DEFLECTION, lowest, settle
 from armcal.calibration.calibration import Calibration
 from armcal.cli.main import cli
 from armcal.errors import NotConvergedError
-from armcal.problem.stability import MOST_DEFLECTION, lowest, settle
 from click.testing import CliRunner
 from made_calibrations import exact_calibration, written
 from scipy.optimize import brentq

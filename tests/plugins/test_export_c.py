@@ -13,7 +13,7 @@ import pytest
 from armcal.base.dataset import Dataset
 from armcal.calibration.exporter import Origin, random_commands, request_of
 from armcal.errors import ConfigError, InputError, ProblemError
-from armcal.problem.compiler import find_compiler
+from armcal.functions.compiler import find_compiler
 from armcal_export import c_code, c_expressions
 from armcal_export.c_code import CExporter, CExportSettings
 from scipy.spatial.transform import Rotation

@@ -65,7 +65,7 @@ def _evaluated(choice: Any) -> _Evaluated:
 
 def _explain() -> None:
     """Compile a file of one line to hear what the compiler says."""
-    from armcal.problem import compiler
+    from armcal.functions import compiler
 
     with tempfile.TemporaryDirectory(prefix="armcal-doctor-") as place:
         (Path(place) / "one.c").write_text("int armcal_doctor(void) { return 0; }\n", encoding="utf-8")

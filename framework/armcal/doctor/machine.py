@@ -19,14 +19,14 @@ _I2C_NAMES = ("i2c-*",)
 
 def compiler_path() -> str | None:
     """The C compiler that armcal would take."""
-    from armcal.problem.compiler import find_compiler
+    from armcal.functions.compiler import find_compiler
 
     return find_compiler()
 
 
 def cache() -> Finding:
     """Where compiled kernels are kept."""
-    from armcal.problem.compiler import cache_directory
+    from armcal.functions.compiler import cache_directory
 
     place = cache_directory()
     there = next(p for p in (place, *place.parents) if p.exists())

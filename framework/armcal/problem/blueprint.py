@@ -8,10 +8,11 @@ from dataclasses import dataclass, field, replace
 from armcal.arm.assembly import Arm
 from armcal.arm.environment import Environment
 from armcal.base.parameters import Parameters
+from armcal.functions.batch_function import EvaluatorChoice
 from armcal.measure.groups import Groups
 from armcal.measure.measurement import Measurement
 from armcal.problem.factor import build_factor
-from armcal.problem.kernel import EvaluatorChoice, Kernel, build_kernel
+from armcal.problem.kernel import Kernel, build_kernel
 
 
 @dataclass(frozen=True)

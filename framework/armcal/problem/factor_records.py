@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
+from armcal.functions.c_source import LANES
 from armcal.measure.groups import NO_GROUP
-from armcal.problem.c_source import LANES
 from armcal.problem.correlation import Correlation
 from armcal.problem.factor import Factor
 from armcal.problem.whitening import by_deviation

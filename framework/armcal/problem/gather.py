@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from armcal.base.domains import Array
 from armcal.base.parameters import Parameters
+from armcal.functions.c_source import LANES
 from armcal.measure.groups import Groups, group_name, owner_of
 from armcal.measure.measurement import GroupedMeasurement, Measurement
-from armcal.problem.c_source import LANES
 
 Indices = NDArray[np.intp]
 HELD = -1

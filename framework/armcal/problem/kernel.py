@@ -10,16 +10,14 @@ import ctypes
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import Any, Literal, NoReturn, Protocol
+from importlib import resources
+from typing import Any, NoReturn, Protocol
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from armcal.base.domains import Array
-from armcal.problem import c_source, compiler, kernel_trial
-from armcal.problem.factor import Factor
-from armcal.problem.stability import (
+from armcal.arm.equilibrium import (
     MOST_DEFLECTION,
     MOST_PASSES,
     NEAR_REST_RAD,
@@ -29,14 +27,17 @@ from armcal.problem.stability import (
     refusal,
     settle,
 )
-
-EvaluatorChoice = Literal["auto", "compiled", "interpreted"]
+from armcal.base.domains import Array
+from armcal.functions import c_source, compiler
+from armcal.functions.batch_function import EvaluatorChoice, quietly
+from armcal.functions.interpreted import InterpretedFunction
+from armcal.problem import kernel_trial
+from armcal.problem.factor import Factor
 
 AS_IT_STANDS = 1e300
 """Any state is at rest: take the one given, to which repeated passes might not lead."""
 WORTH_COMPILING_RECORDS = 5000
 """From this many records on, waiting for the compiler costs less than the virtual machine does."""
-_BLOCK, _FEW = 64, 8
 
 
 class Backend(Protocol):
@@ -63,12 +64,12 @@ class VirtualMachine:
         self._has_state = factor.state.numel() > 0
 
     @cached_property
-    def _pass(self) -> Mapped:
-        return Mapped(self._factor.pass_function())
+    def _pass(self) -> InterpretedFunction:
+        return InterpretedFunction(self._factor.pass_function(), 1)
 
     @cached_property
-    def _linearise(self) -> Mapped:
-        return Mapped(self._factor.linearise_function())
+    def _linearise(self) -> InterpretedFunction:
+        return InterpretedFunction(self._factor.linearise_function(), 1)
 
     def residuals(self, values: Array, record: Array, state: Array, residual: Array, rest: float = REST_RAD) -> int:
         """As the protocol says."""
@@ -81,61 +82,18 @@ class VirtualMachine:
         unsettled = 0
         if self._has_state:
             unsettled = self._settle(values, record, state, residual, rest)
-        following = np.empty_like(state)
-        self._linearise(values, (record, state), (following, residual, jacobian))
-        state[:] = following
+        state[:], residual[:], jacobian[:] = self._linearise(values, record, state)
         return unsettled
 
     def _settle(self, values: Array, record: Array, state: Array, residual: Array, tolerance: float) -> int:
-        following = np.empty_like(state)
         moving = np.ones(record.shape[1], dtype=bool)
         for _ in range(MOST_PASSES):
-            self._pass(values, (record, state), (following, residual))
+            following, residual[:] = self._pass(values, record, state)
             moving = ~(np.abs(following - state).max(axis=0, initial=0.0) <= tolerance)
             state[:] = following
             if not moving.any():
                 return 0
         return int(moving.sum())
-
-
-class Mapped:
-    """A CasADi function over many records, without a conversion for each number."""
-
-    def __init__(self, function: ca.Function, block: int = _BLOCK) -> None:
-        self._block, self._function = block, function.map(f"{function.name()}_block", "serial", block, [0], [])
-        self._out_sizes = [function.numel_out(i) for i in range(function.n_out())]
-        self._in_sizes = [function.numel_in(i) for i in range(1, function.n_in())]
-
-    def __call__(self, values: Array, inputs: Sequence[Array], outputs: Sequence[Array]) -> None:
-        """Fill the outputs (entries x N each) for inputs (entries x N each) and ``values``, the same for all."""
-        count = inputs[0].shape[1]
-        buffer, evaluate = direct_access(self._function)
-        given = [np.zeros((self._block, size)) for size in self._in_sizes]
-        taken = [np.zeros((self._block, size)) for size in self._out_sizes]
-        shared = np.ascontiguousarray(values)
-        for position, array in enumerate([shared, *given]):
-            if array.size:
-                buffer.set_arg(position, array.data)
-        for position, array in enumerate(taken):
-            if array.size:
-                buffer.set_res(position, array.data)
-        for start in range(0, count, self._block):
-            stop = min(start + self._block, count)
-            for block, source in zip(given, inputs, strict=True):
-                block[: stop - start] = source[:, start:stop].T
-            evaluate()
-            for block, target in zip(taken, outputs, strict=True):
-                target[:, start:stop] = self._by_rows(block[: stop - start], target.shape[0])
-
-    @staticmethod
-    def _by_rows(block: Array, rows: int) -> Array:
-        return block.reshape(len(block), rows).T
-
-
-def direct_access(function: ca.Function) -> tuple[Any, Callable[[], None]]:
-    """Direct access to a function's memory."""
-    buffer, evaluate = function.buffer()
-    return buffer, evaluate
 
 
 class Compiled:
@@ -176,12 +134,12 @@ class Kernel:
     identity: str = f"casadi {ca.CasadiMeta.version()}"
 
     @cached_property
-    def _slope(self) -> Mapped:
+    def _slope(self) -> InterpretedFunction:
         """How the next state follows the state."""
-        return Mapped(self.factor.slope_function(), _FEW)
+        return InterpretedFunction(self.factor.slope_function(), 1)
 
     @cached_property
-    def _by_channels(self) -> dict[tuple[str, ...], Mapped]:
+    def _by_channels(self) -> dict[tuple[str, ...], InterpretedFunction]:
         """Slopes by channels, once they were asked for."""
         return {}
 
@@ -202,8 +160,8 @@ class Kernel:
         if slopes.size:
             chosen = tuple(channels)
             if chosen not in self._by_channels:
-                self._by_channels[chosen] = Mapped(self.factor.channel_slope_function(chosen))
-            self._by_channels[chosen](values, (record, state), (slopes,))
+                self._by_channels[chosen] = InterpretedFunction(self.factor.channel_slope_function(chosen), 1)
+            slopes[:] = self._by_channels[chosen](values, record, state)[0]
 
     def residuals(self, values: Array, record: Array, state: Array, residual: Array) -> None:
         """Residuals in equilibrium.
@@ -268,8 +226,7 @@ class Kernel:
         """What ``settle`` asks for, of these records at their states."""
 
         def evaluate(places: NDArray[np.intp]) -> tuple[Array, Array]:
-            following, slopes = (np.empty((size, len(places))) for size in (len(state), len(state) ** 2))
-            self._slope(values, (record[:, places], state[:, places]), (following, slopes))
+            following, slopes = self._slope(values, record[:, places], state[:, places])
             return following, slopes.reshape(len(state), len(state), -1).transpose(2, 1, 0)
 
         return evaluate
@@ -287,16 +244,16 @@ class Kernel:
         self._in_equilibrium(self.factor.nuisance_function(), values, record, state, said)
 
     def _in_equilibrium(self, function: ca.Function, values: Array, record: Array, state: Array, shown: Array) -> None:
-        mapped, following, before = Mapped(function), np.empty_like(state), state.copy()
+        mapped, before = InterpretedFunction(function, 1), state.copy()
         for _ in range(MOST_PASSES):
-            mapped(values, (record, state), (following, shown))
+            following, shown[:] = mapped(values, record, state)
             moved = np.abs(following - state).max(initial=0.0)
             state[:] = following
             if moved <= REST_RAD and not _out_of_hand(state):
                 self.require_held(values, record, state)
                 return
         self._settle_by_newton(values, record, state, before)
-        mapped(values, (record, state), (following, shown))
+        _, shown[:] = mapped(values, record, state)
 
 
 def _out_of_hand(state: Array) -> bool:
@@ -313,7 +270,7 @@ def build_kernel(factor: Factor, records: int, choice: EvaluatorChoice = "auto")
     if choice == "interpreted" or compiler.find_compiler() is None:
         return Kernel(factor, machine)
     functions = (factor.pass_function(), factor.linearise_function())
-    text = "".join(f.serialize() for f in functions) + c_source.support_source() + c_source.driver_source()
+    text = "".join(f.serialize() for f in functions) + c_source.support_source() + driver_source()
     text += f"{c_source.LANES} lanes" + c_source.generator_source()
     key = compiler.library_key(text)
 
@@ -353,15 +310,12 @@ def kernel_source(factor: Factor, single_pass: ca.Function, linearise: ca.Functi
         "LINEARISE_HOISTED": two.hoisted,
     }
     defines = "".join(f"#define {name} {number}\n" for name, number in sizes.items())
-    return defines + c_source.support_source() + one.source + two.source + c_source.driver_source()
+    return defines + c_source.support_source() + one.source + two.source + driver_source()
 
 
-def quietly(build: Callable[[], ctypes.CDLL | None]) -> ctypes.CDLL | None:
-    """What was built, or None: an expression without a C form is no fault, the virtual machine serves."""
-    try:
-        return build()
-    except c_source.UnsupportedExpressionError:
-        return None
+def driver_source() -> str:
+    """The loop over records: equilibrium, residual, Jacobian."""
+    return resources.files("armcal.problem").joinpath("kernel_driver.h").read_text(encoding="utf-8")
 
 
 def _stride(array: Array) -> int:

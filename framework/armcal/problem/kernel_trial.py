@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 
 from armcal.base.domains import Array
-from armcal.problem import c_source, compiler
+from armcal.functions import c_source, compiler
 from armcal.problem.factor import Factor
 
 _AGREEMENT = 1e-12

@@ -16,6 +16,7 @@ from armcal.arm.environment import Environment
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.base.parameters import Parameters
+from armcal.functions.batch_function import EvaluatorChoice
 from armcal.measure.groups import NO_GROUP, Groups, group_numbers, groups_of, refuse_lost, ties_of
 from armcal.measure.measurement import Measurement
 from armcal.measure.partners import with_partners
@@ -23,7 +24,7 @@ from armcal.problem import factor_records, gather
 from armcal.problem.blueprint import Blueprint
 from armcal.problem.factor_records import FactorRecords, correlation_of
 from armcal.problem.gather import Slots
-from armcal.problem.kernel import EvaluatorChoice, Kernel
+from armcal.problem.kernel import Kernel
 from armcal.problem.linearised import linearised, linearised_means, mean_shares
 from armcal.problem.normal_equations import ExtraRows, NormalEquations, TieFunction, stacked
 from armcal.problem.whitening import declared, transformed

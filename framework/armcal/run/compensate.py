@@ -18,8 +18,8 @@ from armcal.calibration.compensation.request import Commands, Options, Redundanc
 from armcal.calibration.measured_point import MeasuredPoint, Point, measured_point, pointed
 from armcal.calibration.tool_expression import APPROACH, arm_expression
 from armcal.errors import ArmcalError, ConfigError
+from armcal.functions.batch_function import EvaluatorChoice
 from armcal.plugins import PluginRegistry
-from armcal.problem.kernel import EvaluatorChoice
 from armcal.run.target_file import TargetFile, read_targets
 from armcal.run.workspace import Workspace, workspace_of
 

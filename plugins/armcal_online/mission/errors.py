@@ -10,7 +10,7 @@ from armcal.base.parameters import Parameters
 from armcal.config.system import System
 from armcal.errors import ConfigError
 from armcal.estimate.mission_truth import Mission
-from armcal.problem.kernel import EvaluatorChoice
+from armcal.functions.batch_function import EvaluatorChoice
 
 from armcal_online.mission.judge import ErrorCurve, Flags
 from armcal_online.mission.mission_log import MissionLog

@@ -14,10 +14,10 @@ from armcal.base.domains import Array
 from armcal.base.parameters import Parameters
 from armcal.base.se3 import Expression
 from armcal.config.system import System
+from armcal.functions.batch_function import EvaluatorChoice
 from armcal.measure.contact import Contact
 from armcal.measure.measurement import Measurement
 from armcal.problem.factor_records import FactorRecords
-from armcal.problem.kernel import EvaluatorChoice
 from armcal.problem.problem import Problem
 
 

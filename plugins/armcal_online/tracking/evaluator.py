@@ -10,7 +10,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from armcal.problem import compiler
+from armcal.functions import compiler
 from armcal.problem.problem import Problem
 from armcal.version import SOURCES, __version__
 

@@ -10,9 +10,9 @@ from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.errors import DataError
 from armcal.estimate.online import Linearised
+from armcal.functions.c_source import LANES
 from armcal.measure.groups import NO_GROUP, group_key, group_name, group_numbers, owner_of
 from armcal.measure.measurement import GroupedMeasurement
-from armcal.problem.c_source import LANES
 from armcal.problem.gather import HELD
 from armcal.problem.kernel import Kernel
 from armcal.problem.one_record import OneRecord

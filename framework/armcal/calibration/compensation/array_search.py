@@ -21,7 +21,7 @@ from armcal.calibration.compensation.goal import (
     chosen_of,
 )
 from armcal.calibration.compensation.request import Mask
-from armcal.problem.batch_function import BatchFunction
+from armcal.functions.batch_function import BatchFunction
 
 
 class ArraySearch:

@@ -24,7 +24,7 @@ from armcal.calibration.compensation.sides import with_sides
 from armcal.calibration.compensation.target_kind import TargetKind
 from armcal.calibration.compensation.turning import turn_between
 from armcal.calibration.tool_expression import APPROACH, ToolExpression
-from armcal.problem.kernel import EvaluatorChoice
+from armcal.functions.batch_function import EvaluatorChoice
 
 SEEDS = 512
 

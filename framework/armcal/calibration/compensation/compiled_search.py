@@ -19,7 +19,7 @@ from armcal.calibration.compensation.goal import (
     Manner,
     Near,
 )
-from armcal.problem.batch_function import BatchFunction, Loop
+from armcal.functions.batch_function import BatchFunction, Loop
 
 _ENTRY = "armcal_search"
 _ARRAYS = ("record", "target", "state", "towards", "low", "high", "held")

@@ -8,13 +8,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from armcal.base.domains import Array
-from armcal.calibration.compensation.request import Mask
-from armcal.calibration.compensation.step import sample_inputs
-from armcal.calibration.tool_expression import ToolExpression
-from armcal.problem.batch_function import BatchFunction
-from armcal.problem.kernel import EvaluatorChoice
-from armcal.problem.stability import (
+from armcal.arm.equilibrium import (
     LONGEST_STEP,
     MOST_DEFLECTION,
     NEAR_REST_RAD,
@@ -24,6 +18,11 @@ from armcal.problem.stability import (
     refusal,
     settle,
 )
+from armcal.base.domains import Array
+from armcal.calibration.compensation.request import Mask
+from armcal.calibration.compensation.step import sample_inputs
+from armcal.calibration.tool_expression import ToolExpression
+from armcal.functions.batch_function import BatchFunction, EvaluatorChoice
 
 _MOST_STEPS = 50
 _TOGETHER = 4096

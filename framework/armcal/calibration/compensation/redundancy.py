@@ -19,8 +19,7 @@ from armcal.calibration.compensation.request import Redundancy
 from armcal.calibration.compensation.solver import Solver
 from armcal.calibration.compensation.step import sample_inputs, slopes, tool_error
 from armcal.calibration.tool_expression import ToolExpression
-from armcal.problem.batch_function import BatchFunction
-from armcal.problem.kernel import EvaluatorChoice
+from armcal.functions.batch_function import BatchFunction, EvaluatorChoice
 
 _STEPS = 25
 _FIRST, _LEAST = 0.3, 1e-4

@@ -13,8 +13,7 @@ from armcal.calibration.compensation.solver import Solver
 from armcal.calibration.compensation.step import sample_inputs, slope_function
 from armcal.calibration.compensation.turning import turn_between
 from armcal.calibration.tool_expression import ToolExpression
-from armcal.problem.batch_function import BatchFunction
-from armcal.problem.kernel import EvaluatorChoice
+from armcal.functions.batch_function import BatchFunction, EvaluatorChoice
 
 _AT_ONCE = 64
 

@@ -17,8 +17,7 @@ from armcal.calibration.compensation.compiled_search import CompiledSearch, loop
 from armcal.calibration.compensation.goal import QUICK, Attempt, Goal, Manner, Near
 from armcal.calibration.compensation.step import Slopes, rough_slopes, sample_inputs, slopes, step_function
 from armcal.calibration.tool_expression import ToolExpression
-from armcal.problem.batch_function import BatchFunction
-from armcal.problem.kernel import EvaluatorChoice
+from armcal.functions.batch_function import BatchFunction, EvaluatorChoice
 
 _REST = 1e-11
 _ROUGH = Near(metres=1e-3, radians=5e-3, rest=1e-2)

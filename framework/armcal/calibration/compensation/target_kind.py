@@ -15,7 +15,7 @@ from armcal.calibration.compensation.rounding import Rounding
 from armcal.calibration.compensation.seeds import Seeds
 from armcal.calibration.compensation.solver import Solver
 from armcal.calibration.tool_expression import ToolExpression
-from armcal.problem.kernel import EvaluatorChoice
+from armcal.functions.batch_function import EvaluatorChoice
 
 
 @dataclass(frozen=True)

@@ -8,23 +8,23 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import partial
 from itertools import accumulate
-from typing import Any
+from typing import Any, Literal
 
 import casadi as ca
 import numpy as np
 
 from armcal.base.domains import Array
-from armcal.problem import c_source, compiler
-from armcal.problem.kernel import EvaluatorChoice, Mapped, quietly
+from armcal.functions import c_source, compiler
+from armcal.functions.interpreted import InterpretedFunction
+
+EvaluatorChoice = Literal["auto", "compiled", "interpreted"]
 
 _ENTRY, _VECTOR = "armcal_evaluate", "armcal_evaluate_vector"
 _AGREEMENT = 1e-9
 _WORTH_COMPILING = 100_000
 """Records that the virtual machine takes longer for than the compiler takes to make a library."""
-_BLOCK = 16
-"""Records that the virtual machine evaluates together; what is left of them one by one."""
 
 
 @dataclass(frozen=True)
@@ -55,6 +55,7 @@ class BatchFunction:
 
     Attributes:
         function: the CasADi function (SX, dense inputs and outputs).
+        interpreted: the same by CasADi's virtual machine.
         compiled: whether C serves it.
     """
 
@@ -71,7 +72,7 @@ class BatchFunction:
         were asked for that it would have paid; ``compiled`` waits for it; ``interpreted`` does without. A ``loop`` is
         compiled with the function.
         """
-        self.function = function
+        self.function, self.interpreted = function, InterpretedFunction(function)
         self._sizes_out = [function.numel_out(i) for i in range(function.n_out())]
         self.places = list(zip(self._sizes_out, accumulate(self._sizes_out), strict=True))
         self._all_in = sum(function.numel_in(i) for i in range(function.n_in()))
@@ -97,7 +98,7 @@ class BatchFunction:
         count = inputs[0].shape[1]
         if self._library is None:
             self._count(count)
-            return self.interpreted(inputs, count)
+            return self.interpreted(*inputs)
         whole = count - count % c_source.LANES
         if not whole and count:
             return self._rest(inputs, 0)
@@ -106,16 +107,6 @@ class BatchFunction:
         if whole < count:
             for target, source in zip(outputs, self._rest(inputs, whole), strict=True):
                 target[:, whole:] = source
-        return outputs
-
-    def interpreted(self, inputs: Sequence[Array], count: int) -> list[Array]:
-        """The outputs by the virtual machine."""
-        outputs = [np.empty((size, count)) for size in self._sizes_out]
-        whole = count - count % _BLOCK
-        if whole:
-            self._mapped(np.zeros(0), [each[:, :whole] for each in inputs], [output[:, :whole] for output in outputs])
-        if whole < count:
-            self._single(np.zeros(0), [each[:, whole:] for each in inputs], [output[:, whole:] for output in outputs])
         return outputs
 
     def _count(self, records: int) -> None:
@@ -136,20 +127,6 @@ class BatchFunction:
         self._library.armcal_evaluate_vector(given.ctypes.data, taken.ctypes.data)
         return [taken[end - size : end, :count] for size, end in self.places]
 
-    @cached_property
-    def _shared(self) -> ca.Function:
-        """With a first input that all records share, which is empty."""
-        symbols = [ca.SX.sym(f"in{i}", self.function.numel_in(i)) for i in range(self.function.n_in())]
-        return ca.Function("batch", [ca.SX(0, 1), *symbols], self.function.call(symbols), {"cse": True})
-
-    @cached_property
-    def _mapped(self) -> Mapped:
-        return Mapped(self._shared, _BLOCK)
-
-    @cached_property
-    def _single(self) -> Mapped:
-        return Mapped(self._shared, 1)
-
 
 def _library(
     function: ca.Function, choice: EvaluatorChoice, loop: Loop | None, trial: Callable[[], compiler.Trial]
@@ -169,6 +146,14 @@ def _library(
     if library is None and choice == "compiled":
         library = quietly(partial(compiler.compile_now, key, source, entries, trial))
     return library, partial(compiler.compile_in_background, key, source, trial)
+
+
+def quietly(build: Callable[[], ctypes.CDLL | None]) -> ctypes.CDLL | None:
+    """What was built, or None: an expression without a C form is no fault, the virtual machine serves."""
+    try:
+        return build()
+    except c_source.UnsupportedExpressionError:
+        return None
 
 
 def _driver(function: ca.Function) -> str:
@@ -203,7 +188,7 @@ def _addresses(name: str, sizes: Sequence[int]) -> list[str]:
 def _trial(batch: BatchFunction, sample: Sequence[Array]) -> compiler.Trial:
     """What a new library has to give for the sample, all inputs in one piece of memory and so all outputs."""
     given = [np.ascontiguousarray(each[:, : c_source.LANES], dtype=float) for each in sample]
-    expected = np.concatenate(batch.interpreted(given, c_source.LANES))
+    expected = np.concatenate(batch.interpreted(*given))
     return compiler.Trial(_VECTOR, (np.concatenate(given), np.zeros_like(expected)), {1: expected}, _AGREEMENT)
 
 

@@ -153,18 +153,13 @@ def write_function(function: ca.Function, name: str, uniform_inputs: int) -> CFu
 
 
 def support_source() -> str:
-    """Vector type, elementary functions and the loop over records."""
-    return resources.files("armcal.problem").joinpath("kernel_support.h").read_text(encoding="utf-8")
-
-
-def driver_source() -> str:
-    """The loop over records: equilibrium, residual, Jacobian."""
-    return resources.files("armcal.problem").joinpath("kernel_driver.h").read_text(encoding="utf-8")
+    """Vector type and elementary functions."""
+    return resources.files("armcal.functions").joinpath("kernel_support.h").read_text(encoding="utf-8")
 
 
 def generator_source() -> str:
     """This module's own text: part of what a compiled library depends on."""
-    return resources.files("armcal.problem").joinpath("c_source.py").read_text(encoding="utf-8")
+    return resources.files("armcal.functions").joinpath("c_source.py").read_text(encoding="utf-8")
 
 
 def _definition(name: str, arguments: list[str], lines: list[str]) -> str:

@@ -29,7 +29,7 @@ from pathlib import Path
 import numpy as np
 
 from armcal.base.domains import Array
-from armcal.problem import library_build
+from armcal.functions import library_build
 
 FLAGS = ("-O1", "-march=native", "-ffp-contract=off", "-fPIC", "-shared", "-w")
 ENTRY_POINTS = ("armcal_residuals", "armcal_linearise")

@@ -1,0 +1,1 @@
+"""CasADi functions of many records: interpreted, or compiled from generated C."""
