@@ -770,7 +770,7 @@ def test_a_miscompiled_kernel_of_the_arm_is_not_used(lrm, tmp_path, monkeypatch)
     whole = kernel.driver_source()
     wrong = whole.replace("N_RESIDUAL * N_VALUES);", "N_RESIDUAL * N_VALUES - 1);")
     assert wrong != whole
-    monkeypatch.setattr(c_source, "driver_source", lambda: wrong)
+    monkeypatch.setattr(kernel, "driver_source", lambda: wrong)
     problem = lrm.problem(lrm.experiment(), lrm.dataset(oracle.random_poses(3, 0)), "compiled")
     assert problem.backend == "virtual machine"
     assert not list(tmp_path.iterdir()), "no later run meets it"
