@@ -10,7 +10,7 @@ import pytest
 from armcal.estimate.online import normalised_innovation_squared
 from armcal_kalman.extended import ExtendedFilter, ExtendedSettings
 from armcal_online.tracking.start import FilterSetup
-from online_arm import STATES, Filtered, World, begun, begun_setup, nees, replayer_of, settings, told
+from online_arm import STATES, Filtered, World, begun, begun_setup, nees, random_walk, settings, told
 from scipy.stats import chi2
 
 UPDATES = 300
@@ -118,7 +118,7 @@ def test_what_is_sound_is_not_seen_as_inconsistent(held: bool) -> None:
 NOTICED = {
     "a quarter of the noise": ({"noise_mm": 0.15}, {}, {}),
     "no process noise under drift": ({}, {"process_noise": {}}, {}),
-    "1 mm bias": ({"held_base": True}, {"process_noise": replayer_of(1, True)}, {"bias": BIAS}),
+    "1 mm bias": ({"held_base": True}, {"process_noise": random_walk(1, True)}, {"bias": BIAS}),
 }
 
 

@@ -12,7 +12,7 @@ from armcal.arm.holding import holding_efforts
 from armcal.arm.loading import LOAD_CHANNELS, site_loads
 from armcal.base.dataset import Dataset
 from armcal.diagnose.evidence import priors_alone, unseen_poses
-from armcal.diagnose.large_errors import Judged, misses
+from armcal.diagnose.large_errors import Judged, large_errors
 from armcal.diagnose.residual_structure import LEVEL, MOST_RECORDS, structure
 from armcal.diagnose.score_tests import DRAWS, family_test, linear_fit, own_basis
 from armcal.estimate.weighing import fit
@@ -288,7 +288,7 @@ def large_errors_of(lrm, spoil, limit=None, seed=11):
     raw = problem.residuals(found.values, records)
     errors = 1000 * np.linalg.norm(raw[0], axis=0)
     motion = Motion.of(problem, found.values, records, dataset)
-    return misses(problem, records, found, dataset, motion, Judged(errors, raw, np.arange(120)), limit)
+    return large_errors(problem, records, found, dataset, motion, Judged(errors, raw, np.arange(120)), limit)
 
 
 def test_a_single_wrong_record_is_to_be_measured_again(lrm):
