@@ -1,19 +1,20 @@
-"""From a request to its answer, by one calibration. Whatever is asked, there is an answer and no exception."""
+"""From a request to its answer, by one calibration. Every request has an answer; none raises."""
 
 from __future__ import annotations
 
 import difflib
+import math
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from operator import itemgetter
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from armcal.base.domains import Array
 from armcal.base.pose_settings import PoseSettings, quaternion_of
 from armcal.base.quaternions import rotation_matrix
-from armcal.calibration.compensation.request import Targets
+from armcal.base.units import to_unit
+from armcal.calibration.compensation.request import Commands, Targets
 from armcal.errors import ArmcalError, DataError, Location
 
 from armcal_serve.protocol import (
@@ -26,14 +27,16 @@ from armcal_serve.protocol import (
     ForwardRequest,
     TargetRequest,
     Tool,
+    Units,
     as_bytes,
     known_id,
     refusal,
 )
 from armcal_serve.reading import parsed, request_of
-from armcal_serve.rows import command_rows
 from armcal_serve.served_arm import TEMPERATURE, TEMPERATURE_KEY, ServedArm
-from armcal_serve.shares import Share, shares
+
+if TYPE_CHECKING:
+    from armcal.calibration.compensation.compensator import Compensator
 
 Clock = Callable[[], float]
 
@@ -44,9 +47,9 @@ class Answerer:
 
     Attributes:
         arms: by name.
-        tag: says which calibration it is, in every answer.
+        tag: identifies the calibration in every answer.
         clock: monotonic seconds, the same in all processes of this machine.
-        fault: what is answered to everything; None where the calibration may be used.
+        fault: the answer to every request; None where the calibration may be used.
     """
 
     arms: Mapping[str, ServedArm]
@@ -59,38 +62,44 @@ class Answerer:
         began = self.clock()
         identity = None
         try:
-            content = parsed(line)
-            identity = known_id(content)
-            found: dict[str, Any] = {**self._answered(content)}
+            fields = parsed(line)
+            identity = known_id(fields)
+            request = request_of(fields)
+            if self.fault is not None:
+                raise self.fault
+            if isinstance(request, ForwardRequest):
+                answer: dict[str, Any] = {**self._forward(request)}
+            elif isinstance(request, CompensateRequest):
+                answer = {**self._compensate(request)}
+            else:
+                text = "a request for the status is short, and without escapes."
+                raise DataError(text, hint='Send {"do": "status"}.')
         except ArmcalError as fault:
-            found = {**refusal(identity, fault)}
+            answer = {**refusal(identity, fault)}
         except Exception as fault:  # a request that nobody thought of must not end the server
             hint = "Report it with the request; others are answered as before."
-            found = {**refusal(identity, ArmcalError(f"it failed ({type(fault).__name__}: {fault}).", hint=hint))}
-        found["calibration"] = self.tag
-        found["waited_ms"] = round(1000 * (began - arrived), 3)
-        found["took_ms"] = round(1000 * (self.clock() - arrived), 3)
-        return as_bytes(found)
-
-    def _answered(self, content: Any) -> Mapping[str, Any]:
-        request = request_of(content)
-        if self.fault is not None:
-            raise self.fault
-        if isinstance(request, ForwardRequest):
-            return self._forward(request)
-        if isinstance(request, CompensateRequest):
-            return self._compensate(request)
-        raise DataError("a request for the status is short, and without escapes.", hint='Send {"do": "status"}.')
+            answer = {**refusal(identity, ArmcalError(f"it failed ({type(fault).__name__}: {fault}).", hint=hint))}
+        answer["calibration"] = self.tag
+        answer["waited_ms"] = round(1000 * (began - arrived), 3)
+        answer["took_ms"] = round(1000 * (self.clock() - arrived), 3)
+        return as_bytes(answer)
 
     def _forward(self, request: ForwardRequest) -> ForwardAnswer:
         arm = self._arm(request.arm)
-        rows = self._postures(arm, request)
+        if (request.joint_angles is None) == (request.joints is None):
+            text = "found neither joint_angles nor joints" if request.joints is None else "found both of them"
+            hint = f"Give joint_angles_deg: {len(arm.joints)} numbers, or several such rows."
+            raise DataError(f"{text}, expected one.", where=Location(field="joint_angles_deg"), hint=hint)
+        if request.joint_angles is not None:
+            rows = arm.angles(request.joint_angles, "joint_angles")
+        else:
+            rows = arm.named(request.joints or (), "joints")
         acting, approach = arm.acting(request, len(rows)), arm.approach(request, len(rows))
         if request.temperature is None:
             poses = arm.compensator.forward(rows, acting, approach.T)
         else:
-            told = {TEMPERATURE: request.temperature}
-            poses = arm.at_temperature(TEMPERATURE_KEY).forward(rows, acting, approach.T, told)
+            conditions = {TEMPERATURE: request.temperature}
+            poses = arm.at_temperature(TEMPERATURE_KEY).forward(rows, acting, approach.T, conditions)
         return {
             "armcal_serve": VERSION,
             "id": request.id,
@@ -99,28 +108,38 @@ class Answerer:
             "tools": [_tool(pose) for pose in poses],
         }
 
-    @staticmethod
-    def _postures(arm: ServedArm, request: ForwardRequest) -> Array:
-        if (request.joint_angles is None) == (request.joints is None):
-            text = "found neither joint_angles nor joints" if request.joints is None else "found both of them"
-            hint = f"Give joint_angles_deg: {len(arm.joints)} numbers, or several such rows."
-            raise DataError(f"{text}, expected one.", where=Location(field="joint_angles_deg"), hint=hint)
-        if request.joint_angles is not None:
-            return arm.angles(request.joint_angles, "joint_angles")
-        return arm.named(request.joints or (), "joints")
-
     def _compensate(self, request: CompensateRequest) -> CompensateAnswer:
         arm = self._arm(request.arm)
         if request.units in ("counts", "pulse_us") and not arm.compensator.expression.servos:
             hint = "Ask for rad or deg, or give the arm's joints pulse tables and calibrate again."
             raise DataError("the arm has no pulse tables.", where=Location(field="units"), hint=hint)
+        if request.start is not None and request.start_joints is not None:
+            text = "found both start and start_joints."
+            raise DataError(text, where=Location(field="start"), hint="Give one of them.")
+        start: Array | None = None
+        if request.start is not None:
+            start = np.asarray(arm.angles([request.start], "start")[0])
+        if request.start_joints is not None:
+            start = np.asarray(arm.named([request.start_joints], "start_joints")[0])
+        solved: list[tuple[Sequence[int], Commands]] = []
+        try:
+            for compensator, targets, places in shares(arm, request, _targets(arm, request)):
+                find = compensator.follow if request.path else compensator.solve
+                solved.append((places, find(targets, start)))
+        except ValueError as fault:
+            raise DataError(f"{fault}.", where=Location(field="targets"), hint="Correct the request.") from fault
+        rows = {
+            place: row
+            for places, commands in solved
+            for place, row in zip(places, command_rows(arm, commands, request.units), strict=True)
+        }
         return {
             "armcal_serve": VERSION,
             "id": request.id,
             "ok": True,
             "arm": arm.name,
             "joint_names": [*arm.joints],
-            "commands": _commands(arm, request),
+            "commands": [rows[place] for place in sorted(rows)],
         }
 
     def _arm(self, name: str | None) -> ServedArm:
@@ -135,28 +154,34 @@ class Answerer:
         raise DataError(f"{text}.", where=Location(field="arm"), hint=hint)
 
 
-def _commands(arm: ServedArm, request: CompensateRequest) -> list[Command]:
-    """One for each target, in their order."""
-    start, rows = _start(arm, request), list[tuple[int, Command]]()
-    for share in _shares(arm, request):
-        find = share.compensator.follow if request.path else share.compensator.solve
-        try:
-            commands = find(share.targets, start)
-        except ValueError as fault:
-            raise _refused(fault) from fault
-        rows += zip(share.places, command_rows(arm, commands, request.units, _tool), strict=True)
-    return [command for _, command in sorted(rows, key=itemgetter(0))]
+def shares(
+    arm: ServedArm, request: CompensateRequest, targets: Targets
+) -> list[tuple[Compensator, Targets, Sequence[int]]]:
+    """All targets to one compensator; to two where some targets state the temperature and others do not.
 
+    Returns:
+        compensators, each with its targets and their places in the request.
 
-def _shares(arm: ServedArm, request: CompensateRequest) -> list[Share]:
-    try:
-        return shares(arm, request, _targets(arm, request))
-    except ValueError as fault:
-        raise _refused(fault) from fault
-
-
-def _refused(fault: ValueError) -> DataError:
-    return DataError(f"{fault}.", where=Location(field="targets"), hint="Correct the request.")
+    Raises:
+        DataError: the arm does not change with the temperature; or some targets of a path state it and others do not.
+    """
+    stated = [request.temperature if target.temperature is None else target.temperature for target in request.targets]
+    warm = [place for place, value in enumerate(stated) if value is not None]
+    if not warm:
+        return [(arm.compensator, targets, range(len(stated)))]
+    field = TEMPERATURE_KEY if request.temperature is not None else f"targets.{warm[0]}.{TEMPERATURE_KEY}"
+    heated = arm.at_temperature(field)
+    rest = [place for place, value in enumerate(stated) if value is None]
+    if rest and request.path:
+        raise DataError(
+            "found targets of a path with a temperature and targets without, expected all of one kind.",
+            where=Location(field=f"targets.{rest[0]}"),
+            hint=f"Give {TEMPERATURE_KEY} for all of the request, or for each target.",
+        )
+    temperatures = np.array([stated[place] for place in warm], dtype=float)
+    known = replace(targets.subset(np.array(warm)), conditions={TEMPERATURE: temperatures})
+    unheated = [(arm.compensator, targets.subset(np.array(rest)), rest)] if rest else []
+    return [(heated, known, warm), *unheated]
 
 
 def _targets(arm: ServedArm, request: CompensateRequest) -> Targets:
@@ -190,14 +215,37 @@ def _rotation(target: TargetRequest, index: int) -> Array:
     return rotation_matrix(np.array(stated.unit_quaternion))
 
 
-def _start(arm: ServedArm, request: CompensateRequest) -> Array | None:
-    if request.start is not None and request.start_joints is not None:
-        raise DataError("found both start and start_joints.", where=Location(field="start"), hint="Give one of them.")
-    if request.start is not None:
-        return np.asarray(arm.angles([request.start], "start")[0])
-    if request.start_joints is not None:
-        return np.asarray(arm.named([request.start_joints], "start_joints")[0])
-    return None
+def command_rows(arm: ServedArm, commands: Commands, units: Units) -> list[Command]:
+    """One row a target, in the units of the request."""
+    return [
+        {
+            **_commanded(arm, commands, i, units),  # type: ignore[typeddict-item]
+            "found": bool(commands.found[i]),
+            "why_not": commands.reasons[i],
+            "error_mm": float(commands.distances[i]) * 1000,
+            "error_deg": math.degrees(float(commands.turns[i])),
+            "nearest_mm": float(commands.bounds[i]) * 1000,
+            "approach": [round(side) for side in commands.approach[i].tolist()],
+            "tool": _tool(commands.base_T_tool[i]),
+        }
+        for i in range(len(commands))
+    ]
+
+
+def _commanded(arm: ServedArm, commands: Commands, row: int, units: Units) -> dict[str, Any]:
+    """What to command for one target."""
+    if units == "rad" or units == "deg":
+        values = commands.joint_angles[row]
+        if not arm.turns_only:
+            return {"joints": arm.written(values.tolist(), units)}
+        return {f"joint_angles_{units}": to_unit(values, units).tolist()}
+    servos = arm.compensator.expression.servos
+    counts = [] if commands.counts is None else commands.counts[row].tolist()
+    if units == "counts":
+        shown = zip(arm.joints, counts, strict=True)
+        return {"counts": [count if name in servos else None for name, count in shown]}
+    ticks = [servos[name][1].tick if name in servos else None for name in arm.joints]
+    return {"pulse_us": [None if tick is None else n * tick * 1e6 for tick, n in zip(ticks, counts, strict=True)]}
 
 
 def _tool(pose: Array) -> Tool:

@@ -90,7 +90,9 @@ class CalibrationWatch:
     def look(self) -> Snapshot | None:
         """Another content that came to rest and may be tried; None while there is none."""
         now = self._clock()
-        status = _stat(self.path)
+        status: _Stat | None = None
+        with contextlib.suppress(OSError):
+            status = _key(self.path.stat())
         if status is None:
             self._seen = None
             self._say("missing", "there is no such file; the calibration before is used on.")
@@ -114,12 +116,12 @@ class CalibrationWatch:
         return self._rested() if now >= self._rests_at else None
 
     def taken(self) -> None:
-        """What was tried last is answered from."""
+        """The content that was tried last is used now."""
         self._taken_sha256, self._refusal = self._tried_sha256, ""
         self._say("taken", "")
 
     def refused(self, why: str, again: bool = False) -> None:
-        """What was tried last is not used; ``again``: for no reason of its own, so that it is tried once more."""
+        """The content that was tried last is not used; ``again``: for no fault of its own, so it is tried once more."""
         self._refusal = why
         self._say("refused", why)
         self._again_at = self._clock() + AGAIN_S if again else None
@@ -188,11 +190,5 @@ def _not_whole(snapshot: Snapshot) -> str:
     return ""
 
 
-def _stat(path: Path) -> _Stat | None:
-    with contextlib.suppress(OSError):
-        return _key(path.stat())
-    return None
-
-
-def _key(found: os.stat_result) -> _Stat:
-    return found.st_dev, found.st_ino, found.st_size, found.st_mtime_ns
+def _key(status: os.stat_result) -> _Stat:
+    return status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns

@@ -20,13 +20,14 @@ from armcal.functions.batch_function import EvaluatorChoice
 from armcal.io.signals import Signals
 from armcal.io.standard_output import StandardOutput
 
+from armcal_serve.protocol import Tell
 from armcal_serve.server import Opening, Server
 from armcal_serve.transports.datagrams import Datagrams
 from armcal_serve.transports.standard import StandardStreams
 from armcal_serve.transports.unix import UnixSocket
 
 _ALWAYS = ("refused", "worker_lost", "missing", "status", "notice")
-"""Events that are told although all is to be quiet."""
+"""Events that are written with --quiet too."""
 
 
 @click.command()
@@ -79,33 +80,26 @@ def serve(
     if port is not None:
         openings.append(partial(Datagrams, port))
     if not openings:
-        openings.append(_standard_streams())
-    said = _Said(console, StandardOutput(getattr(sys.stderr, "buffer", None), patience_s=0.0))
+        if sys.__stdin__ is None or sys.__stdout__ is None:
+            text = "standard input or output is closed, expected requests by the one and a reader of the other."
+            raise InputError(text, hint="Open both, or give --socket or --udp.")
+        openings.append(partial(StandardStreams, sys.__stdin__.fileno(), sys.__stdout__.fileno()))
     how: dict[str, Any] = {"redundancy": redundancy, "within": str(within or ""), "evaluator": evaluator}
     how |= {"point": point or "tool", "accept": accept}
     with Signals() as signals:
-        Server(calibration, workers or min(2, os.cpu_count() or 1), how, openings, said.tell).run(signals)
+        Server(calibration, workers or min(2, os.cpu_count() or 1), how, openings, _teller(console)).run(signals)
 
 
-def _standard_streams() -> Opening:
-    incoming, outgoing = sys.__stdin__, sys.__stdout__
-    if incoming is None or outgoing is None:
-        text = "standard input or output is closed, expected requests by the one and a reader of the other."
-        raise InputError(text, hint="Open both, or give --socket or --udp.")
-    return partial(StandardStreams, incoming.fileno(), outgoing.fileno())
-
-
-class _Said:
+def _teller(console: Console) -> Tell:
     """Events to standard error, which nobody need read: a sentence a line, or a JSON object with --json."""
+    out = StandardOutput(getattr(sys.stderr, "buffer", None), patience_s=0.0)
 
-    def __init__(self, console: Console, out: StandardOutput) -> None:
-        self._voice, self._out = console, out
-
-    def tell(self, event: str, sentence: str, content: Mapping[str, Any]) -> None:
-        """See ``armcal_serve.protocol.Tell``."""
-        if self._voice.quiet and event not in _ALWAYS:
+    def tell(event: str, sentence: str, content: Mapping[str, Any]) -> None:
+        if console.quiet and event not in _ALWAYS:
             return
-        if self._voice.json:
-            self._out.write(as_line({"event": event, "at": time.time(), "sentence": sentence, **content}))
+        if console.json:
+            out.write(as_line({"event": event, "at": time.time(), "sentence": sentence, **content}))
         else:
-            self._out.write(f"armcal serve: {sentence}")
+            out.write(f"armcal serve: {sentence}")
+
+    return tell

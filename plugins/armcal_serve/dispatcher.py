@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
@@ -22,7 +23,7 @@ class Dispatcher:
     """Takes requests from clients, and gives them to whichever worker answers now.
 
     Args:
-        status: what is answered to whoever asks how the server is; no worker is needed for that.
+        status: gives the answer to a request for the status; no worker is needed for that.
 
     Attributes:
         asked: requests so far.
@@ -43,10 +44,12 @@ class Dispatcher:
         """A request from a client."""
         self.asked += 1
         ticket = conversation.ask(self.asked, line, time.monotonic())
-        status = self._status_of(line)
-        if status is not None:
-            ticket.answered(status)
-            return ticket
+        if len(line) <= _LONGEST_STATUS and b'"status"' in line:
+            with contextlib.suppress(InputError):  # whatever else it is, a worker says what is wrong with it
+                request = request_of(parsed(line))
+                if request.do == "status":
+                    ticket.answered(as_bytes({**self._status(), "id": request.id}))
+                    return ticket
         if not conversation.waiting:
             self._round.append(conversation)
         conversation.waiting.append(ticket)
@@ -93,13 +96,3 @@ class Dispatcher:
                 self._round.append(conversation)
             return ticket
         return None
-
-    def _status_of(self, line: bytes) -> bytes | None:
-        """The answer to a request for the status; None if it is no such request."""
-        if len(line) > _LONGEST_STATUS or b'"status"' not in line:
-            return None
-        try:
-            request = request_of(parsed(line))
-        except InputError:
-            return None
-        return as_bytes({**self._status(), "id": request.id}) if request.do == "status" else None

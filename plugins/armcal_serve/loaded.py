@@ -1,4 +1,4 @@
-"""A calibration's file made ready to answer: read, checked, built and tried, before anybody waits for it."""
+"""A calibration's file made ready to answer: read, checked, built and warmed up, before anybody waits for it."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ import gc
 import json
 import tempfile
 import time
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -58,7 +58,7 @@ class Order:
 
 
 def loaded(order: Order, data: bytes) -> Answerer:
-    """What answers by these bytes.
+    """The answerer of a calibration's bytes.
 
     Raises:
         ArmcalError: they are no calibration, one of another arm, or one that cannot be used.
@@ -72,17 +72,21 @@ def loaded(order: Order, data: bytes) -> Answerer:
             where=Location(order.shown),
             hint="Put a calibration of the same arm there, or start a server of its own for this one.",
         )
-    kept = (calibration_file.recalibrated or {}).get("sequence")
+    sequence = (calibration_file.recalibrated or {}).get("sequence")
     tag: CalibrationTag = {
         "sequence": order.sequence,
         "created": calibration_file.created,
         "sha256": order.sha256,
         "arm": identity,
-        "recalibrated": kept if isinstance(kept, int) else None,
+        "recalibrated": sequence if isinstance(sequence, int) else None,
         "level": calibration_file.level,
     }
-    answerer = Answerer(_arms(calibration, order), tag)
-    _tried(answerer)
+    answerer = Answerer({name: _arm(calibration, name, order) for name in calibration.system.arms}, tag)
+    for arm in answerer.arms.values():
+        _warm_up(answerer, arm, {})
+        if arm.heated is not None:
+            with suppress(InputError):  # what is ordinary elsewhere may be too hot for this arm
+                _warm_up(answerer, arm, {TEMPERATURE_KEY: _ORDINARY_C})
     gc.collect()
     gc.freeze()
     lost = calibration_file.level == "lost" and not order.accept
@@ -90,26 +94,17 @@ def loaded(order: Order, data: bytes) -> Answerer:
 
 
 def _read(order: Order, data: bytes) -> Calibration:
+    """From a file of its own; messages name the one that the user knows."""
     with tempfile.TemporaryDirectory(prefix="armcal-serve-") as folder:
         path = Path(folder) / "calibration.yaml"
         path.write_bytes(data)
-        with _shown_as(str(path), order.shown):
+        try:
             return Calibration.load(path, accept=order.accept or order.sequence > 1)
-
-
-@contextmanager
-def _shown_as(path: str, shown: str) -> Iterator[None]:
-    """Messages name the file that the user knows."""
-    try:
-        yield
-    except ArmcalError as fault:
-        where = fault.where and replace(fault.where, file=(fault.where.file or "").replace(path, shown) or None)
-        fault.message, fault.hint = fault.message.replace(path, shown), fault.hint.replace(path, shown)
-        raise type(fault)(fault.message, where=where, hint=fault.hint) from fault
-
-
-def _arms(calibration: Calibration, order: Order) -> Mapping[str, ServedArm]:
-    return {name: _arm(calibration, name, order) for name in calibration.system.arms}
+        except ArmcalError as fault:
+            where, own, shown = fault.where, str(path), order.shown
+            where = where and replace(where, file=(where.file or "").replace(own, shown) or None)
+            message, hint = fault.message.replace(own, shown), fault.hint.replace(own, shown)
+            raise type(fault)(message, where=where, hint=hint) from fault
 
 
 def _arm(calibration: Calibration, name: str, order: Order) -> ServedArm:
@@ -126,7 +121,14 @@ def _arm(calibration: Calibration, name: str, order: Order) -> ServedArm:
             where=Location(order.shown),
             hint="Use armcal predict or armcal compensate, which read it from a column.",
         )
-    limits, allowed = _space(order.within, joints) if order.within else ({}, None)
+    limits: Mapping[str, tuple[float, float]] = {}
+    allowed = None
+    if order.within:
+        from armcal.plugins import discover  # late: not needed without limits
+        from armcal.run.workspace import workspace_of
+
+        space = workspace_of(Path(order.within), joints, discover())
+        limits, allowed = space.limits, space.allowed
     options = Options(limits=limits, redundancy=order.redundancy)
     try:
         # A request never waits for a compiler, so the compiler is waited for here.
@@ -141,40 +143,23 @@ def _arm(calibration: Calibration, name: str, order: Order) -> ServedArm:
     return ServedArm(name, dict(arm.commanded), compensator, needs_payload, heated, order.point)
 
 
-def _space(within: str, joints: tuple[str, ...]) -> tuple[Mapping[str, tuple[float, float]], Any]:
-    """Limits, and what asks whether the arm may be somewhere; what reads them is not needed without."""
-    from armcal.plugins import discover
-    from armcal.run.workspace import workspace_of
-
-    space = workspace_of(Path(within), joints, discover())
-    return space.limits, space.allowed
-
-
-def _tried(answerer: Answerer) -> None:
+def _warm_up(answerer: Answerer, arm: ServedArm, acting: Mapping[str, float]) -> None:
     """Ask everything that can be asked, some times.
 
     Raises:
-        InputError: an arm cannot even be predicted.
+        InputError: the arm cannot even be predicted.
     """
-    for arm in answerer.arms.values():
-        _tried_with(answerer, arm, {})
-        if arm.heated is not None:
-            with suppress(InputError):  # what is ordinary elsewhere may be too hot for this arm
-                _tried_with(answerer, arm, {TEMPERATURE_KEY: _ORDINARY_C})
-
-
-def _tried_with(answerer: Answerer, arm: ServedArm, said: Mapping[str, float]) -> None:
     began = time.monotonic()
     for i in range(_TRIES):
         posture = {"joints": arm.written([0.05 * (k + 1) + 0.01 * i for k in range(len(arm.joints))], "rad")}
-        content = _asked(answerer, arm, {"do": "forward", **posture, **said})
-        if not content["ok"]:
-            raise InputError(f"the arm {arm.name} cannot be predicted: {content['error']}", hint=content["hint"])
-        tool = content["tools"][0]
+        answer = _asked(answerer, arm, {"do": "forward", **posture, **acting})
+        if not answer["ok"]:
+            raise InputError(f"the arm {arm.name} cannot be predicted: {answer['error']}", hint=answer["hint"])
+        tool = answer["tools"][0]
         for target in (tool, {"position_mm": tool["position_mm"]}):
             for path in (False, True):
-                _asked(answerer, arm, {"do": "compensate", "targets": target, "path": path, **said})
-        _asked(answerer, arm, {"do": "compensate", "targets": tool, "start_joints": posture["joints"], **said})
+                _asked(answerer, arm, {"do": "compensate", "targets": target, "path": path, **acting})
+        _asked(answerer, arm, {"do": "compensate", "targets": tool, "start_joints": posture["joints"], **acting})
         if time.monotonic() - began > _LONGEST_S:
             break
 

@@ -4,17 +4,9 @@ from __future__ import annotations
 
 import selectors
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 Call = Callable[[], None]
-_NOTHING: Call = lambda: None  # noqa: E731
-
-
-@dataclass
-class _Watched:
-    read: Call
-    write: Call
 
 
 class Poller:
@@ -33,22 +25,22 @@ class Poller:
         that hung up would be reported for ever.
         """
         events = (selectors.EVENT_READ if read else 0) | (selectors.EVENT_WRITE if write else 0)
-        watched = _Watched(read or _NOTHING, write or _NOTHING)
         registered = place in self._selector.get_map()
         if not events:
             if registered:
                 self._selector.unregister(place)
         elif not registered:
-            self._selector.register(place, events, watched)
+            self._selector.register(place, events, (read, write))
         elif self._selector.get_key(place).events != events:
-            self._selector.modify(place, events, watched)
+            self._selector.modify(place, events, (read, write))
 
     def step(self, longest_s: float) -> None:
         """Wait at most so long, and call those concerned."""
         for key, events in self._selector.select(longest_s):
+            read, write = key.data
             if self._selector.get_map().get(key.fd) is not key:
                 continue  # an earlier call let go of it, or changed it
             if events & selectors.EVENT_READ:
-                key.data.read()
+                read()
             if events & selectors.EVENT_WRITE and self._selector.get_map().get(key.fd) is key:
-                key.data.write()
+                write()

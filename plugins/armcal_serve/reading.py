@@ -17,7 +17,7 @@ _EXAMPLE = '{"id": 1, "do": "status"}'
 
 
 def parsed(line: bytes) -> Any:
-    """The content of a line.
+    """The JSON in a line.
 
     Raises:
         DataError: it is not JSON.
@@ -34,48 +34,38 @@ def parsed(line: bytes) -> Any:
         raise DataError(text, hint=f"Send an object a line, such as {_EXAMPLE}.") from fault
 
 
-def request_of(content: Any) -> Request:
+def request_of(fields: Any) -> Request:
     """A request, checked.
 
     Raises:
         InputError: it is none; the message names the field.
     """
     words = ", ".join(REQUESTS)
-    if not isinstance(content, dict):
-        short = _short(json.dumps(content))
+    if not isinstance(fields, dict):
+        short = _short(json.dumps(fields))
         raise DataError(f"found {short}, expected an object.", hint=f"Send an object such as {_EXAMPLE}.")
-    word = content.get("do")
+    word = fields.get("do")
     if not isinstance(word, str) or word not in REQUESTS:
         near = difflib.get_close_matches(word, REQUESTS, n=1) if isinstance(word, str) else []
-        short = f"found {_short(json.dumps(word))}" if "do" in content else "found nothing"
+        short = f"found {_short(json.dumps(word))}" if "do" in fields else "found nothing"
         hint = f"Did you mean {near[0]}?" if near else f"For example {_EXAMPLE}."
         raise DataError(f"{short}, expected one of {words}.", where=Location(field="do"), hint=hint)
-    if content.get("armcal_serve", VERSION) != VERSION:
-        short = _short(json.dumps(content["armcal_serve"]))
+    if fields.get("armcal_serve", VERSION) != VERSION:
+        short = _short(json.dumps(fields["armcal_serve"]))
         where = Location(field="armcal_serve")
         raise DataError(f"found version {short}, expected {VERSION}.", where=where, hint="Leave it out, or say 1.")
     try:
-        return REQUESTS[word].model_validate(content)
+        return REQUESTS[word].model_validate(fields)
     except ValueError:
-        _explain(REQUESTS[word], content)
-
-
-def _explain(schema: type[Request], content: dict[str, Any]) -> NoReturn:
-    """Say what is wrong, in the words of a configuration.
-
-    Raises:
-        InputError: always.
-    """
-    source = ConfigSource(content, {(): Location()}, Path(), Path(), ())
-    try:
-        validate(schema, source)
+        pass
+    hint = "Send what docs/serve.md shows."
+    try:  # the same check says what is wrong in the words of a configuration
+        validate(REQUESTS[word], ConfigSource(fields, {(): Location()}, Path(), Path(), ()))
     except InputError:
         raise
-    except Exception as fault:  # what was sent cannot even be explained
-        raise DataError(
-            f"the request is refused ({type(fault).__name__}).", hint="Send what docs/serve.md shows."
-        ) from (fault)
-    raise DataError("the request is refused.", hint="Send what docs/serve.md shows.")
+    except Exception as fault:  # not even that is possible
+        raise DataError(f"the request is refused ({type(fault).__name__}).", hint=hint) from fault
+    raise DataError("the request is refused.", hint=hint)
 
 
 def _not_finite(word: str) -> NoReturn:

@@ -34,8 +34,8 @@ class ServedArm:
         name: the arm's instance name.
         dimensions: ``angle`` or ``length`` by commanded joint, in order.
         compensator: of the calibration as it was loaded.
-        needs_payload: whether it gives under load and nothing says what hangs on it.
-        heated: the compensator of requests that tell the temperature; None where the arm does not change with it.
+        needs_payload: whether it deflects under load and the calibration states no payload.
+        heated: the compensator of requests that state the temperature; None where the arm does not change with it.
         point: what requests and answers are about: the tool's frame, or the target that was measured.
     """
 
@@ -58,9 +58,9 @@ class ServedArm:
 
     @property
     def shown(self) -> Mapping[str, str | list[str]]:
-        """What a client can know of it: joints, what arrives, and the keys of the surroundings that it changes with."""
-        found: dict[str, str | list[str]] = {"joints": [*self.joints], "point": self.point}
-        return found if self.heated is None else {**found, "conditions": [TEMPERATURE_KEY]}
+        """For clients: its joints, the point that arrives, and the keys of the surroundings that it changes with."""
+        conditions: dict[str, str | list[str]] = {} if self.heated is None else {"conditions": [TEMPERATURE_KEY]}
+        return {"joints": [*self.joints], "point": self.point, **conditions}
 
     def angles(self, given: Sequence[Sequence[float] | Mapping[str, float]], field: str) -> Array:
         """Postures (N x n; rad) from angles in order or by name.
@@ -83,10 +83,17 @@ class ServedArm:
         for i, row in enumerate(given):
             values: dict[str, float] = {}
             for key, value in row.items():
-                name, number = self._read(key, value, f"{field}.{i}")
+                split = split_suffix(key)
+                if split is None:
+                    _refuse(f"found {_short(key)!r} without a unit.", f"{field}.{i}", f"For example {self._example()}.")
+                name, unit = split
+                self._known(name, f"{field}.{i}")
+                if unit.dimension != self.dimensions[name]:
+                    text = f"found {unit.name} for the joint {name}, expected a unit of {self.dimensions[name]}."
+                    _refuse(text, f"{field}.{i}", f"For example {self._example()}.")
                 if name in values:
                     _refuse(f"the joint {name} is given twice.", f"{field}.{i}", "Give it once.")
-                values[name] = number
+                values[name] = from_unit(value, unit.name)
             rows.append(self._in_order(values, f"{field}.{i}"))
         return np.array(rows)
 
@@ -96,9 +103,9 @@ class ServedArm:
         named = zip(self.dimensions.items(), values, strict=True)
         return {f"{name}_{units[kind]}": to_unit(float(value), units[kind]) for (name, kind), value in named}
 
-    def approach(self, said: Acting, count: int) -> Array:
-        """From where each joint comes (n x count)."""
-        given = said.approach
+    def approach(self, acting: Acting, count: int) -> Array:
+        """From where each joint comes (n x count): -1, 0 (not known) or 1."""
+        given = acting.approach
         if given is None:
             return np.zeros((len(self.joints), count))
         if isinstance(given, Mapping):
@@ -110,28 +117,29 @@ class ServedArm:
         return np.repeat(np.array(row, dtype=float)[:, None], count, axis=1)
 
     def acting(self, general: Acting, count: int, single: Sequence[Acting] = ()) -> Array:
-        """What acts (LOAD_CHANNELS x count): as said for all, then as said for each.
+        """What acts (LOAD_CHANNELS x count; SI): as stated for all, then as stated for each.
 
         Raises:
-            DataError: what hangs on the arm is needed, and said nowhere.
+            DataError: the payload is needed, and stated nowhere.
         """
         expression = self.compensator.expression
         start = expression.channels.index(LOAD_CHANNELS[0])
         defaults = expression.defaults[start : start + len(LOAD_CHANNELS)]
-        found = np.repeat(np.asarray(defaults, dtype=float)[:, None], count, axis=1)
-        _put(found, general, slice(None))
-        for i, each in enumerate(single):
-            _put(found, each, slice(i, i + 1))
-        if self.needs_payload and general.payload is None and not (single and all(_has_payload(e) for e in single)):
+        loads = np.repeat(np.asarray(defaults, dtype=float)[:, None], count, axis=1)
+        _put(loads, general, slice(None))
+        for i, acting in enumerate(single):
+            _put(loads, acting, slice(i, i + 1))
+        stated = general.payload is not None or (single and all(acting.payload is not None for acting in single))
+        if self.needs_payload and not stated:
             _refuse(
                 "the arm gives under load, and neither the request nor the calibration says what hangs on it.",
                 "payload_g",
                 "Give payload_g, 0 where nothing hangs on it.",
             )
-        return found
+        return loads
 
     def at_temperature(self, field: str) -> Compensator:
-        """What answers where a field of the request tells the temperature.
+        """The compensator where a field of the request states the temperature.
 
         Raises:
             DataError: the arm does not change with it.
@@ -154,17 +162,6 @@ class ServedArm:
             _refuse(text, field, "Give one for each joint, in this order, or give them by name.")
         return [float(value) for value in row]
 
-    def _read(self, key: str, value: float, field: str) -> tuple[str, float]:
-        split = split_suffix(key)
-        if split is None:
-            _refuse(f"found {_short(key)!r} without a unit.", field, f"For example {self._example()}.")
-        name, unit = split
-        self._known(name, field)
-        if unit.dimension != self.dimensions[name]:
-            message = f"found {unit.name} for the joint {name}, expected a unit of {self.dimensions[name]}."
-            _refuse(message, field, f"For example {self._example()}.")
-        return name, from_unit(value, unit.name)
-
     def _known(self, name: str, field: str) -> None:
         if name in self.dimensions:
             return
@@ -177,18 +174,15 @@ class ServedArm:
         return f"{name}_{'deg' if kind == 'angle' else 'mm'}"
 
 
-def _put(found: Array, said: Acting, columns: slice) -> None:
-    if said.payload is not None:
-        found[LOAD_CHANNELS.index("payload"), columns] = said.payload
+def _put(loads: Array, acting: Acting, columns: slice) -> None:
+    """Write what is stated into columns of loads (LOAD_CHANNELS x N)."""
+    if acting.payload is not None:
+        loads[LOAD_CHANNELS.index("payload"), columns] = acting.payload
     for field in _VECTORS:
-        vector = getattr(said, field)
+        vector = getattr(acting, field)
         if vector is not None:
             first = LOAD_CHANNELS.index(f"{_CHANNEL.get(field, field)}_x")
-            found[first : first + 3, columns] = np.array(vector)[:, None]
-
-
-def _has_payload(said: Acting) -> bool:
-    return said.payload is not None
+            loads[first : first + 3, columns] = np.array(vector)[:, None]
 
 
 def _refuse(message: str, field: str, hint: str) -> NoReturn:

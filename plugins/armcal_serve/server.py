@@ -1,4 +1,4 @@
-"""The server: requests from its transports, answers from its crew of workers, until it is told to end."""
+"""The server: requests from its transports, answers from its workers, until a signal asks for the end."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Server:
         workers: how many processes answer.
         how: commands are found; see ``armcal_serve.worker_pool.WorkerPool``.
         openings: make the transports.
-        tell: is told what whoever started it should know.
+        tell: takes what whoever started it should know.
 
     Raises:
         InputError: a transport cannot be opened.
@@ -63,7 +63,10 @@ class Server:
             ArmcalError: the calibration cannot be used.
         """
         try:
-            self._make_ready(signals)
+            self._pool.begin(self._watch.first())
+            while self._pool.tag is None and not signals.finish:
+                self._poller.step(_STEP_S)
+                self._pool.tend(looking=False)
             if not signals.finish:
                 self._serve(signals)
         finally:
@@ -85,16 +88,10 @@ class Server:
             "up_s": round(time.monotonic() - self._began, 1),
         }
 
-    def _make_ready(self, signals: Signals) -> None:
-        self._pool.begin(self._watch.first())
-        while self._pool.tag is None and not signals.finish:
-            self._poller.step(_STEP_S)
-            self._pool.tend(looking=False)
-
     def _serve(self, signals: Signals) -> None:
         names = [transport.name for transport in self._transports]
-        told = {"calibration": self._pool.tag, "arms": self._pool.arms, "by": names}
-        self._tell("ready", f"ready: {self._watch.path} by {', '.join(names)}", told)
+        content = {"calibration": self._pool.tag, "arms": self._pool.arms, "by": names}
+        self._tell("ready", f"ready: {self._watch.path} by {', '.join(names)}", content)
         gc.collect()
         gc.freeze()
         for transport in self._transports:
@@ -106,13 +103,8 @@ class Server:
                 tag = self._pool.tag
                 number = 0 if tag is None else tag["sequence"]
                 sentence = f"calibration {number} is answered from, {self._dispatcher.asked} requests so far; "
-                self._tell(
-                    "status", f"{sentence}the file is {self._watch.state}. {self._watch.why}".rstrip(), self.status()
-                )
-        self._finish()
-
-    def _finish(self) -> None:
-        """Answer what was asked."""
+                sentence += f"the file is {self._watch.state}. {self._watch.why}"
+                self._tell("status", sentence.rstrip(), self.status())
         for transport in self._transports:
             transport.listen_no_more()
         ends = time.monotonic() + _GRACE_S

@@ -1,4 +1,4 @@
-"""The process that answers: it has one calibration, from its start to its end."""
+"""The process that answers, with one calibration from its start to its end; and its messages to and from the server."""
 
 from __future__ import annotations
 
@@ -6,22 +6,65 @@ import json
 import os
 import signal
 import socket
+import struct
 import sys
 import warnings
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from armcal.errors import EXIT_FAULT, ArmcalError, CalibrationWarning
-
-from armcal_serve.frames import ABOUT_ITSELF, Message, Unpacker
+from armcal.errors import EXIT_FAULT, ArmcalError, CalibrationWarning, Location
 
 if TYPE_CHECKING:
     from armcal_serve.answering import Answerer
 
+ABOUT_ITSELF = 0
+"""The ticket of messages that are no request: orders to a worker, and its state."""
+_HEAD = struct.Struct("!IQd")
 _NICENESS = 19
 """Requests come first."""
 _CHUNK = 256 * 1024
+
+
+@dataclass(frozen=True)
+class Message:
+    """One message: a head of fixed size, and bytes.
+
+    Attributes:
+        ticket: of the request that it belongs to.
+        content: the request, or its answer.
+        arrived: when the request came (monotonic seconds).
+    """
+
+    ticket: int
+    content: bytes
+    arrived: float = 0.0
+
+    def packed(self) -> bytes:
+        """As it is sent."""
+        return _HEAD.pack(len(self.content), self.ticket, self.arrived) + self.content
+
+
+class Unpacker:
+    """Cuts bytes into messages."""
+
+    def __init__(self) -> None:
+        self._open = bytearray()
+
+    def feed(self, data: bytes) -> list[Message]:
+        """The messages that are complete now."""
+        self._open += data
+        messages, at = [], 0
+        while len(self._open) - at >= _HEAD.size:
+            length, ticket, arrived = _HEAD.unpack_from(self._open, at)
+            end = at + _HEAD.size + length
+            if len(self._open) < end:
+                break
+            messages.append(Message(ticket, bytes(self._open[at + _HEAD.size : end]), arrived))
+            at = end
+        del self._open[:at]
+        return messages
 
 
 def main(descriptor: int) -> None:
@@ -33,7 +76,8 @@ def main(descriptor: int) -> None:
     messages = _messages(link)
     try:
         order, data = json.loads(next(messages).content), next(messages).content
-        answerer = _prepared(order, data, link)
+        answerer, state = _prepared(order, data)
+        link.sendall(Message(ABOUT_ITSELF, json.dumps(state).encode()).packed())
         if answerer is None:
             return
         for message in messages:
@@ -49,37 +93,24 @@ def _messages(link: socket.socket) -> Iterator[Message]:
         yield from cutter.feed(data)
 
 
-def _prepared(order: dict[str, Any], data: bytes, link: socket.socket) -> Answerer | None:
-    """What answers, once the server was told that it is ready; None if it was told why not."""
+def _prepared(order: dict[str, Any], data: bytes) -> tuple[Answerer | None, dict[str, Any]]:
+    """The answerer, and that it is ready; None, and why there is none."""
     try:
         with ThreadPoolExecutor(1) as aside:
             answerer, notices = aside.submit(_made, order, data).result()
     except ArmcalError as fault:
-        content: dict[str, Any] = {
-            "fault": {
-                "message": fault.message,
-                "file": fault.where.file if fault.where else None,
-                "line": fault.where.line if fault.where else None,
-                "field": fault.where.field if fault.where else None,
-                "hint": fault.hint,
-                "exit_code": fault.exit_code,
-            }
-        }
-        link.sendall(Message(ABOUT_ITSELF, json.dumps(content).encode()).packed())
-        return None
+        where = fault.where or Location()
+        content: dict[str, Any] = {"message": fault.message, "file": where.file, "line": where.line}
+        return None, {"fault": {**content, "field": where.field, "hint": fault.hint, "exit_code": fault.exit_code}}
     except Exception as fault:
         text = f"it cannot be used ({type(fault).__name__}: {fault})."
-        content = {"fault": {"message": text, "file": order["shown"], "exit_code": EXIT_FAULT}}
-        link.sendall(Message(ABOUT_ITSELF, json.dumps(content).encode()).packed())
-        return None
+        return None, {"fault": {"message": text, "file": order["shown"], "exit_code": EXIT_FAULT}}
     arms = {name: arm.shown for name, arm in answerer.arms.items()}
-    content = {"ready": answerer.tag, "arms": arms, "notices": notices}
-    link.sendall(Message(ABOUT_ITSELF, json.dumps(content).encode()).packed())
-    return answerer
+    return answerer, {"ready": answerer.tag, "arms": arms, "notices": notices}
 
 
 def _made(order: dict[str, Any], data: bytes) -> tuple[Answerer, list[str]]:
-    """What answers, and what its users should know of the calibration.
+    """The answerer, and what its users should know of the calibration.
 
     In a thread of its own: on Linux a niceness is a thread's, and could not be taken back from a whole process.
     """
@@ -91,4 +122,4 @@ def _made(order: dict[str, Any], data: bytes) -> tuple[Answerer, list[str]]:
         warnings.simplefilter("ignore")
         warnings.simplefilter("always", CalibrationWarning)
         answerer = loaded(Order(**{name: value for name, value in order.items() if name != "gently"}), data)
-    return answerer, [str(each.message) for each in caught]
+    return answerer, [str(notice.message) for notice in caught]

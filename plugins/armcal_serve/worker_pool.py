@@ -32,10 +32,10 @@ class WorkerPool:
     Args:
         size: how many answer.
         watch: of the file.
-        how: commands are found: the fields those fields of an ``Order`` that a command line sets.
+        how: commands are found: those fields of an ``Order`` that a command line sets.
         poller: of the server.
         dispatcher: has the requests.
-        tell: is told of changes.
+        tell: takes news of changes.
 
     Attributes:
         tag: the calibration that is answered from; None before the first is ready.
@@ -95,7 +95,15 @@ class WorkerPool:
         elif self._served is not None and now - self._without_since > LONGEST_S:
             hint = "Ask again; the status says what is known."
             self._dispatcher.give_up(ArmcalError("no process answers at present.", hint=hint))
-        self._tend_leaving()
+        for worker in [*self._leaving]:
+            if worker.gone and worker.given is not None:
+                fault = ArmcalError("it ended the process that answers, twice.", hint="Do not send it again.")
+                given, worker.given = worker.given, None
+                self._dispatcher.requeue(given, fault)
+            if not worker.gone and worker.given is None:
+                worker.leave()
+            if worker.gone and worker.ended():
+                self._leaving.remove(worker)
 
     def close(self) -> None:
         """End all workers."""
@@ -144,7 +152,7 @@ class WorkerPool:
         making = self._making
         if making is None:
             return
-        if making.told is None and not making.gone:
+        if making.state is None and not making.gone:
             if now - making.since <= (_GENTLY_S if self._gently else _LONGEST_LOADING_S):
                 return
             if self._gently:
@@ -153,30 +161,33 @@ class WorkerPool:
                 self._start(gently=False, again=self._made_of is self._served)
                 return
         self._making = None
-        content = making.told or {"fault": {"message": "the process that was to load it ended or hangs."}}
-        tag = content.get("ready")
+        state = making.state or {"fault": {"message": "the process that was to load it ended or hangs."}}
+        tag = state.get("ready")
         if tag is None or making.gone:
             making.kill()
             self._leaving.append(making)
-            fault = _fault(content.get("fault", {"message": "its process ended."}))
-            self._not_made(self._made_of, fault, passing="fault" not in (making.told or {}))
+            content = state.get("fault", {"message": "its process ended."})
+            where = Location(content.get("file"), content.get("line"), content.get("field"))
+            kind = InputError if content.get("exit_code") == EXIT_BAD_INPUT else ArmcalError
+            fault = kind(content["message"], where=where, hint=content.get("hint", ""))
+            self._not_made(self._made_of, fault, passing="fault" not in (making.state or {}))
         elif self.tag is not None and tag["sequence"] == self.tag["sequence"]:
             self._active.append(making)
         else:
             self._next_ready.append(making)
             if len(self._next_ready) == self._size or not self._active:
-                self._promote(content)
+                self._promote(state)
 
-    def _promote(self, told: Mapping[str, Any]) -> None:
+    def _promote(self, state: Mapping[str, Any]) -> None:
         """From now on requests go to the workers of the next calibration."""
         first = self.tag is None
         self._leaving += self._active
         self._active, self._next_ready = self._next_ready, []
         self._served, self._next = self._next, None
-        tag: CalibrationTag = told["ready"]
-        self.tag, self.arms = tag, told["arms"]
+        tag: CalibrationTag = state["ready"]
+        self.tag, self.arms = tag, state["arms"]
         self._watch.taken()
-        for notice in told["notices"]:
+        for notice in state["notices"]:
             self._tell("notice", notice, {})
         if not first:
             level = f", level {tag['level']}" if tag["level"] else ""
@@ -221,20 +232,3 @@ class WorkerPool:
         self._leaving.append(worker)
         self._tell("worker_lost", f"a process that answers ({worker.pid}) is gone; another is started", {})
         return True
-
-    def _tend_leaving(self) -> None:
-        for worker in [*self._leaving]:
-            if worker.gone and worker.given is not None:
-                fault = ArmcalError("it ended the process that answers, twice.", hint="Do not send it again.")
-                given, worker.given = worker.given, None
-                self._dispatcher.requeue(given, fault)
-            if not worker.gone and worker.given is None:
-                worker.leave()
-            if worker.gone and worker.ended():
-                self._leaving.remove(worker)
-
-
-def _fault(content: Mapping[str, Any]) -> ArmcalError:
-    where = Location(content.get("file"), content.get("line"), content.get("field"))
-    kind = InputError if content.get("exit_code") == EXIT_BAD_INPUT else ArmcalError
-    return kind(content["message"], where=where, hint=content.get("hint", ""))

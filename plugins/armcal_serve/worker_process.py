@@ -12,8 +12,8 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from armcal_serve.conversation import Ticket
-from armcal_serve.frames import ABOUT_ITSELF, Message, Unpacker
 from armcal_serve.poller import Poller
+from armcal_serve.worker import ABOUT_ITSELF, Message, Unpacker
 
 # -P: a file of the working directory called like a library is not taken for it, as it is not by the command.
 _COMMAND = (sys.executable, "-P", "-c", "import sys; from armcal_serve.worker import main; main(int(sys.argv[1]))")
@@ -27,14 +27,14 @@ class WorkerProcess:
     Attributes:
         given: the request that it has.
         since: when it was started, or given that (monotonic seconds).
-        told: what it said of itself: ``ready`` and ``arms``, or a ``fault``; None before.
+        state: ``ready``, ``arms`` and ``notices``, or a ``fault``; None before.
         gone: whether it ended.
     """
 
     def __init__(self, order: Mapping[str, Any], data: bytes, poller: Poller, heard: Callable[[], None]) -> None:
         self.given: Ticket | None = None
         self.since = time.monotonic()
-        self.told: dict[str, Any] | None = None
+        self.state: dict[str, Any] | None = None
         self.gone = False
         self._heard = heard
         self._poller = poller
@@ -114,7 +114,7 @@ class WorkerProcess:
             data = b""
         for message in self._cutter.feed(data):
             if message.ticket == ABOUT_ITSELF:
-                self.told = json.loads(message.content)
+                self.state = json.loads(message.content)
             elif self.given is not None and self.given.number == message.ticket:
                 given, self.given = self.given, None
                 given.answered(message.content)

@@ -19,16 +19,14 @@ from armcal.cli.main import cli
 from armcal.errors import ConfigError, InputError
 from armcal.estimate.mission_truth import DAY_S, Mission
 from armcal.estimate.simulation import SimulationRequest, measured_without_noise
-from armcal_online.commands.mission import _write
-from armcal_online.mission.errors import error_curve
-from armcal_online.mission.files import curve_text, figures, schedule, truth_text
+from armcal_online.mission.errors import error_curve, random_poses
+from armcal_online.mission.figure import mission_figure
+from armcal_online.mission.files import curve_text, figures, schedule, truth_text, write_files
 from armcal_online.mission.judge import Judgement, judge
 from armcal_online.mission.mission import MissionResult, before_launch, recalibrated, simulated
 from armcal_online.mission.mission_log import MissionLog
 from armcal_online.mission.settings import MissionPlan
 from armcal_online.mission.source import MissionSource, PowerCutError
-from armcal_online.mission.tips import random_poses
-from armcal_online.mission_figure import mission_figure
 from armcal_online.tracking.settings import RecalibrateSettings
 from click.testing import CliRunner, Result
 
@@ -375,5 +373,5 @@ def test_a_mission_writes_through_no_link(
     folder.mkdir()
     (folder / "mission.csv").symlink_to(elsewhere)
     with pytest.raises(InputError, match=r"mission\.csv: it is a link"):
-        _write(folder, plan(), MissionResult(mission(), start, *knowing), {})
+        write_files(folder, plan(), MissionResult(mission(), start, *knowing), {})
     assert not elsewhere.exists()

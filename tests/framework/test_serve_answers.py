@@ -19,11 +19,10 @@ from armcal.calibration.calibration import Calibration
 from armcal.calibration.calibration_file import sealed
 from armcal.calibration.compensation.request import Commands
 from armcal.errors import ConfigError, DataError
-from armcal_serve.answering import Answerer
+from armcal_serve.answering import Answerer, command_rows
 from armcal_serve.calibration_watch import CalibrationWatch
 from armcal_serve.loaded import Order, loaded
 from armcal_serve.protocol import Acting, CompensateAnswer, ForwardAnswer, Refusal
-from armcal_serve.rows import command_rows
 from armcal_serve.served_arm import ServedArm
 from pydantic import TypeAdapter
 from scipy.spatial.transform import Rotation
@@ -231,16 +230,16 @@ def commands(counts: Any = None) -> Commands:
 def test_counts_pulses_and_sliding_joints() -> None:
     arm = fake_arm(q1="angle", s="length")
     counted = commands(counts=np.array([[307, 0]]))
-    (row,) = command_rows(arm, counted, "counts", lambda pose: {"position_mm": [], "quaternion_wxyz": []})
+    (row,) = command_rows(arm, counted, "counts")
     assert (
         row["counts"] == [307, None]
         and row["approach"] == [-1, 0]
         and row["error_mm"] == 1.0
         and row["error_deg"] == pytest.approx(1.0)
     )
-    (row,) = command_rows(arm, counted, "pulse_us", lambda pose: {"position_mm": [], "quaternion_wxyz": []})
+    (row,) = command_rows(arm, counted, "pulse_us")
     assert row["pulse_us"] == [pytest.approx(307 * 122 / 25), None]
-    (row,) = command_rows(arm, commands(), "deg", lambda pose: {"position_mm": [], "quaternion_wxyz": []})
+    (row,) = command_rows(arm, commands(), "deg")
     assert row["joints"] == {"q1_deg": pytest.approx(28.64788975654116), "s_mm": 20.0}
     assert arm.named([{"s_mm": 5, "q1_deg": 180}], "joints") == pytest.approx(np.array([[np.pi, 0.005]]))
     with pytest.raises(DataError, match="sliding"):

@@ -17,12 +17,12 @@ import pytest
 from armcal.errors import ArmcalError, InputError
 from armcal_serve.conversation import MOST_WAITING, Ticket
 from armcal_serve.dispatcher import Dispatcher
-from armcal_serve.frames import Message, Unpacker
 from armcal_serve.poller import Poller
 from armcal_serve.protocol import MAX_LINE_BYTES
 from armcal_serve.transports.datagrams import Datagrams
 from armcal_serve.transports.standard import StandardStreams
 from armcal_serve.transports.unix import MOST_CLIENTS, UnixSocket
+from armcal_serve.worker import Message, Unpacker
 
 
 class Worker:

@@ -10,6 +10,7 @@ import socket
 import threading
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 from armcal.base.dataset import Dataset
@@ -19,11 +20,10 @@ from armcal_online.running.progress import MAX_FILES, Progress
 from armcal_online.sources.csv_file import CsvFile
 from armcal_online.sources.folder import Folder
 from armcal_online.sources.incoming import Incoming, Place
-from armcal_online.sources.lines import Lines
 from armcal_online.sources.opening import open_source
 from armcal_online.sources.row_parser import RowParser
 from armcal_online.sources.source import Source
-from armcal_online.sources.udp import Udp
+from armcal_online.sources.streams import Lines, Udp
 from armcal_tracker.csv_reader import CsvReader, CsvSettings
 from fake_recalibrator import HEADER, request, row
 
@@ -450,3 +450,25 @@ def test_a_pipe_in_the_place_of_a_followed_file_is_not_waited_for(tmp_path: Path
     path.unlink()
     path.write_text(table(3, 7))
     assert len(everything(source)) == 3
+
+
+def test_a_pipe_that_takes_the_place_of_a_file_before_it_is_opened_is_not_waited_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "a.csv").write_text(table(1))
+    (tmp_path / "b.csv").write_text(table(1, 7))
+    settled = Folder._is_settled
+
+    def replaced(self: Folder, name: str, watched: Any) -> bool:
+        ready = settled(self, name, watched)
+        if ready and name == "a.csv":
+            (tmp_path / name).unlink()
+            os.mkfifo(tmp_path / name)
+        return ready
+
+    monkeypatch.setattr(Folder, "_is_settled", replaced)
+    found: list[Incoming] = []
+    looking = threading.Thread(target=lambda: found.extend(everything(folder(tmp_path), 0.5)), daemon=True)
+    looking.start()
+    looking.join(10)
+    assert not looking.is_alive() and ids(found) == ["p7"]

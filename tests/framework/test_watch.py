@@ -21,12 +21,13 @@ import yaml
 from armcal.calibration.calibration import Calibration
 from armcal.cli.main import cli
 from armcal.io.event_file import EventFile
+from armcal.io.line_cutter import MAX_LINE_BYTES
 from armcal_online.watch.events import message_of, record_of
 from armcal_online.watch.feed import Feed
 from armcal_online.watch.history import OLDER_ACCEPTED, OLDER_OTHERS, RECENT_RECORDS, History
 from armcal_online.watch.lenient import LONGEST_TEXT, number, parsed, text
 from armcal_online.watch.shape import Shape, drawing_of
-from armcal_online.watch.tail import LONGEST_LINE, Tail
+from armcal_online.watch.tail import Tail
 from armcal_online.watch.terminal import line, picture
 from armcal_online.watch.thinned import Thinned
 from click.testing import CliRunner
@@ -127,7 +128,7 @@ def test_no_file_is_held_so_that_what_is_dropped_makes_room(tmp_path: Path) -> N
 
 def test_a_line_without_end_is_passed_over_and_memory_stays_flat(tmp_path: Path) -> None:
     path, tail = tmp_path / "events.jsonl", tail_of(tmp_path)
-    path.write_bytes(b"before\n" + b"x" * (3 * LONGEST_LINE) + b"\nafter\n")
+    path.write_bytes(b"before\n" + b"x" * (3 * MAX_LINE_BYTES) + b"\nafter\n")
     assert all_lines(tail) == ["before", "after"]
     assert tail.too_long == 1
 

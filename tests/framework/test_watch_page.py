@@ -11,7 +11,7 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 import pytest
-from armcal_online.watch.page import page
+from armcal_online.watch.server import page
 from armcal_online.watch.shape import Shape
 from browser import CHROMIUM, Browser
 from watching import Served, decision, made_up, made_up_folder

@@ -9,9 +9,8 @@ from pathlib import Path
 
 import pytest
 from armcal.errors import InputError
-from armcal_online.watch.access import Access, is_loopback
 from armcal_online.watch.feed import Feed
-from armcal_online.watch.server import MOST_STREAMS, WatchServer
+from armcal_online.watch.server import MOST_STREAMS, Access, WatchServer, is_loopback
 from watching import Served, Stream, decision, made_up_folder
 
 ROOT = Path(__file__).resolve().parents[2]

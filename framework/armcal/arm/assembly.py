@@ -62,13 +62,15 @@ class ArmState:
     """An arm in one record: its tool and named frames, and the deflection that its springs answer with.
 
     In equilibrium ``next_deflection`` equals the deflection that was put in. ``efforts`` are what gravity and load do
-    about or along each joint's own axis (joints x 1; N m, N on sliding joints).
+    about or along each joint's own axis (joints x 1; N m, N on sliding joints). ``origins`` are those of the mount
+    and of each joint's frame in the base frame (3x1 each; m).
     """
 
     base_T_tool: Transform
     frames: Mapping[str, Transform]
     next_deflection: Expression
     efforts: Expression = None
+    origins: tuple[Expression, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -191,7 +193,8 @@ class Arm:
         frames = forward(chain, displacements, rotations)
         acting = wrenches(chain, frames, self._masses(values), inputs.load)
         answer = deflections(chain, frames, acting, sites, commands)
-        return ArmState(frames.base_T_tool, frames.named, answer, joint_efforts(chain, frames, acting))
+        origins = tuple(site.origin for site in frames.sites)
+        return ArmState(frames.base_T_tool, frames.named, answer, joint_efforts(chain, frames, acting), origins)
 
     @property
     def conditions(self) -> tuple[str, ...]:

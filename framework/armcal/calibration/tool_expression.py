@@ -41,6 +41,7 @@ class ToolExpression:
         state: symbols, the deflection (n_d; rad or m).
         next_state: what the springs answer with; equal to ``state`` in equilibrium.
         base_T_tool: at ``state``.
+        origins: of the mount and of each joint's frame in the base frame, at ``state`` (3x1 each; m).
         efforts: about or along the axes of all joints of the chain, at ``state`` (N m, N on sliding joints).
         servos: by commanded joint, which displacements can be set.
         tool_T_point: the point of the tool that ``base_T_tool`` is of (constant); the tool itself unless ``at`` chose.
@@ -55,6 +56,7 @@ class ToolExpression:
     state: Expression
     next_state: Expression
     base_T_tool: Transform
+    origins: tuple[Expression, ...]
     efforts: Expression
     servos: Mapping[str, tuple[PulseTable, PulseClock]]
     tool_T_point: Transform = field(default_factory=se3.identity)
@@ -133,6 +135,7 @@ def arm_expression(
         state=deflection,
         next_state=ca.densify(arm_state.next_deflection),
         base_T_tool=arm_state.base_T_tool,
+        origins=arm_state.origins,
         efforts=ca.densify(arm_state.efforts),
         servos=servos,
     )

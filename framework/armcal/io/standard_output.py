@@ -48,17 +48,28 @@ class StandardOutput:
         """Whether the line went out whole; half a line is ended before the next."""
         left = memoryview(b"\n" + data if self._begun else data)
         while left:
-            wait_s = 0.0 if self.lost else self._patience_s
-            poll = select.poll()
-            poll.register(descriptor, select.POLLOUT)
-            if not poll.poll(wait_s * 1000):
+            count = write_ready(descriptor, left, 0.0 if self.lost else self._patience_s)
+            if not count:
                 return False
-            try:
-                left = left[os.write(descriptor, left[:_AT_ONCE]) :]
-            except BlockingIOError:
-                return False
+            left = left[count:]
             self._begun = bool(left)
         return True
+
+
+def write_ready(descriptor: int, data: memoryview, wait_s: float = 0.0) -> int:
+    """Write what a descriptor takes without blocking, at most 4 KiB; the number of bytes, 0 if it does not get ready.
+
+    Raises:
+        OSError: nobody reads it any more.
+    """
+    poll = select.poll()
+    poll.register(descriptor, select.POLLOUT)
+    if not poll.poll(wait_s * 1000):
+        return 0
+    try:
+        return os.write(descriptor, data[:_AT_ONCE])
+    except BlockingIOError:
+        return 0
 
 
 def _descriptor(stream: BinaryIO | None) -> int | None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,15 +26,7 @@ def control(console: Console, folder: Path, command: str, values: tuple[str, ...
 
     `rollback N` takes up the estimate as it was after record N; `what-if q1_deg=10 q2_deg=20 ...` predicts the tip.
     """
-    reply = ask(folder, _request(command, values), timeout)
-    if not reply.pop("ok", False):
-        error = str(reply.get("error", "it answered with nothing that is known."))
-        raise InputError(error, hint="" if error.endswith((".", "?")) else "Ask `armcal control DIR status` first.")
-    if not console.quiet:
-        click.echo(json.dumps(reply, indent=2))
-
-
-def _request(command: str, values: Sequence[str]) -> dict[str, Any]:
+    request: dict[str, Any] = {"command": command}
     if command == "rollback":
         if len(values) != 1 or not (values[0].isascii() and values[0].isdigit()):
             raise InputError(
@@ -43,14 +34,18 @@ def _request(command: str, values: Sequence[str]) -> dict[str, Any]:
                 where=Location("rollback"),
                 hint="For example: armcal control DIR rollback 120.",
             )
-        return {"command": "rollback", "to": int(values[0])}
-    if command == "what-if":
-        return {"command": "what_if", "joints": dict(map(_value, values))}
-    if values:
-        raise InputError(
-            f"found {' '.join(values)}, expected nothing more.", where=Location(command), hint="Leave it out."
-        )
-    return {"command": command}
+        request["to"] = int(values[0])
+    elif command == "what-if":
+        request = {"command": "what_if", "joints": dict(map(_value, values))}
+    elif values:
+        text = f"found {' '.join(values)}, expected nothing more."
+        raise InputError(text, where=Location(command), hint="Leave it out.")
+    reply = ask(folder, request, timeout)
+    if not reply.pop("ok", False):
+        error = str(reply.get("error", "its answer cannot be understood."))
+        raise InputError(error, hint="" if error.endswith((".", "?")) else "Ask `armcal control DIR status` first.")
+    if not console.quiet:
+        click.echo(json.dumps(reply, indent=2))
 
 
 def _value(text: str) -> tuple[str, float]:

@@ -2,25 +2,29 @@
 
 from __future__ import annotations
 
+import io
 import json
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import click
-from armcal.base.config_text import as_json
+from armcal.calibration.calibration import Calibration
 from armcal.cli.common import Console, overrides, speaking
-from armcal.errors import InputError, Location
 from armcal.io.folder import reserved
-from armcal.io.plain_files import check_output
-from armcal.plugins import discover
+from armcal.io.standard_output import StandardOutput
+from armcal.plugins import PluginRegistry, discover
 from armcal.run.pipeline import Stopwatch
 from rich.table import Table
 
-from armcal_online.commands.mission_session import loop_session
-from armcal_online.mission.files import curve_text, figures, schedule, truth_text
-from armcal_online.mission.mission import BENCH, CALIBRATION, RECALIBRATION, RECORDS, MissionResult, run_mission
+from armcal_online.commands.recalibrate import setup_of
+from armcal_online.mission.files import figures, write_files
+from armcal_online.mission.mission import BENCH, CALIBRATION, RECALIBRATION, RECORDS, Session, run_mission
 from armcal_online.mission.settings import MissionPlan
-from armcal_online.mission_figure import mission_figure
+from armcal_online.mission.source import MissionSource, PowerCutError
+from armcal_online.running.session import opened
+from armcal_online.tracking.recalibrator import Recalibrator
+from armcal_online.tracking.settings import RecalibrateSettings
 
 TRUTH = ("truth.csv", "truth.json")
 FIGURES = ("mission.csv", "mission.json", "mission.png")
@@ -46,33 +50,12 @@ def mission(console: Console, config: Path, out: Path, overrides: tuple[str, ...
     with console.progress() as progress:
         result = run_mission(plan, out, loop_session(registry), registry, progress, watch)
     content = {**figures(plan.experiment.name, result.mission, result.log, result.judgement), "seconds": watch.seconds}
-    _write(out, plan, result, content)
+    write_files(out, plan, result, content)
     console.result({**content, "folder": str(out)})
     _show(console, content)
     for stage, seconds in watch.seconds.items():
         console.detail(f"{stage}: {seconds:.1f} s")
     console.out.print(f"figure: {out / 'mission.png'}  ({watch.total():.1f} s)", markup=False, soft_wrap=True)
-
-
-def _write(folder: Path, plan: MissionPlan, result: MissionResult, told: dict[str, Any]) -> None:
-    curve, truth = result.judgement.curve, result.mission.truth
-    texts = {
-        "truth.csv": truth_text(result.mission, plan.experiment.parameters),
-        "truth.json": json.dumps(schedule(result.mission), indent=2) + "\n",
-        "mission.csv": curve_text(curve, truth.temperature_at(curve.times)),
-        "mission.json": as_json(told) + "\n",
-    }
-    try:
-        picture = mission_figure(result.mission, result.judgement, plan.experiment.name)
-        for name, content in {**{n: text.encode() for n, text in texts.items()}, "mission.png": picture}.items():
-            check_output(folder / name, InputError)
-            (folder / name).write_bytes(content)
-    except OSError as fault:
-        raise InputError(
-            f"it cannot be written ({fault.strerror or fault}).",
-            where=Location(str(folder)),
-            hint="Check the room on the disk.",
-        ) from fault
 
 
 def _show(console: Console, content: dict[str, Any]) -> None:
@@ -81,8 +64,8 @@ def _show(console: Console, content: dict[str, Any]) -> None:
     table.add_column("calibration")
     for column in ("mean", "median", "p95", "max", "last"):
         table.add_column(column, justify="right")
-    for name, figures_ in errors.items():
-        table.add_row(name, *(f"{figures_[column]:.3f}" for column in ("mean", "median", "p95", "max", "last")))
+    for name, summary in errors.items():
+        table.add_row(name, *(f"{summary[column]:.3f}" for column in ("mean", "median", "p95", "max", "last")))
     console.out.print(table)
     for event in content["events"]:
         records = event["recovered_after_records"]
@@ -104,3 +87,24 @@ def _show(console: Console, content: dict[str, Any]) -> None:
 
 def _line(console: Console, text: str) -> None:
     console.out.print(text, markup=False, soft_wrap=True)
+
+
+def loop_session(registry: PluginRegistry) -> Session:
+    """Sessions through the loop that ``armcal recalibrate`` uses, each resuming from the journal in its folder."""
+
+    def session(
+        calibration: Path, settings: RecalibrateSettings, source: MissionSource, folder: Path
+    ) -> Sequence[Mapping[str, Any]]:
+        recalibrator = Recalibrator.begin(Calibration.load(calibration, registry), settings, registry)
+        events = io.BytesIO()
+        setup = setup_of(settings, calibration, folder, StandardOutput(events))
+        try:
+            with opened(setup, recalibrator, lambda rows: source) as loop:
+                loop.run()
+                if not source.ended:
+                    raise KeyboardInterrupt
+        except PowerCutError:
+            pass
+        return [json.loads(line) for line in events.getvalue().decode().splitlines()]
+
+    return session

@@ -15,7 +15,7 @@ from armcal.plugins import discover
 
 from armcal_online.running.loop import Pace
 from armcal_online.running.session import Setup, opened
-from armcal_online.sources.opening import open_source
+from armcal_online.sources.opening import KINDS, open_source
 from armcal_online.sources.source import AtEnd
 from armcal_online.tracking.recalibrator import Recalibrator
 from armcal_online.tracking.settings import RecalibrateSettings, load_settings
@@ -31,7 +31,7 @@ _NOT_DECIDING = ("output", "journal")
     "source",
     required=True,
     metavar="SOURCE",
-    help="Where records come from: - (standard input), udp:PORT, udp:HOST:PORT?from=SENDER, a directory, or a CSV.",
+    help=f"Where records come from: {KINDS}.",
 )
 @click.option("--config", type=click.Path(path_type=Path), help="How to recalibrate.")
 @overrides
@@ -59,9 +59,9 @@ def recalibrate(
     stream = StandardOutput(None if console.quiet else sys.stdout.buffer)
     at_end: AtEnd = "wait" if follow else "stop"
     setup = setup_of(settings, calibration, out, stream)
-    with opened(setup, session, lambda rows: open_source(source, rows, at_end)) as going:
+    with opened(setup, session, lambda rows: open_source(source, rows, at_end)) as loop:
         console.detail(f"records from {source}, kept in {out}")
-        going.run()
+        loop.run()
 
 
 def setup_of(settings: RecalibrateSettings, calibration: Path, out: Path, stream: StandardOutput) -> Setup:

@@ -67,15 +67,17 @@ def replay_command(
     check_until(held, until)
     header = held.first.header
     settings = _evaluated(kept_settings(header), evaluator)
-    recalibrate_settings = _wanted(header, config, overrides)
+    other_settings = kept_settings(header, overrides) if overrides else None
+    if config is not None:
+        other_settings = load_settings(config, overrides)
     begun_from = kept_calibration(header, folder, registry)
     session = begun(begun_from, settings, registry)
     comparer = Comparer(session.evaluator)
     with console.progress() as progress:
         done = replay(held, session, comparer, until, progress)
         other = None
-        if recalibrate_settings is not None:
-            others = begun(begun_from, _evaluated(recalibrate_settings, evaluator), registry)
+        if other_settings is not None:
+            others = begun(begun_from, _evaluated(other_settings, evaluator), registry)
             replayer = replay(held, others, NoVerifier(), until, progress, "with other settings").replayer
             other = _Other(replayer, compared(done.replayer, replayer))
     chosen = other.replayer if other else done.replayer
@@ -83,17 +85,10 @@ def replay_command(
     if written:
         write_whole(REAL_FILES, written, chosen.session.calibration_text().encode())
     console.result(_as_json(held, done, comparer, other, written))
-    _tell(console, held, done, comparer, other)
+    _show(console, held, done, comparer, other)
     if written:
         console.out.print(f"the calibration after entry {chosen.last}: {written}", markup=False, soft_wrap=True)
     _leave(held, done)
-
-
-def _wanted(header: Mapping[str, Any], config: Path | None, overrides: tuple[str, ...]) -> RecalibrateSettings | None:
-    """The other settings that are asked about, if any are."""
-    if config is not None:
-        return load_settings(config, overrides)
-    return kept_settings(header, overrides) if overrides else None
 
 
 def _evaluated(settings: RecalibrateSettings, evaluator: str | None) -> RecalibrateSettings:
@@ -123,36 +118,32 @@ def _leave(held: Kept, done: Replayed) -> None:
         context.exit(EXIT_FAULT)
 
 
-def _verdict(done: Replayed, comparer: Comparer) -> str:
-    counts = f"{done.replayer.entries} entries, {comparer.states} states compared"
-    if done.difference is not None:
-        return f"{counts}; after entry {done.difference.sequence} they differ. {done.difference.sentence}"
-    if comparer.equal == comparer.states:
-        return f"{counts}, all the same to the last bit"
-    text = f"{counts}, {comparer.equal} the same to the last bit"
-    if comparer.measured:
-        widest = f"{comparer.widest.values:.1e} sd ({comparer.widest.covariance:.1e} in the covariance)"
-        text += f"; {comparer.measured} of the others were noted in full and differ by at most {widest}"
-    return f"{text}; all {comparer.decisions} decisions and levels are the same"
-
-
-def _tell(console: Console, held: Kept, done: Replayed, comparer: Comparer, other: _Other | None) -> None:
+def _show(console: Console, held: Kept, done: Replayed, comparer: Comparer, other: _Other | None) -> None:
     def say(text: str) -> None:
         console.out.print(text, markup=False, soft_wrap=True)
 
     header, replayer = held.first.header, done.replayer
     say(f"{held.folder}: begun from {header['path']}, replayed from entry {replayer.first} to {replayer.last}")
-    evaluator = replayer.session.evaluator
     same = "as the journal was written" if not comparer.others else f"another than the journal's: {comparer.others[0]}"
-    say(f"evaluator: {evaluator['backend']}, {same}")
+    say(f"evaluator: {replayer.session.evaluator['backend']}, {same}")
     for text in comparer.others[1:]:
         console.detail(f"  {text}")
-    say(_verdict(done, comparer))
+    counts = f"{replayer.entries} entries, {comparer.states} states compared"
+    if done.difference is not None:
+        say(f"{counts}; after entry {done.difference.sequence} they differ. {done.difference.sentence}")
+    elif comparer.equal == comparer.states:
+        say(f"{counts}, all the same to the last bit")
+    else:
+        counts = f"{counts}, {comparer.equal} the same to the last bit"
+        if comparer.measured:
+            widest = f"{comparer.widest.values:.1e} sd ({comparer.widest.covariance:.1e} in the covariance)"
+            counts += f"; {comparer.measured} of the others were noted in full and differ by at most {widest}"
+        say(f"{counts}; all {comparer.decisions} decisions and levels are the same")
     if other is not None:
-        console.out.print(_table(done.replayer, other))
+        console.out.print(_table(replayer, other))
     else:
         state = replayer.session.state
-        counts = ", ".join(f"{count} {what}" for what, count in state.counts.items())
+        counts = ", ".join(f"{count} {verdict}" for verdict, count in state.counts.items())
         say(f"{replayer.records} records, of these in the estimate: {counts}; level {state.health.level}")
     if held.cut is not None:
         console.warn(held.cut.sentence)

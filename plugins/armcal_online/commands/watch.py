@@ -28,7 +28,14 @@ _REFRESH = 1.0
 @click.option("--json", "as_json", is_flag=True, help="With --once: as JSON.")
 def watch(folder: Path, host: str, port: int, terminal: bool, once: bool, as_json: bool) -> None:
     """Show a recalibration live: a page in the browser, or this terminal. DIR is its folder, which is only read."""
-    _check(folder, once, as_json)
+    where, hint = Location(str(folder)), "Give what armcal recalibrate was given as --out"
+    if folder.exists() and not folder.is_dir():
+        raise InputError("it is a file, expected the folder of a recalibration.", where=where, hint=f"{hint}.")
+    if once and not folder.exists():
+        raise InputError("there is no such folder.", where=where, hint=f"{hint}; without --once it is waited for.")
+    if as_json and not once:
+        hint = "Programs follow events.jsonl in the folder itself."
+        raise InputError("it is only for --once.", where=Location("--json"), hint=hint)
     if once:
         _print_once(Feed(folder), as_json)
         return
@@ -46,27 +53,6 @@ def watch(folder: Path, host: str, port: int, terminal: bool, once: bool, as_jso
         signal.signal(signal.SIGTERM, earlier)
 
 
-def _check(folder: Path, once: bool, as_json: bool) -> None:
-    if folder.exists() and not folder.is_dir():
-        raise InputError(
-            "it is a file, expected the folder of a recalibration.",
-            where=Location(str(folder)),
-            hint="Give what armcal recalibrate was given as --out.",
-        )
-    if once and not folder.exists():
-        raise InputError(
-            "there is no such folder.",
-            where=Location(str(folder)),
-            hint="Give what armcal recalibrate was given as --out; without --once it is waited for.",
-        )
-    if as_json and not once:
-        raise InputError(
-            "it is only for --once.",
-            where=Location("--json"),
-            hint="Programs follow events.jsonl in the folder itself.",
-        )
-
-
 def _print_once(feed: Feed, as_json: bool) -> None:
     while feed.step():
         pass
@@ -81,33 +67,27 @@ def _print_once(feed: Feed, as_json: bool) -> None:
 
 
 def _terminal(feed: Feed, stop: threading.Event) -> None:
-    console = Screen()
-    if not console.is_terminal:
-        _lines(feed, stop)
-        return
+    """A picture that is drawn again and again; a line an event where the output is no terminal."""
     from rich.live import Live
 
-    from armcal_online.watch.terminal import picture
+    from armcal_online.watch.terminal import line, picture
 
-    with Live(console=console, screen=True, auto_refresh=False) as live:
-        while not stop.is_set():
-            while feed.step():
-                pass
-            live.update(picture(feed.state(), console.width), refresh=True)
-            stop.wait(_REFRESH)
-
-
-def _lines(feed: Feed, stop: threading.Event) -> None:
-    from armcal_online.watch.terminal import line
-
-    told: str | None = None
-    while not stop.is_set() and getattr(sys.stdout, "fault", None) is None:  # who went away reads no more
+    console = Screen()
+    if console.is_terminal:
+        with Live(console=console, screen=True, auto_refresh=False) as live:
+            while not stop.is_set():
+                while feed.step():
+                    pass
+                live.update(picture(feed.state(), console.width), refresh=True)
+                stop.wait(_REFRESH)
+    waiting: str | None = None
+    while not stop.is_set() and getattr(sys.stdout, "fault", None) is None:  # nobody reads lines after a fault
         messages = feed.step()
         for text in filter(None, map(line, messages)):
             say(text)
-        if feed.waiting and feed.waiting != told:
+        if feed.waiting and feed.waiting != waiting:
             say(feed.waiting, err=True)
-        told = feed.waiting
+        waiting = feed.waiting
         if not messages:
             sys.stdout.flush()
             stop.wait(_REFRESH)

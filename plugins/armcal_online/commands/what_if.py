@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import click
-from armcal.base.dataset import Dataset
 from armcal.calibration.calibration import Calibration
 from armcal.cli.common import Console, speaking
 from armcal.cli.predict import read_commands
@@ -18,7 +17,7 @@ from armcal.io.plain_files import check_output
 from armcal.plugins import discover
 from rich.table import Table
 
-from armcal_online.tracking.pose_worth import PoseWorth, ranked
+from armcal_online.tracking.pose_worth import ranked
 from armcal_online.tracking.settings import RecalibrateSettings
 from armcal_online.tracking.start import filter_setup
 
@@ -32,10 +31,10 @@ _SHOWN = 10
 @click.option("--columns", multiple=True, metavar="NAME=COLUMN", help="What the CSV calls a column: sequence=pose_id.")
 @speaking
 def what_if(console: Console, calibration: Path, poses: Path, out: Path | None, columns: tuple[str, ...]) -> None:
-    """How much one more record at each of POSES would tell of the arm in CALIBRATION, best first.
+    """Rank POSES by the information that one more record there would add to CALIBRATION, best first.
 
-    That is the information in bits, how well the prediction there is known, and the parameters whose standard
-    deviations would shrink most.
+    Shown are the information in bits, the standard deviation of the prediction there, and the parameters whose
+    standard deviations would shrink most.
     """
     registry = discover()
     console.plugin_faults(registry)
@@ -48,38 +47,32 @@ def what_if(console: Console, calibration: Path, poses: Path, out: Path | None, 
     if lost:
         console.warn(f"{len(lost)} poses have no elastic equilibrium, the first is {commands.ids[lost[0]]}.")
     unit = error_unit(setup.problem)
-    rows = [_row(rank, pose_worth, commands, unit) for rank, pose_worth in enumerate(pose_worths, 1)]
+    rows: list[dict[str, Any]] = [
+        {
+            "rank": rank,
+            "id": commands.ids[pose_worth.place],
+            "row": commands.rows[pose_worth.place] if commands.rows else pose_worth.place + 1,
+            "bits": pose_worth.worth.bits,
+            f"prediction_sd_{unit}": 1000 * pose_worth.worth.deviation,
+            "tells_most": dict(pose_worth.worth.tells_most),
+        }
+        for rank, pose_worth in enumerate(pose_worths, 1)
+    ]
     if out is not None:
-        _write(out, rows, unit)
+        check_output(out)
+        with out.open("w", newline="", encoding="utf-8") as file:
+            table = csv.DictWriter(file, ["rank", "id", "row", "bits", f"prediction_sd_{unit}", "tells_most"])
+            table.writeheader()
+            table.writerows({**row, "tells_most": _reductions(row["tells_most"])} for row in rows)
     console.result({"poses": rows, "no_equilibrium": [commands.ids[place] for place in lost]})
     console.out.print(_table(rows, unit))
     if out is not None:
         console.out.print(f"{len(rows)} poses, best first: {out}", markup=False, soft_wrap=True)
 
 
-def _row(rank: int, pose_worth: PoseWorth, commands: Dataset, unit: str) -> dict[str, Any]:
-    return {
-        "rank": rank,
-        "id": commands.ids[pose_worth.place],
-        "row": commands.rows[pose_worth.place] if commands.rows else pose_worth.place + 1,
-        "bits": pose_worth.worth.bits,
-        f"prediction_sd_{unit}": 1000 * pose_worth.worth.deviation,
-        "tells_most": dict(pose_worth.worth.tells_most),
-    }
-
-
-def _shrinks(told: Mapping[str, float]) -> str:
-    return ", ".join(f"{name} -{100 * (1 - left):.1f} %" for name, left in told.items())
-
-
-def _write(out: Path, rows: Sequence[Mapping[str, Any]], unit: str) -> None:
-    check_output(out)
-    headings = ("rank", "id", "row", "bits", f"prediction_sd_{unit}", "tells_most")
-    with out.open("w", newline="", encoding="utf-8") as file:
-        table = csv.writer(file)
-        table.writerow(headings)
-        for row in rows:
-            table.writerow([*(row[name] for name in headings[:-1]), _shrinks(row["tells_most"])])
+def _reductions(remaining: Mapping[str, float]) -> str:
+    """Of standard deviations, from the part of each that remains."""
+    return ", ".join(f"{name} -{100 * (1 - part):.1f} %" for name, part in remaining.items())
 
 
 def _table(rows: Sequence[Mapping[str, Any]], unit: str) -> Table:
@@ -89,5 +82,5 @@ def _table(rows: Sequence[Mapping[str, Any]], unit: str) -> Table:
         table.add_column(heading)
     for row in rows[:_SHOWN]:
         known = f"{row[f'prediction_sd_{unit}']:.3g} {unit}"
-        table.add_row(str(row["id"]), f"{row['bits']:.2f}", known, _shrinks(row["tells_most"]))
+        table.add_row(str(row["id"]), f"{row['bits']:.2f}", known, _reductions(row["tells_most"]))
     return table

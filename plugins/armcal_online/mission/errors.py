@@ -2,20 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
+import casadi as ca
 import numpy as np
+from armcal.arm.assembly import ArmState
+from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.base.parameters import Parameters
+from armcal.base.se3 import Expression
 from armcal.config.system import System
 from armcal.errors import ConfigError
 from armcal.estimate.mission_truth import Mission
 from armcal.functions.batch_function import EvaluatorChoice
+from armcal.measure.contact import Contact
+from armcal.measure.measurement import Measurement
+from armcal.problem.factor_records import FactorRecords
+from armcal.problem.problem import Problem
 
-from armcal_online.mission.judge import ErrorCurve, Flags
+from armcal_online.mission.judge import ErrorCurve
 from armcal_online.mission.mission_log import MissionLog
 from armcal_online.mission.settings import MissionRunSettings
-from armcal_online.mission.tips import Tips, random_poses
 
 _HOUR_S = 3600.0
 
@@ -28,15 +36,10 @@ def error_curve(
     settings: MissionRunSettings,
     evaluator: EvaluatorChoice = "auto",
 ) -> ErrorCurve:
-    """Mean distance between a calibration's tip and the true one, as the camera sees it, in fixed random poses.
+    """Mean distance (m) between a calibration's tip and the true one, as the camera sees it, in fixed random poses.
 
-    Args:
-        system: the arm on its mission: gravity of the level rover.
-        parameters: nominal values are those of the calibration before launch.
-        mission: records and truth.
-        log: the estimates over time.
-        settings: how many poses.
-        evaluator: of the arm.
+    ``system`` is the arm on its mission, in the gravity of the level rover; nominal ``parameters`` are those of the
+    calibration before launch.
 
     Raises:
         ConfigError: calibration and truth do not describe the same arm.
@@ -46,42 +49,91 @@ def error_curve(
             "the calibration's parameters are not those of the simulated arm.",
             hint="Let mission.experiment describe the same arm, effects and measurements as the mission.",
         )
-    times, is_record, is_hour = _moments(mission)
-    true, estimated = mission.truth.values_at(times), [_vector(parameters, found) for _, found in log.estimates]
-    frozen = parameters.nominal()
+    hours = np.arange(0.0, mission.seconds, _HOUR_S)
+    times = np.unique(np.concatenate([mission.times, hours]))
+    frozen, true = parameters.nominal(), mission.truth.values_at(times)
+    entries = dict(zip(parameters.entry_names, frozen.tolist(), strict=True))
+    estimated = [np.array(list((entries | {**values}).values())) for _, values in log.estimates]
+    differing = np.any(np.vstack([true, *estimated]) != frozen, axis=0)
+    changing = [block.name for block in parameters.blocks if differing[parameters.entries_of(block.name)].any()]
     arm, instrument = next(iter(system.arms.values())), next(iter(system.measurements))
     poses = random_poses(mission.records, tuple(arm.commanded), arm.name, settings.poses, settings.seed)
-    everything = np.vstack([frozen, true, *estimated])
-    differing = set(np.flatnonzero(np.any(everything != frozen, axis=0)).tolist())
-    changing = [b.name for b in parameters.blocks if differing & set(range(*_span(parameters, b.name)))]
     tips = Tips.of(system, instrument, parameters, changing, poses, evaluator)
-    ours, start, cameras = tips.again(poses), tips.again(poses).at(frozen), mission.truth.camera_T_base_at(times)
-    found, errors, last = log.estimate_numbers(times), np.zeros((2, len(times))), -1
-    now = start
+    recalibrated, start = tips.again(poses), tips.again(poses).at(frozen)
+    cameras, numbers = mission.truth.camera_T_base_at(times), log.estimate_numbers(times)
+    errors, now = np.zeros((2, len(times))), start
     for i in range(len(times)):
-        if found[i] != last:
-            last = int(found[i])
-            now = ours.at(estimated[last])
+        if i == 0 or numbers[i] != numbers[i - 1]:
+            now = recalibrated.at(estimated[numbers[i]])
         truth = tips.at(true[i]) @ cameras[i, :3, :3].T + cameras[i, :3, 3]
-        errors[:, i] = [float(np.linalg.norm(each - truth, axis=1).mean()) for each in (start, now)]
+        errors[:, i] = [float(np.linalg.norm(tip - truth, axis=1).mean()) for tip in (start, now)]
+    is_record, is_hour = np.isin(times, mission.times), np.isin(times, hours)
     return ErrorCurve(times, is_hour, is_record, errors[0], errors[1], log.levels_at(times))
 
 
-def _moments(mission: Mission) -> tuple[Array, Flags, Flags]:
-    """Every record's time and every hour; and which are which."""
-    hours = np.arange(0.0, mission.seconds, _HOUR_S)
-    times = np.unique(np.concatenate([mission.times, hours]))
-    return times, np.isin(times, mission.times), np.isin(times, hours)
+class Seen(Contact):
+    """An instrument's readings in place of its residual, so that the compiled residual gives them."""
+
+    def __init__(self, instrument: Measurement) -> None:
+        self._instrument = instrument
+        self.arms = tuple(instrument.arms)
+        self._width = len(instrument.channels())
+
+    def residual(
+        self, arms: Mapping[str, ArmState], measured: Mapping[str, Expression], values: Mapping[str, Expression]
+    ) -> Expression:
+        """What the instrument would read (m)."""
+        return ca.vertcat(*self._instrument.outputs(arms, values).values())
+
+    def noise(self) -> tuple[float, ...]:
+        """Of no meaning."""
+        return (1.0,) * self._width
 
 
-def _vector(parameters: Parameters, found: Mapping[str, float]) -> Array:
-    """The calibration's values with those of an estimate."""
-    values, place = parameters.nominal(), {name: i for i, name in enumerate(parameters.entry_names)}
-    for name, value in found.items():
-        values[place[name]] = value
-    return values
+@dataclass(frozen=True)
+class Tips:
+    """Fixed poses of an arm, and a problem that gives its tip there.
+
+    Deflections of the last call are where the next one starts, so that values that change little cost little.
+    """
+
+    problem: Problem
+    records: tuple[FactorRecords, ...]
+
+    @classmethod
+    def of(
+        cls,
+        system: System,
+        instrument: str,
+        parameters: Parameters,
+        changing: Sequence[str],
+        poses: Dataset,
+        evaluator: EvaluatorChoice,
+    ) -> Tips:
+        """Compile for values that differ in the blocks ``changing``; in the system's own gravity and load."""
+        free = parameters.with_free(changing)
+        seen = {instrument: Seen(system.measurements[instrument])}
+        problem = Problem.build(system.arms, seen, free, system.environment, poses, evaluator, groups={})
+        return cls(problem, problem.records(poses))
+
+    def again(self, poses: Dataset) -> Tips:
+        """The same, with deflections of its own."""
+        return Tips(self.problem, self.problem.records(poses))
+
+    def at(self, values: Array) -> Array:
+        """Tips (poses x 3, m) at a value vector.
+
+        Raises:
+            NotConvergedError: a pose has no elastic equilibrium.
+        """
+        return self.problem.residuals(values, self.records)[0].T
 
 
-def _span(parameters: Parameters, name: str) -> tuple[int, int]:
-    place = parameters.entries_of(name)
-    return place.start, place.stop
+def random_poses(records: Dataset, joints: Sequence[str], arm: str, count: int, seed: int) -> Dataset:
+    """Poses uniform within the span of some records, each approached from a random side."""
+    random, channels = np.random.default_rng(seed), {}
+    for joint in joints:
+        angles = records.column(f"{arm}.{joint}")
+        channels[f"{arm}.{joint}"] = random.uniform(angles.min(), angles.max(), count)
+        channels[f"{arm}.approach.{joint}"] = random.choice([-1.0, 1.0], count)
+    return Dataset(tuple(map(str, range(count))), channels, source="random poses")

@@ -1,22 +1,56 @@
-"""What a mission leaves as text: its truth, its errors over time, and its figures."""
+"""The files that a mission leaves: its truth, its errors over time, its figures."""
 
 from __future__ import annotations
 
 import csv
 import io
+import json
+from collections import Counter
+from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+from armcal.base.config_text import as_json
 from armcal.base.domains import Array
 from armcal.base.parameters import Parameters
 from armcal.base.units import to_unit
+from armcal.errors import InputError, Location
 from armcal.estimate.mission_truth import DAY_S, Mission
+from armcal.io.plain_files import check_output
 
-from armcal_online.mission.judge import ErrorCurve, EventReport, Judgement
+from armcal_online.mission.figure import mission_figure
+from armcal_online.mission.judge import ErrorCurve, Judgement
+from armcal_online.mission.mission import MissionResult
 from armcal_online.mission.mission_log import Decision, MissionLog
+from armcal_online.mission.settings import MissionPlan
 
 _MM = 1000.0
 _SHOWN = {"m": "mm", "rad": "deg"}
+
+
+def write_files(folder: Path, plan: MissionPlan, result: MissionResult, content: Mapping[str, Any]) -> None:
+    """Write the truth, the errors, the judgement's figures (``content``) and the figure.
+
+    Raises:
+        InputError: a file cannot be written, or a link or device stands in its place.
+    """
+    curve, truth, name = result.judgement.curve, result.mission.truth, plan.experiment.name
+    texts = {
+        "truth.csv": truth_text(result.mission, plan.experiment.parameters),
+        "truth.json": json.dumps(schedule(result.mission), indent=2) + "\n",
+        "mission.csv": curve_text(curve, truth.temperature_at(curve.times)),
+        "mission.json": as_json(content) + "\n",
+    }
+    files = {name: text.encode() for name, text in texts.items()}
+    files["mission.png"] = mission_figure(result.mission, result.judgement, name)
+    try:
+        for name, data in files.items():
+            check_output(folder / name, InputError)
+            (folder / name).write_bytes(data)
+    except OSError as fault:
+        text = f"it cannot be written ({fault.strerror or fault})."
+        raise InputError(text, where=Location(str(folder)), hint="Check the room on the disk.") from fault
 
 
 def truth_text(mission: Mission, parameters: Parameters) -> str:
@@ -56,7 +90,7 @@ def curve_text(curve: ErrorCurve, temperature: Array) -> str:
     """A CSV: errors over time."""
     rows = zip(
         (curve.times / DAY_S).round(6).tolist(),
-        ["record" if each else "hour" for each in curve.is_record],
+        ["record" if is_record else "hour" for is_record in curve.is_record],
         (curve.frozen * _MM).round(6).tolist(),
         (curve.recalibrated * _MM).round(6).tolist(),
         curve.levels,
@@ -69,6 +103,7 @@ def curve_text(curve: ErrorCurve, temperature: Array) -> str:
 def figures(name: str, mission: Mission, log: MissionLog, judged: Judgement) -> dict[str, Any]:
     """The whole judgement for other programs."""
     curve, counts = judged.curve, judged.records
+    levels = [level for level, hour in zip(curve.levels, curve.is_hour, strict=True) if hour]
     return {
         "mission": name,
         "days": mission.seconds / DAY_S,
@@ -79,28 +114,27 @@ def figures(name: str, mission: Mission, log: MissionLog, judged: Judgement) -> 
         },
         "availability": judged.availability,
         "frozen_within_limit": judged.frozen_within,
-        "events": [_event(report) for report in judged.events],
+        "events": [
+            {
+                "day": report.event.time / DAY_S,
+                "kind": report.event.kind,
+                "joint": report.event.joint or None,
+                "label": report.event.label,
+                "named": report.named,
+                "decision": _decision(report.decision) if report.decision else None,
+                "before_mm": report.before * _MM,
+                "worst_mm": report.worst * _MM,
+                "recovered_after_records": report.records,
+                "recovered_after_hours": None if report.seconds is None else report.seconds / 3600,
+            }
+            for report in judged.events
+        ],
         "missed": judged.missed,
         "false_alarms": [_decision(false_alarm) for false_alarm in judged.false_alarms],
         "records": {key: getattr(counts, key) for key in counts.__dataclass_fields__},
         "power_cuts": [time / DAY_S for time in mission.power_cuts],
         "resumed": log.resumed,
-        "hours_at_level": _hours(curve),
-    }
-
-
-def _event(report: EventReport) -> dict[str, Any]:
-    return {
-        "day": report.event.time / DAY_S,
-        "kind": report.event.kind,
-        "joint": report.event.joint or None,
-        "label": report.event.label,
-        "named": report.named,
-        "decision": _decision(report.decision) if report.decision else None,
-        "before_mm": report.before * _MM,
-        "worst_mm": report.worst * _MM,
-        "recovered_after_records": report.records,
-        "recovered_after_hours": None if report.seconds is None else report.seconds / 3600,
+        "hours_at_level": Counter(levels),
     }
 
 
@@ -111,11 +145,6 @@ def _decision(decision: Decision) -> dict[str, Any]:
         "joint": decision.joint or None,
         "sentence": decision.sentence,
     }
-
-
-def _hours(curve: ErrorCurve) -> dict[str, int]:
-    held = [level for level, hour in zip(curve.levels, curve.is_hour, strict=True) if hour]
-    return {level: held.count(level) for level in dict.fromkeys(held)}
 
 
 def _summary(errors: Array) -> dict[str, float]:

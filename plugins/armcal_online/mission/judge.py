@@ -50,9 +50,9 @@ class ErrorCurve:
 class EventReport:
     """What became of one event.
 
-    ``named``: ``right`` or ``wrong`` by the first decision that names anything, ``seen`` if it was only told that
-    something changed, ``missed`` if nothing was. ``before`` and ``worst`` are mean tip errors (m). Recovery is counted
-    in records that arrived and in s, None if it did not come about before the next event or the end.
+    ``named``: ``right`` or ``wrong`` by the first decision that names anything, ``seen`` if a decision only said that
+    something changed, ``missed`` if there was none. ``before`` and ``worst`` are mean tip errors (m). Recovery is
+    counted in records that arrived and in s, None if it did not come about before the next event or the end.
     """
 
     event: MissionEvent
@@ -107,22 +107,23 @@ def judge(mission: Mission, log: MissionLog, curve: ErrorCurve, limit: float, re
 
     Args:
         mission: records and truth.
-        log: what the recalibration told.
+        log: what the recalibration did.
         curve: errors over time.
         limit: of the mean tip error for use, m.
         recovered: the error is back within so many times what it was before an event.
     """
     ends = [*(event.time for event in mission.events), mission.seconds][1:]
-    reports = tuple(_report(event, end, log, curve, recovered) for event, end in zip(mission.events, ends, strict=True))
-    windows = [(e.time, min(e.time + _WINDOW_S, end)) for e, end in zip(mission.events, ends, strict=True)]
+    events = list(zip(mission.events, ends, strict=True))
+    reports = [_event_report(event, end, log, curve, recovered) for event, end in events]
+    windows = [(event.time, min(event.time + _WINDOW_S, end)) for event, end in events]
     alarms = [decision for decision in log.decisions if decision.kind in ALARMS]
     apart = tuple(alarm for alarm in alarms if not _within(alarm.time, windows))
     usable = np.array([level in USABLE for level in curve.levels]) & (curve.recalibrated <= limit)
     return Judgement(
         curve=curve,
-        events=reports,
+        events=tuple(reports),
         false_alarms=apart,
-        records=_counted(mission, log, windows),
+        records=_record_count(mission, log, windows),
         availability=float(usable[curve.is_hour].mean()),
         frozen_within=float((curve.frozen <= limit)[curve.is_hour].mean()),
         limit=limit,
@@ -133,8 +134,9 @@ def _within(time: float, windows: Sequence[tuple[float, float]]) -> bool:
     return any(first <= time < last for first, last in windows)
 
 
-def _report(event: MissionEvent, end: float, log: MissionLog, curve: ErrorCurve, recovered: float) -> EventReport:
-    before = _before(event.time, curve)
+def _event_report(event: MissionEvent, end: float, log: MissionLog, curve: ErrorCurve, recovered: float) -> EventReport:
+    day_before = (curve.times < event.time) & (curve.times >= event.time - DAY_S)
+    before = float(np.median(curve.recalibrated[day_before if day_before.any() else slice(1)]))
     after = (curve.times >= event.time) & (curve.times < end)
     following = np.flatnonzero(after & curve.is_record)
     good = curve.recalibrated[following] <= recovered * before
@@ -143,9 +145,13 @@ def _report(event: MissionEvent, end: float, log: MissionLog, curve: ErrorCurve,
     last = min(event.time + _WINDOW_S, end)
     alarms = [d for d in log.decisions if d.kind in ALARMS and event.time <= d.time < last]
     decision = next((alarm for alarm in alarms if alarm.kind in NAMING), alarms[0] if alarms else None)
+    named = "missed" if decision is None else "seen"
+    if decision is not None and decision.kind in NAMING:
+        right = decision.kind in EXPECTED[event.kind] and decision.joint == event.joint
+        named = "right" if right else "wrong"
     return EventReport(
         event=event,
-        named=_named(event, decision),
+        named=named,
         decision=decision,
         before=before,
         worst=float(curve.recalibrated[after].max(initial=0.0)),
@@ -154,21 +160,7 @@ def _report(event: MissionEvent, end: float, log: MissionLog, curve: ErrorCurve,
     )
 
 
-def _before(time: float, curve: ErrorCurve) -> float:
-    """The median error in the day before; the first one's where there is none."""
-    chosen = (curve.times < time) & (curve.times >= time - DAY_S)
-    return float(np.median(curve.recalibrated[chosen])) if chosen.any() else float(curve.recalibrated[0])
-
-
-def _named(event: MissionEvent, decision: Decision | None) -> str:
-    if decision is None:
-        return "missed"
-    if decision.kind not in NAMING:
-        return "seen"
-    return "right" if decision.kind in EXPECTED[event.kind] and decision.joint == event.joint else "wrong"
-
-
-def _counted(mission: Mission, log: MissionLog, windows: Sequence[tuple[float, float]]) -> RecordCount:
+def _record_count(mission: Mission, log: MissionLog, windows: Sequence[tuple[float, float]]) -> RecordCount:
     verdicts = np.array([log.verdicts.get(text, "ignored") for text in mission.records.ids])
     apart = np.array([not _within(time, windows) for time in mission.times.tolist()], dtype=bool)
     good, rejected, accepted = ~mission.outliers, verdicts == "rejected", verdicts == "accepted"

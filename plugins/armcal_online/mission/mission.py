@@ -35,12 +35,12 @@ RECALIBRATION = "recalibration"
 
 
 class Session(Protocol):
-    """Recalibrates from a source until it ends, in a folder that it goes on from if it was used before."""
+    """Recalibrates from a source until it ends; resumes what is in the folder."""
 
     def __call__(
         self, calibration: Path, settings: RecalibrateSettings, source: MissionSource, folder: Path
     ) -> Sequence[Mapping[str, Any]]:
-        """The events that it wrote; those up to a power cut, which it does not let through."""
+        """The events that it wrote; those up to a power cut, which it does not raise."""
 
 
 @dataclass(frozen=True)
@@ -71,11 +71,6 @@ def simulated(plan: MissionPlan) -> Mission:
             hint="Make it longer, or lose fewer records.",
         )
     return mission
-
-
-def write_records(plan: MissionPlan, mission: Mission, folder: Path) -> None:
-    """The records as a CSV that ``armcal recalibrate`` takes too."""
-    write_csv(folder / RECORDS, mission.records, plan.experiment.request(measured=True).wanted)
 
 
 def before_launch(plan: MissionPlan, folder: Path, progress: Progress = no_progress) -> Path:
@@ -127,7 +122,7 @@ def run_mission(
     progress: Progress = no_progress,
     watch: Stopwatch | None = None,
 ) -> MissionResult:
-    """The whole mission in a folder.
+    """The whole mission in a folder, its records as a CSV that ``armcal recalibrate`` takes too.
 
     Raises:
         InputError: the mission, or what it begins with, is refused.
@@ -136,7 +131,7 @@ def run_mission(
     watch = watch or Stopwatch()
     with watch.stage("simulate"):
         mission = simulated(plan)
-        write_records(plan, mission, folder)
+        write_csv(folder / RECORDS, mission.records, plan.experiment.request(measured=True).wanted)
     with watch.stage("calibrate"):
         path = before_launch(plan, folder, progress)
         calibration = Calibration.load(path, registry)

@@ -1,4 +1,4 @@
-"""What a recalibration told of a mission, read from its events."""
+"""What a recalibration did in a mission, read from its events."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class MissionLog:
 
 
 def read_mission_log(events: Iterable[Mapping[str, Any]], mission: Mission) -> MissionLog:
-    """The story of a mission from the events that a recalibration wrote, in order.
+    """The log of a mission from the events that a recalibration wrote, in order.
 
     An event without a record of its own has the time of the last record before it.
     """
@@ -76,12 +76,12 @@ def read_mission_log(events: Iterable[Mapping[str, Any]], mission: Mission) -> M
             now = times.get(str(event["id"]), now)
             verdicts[str(event["id"])] = str(event["verdict"])
         elif kind == "estimate":
-            estimates[now] = {name: float(found[0]) for name, found in event["parameters"].items()}
+            estimates[now] = {name: float(pair[0]) for name, pair in event["parameters"].items()}
         elif kind == "level":
             levels.append((now, str(event["to"])))
         elif kind == "decision":
-            said = (str(event.get(key) or "") for key in ("kind", "joint", "sentence"))
-            decisions.append(Decision(now, *said))
+            fields = (str(event.get(key) or "") for key in ("kind", "joint", "sentence"))
+            decisions.append(Decision(now, *fields))
     return MissionLog(
         verdicts, tuple(estimates.items()), tuple(levels or [(0.0, "nominal")]), tuple(decisions), resumed
     )

@@ -1,4 +1,4 @@
-"""What the command that runs a mission is told: the calibration to begin with, and how it is judged."""
+"""Settings of a mission run: the calibration to begin with, and how the recalibration is judged."""
 
 from __future__ import annotations
 
@@ -72,8 +72,8 @@ class MissionPlan:
         """
         source = load_config(path, overrides)
         settings = validate(MissionRunSettings, source, (SECTION,))
-        found = RECALIBRATE in source.data
-        recalibrate = validate(RecalibrateSettings, source, (RECALIBRATE,)) if found else RecalibrateSettings()
+        stated = RECALIBRATE in source.data
+        recalibrate = validate(RecalibrateSettings, source, (RECALIBRATE,)) if stated else RecalibrateSettings()
         rest = {key: value for key, value in source.data.items() if key not in (SECTION, RECALIBRATE)}
         experiment = Experiment.of(replace(source, data=rest), registry=registry or discover())
         simulator = experiment.simulator()

@@ -19,7 +19,7 @@ class PowerCutError(Exception):
 
 
 def as_incoming(records: Dataset, times: Array, began: float) -> tuple[Incoming, ...]:
-    """Records as they arrive, the clock being that of the mission (times in s since it began)."""
+    """Records as they arrive, by the mission's clock (times in s since it began)."""
     names = list(records.channels)
     columns = [records.channels[name].tolist() for name in names]
     labels = list(records.extra)
@@ -66,10 +66,6 @@ class MissionSource(Source):
             return None
         self._next += 1
         return self._records[self._next - 1]
-
-    @override
-    def acknowledge(self, incoming: Incoming, sequence: int) -> None:
-        """The journal remembers the row."""
 
     @override
     def close(self) -> None: ...

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import math
 import os
+import sys
 import time
 from collections.abc import Mapping
 from pathlib import Path
 
+from armcal.errors import InputError
+from armcal.io.plain_files import input_file
 from typing_extensions import override
 
 from armcal_online.sources.incoming import Incoming, Place
-from armcal_online.sources.line_parser import Kind, LineParser
 from armcal_online.sources.reading import LineReading, Reading, WholeReading
-from armcal_online.sources.row_parser import RowParser, faulty
+from armcal_online.sources.row_parser import KINDS, LineParser, RowParser, faulty
 from armcal_online.sources.source import THROUGH, Clock, Source, key_of, wait_until
 
 SETTLED_S = 1.0
@@ -21,11 +23,10 @@ SETTLED_S = 1.0
 IMPATIENT_S = 10.0
 """A last line without an end is taken after so long."""
 
-_KINDS: Mapping[str, Kind] = {".csv": "csv", ".jsonl": "json", ".ndjson": "json"}
 _WHOLE = ".json"
 _GONE = -1
 _WATCHED = 16
-"""So many of the files read last are read on when they grow."""
+"""So many of the files that were read last are read further when they grow."""
 _RESCAN_S = 5.0
 """The directory is listed when it changes, and this often besides: its time may have too few digits."""
 
@@ -39,16 +40,16 @@ class _Watched:
         self.seen = at
         self.changed = at
         self.reading: Reading | None = None
-        self.told = False
+        self.shorter = False
 
     def look(self, path: Path) -> None:
-        """At its size, and when it was written to (unix seconds)."""
+        """Take its size, and when it was written to (unix seconds)."""
         try:
-            found = path.stat()
+            status = path.stat()
         except OSError:
             size, self.modified = _GONE, math.inf
         else:
-            size, self.modified = found.st_size, found.st_mtime
+            size, self.modified = status.st_size, status.st_mtime
         if size != self.size:
             self.size, self.changed = size, time.monotonic()
 
@@ -90,14 +91,10 @@ class Folder(Source):
         deadline = time.monotonic() + wait_s
         while self._open:
             self._scan()
-            found = self._next()
-            if found is not None or not wait_until(deadline):
-                return found
+            incoming = self._next()
+            if incoming is not None or not wait_until(deadline):
+                return incoming
         return None
-
-    @override
-    def acknowledge(self, incoming: Incoming, sequence: int) -> None:
-        """The journal remembers the row."""
 
     @override
     def close(self) -> None:
@@ -113,9 +110,10 @@ class Folder(Source):
             if changed == self._stamp[0] and now < self._stamp[1] + _RESCAN_S:
                 return
             with os.scandir(self._path) as entries:
-                names = {entry.name for entry in entries if _is_ours(entry.name) and entry.is_file()}
+                files = [entry.name for entry in entries if not entry.name.startswith(".") and entry.is_file()]
         except OSError:
             return
+        names = {name for name in files if Path(name).suffix in (*KINDS, _WHOLE)}
         self._stamp = (changed, now)
         taken = {n for n in names - self._known if self._through >= key_of(n) and key_of(n) not in self._positions}
         new = names - self._known - taken
@@ -137,7 +135,8 @@ class Folder(Source):
                 return None
             self._pending.pop(0)
             incoming = self._begun(name, watched) or self._advance(name, watched)
-            self._trim()
+            for earlier in [*self._watched][:-_WATCHED]:
+                self._forget(earlier)
             if incoming is not None:
                 return incoming
         return None
@@ -159,14 +158,17 @@ class Folder(Source):
             through = max(through, watched.reading.row)
         watched.reading = None
         try:
-            file = path.open("rb", buffering=0)
+            file = input_file(path, sys.maxsize, "a file of records", buffering=0)
+        except InputError as fault:
+            if isinstance(fault.__cause__, FileNotFoundError) or not isinstance(fault.__cause__, OSError):
+                return None  # it is gone, or a pipe or device took its place: nobody waits for those
+            return faulty(Place(self._clock(), key, 0), f"{key} cannot be read ({fault.__cause__.strerror}).")
+        try:
             if path.suffix == _WHOLE:
                 watched.reading = WholeReading(file, self._rows, key, through, self._clock)
             else:
-                parser = LineParser(self._rows, _KINDS[path.suffix], str(path))
+                parser = LineParser(self._rows, KINDS[path.suffix], str(path))
                 watched.reading = LineReading(file, parser, key, through, self._clock)
-        except FileNotFoundError:
-            return None
         except OSError as fault:
             return faulty(Place(self._clock(), key, 0), f"{key} cannot be read ({fault.strerror}).")
         return None
@@ -182,23 +184,14 @@ class Folder(Source):
         if isinstance(watched.reading, WholeReading):
             if watched.size not in (_GONE, watched.reading.offset) and self._is_settled(name, watched):
                 return self._begun(name, watched)
-        elif _GONE < watched.size < watched.reading.offset and not watched.told:
-            watched.told = True
+        elif _GONE < watched.size < watched.reading.offset and not watched.shorter:
+            watched.shorter = True
             mend = "give what is new a name of its own"
             return faulty(Place(self._clock(), key_of(name), 0), f"{name} became shorter after it was read; {mend}.")
         quiet = time.monotonic() - watched.changed >= IMPATIENT_S
         return watched.reading.last() if watched.reading.begun and quiet else None
 
-    def _trim(self) -> None:
-        """Let go of the files read first."""
-        for name in [*self._watched][:-_WATCHED]:
-            self._forget(name)
-
     def _forget(self, name: str) -> None:
         reading = self._watched.pop(name).reading
         if reading is not None:
             reading.close()
-
-
-def _is_ours(name: str) -> bool:
-    return not name.startswith(".") and Path(name).suffix in (*_KINDS, _WHOLE)

@@ -7,8 +7,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-_NOT_FINITE = {"nan": math.nan, "inf": math.inf, "-inf": -math.inf}
-
 
 @dataclass(frozen=True)
 class Place:
@@ -51,7 +49,7 @@ class Incoming:
         """As JSON: floats exactly, those that are not finite as ``nan``, ``inf`` and ``-inf``."""
         return {
             "id": self.record_id,
-            "channels": {name: _written(value) for name, value in self.channels.items()},
+            "channels": {name: value if math.isfinite(value) else str(value) for name, value in self.channels.items()},
             "labels": dict(self.labels),
             "arrived": self.arrived,
             "key": self.source_key,
@@ -64,24 +62,14 @@ class Incoming:
         """The record that ``as_dict`` wrote.
 
         Raises:
-            KeyError, TypeError, ValueError: it is not one.
+            KeyError, TypeError, ValueError: it is no such record.
         """
         return cls(
             record_id=str(content["id"]),
-            channels={name: _read(value) for name, value in content["channels"].items()},
+            channels={name: float(value) for name, value in content["channels"].items()},
             labels={name: str(text) for name, text in content["labels"].items()},
             arrived=float(content["arrived"]),
             source_key=str(content["key"]),
             source_row=int(content["row"]),
             fault=str(content["fault"]),
         )
-
-
-def _written(value: float) -> float | str:
-    if math.isfinite(value):
-        return value
-    return "nan" if math.isnan(value) else "inf" if value > 0 else "-inf"
-
-
-def _read(value: Any) -> float:
-    return _NOT_FINITE[value] if isinstance(value, str) else float(value)

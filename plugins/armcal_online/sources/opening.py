@@ -11,10 +11,9 @@ from armcal.io.udp import UDP_KINDS, parsed
 
 from armcal_online.sources.csv_file import CsvFile
 from armcal_online.sources.folder import Folder
-from armcal_online.sources.lines import Lines
 from armcal_online.sources.row_parser import RowParser
 from armcal_online.sources.source import AtEnd, Clock, Source
-from armcal_online.sources.udp import Udp
+from armcal_online.sources.streams import Lines, Udp
 
 KINDS = f"- (standard input), {UDP_KINDS}, a directory, or a CSV file"
 

@@ -11,8 +11,7 @@ from armcal.io.line_cutter import LineCutter
 from typing_extensions import override
 
 from armcal_online.sources.incoming import Incoming, Place
-from armcal_online.sources.line_parser import LineParser
-from armcal_online.sources.row_parser import RowParser, faulty
+from armcal_online.sources.row_parser import LineParser, RowParser, faulty
 from armcal_online.sources.source import Clock
 
 MAX_JSON_BYTES = 4 * 1024**2
@@ -38,7 +37,8 @@ class Reading(Protocol):
         """The record in a last line without an end, now that no end is to come."""
 
     def close(self) -> None:
-        """Close the file."""
+        """Close the file, where it is still open."""
+        return
 
 
 class LineReading(Reading):
@@ -116,11 +116,11 @@ class WholeReading(Reading):
         try:
             if len(data) > MAX_JSON_BYTES:
                 raise ValueError("it has more than 4 MiB")
-            content = json.loads(data.decode("utf-8-sig"))
+            objects = json.loads(data.decode("utf-8-sig"))
         except (ValueError, RecursionError) as fault:
             self._fault = f"The file is not JSON ({fault})."
             return
-        self._objects.extend(content if isinstance(content, list) else [content])
+        self._objects.extend(objects if isinstance(objects, list) else [objects])
         while self._objects and self._row < through:
             self._objects.popleft()
             self._row += 1
@@ -151,6 +151,3 @@ class WholeReading(Reading):
     def last(self) -> Incoming | None:
         fault, self._fault = self._fault, ""
         return faulty(Place(self._clock(), self._key, 0), fault) if fault else None
-
-    @override
-    def close(self) -> None: ...

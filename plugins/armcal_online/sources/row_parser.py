@@ -1,4 +1,4 @@
-"""Rows of a table and JSON objects become records, by the names and units that the csv reader knows.
+"""Lines of text, rows of a table and JSON objects become records, by the names and units that the csv reader knows.
 
 A source must survive any input: what cannot be read becomes a record with a fault, never an exception.
 """
@@ -10,7 +10,7 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Literal
 
 from armcal.base.units import from_unit
 from armcal.errors import DataError
@@ -25,9 +25,14 @@ MAX_LABEL = 500
 MAX_ID = 200
 MAX_FAULT = 500
 
+Kind = Literal["csv", "json", "either"]
+"""What lines are; in ``either``, those that begin with a brace are JSON and others CSV."""
+KINDS: Mapping[str, Kind] = {".csv": "csv", ".jsonl": "json", ".ndjson": "json"}
+"""By the ending of a file's name."""
+
 _APPROACH = ".approach."
 _PLANS = 64
-"""So many ways of naming a record's numbers are kept in mind; a sender has one or two."""
+"""So many sets of names are remembered; a sender has one or two."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +45,7 @@ class Table:
 
 
 class RowParser:
-    """Records for a request, with a source's own names of columns (wanted name to own name)."""
+    """Records for a request, with a source's own names of columns (requested name to own name)."""
 
     def __init__(self, request: ReadRequest, columns: Mapping[str, str]) -> None:
         self._wanted = request.wanted
@@ -60,12 +65,7 @@ class RowParser:
         except csv.Error as fault:
             raise DataError(f"the header is not CSV ({fault}).", hint="Close every quote.") from fault
         header = renamed(header_of(cells, source, number), self._columns)
-        plan = match_columns(header, self._optional)
-        lacking = self._lacking(set(plan.channels))
-        if lacking is not None:
-            known = {column.known_as for column, _ in plan.channels.values()}
-            refuse_missing(header, lacking, [c.known_as for c in header.columns if c.known_as not in known])
-        return Table(tuple(cells), delimiter, plan)
+        return Table(tuple(cells), delimiter, self._matched(header))
 
     def row(self, table: Table, line: str, place: Place) -> Incoming | None:
         """The record in a line of a table; None for the header, written again."""
@@ -82,41 +82,45 @@ class RowParser:
     def json_text(self, text: str, place: Place) -> Incoming:
         """The record in the text of a JSON object."""
         try:
-            content = json.loads(text, object_pairs_hook=_without_repeats)
+            fields = json.loads(text, object_pairs_hook=_without_repeats)
         except (ValueError, RecursionError) as fault:
             return faulty(place, f"It is not JSON ({_short(str(fault), 120)}).")
-        return self.object(content, place)
+        return self.object(fields, place)
 
-    def object(self, content: Any, place: Place) -> Incoming:
+    def object(self, fields: Any, place: Place) -> Incoming:
         """The record in a JSON object, name to number or text."""
-        if not isinstance(content, dict):
-            text = "an array" if isinstance(content, list) else _short(json.dumps(content), 40)
+        if not isinstance(fields, dict):
+            text = "an array" if isinstance(fields, list) else _short(json.dumps(fields), 40)
             return faulty(place, f"Found {text}, expected a JSON object.")
-        names = tuple(content)
-        plan = self._plan(names)
+        plan = self._plan(tuple(fields))
         if isinstance(plan, str):
             return faulty(place, plan)
-        return self._record(plan, list(content.values()), place)
+        return self._record(plan, list(fields.values()), place)
 
     def _plan(self, names: tuple[str, ...]) -> Plan | str:
-        """Which name is what, or why that cannot be told."""
+        """Which name is what, or why that is not known."""
         if names not in self._plans:
             if len(self._plans) >= _PLANS:
                 self._plans.clear()
+            own = {name: column for name, column in self._columns.items() if column in names}
             try:
-                self._plans[names] = self._planned(names)
+                header = renamed(header_of(names, "", None) if names else Header("", None, ()), own)
+                self._plans[names] = self._matched(header)
             except DataError as fault:
                 self._plans[names] = str(fault)
         return self._plans[names]
 
-    def _planned(self, names: tuple[str, ...]) -> Plan:
-        own = {name: column for name, column in self._columns.items() if column in names}
-        header = renamed(header_of(names, "", None) if names else Header("", None, ()), own)
+    def _matched(self, header: Header) -> Plan:
+        """Which column is what.
+
+        Raises:
+            DataError: a column is ambiguous, has no unit, or one that every record needs is not there.
+        """
         plan = match_columns(header, self._optional)
         lacking = self._lacking(set(plan.channels))
         if lacking is not None:
             known = {column.known_as for column, _ in plan.channels.values()}
-            refuse_missing(header, lacking, [name for name in names if name not in known])
+            refuse_missing(header, lacking, [c.known_as for c in header.columns if c.known_as not in known])
         return plan
 
     def _lacking(self, present: set[str]) -> RequestedChannel | None:
@@ -138,25 +142,69 @@ class RowParser:
             for column in plan.extra[:MAX_LABELS]
             if (text := _text(cells[column.index])) and len(text) <= MAX_LABEL
         }
-        given = _text(cells[plan.record_id.index]).strip() if plan.record_id else str(place.row)
-        record_id = _short(given, MAX_ID)
+        text = _text(cells[plan.record_id.index]).strip() if plan.record_id else str(place.row)
+        record_id = _short(text, MAX_ID)
         if not record_id:
             return faulty(place, "Its id is empty.")
         channels: dict[str, float] = {}
         for channel, (column, unit) in plan.channels.items():
             number = _number(cells[column.index])
-            if (
-                _APPROACH in channel
-                and isinstance(number, float)
-                and abs(number) not in (0.0, 1.0)
-                and number == number
-            ):
+            if _APPROACH in channel and isinstance(number, float) and not (math.isnan(number) or number in (-1, 0, 1)):
                 number = CellFault(f"found the approach {number:g}, expected -1, 0 or 1.", "")
             if isinstance(number, CellFault):
                 sentence = f"{_short(column.name, MAX_ID)}: {number.found} {number.hint}".rstrip()
                 return replace(faulty(place, sentence), record_id=record_id)
             channels[channel] = from_unit(number, unit)
         return Incoming(record_id, channels, labels, place.arrived, place.source_key, place.row)
+
+
+class LineParser:
+    """One text, line by line.
+
+    Attributes:
+        refused: why nothing in a CSV can be read: its header; empty while it can.
+    """
+
+    def __init__(self, rows: RowParser, kind: Kind, source: str) -> None:
+        self._rows = rows
+        self._kind = kind
+        self._source = source
+        self._table: Table | None = None
+        self.refused = ""
+
+    @property
+    def needs_header(self) -> bool:
+        """Whether no row can be read before the header was."""
+        return self._kind == "csv" and self._table is None
+
+    def record(self, line: bytes | None, place: Place) -> Incoming | None:
+        """The record in a line (None: one that was too long); None for blank lines, headers, and all that is refused.
+
+        The line that makes a CSV refused gives a record with the reason as its fault.
+        """
+        if self.refused:
+            return None
+        if line is None:
+            return faulty(place, "The line has more than 1 MiB, expected a record.")
+        if b"\0" in line:
+            return faulty(place, "The line holds a NUL byte, expected text.")
+        try:
+            text = line.decode("utf-8").removeprefix("\ufeff")
+        except UnicodeDecodeError as fault:
+            return faulty(place, f"The line holds the byte 0x{line[fault.start]:02x}, which is not UTF-8 text.")
+        if not text.strip():
+            return None
+        if self._kind == "json" or (self._kind == "either" and text.lstrip().startswith("{")):
+            return self._rows.json_text(text, place)
+        if self._table is not None:
+            return self._rows.row(self._table, text, place)
+        try:
+            self._table = self._rows.table(text, self._source, place.row)
+        except DataError as fault:
+            if self._kind == "csv":
+                self.refused = str(fault)
+            return faulty(place, str(fault))
+        return None
 
 
 def faulty(place: Place, sentence: str) -> Incoming:
@@ -198,9 +246,9 @@ def _short(text: str, length: int) -> str:
 
 def _without_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     """An object, each of whose names is given once."""
-    content = dict(pairs)
-    if len(content) != len(pairs):
+    fields = dict(pairs)
+    if len(fields) != len(pairs):
         names = [name for name, _ in pairs]
         twice = next(name for name in names if names.count(name) > 1)
         raise ValueError(f"{_short(twice, 40)} is given twice")
-    return content
+    return fields

@@ -37,10 +37,12 @@ class Source(Protocol):
         """The next record; None if there is none within the wait. Whatever it reads, it never raises."""
 
     def resume(self, positions: Mapping[str, int]) -> None:
-        """Pass over what was taken before: the last row taken, by file."""
+        """Pass over what was taken before: the last row taken, by file. Nothing for a stream, which begins anew."""
+        return
 
     def acknowledge(self, incoming: Incoming, sequence: int) -> None:
-        """Tell the sender, if there is one, that a record is safe."""
+        """Tell the sender, if there is one, that a record is safe. Nothing for files: the journal keeps the row."""
+        return
 
     def close(self) -> None:
         """Let go of files and sockets."""

@@ -1,4 +1,4 @@
-"""Parameters over time: how far each has come since the start, and how sure that is."""
+"""Parameters over time: the change of each since the start, and its standard deviation."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ class Followed:
     start: float
     start_sd: float | None
 
-    def told(self) -> dict[str, Any]:
-        """As pages are told: in the unit shown."""
+    def state(self) -> dict[str, Any]:
+        """For pages: in the unit shown."""
         sd = None if self.start_sd is None else self.start_sd * self.factor
         return {
             "name": self.name,
@@ -39,7 +39,7 @@ class Followed:
 
 
 class Estimates:
-    """All that is known of all parameters, in bounded memory."""
+    """The estimates of all parameters, in bounded memory."""
 
     def __init__(self) -> None:
         self._followed: dict[str, Followed] = {}
@@ -51,39 +51,39 @@ class Estimates:
         self._rows.clear()
 
     def start(self, event: Mapping[str, Any]) -> dict[str, Any] | None:
-        """Where parameters stand at a start; where one started before is not changed by a later start."""
+        """The values at a start; where a parameter started before, its start stays."""
         listed = event.get("parameters")
-        entries = [content for content in listed if isinstance(content, Mapping)] if isinstance(listed, list) else []
-        found = {}
+        entries = [entry for entry in listed if isinstance(entry, Mapping)] if isinstance(listed, list) else []
+        estimates = {}
         for entry in entries:
             name, value = text(entry.get("name")), number(entry.get("value"))
             if name is not None and value is not None:
-                found[name] = (value, number(entry.get("sd")))
-                self._follow(name, found[name], entry.get("unit"))
-        return self._row(event, found)
+                estimates[name] = (value, number(entry.get("sd")))
+                self._follow(name, estimates[name], entry.get("unit"))
+        return self._row(event, estimates)
 
     def take(self, event: Mapping[str, Any]) -> dict[str, Any] | None:
-        """An estimate, as pages are told: columns in the order of the parameters."""
+        """An estimate as a message to pages: columns in the order of the parameters."""
         listed = event.get("parameters")
-        found = {}
+        estimates = {}
         for key, pair in listed.items() if isinstance(listed, Mapping) else ():
             name, value = text(key), number(pair[0]) if isinstance(pair, list) and pair else None
             if name is not None and value is not None:
-                found[name] = (value, number(pair[1]) if len(pair) > 1 else None)
-                self._follow(name, found[name], None)
-        return self._row(event, found)
+                estimates[name] = (value, number(pair[1]) if len(pair) > 1 else None)
+                self._follow(name, estimates[name], None)
+        return self._row(event, estimates)
 
-    def told(self) -> dict[str, Any]:
-        """As pages are told."""
-        return {"parameters": [followed.told() for followed in self._followed.values()], "rows": list(self._rows)}
+    def state(self) -> dict[str, Any]:
+        """For pages."""
+        return {"parameters": [followed.state() for followed in self._followed.values()], "rows": list(self._rows)}
 
     @property
     def without_unit(self) -> bool:
-        """Whether there are parameters whose unit no event told: the start was rotated away."""
+        """Whether there are parameters whose unit no event gave: the start was rotated away."""
         return any(not followed.unit for followed in self._followed.values())
 
     def add_units(self, units: Mapping[str, str]) -> bool:
-        """Units by name, where none is known yet; rows that are kept are told in them from now on.
+        """Units by name, where none is known yet; rows that are kept are converted to them.
 
         Returns:
             whether any was new.
@@ -101,20 +101,22 @@ class Estimates:
                         column[index] = rounded(column[index] * followed.factor)
         return new
 
-    def _follow(self, name: str, found: tuple[float, float | None], unit: Any) -> None:
+    def _follow(self, name: str, estimate: tuple[float, float | None], unit: Any) -> None:
         known = self._followed.get(name)
         if known is None and len(self._followed) < MOST_PARAMETERS:
-            self._followed[name] = Followed(name, *_shown(unit), *found)
+            self._followed[name] = Followed(name, *_shown(unit), *estimate)
         elif known is not None and isinstance(unit, str):
             self.add_units({name: unit})
 
-    def _row(self, event: Mapping[str, Any], found: Mapping[str, tuple[float, float | None]]) -> dict[str, Any] | None:
-        if not found:
+    def _row(
+        self, event: Mapping[str, Any], estimates: Mapping[str, tuple[float, float | None]]
+    ) -> dict[str, Any] | None:
+        if not estimates:
             return None
         change: list[float | None] = []
         deviations: list[float | None] = []
         for name, followed in self._followed.items():
-            value, sd = found.get(name, (None, None))
+            value, sd = estimates.get(name, (None, None))
             change.append(None if value is None else rounded((value - followed.start) * followed.factor))
             deviations.append(None if sd is None else rounded(sd * followed.factor, 4))
         row = {

@@ -1,4 +1,4 @@
-"""What the events of a recalibration say, checked and cut to what is shown."""
+"""The events of a recalibration, checked and cut to what is shown."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from armcal_online.watch.lenient import number, numbers, rounded, text, vector, 
 
 VERDICTS = ("accepted", "rejected", "ignored")
 LEVELS = ("nominal", "watch", "suspect", "lost")
-TOLD = ("started", "decision", "level", "calibration", "control", "alarm", "finished")
+LISTED = ("started", "decision", "level", "calibration", "control", "alarm", "finished")
 """Events that are listed with their sentence."""
 _ALONG = ("joint", "measurement", "kind", "from", "to", "path", "why", "command", "calibration", "evaluator")
 
@@ -26,7 +26,8 @@ def record_of(event: Mapping[str, Any]) -> Message | None:
     kept |= {"nis": rounded(number(event.get("nis")), 7), "dof": whole(event.get("dof"))}
     kept |= {key: text(event.get(key)) for key in ("id", "why", "measurement", "level")}
     for key in ("residual_mm", "measured_mm", "predicted_mm"):
-        kept[key] = _rounded_all(vector(event.get(key)))
+        values = vector(event.get(key))
+        kept[key] = values and [rounded(value) for value in values]
     kept["inputs"] = {name: rounded(value, 9) for name, value in numbers(event.get("inputs")).items()}
     return {key: value for key, value in kept.items() if value not in (None, {})}
 
@@ -40,7 +41,7 @@ def shortened(record: Message) -> Message:
 def message_of(event: Mapping[str, Any]) -> Message | None:
     """An event that is listed, with a sentence in any case; None for other kinds."""
     kind = event.get("event")
-    if kind not in TOLD:
+    if kind not in LISTED:
         return None
     at = number(event.get("at")) or None  # 0: before the first record
     kept: Message = {"event": kind, "sequence": whole(event.get("sequence")), "at": at}
@@ -52,17 +53,14 @@ def message_of(event: Mapping[str, Any]) -> Message | None:
     return kept
 
 
-def _sentence(content: Message) -> str:
-    if content["event"] == "started":
-        return "The recalibration went on." if "resumed" in content else "The recalibration started."
-    if content["event"] == "calibration":
-        return f"Wrote {content.get('path', 'a calibration')}."
-    if content["event"] == "level":
-        return f"From {content.get('from', 'unknown')} to {content.get('to', 'unknown')}."
-    parts = [content[key] for key in ("kind", "command", "joint", "measurement", "why") if key in content]
-    parts += [f"{content[key]:g} {key[5:]}" for key in ("size_deg", "size_mm") if key in content]
-    return ", ".join(parts) or str(content["event"])
-
-
-def _rounded_all(values: list[float] | None) -> list[float | None] | None:
-    return None if values is None else [rounded(value) for value in values]
+def _sentence(message: Message) -> str:
+    """For an event that brings none."""
+    if message["event"] == "started":
+        return "The recalibration went on." if "resumed" in message else "The recalibration started."
+    if message["event"] == "calibration":
+        return f"Wrote {message.get('path', 'a calibration')}."
+    if message["event"] == "level":
+        return f"From {message.get('from', 'unknown')} to {message.get('to', 'unknown')}."
+    parts = [message[key] for key in ("kind", "command", "joint", "measurement", "why") if key in message]
+    parts += [f"{message[key]:g} {key[5:]}" for key in ("size_deg", "size_mm") if key in message]
+    return ", ".join(parts) or str(message["event"])

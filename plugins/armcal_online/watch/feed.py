@@ -2,24 +2,26 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import threading
 import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from secrets import token_hex
 from typing import Any
+
+from armcal.errors import ArmcalError
+from armcal.io.event_file import EARLIER, EVENTS
 
 from armcal_online.watch.events import VERDICTS, Message
 from armcal_online.watch.history import History
 from armcal_online.watch.lenient import numbers, parsed, scalar, text
 from armcal_online.watch.shape import Shape
 from armcal_online.watch.tail import Tail
-from armcal_online.watch.units import units_of
 
-EVENTS, ROTATED, STATUS = "events.jsonl", "events.1.jsonl", "status.json"
-CALIBRATION = "calibration.yaml"
+STATUS, CALIBRATION = "status.json", "calibration.yaml"
 MOST_MESSAGES = 1000
 """Messages kept for pages that were away; who missed more begins anew."""
 TIPS = 40
@@ -44,7 +46,7 @@ class Feed:
         self.trouble: str | None = None
         self.run = token_hex(4)
         self._shape = shape
-        self._tail = Tail(folder / EVENTS, folder / ROTATED)
+        self._tail = Tail(folder / EVENTS, folder / EARLIER)
         self._status: dict[str, Any] = {}
         self._status_time = 0
         self._units_after = 0.0
@@ -56,8 +58,8 @@ class Feed:
         self._changed = threading.Condition()
 
     def step(self) -> list[Message]:
-        """Read what is new; returns what pages are told of it."""
-        told: list[Message] = []
+        """Read what is new; returns the messages to pages about it."""
+        messages: list[Message] = []
         try:
             lines = self._tail.lines()
             self.trouble = None
@@ -65,13 +67,19 @@ class Feed:
             lines, self.trouble = [], f"{self.folder} cannot be read: {fault}"
         with self._changed:
             for line in lines:
-                told += self.history.take(parsed(line))
+                messages += self.history.take(parsed(line))
             if lines:
-                self._heard = self._written()
-            told += self._units()
-            told += self._new_status()
-            self._publish(told)
-        return told
+                self._heard = time.time()
+                with contextlib.suppress(OSError):
+                    self._heard = (self.folder / EVENTS).stat().st_mtime
+            estimates, path = self.history.estimates, self.folder / CALIBRATION
+            if estimates.without_unit and time.monotonic() >= self._units_after and path.exists():
+                self._units_after = time.monotonic() + _RETRY
+                if estimates.add_units(units_of(path)):
+                    messages.append({"event": "reset"})  # pages begin anew, with the units
+            messages += self._new_status()
+            self._publish(messages)
+        return messages
 
     def draw(self) -> None:
         """The arm at the newest record, where there is a newer one than that drawn."""
@@ -85,7 +93,7 @@ class Feed:
             self._publish([self._arm])
 
     def follow(self, stop: threading.Event) -> None:
-        """Read on until told to stop; the arm is drawn when all is read, or now and then while much comes."""
+        """Read on until ``stop``; the arm is drawn when all is read, or every 2 s while much comes."""
         drawn = time.monotonic()
         while not stop.is_set():
             busy = bool(self.step())
@@ -143,12 +151,12 @@ class Feed:
             newest = list(self._messages)[len(self._messages) - missed :]
         return [(f"{self.run}-{number}", message) for number, message in newest]
 
-    def _publish(self, told: Sequence[Message]) -> None:
-        self._number += max(len(told) - MOST_MESSAGES, 0)
-        for message in told[-MOST_MESSAGES:]:
+    def _publish(self, messages: Sequence[Message]) -> None:
+        self._number += max(len(messages) - MOST_MESSAGES, 0)
+        for message in messages[-MOST_MESSAGES:]:
             self._number += 1
             self._messages.append((self._number, json.dumps(message, allow_nan=False, separators=(",", ":"))))
-        if told:
+        if messages:
             self._changed.notify_all()
 
     @staticmethod
@@ -156,34 +164,33 @@ class Feed:
         """Seconds; none where clocks disagree."""
         return round(max(0.0, time.time() - moment), 1)
 
-    def _written(self) -> float:
-        try:
-            return (self.folder / EVENTS).stat().st_mtime
-        except OSError:
-            return time.time()
-
-    def _units(self) -> list[Message]:
-        """Units from the calibration, where the event that told them is gone; pages begin anew with them."""
-        estimates, path = self.history.estimates, self.folder / CALIBRATION
-        if not estimates.without_unit or time.monotonic() < self._units_after or not path.exists():
-            return []
-        self._units_after = time.monotonic() + _RETRY
-        return [{"event": "reset"}] if estimates.add_units(units_of(path)) else []
-
     def _new_status(self) -> list[Message]:
         path = self.folder / STATUS
         try:
             written = path.stat().st_mtime_ns
             if written == self._status_time:
                 return []
-            content = parsed(path.read_bytes()[:_LONGEST_STATUS])
+            status = parsed(path.read_bytes()[:_LONGEST_STATUS])
         except OSError:
             return []
         self._status_time = written
-        if content is None:
+        if status is None:
             return []
-        self._status = {str(text(key)): value for key, each in content.items() if (value := scalar(each)) is not None}
-        counts = numbers(content.get("counts"))
+        self._status = {str(text(key)): value for key, raw in status.items() if (value := scalar(raw)) is not None}
+        counts = numbers(status.get("counts"))
         if all(verdict in counts for verdict in VERDICTS):
             self._status["counts"] = {verdict: counts[verdict] for verdict in VERDICTS}
         return [{"event": "status", "status": self._status}]
+
+
+def units_of(path: Path) -> Mapping[str, str]:
+    """The units of parameters by name, from a calibration whose arm is not built; empty where it cannot be read."""
+    from armcal.config.yaml_source import load_config  # late: needed only where events of the start are gone
+
+    try:
+        listed = load_config(path).data.get("parameters")
+    except (ArmcalError, OSError):
+        return {}
+    entries = [entry for entry in listed if isinstance(entry, Mapping)] if isinstance(listed, list) else []
+    known = [(text(entry.get("name")), text(entry.get("unit"))) for entry in entries]
+    return {name: unit for name, unit in known if name and unit}

@@ -1,4 +1,4 @@
-"""All that a watcher knows of a recalibration, in bounded memory, and what each event adds to it."""
+"""The state of a recalibration as its events give it, in bounded memory."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from armcal_online.watch.thinned import Thinned
 RECENT_RECORDS = 2000
 """The newest records, kept whole."""
 OLDER_ACCEPTED, OLDER_OTHERS = 2000, 1000
-MOST_TOLD = 400
+MOST_EVENTS = 400
 """Events in the list; the oldest are forgotten."""
 
 
 class History:
-    """What the events said so far."""
+    """What the events gave so far."""
 
     def __init__(self) -> None:
         self._accepted: Thinned[Message] = Thinned(RECENT_RECORDS, OLDER_ACCEPTED, shortened)
         self._others: Thinned[Message] = Thinned(RECENT_RECORDS // 2, OLDER_OTHERS, shortened)
         self.estimates = Estimates()
-        self._told: deque[Message] = deque(maxlen=MOST_TOLD)
+        self._listed: deque[Message] = deque(maxlen=MOST_EVENTS)
         self.unknown = self.unreadable = 0
         self._forget()
 
@@ -33,7 +33,7 @@ class History:
         self._accepted.clear()
         self._others.clear()
         self.estimates.clear()
-        self._told.clear()
+        self._listed.clear()
         self.written: Message | None = None
         self._counts = dict.fromkeys(VERDICTS, 0)
         self._first: int | None = None
@@ -44,23 +44,32 @@ class History:
         self.gate: float | None = None
 
     def take(self, event: Mapping[str, Any] | None) -> list[Message]:
-        """Add an event (None: a line that could not be read); returns what pages are told of it.
+        """Add an event (None: a line that could not be read); returns the messages to pages about it.
 
-        A start that is not the going on of an earlier one makes everything before it void: pages are told ``reset``.
+        A start that does not resume an earlier one makes everything before it void: pages get ``reset``.
         """
-        kind = None if event is None else event.get("event")
         if event is None:
             self.unreadable += 1
-        elif kind == "record":
+            return []
+        kind = event.get("event")
+        if kind == "record":
             return self._record(event)
-        elif kind == "estimate":
+        if kind == "started":
+            return self._started(event)
+        if kind == "estimate":
             row = self.estimates.take(event)
             return [row] if row else []
-        elif kind == "started":
-            return self._started(event)
+        message = message_of(event)
+        if message is None:
+            self.unknown += 1
+            return []
+        if message["event"] == "level":
+            self._stand(message.get("to"), message["sentence"])
+        if message["event"] == "calibration":
+            self.written = message
         else:
-            return self._other(event)
-        return []
+            self._listed.append(message)
+        return [message]
 
     def state(self) -> dict[str, Any]:
         """Everything, for a page that begins; numbers are SI unless their key says otherwise."""
@@ -73,8 +82,8 @@ class History:
             "last": self.last,
             "gate_probability": self.gate,
             "records": [{k: v for k, v in r.items() if k != "event"} for r in records],
-            "estimates": self.estimates.told(),
-            "told": list(self._told),
+            "estimates": self.estimates.state(),
+            "told": list(self._listed),
             "written": self.written,
             "unknown": self.unknown,
             "unreadable": self.unreadable,
@@ -91,7 +100,7 @@ class History:
             self.unknown += 1
             return []
         if record.setdefault("sequence", self._sequence + 1) <= self._sequence:
-            return []  # told a second time
+            return []  # written a second time
         self._sequence = record["sequence"]
         self._counts[record["verdict"]] += 1
         if self._first is None:
@@ -106,7 +115,7 @@ class History:
     def _started(self, event: Mapping[str, Any]) -> list[Message]:
         message = message_of(event)
         messages: list[Message] = []
-        if event.get("resumed") is not True and (self.last or self._told):
+        if event.get("resumed") is not True and (self.last or self._listed):
             self._forget()
             messages.append({"event": "reset"})
         self.calibration = text(event.get("calibration")) or self.calibration
@@ -117,22 +126,9 @@ class History:
         row = self.estimates.start(event)
         self._stand(text(event.get("level")), None)
         if message:
-            self._told.append(message)
+            self._listed.append(message)
             messages.append(message)
         return [*messages, *([row] if row else [])]
-
-    def _other(self, event: Mapping[str, Any]) -> list[Message]:
-        message = message_of(event)
-        if message is None:
-            self.unknown += 1
-            return []
-        if message["event"] == "level":
-            self._stand(message.get("to"), message["sentence"])
-        if message["event"] == "calibration":
-            self.written = message
-        else:
-            self._told.append(message)
-        return [message]
 
     def _stand(self, level: Any, sentence: str | None) -> None:
         if level not in LEVELS:

@@ -17,10 +17,10 @@ def parsed(line: bytes | str) -> Mapping[str, Any] | None:
     """One JSON object; None for anything else."""
     text = line.decode("utf-8", "replace") if isinstance(line, bytes) else line
     try:
-        content = json.loads(text)
+        event = json.loads(text)
     except (ValueError, RecursionError):
         return None
-    return content if isinstance(content, dict) else None
+    return event if isinstance(event, dict) else None
 
 
 def number(value: Any) -> float | None:
@@ -61,16 +61,16 @@ def vector(value: Any) -> list[float] | None:
     """A list of three finite numbers."""
     if not isinstance(value, (list, tuple)) or len(value) != 3:
         return None
-    known = [number(each) for each in value]
-    return [each for each in known if each is not None] if None not in known else None
+    known = [finite for item in value if (finite := number(item)) is not None]
+    return known if len(known) == 3 else None
 
 
 def numbers(value: Any) -> dict[str, float]:
     """Finite numbers by name; at most 64 of them."""
     if not isinstance(value, Mapping):
         return {}
-    named = ((text(name), number(each)) for name, each in value.items())
-    kept = [(name, each) for name, each in named if name is not None and each is not None]
+    named = ((text(name), number(item)) for name, item in value.items())
+    kept = [(name, finite) for name, finite in named if name is not None and finite is not None]
     return dict(kept[:_MOST_NUMBERS])
 
 

@@ -1,27 +1,111 @@
-"""The page's server: three addresses that are read, nothing that is written."""
+"""The page and its server: three addresses that are read, nothing that is written.
+
+On this machine anyone may look who asks for it by a name of its own, from elsewhere who knows the token.
+"""
 
 from __future__ import annotations
 
+import base64
 import gzip
+import hashlib
+import hmac
+import ipaddress
 import json
+import re
 import socket
 import threading
+from dataclasses import dataclass
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from importlib import resources
+from secrets import token_urlsafe
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
 from armcal.errors import InputError, Location
 
-from armcal_online.watch.access import Access
 from armcal_online.watch.feed import Feed
-from armcal_online.watch.page import page
 
+SCRIPTS = ("drawing.js", "innovations.js", "parameters.js", "arm.js", "page.js")
+"""In this order: each uses what those before it define."""
 MOST_STREAMS = 32
 """Pages that are open at once."""
 _MOST_CONNECTIONS = 64
 _HEARTBEAT = 5.0
 _PATIENCE = 10.0
+_OWN_NAMES = ("localhost", "127.0.0.1", "::1")
+_HOST_HEADER = re.compile(r"(?:\[(?P<ipv6>[^\]]+)\]|(?P<name>[^:\[]+))(?::[0-9]*)?")
+_ALWAYS = {
+    "Cache-Control": "no-store",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Referrer-Policy": "no-referrer",
+    "X-Content-Type-Options": "nosniff",
+    "X-Frame-Options": "DENY",
+}
+
+
+def is_loopback(host: str) -> bool:
+    """Whether an address can only be reached from this machine."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+@dataclass(frozen=True)
+class Access:
+    """Decides whether a request is answered.
+
+    Attributes:
+        host: what the server listens on.
+        token: demanded of every request; None on an address of this machine alone.
+    """
+
+    host: str
+    token: str | None
+
+    @classmethod
+    def of(cls, host: str) -> Access:
+        """With a new token where others can reach the address."""
+        return cls(host, None if is_loopback(host) else token_urlsafe(24))
+
+    def allows(self, host_header: str | None, token: str | None) -> bool:
+        """Judge a request by its Host header and its token.
+
+        Without a token the header must name this machine: a page of another site, whose name was made to point here,
+        is refused. The port may be any, since a tunnel may begin at another one.
+        """
+        if self.token is not None:
+            return hmac.compare_digest((token or "").encode(), self.token.encode())
+        named = _HOST_HEADER.fullmatch((host_header or "").strip().lower())
+        return named is not None and (named["ipv6"] or named["name"]) in (*_OWN_NAMES, self.host)
+
+
+@dataclass(frozen=True)
+class Page:
+    """A page as it is sent, and its Content-Security-Policy."""
+
+    html: bytes
+    policy: str
+
+
+def page() -> Page:
+    """Put together from the files of this package."""
+    style, script = _file("page.css"), "\n".join(_file(name) for name in SCRIPTS)
+    html = _file("page.html").replace("/* style */", style).replace("/* script */", script)
+    policy = (
+        f"default-src 'none'; script-src {_hash(script)}; style-src {_hash(style)}; connect-src 'self'; "
+        "img-src data:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+    )
+    return Page(html.encode(), policy)
+
+
+def _file(name: str) -> str:
+    return resources.files("armcal_online.watch").joinpath(name).read_text(encoding="utf-8")
+
+
+def _hash(text: str) -> str:
+    return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
 
 
 class WatchServer(ThreadingHTTPServer):
@@ -110,16 +194,16 @@ class _Handler(BaseHTTPRequestHandler):
 
     def do_GET(self) -> None:
         """The page, the state, or the stream of events."""
-        asked = urlsplit(self.path)
-        query = {key: values[-1] for key, values in parse_qs(asked.query).items()}
+        address = urlsplit(self.path)
+        query = {key: values[-1] for key, values in parse_qs(address.query).items()}
         if not self.server.access.allows(self.headers.get("Host"), query.get("token")):
             self._answer(HTTPStatus.FORBIDDEN, b"Forbidden: wrong name or token in the address.\n")
-        elif asked.path == "/":
+        elif address.path == "/":
             self._answer(HTTPStatus.OK, self.server.page.html, "text/html")
-        elif asked.path == "/state":
+        elif address.path == "/state":
             state = json.dumps(self.server.feed.state(), allow_nan=False, separators=(",", ":"))
             self._answer(HTTPStatus.OK, state.encode(), "application/json")
-        elif asked.path == "/events":
+        elif address.path == "/events":
             self._stream(self.headers.get("Last-Event-ID") or query.get("after", ""))
         else:
             self._answer(HTTPStatus.NOT_FOUND, b"Not found.\n")
@@ -151,27 +235,15 @@ class _Handler(BaseHTTPRequestHandler):
             self._head(HTTPStatus.OK, "text/event-stream")
             self.end_headers()
             self.wfile.write(b"retry: 2000\n\n")
-            self._follow(place)
+            while not self.server.ending.is_set():
+                messages = self.server.feed.after(place, self.server.heartbeat)
+                if messages is None:
+                    self.wfile.write(b"event: reset\ndata: {}\n\n")
+                    return
+                if messages:
+                    place = messages[-1][0]
+                    self.wfile.write("".join(f"id: {at}\ndata: {text}\n\n" for at, text in messages).encode())
+                else:
+                    self.wfile.write(b": still there\n\n")
         finally:
             self.server.streams.release()
-
-    def _follow(self, place: str) -> None:
-        while not self.server.ending.is_set():
-            messages = self.server.feed.after(place, self.server.heartbeat)
-            if messages is None:
-                self.wfile.write(b"event: reset\ndata: {}\n\n")
-                return
-            if not messages:
-                self.wfile.write(b": still there\n\n")
-                continue
-            place = messages[-1][0]
-            self.wfile.write("".join(f"id: {at}\ndata: {text}\n\n" for at, text in messages).encode())
-
-
-_ALWAYS = {
-    "Cache-Control": "no-store",
-    "Cross-Origin-Resource-Policy": "same-origin",
-    "Referrer-Policy": "no-referrer",
-    "X-Content-Type-Options": "nosniff",
-    "X-Frame-Options": "DENY",
-}

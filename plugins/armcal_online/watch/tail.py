@@ -8,15 +8,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
-LONGEST_LINE = 1 << 20
-"""Longer lines are passed over (bytes)."""
+from armcal.io.line_cutter import LineCutter
+
 _AT_ONCE = 1 << 20
 _HEAD = 256
 
 
 @dataclass(frozen=True)
 class _Mark:
-    """What a file is known again by, whatever it is called by then: device, number and how it begins."""
+    """What identifies a file, whatever it is called by then: device, inode number and how it begins."""
 
     place: tuple[int, int]
     head: bytes
@@ -31,9 +31,10 @@ class _Mark:
 class Tail:
     """The complete lines of ``path``, oldest first, from the file it was last rotated to onwards.
 
-    A half-written line waits for its end. A file that was rotated is read to its end before the new one is begun; one
-    that became shorter, or begins otherwise than before, is read from its start. Files need not exist yet. None is
-    kept open, so that a file that is dropped to make room on a disk does make room.
+    A half-written line waits for its end; a line of more than 1 MiB is passed over. A file that was rotated is read to
+    its end before the new one is begun; one that became shorter, or begins otherwise than before, is read from its
+    start. Files need not exist yet. None is kept open, so that a file that is dropped to make room on a disk does
+    make room.
 
     Args:
         path: the newest file.
@@ -44,9 +45,7 @@ class Tail:
         self._path, self._rotated = path, rotated
         self._reading: _Mark | None = None
         self._before: _Mark | None = None
-        self._position = 0
-        self._partial = b""
-        self._skipping = False
+        self._position, self._cutter = 0, LineCutter()
         self.too_long = 0
 
     def lines(self) -> list[bytes]:
@@ -61,9 +60,9 @@ class Tail:
             file = self._current(newest, earlier)
             if file is None:
                 return []
-            found = self._read(file)
-            if found or newest is None or _place(file) == _place(newest):
-                return found
+            lines = self._read(file)
+            if lines or newest is None or _place(file) == _place(newest):
+                return lines
             self._before = self._reading
             self._begin(newest)
             return self._read(newest)
@@ -86,27 +85,19 @@ class Tail:
 
     def _begin(self, file: BinaryIO) -> None:
         self._reading = _Mark(_place(file), b"")
-        self._position, self._partial, self._skipping = 0, b"", False
+        self._position, self._cutter = 0, LineCutter()
 
     def _read(self, file: BinaryIO) -> list[bytes]:
         completed: list[bytes] = []
         file.seek(self._position)
         while not completed and (data := file.read(_AT_ONCE)):
             self._position += len(data)
-            completed = self._completed(data)
+            lines = self._cutter.feed(data)
+            self.too_long += lines.count(None)
+            completed = [line for line in lines if line and line.strip()]
         head = os.pread(file.fileno(), min(_HEAD, self._position), 0)
         self._reading = _Mark(_place(file), head)
         return completed
-
-    def _completed(self, data: bytes) -> list[bytes]:
-        *whole, rest = (self._partial + data).split(b"\n")
-        if whole and self._skipping:
-            whole, self._skipping = whole[1:], False
-        if self._skipping or len(rest) > LONGEST_LINE:
-            self.too_long += not self._skipping
-            rest, self._skipping = b"", True
-        self._partial = rest
-        return [line for line in whole if line.strip()]
 
 
 def _open(path: Path, opened: ExitStack) -> BinaryIO | None:
@@ -117,5 +108,5 @@ def _open(path: Path, opened: ExitStack) -> BinaryIO | None:
 
 
 def _place(file: BinaryIO) -> tuple[int, int]:
-    known = os.fstat(file.fileno())
-    return known.st_dev, known.st_ino
+    status = os.fstat(file.fileno())
+    return status.st_dev, status.st_ino

@@ -29,20 +29,26 @@ def picture(state: Mapping[str, Any], width: int = 80) -> RenderableType:
     if state["estimates"]["rows"]:
         parts.append(_parameters(state["estimates"]))
     if state["told"]:
-        parts.append(_told(state["told"][-_EVENTS:]))
+        events = _table("event", "at", "")
+        for event in reversed(state["told"][-_EVENTS:]):
+            events.add_row(Text(_kind(event)), Text(_place(event)), Text(event["sentence"]))
+        parts.append(events)
     return Group(*parts)
 
 
 def line(message: Mapping[str, Any]) -> str | None:
-    """One message as a line of plain text; None for those that a line says nothing of."""
+    """One message as a line of plain text; None for estimates, drawings and states, which have none."""
     kind = message["event"]
-    if kind == "record":
-        return f"{_place(message)}: {message['verdict']}{_judged(message)}"
     if kind in ("estimate", "arm", "status"):
         return None
     if kind == "reset":
         return "A new recalibration begins."
-    return f"{_place(message)}: {_kind(message)}: {message['sentence']}"
+    if kind != "record":
+        return f"{_place(message)}: {_kind(message)}: {message['sentence']}"
+    numbers = [f"NIS {message['nis']:.3g}"] if "nis" in message else []
+    numbers += [f"gate {message['limit']:.3g}"] if "limit" in message else []
+    judged = message["verdict"] + (f" ({', '.join(numbers)})" if numbers else "")
+    return f"{_place(message)}: {judged}" + (f". {message['why']}" if "why" in message else "")
 
 
 def _health(state: Mapping[str, Any]) -> Panel:
@@ -65,17 +71,13 @@ def _strip(records: Sequence[Mapping[str, Any]], width: int) -> Text:
     """NIS against the gate, a character a record; a full block is at the gate or above."""
     text = Text("NIS to gate, logarithmic: ", style="dim")
     for record in records[-max(10, width - 28) :]:
-        text.append(_bar(record), style=VERDICT_STYLES[record["verdict"]])
+        nis, limit, bar = record.get("nis") or 0.0, record.get("limit") or 0.0, "."
+        if nis > 0 and limit > 0:
+            part = 1 + math.log10(nis / limit) / 3  # three decades below the gate
+            bar = _BARS[min(max(round(part * (len(_BARS) - 1)), 1), len(_BARS) - 1)]
+        text.append(bar, style=VERDICT_STYLES[record["verdict"]])
     text.no_wrap = True
     return text
-
-
-def _bar(record: Mapping[str, Any]) -> str:
-    nis, limit = record.get("nis"), record.get("limit")
-    if not nis or not limit or nis <= 0 or limit <= 0:
-        return "."
-    part = 1 + math.log10(nis / limit) / 3  # three decades below the gate
-    return _BARS[min(max(round(part * (len(_BARS) - 1)), 1), len(_BARS) - 1)]
 
 
 def _records(records: Sequence[Mapping[str, Any]]) -> Table:
@@ -96,21 +98,14 @@ def _records(records: Sequence[Mapping[str, Any]]) -> Table:
 def _parameters(estimates: Mapping[str, Any]) -> Table:
     row = estimates["rows"][-1]
     listed = zip(estimates["parameters"], row["change"], row["sd"], strict=False)
-    known = [(each, change, sd) for each, change, sd in listed if change is not None]
+    known = [(parameter, change, sd) for parameter, change, sd in listed if change is not None]
     known.sort(key=lambda entry: -abs(entry[1]) / (entry[0]["start_sd"] or math.inf))
     table = _table("parameter, most changed first", "change since the start", "+- (95 %)", "unit")
-    for each, change, sd in known[:_PARAMETERS]:
+    for parameter, change, sd in known[:_PARAMETERS]:
         band = None if sd is None else _BAND * sd
-        table.add_row(Text(each["name"]), f"{change:+.3g}", _number(band), Text(each["unit"]))
+        table.add_row(Text(parameter["name"]), f"{change:+.3g}", _number(band), Text(parameter["unit"]))
     if len(known) > _PARAMETERS:
         table.add_row(Text(f"and {len(known) - _PARAMETERS} more", style="dim"))
-    return table
-
-
-def _told(told: Sequence[Mapping[str, Any]]) -> Table:
-    table = _table("event", "at", "")
-    for event in reversed(told):
-        table.add_row(Text(_kind(event)), Text(_place(event)), Text(event["sentence"]))
     return table
 
 
@@ -125,13 +120,6 @@ def _kind(event: Mapping[str, Any]) -> str:
     if event["event"] == "decision":
         return str(event.get("kind", "decision")).replace("_", " ")
     return f"level {event.get('to', '')}" if event["event"] == "level" else str(event["event"])
-
-
-def _judged(record: Mapping[str, Any]) -> str:
-    parts = [f"NIS {record['nis']:.3g}"] if "nis" in record else []
-    parts += [f"gate {record['limit']:.3g}"] if "limit" in record else []
-    text = f" ({', '.join(parts)})" if parts else ""
-    return f"{text}. {record['why']}" if "why" in record else text
 
 
 def _name(record: Mapping[str, Any]) -> str:

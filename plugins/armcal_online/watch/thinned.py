@@ -28,12 +28,11 @@ class Thinned(Generic[T]):
     def add(self, item: T) -> None:
         """The newest item."""
         self._recent.append(item)
-        if len(self._recent) > self._most[0]:
-            self._keep(self._recent.popleft())
-
-    def _keep(self, item: T) -> None:
+        if len(self._recent) <= self._most[0]:
+            return
+        oldest = self._recent.popleft()
         if self._passed % self._stride == 0:
-            self._older.append(self._shorten(item))
+            self._older.append(self._shorten(oldest))
         self._passed += 1
         if len(self._older) > self._most[1]:
             del self._older[1::2]

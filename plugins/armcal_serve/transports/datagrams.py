@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import socket
-from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from armcal.errors import ArmcalError, DataError
@@ -86,17 +86,14 @@ class Datagrams(Transport):
                 data, sender = self._socket.recvfrom(_LONGEST + 1)
             except OSError:
                 return
-            if sum(each.open for each in self._senders.values()) >= _MOST_OPEN:
+            if sum(conversation.open for conversation in self._senders.values()) >= _MOST_OPEN:
                 busy = ArmcalError(f"{_MOST_OPEN} requests are waiting.", hint="Ask again in a while.")
                 self._send(sender, as_bytes(refusal(None, busy)))
                 continue
             conversation = self._senders.get(sender)
             if conversation is None:
-                conversation = self._senders[sender] = Conversation(self._sending(sender))
+                conversation = self._senders[sender] = Conversation(partial(self._send, sender))
             self._dispatcher.ask(conversation, data)
-
-    def _sending(self, sender: Any) -> Callable[[bytes], None]:
-        return lambda answer: self._send(sender, answer)
 
     def _send(self, sender: Any, answer: bytes) -> None:
         if len(answer) > _LONGEST:

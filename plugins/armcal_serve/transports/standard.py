@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import os
-import select
 
+from armcal.io.standard_output import write_ready
 from typing_extensions import override
 
 from armcal_serve.dispatcher import Dispatcher
 from armcal_serve.poller import Poller
 from armcal_serve.transports.stream import CHUNK, StreamClient
 from armcal_serve.transports.transport import Transport
-
-_AT_ONCE = 4096
-"""A pipe that is ready takes so many bytes without waiting (PIPE_BUF)."""
 
 
 class StandardStreams(Transport):
@@ -69,6 +66,4 @@ class StandardStreams(Transport):
         return os.read(self._incoming, CHUNK)
 
     def _send(self, data: memoryview) -> int:
-        poll = select.poll()
-        poll.register(self._outgoing, select.POLLOUT)
-        return os.write(self._outgoing, data[:_AT_ONCE]) if poll.poll(0) else 0
+        return write_ready(self._outgoing, data)

@@ -25,14 +25,14 @@ Send = Callable[[memoryview], int]
 
 
 class StreamClient:
-    """One client. It is read from as long as it reads what it is told.
+    """One client. It is read from as long as it reads its answers.
 
     Args:
         incoming, outgoing: descriptors, or what has one; the same for a socket.
         receive, send: raise OSError when nobody is there any more.
 
     Attributes:
-        ended: whether there is nobody to be told anything any more.
+        ended: whether nobody is there any more.
         heard_all: whether all of its requests have come.
         moved: when it last took something, or had nothing to take (monotonic seconds).
         asked: whether it ever sent a whole line.
@@ -94,9 +94,14 @@ class StreamClient:
             self._poller.watch(place)
 
     def arrange(self) -> None:
-        """Ask what can be asked, and say what is to be waited for."""
+        """Ask what can be asked, and watch what is to be waited for."""
         while self._lines and self.conversation.open < MOST_WAITING and not self.ended:
-            self._ask(self._lines.popleft())
+            line = self._lines.popleft()
+            if line is None:
+                text = f"the request has more than {MAX_LINE_BYTES // 1024} KiB."
+                self._dispatcher.refuse(self.conversation, DataError(text, hint="Ask for less at a time."))
+            elif line.strip():
+                self._dispatcher.ask(self.conversation, line)
         if self.ended:
             return
         full = bool(self._lines) or len(self._out) > MOST_UNREAD_BYTES
@@ -107,15 +112,6 @@ class StreamClient:
         else:
             self._poller.watch(self._incoming, read)
             self._poller.watch(self._outgoing, None, write)
-
-    def _ask(self, line: bytes | None) -> None:
-        if line is None:
-            fault = DataError(
-                f"the request has more than {MAX_LINE_BYTES // 1024} KiB.", hint="Ask for less at a time."
-            )
-            self._dispatcher.refuse(self.conversation, fault)
-        elif line.strip():
-            self._dispatcher.ask(self.conversation, line)
 
     def _read(self) -> None:
         try:

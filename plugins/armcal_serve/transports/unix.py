@@ -6,6 +6,7 @@ import contextlib
 import errno
 import socket
 import time
+from functools import partial
 from pathlib import Path
 
 from armcal.errors import ArmcalError
@@ -111,23 +112,20 @@ class UnixSocket(Transport):
     def _accept(self) -> None:
         try:
             connection, _ = self._listener.accept()
-        except OSError as fault:
-            if fault.errno in _NO_MORE and not self._make_room("the system has no place for another"):
+        except OSError as failed:
+            if failed.errno in _NO_MORE and not self._make_room("the system has no place for another"):
                 self._poller.watch(self._listener)
                 self._opens_at = time.monotonic() + _PAUSE_S
             return
         connection.setblocking(False)
         if self._staying >= MOST_CLIENTS and not self._make_room(f"{MOST_CLIENTS} clients are connected"):
-            _turn_away(connection)
+            fault = ArmcalError(f"{MOST_CLIENTS} clients are connected.", hint="Close connections that are not used.")
+            with contextlib.suppress(OSError):
+                connection.send(as_bytes(refusal(None, fault)) + b"\n")
+            connection.close()
             return
-        client = StreamClient(
-            connection,
-            connection,
-            lambda: _received(connection),
-            lambda data: _sent(connection, data),
-            self._poller,
-            self._dispatcher,
-        )
+        receive, send = partial(_received, connection), partial(_sent, connection)
+        client = StreamClient(connection, connection, receive, send, self._poller, self._dispatcher)
         self._clients[connection] = client
 
     @property
@@ -160,10 +158,3 @@ def _sent(connection: socket.socket, data: memoryview) -> int:
         return connection.send(data)
     except BlockingIOError:
         return 0
-
-
-def _turn_away(connection: socket.socket) -> None:
-    fault = ArmcalError(f"{MOST_CLIENTS} clients are connected.", hint="Close connections that are not used.")
-    with contextlib.suppress(OSError):
-        connection.send(as_bytes(refusal(None, fault)) + b"\n")
-    connection.close()

@@ -1,29 +1,82 @@
-"""Datagrams: a JSON object in each, acknowledged to its sender once it is safe."""
+"""Streams: a record a line from standard input or another pipe, or a JSON object in each datagram."""
 
 from __future__ import annotations
 
 import contextlib
 import json
+import os
 import select
 import socket
 import time
-from collections import OrderedDict
-from collections.abc import Mapping, Sequence
+from collections import OrderedDict, deque
+from collections.abc import Sequence
 from typing import Any
 
+from armcal.io.line_cutter import LineCutter
 from armcal.io.udp import MAX_DATAGRAM_BYTES, listening
 from typing_extensions import override
 
 from armcal_online.sources.incoming import Incoming, Place
-from armcal_online.sources.row_parser import RowParser, faulty
+from armcal_online.sources.row_parser import LineParser, RowParser, faulty
 from armcal_online.sources.source import Clock, Source
 
+_CHUNK = 64 * 1024
 _WAITING = 64
 """So many senders are remembered until their records are acknowledged; there is one unless a disk is full."""
 
 
+class Lines(Source):
+    """JSON or CSV lines from a descriptor, which stays the caller's. A last line without an end is not trusted."""
+
+    keeps_records = False
+
+    def __init__(self, descriptor: int, rows: RowParser, clock: Clock = time.time) -> None:
+        self._descriptor = descriptor
+        self._parser = LineParser(rows, "either", "standard input")
+        self._clock = clock
+        self._cutter = LineCutter()
+        self._lines: deque[bytes | None] = deque()
+        self._row = 0
+        self._open = True
+
+    @property
+    @override
+    def ended(self) -> bool:
+        return not self._open and not self._lines
+
+    @override
+    def incoming(self, wait_s: float) -> Incoming | None:
+        deadline = time.monotonic() + wait_s
+        while True:
+            while self._lines:
+                incoming = self._parser.record(self._lines.popleft(), self._next_place())
+                if incoming is not None:
+                    return incoming
+            left = max(deadline - time.monotonic(), 0.0)
+            if not self._open or not select.select([self._descriptor], [], [], left)[0]:
+                return None
+            try:
+                data = os.read(self._descriptor, _CHUNK)
+            except OSError:
+                data = b""
+            self._lines.extend(self._cutter.feed(data))
+            if not data:
+                self._open = False
+                if self._cutter.begun:
+                    return faulty(self._next_place(), "The last line has no end: it may have been cut short.")
+
+    @override
+    def close(self) -> None:
+        self._open = False
+        self._lines.clear()
+
+    def _next_place(self) -> Place:
+        self._row += 1
+        return Place(self._clock(), "", self._row)
+
+
 class Udp(Source):
-    """A socket on a port; what it did not take before the record was lost has to be sent again by its sender.
+    """A JSON object in each datagram; a record that was not acknowledged has to be sent again by its sender.
 
     The reply is ``{"acknowledged": sequence, "id": id}``, with a ``fault`` where the record could not be read.
     ``senders`` are the addresses whose datagrams are records, or ``any``; those of this machine by default. Others get
@@ -48,17 +101,13 @@ class Udp(Source):
     @property
     def address(self) -> tuple[str, int]:
         """Host and port."""
-        found = self._socket.getsockname()
-        return str(found[0]), int(found[1])
+        host, port, *_ = self._socket.getsockname()
+        return str(host), int(port)
 
     @property
     @override
     def ended(self) -> bool:
         return not self._open
-
-    @override
-    def resume(self, positions: Mapping[str, int]) -> None:
-        """Datagrams have no positions."""
 
     @override
     def incoming(self, wait_s: float) -> Incoming | None:
@@ -69,7 +118,12 @@ class Udp(Source):
         except OSError:
             return None
         if not self._is_ours(sender[0]):
-            return self._stranger(sender[0])
+            if self._strange:
+                return None  # one that sends many must not fill the journal
+            self._strange = True
+            self._row += 1
+            text = f"A datagram came from {sender[0]}, which is not named as a sender. Further ones are passed over."
+            return faulty(Place(self._clock(), "", self._row), text)
         self._row += 1
         self._senders[self._row] = sender
         while len(self._senders) > _WAITING:
@@ -81,15 +135,6 @@ class Udp(Source):
             return self._rows.json_text(data.decode("utf-8-sig"), place)
         except UnicodeDecodeError as fault:
             return faulty(place, f"The datagram holds the byte 0x{data[fault.start]:02x}, which is not UTF-8 text.")
-
-    def _stranger(self, sender: str) -> Incoming | None:
-        """A fault for the first datagram of a sender that is not named; whoever sends many fills no journal."""
-        if self._strange:
-            return None
-        self._strange = True
-        self._row += 1
-        fault = f"A datagram came from {sender}, which is not named as a sender. Further ones are passed over unseen."
-        return faulty(Place(self._clock(), "", self._row), fault)
 
     @override
     def acknowledge(self, incoming: Incoming, sequence: int) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -30,27 +30,27 @@ def mission_figure(mission: Mission, judged: Judgement, title: str) -> bytes:
     FigureCanvasAgg(figure)
     axes, band = figure.subplots(2, 1, sharex=True, gridspec_kw={"height_ratios": [16, 1], "hspace": 0.02})
     days = mission.seconds / DAY_S
-    _curves(axes, judged, days)
-    rows = _happenings(axes, mission, judged)
-    _level_band(band, judged.curve, days)
+    _draw_curves(axes, judged, days)
+    rows = _draw_events(axes, mission, judged)
+    _draw_levels(band, judged.curve, days)
     below = {"loc": "upper right", "bbox_to_anchor": (1.0, -2.0), "borderaxespad": 0.0}
     band.legend(*axes.get_legend_handles_labels(), ncols=2, fontsize=8.5, frameon=False, **below)
-    for each in (axes, band):
-        each.set_xlim(0, days)
-        for side in ("top", "right"):
-            each.spines[side].set_visible(False)
+    for plot in (axes, band):
+        plot.set_xlim(0, days)
+        plot.spines[["top", "right"]].set_visible(False)
     axes.set_title(title, loc="left", fontsize=12, color=_INK, pad=8 + _ROW * rows)
     stream = io.BytesIO()
     figure.savefig(stream, format="png")
     return stream.getvalue()
 
 
-def _curves(axes: Any, judged: Judgement, days: float) -> None:
+def _draw_curves(axes: Any, judged: Judgement, days: float) -> None:
     curve = judged.curve
     at, shown = curve.times / DAY_S, np.vstack([curve.frozen, curve.recalibrated]) * _MM
     low, high = max(float(shown.min()), _LEAST_MM) / 1.4, max(float(shown.max()), judged.limit * _MM) * 1.6
-    for first, last in _nights(days):
-        axes.axvspan(first, last, color="#eef0f4", lw=0, zorder=0)
+    for day in range(-1, int(np.ceil(days))):
+        evening, morning = (day + hour / 24 for hour in _NIGHT)
+        axes.axvspan(max(evening, 0.0), min(morning, days), color="#eef0f4", lw=0, zorder=0)
     axes.plot(at, shown[0], color=_FROZEN, lw=1.2, label="calibration before launch, frozen")
     axes.plot(at, shown[1], color=_RECALIBRATED, lw=1.4, label="recalibrated", zorder=4)
     axes.axhline(judged.limit * _MM, color=_INK, lw=0.9, ls=(0, (5, 4)), zorder=2)
@@ -75,15 +75,13 @@ def _curves(axes: Any, judged: Judgement, days: float) -> None:
     axes.tick_params(labelsize=9, colors=_INK)
 
 
-def _nights(days: float) -> Iterator[tuple[float, float]]:
-    for day in range(-1, int(np.ceil(days))):
-        first, last = (day + hour / 24 for hour in _NIGHT)
-        yield max(first, 0.0), min(last, days)
-
-
-def _happenings(axes: Any, mission: Mission, judged: Judgement) -> int:
+def _draw_events(axes: Any, mission: Mission, judged: Judgement) -> int:
     """Events as labelled lines, each label in the lowest free row; power cuts inside the axes. How many rows."""
-    labels = [(e.event.time / mission.seconds, _told(e.event.label, e.records)) for e in judged.events]
+    labels = []
+    for report in judged.events:
+        count = report.records
+        recovery = "not recovered" if count is None else f"recovered in {count} record{'' if count == 1 else 's'}"
+        labels.append((report.event.time / mission.seconds, f"{report.event.label}\n{recovery}"))
     rows = _rows([place for place, _ in labels])
     for (place, text), row in zip(labels, rows, strict=True):
         day = place * mission.seconds / DAY_S
@@ -94,12 +92,6 @@ def _happenings(axes: Any, mission: Mission, judged: Judgement) -> int:
         axes.axvline(time / DAY_S, color=_FAINT, lw=0.9, ls=":", zorder=3)
         _write(axes, time / DAY_S, "power cut", xytext=(3, -4), rotation=90, va="top", color=_FAINT)
     return max(rows, default=-1) + 1
-
-
-def _told(label: str, records: int | None) -> str:
-    if records is None:
-        return f"{label}\nnot recovered"
-    return f"{label}\nrecovered in {records} record{'' if records == 1 else 's'}"
 
 
 def _write(axes: Any, day: float, text: str, **how: Any) -> None:
@@ -121,7 +113,7 @@ def _rows(places: Sequence[float]) -> list[int]:
     return rows
 
 
-def _level_band(band: Any, curve: ErrorCurve, days: float) -> None:
+def _draw_levels(band: Any, curve: ErrorCurve, days: float) -> None:
     from matplotlib.patches import Patch
 
     at = curve.times / DAY_S
