@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from heapq import heappop, heappush
 from typing import Annotated, Any, Literal
 
 from armcal.base.settings import Settings
 from pydantic import Field, ValidationError
-
-from armcal_simulation.board_firmware import NEVER
 
 Count = Annotated[int, Field(ge=0, le=1_000_000)]
 Seconds = Annotated[float, Field(ge=0)]
@@ -82,7 +81,7 @@ class FaultCalendar:
 
     def next_event(self) -> float:
         """When the next is due."""
-        return self._waiting[0][0] if self._waiting else NEVER
+        return self._waiting[0][0] if self._waiting else math.inf
 
     def run(self) -> None:
         """Do what is due."""

@@ -1,30 +1,81 @@
-"""The parts of a simulated bench, built from its settings and an experiment."""
+"""The settings of a simulated servo bench, and its parts, built from them and an experiment."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
+from typing import Annotated, Literal
 
 import numpy as np
-from armcal.arm.assembly import Arm, MassSpec
+from armcal.arm.assembly import Arm
 from armcal.arm.holding import holding_function
 from armcal.arm.joints import unknown_joint
 from armcal.base.domains import Array
 from armcal.base.pose_settings import PoseSettings
 from armcal.base.quaternions import rotation_matrix
+from armcal.base.settings import Angle, InputPath, Settings
 from armcal.config.selection import with_values
 from armcal.config.servo_file import ServoFile, load_servo_file
 from armcal.config.yaml_source import load_config
 from armcal.errors import ConfigError, Location
 from armcal.run.experiment import Experiment
 from armcal.run.plan_clearance import clearance_check
+from pydantic import Field, model_validator
 
-from armcal_simulation.bench_physics import BenchPhysics, Seen, ServoKind, Torques
-from armcal_simulation.bench_settings import ALL, ServoBenchSettings, ServoJointSettings
+from armcal_simulation.bench_physics import BenchPhysics, Seen, Torques
+from armcal_simulation.dtrack_sender import DTrackSenderSettings
 from armcal_simulation.elastic_pose import ElasticPose, TrackedArm, without_effects
-from armcal_simulation.safety import Bounds
-from armcal_simulation.servo_heat import HeatPath
-from armcal_simulation.servo_model import ServoBuild, ServoModel
+from armcal_simulation.safety import Bounds, SafetySettings
+from armcal_simulation.servo_model import ServoJointSettings, ServoModel
+
+ALL = "all"
+"""In the place of a joint's name: what holds for all joints that do not say otherwise."""
+
+
+class BenchTrackerSettings(DTrackSenderSettings):
+    """Where its datagrams go, and which of its bodies sit on the tool and at the arm's base (none: nobody sees it)."""
+
+    host: str = "127.0.0.1"
+    port: Annotated[int, Field(ge=1, le=65535)] = 5000
+    tool: str = "tool"
+    base: str | None = "base"
+
+    @model_validator(mode="after")
+    def _known(self) -> BenchTrackerSettings:
+        for name in (self.tool, self.base):
+            if name is not None and name not in self.bodies:
+                raise ValueError(f"found the body {name!r}, expected one of {', '.join(self.bodies)}")
+        return self
+
+
+class ServoBenchSettings(Settings):
+    """The truth of a bench: boards, servos, arm, tracker, and what counts as unsafe.
+
+    ``servos`` is a servo file with the true oscillators and pulse tables; ``truth`` has the arm's true parameters by
+    name, and ``without_effects`` what the servos here do themselves. ``joints`` says what kind of servos they are, by
+    joint or for ``all``. Before the first pulse the arm hangs as it falls from ``start``. ``measurement`` is the one
+    whose body the tracker sees, the only one by default. ``board_id`` and ``states_oscillator_hz`` are what a framed
+    board says of itself (0: nothing).
+    """
+
+    firmware: Literal["firmata", "framed"] = "framed"
+    board_id: str = "SIMULATED"
+    states_oscillator_hz: Annotated[int, Field(ge=0, le=2**32 - 1)] = 0
+    servos: InputPath
+    truth: InputPath | None = None
+    without_effects: tuple[str, ...] = ()
+    measurement: str | None = None
+    joints: dict[str, ServoJointSettings] = Field(default_factory=dict)
+    start: dict[str, Angle] = Field(default_factory=dict)
+    world_T_base: PoseSettings = Field(default_factory=PoseSettings)
+    tracker: BenchTrackerSettings = Field(default_factory=BenchTrackerSettings.si)
+    safety: SafetySettings = Field(default_factory=SafetySettings)
+    seed: Annotated[int, Field(ge=0)] = 0
+
+    def servo_of(self, joint: str) -> ServoJointSettings:
+        """What kind of servo drives a joint: its own settings above those of all."""
+        stated = [self.joints[name] for name in (ALL, joint) if name in self.joints]
+        merged = {key: getattr(settings, key) for settings in stated for key in settings.model_fields_set}
+        return ServoJointSettings.si(**merged)
 
 
 def true_servos(settings: ServoBenchSettings, arm: Arm) -> ServoFile:
@@ -73,33 +124,25 @@ def tracked_arm(settings: ServoBenchSettings, experiment: Experiment) -> Tracked
 
 
 def physics(settings: ServoBenchSettings, tracked: TrackedArm, servos: ServoFile, seen: Seen) -> BenchPhysics:
-    """Servos under the arm's weight, hanging as they fell, and the pose they give the arm."""
+    """Servos under the arm's weight, hanging as they fell, and the pose they give the arm.
+
+    Torques are those of the true masses on the nominal geometry, from which they hardly differ.
+    """
     arm, environment = tracked.arm, tracked.environment
-    kinds = {joint: servo_kind(settings.servo_of(joint)) for joint in arm.commanded}
     models = {
-        joint: ServoModel(kind.build, servos.servos[joint].table, settings.start.get(joint, 0.0))
-        for joint, kind in kinds.items()
+        joint: ServoModel(settings.servo_of(joint), servos.servos[joint].table, settings.start.get(joint, 0.0))
+        for joint in arm.commanded
     }
+    values = {block.name: float(block.nominal[0]) for block in tracked.parameters.blocks if block.size == 1}
+    masses = []
+    for mass in arm.masses:
+        scope = f"{arm.name}.links.{mass.name}"
+        x, y, z = (values[f"{scope}.com_{axis}"] for axis in "xyz")
+        masses.append(replace(mass, mass=values[f"{scope}.mass"], com=(x, y, z)))
     function = holding_function(
-        _at_truth(tracked), environment.gravity, environment.payload_mass, environment.payload_com
+        replace(arm, masses=tuple(masses)), environment.gravity, environment.payload_mass, environment.payload_com
     )
-    frame_s = 1 / settings.tracker.rate_hz
-    return BenchPhysics(models, kinds, Torques(function), ElasticPose(tracked), frame_s, seen)
-
-
-def servo_kind(settings: ServoJointSettings) -> ServoKind:
-    """A servo's build and heat."""
-    build = ServoBuild(
-        float(np.radians(settings.speed_deg_per_s)),
-        settings.dead_band,
-        settings.backlash,
-        settings.travel,
-        settings.stall,
-        settings.friction,
-        float(np.radians(settings.fall_deg_per_s)),
-    )
-    heat = HeatPath(settings.continuous, settings.winding_time, settings.case_time, settings.winding_share)
-    return ServoKind(build, heat)
+    return BenchPhysics(models, Torques(function), ElasticPose(tracked), 1 / settings.tracker.rate_hz, seen)
 
 
 def bounds(experiment: Experiment, file: ServoFile) -> Bounds:
@@ -108,10 +151,8 @@ def bounds(experiment: Experiment, file: ServoFile) -> Bounds:
     pulses = {joint: servo.pulse_range for joint, servo in file.servos.items()}
     if plan is None:
         return Bounds({}, None, pulses)
-    check = None
-    if plan.clearance is not None:
-        check = clearance_check(plan.clearance, experiment.system.arms, experiment.source)
-    return Bounds(plan.limits, check, pulses)
+    clearance = plan.clearance and clearance_check(plan.clearance, experiment.system.arms, experiment.source)
+    return Bounds(plan.limits, clearance, pulses)
 
 
 def matrix_of(pose: PoseSettings) -> Array:
@@ -120,17 +161,3 @@ def matrix_of(pose: PoseSettings) -> Array:
     matrix[:3, :3] = rotation_matrix(np.array(pose.unit_quaternion))
     matrix[:3, 3] = pose.position
     return matrix
-
-
-def _at_truth(tracked: TrackedArm) -> Arm:
-    """The arm with its true masses for nominal ones; its geometry stays nominal, which torques hardly notice."""
-    values: Mapping[str, float] = {
-        block.name: float(block.nominal[0]) for block in tracked.parameters.blocks if block.size == 1
-    }
-
-    def true(mass: MassSpec) -> MassSpec:
-        scope = f"{tracked.arm.name}.links.{mass.name}"
-        x, y, z = (values[f"{scope}.com_{axis}"] for axis in "xyz")
-        return replace(mass, mass=values[f"{scope}.mass"], com=(x, y, z))
-
-    return replace(tracked.arm, masses=tuple(map(true, tracked.arm.masses)))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import casadi as ca
@@ -13,8 +12,7 @@ from armcal.errors import NotConvergedError
 from armcal.functions.interpreted import BoundFunction
 
 from armcal_simulation.elastic_pose import ElasticPose
-from armcal_simulation.servo_heat import HeatPath, ServoHeat
-from armcal_simulation.servo_model import ServoBuild, ServoModel
+from armcal_simulation.servo_model import ServoHeat, ServoModel
 
 FALL_STEP_S = 0.02
 """How often the torque on a servo that gives way is looked up."""
@@ -22,17 +20,8 @@ SLOW_S = 0.1
 """How often torques and heat are, else."""
 _HANGING_S = 60.0
 
-
 Seen = Callable[[float, Array | None], None]
 """Takes the tracker's frames: time (s) and ``base_T_body`` (4x4, m); None where the springs do not hold the arm."""
-
-
-@dataclass(frozen=True)
-class ServoKind:
-    """A servo's build and its heat's constants."""
-
-    build: ServoBuild
-    heat: HeatPath
 
 
 class Torques:
@@ -59,7 +48,6 @@ class BenchPhysics:
 
     Args:
         servos: by joint, in the arm's order.
-        kinds: of the servos.
         torques: see there.
         pose: see there.
         frame_s: between the tracker's frames.
@@ -69,14 +57,13 @@ class BenchPhysics:
     def __init__(
         self,
         servos: Mapping[str, ServoModel],
-        kinds: Mapping[str, ServoKind],
         torques: Torques,
         pose: ElasticPose,
         frame_s: float,
         seen: Seen,
     ) -> None:
         self.servos = dict(servos)
-        self.heat = {joint: ServoHeat(kinds[joint].heat) for joint in servos}
+        self.heat = {joint: ServoHeat(servo.settings) for joint, servo in servos.items()}
         self.torques = dict.fromkeys(servos, 0.0)
         self.on_failure: Callable[[str, float, float], None] = lambda joint, now, heat: None
         self._find_torques, self._find_pose = torques, pose
@@ -87,7 +74,14 @@ class BenchPhysics:
         self._pose: Array | None = None
         self._yielding = True
         self._look_up_torques()
-        self._hang()
+        # The arm falls from where it was put until it hangs, before time begins.
+        for _ in range(int(_HANGING_S / FALL_STEP_S)):
+            moved = [servo.advance(FALL_STEP_S, self.torques[joint]) for joint, servo in self._all]
+            if not any(moved):
+                break
+            self._look_up_torques()
+        for _, servo in self._all:
+            servo.approach = 0
 
     def next_event(self) -> float:
         """When something of the physics is due (s)."""
@@ -111,7 +105,13 @@ class BenchPhysics:
                 self._look_up_torques()
         if now >= self._slow * SLOW_S:
             self._slow += 1
-            self._slowly()
+            self._look_up_torques()
+            for joint, servo in self._all:
+                heat = self.heat[joint]
+                heat.advance(SLOW_S, self.torques[joint] if servo.powered else 0.0)
+                if heat.winding >= 1 and not servo.failed:
+                    servo.failed, self._yielding = True, True
+                    self.on_failure(joint, now, heat.winding)
         if now >= self._frames * self._frame_s:
             self._frames += 1
             self._seen(now, self.body_pose())
@@ -156,22 +156,3 @@ class BenchPhysics:
         torques = self._find_torques([servo.angle for _, servo in self._all])
         self.torques = dict(zip(self.servos, torques, strict=True))
         self._yielding = self._gives_way()
-
-    def _slowly(self) -> None:
-        self._look_up_torques()
-        for joint, servo in self._all:
-            heat = self.heat[joint]
-            heat.advance(SLOW_S, self.torques[joint] if servo.powered else 0.0)
-            if heat.winding >= 1 and not servo.failed:
-                servo.failed, self._yielding = True, True
-                self.on_failure(joint, self._now, heat.winding)
-
-    def _hang(self) -> None:
-        """Fall from where the arm was put until it hangs, before time begins."""
-        for _ in range(int(_HANGING_S / FALL_STEP_S)):
-            moved = [servo.advance(FALL_STEP_S, self.torques[joint]) for joint, servo in self._all]
-            if not any(moved):
-                break
-            self._look_up_torques()
-        for _, servo in self._all:
-            servo.approach = 0

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
+import math
+import struct
 from collections.abc import Callable
 from dataclasses import dataclass
 
 from armcal.devices.framed.messages import Guard, GuardedChannel
 
-from armcal_simulation.board_firmware import NEVER
 from armcal_simulation.i2c_bus import BusStuckError, I2cBus
 from armcal_simulation.pca9685_model import COUNTS, FULL, LED0
 
@@ -24,11 +26,6 @@ class _Leg:
     seconds: float
     start: dict[GuardedChannel, int]
     end: dict[GuardedChannel, int]
-
-    def counts(self, channel: GuardedChannel, now: float) -> int:
-        share = 1.0 if self.seconds <= 0 else min(1.0, (now - self.begin) / self.seconds)
-        start, end = self.start[channel], self.end[channel]
-        return start + round(share * (end - start))
 
 
 class BoardGuard:
@@ -50,7 +47,7 @@ class BoardGuard:
         self._leg: _Leg | None = None
         self._left: list[tuple[int, ...]] = []
         self._on: dict[GuardedChannel, int] = {}
-        self._next_tick = NEVER
+        self._next_tick = math.inf
 
     @property
     def is_set(self) -> bool:
@@ -62,7 +59,7 @@ class BoardGuard:
         self._heard = self._clock()
 
     def set(self, guard: Guard) -> None:
-        """Replace what was told before; without channels, watch no more. A drive under way goes on.
+        """Replace the guard set before; without channels, watch no more. A drive under way goes on.
 
         Raises:
             ValueError: a channel is none, or could never arrive.
@@ -77,7 +74,7 @@ class BoardGuard:
     def take(self) -> None:
         """The host takes over again: the drive stops where it stands."""
         self.took_over = False
-        self._leg, self._left, self._next_tick = None, [], NEVER
+        self._leg, self._left, self._next_tick = None, [], math.inf
 
     def next_event(self) -> float:
         """When it next acts."""
@@ -93,21 +90,22 @@ class BoardGuard:
             self._next_tick = now
         if self.took_over and now >= self._next_tick:
             self._next_tick = now + TICK_S
-            try:
+            with contextlib.suppress(BusStuckError):  # it tries again at the next tick
                 self._drive(now)
-            except BusStuckError:
-                return  # it tries again at the next tick
 
     def _drive(self, now: float) -> None:
         if self._leg is None:
             if not self._left or self._guard is None:
-                self._next_tick = NEVER
+                self._next_tick = math.inf
                 return
             self._leg = self._begin(now, self._guard, self._left[0])
             self._left.pop(0)  # not before: on a stuck bus nothing begins
         leg = self._leg
-        for channel in leg.end:
-            self._write(channel, leg.counts(channel, now))
+        share = 1.0 if leg.seconds <= 0 else min(1.0, (now - leg.begin) / leg.seconds)
+        for channel, end in leg.end.items():
+            start, on = leg.start[channel], self._on[channel]
+            off = (on + start + round(share * (end - start))) % COUNTS
+            self._bus.write(channel.address, struct.pack("<BHH", LED0 + 4 * channel.channel, on, off))
         if now >= leg.begin + leg.seconds:
             self._leg = None
 
@@ -124,9 +122,3 @@ class BoardGuard:
             end[channel] = target
         seconds = max((abs(end[c] - start[c]) * _RATE_UNIT / c.rate for c in end), default=0.0)
         return _Leg(now, seconds, start, end)
-
-    def _write(self, channel: GuardedChannel, counts: int) -> None:
-        on = self._on[channel]
-        off = (on + counts) % COUNTS
-        data = bytes((LED0 + 4 * channel.channel, on & 0xFF, on >> 8, off & 0xFF, off >> 8))
-        self._bus.write(channel.address, data)

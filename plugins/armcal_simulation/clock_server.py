@@ -66,10 +66,18 @@ class ClockServer:
     def serve(self, port: Callable[[], Port | None], readable: Callable[[], None], ended: Callable[[], bool]) -> None:
         """Answer until ``ended``; call ``readable`` whenever something happens at the port."""
         while not ended():
-            self._watch(port())
-            for number, _ in self._awaited():
+            watched = port()
+            if watched != self._watched:
+                self._watched = watched  # a descriptor that was closed has left the poll by itself
+                if watched is not None:
+                    # Edges only: a port that nobody has open is at its end all the time.
+                    self._poll.register(watched[0], select.EPOLLIN | select.EPOLLHUP | select.EPOLLET)
+            for number, _ in self._events():
                 if number == self._listener.fileno():
-                    self._accept()
+                    client, _ = self._listener.accept()
+                    client.settimeout(_PATIENCE_S)
+                    self._clients[client.fileno()] = client, bytearray()
+                    self._poll.register(client.fileno(), select.EPOLLIN)
                 elif number in self._clients:
                     self._read(number)
                 else:
@@ -84,27 +92,13 @@ class ClockServer:
         if self._bound:
             self._path.unlink(missing_ok=True)
 
-    def _awaited(self) -> list[tuple[int, int]]:
+    def _events(self) -> list[tuple[int, int]]:
         """What happens next. A client that works with the bench asks again at once: it is not worth falling asleep."""
         until = time.perf_counter() + _AWAKE_S
         while self._clients and time.perf_counter() < until:
-            if found := self._poll.poll(0):
-                return found
+            if events := self._poll.poll(0):
+                return events
         return self._poll.poll(_LOOK_UP_S)
-
-    def _watch(self, port: Port | None) -> None:
-        """Edges only: a port that nobody has open is at its end all the time."""
-        if port == self._watched:
-            return
-        self._watched = port  # a descriptor that was closed has left the poll by itself
-        if port is not None:
-            self._poll.register(port[0], select.EPOLLIN | select.EPOLLHUP | select.EPOLLET)
-
-    def _accept(self) -> None:
-        client, _ = self._listener.accept()
-        client.settimeout(_PATIENCE_S)
-        self._clients[client.fileno()] = client, bytearray()
-        self._poll.register(client.fileno(), select.EPOLLIN)
 
     def _read(self, number: int) -> None:
         client, buffer = self._clients[number]
@@ -120,21 +114,19 @@ class ClockServer:
             line = bytes(buffer[:end])
             del buffer[: end + 1]
             try:
-                client.sendall(json.dumps(self._answered(line)).encode() + b"\n")
+                request = json.loads(line)
+                if not isinstance(request, dict):
+                    raise ValueError("found no JSON object")
+                answer = self._answer(request)
+            except (ValueError, RecursionError) as fault:
+                answer = {"error": str(fault)}
+            try:
+                client.sendall(json.dumps(answer).encode() + b"\n")
             except OSError:
                 self._drop(number)
                 return
         if len(buffer) > _LONGEST_LINE:
             self._drop(number)
-
-    def _answered(self, line: bytes) -> dict[str, Any]:
-        try:
-            request = json.loads(line)
-            if not isinstance(request, dict):
-                raise ValueError("found no JSON object")
-            return self._answer(request)
-        except (ValueError, RecursionError) as fault:
-            return {"error": str(fault)}
 
     def _drop(self, number: int) -> None:
         client, _ = self._clients.pop(number)

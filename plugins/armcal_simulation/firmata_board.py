@@ -5,9 +5,10 @@ No acknowledgement, no checksum, no watchdog: what is damaged on the way is done
 
 from __future__ import annotations
 
+import contextlib
+import math
 from collections.abc import Callable
 
-from armcal_simulation.board_firmware import NEVER
 from armcal_simulation.i2c_bus import BusStuckError, I2cBus
 
 START_SYSEX, END_SYSEX, VERSION = 0xF0, 0xF7, 0xF9
@@ -16,7 +17,6 @@ PROTOCOL = (2, 5)
 _LONGEST_SYSEX = 64
 _WIRE_BUFFER = 32
 _WRITE, _READ_ONCE = 0, 1
-_TOO_FEW = "I2C: Too few bytes received"
 
 
 class FirmataBoard:
@@ -62,7 +62,7 @@ class FirmataBoard:
 
     def next_event(self) -> float:
         """It does nothing by itself."""
-        return NEVER
+        return math.inf
 
     def run_timers(self) -> None:
         """See ``next_event``."""
@@ -78,29 +78,24 @@ class FirmataBoard:
             if ten_bits:
                 self._text("10-bit addressing not supported")
             elif mode == _WRITE:
-                self._write(content[0], paired(content[2:]))
+                with contextlib.suppress(BusStuckError):  # the host does not learn of it
+                    self._bus.write(content[0], paired(content[2:])[:_WIRE_BUFFER])
             elif mode == _READ_ONCE:
                 self._read(content[0], [low | high << 7 for low, high in _pairs(content[2:])])
-
-    def _write(self, address: int, data: bytes) -> None:
-        try:
-            self._bus.write(address, data[:_WIRE_BUFFER])
-        except BusStuckError:
-            return  # nobody is told
 
     def _read(self, address: int, numbers: list[int]) -> None:
         if not numbers:
             return
         register, count = (numbers[0], numbers[1]) if len(numbers) > 1 else (0, numbers[0])
         try:
-            found = self._bus.read(address, register & 0xFF, min(count, _WIRE_BUFFER)) or b""
+            data = self._bus.read(address, register & 0xFF, min(count, _WIRE_BUFFER)) or b""
         except BusStuckError:
-            found = b""
+            data = b""
         count = min(count, _LONGEST_SYSEX - 2)
-        if len(found) < count:
-            self._text(_TOO_FEW)
-        # The reply is as long as was asked for: what did not come is what the buffer held before.
-        self._buffer[: len(found)] = found
+        if len(data) < count:
+            self._text("I2C: Too few bytes received")
+        # The reply has the requested length: what did not come is what the buffer held before.
+        self._buffer[: len(data)] = data
         self._sysex_out(I2C_REPLY, bytes((address, register & 0xFF)) + bytes(self._buffer[:count]))
 
     def _report_version(self) -> None:

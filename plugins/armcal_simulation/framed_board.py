@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -9,7 +10,6 @@ from armcal.devices.framed.frames import MAX_PAYLOAD, Frame, FrameDecoder, encod
 from armcal.devices.framed.messages import (
     LATE,
     VERSION,
-    ChannelTarget,
     Code,
     Flag,
     Guard,
@@ -35,7 +35,7 @@ _HEAD_SIZE = 5
 
 @dataclass(frozen=True)
 class BoardIdentity:
-    """What the board says of itself; the oscillator is 0 where it does not know."""
+    """What the board reports of itself; the oscillator is 0 where it does not know it."""
 
     board_id: str
     oscillator_hz: int = 0
@@ -78,7 +78,7 @@ class FramedBoard:
         self._forget()
 
     def boot(self) -> None:
-        """Forget all but the counter; say nothing until asked."""
+        """Forget all but the counter; send nothing until the host does."""
         self.boots += 1
         self._forget()
 
@@ -94,11 +94,6 @@ class FramedBoard:
     def run_timers(self) -> None:
         """The watchdog's."""
         self.guard.run()
-
-    @property
-    def dropped(self) -> int:
-        """How many frames arrived damaged since it started."""
-        return self._decoder.dropped
 
     def _forget(self) -> None:
         self.guard = BoardGuard(self._clock, self._bus)
@@ -122,18 +117,15 @@ class FramedBoard:
             kind, content = int(Kind.REFUSED), Refusal(frame.kind, refused.code, refused.detail).pack()
         except BusStuckError:
             kind, content = int(Kind.REFUSED), Refusal(frame.kind, Code.STUCK).pack()
-        self._reply = encoded(Frame(kind, frame.sequence, packed_head(Head(self.boots, self._flags())) + content))
+        flags = Flag.TOOK_OVER if self.guard.took_over else Flag(0)
+        flags |= Flag.GUARDED if self.guard.is_set else Flag(0)
+        flags |= Flag.STUCK if self._bus.stuck else Flag(0)
+        self._reply = encoded(Frame(kind, frame.sequence, packed_head(Head(self.boots, flags)) + content))
         self._send(self._reply)
 
-    def _flags(self) -> Flag:
-        flags = Flag(0)
-        flags |= Flag.TOOK_OVER if self.guard.took_over else Flag(0)
-        flags |= Flag.GUARDED if self.guard.is_set else Flag(0)
-        return flags | (Flag.STUCK if self._bus.stuck else Flag(0))
-
     def _done(self, frame: Frame) -> bytes:
-        """Do what is asked; the reply's content."""
-        does = {
+        """Do what the frame requests; the reply's content."""
+        handlers = {
             Kind.HELLO: self._hello,
             Kind.TAKE: self._take_over,
             Kind.WRITE: self._write,
@@ -142,10 +134,10 @@ class FramedBoard:
             Kind.BEAT: self._beat,
             Kind.GUARD: self._guard,
         }
-        if frame.kind not in does:
+        if frame.kind not in handlers:
             raise _RefusedError(Code.UNKNOWN_TYPE)
         try:
-            return does[Kind(frame.kind)](frame.payload)
+            return handlers[Kind(frame.kind)](frame.payload)
         except ValueError:
             raise _RefusedError(Code.BAD_PAYLOAD) from None
 
@@ -170,10 +162,10 @@ class FramedBoard:
         request = Read.read(payload)
         if request.count > MAX_PAYLOAD - _HEAD_SIZE:
             raise ValueError("more than a reply holds")
-        found = self._bus.read(request.address, request.register, request.count)
-        if found is None:
+        data = self._bus.read(request.address, request.register, request.count)
+        if data is None:
             raise _RefusedError(Code.NO_ADDRESS)
-        return found
+        return data
 
     def _set(self, payload: bytes) -> bytes:
         targets = Set.read(payload).targets
@@ -181,12 +173,13 @@ class FramedBoard:
             raise ValueError("no such channel")
         self._require_host()
         for target in targets:
-            self._transaction(target.address, _channel_bytes(target))
+            register = LED0 + 4 * target.channel
+            self._transaction(target.address, struct.pack("<BHH", register, target.on, target.off))
         return b""
 
     def _beat(self, payload: bytes) -> bytes:
         if payload:
-            raise ValueError("a beat says nothing")
+            raise ValueError("found a payload in a beat, expected none")
         return b""
 
     def _guard(self, payload: bytes) -> bytes:
@@ -203,8 +196,3 @@ class FramedBoard:
             raise _RefusedError(Code.NO_ADDRESS)
         if acknowledged <= len(data):
             raise _RefusedError(Code.NO_DATA, acknowledged - 1)
-
-
-def _channel_bytes(target: ChannelTarget) -> bytes:
-    register = LED0 + 4 * target.channel
-    return bytes((register,)) + target.on.to_bytes(2, "little") + target.off.to_bytes(2, "little")

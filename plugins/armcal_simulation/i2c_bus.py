@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import reduce
+from operator import and_
 
 from armcal_simulation.pca9685_model import Pca9685Model
 
@@ -54,7 +56,8 @@ class I2cBus:
             BusStuckError: see there.
         """
         self._require_free()
-        refused = self._refused_byte()
+        refused = next((byte for after, byte in self._planned if after == 0), None)
+        self._planned = [(after - 1, byte) for after, byte in self._planned if after > 0]
         if refused == ADDRESS_ONLY:
             return 0
         whole = data if refused is None else data[:refused]
@@ -67,25 +70,12 @@ class I2cBus:
             BusStuckError: see there.
         """
         self._require_free()
-        found = [data for chip in self.chips if (data := chip.read(address, register, count)) is not None]
-        if not found:
+        answers = [data for chip in self.chips if (data := chip.read(address, register, count)) is not None]
+        if not answers:
             return None
         # Several chips that answer at once pull the same line down: zeros win.
-        return bytes(_all_bits(column) for column in zip(*found, strict=True))
+        return bytes(reduce(and_, column) for column in zip(*answers, strict=True))
 
     def _require_free(self) -> None:
         if self.stuck:
             raise BusStuckError
-
-    def _refused_byte(self) -> int | None:
-        """The byte of this write that is refused, by the plans."""
-        due = next((byte for after, byte in self._planned if after == 0), None)
-        self._planned = [(after - 1, byte) for after, byte in self._planned if after > 0]
-        return due
-
-
-def _all_bits(column: Sequence[int]) -> int:
-    found = 0xFF
-    for byte in column:
-        found &= byte
-    return found

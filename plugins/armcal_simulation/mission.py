@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
@@ -10,23 +11,77 @@ from armcal.arm.assembly import Arm
 from armcal.arm.joints import Limits, by_dimension, joint_limits, unknown_joint
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
-from armcal.config.selection import with_values
-from armcal.config.yaml_source import load_config
 from armcal.errors import ConfigError
 from armcal.estimate.mission_truth import DAY_S, Mission
 from armcal.estimate.simulation import SimulationRequest, with_channels
 from armcal.testing import EXAMPLE_TRUTH
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from armcal_simulation.mission_changes import MovingTruth, moving_truth, scheduled
-from armcal_simulation.mission_schedule import Stands, arriving, record_times
-from armcal_simulation.mission_settings import MissionSettings, RecordSettings, began_at
-from armcal_simulation.motions import approach_of
+from armcal_simulation.mission_settings import LossSettings, MissionSettings, RecordSettings, TiltSettings, began_at
 from armcal_simulation.moving_arm import measured_while_moving
-from armcal_simulation.outliers import with_outliers
-from armcal_simulation.readings import disturbed
+from armcal_simulation.readings import approach_of, at_truth, disturbed, with_outliers
 
 _STREAMS = ("times", "losses", "tilt", "poses", "creep", "noise", "outliers")
+_HOUR_S = 3600.0
+
+
+def record_times(days: float, records: RecordSettings, random: np.random.Generator) -> Array:
+    """When the arm is measured, s since the mission began, in order."""
+    first, last = (hour * _HOUR_S for hour in records.hours)
+    times: list[float] = []
+    for day in range(int(np.ceil(days))):
+        at = day * DAY_S + first + random.exponential(records.every)
+        while at < min(day * DAY_S + last, days * DAY_S):
+            times.append(at)
+            at += random.exponential(records.every)
+    return np.array(times)
+
+
+def arriving(times: Array, losses: LossSettings, random: np.random.Generator) -> NDArray[np.bool_]:
+    """Which records arrive (N): not in an hour without contact, nor if they are lost alone."""
+    hours = np.floor(times / _HOUR_S).astype(int)
+    silent = random.random(int(hours.max(initial=0)) + 1) < losses.hours
+    return ~silent[hours] & (random.random(len(times)) >= losses.fraction)
+
+
+@dataclass(frozen=True)
+class Stands:
+    """How the rover stood: from when (M, s), turned by which rotation vector (M x 3, rad), and as it reads that."""
+
+    since: Array
+    turns: Array
+    readings: Array
+
+    @classmethod
+    def drawn(
+        cls,
+        days: float,
+        tilt: TiltSettings,
+        hours: tuple[float, float],
+        gravity: Array,
+        random: np.random.Generator,
+    ) -> Stands:
+        """Tilts about random level axes, uniform up to the most; a new one after each drive in working hours."""
+        drives = random.poisson(tilt.drives_per_day * days) if tilt.drives_per_day else 0
+        day, hour = random.integers(0, int(np.ceil(days)), drives), random.uniform(*hours, drives)
+        since = np.concatenate([[0.0], np.sort(day * DAY_S + hour * _HOUR_S)])
+        down = gravity / np.linalg.norm(gravity)
+        level = np.linalg.svd(down[None, :])[2][1:]
+        azimuth = random.uniform(0, 2 * np.pi, len(since))
+        axes = np.stack([np.cos(azimuth), np.sin(azimuth)], axis=1) @ level
+        turns = axes * random.uniform(0, tilt.most, (len(since), 1))
+        error = Rotation.from_rotvec(random.normal(0, 1, (len(since), 3)) * tilt.error)
+        return cls(since, turns, (Rotation.from_rotvec(turns) * error).as_rotvec())
+
+    def at(self, times: Array, turns: Array) -> Rotation:
+        """level_R_rover at these times, by the true turns or by the readings."""
+        return Rotation.from_rotvec(turns[np.searchsorted(self.since, times, side="right") - 1])
+
+    def gravity(self, times: Array, level: Array, turns: Array) -> Array:
+        """Gravity in the rover's base frame (3 x N), from that of the level rover (3)."""
+        return np.asarray(self.at(times, turns).inv().apply(level).T)
 
 
 class MissionOfDays:
@@ -70,8 +125,10 @@ class MissionOfDays:
         """
         settings = self._settings
         _check(request, settings)
-        random = dict(zip(_STREAMS, _streams(settings.seed), strict=True))
-        truth = moving_truth(_true(request, settings).parameters, settings, random["creep"])
+        # a generator for each purpose, so that a change of one setting leaves the others' draws alone
+        seeds = np.random.SeedSequence(settings.seed).spawn(len(_STREAMS))
+        random = {name: np.random.default_rng(seed) for name, seed in zip(_STREAMS, seeds, strict=True)}
+        truth = moving_truth(at_truth(request, settings.truth).parameters, settings, random["creep"])
         times = record_times(settings.days, settings.records, random["times"])
         there = arriving(times, settings.losses, random["losses"])
         level = np.array(request.environment.gravity)
@@ -95,7 +152,7 @@ class MissionOfDays:
         )
 
     def _commands(self, arm: Arm, times: Array, truth: MovingTruth, random: np.random.Generator) -> Dataset:
-        """Where the arm is told to go, and when; nothing hangs on the tool."""
+        """Random commands, and when the arm is there; nothing hangs on the tool."""
         spans = _spans(arm, self._settings.records)
         angles = np.array([random.uniform(low, high, len(times)) for low, high in spans])
         approach = approach_of(angles) if len(times) else angles
@@ -113,22 +170,16 @@ class MissionOfDays:
         truth: MovingTruth,
         random: Mapping[str, np.random.Generator],
     ) -> tuple[dict[str, Array], NDArray[np.bool_]]:
-        """What instruments read, and which records are wrong."""
+        """Readings of the cameras, where they stand at each time, and which records are wrong."""
         exact = measured_while_moving(request, standing, truth.values_at(times))
-        seen = _seen(exact, tuple(request.measurements), truth.camera_T_base_at(times))
-        noisy = disturbed(request, standing, seen, self._settings.noise, random["noise"])
+        camera_T_base = truth.camera_T_base_at(times)
+        for name in request.measurements:
+            axes = [f"{name}.{axis}" for axis in "xyz"]
+            position = np.stack([exact[axis] for axis in axes], axis=1)
+            moved = np.einsum("nij,nj->ni", camera_T_base[:, :3, :3], position) + camera_T_base[:, :3, 3]
+            exact |= dict(zip(axes, moved.T, strict=True))
+        noisy = disturbed(request, standing, exact, self._settings.noise, random["noise"])
         return with_outliers(noisy, self._settings.outliers, random["outliers"])
-
-
-def _streams(seed: int) -> list[np.random.Generator]:
-    """One source of randomness for each purpose, so that a change of one setting leaves the others' draws alone."""
-    return [np.random.default_rng(each) for each in np.random.SeedSequence(seed).spawn(len(_STREAMS))]
-
-
-def _true(request: SimulationRequest, settings: MissionSettings) -> SimulationRequest:
-    source = load_config(settings.truth)
-    parameters = with_values(request.parameters, source.data, source, ())
-    return SimulationRequest(request.arms, request.measurements, parameters, request.environment)
 
 
 def _check(request: SimulationRequest, settings: MissionSettings) -> None:
@@ -155,7 +206,7 @@ def _spans(arm: Arm, records: RecordSettings) -> list[Limits]:
     ).items():
         if span is None:
             raise ConfigError(
-                f"simulation.records: nothing says how far {joint} is driven, and the arm states no limits of it.",
+                f"simulation.records: found no range of {joint}, and the arm states no limits of it.",
                 hint=f"Write for example ranges_deg: {{{joint}: [-90, 90]}}.",
             )
         spans.append(span)
@@ -164,13 +215,3 @@ def _spans(arm: Arm, records: RecordSettings) -> list[Limits]:
 
 def _gravity(vectors: Array) -> dict[str, Array]:
     return {f"gravity_{axis}": vectors[i] for i, axis in enumerate("xyz")}
-
-
-def _seen(exact: Mapping[str, Array], instruments: tuple[str, ...], camera_T_base: Array) -> dict[str, Array]:
-    """Positions as the cameras see them, where they stand now (channels of N, m)."""
-    seen = dict(exact)
-    for name in instruments:
-        position = np.stack([exact[f"{name}.{axis}"] for axis in "xyz"], axis=1)
-        moved = np.einsum("nij,nj->ni", camera_T_base[:, :3, :3], position) + camera_T_base[:, :3, 3]
-        seen |= {f"{name}.{axis}": moved[:, i] for i, axis in enumerate("xyz")}
-    return seen

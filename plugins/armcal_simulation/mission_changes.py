@@ -14,10 +14,8 @@ from armcal.errors import ConfigError
 from armcal.estimate.mission_truth import DAY_S, MissionEvent
 from scipy.spatial.transform import Rotation
 
-from armcal_simulation.mission_schedule import temperatures
 from armcal_simulation.mission_settings import (
     BumpSettings,
-    Event,
     MissionSettings,
     SlipSettings,
     TemperatureSettings,
@@ -73,7 +71,7 @@ class MovingTruth:
     @property
     def moving(self) -> tuple[str, ...]:
         """Those that change, in the order of all."""
-        entries = {each.entry for each in (*self.paths, *self.steps, *self.warmings)}
+        entries = {change.entry for change in (*self.paths, *self.steps, *self.warmings)}
         return tuple(self.names[i] for i in sorted(entries))
 
     def values_at(self, times: Array) -> Array:
@@ -100,7 +98,8 @@ class MovingTruth:
 
     def temperature_at(self, times: Array) -> Array:
         """N, degrees Celsius."""
-        return temperatures(times, self.temperature)
+        sine, since_warmest = self.temperature, times - self.temperature.warmest * 3600.0
+        return sine.mean + sine.swing * np.cos(2 * np.pi * since_warmest / sine.period)
 
 
 def moving_truth(parameters: Parameters, settings: MissionSettings, random: np.random.Generator) -> MovingTruth:
@@ -109,29 +108,36 @@ def moving_truth(parameters: Parameters, settings: MissionSettings, random: np.r
     Raises:
         ConfigError: no such parameter, no single number, or a wrong unit.
     """
+    warmings = [
+        Warming(_entry(parameters, name), _amount(parameters, name, thermal.per_K), thermal.reference)
+        for glob, thermal in settings.thermal.items()
+        for name in parameters.select([glob])
+    ]
+    bumps = [event for event in settings.events if isinstance(event, BumpSettings)]
     return MovingTruth(
         parameters,
         tuple(_paths(parameters, settings, random)),
         tuple(_steps(parameters, settings)),
-        tuple(_warmings(parameters, settings)),
-        tuple(sorted((e for e in settings.events if isinstance(e, BumpSettings)), key=lambda each: each.day)),
+        tuple(warmings),
+        tuple(sorted(bumps, key=lambda bump: bump.day)),
         settings.temperature,
     )
 
 
 def scheduled(settings: MissionSettings) -> tuple[MissionEvent, ...]:
     """The events within the mission, in order."""
-    mission_events = [MissionEvent(e.kind, e.day * DAY_S, getattr(e, "joint", ""), _label(e)) for e in settings.events]
-    return tuple(sorted((e for e in mission_events if e.time < settings.days * DAY_S), key=lambda each: each.time))
-
-
-def _label(event: Event) -> str:
-    if isinstance(event, SlipSettings):
-        return f"{event.joint} slips by {math.degrees(_slip(event)):.1f} deg"
-    if isinstance(event, BumpSettings):
-        shift, turn = (float(np.linalg.norm(v)) for v in (event.shift, event.turn))
-        return f"camera bumped by {1000 * shift:.1f} mm, {math.degrees(turn):.1f} deg"
-    return f"servo of {event.joint} replaced"
+    events: list[MissionEvent] = []
+    for event in settings.events:
+        if isinstance(event, SlipSettings):
+            label = f"{event.joint} slips by {math.degrees(_slip(event)):.1f} deg"
+        elif isinstance(event, BumpSettings):
+            shift, turn = (float(np.linalg.norm(vector)) for vector in (event.shift, event.turn))
+            label = f"camera bumped by {1000 * shift:.1f} mm, {math.degrees(turn):.1f} deg"
+        else:
+            label = f"servo of {event.joint} replaced"
+        if event.day < settings.days:
+            events.append(MissionEvent(event.kind, event.day * DAY_S, getattr(event, "joint", ""), label))
+    return tuple(sorted(events, key=lambda event: event.time))
 
 
 def _slip(event: SlipSettings) -> float:
@@ -167,12 +173,6 @@ def _steps(parameters: Parameters, settings: MissionSettings) -> Iterator[Step]:
             continue
         for name, change in event.changes.items():
             yield Step(_entry(parameters, name), event.day * DAY_S, _amount(parameters, name, change))
-
-
-def _warmings(parameters: Parameters, settings: MissionSettings) -> Iterator[Warming]:
-    for glob, thermal in settings.thermal.items():
-        for name in parameters.select([glob]):
-            yield Warming(_entry(parameters, name), _amount(parameters, name, thermal.per_K), thermal.reference)
 
 
 def _entry(parameters: Parameters, name: str) -> int:

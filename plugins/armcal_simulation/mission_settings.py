@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 from armcal.base.settings import Angle, Angle3, Duration, InputPath, Length, Length3, Settings, Temperature
 from pydantic import Field, field_validator, model_validator
 
-from armcal_simulation.outliers import OutlierSettings
+from armcal_simulation.readings import OutlierSettings
 
 _CREEP = re.compile(r"\s*(?P<walk>walk\s+)?(?P<amount>\S.*?)\s+in\s+(?P<over>[0-9.]+)\s*(?P<unit>d|h|min|s)\s*")
 _SECONDS = {"d": 86400.0, "h": 3600.0, "min": 60.0, "s": 1.0}

@@ -1,4 +1,4 @@
-"""The PCA9685 as its data sheet tells it: what a master may write, and what then stands at the pins. [PCA9685]
+"""The PCA9685 by its data sheet: what a master may write, and what then stands at the pins. [PCA9685]
 
 Where the data sheet forbids something without saying what would follow, the model notes a violation and does what
 would hurt most, so that a driver which breaks a rule is seen to break it.
@@ -87,11 +87,14 @@ class Pca9685Model:
             how many bytes were acknowledged, the address counted: 0 nobody is there, ``len(data) + 1`` all of them.
         """
         if address == GENERAL_CALL:
-            return self._general_call(data)
+            if data[:1] != bytes([SOFTWARE_RESET]):
+                return 1
+            if len(data) == 1:  # a further byte is not acknowledged, and nothing is reset
+                self.power_cycle()
+            return 2
         if not self._answers(address):
             return 0
-        if self._is_channel(data):
-            self._write_channel(data)
+        if self._write_channel(data):
             return len(data) + 1
         acknowledged = 1
         for index, byte in enumerate(data):
@@ -111,11 +114,11 @@ class Pca9685Model:
         if not self._answers(address) or LED_END < register < ALL_LED:
             return None
         self._register = register
-        found = bytearray()
+        data = bytearray()
         for _ in range(count):
-            found.append(self._read(self._register))
+            data.append(self._byte_in(self._register))
             self._advance()
-        return bytes(found)
+        return bytes(data)
 
     def pulse_s(self, channel: int) -> float | None:
         """The length of a channel's pulses at the pin (s), by the true oscillator; None: there are none.
@@ -148,14 +151,6 @@ class Pca9685Model:
         enabled = (SUB1, SUB1 >> 1, SUB1 >> 2, ALLCALL)
         return any(self._mode1 & bit and address == own >> 1 for bit, own in zip(enabled, self._addresses, strict=True))
 
-    def _general_call(self, data: bytes) -> int:
-        if data[:1] != bytes([SOFTWARE_RESET]):
-            return 1
-        if len(data) > 1:
-            return 2  # a further byte is not acknowledged, and nothing is reset
-        self.power_cycle()
-        return 2
-
     def _advance(self) -> None:
         if not self._mode1 & AI:
             return
@@ -164,7 +159,7 @@ class Pca9685Model:
         elif self._register != TEST:
             self._register += 1
 
-    def _read(self, register: int) -> int:
+    def _byte_in(self, register: int) -> int:
         if register == MODE1:
             return self._mode1 | (RESTART if self._restart_set() else 0)
         if register == MODE2:
@@ -191,36 +186,35 @@ class Pca9685Model:
             for channel in range(CHANNELS):
                 self._write_led(channel, register - ALL_LED, byte)
         elif register == PRE_SCALE:
-            self._write_prescale(byte)
+            if self._mode1 & SLEEP:
+                self._prescale = max(LEAST_PRESCALE, byte)
+            else:
+                self._violated("PRE_SCALE was written while the oscillator runs: it is ignored")
         elif register == TEST:
             self._test = byte
             self._violated("the test register was written")
 
-    def _is_channel(self, data: bytes) -> bool:
-        """Whether data is the commonest write by far: all four bytes of one channel, to be taken on STOP."""
+    def _write_channel(self, data: bytes) -> bool:
+        """Do the commonest write by far at once, as ``transaction`` does byte by byte; whether it was one.
+
+        It has all four bytes of one channel, to be taken on STOP.
+        """
         if len(data) != 5 or not self._mode1 & AI or self._mode2 & OCH:
             return False
-        return LED0 <= data[0] < LED_END and (data[0] - LED0) % 4 == 0
-
-    def _write_channel(self, data: bytes) -> None:
-        """What ``transaction`` does with such a write byte by byte, at once."""
+        if not LED0 <= data[0] < LED_END or (data[0] - LED0) % 4:
+            return False
         channel = (data[0] - LED0) // 4
         self._leds[4 * channel : 4 * channel + 4] = bytes((data[1], data[2] & 0x1F, data[3], data[4] & 0x1F))
         self._register = MODE1 if channel == CHANNELS - 1 else data[0] + 4
         self._written[channel] = 0b1111
         self._stop()
+        return True
 
     def _write_led(self, channel: int, part: int, byte: int) -> None:
         self._leds[4 * channel + part] = byte & (0x1F if part % 2 else 0xFF)
         self._written[channel] |= 1 << part
         if self._mode2 & OCH and self._written[channel] == 0b1111:
             self._latch([channel])
-
-    def _write_prescale(self, byte: int) -> None:
-        if not self._mode1 & SLEEP:
-            self._violated("PRE_SCALE was written while the oscillator runs: it is ignored")
-            return
-        self._prescale = max(LEAST_PRESCALE, byte)
 
     def _write_mode1(self, byte: int) -> None:
         was_asleep = bool(self._mode1 & SLEEP)
@@ -229,25 +223,20 @@ class Pca9685Model:
         kept = self._mode1 & EXTCLK  # sticky
         self._mode1 = kept | byte & ~RESTART & 0xFF
         if byte & SLEEP and not was_asleep:
-            self._fall_asleep()
+            self._stopped_while_running = [
+                running and not self._latched[4 * channel + 3] & FULL for channel, running in enumerate(self._running)
+            ]
+            self._running = [False] * CHANNELS
+            # The bit is set when the refresh cycle ends, at the latest one period from now.
+            self._restart_at = self._clock() + self.period_s if any(self._stopped_while_running) else None
+            self._awake_since = None
         elif was_asleep and not byte & SLEEP:
-            self._wake()
+            self._awake_since = self._clock()
+            if not self._restart_set():
+                self._restart_at = None  # woken within the cycle: nothing was stopped that could be restarted
         if byte & RESTART:
             self._restart()
         self._update_pins(range(CHANNELS))
-
-    def _fall_asleep(self) -> None:
-        active = [self._active(channel) for channel in range(CHANNELS)]
-        self._stopped_while_running = active
-        self._running = [False] * CHANNELS
-        # The bit is set when the refresh cycle ends, at the latest one period from now.
-        self._restart_at = self._clock() + self.period_s if any(active) else None
-        self._awake_since = None
-
-    def _wake(self) -> None:
-        self._awake_since = self._clock()
-        if not self._restart_set():
-            self._restart_at = None  # woken within the cycle: nothing was stopped that could be restarted
 
     def _restart_set(self) -> bool:
         return self._restart_at is not None and self._clock() >= self._restart_at
@@ -293,9 +282,6 @@ class Pca9685Model:
     def _counts(self, channel: int) -> tuple[int, int]:
         on_low, on_high, off_low, off_high = self._latched[4 * channel : 4 * channel + 4]
         return on_low | (on_high & 0x0F) << 8, off_low | (off_high & 0x0F) << 8
-
-    def _active(self, channel: int) -> bool:
-        return self._running[channel] and not self._latched[4 * channel + 3] & FULL
 
     def _at_pin(self, channel: int) -> float | None:
         clocked = not self._mode1 & SLEEP and (not self._mode1 & EXTCLK or self._external_hz is not None)

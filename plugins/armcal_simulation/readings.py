@@ -1,15 +1,40 @@
-"""What an instrument reads: what it would read without noise, disturbed by it."""
+"""What is recorded: readings disturbed by noise, some of them outliers, and the approach direction of each joint."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
+from armcal.base.settings import Length, Settings
+from armcal.config.selection import with_values
+from armcal.config.yaml_source import load_config
 from armcal.estimate.simulation import SimulationRequest, measured_with_noise
+from numpy.typing import NDArray
+from pydantic import Field
 
 _QUATERNION = ("qw", "qx", "qy", "qz")
+
+
+class OutlierSettings(Settings):
+    """Some measurements are wrong: how many, and by how much at least (in a random direction)."""
+
+    fraction: Annotated[float, Field(ge=0, le=1)] = 0.0
+    size: Length = 0.03
+
+
+def at_truth(request: SimulationRequest, truth: Path) -> SimulationRequest:
+    """The request at the parameter values of a file.
+
+    Raises:
+        ConfigError: the file names unknown parameters.
+    """
+    source = load_config(truth)
+    return replace(request, parameters=with_values(request.parameters, source.data, source, ()))
 
 
 def disturbed(
@@ -24,15 +49,38 @@ def disturbed(
     Raises:
         ProblemError: the residual of a measurement depends on something else than its readings.
     """
-    found = measured_with_noise(request, commands, exact, random, stated)
+    readings = measured_with_noise(request, commands, exact, random, stated)
     for name in request.measurements:
         parts = [f"{name}.{part}" for part in _QUATERNION]
-        if set(parts) <= found.keys():
-            length = np.linalg.norm([found[part] for part in parts], axis=0)
-            found |= {part: found[part] / length for part in parts}
-    return found
+        if set(parts) <= readings.keys():
+            length = np.linalg.norm([readings[part] for part in parts], axis=0)
+            readings |= {part: readings[part] / length for part in parts}
+    return readings
 
 
 def is_orientation(channel: str) -> bool:
     """Whether a channel is a part of a quaternion."""
     return channel.rpartition(".")[2] in _QUATERNION
+
+
+def with_outliers(
+    measured: Mapping[str, Array], outliers: OutlierSettings, random: np.random.Generator
+) -> tuple[dict[str, Array], NDArray[np.bool_]]:
+    """Channels (N each, m) with some records pushed away by once to twice the size, and which those are (N)."""
+    count = len(next(iter(measured.values())))
+    wrong = random.random(count) < outliers.fraction
+    push = random.normal(size=(len(measured), count))
+    push *= outliers.size * (1 + random.random(count)) / np.linalg.norm(push, axis=0)
+    pushed = {
+        channel: values + np.where(wrong, push[row], 0.0) for row, (channel, values) in enumerate(measured.items())
+    }
+    return pushed, wrong
+
+
+def approach_of(commands: Array) -> Array:
+    """The sign of each joint's last motion; 0 before its first (joints x poses)."""
+    moves = np.sign(np.diff(commands, axis=1, prepend=commands[:, :1]))
+    for column in range(1, moves.shape[1]):
+        still = moves[:, column] == 0
+        moves[still, column] = moves[still, column - 1]
+    return np.asarray(moves)

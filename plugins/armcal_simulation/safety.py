@@ -11,17 +11,34 @@ from typing import Any
 
 import numpy as np
 from armcal.arm.clearance import ClearanceCheck
+from armcal.base.settings import Angle, Duration, Length, Settings
 
-from armcal_simulation.bench_settings import SafetySettings
 from armcal_simulation.pca9685_model import COUNTS, Commit
-from armcal_simulation.servo_model import ServoModel
+from armcal_simulation.servo_model import Positive, ServoModel
 
 SPEED_SLACK = 1.05
 _TICK_S = 0.02
-"""Hosts command at ticks: what was told at a window's first moment may have been told one tick before."""
+"""Hosts command at ticks: a command of a window's first moment may be of one tick before."""
 _AT_ONCE = 512
 _AT_REST_S = 1.0
 _NO_TIME = -1e9
+
+
+class SafetySettings(Settings):
+    """What the arm must not be made to do, judged by the true pulse tables.
+
+    The commanded speed over ``window`` may be above ``rate_deg_per_s`` by a twentieth and one count. Joint limits and
+    clearances are the plan's, less what a host cannot know of the true tables. Pulses are those that the true servo
+    file's servos bear, less what a host cannot know of the true oscillator. Two joints whose pulses begin within
+    ``together`` were not energised one at a time.
+    """
+
+    rate_deg_per_s: Positive = 20.0
+    window: Duration = 0.25
+    limits_slack: Angle = 0.035
+    clearance_slack: Length = 0.005
+    pulse_slack: Duration = 2e-5
+    together: Duration = 0.1
 
 
 @dataclass(frozen=True)
@@ -53,7 +70,7 @@ class Safety:
         self.offences: Counter[str] = Counter()
         self.events: Counter[str] = Counter()
         self._settings, self._bounds, self._servos, self._log = settings, bounds, servos, log
-        self._told: dict[str, float] = {}
+        self._commanded: dict[str, float] = {}
         self._past: dict[str, deque[tuple[float, float]]] = {joint: deque() for joint in servos}
         self._first_pulse: tuple[float, str] = (_NO_TIME, "")
         self._logged: set[tuple[str, str]] = set()
@@ -62,20 +79,31 @@ class Safety:
         self._moved = False
         self._poses: list[tuple[float, list[float]]] = []
 
-    def committed(self, joint: str, commit: Commit, period: float, torque: float, friction: float) -> None:
-        """A change at a joint's pin, while its servo carried a torque (N m) that its friction may hold."""
+    def committed(self, joint: str, commit: Commit, period: float, torque: float) -> None:
+        """A change at a joint's pin, while its servo carried a torque (N m)."""
+        servo, now, settings = self._servos[joint], commit.time, self._settings
         if commit.after is None:
-            self._ended(joint, commit.time, torque, friction)
+            self._commanded.pop(joint, None)
+            self._past[joint].clear()
+            if abs(torque) > servo.settings.friction:
+                self._dropped[joint] = servo.angle
+                self._note("drop", joint, now, torque)
             return
-        angle = self._servos[joint].angle_of(commit.after)
+        angle = servo.angle_of(commit.after)
         if commit.before is None:
-            self._began(joint, commit.time, angle)
+            self._judge_start(joint, now, angle)
         else:
             self._judge_speed(joint, commit, angle, period)
-        self._told[joint] = angle
-        self._past[joint].append((commit.time, angle))
-        self._judge_limits(joint, commit.time, angle)
-        self._judge_pulse(joint, commit.time, commit.after)
+        self._commanded[joint] = angle
+        self._past[joint].append((now, angle))
+        judged = (
+            ("limits", angle, self._bounds.limits, settings.limits_slack),
+            ("pulse", commit.after, self._bounds.pulses, settings.pulse_slack),
+        )
+        for kind, value, bounds, slack in judged:
+            low, high = bounds.get(joint, (-np.inf, np.inf))
+            if not low - slack <= value <= high + slack:
+                self._offend(kind, joint, now, value, low - slack if value < low else high + slack)
         self._moved = True
 
     def failed(self, joint: str, now: float, heat: float) -> None:
@@ -83,14 +111,14 @@ class Safety:
         self._offend("heat", joint, now, heat, 1.0)
 
     def passed(self, now: float) -> None:
-        """Time goes on from here: what the pins ask for now is what the arm is driven to."""
+        """Time goes on from here: the arm is driven to what the pins command now."""
         if not self._moved or self._bounds.clearance is None:
             if self._poses and now - self._poses[-1][0] > _AT_REST_S:
                 self.judge_clearance()
             return
         self._moved = False
-        if len(self._told) == len(self._servos):
-            self._poses.append((now, [self._told[joint] for joint in self._servos]))
+        if len(self._commanded) == len(self._servos):
+            self._poses.append((now, [self._commanded[joint] for joint in self._servos]))
             if len(self._poses) >= _AT_ONCE:
                 self.judge_clearance()
 
@@ -125,8 +153,7 @@ class Safety:
         window, now, past = self._settings.window, commit.time, self._past[joint]
         while len(past) > 1 and past[1][0] <= now - window:
             past.popleft()
-        servo, pulse = self._servos[joint], commit.after or 0.0
-        count = abs(servo.angle_of(pulse + period / COUNTS) - angle)
+        count = abs(self._servos[joint].angle_of((commit.after or 0.0) + period / COUNTS) - angle)
         most = np.radians(self._settings.rate_deg_per_s)
         worst = 0.0
         for since, before in past:
@@ -135,21 +162,7 @@ class Safety:
         if worst > SPEED_SLACK * most:
             self._offend("speed", joint, now, worst, SPEED_SLACK * most)
 
-    def _judge_limits(self, joint: str, now: float, angle: float) -> None:
-        if joint not in self._bounds.limits:
-            return
-        low, high = self._bounds.limits[joint]
-        slack = self._settings.limits_slack
-        if angle < low - slack or angle > high + slack:
-            self._offend("limits", joint, now, angle, low - slack if angle < low else high + slack)
-
-    def _judge_pulse(self, joint: str, now: float, pulse: float) -> None:
-        low, high = self._bounds.pulses.get(joint, (0.0, np.inf))
-        slack = self._settings.pulse_slack
-        if not low - slack <= pulse <= high + slack:
-            self._offend("pulse", joint, now, pulse, low - slack if pulse < low else high + slack)
-
-    def _began(self, joint: str, now: float, angle: float) -> None:
+    def _judge_start(self, joint: str, now: float, angle: float) -> None:
         last, other = self._first_pulse
         if other != joint and now - last < self._settings.together * (1 - 1e-9):
             self._offend("energised_together", joint, now, now - last, self._settings.together)
@@ -158,13 +171,6 @@ class Safety:
         self._dropped.pop(joint, None)
         self._weigh("first_pulse", joint, abs(jump), value=jump)
         self._note("first_pulse", joint, now, jump)
-
-    def _ended(self, joint: str, now: float, torque: float, friction: float) -> None:
-        self._told.pop(joint, None)
-        self._past[joint].clear()
-        if abs(torque) > friction:
-            self._dropped[joint] = self._servos[joint].angle
-            self._note("drop", joint, now, torque)
 
     def _offend(self, kind: str, joint: str, now: float, value: float, limit: float) -> None:
         self.offences[kind] += 1

@@ -12,14 +12,94 @@ import os
 import select
 import termios
 import tty
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal, get_args
 
 import numpy as np
 
-from armcal_simulation.line_faults import FaultyStream
-
 _AT_ONCE = 65536
 _MOST_WAITING = 1 << 20
+
+LineFault = Literal["drop", "duplicate", "reorder", "flip", "split"]
+LINE_FAULTS: tuple[LineFault, ...] = get_args(LineFault)
+
+
+@dataclass
+class _Plan:
+    kind: LineFault
+    after: int
+    count: int
+    frames: bool
+
+
+class FaultyStream:
+    """One direction of a line, on which messages or bytes are lost, doubled, swapped, damaged or torn apart.
+
+    Args:
+        delimiter: the byte that ends a message.
+        random: chooses the bit that is damaged.
+    """
+
+    def __init__(self, delimiter: int, random: np.random.Generator) -> None:
+        self._delimiter, self._random = delimiter, random
+        self._plans: list[_Plan] = []
+        self._unfinished = b""
+        self._held = b""
+
+    def plan(self, kind: LineFault, count: int, after: int = 0, *, frames: bool = True) -> None:
+        """Do this to the next ``count`` messages, or bytes, once ``after`` of them have passed."""
+        self._plans.append(_Plan(kind, after, count, frames))
+
+    def clear(self) -> None:
+        """No more faults; what was held back is lost."""
+        self._plans.clear()
+        self._unfinished = self._held = b""
+
+    def through(self, data: bytes) -> list[bytes]:
+        """What arrives, in pieces that arrive one after another."""
+        if not self._plans and not self._unfinished and not self._held:
+            return [data] if data else []
+        waiting, self._unfinished = self._unfinished + data, b""
+        if self._plans and not self._plans[0].frames:
+            messages = [bytes((byte,)) for byte in waiting]
+        else:
+            end = bytes((self._delimiter,))
+            *whole, self._unfinished = waiting.split(end)
+            messages = [message + end for message in whole]
+        delivered: list[bytes] = []
+        for message in messages:
+            late, self._held = self._held, b""
+            delivered += [*self._harmed(message), late]
+        if not self._plans and not self._held:
+            delivered.append(self._unfinished)
+            self._unfinished = b""
+        return [piece for piece in delivered if piece]
+
+    def _harmed(self, message: bytes) -> list[bytes]:
+        """What the first plan leaves of a message."""
+        if not self._plans:
+            return [message]
+        plan = self._plans[0]
+        if plan.after > 0:
+            plan.after -= 1
+            return [message]
+        plan.count -= 1
+        if plan.count <= 0:
+            self._plans.pop(0)
+        if plan.kind == "drop":
+            return []
+        if plan.kind == "duplicate":
+            return [message, message]
+        if plan.kind == "reorder":
+            self._held = message
+            return []
+        if plan.kind == "split":
+            return [bytes((byte,)) for byte in message]
+        place, bit = int(self._random.integers(len(message))), int(self._random.integers(8))
+        damaged = bytearray(message)
+        damaged[place] ^= 1 << bit
+        return [bytes(damaged)]
 
 
 class SerialLine:
@@ -73,23 +153,27 @@ class SerialLine:
         """All that the host has written, harmed as planned."""
         if self._master is None:
             return []
-        found = bytearray()
+        received = bytearray()
         while True:
             try:
                 data = os.read(self._master, _AT_ONCE)
             except OSError as fault:
                 if fault.errno == errno.EIO:
-                    self._closed_by_host()
+                    self._lift_claim()
                 break
             if not data:
                 break
-            found += data
-        self._spoken |= bool(found)
-        return self.to_board.through(bytes(found)) if found else []
+            received += data
+        self._spoken |= bool(received)
+        return self.to_board.through(bytes(received)) if received else []
 
     def send(self, data: bytes) -> None:
         """To the host; lost where nobody has the port open, as on a real one."""
-        if self._master is None or not self._is_open():
+        if self._master is None:
+            return
+        poll = select.poll()
+        poll.register(self._master, select.POLLHUP)
+        if any(event & select.POLLHUP for _, event in poll.poll(0)):
             self._waiting = b""
             return
         for piece in self.to_host.through(data):
@@ -105,12 +189,7 @@ class SerialLine:
             except OSError:
                 return
 
-    def _is_open(self) -> bool:
-        poll = select.poll()
-        poll.register(self._master, select.POLLHUP)  # type: ignore[arg-type]
-        return not any(event & select.POLLHUP for _, event in poll.poll(0))
-
-    def _closed_by_host(self) -> None:
+    def _lift_claim(self) -> None:
         """A host's claim to a port alone must not outlive it; on a pty it does, so the claim is lifted."""
         self._waiting = b""
         if not self._spoken:

@@ -1,92 +1,115 @@
-"""A hobby servo: it drives to the angle of its pulses, as fast as it can, and tells nobody where it is."""
+"""A hobby servo: it drives to the angle of its pulses, as fast as it can, heats, and reports nothing.
+
+Two nodes carry its heat, in units in which a steady loss of 1 heats the winding by 1 above the air:
+``loss = (torque / continuous)^2``. The winding lies inside the case, which the air cools; heat 1 is its limit.
+"""
 
 from __future__ import annotations
 
+import math
 from bisect import bisect_right
-from dataclasses import dataclass
+from typing import Annotated
 
 from armcal.arm.servo import PulseTable
+from armcal.base.settings import Angle, Duration, Settings, Torque
+from pydantic import Field, model_validator
 
+Positive = Annotated[float, Field(gt=0)]
 _NEAR = 1e-12
+_HEAT_STEP = 0.05
+"""Of the shorter time constant: an explicit step this short stays within some thousandths of the exact course."""
 
 
-@dataclass(frozen=True)
-class ServoBuild:
-    """What kind of servo it is.
+class ServoJointSettings(Settings):
+    """What kind of servo drives a joint.
 
-    Attributes:
-        speed: rad/s.
-        dead_band: errors of this size (rad) or less do not make it move.
-        backlash: the whole gap between gear and horn (rad); the horn lags by half of it.
-        travel: where its stops are (rad).
-        stall: the torque that it gives way to (N m).
-        friction: the torque that its unpowered gear holds (N m).
-        fall_speed: how fast it gives way (rad/s).
+    ``dead_band``: errors of this size or less do not make it move. ``backlash`` is the whole gap between gear and horn,
+    ``travel`` where its stops are. A load above ``stall`` turns it; unpowered it gives way to torques above
+    ``friction``, at ``fall_deg_per_s``. Steadily under ``continuous`` torque its winding reaches its limit; beyond
+    that it fails. ``winding_share`` of that rise lies between winding and case. ``winding_time`` and ``case_time`` are
+    the time constants of each node against what it gives its heat to.
     """
 
-    speed: float
-    dead_band: float
-    backlash: float
-    travel: tuple[float, float]
-    stall: float
-    friction: float
-    fall_speed: float
+    speed_deg_per_s: Positive = 300.0
+    dead_band: Angle = 0.0
+    backlash: Angle = 0.0
+    travel: tuple[Angle, Angle] = (-2.4, 2.4)
+    stall: Torque = 4.0
+    friction: Torque = 0.05
+    fall_deg_per_s: Positive = 60.0
+    continuous: Torque = 1.5
+    winding_time: Duration = 60.0
+    case_time: Duration = 900.0
+    winding_share: Annotated[float, Field(gt=0, lt=1)] = 0.3
+
+    @model_validator(mode="after")
+    def _physical(self) -> ServoJointSettings:
+        for name in ("stall", "continuous", "winding_time", "case_time"):
+            if getattr(self, name) <= 0:
+                raise ValueError(f"found a {name} that is not above zero")
+        for name in ("dead_band", "backlash", "friction"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"found a {name} below zero, expected 0 or more")
+        if not self.travel[0] < self.travel[1]:
+            raise ValueError("the ends of travel are not in rising order: give [lowest, highest]")
+        return self
+
+    @property
+    def heat_capacities(self) -> tuple[float, float]:
+        """What winding and case take up for a rise of 1 (s)."""
+        return self.winding_time / self.winding_share, self.case_time / (1 - self.winding_share)
 
 
 class ServoModel:
     """One servo under a load.
 
     Attributes:
+        settings: what kind of servo it is.
         angle: of its horn (rad).
+        target: where its pulses send it (rad), within its stops; None without pulses.
         approach: the sign of its last motion; 0 before the first.
         failed: it has burnt out, and holds nothing.
 
     Args:
-        build: see there.
-        table: which pulse makes it go where, in truth.
+        settings: see above.
+        table: the angle that it takes at each pulse length, in truth.
         angle: where it stands.
     """
 
-    def __init__(self, build: ServoBuild, table: PulseTable, angle: float) -> None:
-        self.angle, self.approach, self.failed = angle, 0, False
-        self._build, self._gear = build, angle
+    def __init__(self, settings: ServoJointSettings, table: PulseTable, angle: float) -> None:
+        self.settings, self.angle, self.approach, self.failed = settings, angle, 0, False
+        self.target: float | None = None
+        self._gear = angle  # where the gear stands, without its backlash (rad)
+        self._driving = False
+        self._speed, self._fall_speed = math.radians(settings.speed_deg_per_s), math.radians(settings.fall_deg_per_s)
         rising = table.pulses[0] < table.pulses[-1]
         order = slice(None) if rising else slice(None, None, -1)
         self._pulses, self._angles = table.pulses[order], table.angles[order]
-        self._target: float | None = None
-        self._driving = False
 
     @property
     def powered(self) -> bool:
         """Whether it holds anything."""
-        return self._target is not None and not self.failed
-
-    @property
-    def gear(self) -> float:
-        """Where the gear stands, without its play (rad)."""
-        return self._gear
-
-    @property
-    def target(self) -> float | None:
-        """Where it is told to go (rad), within its stops."""
-        return self._target
+        return self.target is not None and not self.failed
 
     def angle_of(self, pulse: float) -> float:
-        """What a pulse (s) asks for (rad); linear between the table's knots and beyond them."""
+        """The angle (rad) that a pulse (s) commands; linear between the table's knots and beyond them."""
         at = min(max(bisect_right(self._pulses, pulse), 1), len(self._pulses) - 1)
         p0, p1, a0, a1 = self._pulses[at - 1], self._pulses[at], self._angles[at - 1], self._angles[at]
         return a0 + (pulse - p0) * (a1 - a0) / (p1 - p0)
 
     def set_pulse(self, pulse: float | None) -> None:
         """Other pulses (s), or none."""
-        low, high = self._build.travel
-        self._target = None if pulse is None else min(max(self.angle_of(pulse), low), high)
+        low, high = self.settings.travel
+        self.target = None if pulse is None else min(max(self.angle_of(pulse), low), high)
 
     def rests(self, torque: float) -> bool:
         """Whether it stays where it is under a torque (N m), as it is driven now."""
-        if not self.holds(torque):
-            return abs(torque) <= self._build.friction or self._at_stop(torque)
-        return not self._wants_to_move()
+        if self.holds(torque):
+            error = abs((self.target or 0.0) - self._gear)
+            return error <= _NEAR or not (self._driving or error > self.settings.dead_band)
+        low, high = self.settings.travel
+        at_stop = self._gear >= high - _NEAR if torque > 0 else self._gear <= low + _NEAR
+        return at_stop or abs(torque) <= self.settings.friction
 
     def advance(self, seconds: float, torque: float) -> bool:
         """Let time pass under a torque of its load (N m, turning towards larger angles); whether it moved."""
@@ -94,36 +117,47 @@ class ServoModel:
             return False
         before = self._gear
         if self.holds(torque):
-            self._drive(seconds)
+            error = (self.target or 0.0) - before
+            step = self._speed * seconds
+            self._driving = abs(error) > step
+            self._gear += math.copysign(step, error) if self._driving else error
         else:
-            step = self._build.fall_speed * seconds
-            low, high = self._build.travel
-            self._gear = min(max(self._gear + (step if torque > 0 else -step), low), high)
-        return self._follow(before)
-
-    def holds(self, torque: float) -> bool:
-        """Whether it is strong enough for a torque (N m), as it is powered now."""
-        return self.powered and abs(torque) <= self._build.stall
-
-    def _at_stop(self, torque: float) -> bool:
-        low, high = self._build.travel
-        return self._gear >= high - _NEAR if torque > 0 else self._gear <= low + _NEAR
-
-    def _wants_to_move(self) -> bool:
-        error = abs((self._target or 0.0) - self._gear)
-        return error > _NEAR and (self._driving or error > self._build.dead_band)
-
-    def _drive(self, seconds: float) -> None:
-        error = (self._target or 0.0) - self._gear
-        step = self._build.speed * seconds
-        self._driving = abs(error) > step
-        self._gear = self._gear + (step if error > 0 else -step) if self._driving else self._gear + error
-
-    def _follow(self, before: float) -> bool:
-        """The horn, at the end of the play that the motion pushes it to."""
+            step = self._fall_speed * seconds
+            low, high = self.settings.travel
+            self._gear = min(max(before + (step if torque > 0 else -step), low), high)
         moved = self._gear - before
         if moved:
             self.approach = 1 if moved > 0 else -1
-        half = self._build.backlash / 2
+        # the gear pushes the horn at one end of the gap
+        half = self.settings.backlash / 2
         self.angle = min(max(self.angle, self._gear - half), self._gear + half)
         return bool(moved)
+
+    def holds(self, torque: float) -> bool:
+        """Whether it is strong enough for a torque (N m), as it is powered now."""
+        return self.powered and abs(torque) <= self.settings.stall
+
+
+class ServoHeat:
+    """One servo's temperatures above the air, in parts of what the winding bears.
+
+    Attributes:
+        winding, case: of the two nodes.
+    """
+
+    def __init__(self, settings: ServoJointSettings) -> None:
+        self.winding, self.case = 0.0, 0.0
+        self._settings, self._capacities = settings, settings.heat_capacities
+        self._longest = _HEAT_STEP * min(settings.winding_time, settings.case_time)
+
+    def advance(self, seconds: float, torque: float) -> None:
+        """Hold a torque (N m; 0 for an unpowered servo) for so long."""
+        share, (winding_capacity, case_capacity) = self._settings.winding_share, self._capacities
+        loss = (torque / self._settings.continuous) ** 2
+        while seconds > 0:
+            step = min(seconds, self._longest)
+            to_case = (self.winding - self.case) / share
+            to_air = self.case / (1 - share)
+            self.winding += step * (loss - to_case) / winding_capacity
+            self.case += step * (to_case - to_air) / case_capacity
+            seconds -= step

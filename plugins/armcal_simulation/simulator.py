@@ -1,6 +1,6 @@
 """An arm with a stated truth: poses, command quantisation, noise and outliers from a fixed seed.
 
-The recorded command is the one asked for; the arm stands at the nearest one its servo board can make.
+The record has the given command; the arm stands at the nearest one that its servo board can make.
 """
 
 from __future__ import annotations
@@ -13,16 +13,19 @@ from armcal.arm.assembly import Arm
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.base.settings import Angle, InputPath, Length, Settings
-from armcal.config.selection import with_values
-from armcal.config.yaml_source import load_config
 from armcal.errors import ConfigError
 from armcal.estimate.simulation import SimulationRequest, measured_without_noise, with_channels
 from armcal.testing import EXAMPLE_TRUTH
 from pydantic import Field, model_validator
 
-from armcal_simulation.motions import approach_of
-from armcal_simulation.outliers import OutlierSettings, with_outliers
-from armcal_simulation.readings import disturbed, is_orientation
+from armcal_simulation.readings import (
+    OutlierSettings,
+    approach_of,
+    at_truth,
+    disturbed,
+    is_orientation,
+    with_outliers,
+)
 
 
 class PoseSettings(Settings):
@@ -38,22 +41,33 @@ class PoseSettings(Settings):
     levels: dict[str, Annotated[tuple[Angle, ...], Field(min_length=1)]] = Field(default_factory=dict)
     travel: dict[str, Annotated[tuple[Length, ...], Field(min_length=1)]] = Field(default_factory=dict)
 
-    def of(self, arm: Arm) -> list[Array]:
-        """The levels of each joint, in the arm's order (rad, or m on sliding joints).
+    def commands(self, arm: Arm, random: np.random.Generator) -> Array:
+        """Joints x poses, in the arm's order (rad, or m on sliding joints).
 
         Raises:
-            ConfigError: a joint has none, or a name is not a joint's.
+            ConfigError: a joint has no levels, a name is not a joint's, or the grid has fewer poses.
         """
         turning = {j for j, kind in arm.commanded.items() if kind == "angle"}
         sliding = set(arm.commanded) - turning
-        for given, texts, key in ((self.levels, turning, "levels"), (self.travel, sliding, "travel")):
-            missing, unknown = sorted(texts - set(given)), sorted(set(given) - texts)
+        for given, joints, key in ((self.levels, turning, "levels"), (self.travel, sliding, "travel")):
+            missing, unknown = sorted(joints - set(given)), sorted(set(given) - joints)
             if missing or unknown:
                 raise ConfigError(
                     f"simulation.poses.{key}: missing {missing or 'none'}, unknown {unknown or 'none'}.",
-                    hint=f"Give one list for each of {', '.join(sorted(texts)) or 'no joint'}.",
+                    hint=f"Give one list for each of {', '.join(sorted(joints)) or 'no joint'}.",
                 )
-        return [np.array(self.levels.get(j) or self.travel[j]) for j in arm.commanded]
+        levels = [np.array(self.levels.get(j) or self.travel[j]) for j in arm.commanded]
+        if self.kind == "random":
+            return np.array([random.uniform(level.min(), level.max(), self.count) for level in levels])
+        shape = [len(level) for level in levels]
+        total = int(np.prod(shape))
+        if self.count > total:
+            raise ConfigError(
+                f"simulation.poses.count: found {self.count}, the grid has {total} poses.",
+                hint="Give more levels.",
+            )
+        indices = np.unravel_index(np.sort(random.choice(total, self.count, replace=False)), shape)
+        return np.array([level[index] for level, index in zip(levels, indices, strict=True)])
 
 
 class ElasticArmSettings(Settings):
@@ -96,7 +110,7 @@ class ElasticArmSimulator:
         """
         settings, random = self._settings, np.random.default_rng(self._settings.seed)
         arm = next(iter(request.arms.values()))
-        commands = _poses(settings.poses, settings.poses.of(arm), random)
+        commands = settings.poses.commands(arm, random)
         reached, step = commands.copy(), settings.quantisation
         if step:
             turning = [dimension == "angle" for dimension in arm.commanded.values()]
@@ -109,35 +123,8 @@ class ElasticArmSimulator:
             {**dict(zip(named, reached, strict=True)), **channels},
             source="simulation",
         )
-        measured = self._measured(request, standing, random)
-        return with_channels(standing, {**dict(zip(named, commands, strict=True)), **measured})
-
-    def _measured(
-        self, request: SimulationRequest, standing: Dataset, random: np.random.Generator
-    ) -> Mapping[str, Array]:
-        true = _with_truth(request, self._settings)
-        exact = measured_without_noise(true, standing)
-        read = disturbed(true, standing, exact, self._settings.noise, random)
+        true = at_truth(request, settings.truth)
+        read = disturbed(true, standing, measured_without_noise(true, standing), settings.noise, random)
         moved = {channel: values for channel, values in read.items() if not is_orientation(channel)}
-        return {**read, **with_outliers(moved, self._settings.outliers, random)[0]}
-
-
-def _poses(poses: PoseSettings, levels: list[Array], random: np.random.Generator) -> Array:
-    """Commands (joints x poses, rad or m)."""
-    if poses.kind == "random":
-        return np.array([random.uniform(level.min(), level.max(), poses.count) for level in levels])
-    total = int(np.prod([len(level) for level in levels]))
-    if poses.count > total:
-        raise ConfigError(
-            f"simulation.poses.count: found {poses.count}, the grid has {total} poses.",
-            hint="Give more levels.",
-        )
-    chosen = np.sort(random.choice(total, poses.count, replace=False))
-    indices = np.unravel_index(chosen, [len(level) for level in levels])
-    return np.array([level[index] for level, index in zip(levels, indices, strict=True)])
-
-
-def _with_truth(request: SimulationRequest, settings: ElasticArmSettings) -> SimulationRequest:
-    source = load_config(settings.truth)
-    parameters = with_values(request.parameters, source.data, source, ())
-    return SimulationRequest(request.arms, request.measurements, parameters, request.environment)
+        pushed, _ = with_outliers(moved, settings.outliers, random)
+        return with_channels(standing, {**dict(zip(named, commands, strict=True)), **read, **pushed})

@@ -14,10 +14,10 @@ from armcal_bench.acquisition.path_planner import travel
 from armcal_bench.acquisition.preparation import prepare
 from armcal_bench.acquisition.schedule import LeaveOut, Measure, Rest, ScheduleForecast, Scheduler, forecast_schedule
 from armcal_bench.acquisition.settings import ServoHeatSettings
-from armcal_simulation.servo_heat import HeatPath, ServoHeat
+from armcal_simulation.servo_model import ServoHeat, ServoJointSettings
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs" / "lrm_arm"
-TRUTH = HeatPath(continuous=0.3, winding_time=60.0, case_time=900.0, winding_share=0.3)
+TRUTH = ServoJointSettings.si(continuous=0.3, winding_time=60.0, case_time=900.0, winding_share=0.3)
 """A winding inside its case, as the simulated bench has it for joint 4."""
 POSES, CAPTURE_S = 190, 12.0
 Q4 = 3

@@ -12,9 +12,9 @@ from armcal.errors import ConfigError
 from armcal.estimate.mission_truth import DAY_S, Mission, MissionSimulator
 from armcal.estimate.simulation import SimulationRequest, measured_without_noise
 from armcal.run.experiment import Experiment
-from armcal_simulation.mission_schedule import Stands
+from armcal_simulation.mission import Stands
 from armcal_simulation.mission_settings import MissionSettings, TiltSettings, parsed_creep
-from armcal_simulation.motions import approach_of
+from armcal_simulation.readings import approach_of
 from scipy.spatial.transform import Rotation
 
 CONFIG = Path(__file__).resolve().parents[2] / "configs" / "lrm_arm" / "mission.yaml"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,16 +14,16 @@ from armcal.config.yaml_source import load_config
 from armcal.errors import ConfigError
 from armcal.estimate.simulation import SimulationRequest, measured_without_noise
 from armcal.run.experiment import Experiment
-from armcal_simulation.bench_parts import tracked_arm
-from armcal_simulation.bench_settings import ServoBenchSettings
+from armcal_simulation.bench_parts import ServoBenchSettings, tracked_arm
 from armcal_simulation.elastic_pose import ElasticPose
-from armcal_simulation.servo_heat import HeatPath, ServoHeat
-from armcal_simulation.servo_model import ServoBuild, ServoModel
+from armcal_simulation.servo_model import ServoHeat, ServoJointSettings, ServoModel
 from hypothesis import given
 from hypothesis import strategies as st
 
 TABLE = PulseTable((-1.7, 0.0, 1.7), (620e-6, 1540e-6, 2400e-6))
-PLAIN = ServoBuild(5.0, 0.0, 0.0, (-2.0, 2.0), 2.0, 0.05, 1.0)
+PLAIN = ServoJointSettings.si(
+    speed_deg_per_s=np.degrees(5.0), travel=(-2.0, 2.0), stall=2.0, friction=0.05, fall_deg_per_s=np.degrees(1.0)
+)
 LOAD = 0.5
 
 
@@ -56,7 +55,7 @@ class TestServo:
 
     @given(st.lists(st.floats(0.001, 0.2), min_size=1, max_size=20))
     def test_the_way_time_is_cut_up_changes_nothing(self, steps: Sequence[float]) -> None:
-        whole, cut = (ServoModel(replace(PLAIN, backlash=0.02), TABLE, 0.0) for _ in range(2))
+        whole, cut = (ServoModel(PLAIN.model_copy(update={"backlash": 0.02}), TABLE, 0.0) for _ in range(2))
         driven(whole, 1.5, sum(steps))
         for step in steps:
             driven(cut, 1.5, step)
@@ -64,7 +63,7 @@ class TestServo:
 
     @given(st.floats(-1.5, 1.5), st.floats(0.0, 0.1))
     def test_both_sides_of_an_angle_differ_by_the_backlash(self, angle: float, gap: float) -> None:
-        servo = ServoModel(replace(PLAIN, backlash=gap), TABLE, 0.0)
+        servo = ServoModel(PLAIN.model_copy(update={"backlash": gap}), TABLE, 0.0)
         driven(servo, angle - 0.3)
         below = driven(servo, angle)
         driven(servo, angle + 0.3)
@@ -73,13 +72,13 @@ class TestServo:
         assert (above + below) / 2 == pytest.approx(angle, abs=1e-9)
 
     def test_a_move_within_the_play_moves_the_gear_only(self) -> None:
-        servo = ServoModel(replace(PLAIN, backlash=0.1), TABLE, 0.0)
+        servo = ServoModel(PLAIN.model_copy(update={"backlash": 0.1}), TABLE, 0.0)
         driven(servo, 1.0)
         assert driven(servo, 0.95) == pytest.approx(0.95)
         assert driven(servo, 0.99) == pytest.approx(0.95)
 
     def test_errors_within_the_dead_band_do_not_make_it_move(self) -> None:
-        servo = ServoModel(replace(PLAIN, dead_band=0.01), TABLE, 0.0)
+        servo = ServoModel(PLAIN.model_copy(update={"dead_band": 0.01}), TABLE, 0.0)
         assert driven(servo, 0.009) == 0.0
         assert driven(servo, 0.05) == pytest.approx(0.05), "once it moves it goes all the way"
 
@@ -111,7 +110,7 @@ class TestServo:
         assert servo.angle == pytest.approx(-0.1)
 
 
-PATH = HeatPath(0.3, 60.0, 900.0, 0.3)
+PATH = ServoJointSettings.si(continuous=0.3, winding_time=60.0, case_time=900.0, winding_share=0.3)
 torques = st.lists(st.tuples(st.floats(0.5, 120.0), st.floats(-0.6, 0.6)), min_size=1, max_size=12)
 
 
@@ -125,7 +124,7 @@ class TestHeat:
                 heat.advance(seconds / 40, torque)
                 given_off += seconds / 40 * (before + heat.case) / 2 / (1 - PATH.winding_share)
                 put_in += seconds / 40 * (torque / PATH.continuous) ** 2
-        winding, case = PATH.capacities
+        winding, case = PATH.heat_capacities
         stored = winding * heat.winding + case * heat.case
         assert stored + given_off == pytest.approx(put_in, rel=0.01, abs=1e-6)
 
@@ -172,7 +171,7 @@ class TestHeat:
         gravity = experiment.system.statics.gravity
         held = holding_efforts(experiment.system.arms["arm"], np.radians(angles).T, gravity)[3]
         section = load_config(config).data["bench"]["simulator"]["joints"]["q4"]
-        heat, seconds = ServoHeat(HeatPath(float(section["continuous_Nm"]), 60.0, 900.0, 0.3)), 0.0
+        heat, seconds = ServoHeat(PATH.model_copy(update={"continuous": float(section["continuous_Nm"])})), 0.0
         for torque in held:
             heat.advance(15.0, float(torque))
             seconds += 15.0
