@@ -22,7 +22,7 @@ from armcal.base.domains import Array
 from armcal.base.settings import InputPath, Settings
 from armcal.base.units import from_unit
 from armcal.errors import DataError, Location
-from armcal.io.cells import DECIMAL_COMMA, CellFault, read_cell, with_point
+from armcal.io.cells import DECIMAL_COMMA, CellFault, plain_numbers, read_cell, with_point
 from armcal.io.plain_files import input_file
 from armcal.measure.checks import check_dataset, layout_of
 from armcal.measure.column_match import Column, Header, Plan, header_of, match_columns, renamed
@@ -62,13 +62,17 @@ class CsvReader:
         Raises:
             DataError: with file, line and column.
         """
-        path, digest = self._settings.path, hashlib.sha256()
-        source = str(path)
+        s, digest = self._settings, hashlib.sha256()
+        path, source = s.path, str(s.path)
         try:
-            with _opened(path) as handle:
-                lines = _text_lines(handle, source, digest)
-                rows = _rows(lines, source, self._settings.delimiter)
-                header = _header(rows, source, self._settings)
+            with input_file(path, MAX_BYTES, "a CSV file") as file:
+                if not os.fstat(file.fileno()).st_size:
+                    _refuse_file(path, "it is empty.", "Give a header and one line a record.")
+                rows = _rows(_text_lines(file, path, digest), path, s.delimiter)
+                line, cells = next(rows, (1, []))
+                if len(cells) == 1:
+                    _refuse_delimiter(header_of(cells, source, line), s.delimiter, rows)
+                header = renamed(header_of(cells, source, line), s.columns)
                 plan = match_columns(header, request.wanted)
                 dataset = _load(rows, header, plan)
         except OSError as fault:
@@ -83,19 +87,10 @@ def _refuse_file(path: Path, message: str, hint: str, line: int | None = None) -
     raise DataError(message, where=Location(str(path), line=line), hint=hint)
 
 
-def _opened(path: Path) -> BinaryIO:
-    """The file, once it is known to be one and of a size that can be read."""
-    file = input_file(path, MAX_BYTES, "a CSV file")
-    if not os.fstat(file.fileno()).st_size:
-        file.close()
-        _refuse_file(path, "it is empty.", "Give a header and one line a record.")
-    return file
-
-
-def _text_lines(handle: BinaryIO, source: str, digest: Any) -> Iterator[str]:
+def _text_lines(file: BinaryIO, path: Path, digest: Any) -> Iterator[str]:
     """The file as text, each line checked as it comes by; all its bytes go into ``digest``."""
-    offset, path = 0, Path(source)
-    for number, raw in enumerate(iter(partial(handle.readline, MAX_LINE_BYTES + 1), b""), start=1):
+    offset = 0
+    for number, raw in enumerate(iter(partial(file.readline, MAX_LINE_BYTES + 1), b""), start=1):
         digest.update(raw)
         if b"\0" in raw:
             at = offset + raw.index(b"\0")
@@ -106,13 +101,13 @@ def _text_lines(handle: BinaryIO, source: str, digest: Any) -> Iterator[str]:
             text = raw.decode("utf-8")
         except UnicodeDecodeError as fault:
             at = offset + fault.start
-            found = f"found the byte 0x{raw[fault.start]:02x} at offset {at}, which is not UTF-8 text."
-            _refuse_file(path, found, _SAVE_AS_TEXT, number)
+            message = f"found the byte 0x{raw[fault.start]:02x} at offset {at}, which is not UTF-8 text."
+            _refuse_file(path, message, _SAVE_AS_TEXT, number)
         yield text.removeprefix("\ufeff") if number == 1 else text
         offset += len(raw)
 
 
-def _rows(lines: Iterator[str], source: str, delimiter: str) -> Iterator[tuple[int, list[str]]]:
+def _rows(lines: Iterator[str], path: Path, delimiter: str) -> Iterator[tuple[int, list[str]]]:
     """Rows that are not blank, each with the line on which it begins."""
     reader = csv.reader(lines, delimiter=delimiter, strict=True)
     line = 1
@@ -123,14 +118,7 @@ def _rows(lines: Iterator[str], source: str, delimiter: str) -> Iterator[tuple[i
             line = reader.line_num + 1
     except csv.Error as fault:
         hint = "Close every quote, end lines with LF or CRLF, and put no bare quote inside a quoted cell."
-        _refuse_file(Path(source), f"found a row that is not CSV ({fault}).", hint, line)
-
-
-def _header(rows: Iterator[tuple[int, list[str]]], source: str, settings: CsvSettings) -> Header:
-    line, cells = next(rows, (1, []))
-    if len(cells) == 1:
-        _refuse_delimiter(header_of([cells[0]], source, line), settings.delimiter, rows)
-    return renamed(header_of(cells, source, line), settings.columns)
+        _refuse_file(path, f"found a row that is not CSV ({fault}).", hint, line)
 
 
 def _refuse_delimiter(header: Header, delimiter: str, rows: Iterator[tuple[int, list[str]]]) -> None:
@@ -159,11 +147,17 @@ def _load(rows: Iterator[tuple[int, list[str]]], header: Header, plan: Plan) -> 
     texts: dict[str, list[str]] = {column.known_as: [] for column in plan.extra}
     while block := list(islice(rows, _ROWS_AT_ONCE)):
         lines = [line for line, _ in block]
-        if {len(cells) for _, cells in block} != {len(header.columns)}:
-            _refuse_ragged(block, header)
+        ragged = next(((line, cells) for line, cells in block if len(cells) != len(header.columns)), None)
+        if ragged is not None:
+            _refuse_ragged(*ragged, header)
         table = list(zip(*(cells for _, cells in block), strict=True))
         for channel, (column, unit) in plan.channels.items():
-            numbers = _numbers(table[column.index], lines, column, header)
+            cells = table[column.index]
+            numbers = plain_numbers(cells)
+            if numbers is None:
+                numbers = np.array(
+                    [_number(cell, line, column, header) for cell, line in zip(cells, lines, strict=True)]
+                )
             blocks[channel].append(from_unit(numbers, unit))
         for column in plan.extra:
             texts[column.known_as] += table[column.index]
@@ -181,34 +175,18 @@ def _load(rows: Iterator[tuple[int, list[str]]], header: Header, plan: Plan) -> 
     return replace(dataset.without(nameless), warnings=(warning,))
 
 
-def _refuse_ragged(block: Sequence[tuple[int, list[str]]], header: Header) -> NoReturn:
-    expected = len(header.columns)
-    line, cells = next((line, cells) for line, cells in block if len(cells) != expected)
+def _refuse_ragged(line: int, cells: Sequence[str], header: Header) -> NoReturn:
     mend = "Fill in what is missing, leave a cell empty if its value is not known."
-    if len(cells) > expected:
+    if len(cells) > len(header.columns):
         mend = "Quote text that holds the delimiter, and write numbers with a decimal point (12.5), not a comma."
-    raise DataError(
-        f"found {len(cells)} cells, expected {expected} as in the header.",
-        where=Location(header.source, line=line),
-        hint=mend,
-    )
-
-
-def _numbers(cells: Sequence[str], lines: Sequence[int], column: Column, header: Header) -> Array:
-    joined = "".join(cells)
-    if joined.isascii() and "_" not in joined:  # Python would read 1_000, and digits of other scripts
-        try:
-            return np.array(cells, dtype=np.float64)
-        except ValueError:  # a cell is empty, or is no number
-            pass
-    return np.array([_number(cell, line, column, header) for cell, line in zip(cells, lines, strict=True)])
+    message = f"found {len(cells)} cells, expected {len(header.columns)} as in the header."
+    raise DataError(message, where=Location(header.source, line=line), hint=mend)
 
 
 def _number(cell: str, line: int, column: Column, header: Header) -> float:
     """One cell; NaN if its value is missing."""
-    cell_fault = read_cell(cell)
-    if isinstance(cell_fault, CellFault):
-        raise DataError(
-            cell_fault.found, where=Location(header.source, line=line, field=column.name), hint=cell_fault.hint
-        )
-    return cell_fault
+    number = read_cell(cell)
+    if isinstance(number, CellFault):
+        where = Location(header.source, line=line, field=column.name)
+        raise DataError(number.found, where=where, hint=number.hint)
+    return number

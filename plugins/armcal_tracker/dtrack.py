@@ -3,26 +3,27 @@
 from __future__ import annotations
 
 import ipaddress
-import statistics
-from collections import Counter, deque
+import socket
 from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar
 
 from armcal.base.settings import Settings
 from armcal.devices.clock import Clock
-from armcal.devices.tracker import Tracker, TrackerFrame
+from armcal.devices.faults import DeviceRefusedError
+from armcal.devices.tracker import TrackerFrame
+from armcal.errors import InputError, Location
+from armcal.io.udp import bound
 from pydantic import Field, field_validator
 from typing_extensions import override
 
-from armcal_tracker.dtrack_message import Message, messages
-from armcal_tracker.frame_counter import FrameCounter
-from armcal_tracker.udp_port import UdpPort
-from armcal_tracker.unreadable import UnreadableError
+from armcal_tracker.dtrack_message import messages
+from armcal_tracker.frames import CountingTracker, FrameCounter, UnreadableError
 
 DAY_S = 86400.0
-_AGREE_S = 1.0
-"""Clocks that differ by more do not agree, so that the difference is no latency."""
-_LATENCIES = 200
+_MOST_BYTES = 65536
+_MOST_AT_ONCE = 10_000
+"""Datagrams; the rest waits in the system's queue, which holds some 0.2 MB or more."""
+_BUFFER_BYTES = 4 * 1024**2
 
 
 class DTrackSettings(Settings):
@@ -52,31 +53,17 @@ class DTrackSettings(Settings):
         return value
 
 
-class DTrackTracker(Tracker):
+class DTrackTracker(CountingTracker):
     """Listens on a port; what DTrack is to send is set up in DTrack. See ``armcal.devices.tracker.Tracker``."""
 
     Settings: ClassVar[type[DTrackSettings]] = DTrackSettings
     EXAMPLE: ClassVar[Mapping[str, Any]] = {"port": 0}
 
     def __init__(self, settings: DTrackSettings) -> None:
+        super().__init__()
         self._settings = settings
-        self._port: UdpPort | None = None
-        self._clock: Clock | None = None
-        self._refused: Counter[str] = Counter()
-        self._counter = FrameCounter()
-        self._latencies: deque[float] = deque(maxlen=_LATENCIES)
+        self._socket: socket.socket | None = None
         self._stamp: float | None = None
-
-    @property
-    @override
-    def refused(self) -> Mapping[str, int]:
-        """Bodies that were listed as seen and cannot be believed are counted as well."""
-        return dict(self._refused)
-
-    @property
-    def missing(self) -> int:
-        """How many frames never came, by their counter."""
-        return self._counter.missing
 
     @property
     def restarts(self) -> int:
@@ -84,70 +71,67 @@ class DTrackTracker(Tracker):
         return self._counter.restarts
 
     @property
-    def latency(self) -> float | None:
-        """From the moment to its arrival (s, median of late); None if the clocks differ too much to tell. Not used."""
-        if not self._latencies:
-            return None
-        found = statistics.median(self._latencies)
-        return found if abs(found) < _AGREE_S else None
-
-    @property
     def address(self) -> tuple[str, int]:
         """Host and port, once it is open."""
-        assert self._port is not None
-        return self._port.address
+        assert self._socket is not None
+        host, port, *_ = self._socket.getsockname()
+        return str(host), int(port)
 
     @override
     def open(self, clock: Clock) -> None:
         self.close()
         s = self._settings
-        self._port = UdpPort(s.host, s.port, s.group, s.sender)
-        self._clock = clock
+        try:
+            opened = bound(s.host, s.port)
+            try:
+                opened.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER_BYTES)
+                if s.group is not None:
+                    member = socket.inet_aton(s.group) + socket.inet_aton("0.0.0.0" if s.host == s.group else s.host)
+                    opened.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, member)
+            except OSError:
+                opened.close()
+                raise
+        except (OSError, InputError) as fault:
+            raise DeviceRefusedError(
+                f"the port cannot be opened ({fault}).",
+                where=Location(f"udp:{s.host}:{s.port}"),
+                hint="Is another program listening there? Give a free port, and an address of this machine.",
+            ) from fault
+        self._socket, self._clock = opened, clock
         self._counter, self._stamp = FrameCounter(), None
-        self._latencies.clear()
 
     @override
     def frames(self) -> list[TrackerFrame]:
         """Call it every few seconds at least: what the system cannot hold is lost, and ``missing``."""
         tracker_frames: list[TrackerFrame] = []
-        if self._port is None or self._clock is None:
+        if self._socket is None or self._clock is None:
             return tracker_frames
-        now, wall = self._clock.now(), self._clock.wall()
-        for data in self._port.datagrams():
-            if data is None:
-                self._refused["a datagram from another sender"] += 1
+        now = self._clock.now()
+        for _ in range(_MOST_AT_ONCE):
+            try:
+                data, sender = self._socket.recvfrom(_MOST_BYTES)
+            except OSError:  # nothing is left, or the network is gone for now: both are silence
+                break
+            try:
+                if self._settings.sender not in (None, sender[0]):
+                    raise UnreadableError("a datagram from another sender")
+                frames = messages(data)
+            except UnreadableError as fault:
+                self._refused[str(fault)] += 1
                 continue
-            tracker_frames += self._read(data, now, wall)
+            for frame in frames:
+                if not self._accepts(frame):
+                    continue
+                if frame.stamp is not None:
+                    # on a clock that does not fall back at midnight (s, from the midnight before the first frame)
+                    before = frame.stamp if self._stamp is None else self._stamp
+                    self._stamp = frame.stamp + DAY_S * round((before - frame.stamp) / DAY_S)
+                stamp = None if frame.stamp is None else self._stamp
+                tracker_frames.append(TrackerFrame(frame.counter, now, stamp, frame.bodies))
         return tracker_frames
 
     @override
     def close(self) -> None:
-        if self._port is not None:
-            self._port.close()
-        self._port = None
-
-    def _read(self, data: bytes, now: float, wall: float) -> list[TrackerFrame]:
-        try:
-            frames = messages(data)
-        except UnreadableError as fault:
-            self._refused[str(fault)] += 1
-            return []
-        tracker_frames = []
-        for message in frames:
-            passed_over = self._counter.fault(message.counter)
-            if passed_over:
-                self._refused[passed_over] += 1
-                continue
-            self._refused.update(message.wrong)
-            tracker_frames.append(TrackerFrame(message.counter, now, self._stamped(message, wall), message.bodies))
-        return tracker_frames
-
-    def _stamped(self, message: Message, wall: float) -> float | None:
-        """The moment on a clock that does not fall back at midnight (s, from the midnight before the first frame)."""
-        of_day = message.of_day
-        if of_day is None:
-            return None
-        self._latencies.append((wall - of_day + DAY_S / 2) % DAY_S - DAY_S / 2)
-        before = of_day if self._stamp is None else self._stamp
-        self._stamp = of_day + DAY_S * round((before - of_day) / DAY_S)
-        return self._stamp
+        if self._socket is not None:
+            self._socket.close()
+        self._socket = None

@@ -13,8 +13,7 @@ from armcal.base.units import from_unit, split_suffix
 from armcal.errors import DataError, Location
 from armcal.io.cells import DELIMITERS, read_cell, split
 
-from armcal_tracker.body_pose import body_pose
-from armcal_tracker.unreadable import UnreadableError
+from armcal_tracker.frames import Frame, UnreadableError, body_pose
 
 ONLY_BODY = "tool"
 """What a body is called whose columns have no name before them."""
@@ -26,10 +25,10 @@ _MOST_FRAMES = 2**63
 
 @dataclass(frozen=True)
 class BodyColumns:
-    """Where a body stands in a row: places of x, y, z with their units, and of a quaternion, if it has one."""
+    """Where a body stands in a row: places of x, y, z with their units, and of a quaternion; empty if it has none."""
 
     position: tuple[tuple[int, str], ...]
-    quaternion: tuple[int, ...] | None
+    quaternion: tuple[int, ...]
 
 
 @dataclass(frozen=True)
@@ -41,16 +40,6 @@ class FrameTable:
     frame: int
     time: tuple[int, str] | None
     bodies: Mapping[str, BodyColumns]
-
-
-@dataclass(frozen=True)
-class Row:
-    """A frame: its number, its time where it has one (s), its bodies, and why some of them are not believed."""
-
-    counter: int
-    stamp: float | None
-    bodies: Mapping[str, Array | None]
-    wrong: tuple[str, ...]
 
 
 def frame_table(line: str, source: str) -> FrameTable:
@@ -72,14 +61,20 @@ def frame_table(line: str, source: str) -> FrameTable:
     if frame is None:
         _refuse(source, f"found no column frame among {_shown(cells)}.", "Give each frame its number, one higher each.")
     time = next(((places[name], unit) for name, unit in _TIMES.items() if name in places), None)
-    bodies = {name: _body(name, units, places, source) for name, units in _positions(cells).items()}
+    positions: dict[str, dict[str, str]] = {}
+    for cell in cells:
+        unit = split_suffix(cell, "length")
+        if unit is not None and unit[0].rpartition("_")[2] in ("x", "y", "z"):
+            name, _, axis = unit[0].rpartition("_")
+            positions.setdefault(name or ONLY_BODY, {}).setdefault(axis, cell)
+    bodies = {name: _body(name, columns, places, source) for name, columns in positions.items()}
     if not bodies:
         hint = "Name them after the body, with their unit: tool_x_mm, tool_y_mm, tool_z_mm."
         _refuse(source, f"found no column of positions among {_shown(cells)}.", hint)
     return FrameTable(tuple(cells), delimiter, frame, time, bodies)
 
 
-def row_of(table: FrameTable, line: bytes) -> Row | None:
+def row_of(table: FrameTable, line: bytes) -> Frame | None:
     """The frame in a line; None for the header, written again.
 
     Raises:
@@ -97,26 +92,19 @@ def row_of(table: FrameTable, line: bytes) -> Row | None:
     if not 0 <= counter < _MOST_FRAMES or counter != int(counter):
         raise UnreadableError("a frame that is no whole number")
     stamp = math.nan if table.time is None else from_unit(_number(cells[table.time[0]]), table.time[1])
-    found: dict[str, Array | None] = {}
+    bodies: dict[str, Array | None] = {}
     wrong: list[str] = []
     for name, columns in table.bodies.items():
-        pose = _pose(columns, cells)
-        if isinstance(pose, str):
-            wrong.append(pose)
-            pose = None
-        found[name] = pose
-    return Row(int(counter), None if math.isnan(stamp) else stamp, found, tuple(wrong))
-
-
-def _positions(cells: Sequence[str]) -> dict[str, dict[str, str]]:
-    """By body: the column of each axis with its unit."""
-    found: dict[str, dict[str, str]] = {}
-    for cell in cells:
-        unit = split_suffix(cell, "length")
-        if unit is not None and unit[0].rpartition("_")[2] in ("x", "y", "z"):
-            name, _, axis = unit[0].rpartition("_")
-            found.setdefault(name, {}).setdefault(axis, cell)
-    return {name or ONLY_BODY: columns for name, columns in found.items()}
+        position = [from_unit(_number(cells[i]), unit) for i, unit in columns.position]
+        turn = [_number(cells[i]) for i in columns.quaternion]
+        bodies[name] = None
+        if not any(map(math.isnan, position)):
+            pose = body_pose(position, None if not turn or any(map(math.isnan, turn)) else turn)
+            if isinstance(pose, str):
+                wrong.append(pose)
+            else:
+                bodies[name] = pose
+    return Frame(int(counter), None if math.isnan(stamp) else stamp, bodies, tuple(wrong))
 
 
 def _body(name: str, columns: Mapping[str, str], places: Mapping[str, int], source: str) -> BodyColumns:
@@ -132,23 +120,15 @@ def _body(name: str, columns: Mapping[str, str], places: Mapping[str, int], sour
     if len(quaternion) not in (0, 4):
         hint = f"Give {stem}qw, {stem}qx, {stem}qy and {stem}qz, or none."
         _refuse(source, f"found {len(quaternion)} columns of the quaternion of {name}.", hint)
-    return BodyColumns(position, quaternion or None)
-
-
-def _pose(columns: BodyColumns, cells: Sequence[str]) -> Array | str | None:
-    position = [from_unit(_number(cells[i]), unit) for i, unit in columns.position]
-    if any(map(math.isnan, position)):
-        return None
-    turn = None if columns.quaternion is None else [_number(cells[i]) for i in columns.quaternion]
-    return body_pose(position, None if turn is None or any(map(math.isnan, turn)) else turn)
+    return BodyColumns(position, quaternion)
 
 
 def _number(cell: str) -> float:
     """NaN where it is missing."""
-    found = read_cell(cell)
-    if not isinstance(found, float) or math.isinf(found):
+    number = read_cell(cell)
+    if not isinstance(number, float) or math.isinf(number):
         raise UnreadableError("a cell that is no number")
-    return found
+    return number
 
 
 def _shown(cells: Sequence[str]) -> str:

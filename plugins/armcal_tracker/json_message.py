@@ -10,15 +10,12 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any, NoReturn
 
 from armcal.base.domains import Array
 from armcal.base.units import from_unit
 
-from armcal_tracker.body_pose import body_pose
-from armcal_tracker.unreadable import UnreadableError
+from armcal_tracker.frames import Frame, UnreadableError, body_pose
 
 MOST_BODIES = 100
 LONGEST_NAME = 100
@@ -27,45 +24,14 @@ _MOST_DIGITS = 20
 _POSITIONS = {"p_m": "m", "p_mm": "mm"}
 
 
-@dataclass(frozen=True)
-class JsonFrame:
-    """A frame: its number, its time where it says so (s), its bodies, and why some that it lists are not believed."""
-
-    counter: int
-    stamp: float | None
-    bodies: Mapping[str, Array | None]
-    wrong: tuple[str, ...]
-
-
-def json_frame(line: bytes) -> JsonFrame:
+def json_frame(line: bytes) -> Frame:
     """The frame in a line.
 
     Raises:
         UnreadableError: it is none.
     """
-    content = _parsed(line)
-    if not isinstance(content, dict) or not {"frame", "bodies"} <= set(content) <= {"frame", "t", "bodies"}:
-        raise UnreadableError("not an object with frame, bodies, and perhaps t")
-    counter, bodies = content["frame"], content["bodies"]
-    if type(counter) is not int or not 0 <= counter < _MOST_FRAMES:
-        raise UnreadableError("a frame that is no whole number")
-    if not isinstance(bodies, dict) or len(bodies) > MOST_BODIES or max(map(len, bodies), default=0) > LONGEST_NAME:
-        raise UnreadableError("bodies that are no object of bodies by name")
-    stamp = None if content.get("t") is None else _numbers([content["t"]], 1)[0]
-    found: dict[str, Array | None] = {}
-    wrong: list[str] = []
-    for name, body in bodies.items():
-        pose = None if body is None else _pose(body)
-        if isinstance(pose, str):
-            wrong.append(pose)
-            pose = None
-        found[name] = pose
-    return JsonFrame(counter, stamp, found, tuple(wrong))
-
-
-def _parsed(line: bytes) -> Any:
     try:
-        return json.loads(
+        content = json.loads(
             line.decode("utf-8"), parse_constant=_not_finite, parse_int=_integer, object_pairs_hook=_without_repeats
         )
     except UnreadableError:
@@ -74,6 +40,17 @@ def _parsed(line: bytes) -> Any:
         raise UnreadableError("not UTF-8 text") from None
     except (ValueError, RecursionError):
         raise UnreadableError("not JSON") from None
+    if not isinstance(content, dict) or not {"frame", "bodies"} <= set(content) <= {"frame", "t", "bodies"}:
+        raise UnreadableError("not an object with frame, bodies, and perhaps t")
+    counter, bodies = content["frame"], content["bodies"]
+    if type(counter) is not int or not 0 <= counter < _MOST_FRAMES:
+        raise UnreadableError("a frame that is no whole number")
+    if not isinstance(bodies, dict) or len(bodies) > MOST_BODIES or max(map(len, bodies), default=0) > LONGEST_NAME:
+        raise UnreadableError("bodies that are no object of bodies by name")
+    stamp = None if content.get("t") is None else _numbers([content["t"]], 1)[0]
+    poses = {name: None if body is None else _pose(body) for name, body in bodies.items()}
+    wrong = tuple(pose for pose in poses.values() if isinstance(pose, str))
+    return Frame(counter, stamp, {n: None if isinstance(pose, str) else pose for n, pose in poses.items()}, wrong)
 
 
 def _pose(body: Any) -> Array | str:
@@ -87,10 +64,10 @@ def _pose(body: Any) -> Array | str:
 def _numbers(values: Any, count: int) -> list[float]:
     if not isinstance(values, list) or len(values) != count or any(type(x) not in (int, float) for x in values):
         raise UnreadableError("a time, position or quaternion that is not so many numbers as it has")
-    found = [float(x) for x in values]
-    if not all(map(math.isfinite, found)):
+    numbers = [float(x) for x in values]
+    if not all(map(math.isfinite, numbers)):
         raise UnreadableError("a number that is not finite")
-    return found
+    return numbers
 
 
 def _integer(text: str) -> int:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Literal, Protocol
+from typing import ClassVar, Literal
 
 import numpy as np
 from armcal.base.domains import Array
 from armcal.base.settings import Settings
 from scipy.spatial.transform import Rotation
+from typing_extensions import override
 
 QUATERNION = ("qw", "qx", "qy", "qz")
 TURNS = ("turn1", "turn2", "turn3")
@@ -17,28 +18,31 @@ _OTHER = {"xyzw": "wxyz", "wxyz": "xyzw"}
 _Nine = tuple[str, str, str, str, str, str, str, str, str]
 
 
-class Orientation(Protocol):
+class Orientation(Settings):
     """How a file gives base_T_body's rotation.
 
     Values are numbers of all records, one row each, in the order of ``mapped``.
     """
 
-    @property
-    def kind(self) -> str:
-        """What one of them is called."""
+    kind: ClassVar[str]
+    """What one of them is called."""
 
     @property
     def declared(self) -> str:
         """What the file is said to hold."""
+        raise NotImplementedError
 
     def mapped(self) -> Mapping[str, str]:
         """The file's own column of each local name."""
+        raise NotImplementedError
 
     def size(self, values: Array) -> Array:
         """How large each is (N); zero for none at all."""
+        return np.ones(len(values))
 
     def fault(self, values: Array) -> Array:
         """How far each is from a rotation or a reflection (N)."""
+        return np.zeros(len(values))
 
     def rotations(self, values: Array) -> Rotation:
         """Of each record.
@@ -46,44 +50,44 @@ class Orientation(Protocol):
         Raises:
             ValueError: a value is none.
         """
+        raise NotImplementedError
 
     def others(self, values: Array) -> Mapping[str, Rotation]:
         """What the columns would be if they meant something else."""
+        raise NotImplementedError
 
 
-class QuaternionColumns(Settings):
+class QuaternionColumns(Orientation):
     """The four columns of a quaternion, as they stand in the file, and in which order its parts stand in them."""
 
+    kind = "quaternion"
     columns: tuple[str, str, str, str]
     order: Literal["xyzw", "wxyz"]
 
     @property
-    def kind(self) -> str:
-        """See ``Orientation``, as below."""
-        return "quaternion"
-
-    @property
+    @override
     def declared(self) -> str:
-        """The order."""
         return f"order: {self.order}"
 
+    @override
     def mapped(self) -> dict[str, str]:
         """Channels w, x, y, z, whatever the order in the file."""
         own = dict(zip(self.order, self.columns, strict=True))
         return {name: own[name[1]] for name in QUATERNION}
 
+    @override
     def size(self, values: Array) -> Array:
-        """The length."""
         return np.asarray(np.linalg.norm(values, axis=1))
 
+    @override
     def fault(self, values: Array) -> Array:
-        """The length's distance from one."""
         return np.abs(self.size(values) - 1)
 
+    @override
     def rotations(self, values: Array) -> Rotation:
-        """Of quaternions of any length but zero."""
         return Rotation.from_quat(values[:, [1, 2, 3, 0]])
 
+    @override
     def others(self, values: Array) -> dict[str, Rotation]:
         """The other order; it is the inverse between two fixed rotations, so no turn tells one from the other."""
         other = _OTHER[self.order]
@@ -92,76 +96,68 @@ class QuaternionColumns(Settings):
         return {f"order: {other}, or as body_T_base,": exchanged}
 
 
-class RotationColumns(Settings):
+class RotationColumns(Orientation):
     """The nine columns of a rotation matrix, row by row."""
 
+    kind = "rotation matrix"
     columns: _Nine
 
     @property
-    def kind(self) -> str:
-        """See ``Orientation``, as below."""
-        return "rotation matrix"
-
-    @property
+    @override
     def declared(self) -> str:
-        """Row by row."""
         return "the matrix row by row"
 
+    @override
     def mapped(self) -> dict[str, str]:
-        """r11, r12, ... r33."""
         return dict(zip(MATRIX, self.columns, strict=True))
 
+    @override
     def size(self, values: Array) -> Array:
         """The largest entry."""
         return np.asarray(np.abs(values).max(axis=1))
 
+    @override
     def fault(self, values: Array) -> Array:
         """The largest entry of R^T R - I."""
         matrices = values.reshape(-1, 3, 3)
         squares = np.swapaxes(matrices, 1, 2) @ matrices
         return np.asarray(np.abs(squares - np.eye(3)).max(axis=(1, 2)))
 
+    @override
     def rotations(self, values: Array) -> Rotation:
         """The nearest ones."""
         return Rotation.from_matrix(values.reshape(-1, 3, 3))
 
+    @override
     def others(self, values: Array) -> dict[str, Rotation]:
         """Column by column, which is the inverse as well."""
         return {"it column by column, that is as body_T_base,": self.rotations(values).inv()}
 
 
-class AnglesColumns(Settings):
-    """The three columns of roll, pitch and yaw: R = Rz(yaw) Ry(pitch) Rx(roll), turns about fixed axes."""
+class AnglesColumns(Orientation):
+    """The three columns of roll, pitch and yaw: R = Rz(yaw) Ry(pitch) Rx(roll), turns about fixed axes.
 
+    Any three angles are a rotation, three zeros too.
+    """
+
+    kind = "triple of roll, pitch and yaw"
     columns: tuple[str, str, str]
     unit: Literal["deg", "rad"]
 
     @property
-    def kind(self) -> str:
-        """See ``Orientation``, as below."""
-        return "triple of roll, pitch and yaw"
-
-    @property
+    @override
     def declared(self) -> str:
-        """The order."""
         return f"R = Rz(yaw) Ry(pitch) Rx(roll) in {self.unit}"
 
+    @override
     def mapped(self) -> dict[str, str]:
-        """turn1 to turn3, in the order of the columns."""
         return dict(zip(TURNS, self.columns, strict=True))
 
-    def size(self, values: Array) -> Array:
-        """One: three zeros are a rotation too."""
-        return np.ones(len(values))
-
-    def fault(self, values: Array) -> Array:
-        """None: any three angles are a rotation."""
-        return np.zeros(len(values))
-
+    @override
     def rotations(self, values: Array) -> Rotation:
-        """About the fixed axes x, y, z, in this order."""
         return Rotation.from_euler("xyz", values, degrees=self.unit == "deg")
 
+    @override
     def others(self, values: Array) -> dict[str, Rotation]:
         """Turns about the axes that turned before, and the other unit."""
         degrees = self.unit == "deg"
@@ -175,20 +171,18 @@ class AnglesColumns(Settings):
 class VectorColumns(AnglesColumns):
     """The three columns of a rotation vector: its direction is the axis, its length the angle."""
 
-    @property
-    def kind(self) -> str:
-        """See ``Orientation``, as below."""
-        return "rotation vector"
+    kind = "rotation vector"
 
     @property
+    @override
     def declared(self) -> str:
-        """What it is."""
         return f"the rotation vector of base_T_body in {self.unit}"
 
+    @override
     def rotations(self, values: Array) -> Rotation:
-        """By the exponential map."""
         return Rotation.from_rotvec(values, degrees=self.unit == "deg")
 
+    @override
     def others(self, values: Array) -> dict[str, Rotation]:
         """The inverse, and the other unit."""
         degrees = self.unit == "deg"

@@ -21,5 +21,7 @@ def armcal_register_readers(register: Register) -> None:
 def armcal_register_trackers(register: Register) -> None:
     """Announce the live trackers."""
     register("dtrack", "armcal_tracker.dtrack:DTrackTracker", "DTrack's ASCII output over UDP")
-    register("json_lines", "armcal_tracker.json_lines:JsonLinesTracker", "a JSON object a line: UDP, or a growing file")
-    register("csv", "armcal_tracker.growing_csv:GrowingCsvTracker", "a table of frames in a growing file")
+    register(
+        "json_lines", "armcal_tracker.line_trackers:JsonLinesTracker", "a JSON object a line: UDP, or a growing file"
+    )
+    register("csv", "armcal_tracker.line_trackers:GrowingCsvTracker", "a table of frames in a growing file")

@@ -6,7 +6,10 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, ClassVar, NoReturn
 
+import casadi as ca
 import numpy as np
+from armcal.arm.assembly import Arm
+from armcal.arm.model import forward
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.base.units import DIMENSIONLESS
@@ -15,6 +18,7 @@ from armcal.measure.checks import Layout, require_records
 from armcal.measure.layout import set_aside, warned
 from armcal.measure.reader import ReadRequest, RequestedChannel
 from pydantic import model_validator
+from scipy.spatial.transform import Rotation
 
 from armcal_tracker.csv_reader import CsvReader, CsvSettings
 from armcal_tracker.orientation import (
@@ -26,7 +30,6 @@ from armcal_tracker.orientation import (
     VectorColumns,
     reflections,
 )
-from armcal_tracker.rotation_match import misfit, nominal_rotations
 
 TOLERANCE = 1e-3
 """How far a quaternion's length may be from one, or an entry of R^T R from the identity's."""
@@ -35,6 +38,11 @@ WORSE = 3.0
 WORST_DEG = 5.0
 """What the columns are said to mean is refused if it fits the arm worse than this, and so much worse than another."""
 _ZERO = 1e-6
+FEWEST = 6
+_STRIDES = (1, 2, 3, 5, 7, 11, 17)
+_MOST_PAIRS = 4000
+_LARGEST_TURN_RAD = 2.6
+"""Beyond it a rotation vector may jump to the other end of its axis."""
 
 
 class PoseCsvSettings(CsvSettings):
@@ -89,21 +97,29 @@ class PoseCsvReader:
         s, instance = self._settings, self._instance(request)
         mapped = {f"{instance}.{name}": own for name, own in self._orientation.mapped().items()}
         reader = CsvReader(CsvSettings(path=s.path, columns={**s.columns, **mapped}, delimiter=s.delimiter))
-        dataset = reader.read(replace(request, wanted=_wanted(request, instance, tuple(mapped))))
+        # the file's numbers in place of the quaternion; they cannot be absent
+        quaternion = {f"{instance}.{name}" for name in QUATERNION}
+        rest = [channel for channel in request.wanted if channel.channel not in quaternion]
+        own = [RequestedChannel(name, (name,), DIMENSIONLESS, True, parts=(instance,)) for name in mapped]
+        dataset = reader.read(replace(request, wanted=(*rest, *own)))
         dataset = self._without_faulty(dataset, tuple(mapped))
         values = dataset.stacked(tuple(mapped)).T
         made = np.flatnonzero(~np.isnan(values).any(axis=1))
-        self._refuse_reflections(dataset, values, made)
+        mirrored = reflections(values[made])
+        if mirrored.size:
+            text = f"found {mirrored.size} of {len(made)} rotation matrices that are reflections (determinant -1)."
+            hint = "Check the order and signs of the columns, and that the frames are right-handed."
+            self._refuse(text, hint, dataset.rows[made[mirrored[0]]])
         self._refuse_other_meaning(dataset.subset(made), request, instance, values[made])
         return self._with_quaternions(dataset, instance, values, made)
 
     def _instance(self, request: ReadRequest) -> str:
         reading = [name for name, m in request.measurements.items() if {c.name for c in m.channels()} >= {*QUATERNION}]
-        text = self._settings.measurement
-        if text in reading or (text is None and len(reading) == 1):
-            return text or reading[0]
+        named = self._settings.measurement
+        if named in reading or (named is None and len(reading) == 1):
+            return named or reading[0]
         self._refuse(
-            f"found {', '.join(reading) or 'no measurement'} to read orientations, expected {text or 'one'}.",
+            f"found {', '.join(reading) or 'no measurement'} to read orientations, expected {named or 'one'}.",
             "Add a measurement tip_pose, or set measurement: NAME in the data section.",
         )
 
@@ -124,13 +140,6 @@ class PoseCsvReader:
             set_aside(dataset, Layout(by_line=True), faulty, f"the {kind} is none", "Measure these again.")
         )
 
-    def _refuse_reflections(self, dataset: Dataset, values: Array, made: Array) -> None:
-        mirrored = reflections(values[made])
-        if mirrored.size:
-            text = f"found {mirrored.size} of {len(made)} rotation matrices that are reflections (determinant -1)."
-            hint = "Check the order and signs of the columns, and that the frames are right-handed."
-            self._refuse(text, hint, dataset.rows[made[mirrored[0]]])
-
     def _refuse_other_meaning(self, dataset: Dataset, request: ReadRequest, instance: str, values: Array) -> None:
         """Refuse orientations that turn unlike the nominal arm, where another reading of the columns turns like it."""
         arm = request.arms.get(request.measurements[instance].arms[0])
@@ -149,13 +158,13 @@ class PoseCsvReader:
 
     def _with_quaternions(self, dataset: Dataset, instance: str, values: Array, made: Array) -> Dataset:
         """Unit quaternions, of a sign that does not jump back and forth for nothing."""
-        found = np.full((len(dataset), 4), np.nan)
-        found[made] = self._orientation.rotations(values[made]).as_quat()[:, [3, 0, 1, 2]]
-        negative = found[:, 0] < 0
-        found[negative] *= -1
+        quaternions = np.full((len(dataset), 4), np.nan)
+        quaternions[made] = self._orientation.rotations(values[made]).as_quat()[:, [3, 0, 1, 2]]
+        negative = quaternions[:, 0] < 0
+        quaternions[negative] *= -1
         given = {f"{instance}.{name}" for name in self._orientation.mapped()}
         channels = {name: numbers for name, numbers in dataset.channels.items() if name not in given}
-        channels |= {f"{instance}.{name}": found[:, i] for i, name in enumerate(QUATERNION)}
+        channels |= {f"{instance}.{name}": quaternions[:, i] for i, name in enumerate(QUATERNION)}
         dataset = replace(dataset, channels=channels)
         if self._settings.quaternion is None or not negative.any():
             return dataset
@@ -168,8 +177,37 @@ class PoseCsvReader:
         raise DataError(message, where=Location(str(self._settings.path), line=line), hint=hint)
 
 
-def _wanted(request: ReadRequest, instance: str, channels: tuple[str, ...]) -> tuple[RequestedChannel, ...]:
-    """The request with the file's numbers in place of the quaternion; they cannot be absent."""
-    quaternion = {f"{instance}.{name}" for name in QUATERNION}
-    rest = tuple(w for w in request.wanted if w.channel not in quaternion)
-    return (*rest, *(RequestedChannel(name, (name,), DIMENSIONLESS, True, parts=(instance,)) for name in channels))
+def nominal_rotations(arm: Arm, dataset: Dataset) -> Rotation:
+    """base_T_tool's rotation of the nominal arm in each record, without its effects."""
+    commands = ca.SX.sym("commands", len(arm.commanded))
+    joint_commands = arm.joint_commands([commands[i] for i in range(commands.numel())])
+    displacements = [joint.offset + joint_commands[i] for i, joint in enumerate(arm.nominal_chain.joints)]
+    rotation = forward(arm.nominal_chain, displacements, {}).base_T_tool.rotation
+    function = ca.Function("rotation", [commands], [ca.densify(ca.vec(rotation.T))])
+    rows = np.asarray(function(dataset.stacked([f"{arm.name}.{joint}" for joint in arm.commanded])))
+    return Rotation.from_matrix(rows.T.reshape(-1, 3, 3))
+
+
+def misfit(measured: Rotation, nominal: Rotation) -> float:
+    """How far measured turns between records are from the nominal ones (rad, the median of pairs of records).
+
+    Turns from record to record, seen from the body, are the nominal ones seen from the tool: both sets of rotation
+    vectors differ by one rotation, which is found first. [Park1994] Angles alone would not do: they stay the same
+    when a quaternion's components are exchanged, and when all rotations are inverted.
+    """
+    index = np.arange(len(nominal))
+    pairs = [(index[:-stride], index[stride:]) for stride in _STRIDES if stride < len(nominal)]
+    if not pairs:
+        return 0.0
+    first, second = (np.concatenate(ends) for ends in zip(*pairs, strict=True))
+    step = max(1, len(first) // _MOST_PAIRS)
+    first, second = first[::step], second[::step]
+    turned = (nominal[first].inv() * nominal[second]).as_rotvec()
+    seen = (measured[first].inv() * measured[second]).as_rotvec()
+    usable = np.linalg.norm(turned, axis=1) < _LARGEST_TURN_RAD
+    turned, seen = turned[usable], seen[usable]
+    if len(turned) < FEWEST:
+        return 0.0
+    left, _, right = np.linalg.svd(turned.T @ seen)
+    tool_T_body = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
+    return float(np.median(np.linalg.norm(turned @ tool_T_body - seen, axis=1)))

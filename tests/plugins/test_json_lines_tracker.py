@@ -13,10 +13,9 @@ from armcal.devices.clock import RealClock
 from armcal.devices.faults import DeviceRefusedError
 from armcal.errors import DataError
 from armcal_tracker.frame_table import frame_table, row_of
-from armcal_tracker.growing_csv import GrowingCsvSettings, GrowingCsvTracker
-from armcal_tracker.json_lines import JsonLinesSettings, JsonLinesTracker
+from armcal_tracker.frames import UnreadableError
 from armcal_tracker.json_message import json_frame
-from armcal_tracker.unreadable import UnreadableError
+from armcal_tracker.line_trackers import GrowingCsvSettings, GrowingCsvTracker, JsonLinesSettings, JsonLinesTracker
 from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 

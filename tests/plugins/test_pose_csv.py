@@ -9,8 +9,7 @@ from armcal.errors import DataError
 from armcal.measure.reader import ReadRequest, requested_channels
 from armcal_mdh.model import MdhModel, MdhSettings
 from armcal_tracker.pose import TipPose, TipPoseSettings
-from armcal_tracker.pose_csv_reader import PoseCsvReader, PoseCsvSettings
-from armcal_tracker.rotation_match import misfit, nominal_rotations
+from armcal_tracker.pose_csv_reader import PoseCsvReader, PoseCsvSettings, misfit, nominal_rotations
 from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 

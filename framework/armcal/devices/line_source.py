@@ -25,7 +25,7 @@ KINDS = f"- (standard input), {UDP_KINDS}, or a file that another program writes
 Begin = Literal["start", "end"]
 """From where a file is read: ``end`` passes over what was in it before."""
 
-_LONGEST_LINE = 64 * 1024
+LONGEST_LINE_BYTES = 64 * 1024
 _CHUNK = 1 << 20
 _MOST_AT_ONCE = 16
 """Chunks, or thousands of datagrams, that are taken at once; the rest waits."""
@@ -100,7 +100,7 @@ class PipeLines(LineSource):
 
     def __init__(self, descriptor: int, *, owned: bool) -> None:
         self._descriptor, self._owned = descriptor, owned
-        self._cutter = LineCutter(_LONGEST_LINE)
+        self._cutter = LineCutter(LONGEST_LINE_BYTES)
         self._open = True
 
     @property
@@ -110,7 +110,7 @@ class PipeLines(LineSource):
 
     @override
     def lines(self) -> list[bytes | None]:
-        found: list[bytes | None] = []
+        lines: list[bytes | None] = []
         for _ in range(_MOST_AT_ONCE):
             if not self._open or not select.select([self._descriptor], [], [], 0)[0]:
                 break
@@ -122,10 +122,10 @@ class PipeLines(LineSource):
                 data = b""
             # A pipe with a name has an end whenever nobody writes; the next writer may come.
             self._open = bool(data) or self._owned
-            found += self._cutter.feed(data)
+            lines += self._cutter.feed(data)
             if not data:
                 break
-        return found
+        return lines
 
     @override
     def close(self) -> None:
@@ -160,16 +160,16 @@ class UdpLines(LineSource):
 
     @override
     def lines(self) -> list[bytes | None]:
-        found: list[bytes | None] = []
+        lines: list[bytes | None] = []
         for _ in range(1000 * _MOST_AT_ONCE if self._open else 0):
             try:
-                data, _, flags, sender = self._socket.recvmsg(_LONGEST_LINE)
+                data, _, flags, sender = self._socket.recvmsg(LONGEST_LINE_BYTES)
             except OSError:  # nothing is left, or the network is gone for now: both are silence
                 break
             if not self._is_ours(sender[0]):
                 continue
-            found += [None] if flags & socket.MSG_TRUNC else data.split(b"\n")
-        return found
+            lines += [None] if flags & socket.MSG_TRUNC else data.split(b"\n")
+        return lines
 
     @override
     def close(self) -> None:
@@ -178,53 +178,58 @@ class UdpLines(LineSource):
 
 
 class FileLines(LineSource):
-    """Lines of a file that grows; one that was cut or replaced is read from its start."""
+    """Lines of a file that grows. One that was cut or replaced is read from its start, in a call of its own.
+
+    Attributes:
+        header: the first line at the time of opening; None if it was not whole.
+        renewed: how often the file was cut or replaced.
+    """
 
     ended = False
 
     def __init__(self, path: Path, begin: Begin) -> None:
         self._path = path
-        self._cutter = LineCutter(_LONGEST_LINE)
+        self._cutter, self._position, self.renewed = LineCutter(LONGEST_LINE_BYTES), 0, 0
         self._file = path.open("rb", buffering=0)
-        self._position = self._after_last_line() if begin == "end" else 0
+        first, ended, _ = os.pread(self._file.fileno(), LONGEST_LINE_BYTES, 0).partition(b"\n")
+        self.header = first.removesuffix(b"\r") if ended else None
+        if begin == "end":
+            size = os.fstat(self._file.fileno()).st_size
+            start = max(0, size - LONGEST_LINE_BYTES)
+            self._position = start + os.pread(self._file.fileno(), size - start, start).rfind(b"\n") + 1
 
     @override
     def lines(self) -> list[bytes | None]:
-        found: list[bytes | None] = []
+        lines: list[bytes | None] = []
+        begun = self._position
         try:
-            self._look()
             for _ in range(_MOST_AT_ONCE):
                 data = os.pread(self._file.fileno(), _CHUNK, self._position)
-                self._position += len(data)
-                found += self._cutter.feed(data)
-                if not data:
+                # what another file holds never follows the rest of this one in the same call
+                if not data and (self._position > begun or not self._turned()):
                     break
+                self._position += len(data)
+                lines += self._cutter.feed(data)
         except (OSError, ValueError):  # gone for now, or closed
-            return found
-        return found
+            return lines
+        return lines
 
     @override
     def close(self) -> None:
         self._file.close()
 
-    def _look(self) -> None:
-        """Begin anew if the file is another one, or shorter than it was."""
-        known = os.fstat(self._file.fileno())
-        try:
-            there = self._path.stat()
-        except OSError:
-            there = known
-        is_another = (there.st_dev, there.st_ino) != (known.st_dev, known.st_ino)
-        if is_another:
+    def _turned(self) -> bool:
+        """Begin anew if the path leads to another file, or to one that is shorter than it was."""
+        known, there = os.fstat(self._file.fileno()), self._path.stat()
+        if (there.st_dev, there.st_ino) != (known.st_dev, known.st_ino):
+            fresh = self._path.open("rb", buffering=0)
             self._file.close()
-            self._file = self._path.open("rb", buffering=0)
-        if is_another or there.st_size < self._position:
-            self._position, self._cutter = 0, LineCutter(_LONGEST_LINE)
-
-    def _after_last_line(self) -> int:
-        size = os.fstat(self._file.fileno()).st_size
-        start = max(0, size - _LONGEST_LINE)
-        return start + os.pread(self._file.fileno(), size - start, start).rfind(b"\n") + 1
+            self._file = fresh
+        elif there.st_size >= self._position:
+            return False
+        self._position, self._cutter = 0, LineCutter(LONGEST_LINE_BYTES)
+        self.renewed += 1
+        return True
 
 
 def _refusal(name: str, why: str) -> DeviceRefusedError:

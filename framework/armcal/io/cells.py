@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import csv
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
+from armcal.base.domains import Array
 from armcal.base.units import UNITS
 
 MISSING = frozenset({"", "na", "n/a", "nan", "null", "none"})
@@ -34,6 +38,17 @@ def is_number(text: str) -> bool:
     except ValueError:
         return False
     return True
+
+
+def plain_numbers(cells: Sequence[str]) -> Array | None:
+    """Cells as numbers, all at once; None where one is empty or holds none, as ``is_number`` has it."""
+    joined = "".join(cells)
+    if not joined.isascii() or "_" in joined:
+        return None
+    try:
+        return np.array(cells, dtype=np.float64)
+    except ValueError:
+        return None
 
 
 def is_missing(text: str) -> bool:
