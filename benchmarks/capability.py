@@ -10,8 +10,8 @@ from armcal.config.yaml_source import load_config
 from armcal_capability.loading import load_task
 from armcal_capability.mechanics import MechanicsFunction
 from armcal_capability.quantities import Postures, Weights, postures_at
-from armcal_capability.sampling import spread
 from armcal_capability.settings import LoadSettings
+from armcal_capability.survey import spread
 
 from benchmarks import lrm, lrm_numpy
 from benchmarks.report import Row

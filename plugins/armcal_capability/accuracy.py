@@ -10,6 +10,7 @@ from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.calibration.calibration import Calibration
 from armcal.calibration.compensation.equilibrium import Equilibrium
+from armcal.calibration.tool_expression import ToolExpression
 from armcal.functions.batch_function import EvaluatorChoice
 from armcal.measure.contact import ArmsAlone
 from armcal.measure.measurement import residual_dimensions
@@ -41,7 +42,7 @@ def unexplained(calibration: Calibration) -> Unexplained | None:
     declared = [m.noise() for m in calibration.readable.values() if residual_dimensions(m) == _POSITION]
     if not declared:
         return None
-    instrument = float(np.sqrt(np.mean([np.sum(np.square(each)) for each in declared])))
+    instrument = float(np.sqrt(np.mean([np.sum(np.square(noises)) for noises in declared])))
     left = float(noise["scale"]) * instrument
     if noise.get("components"):
         # The scale is then of the estimated noise, which may hold all that is left.
@@ -51,37 +52,35 @@ def unexplained(calibration: Calibration) -> Unexplained | None:
 
 
 def with_accuracy(postures: Postures, subject: Subject, choice: EvaluatorChoice) -> Postures:
-    """With the expected errors of the tool's position (mm, root mean square) that can be told.
+    """With the expected errors of the tool's position (mm, root mean square) that are known.
 
     ``expected_mm`` takes together what is not known of the parameters, half a step of each servo at random, and what
     the calibration's records leave beyond the instrument's noise.
     """
     parts: dict[str, Array] = {}
-    calibration = subject.calibration
+    calibration, servos = subject.calibration, subject.expression.servos
     if calibration is not None and calibration.record.prediction is not None:
         parts["known_to_mm"] = _known_to(calibration, postures.commands, choice) * _MM
-    if subject.expression.servos:
-        parts["quantisation_mm"] = _quantisation(subject, postures) * _MM
+    if servos:
+        # the count nearest to the command is anywhere within half a step of it alike: a step over root 12 (mm^2)
+        square = np.zeros(len(postures))
+        for row, joint in enumerate(subject.expression.joints):
+            if joint in servos:
+                steps = steps_at(*servos[joint], postures.commands[row])
+                square += (steps * postures.levers[row]) ** 2 / 12
+        parts["quantisation_mm"] = np.sqrt(square) * _MM
     more = dict(parts)
     if "known_to_mm" in parts and calibration is not None:
-        beyond = _beyond(calibration, subject, parts.get("quantisation_mm"))
-        more["expected_mm"] = np.sqrt(sum(np.square(part) for part in parts.values()) + beyond)
+        left = unexplained(calibration)
+        beyond = 0.0 if left is None else (left.of_the_arm * _MM) ** 2
+        # Where the model did not know of the servos' steps, what they did is in what is left: not to be counted twice.
+        if "quantisation_mm" in parts and not any(isinstance(e, SteppedEffect) for e in subject.arm.effects.values()):
+            beyond -= float(np.mean(np.square(parts["quantisation_mm"])))
+        more["expected_mm"] = np.sqrt(sum(np.square(part) for part in parts.values()) + max(beyond, 0.0))
     if subject.nominal is not None:
-        more["nominal_mm"] = _nominal(subject, postures.commands, choice) * _MM
+        tools = [_tools(expression, postures.commands, choice) for expression in (subject.expression, subject.nominal)]
+        more["nominal_mm"] = np.linalg.norm(tools[0] - tools[1], axis=1) * _MM
     return postures.with_values(more)
-
-
-def _beyond(calibration: Calibration, subject: Subject, steps: Array | None) -> float:
-    """What the records leave beyond the instrument's noise (mm^2).
-
-    Where the model did not know of the servos' steps, what they did is among it, and not to be counted twice.
-    """
-    left = unexplained(calibration)
-    if left is None:
-        return 0.0
-    known = any(isinstance(effect, SteppedEffect) for effect in subject.arm.effects.values())
-    counted = 0.0 if known or steps is None else float(np.mean(np.square(steps)))
-    return max((left.of_the_arm * _MM) ** 2 - counted, 0.0)
 
 
 def steps_at(table: PulseTable, clock: PulseClock, commands: Array) -> Array:
@@ -92,32 +91,12 @@ def steps_at(table: PulseTable, clock: PulseClock, commands: Array) -> Array:
     return np.asarray(slopes[interval] * clock.tick)
 
 
-def _quantisation(subject: Subject, postures: Postures) -> Array:
-    """Of counts nearest to the command, anywhere between them alike: a step over root 12 for each servo (N; m)."""
-    square = np.zeros(len(postures))
-    for row, joint in enumerate(subject.expression.joints):
-        if joint in subject.expression.servos:
-            steps = steps_at(*subject.expression.servos[joint], postures.commands[row])
-            square += (steps * postures.levers[row]) ** 2 / 12
-    return np.sqrt(square)
-
-
-def _nominal(subject: Subject, commands: Array, choice: EvaluatorChoice) -> Array:
-    """From the nominal model's tool to the calibrated one's, under the arm's own weight (N; m)."""
-    if subject.nominal is None:
-        raise TypeError("a configured arm has no other nominal model")
-    tools = [
-        _tools(Equilibrium(tool_expression, choice), tool_expression.defaults, commands)
-        for tool_expression in (subject.expression, subject.nominal)
-    ]
-    return np.asarray(np.linalg.norm(tools[0] - tools[1], axis=1))
-
-
-def _tools(equilibrium: Equilibrium, defaults: Array, commands: Array) -> Array:
-    parts = []
+def _tools(expression: ToolExpression, commands: Array, choice: EvaluatorChoice) -> Array:
+    """Where the tool is under the arm's own weight (N x 3; m)."""
+    equilibrium, parts = Equilibrium(expression, choice), []
     for start in range(0, max(commands.shape[1], 1), AT_ONCE):
         chunk = commands[:, start : start + AT_ONCE]
-        record = np.repeat(defaults[:, None], chunk.shape[1], axis=1)
+        record = np.repeat(expression.defaults[:, None], chunk.shape[1], axis=1)
         record[: len(commands)] = chunk
         parts.append(equilibrium(record).base_T_tool[:, :3, 3])
     return np.concatenate(parts)

@@ -24,7 +24,7 @@ class AreaMap:
     Attributes:
         centres: of its cells (cells x 3; m, base frame).
         counts: postures found that bring the tool to the centre (cells).
-        held: whether in one of them no servo is asked for more than it holds (cells); None where that is not stated.
+        held: whether in one of them no servo carries more than it holds (cells); None where that is not stated.
         values: by quantity: best, mean and worst of the postures (3 x cells; not a number where there is none).
     """
 
@@ -66,10 +66,19 @@ class AreaSearch:
     sampled: Postures
 
     def __call__(self, area: AreaSettings, size: float, ways: int) -> AreaMap:
-        """What is found in an area cut into cells of ``size`` (m), in so many ``ways`` of reaching each at most."""
+        """An area cut into cells of ``size`` (m), with at most so many postures (``ways``) found for each."""
+        from scipy.spatial import cKDTree
+
         centres = cells_of(area, size)
         pointing = Pointing.of(area.tool) if area.tool is not None else None
-        starts = self._starts(centres, ways, pointing)
+        # start from the sampled postures nearest to each centre, rad counted as metres by the length
+        where, targets = self.sampled.positions, centres
+        if pointing is not None:
+            away = np.maximum(pointing.angles(self.sampled.rotations) - pointing.within, 0.0) * self.weights.length
+            where = np.column_stack([where, away])
+            targets = np.column_stack([centres, np.zeros(len(centres))])
+        nearest = cKDTree(where).query(targets, k=min(ways, len(where)))[1].reshape(-1)
+        starts = np.asarray(self.sampled.commands[:, nearest])
         cell = np.repeat(np.arange(len(centres)), starts.shape[1] // len(centres))
         arrivals = reach_for(self.function, centres[cell].T, starts, self.limits, self.weights.length, pointing)
         good = np.flatnonzero(arrivals.arrived)
@@ -81,15 +90,3 @@ class AreaSearch:
         if "effort_ratio" in values:
             held = np.asarray(np.nan_to_num(values["effort_ratio"][0], nan=np.inf) <= 1)
         return AreaMap(centres, counts, held, values)
-
-    def _starts(self, centres: Array, ways: int, pointing: Pointing | None) -> Array:
-        """The sampled postures nearest to each centre (joints x cells * ways), rad counted as metres by the length."""
-        from scipy.spatial import cKDTree
-
-        where, wanted = self.sampled.positions, centres
-        if pointing is not None:
-            away = np.maximum(pointing.angles(self.sampled.rotations) - pointing.within, 0.0) * self.weights.length
-            where = np.column_stack([where, away])
-            wanted = np.column_stack([centres, np.zeros(len(centres))])
-        places = cKDTree(where).query(wanted, k=min(ways, len(where)))[1].reshape(-1)
-        return np.asarray(self.sampled.commands[:, places])

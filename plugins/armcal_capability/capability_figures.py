@@ -19,7 +19,7 @@ _MM = 1000.0
 _INK, _GRID, _LIMIT, _ARM = "#222222", "#dddddd", "#555555", "#d95f02"
 _GOOD_LOW, _GOOD_HIGH, _COUNTS = "cividis_r", "cividis", "Greys"
 _DESIGN_COLOURS = ("#000000", "#e69f00", "#56b4e9", "#009e73", "#d55e00", "#cc79a7", "#0072b2", "#f0e442")
-"""Told apart with any colour vision."""
+"""Distinct with any colour vision."""
 _NAMES = "xyz"
 DRAWN = (
     "sag_mm",
@@ -81,8 +81,13 @@ def _figure(
         mesh = _map(axis, survey.voxels, cells, section, how)
         _limits(axis, survey.voxels, section)
         _areas(axis, settings.areas, section)
-        _arm(axis, survey.outline, section)
-        _label(axis, section, survey.voxels.size)
+        points = survey.outline[:, [section.across, section.up]] * _MM
+        axis.plot(points[:, 0], points[:, 1], "-o", color="white", lw=3.6, ms=5.5, zorder=5)
+        axis.plot(points[:, 0], points[:, 1], "-o", color=_ARM, lw=2.0, ms=3.5, zorder=6)
+        axis.plot(points[-1, 0], points[-1, 1], "s", color=_ARM, mec="white", ms=6, zorder=6)
+        where = f"{_NAMES[section.cut]} = {section.at * _MM:.0f} mm ± {survey.voxels.size * _MM:.0f} mm"
+        axis.set_title(f"section at {where}", fontsize=9.5, color=_INK)
+        _plain_axes(axis, section)
     bar = figure.colorbar(mesh, ax=list(axes), shrink=0.85, pad=0.02, extend="max" if "vmax" in how else "neither")
     bar.set_label(label, fontsize=9.5, color=_INK)
     bar.ax.tick_params(labelsize=8.5, colors=_INK)
@@ -114,11 +119,11 @@ def designs_figure(surveys: Mapping[str, Survey], tables: Mapping[str, Any], set
 
 def _bars(axes: Any, tables: Mapping[str, Any], areas: Sequence[str]) -> None:
     width = 0.8 / max(len(tables), 1)
-    for row, (each, colour) in enumerate(zip(tables.values(), _colours(len(tables)), strict=True)):
+    for row, (by_area, colour) in enumerate(zip(tables.values(), _colours(len(tables)), strict=True)):
         at = np.arange(len(areas)) + (row - (len(tables) - 1) / 2) * width
-        reached = [100 * each[area]["reached"] for area in areas]
+        reached = [100 * by_area[area]["reached"] for area in areas]
         axes.bar(at, reached, width * 0.92, color=colour, alpha=0.35, lw=0)
-        held = [None if each[area]["held"] is None else 100 * each[area]["held"] for area in areas]
+        held = [None if by_area[area]["held"] is None else 100 * by_area[area]["held"] for area in areas]
         if all(h is not None for h in held):
             axes.bar(at, held, width * 0.92, color=colour, lw=0)
         for x, height in zip(at, reached, strict=True):
@@ -175,19 +180,6 @@ def _areas(axes: Any, areas: Mapping[str, AreaSettings], section: _Section) -> N
         axes.annotate(
             name, (low[0], high[1]), xytext=(1, 3), textcoords="offset points", fontsize=8.5, bbox=halo, zorder=8
         )
-
-
-def _arm(axes: Any, outline: Array, section: _Section) -> None:
-    points = outline[:, [section.across, section.up]] * _MM
-    axes.plot(points[:, 0], points[:, 1], "-o", color="white", lw=3.6, ms=5.5, zorder=5)
-    axes.plot(points[:, 0], points[:, 1], "-o", color=_ARM, lw=2.0, ms=3.5, zorder=6)
-    axes.plot(points[-1, 0], points[-1, 1], "s", color=_ARM, mec="white", ms=6, zorder=6)
-
-
-def _label(axes: Any, section: _Section, size: float) -> None:
-    where = f"{_NAMES[section.cut]} = {section.at * _MM:.0f} mm ± {size * _MM:.0f} mm"
-    axes.set_title(f"section at {where}", fontsize=9.5, color=_INK)
-    _plain_axes(axes, section)
 
 
 def _plain_axes(axes: Any, section: _Section) -> None:

@@ -31,7 +31,7 @@ class Picture:
 
 
 def conclusions(name: str, summary: Mapping[str, Any], designs: Mapping[str, Any]) -> list[str]:
-    """What a survey says, in sentences."""
+    """The findings of a survey, in sentences."""
     reach, postures, cells = summary["reach"], summary["postures"], summary["cells"]
     texts = [
         f"{name} reaches {reach['volume_litres']:.1f} litres, in {count(reach['cells'])} cells of "

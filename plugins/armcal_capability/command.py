@@ -24,7 +24,7 @@ from armcal_capability.loading import Task, load_task
 from armcal_capability.quantities import BY_NAME
 from armcal_capability.summary import design_summaries, summary_of
 from armcal_capability.survey import Survey, survey
-from armcal_capability.tables import Table, area_table, design_table, quantity_table
+from armcal_capability.tables import area_table, design_table, quantity_table
 
 _DATA = ("map.csv", "map.npz", "areas.csv", "designs.csv", "capability.json", "capability.html")
 _FIGURES = ("reach.png", "designs.png", *(f"{name}.png" for name in BY_NAME))
@@ -49,25 +49,34 @@ def capability(console: Console, source: Path, out: Path, settings: Path | None,
     task = load_task(source, settings, overrides, registry)
     with console.progress() as progress:
         with watch.stage("survey"):
-            found = survey(task.subject, task.settings, progress)
+            surveyed = survey(task.subject, task.settings, progress)
         designs: dict[str, Survey] = {}
         with watch.stage("designs"):
             for name, subject in task.designs.items():
                 designs[name] = survey(subject, task.settings, partial(_of_design, progress, name))
-    content = {"source": str(source), **summary_of(found, task.settings)}
+    content = {"source": str(source), **summary_of(surveyed, task.settings)}
     compared = design_summaries(designs)
     content["designs"] = {n: {**summary_of(d, task.settings), "areas": compared[n]} for n, d in designs.items()}
     with watch.stage("figures"):
-        pictures = _pictures(task, found, designs, content)
-    tables = _tables(content)
-    sentences = conclusions(task.subject.name, content, _by_design(content))
+        pictures = _pictures(task, surveyed, designs, compared)
+    tables = [quantity_table(content)]
+    if any(compared.values()):
+        tables.insert(0, design_table(compared))
+    elif content["areas"]:
+        tables.insert(0, area_table(content["areas"]))
+    sentences = conclusions(task.subject.name, content, compared)
     facts = {"command": command_line(), "files": ", ".join(sorted({str(file) for file in task.files}))}
     facts |= {"samples": str(task.settings.samples), "seed": str(task.settings.seed)}
     page = render_capability(task.subject.name, sentences, tables, pictures, facts)
-    _write(kept, found, designs, content, page, pictures)
+    _write(kept, surveyed, designs, content, page, pictures)
     console.result({**content, "folder": str(out)})
     for table in tables:
-        console.out.print(_screen(table))
+        on_screen = ScreenTable(title=table.caption, title_justify="left", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+        for words, number in table.headings:
+            on_screen.add_column(words, justify="right" if number else "left")
+        for row in table.rows:
+            on_screen.add_row(*row)
+        console.out.print(on_screen)
     for text in sentences:
         console.out.print(text, markup=False, soft_wrap=True)
     for stage, seconds in watch.seconds.items():
@@ -79,62 +88,42 @@ def _of_design(progress: Any, name: str, _: str, fraction: float) -> None:
     progress(name, fraction)
 
 
-def _by_design(content: Mapping[str, Any]) -> dict[str, Any]:
-    return {name: each["areas"] for name, each in content["designs"].items()}
-
-
-def _tables(content: Mapping[str, Any]) -> list[Table]:
-    made = []
-    if any(_by_design(content).values()):
-        made.append(design_table(_by_design(content)))
-    elif content["areas"]:
-        made.append(area_table(content["areas"]))
-    return [*made, quantity_table(content)]
-
-
 def _pictures(
-    task: Task, found: Survey, designs: Mapping[str, Survey], content: Mapping[str, Any]
+    task: Task, surveyed: Survey, designs: Mapping[str, Survey], compared: Mapping[str, Mapping[str, Any]]
 ) -> tuple[Picture, ...]:
-    made = []
+    pictures = []
     if designs:
         said = "Left: how far each design's tool comes, seen from the side. Right: how much of each area it reaches."
-        made.append(Picture("designs", "Designs", designs_figure(designs, _by_design(content), task.settings), said))
+        pictures.append(Picture("designs", "Designs", designs_figure(designs, compared, task.settings), said))
     said = "Two sections through the workspace; the darker, the more postures of the sample bring the tool there."
-    made.append(Picture("reach", "Reach", reach_figure(found, task.settings), said))
+    pictures.append(Picture("reach", "Reach", reach_figure(surveyed, task.settings), said))
     for name in DRAWN:
-        if name in found.voxels.values:
+        if name in surveyed.voxels.values:
             quantity = BY_NAME[name]
             dark = "the darker, the more" if quantity.good == "low" else "the darker, the less"
             said = f"Two sections through the workspace: {quantity.words}; {dark}. Mean over the postures of each cell."
             title = quantity.words[0].upper() + quantity.words[1:]
-            made.append(Picture(name, title, quantity_figure(found, task.settings, name), said))
-    return tuple(made)
+            pictures.append(Picture(name, title, quantity_figure(surveyed, task.settings, name), said))
+    return tuple(pictures)
 
 
 def _write(
     kept: Reservation,
-    found: Survey,
+    surveyed: Survey,
     designs: Mapping[str, Survey],
     content: Mapping[str, Any],
     page: str,
     pictures: tuple[Picture, ...],
 ) -> None:
-    columns = outputs.map_columns(found)
+    columns = outputs.map_columns(surveyed)
     texts: dict[str, str | bytes] = {f"{picture.name}.png": picture.png for picture in pictures}
     texts |= {"map.npz": outputs.npz_bytes(columns), "map.csv": outputs.csv_text(columns)}
-    if found.areas:
-        texts["areas.csv"] = outputs.areas_text(designs or {found.subject.name: found})
+    if surveyed.areas:
+        texts["areas.csv"] = outputs.areas_text(designs or {surveyed.subject.name: surveyed})
     if designs:
-        texts["designs.csv"] = outputs.table_text(*outputs.design_rows(_by_design(content)))
+        texts["designs.csv"] = outputs.table_text(
+            *outputs.design_rows({name: design["areas"] for name, design in content["designs"].items()})
+        )
     texts["capability.json"] = as_json(content) + "\n"
     texts["capability.html"] = page
     kept.place(texts)
-
-
-def _screen(table: Table) -> ScreenTable:
-    made = ScreenTable(title=table.caption, title_justify="left", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
-    for words, number in table.headings:
-        made.add_column(words, justify="right" if number else "left")
-    for row in table.rows:
-        made.add_row(*row)
-    return made

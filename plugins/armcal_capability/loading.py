@@ -7,22 +7,21 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from armcal.arm.joints import unknown_joint
-from armcal.arm.servo import PulseClock, PulseTable
 from armcal.base.settings import Settings
 from armcal.calibration.calibration import Calibration
 from armcal.config.servo_file import load_servo_file
 from armcal.config.validate import validate
 from armcal.config.yaml_nodes import Node, Origin
-from armcal.config.yaml_source import ConfigSource, Reader, as_source, load_config
-from armcal.config.yaml_tree import override
+from armcal.config.yaml_source import ConfigSource, Reader, as_source, load_config, root_of
+from armcal.config.yaml_tree import entries_of, override, set_at, steps_of
 from armcal.errors import ConfigError, Location
 from armcal.plugins import PluginRegistry, discover
 from pydantic import Field
 
-from armcal_capability.designs import SECTION, load_designs
 from armcal_capability.settings import CapabilitySettings
 from armcal_capability.subject import Corrections, Subject, of_calibration, of_config
 
+SECTION = "capability"
 _RULES = (SECTION, "plan")
 
 
@@ -37,7 +36,7 @@ class Task:
     Attributes:
         settings: how.
         subject: the arm as it is.
-        designs: others, by name; none where no designs are asked for.
+        designs: others, by name; none where no designs are listed.
         files: that were read, for provenance.
     """
 
@@ -65,32 +64,68 @@ def load_task(
         config = _nothing_but(overrides, path)
     else:
         config = load_config(path, overrides)
-    settings = _settings(config)
+    part = replace(config, data={key: value for key, value in config.data.items() if key == SECTION})
+    settings = validate(_CapabilityPart, part).capability
+    corrections: Corrections | None = None
     if is_calibration:
         subject = of_calibration(Calibration.load(path, registry), config, path.name)
-        corrections: Corrections | None = Corrections.read(path, config, registry)
+        corrections = Corrections.read(path, config, registry)
     else:
         base = _with_rules(load_config(path) if rules else config, config)
-        corrections = _corrections(settings, base, registry)
+        if settings.values is not None:
+            described = base if settings.values_of is None else load_config(settings.values_of)
+            corrections = Corrections.read(settings.values, described, registry)
         subject = of_config(base, registry, path.name, corrections)
     designs = {}
-    if settings.designs:
-        _require_arms(config)
-        for name, source in load_designs(config.path, overrides).items():
-            designs[name] = replace(_design(name, _with_rules(source, config), registry, corrections), name=name)
+    if settings.designs and "arms" not in config.data:
+        raise ConfigError(
+            "it lists designs and describes no arm.",
+            where=Location(str(config.path)),
+            hint="Write extends: ARM.yaml in it, with the arm that the designs are of.",
+        )
+    for name, source in load_designs(config.path, overrides).items() if settings.designs else ():
+        try:
+            designs[name] = of_config(_with_rules(source, config), registry, name, corrections)
+        except ConfigError as fault:
+            raise ConfigError(f"design {name!r}: {fault.message}", where=fault.where, hint=fault.hint) from fault
     return Task(settings, _with_servos(subject, settings), designs, (path, *given.files, *config.files))
 
 
-def _design(name: str, source: ConfigSource, registry: PluginRegistry, corrections: Corrections | None) -> Subject:
-    try:
-        return of_config(source, registry, name, corrections)
-    except ConfigError as fault:
-        raise ConfigError(f"design {name!r}: {fault.message}", where=fault.where, hint=fault.hint) from fault
+def load_designs(path: str | Path, overrides: Sequence[str] = ()) -> dict[str, ConfigSource]:
+    """The designs that ``capability.designs`` of a configuration lists, each a whole configuration.
 
+    A design is a mapping of dotted names to values (``{arms.arm.model.base.4.ry_deg: 45}``), as after ``--set``.
 
-def _settings(source: ConfigSource) -> CapabilitySettings:
-    part = replace(source, data={key: value for key, value in source.data.items() if key == SECTION})
-    return validate(_CapabilityPart, part).capability
+    Raises:
+        ConfigError: a name leads nowhere, with its place.
+    """
+    path = Path(path)
+    reader = Reader(root_of(path, None))
+    tree = reader.tree(path, ())
+    for text in overrides:
+        tree = override(tree, text)
+    section = entries_of(tree).get(SECTION)
+    listed = entries_of(section).get("designs") if section else None
+    designs = {}
+    for name, node in entries_of(listed).items() if listed else ():
+        at, design = (SECTION, "designs", str(name)), tree
+        if not (isinstance(node.value, dict) or node.value is None):
+            raise ConfigError(
+                f"found {str(node.value)[:60]!r} for a design, expected names with values.",
+                where=node.origin.at(node.line, at),
+                hint="Write for example {arms.arm.model.rows.1.d_mm: 10}, or {} for the arm as it is.",
+            )
+        for key, value in entries_of(node).items():
+            steps = steps_of(str(key))
+            if steps is None or steps[0] == SECTION or steps[0] not in entries_of(tree):
+                raise ConfigError(
+                    f"found {str(key)!r}, expected the dotted name of a value of the arm.",
+                    where=value.origin.at(value.line, at),
+                    hint="Write for example arms.arm.model.rows.1.d_mm: 10; entries of a list count from 0.",
+                )
+            design = set_at(design, steps, replace(value, origin=replace(value.origin, prefix=steps)))
+        designs[str(name)] = as_source(design, path, reader)
+    return designs
 
 
 def _with_rules(source: ConfigSource, config_source: ConfigSource) -> ConfigSource:
@@ -101,27 +136,11 @@ def _with_rules(source: ConfigSource, config_source: ConfigSource) -> ConfigSour
 
 
 def _nothing_but(overrides: Sequence[str], path: Path) -> ConfigSource:
-    """What is said on the command line alone."""
+    """What the command line sets, alone."""
     tree = Node(Origin(str(path), path.parent, path.parent.resolve()), 1, {})
     for text in overrides:
         tree = override(tree, text)
     return as_source(tree, path, Reader(path.parent.resolve()))
-
-
-def _corrections(settings: CapabilitySettings, base: ConfigSource, registry: PluginRegistry) -> Corrections | None:
-    if settings.values is None:
-        return None
-    described = base if settings.values_of is None else load_config(settings.values_of)
-    return Corrections.read(settings.values, described, registry)
-
-
-def _require_arms(source: ConfigSource) -> None:
-    if "arms" not in source.data:
-        raise ConfigError(
-            "it lists designs and describes no arm.",
-            where=Location(str(source.path)),
-            hint="Write extends: ARM.yaml in it, with the arm that the designs are of.",
-        )
 
 
 def _with_servos(subject: Subject, settings: CapabilitySettings) -> Subject:
@@ -131,9 +150,6 @@ def _with_servos(subject: Subject, settings: CapabilitySettings) -> Subject:
     file = load_servo_file(settings.servos)
     if fault := unknown_joint(file.servos, subject.arm.commanded):
         raise ConfigError(f"{fault}.", where=Location(str(settings.servos)))
-    calibrated_servos = {joint: file.calibrated(joint) for joint in file.servos}
-    servos = {
-        j: (PulseTable(s.angles, s.pulses), PulseClock(s.oscillator_hz, s.prescale))
-        for j, s in calibrated_servos.items()
-    }
+    calibrated = {joint: file.calibrated(joint) for joint in file.servos}
+    servos = {joint: (servo.table, servo.clock) for joint, servo in calibrated.items()}
     return replace(subject, expression=replace(subject.expression, servos=servos))

@@ -58,7 +58,8 @@ class MechanicsFunction:
         self._record = expression.defaults.copy()
         for channel, stated in (("payload", load.payload), ("payload_x", load.payload_com), (_FORCE, load.force)):
             if stated is not None:
-                self._set(channel, np.atleast_1d(stated))
+                start, values = self._place(channel), np.atleast_1d(stated)
+                self._record[start : start + len(values)] = values
         force = self._place(_FORCE)
         self.is_elastic = self._states > 0
         self.is_loaded = bool(self._record[self._place("payload")]) or bool(np.any(self._record[force : force + 3]))
@@ -106,10 +107,6 @@ class MechanicsFunction:
     def _place(self, channel: str) -> int:
         return self.expression.channels.index(channel)
 
-    def _set(self, channel: str, values: Array) -> None:
-        start = self._place(channel)
-        self._record[start : start + len(values)] = values
-
 
 def _function(expression: ToolExpression) -> ca.Function:
     """(record, state) -> pose, its slope by commands and by a force, efforts. [Griewank2008]"""
@@ -122,7 +119,7 @@ def _function(expression: ToolExpression) -> ca.Function:
     by_commands = by_record[:, :joints] + ca.mtimes(by_state, moved)
     by_force = ca.mtimes(by_state[9:, :], given)
     shown = [pose, ca.vec(ca.densify(_twists(pose, by_commands))), ca.vec(ca.densify(by_force)), expression.efforts]
-    return ca.Function("capability", [record, state], [ca.densify(each) for each in shown], {"cse": True})
+    return ca.Function("capability", [record, state], [ca.densify(output) for output in shown], {"cse": True})
 
 
 def _twists(pose: Expression, by_commands: Expression) -> Expression:

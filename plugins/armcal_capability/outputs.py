@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -42,7 +42,8 @@ def csv_text(columns: Mapping[str, Array], before: Mapping[str, str] | None = No
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow([*(before or {}), *columns])
-    writer.writerows(_rows(columns, tuple((before or {}).values())))
+    texts = [[_text(value) for value in np.asarray(column).tolist()] for column in columns.values()]
+    writer.writerows([*(before or {}).values(), *row] for row in zip(*texts, strict=True))
     return text.getvalue()
 
 
@@ -66,7 +67,7 @@ def table_text(headings: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
 
 
 def design_rows(designs: Mapping[str, Mapping[str, Any]]) -> tuple[list[str], list[list[Any]]]:
-    """Headings and rows of designs.csv: a row a design and area, every quantity with all that is told of it."""
+    """Headings and rows of designs.csv: a row a design and area, every quantity with all its statistics."""
     cells = [area for areas in designs.values() for area in areas.values()]
     names = list(dict.fromkeys(name for area in cells for name in area["quantities"]))
     keys = ("mean", "p95", "best_posture_mean", "best_posture_p95", "worst")
@@ -76,7 +77,7 @@ def design_rows(designs: Mapping[str, Mapping[str, Any]]) -> tuple[list[str], li
     for design, areas in designs.items():
         for name, area in areas.items():
             row = [design, name, *(_text(area[key]) for key in ("reached", "held", "postures_per_cell"))]
-            row += [_text(area["quantities"].get(each, {}).get(key)) for each in names for key in keys]
+            row += [_text(area["quantities"].get(quantity, {}).get(key)) for quantity in names for key in keys]
             rows.append(row)
     return headings, rows
 
@@ -94,16 +95,6 @@ def _centres(centres: Array) -> dict[str, Array]:
 
 def _statistics(values: Mapping[str, Array]) -> dict[str, Array]:
     return {f"{name}_{text}": rows[i] for name, rows in values.items() for i, text in enumerate(_STATISTICS)}
-
-
-def _rows(columns: Mapping[str, Array], before: tuple[str, ...]) -> Iterator[list[str]]:
-    texts = [_texts(np.asarray(column)) for column in columns.values()]
-    for row in zip(*texts, strict=True):
-        yield [*before, *row]
-
-
-def _texts(column: Array) -> list[str]:
-    return [_text(each) for each in column.tolist()]
 
 
 def _text(value: float | None) -> str:

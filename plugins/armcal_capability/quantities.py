@@ -1,8 +1,12 @@
-"""What is mapped: named numbers of each posture, with units and which end of them is good."""
+"""What is mapped: named numbers of each posture, with units and which end of them is good.
+
+How dexterous the arm is follows from the singular values of the tool's Jacobian. Joints count by rad, a metre of a
+sliding joint for ``1/length`` rad, and a turn of the tool for ``length`` metres a rad, so that they are metres a rad.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -11,12 +15,13 @@ from armcal.arm.clearance import Mask
 from armcal.base.domains import Array
 from numpy.typing import NDArray
 
-from armcal_capability.dexterity import dexterity, moves, singular_values, weighted
-from armcal_capability.mechanics import Mechanics, MechanicsFunction
+from armcal_capability.mechanics import MechanicsFunction
 
 _MM = 1000.0
 AT_ONCE = 16384
 """Postures in memory together."""
+_NOTHING = 1e-9
+"""Of the largest singular value: below it the arm has no such motion at all."""
 
 
 @dataclass(frozen=True)
@@ -112,55 +117,76 @@ class Weights:
     holding: Array
 
 
-def postures_at(
-    function: MechanicsFunction, commands: Array, weights: Weights, told: Callable[[float], None] = lambda _: None
-) -> Postures:
+def postures_at(function: MechanicsFunction, commands: Array, weights: Weights) -> Postures:
     """The postures at commands (joints x N) that have an equilibrium, with their mechanical quantities."""
-    count = commands.shape[1]
-    parts = []
-    for start in range(0, max(count, 1), AT_ONCE):
-        parts.append(_part(function, np.ascontiguousarray(commands[:, start : start + AT_ONCE]), weights))
-        told(min(1.0, (start + AT_ONCE) / max(count, 1)))
-    joined = _joined([part for part, _, _ in parts])
-    more: dict[str, Array] = {}
+    parts = [
+        _part(function, np.ascontiguousarray(commands[:, start : start + AT_ONCE]), weights)
+        for start in range(0, max(commands.shape[1], 1), AT_ONCE)
+    ]
+    postures = [part for part, _, _ in parts]
+    values = {name: np.concatenate([part.values[name] for part in postures]) for name in postures[0].values}
     for prefix, place in (("", 1), ("pose_", 2)):
         singular = np.concatenate([part[place] for part in parts])
-        found = dexterity(singular, moves(singular))
-        more |= {f"{prefix}{name}": found[name] for name in ("manipulability", "inverse_condition")}
-        more[f"{prefix}smallest_mm_per_rad"] = found["smallest"] * _MM
-    return joined.with_values(more)
+        measures = dexterity(singular, moves(singular))
+        values |= {f"{prefix}{name}": measures[name] for name in ("manipulability", "inverse_condition")}
+        values[f"{prefix}smallest_mm_per_rad"] = measures["smallest"] * _MM
+    return Postures(
+        np.concatenate([part.commands for part in postures], axis=1),
+        np.concatenate([part.positions for part in postures]),
+        np.concatenate([part.rotations for part in postures], axis=2),
+        np.concatenate([part.efforts for part in postures], axis=1),
+        values,
+        np.concatenate([part.levers for part in postures], axis=1),
+    )
 
 
 def _part(function: MechanicsFunction, commands: Array, weights: Weights) -> tuple[Postures, Array, Array]:
     """Some postures, and singular values of the position's and the pose's Jacobian."""
     mechanics = function(commands)
-    kept = mechanics.settled
-    values = _elastic(function, commands, mechanics) if function.is_elastic else {}
+    kept, values = mechanics.settled, {}
+    if function.is_elastic:
+        unloaded = function.without_load(commands, mechanics.states)
+        values["sag_mm"] = np.linalg.norm(unloaded - function.weightless(commands), axis=0) * _MM
+        if function.is_loaded:
+            values["deflection_mm"] = np.linalg.norm(mechanics.positions - unloaded, axis=0) * _MM
+        values["give_mm_per_N"] = singular_values(mechanics.compliances)[:, 0] * _MM
     if np.isfinite(weights.holding).any():
         values["effort_ratio"] = np.max(np.abs(mechanics.efforts) / weights.holding[:, None], axis=0)
     slopes = weighted(mechanics.slopes, weights.slides, weights.length)[kept]
     levers = np.linalg.norm(mechanics.slopes[:, :3], axis=1).T
-    postures = Postures(commands, mechanics.positions.T, mechanics.rotations, mechanics.efforts, values, levers).subset(
-        kept
-    )
+    positions, rotations, efforts = mechanics.positions.T, mechanics.rotations, mechanics.efforts
+    postures = Postures(commands, positions, rotations, efforts, values, levers).subset(kept)
     return postures, singular_values(slopes[:, :3]), singular_values(slopes)
 
 
-def _elastic(function: MechanicsFunction, commands: Array, mechanics: Mechanics) -> dict[str, Array]:
-    """What the springs give (mm, mm/N)."""
-    unloaded = function.without_load(commands, mechanics.states)
-    values = {"sag_mm": np.linalg.norm(unloaded - function.weightless(commands), axis=0) * _MM}
-    if function.is_loaded:
-        values["deflection_mm"] = np.linalg.norm(mechanics.positions - unloaded, axis=0) * _MM
-    return {**values, "give_mm_per_N": singular_values(mechanics.compliances)[:, 0] * _MM}
+def weighted(slopes: Array, slides: Mask, length: float) -> Array:
+    """Jacobians (N x 6 x n; m, then rad, by rad or m) in metres by rad; ``slides`` says which joints slide."""
+    rows = np.array([1.0] * 3 + [length] * 3)
+    columns = np.where(slides, length, 1.0)
+    return np.asarray(slopes * rows[:, None] * columns)
 
 
-def _joined(parts: Sequence[Postures]) -> Postures:
-    return Postures(
-        np.concatenate([part.commands for part in parts], axis=1),
-        np.concatenate([part.positions for part in parts]),
-        np.concatenate([part.rotations for part in parts], axis=2),
-        np.concatenate([part.efforts for part in parts], axis=1),
-        {name: np.concatenate([part.values[name] for part in parts]) for name in parts[0].values},
-        np.concatenate([part.levers for part in parts], axis=1),
-    )
+def singular_values(slopes: Array) -> Array:
+    """Of each Jacobian (N x m x n), the largest first (N x min(m, n))."""
+    rows, columns = slopes.shape[1:]
+    across = np.swapaxes(slopes, 1, 2)
+    square = slopes @ across if rows <= columns else across @ slopes
+    return np.asarray(np.sqrt(np.maximum(np.linalg.eigvalsh(square)[:, ::-1], 0.0)))
+
+
+def moves(values: Array) -> int:
+    """In how many directions the tool moves anywhere; an arm in a plane has no more than two."""
+    if not values.size:
+        return 0
+    return int(np.sum(values.max(axis=0) > _NOTHING * values.max()))
+
+
+def dexterity(values: Array, directions: int) -> Mapping[str, Array]:
+    """Of the first ``directions``: Yoshikawa's measure [Yoshikawa1985], smallest singular value, 1/condition (N each).
+
+    The condition itself has no mean: it is infinite at a singular posture.
+    """
+    used = values[:, : max(directions, 1)]
+    largest, smallest = used[:, 0], used[:, -1]
+    inverse = np.divide(smallest, largest, out=np.zeros(len(used)), where=largest > 0)
+    return {"manipulability": np.prod(used, axis=1), "smallest": smallest, "inverse_condition": inverse}

@@ -106,10 +106,10 @@ def of_config(
 
 @dataclass(frozen=True)
 class Corrections:
-    """How a real arm differs from its description: what was stated of it, and what was found."""
+    """How a real arm differs from its description: its stated parameters, and the corrected ones."""
 
     stated: Parameters
-    found: Parameters
+    corrected: Parameters
 
     @classmethod
     def read(cls, path: Path, described: ConfigSource, registry: PluginRegistry) -> Corrections:
@@ -130,7 +130,7 @@ class Corrections:
         """A design's parameters with the same differences from what the design states.
 
         Raises:
-            ConfigError: it shares no parameter with the arm that they were found of.
+            ConfigError: it shares no parameter with the corrected arm.
         """
         blocks = {}
         if not set(design.names) & set(self.stated.names):
@@ -139,7 +139,7 @@ class Corrections:
                 hint="Give a calibration, or values, of the same arm: its parameters must be called the same.",
             )
         for name in set(design.names) & set(self.stated.names):
-            own, before, after = design[name], self.stated[name], self.found[name]
+            own, before, after = design[name], self.stated[name], self.corrected[name]
             if own.nominal == before.nominal:
                 blocks[name] = replace(own, nominal=after.nominal)
             elif own.size == before.size:
@@ -160,24 +160,19 @@ def _only(system: System, name: str) -> Arm:
 
 
 def _rules(arm: Arm, system: System, source: ConfigSource | None, name: str) -> tuple[Array, ClearanceCheck | None]:
-    """Limits and clearance."""
+    """Limits (joints x 2), those that are stated or the model's own; and clearance."""
     settings, check = PlanSettings(), None
     if source is not None:
         part = replace(source, data={key: value for key, value in source.data.items() if key == "plan"})
         settings = validate(_PlanPart, part).plan or settings
         if settings.clearance is not None:
             check = clearance_check(settings.clearance, system.arms, source)
-    return _limits(arm, settings, name), check
-
-
-def _limits(arm: Arm, settings: PlanSettings, name: str) -> Array:
-    """Those that are stated, or the model's own."""
     stated = by_dimension(arm.commanded, settings.limits, settings.travel_limits, where=Location(name))
-    found = joint_limits(arm.nominal_chain, stated)
-    if missing := [joint for joint, limits in found.items() if limits is None]:
+    limits = joint_limits(arm.nominal_chain, stated)
+    if missing := [joint for joint, span in limits.items() if span is None]:
         raise ConfigError(
             f"found no limits for {', '.join(missing)}.",
             where=Location(name),
             hint="Give plan: {limits: {q1: [-100 deg, 100 deg], ...}}, in the configuration or by --settings FILE.",
         )
-    return np.array([list(limits) for limits in found.values() if limits is not None])
+    return np.array([list(span) for span in limits.values() if span is not None]), check

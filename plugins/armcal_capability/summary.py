@@ -43,30 +43,34 @@ def summary_of(survey: Survey, settings: CapabilitySettings) -> dict[str, Any]:
         "unexplained_mm": None
         if survey.unexplained is None
         else {"left": survey.unexplained.left * _MM, "instrument": survey.unexplained.instrument * _MM},
-        "cells": told(survey.voxels.values),
-        "joints_Nm": _joints(survey),
+        "cells": statistics_of(survey.voxels.values),
+        # the torque (N m; N on sliding joints) that each joint carries over all postures
+        "joints_Nm": {
+            name: {"median": float(np.median(row)), "p95": float(np.percentile(row, 95)), "most": float(row.max())}
+            for name, row in zip(survey.subject.arm.joint_names, np.abs(survey.postures.efforts), strict=True)
+        },
         "areas": {name: area_summary(area) for name, area in survey.areas.items()},
     }
 
 
-def told(values: Mapping[str, Array]) -> dict[str, dict[str, float | None]]:
+def statistics_of(values: Mapping[str, Array]) -> dict[str, dict[str, float | None]]:
     """Over cells: mean and 95 % of the cells' means over postures, the same of their best postures, and the worst.
 
     95 % is what all but a twentieth of the cells are better than.
     """
-    found: dict[str, dict[str, float | None]] = {}
+    statistics: dict[str, dict[str, float | None]] = {}
     for quantity in CATALOGUE:
         if quantity.name not in values:
             continue
         best, mean, worst = (row[np.isfinite(row)] for row in values[quantity.name])
-        found[quantity.name] = {
+        statistics[quantity.name] = {
             "mean": _number(np.mean, mean),
             "p95": _bad_end(quantity.name, mean),
             "best_posture_mean": _number(np.mean, best),
             "best_posture_p95": _bad_end(quantity.name, best),
             "worst": _number(np.max if quantity.good == "low" else np.min, worst),
         }
-    return found
+    return statistics
 
 
 def design_summaries(designs: Mapping[str, Survey]) -> dict[str, dict[str, Any]]:
@@ -88,16 +92,7 @@ def area_summary(area: AreaMap, among: Mask | None = None) -> dict[str, Any]:
         "reached": float(np.mean(area.reached)),
         "held": None if area.held is None else float(np.mean(area.held)),
         "postures_per_cell": float(np.mean(area.counts)),
-        "quantities": told({name: rows[:, chosen] for name, rows in area.values.items()}),
-    }
-
-
-def _joints(survey: Survey) -> dict[str, dict[str, float]]:
-    """The torque (N m; N on sliding joints) that each joint carries over all postures,."""
-    names, efforts = survey.subject.arm.joint_names, np.abs(survey.postures.efforts)
-    return {
-        name: {"median": float(np.median(row)), "p95": float(np.percentile(row, 95)), "most": float(row.max())}
-        for name, row in zip(names, efforts, strict=True)
+        "quantities": statistics_of({name: rows[:, chosen] for name, rows in area.values.items()}),
     }
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -17,13 +18,12 @@ from armcal_capability.accuracy import Unexplained, unexplained, with_accuracy
 from armcal_capability.areas import AreaMap, AreaSearch
 from armcal_capability.mechanics import MechanicsFunction
 from armcal_capability.quantities import Postures, Weights, postures_at
-from armcal_capability.sampling import spread
 from armcal_capability.settings import CapabilitySettings
 from armcal_capability.subject import Subject
 from armcal_capability.voxels import Voxels, voxels_of
 
 WORTH_COMPILING = 20_000
-"""From this many postures on, waiting for the compiler costs less than the virtual machine does."""
+"""From this many postures on, waiting for the compiler costs less than CasADi's interpreter does."""
 MOST_ACROSS = 2000
 """Cells of the map from side to side: a section through it is drawn as a grid of so many by so many."""
 MOST_IN_AREA = 500_000
@@ -99,11 +99,22 @@ def survey(subject: Subject, settings: CapabilitySettings, progress: Progress = 
     )
 
 
+def spread(limits: Array, count: int, seed: int) -> Array:
+    """So many commands (joints x count) between limits (joints x 2), by a scrambled Sobol sequence.
+
+    More of them begin with the same ones; the same seed gives the same.
+    """
+    from scipy.stats import qmc
+
+    drawn = qmc.Sobol(len(limits), rng=seed).random_base2(max(0, math.ceil(math.log2(count))))[:count]
+    return (limits[:, 0] + drawn * (limits[:, 1] - limits[:, 0])).T.copy()
+
+
 def outline(subject: Subject) -> Array:
     """Mount, joints and tool, at the middle of the limits (points x 3; m): rigid, nominal."""
     chain = subject.arm.nominal_chain
-    told = subject.arm.joint_commands(subject.limits.mean(axis=1).tolist())
-    frames = forward(chain, [joint.offset + ca.SX(told[i]) for i, joint in enumerate(chain.joints)], {})
+    commands = subject.arm.joint_commands(subject.limits.mean(axis=1).tolist())
+    frames = forward(chain, [joint.offset + ca.SX(commands[i]) for i, joint in enumerate(chain.joints)], {})
     points = [site.origin for site in frames.sites] + [frames.base_T_tool.translation]
     return np.array([np.asarray(ca.evalf(ca.densify(ca.SX(point))).full()).ravel() for point in points])
 

@@ -29,8 +29,11 @@ class Table:
 def quantity_table(summary: Mapping[str, Any]) -> Table:
     """Each quantity over all cells that are reached."""
     rows = tuple(
-        (_words(name), *(number(each[key]) for key in ("mean", "p95", "best_posture_mean", "worst")))
-        for name, each in summary["cells"].items()
+        (
+            ", ".join(filter(None, (BY_NAME[name].words, BY_NAME[name].unit))),
+            *(number(statistics[key]) for key in ("mean", "p95", "best_posture_mean", "worst")),
+        )
+        for name, statistics in summary["cells"].items()
     )
     caption = "Over all cells that are reached; 95 % of them are better than the second column"
     headings = ("Mean of postures", "95 %", "Best posture", "Worst")
@@ -60,7 +63,10 @@ def _of_areas(designs: Mapping[str, Mapping[str, Any]], caption: str) -> Table:
         for name, area in areas.items():
             row = [design] if named else []
             row += [name, share(area["reached"]), *([share(area["held"])] if held else [])]
-            row += [_pair(area["quantities"].get(text)) for text in shown]
+            for quantity in shown:
+                statistics = area["quantities"].get(quantity) or {"mean": None}
+                known = statistics["mean"] is not None
+                row.append(f"{number(statistics['mean'])} / {number(statistics['p95'])}" if known else "-")
             rows.append(tuple(row))
     words = (
         f"{caption}: the postures of a cell averaged; the mean cell, and what 95 % of them are better than. Sag: by "
@@ -79,14 +85,3 @@ def number(value: float | None) -> str:
 def share(value: float | None) -> str:
     """In per cent."""
     return "-" if value is None else f"{100 * value:.1f} %"
-
-
-def _pair(each: Mapping[str, float | None] | None) -> str:
-    if each is None or each["mean"] is None:
-        return "-"
-    return f"{number(each['mean'])} / {number(each['p95'])}"
-
-
-def _words(name: str) -> str:
-    quantity = BY_NAME[name]
-    return f"{quantity.words}, {quantity.unit}" if quantity.unit else quantity.words

@@ -100,14 +100,14 @@ class BallInSocket(OneArmContact):
         """Known distances, within each tool position."""
         if self.settings.sockets_of is not None:
             return ()
-        found = []
+        ties = []
         for known in self.settings.distances:
             for first in groups:
                 position, slash, socket = first.rpartition("/")
                 second = f"{position}{slash}{known.between[1]}"
                 if socket == known.between[0] and second in groups:
-                    found.append(Tie((first, second), _distance(known.distance), (known.noise,)))
-        return tuple(found)
+                    ties.append(Tie((first, second), _distance(known.distance), (known.noise,)))
+        return tuple(ties)
 
     def residual(self, arms: Mapping[str, ArmState], measured: Mapping[str, Any], values: Mapping[str, Any]) -> Any:
         """From the socket to the ball, in the base frame (3x1, m)."""

@@ -24,12 +24,12 @@ _UNITS = tuple(unit.name for dimension in ("angle", "length") for unit in units_
 
 
 class RefusedLine(ValueError):  # noqa: N818 (it is no error of a program's)
-    """A line that is passed over; its text says why, in few ways, so that reasons can be counted."""
+    """A line that is passed over; its text gives the reason, in few ways, so that reasons can be counted."""
 
 
 @dataclass(frozen=True)
 class JointMessage:
-    """What a line says: the source's own time (s), angles by channel (rad or m), texts."""
+    """A line as it was read: the source's own time (s), angles by channel (rad or m), texts."""
 
     stamp: float | None
     angles: Mapping[str, float]
@@ -71,14 +71,14 @@ class JointMessages:
             raise ValueError(f"two joints are called {doubled[0]!r}")
         back = {channel: joint for joint, channel in short.items()}
         self._names = {c: (own[c],) if c in own else tuple(n for n in (c, back.get(c)) if n) for c in channels}
-        self._numbered = {name.rstrip(_DIGITS) for every in self._names.values() for name in every} - {""}
+        self._numbered = {name.rstrip(_DIGITS) for own in self._names.values() for name in own} - {""}
         self._plans: dict[tuple[str, ...], dict[str, tuple[str, str]]] = {}
 
     def read(self, line: bytes | None) -> JointMessage:
         """One line; None for one that was too long.
 
         Raises:
-            RefusedLine: it says nothing of use.
+            RefusedLine: it holds no reading of the joints.
         """
         if line is None:
             raise RefusedLine("it is too long")
@@ -89,32 +89,33 @@ class JointMessages:
         if not isinstance(content, dict):
             raise RefusedLine("it is no JSON object")
         if self._values is not None:
-            angles, used = self._listed(content.get(self._values)), {self._values}
+            listed = content.get(self._values)
+            if not isinstance(listed, list):
+                raise RefusedLine(f"it has no list {self._values}")
+            if len(listed) != len(self._channels):
+                raise RefusedLine(f"it has {len(listed)} joints, expected {len(self._channels)}")
+            pairs, unit = zip(self._channels, listed, strict=True), self._unit or "rad"
+            angles, used = {c: from_unit(_number(value, c), unit) for c, value in pairs}, {self._values}
         elif isinstance(content.get("name"), list) and "position" in content:
             angles, used = self._named(content["name"], content["position"]), {"name"}
         else:
             angles, used = self._flat(content)
-        return JointMessage(self._stamp(content), angles, _labels(content, used))
-
-    def _listed(self, values: Any) -> dict[str, float]:
-        if not isinstance(values, list):
-            raise RefusedLine(f"it has no list {self._values}")
-        if len(values) != len(self._channels):
-            raise RefusedLine(f"it has {len(values)} joints, expected {len(self._channels)}")
-        unit = self._unit or "rad"
-        return {c: from_unit(_number(value, c), unit) for c, value in zip(self._channels, values, strict=True)}
+        texts = [(key, value.strip()) for key, value in content.items() if isinstance(value, str) and key not in used]
+        fit = [(key, value) for key, value in texts if value and len(value) <= _LONGEST_LABEL]
+        labels = {_clean(key): _clean(value) for key, value in fit[:_MOST_LABELS]}
+        return JointMessage(self._stamp(content), angles, labels)
 
     def _named(self, names: list[Any], positions: Any) -> dict[str, float]:
         if not isinstance(positions, list) or len(positions) != len(names):
             raise RefusedLine("it has not as many positions as names")
         given = {str(name): position for name, position in zip(names, positions, strict=True)}
-        found = {}
+        angles = {}
         for channel, own in self._names.items():
             name = next((n for n in own if n in given), None)
             if name is None:
                 raise RefusedLine(f"it has {len(names)} joints and none called {own[-1]}, expected {len(self._names)}")
-            found[channel] = from_unit(_number(given[name], channel), self._unit or "rad")
-        return found
+            angles[channel] = from_unit(_number(given[name], channel), self._unit or "rad")
+        return angles
 
     def _flat(self, content: Mapping[str, Any]) -> tuple[dict[str, float], set[str]]:
         keys = tuple(content)
@@ -124,20 +125,20 @@ class JointMessages:
             if len(self._plans) > 16:
                 self._plans.clear()
             self._plans[keys] = plan
-        found = {c: from_unit(_number(content[key], c), unit) for c, (key, unit) in plan.items()}
-        return found, {key for key, _ in plan.values()}
+        angles = {c: from_unit(_number(content[key], c), unit) for c, (key, unit) in plan.items()}
+        return angles, {key for key, _ in plan.values()}
 
     def _planned(self, keys: Sequence[str]) -> dict[str, tuple[str, str]]:
         """The key of each channel and its unit."""
         plan: dict[str, tuple[str, str]] = {}
         for channel, own in self._names.items():
-            found = [(key, unit) for name in own for key, unit in self._spelt(name) if key in keys]
-            if len(found) > 1:
-                raise RefusedLine(f"it has both {found[0][0]} and {found[1][0]}")
-            if found and not found[0][1]:
-                raise RefusedLine(f"{found[0][0]} has no unit: call it {found[0][0]}_rad, or give unit: rad")
-            if found:
-                plan[channel] = found[0]
+            spelt = [(key, unit) for name in own for key, unit in self._spelt(name) if key in keys]
+            if len(spelt) > 1:
+                raise RefusedLine(f"it has both {spelt[0][0]} and {spelt[1][0]}")
+            if spelt and not spelt[0][1]:
+                raise RefusedLine(f"{spelt[0][0]} has no unit: call it {spelt[0][0]}_rad, or give unit: rad")
+            if spelt:
+                plan[channel] = spelt[0]
         lacking = [own[-1] for channel, own in self._names.items() if channel not in plan]
         used = {key for key, _ in plan.values()}
         beyond = [key for key in keys if key not in used and self._is_joint(key)]
@@ -182,12 +183,6 @@ def _number(value: Any, name: str) -> float:
     if not math.isfinite(number):
         raise RefusedLine(f"{name} is not finite")
     return number
-
-
-def _labels(content: Mapping[str, Any], used: set[str]) -> dict[str, str]:
-    texts = [(key, value.strip()) for key, value in content.items() if isinstance(value, str) and key not in used]
-    fit = [(key, value) for key, value in texts if value and len(value) <= _LONGEST_LABEL]
-    return {_clean(key): _clean(value) for key, value in fit[:_MOST_LABELS]}
 
 
 def _clean(text: str) -> str:

@@ -86,8 +86,8 @@ class JsonLinesJoints(JointStream):
         if self._source is None or self._clock is None:
             return []
         now = self._clock.now()
-        found = (self._read(line, now) for line in self._source.lines())
-        return [sample for sample in found if sample is not None]
+        samples = (self._read(line, now) for line in self._source.lines())
+        return [sample for sample in samples if sample is not None]
 
     @override
     def close(self) -> None:

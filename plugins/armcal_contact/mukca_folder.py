@@ -26,7 +26,7 @@ class SocketFile:
     path: Path
     position: str
     socket: str
-    content: str
+    text: str
     raw: bytes
 
 
@@ -34,45 +34,42 @@ def found_files(folder: Path) -> tuple[tuple[SocketFile, ...], tuple[str, ...]]:
     """The files of all positions, sorted by their paths, and what a user should know of the rest.
 
     Raises:
-        DataError: there is no such folder, no position in it, or a file cannot be read.
+        DataError: there is no such folder, no position in it, or a file cannot be read or is a copy of another.
     """
-    try:
-        return _found(folder)
-    except OSError as fault:
-        path = Path(str(fault.filename)) if fault.filename else folder
-        _refuse(path, f"it cannot be read ({fault.strerror or fault}).", "Check the path and its permissions.")
-
-
-def hash_of(files: Sequence[SocketFile]) -> str:
-    """sha256 of the contents, one file after the other."""
-    digest = hashlib.sha256()
-    for file in files:
-        digest.update(file.raw)
-    return digest.hexdigest()
-
-
-def _found(folder: Path) -> tuple[tuple[SocketFile, ...], tuple[str, ...]]:
     if not folder.exists():
         _refuse(folder, "there is no such folder.", "Check the path.")
     if not folder.is_dir():
         _refuse(folder, "it is a file, expected a folder.", _LAYOUT)
     files: list[SocketFile] = []
-    warnings = [_ignored(path) for path in sorted(folder.iterdir()) if not path.is_dir() and _is_table(path)]
-    for place in sorted(path for path in folder.iterdir() if path.is_dir() and not path.name.startswith(".")):
-        inside = sorted(place.iterdir())
-        sockets = [path for path in inside if _SOCKET_FILE.fullmatch(path.name)]
-        warnings += [_ignored(path) for path in inside if path not in sockets and _is_table(path)]
-        files += [_file(path, folder) for path in sockets]
-        if len(sockets) < 2:
-            named = f"has only {sockets[0].name}" if sockets else "has no file hole_0.csv, hole_1.csv, ..."
-            rest = "nothing is known of the distance of its sockets" if sockets else "it is ignored"
-            warnings.append(f"{place}: the position {named}: {rest}.")
-    if not files:
+    try:
+        warnings = [_ignored(path) for path in sorted(folder.iterdir()) if not path.is_dir() and _is_table(path)]
+        for place in sorted(path for path in folder.iterdir() if path.is_dir() and not path.name.startswith(".")):
+            inside = sorted(place.iterdir())
+            sockets = [path for path in inside if _SOCKET_FILE.fullmatch(path.name)]
+            warnings += [_ignored(path) for path in inside if path not in sockets and _is_table(path)]
+            files += [_file(path, folder) for path in sockets]
+            if len(sockets) < 2:
+                named = f"has only {sockets[0].name}" if sockets else "has no file hole_0.csv, hole_1.csv, ..."
+                rest = "nothing is known of the distance of its sockets" if sockets else "it is ignored"
+                warnings.append(f"{place}: the position {named}: {rest}.")
         own = any(_SOCKET_FILE.fullmatch(path.name) for path in folder.iterdir())
+    except OSError as fault:
+        path = Path(str(fault.filename)) if fault.filename else folder
+        _refuse(path, f"it cannot be read ({fault.strerror or fault}).", "Check the path and its permissions.")
+    if not files:
         where = " (its files lie in the folder itself: is it one position?)" if own else ""
         _refuse(folder, f"found no position in it, expected folders with hole_0.csv and hole_1.csv{where}.", _LAYOUT)
-    _refuse_copies(files)
+    first: dict[bytes, SocketFile] = {}
+    for file in files:  # no ball sits in two sockets in the same postures
+        other = first.setdefault(file.raw, file)
+        if other is not file and file.text.strip():
+            _refuse(file.path, f"it is a copy of {other.path}.", "Give each socket its own recording.")
     return tuple(files), tuple(warnings)
+
+
+def hash_of(files: Sequence[SocketFile]) -> str:
+    """sha256 of the contents, one file after the other."""
+    return hashlib.sha256(b"".join(file.raw for file in files)).hexdigest()
 
 
 def _file(path: Path, folder: Path) -> SocketFile:
@@ -89,15 +86,6 @@ def _file(path: Path, folder: Path) -> SocketFile:
         line = text[: text.index("\0")].count("\n") + 1
         raise DataError("found a NUL byte.", where=Location(str(path), line=line), hint="Save it as CSV text.")
     return SocketFile(path, path.parent.name, path.stem, text.replace("\r\n", "\n").replace("\r", "\n"), raw)
-
-
-def _refuse_copies(files: Sequence[SocketFile]) -> None:
-    """No ball sits in two sockets in the same postures."""
-    first: dict[bytes, SocketFile] = {}
-    for file in files:
-        other = first.setdefault(file.raw, file)
-        if other is not file and file.content.strip():
-            _refuse(file.path, f"it is a copy of {other.path}.", "Give each socket its own recording.")
 
 
 def _is_table(path: Path) -> bool:

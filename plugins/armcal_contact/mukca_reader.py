@@ -9,12 +9,11 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar, Literal, NoReturn
 
 import numpy as np
-from armcal.arm.assembly import Arm
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.base.settings import InputPath, Settings
@@ -22,7 +21,7 @@ from armcal.errors import DataError, Location
 from armcal.io.cells import is_missing, is_number
 from armcal.measure.checks import check_dataset, layout_of
 from armcal.measure.contact import named_arm
-from armcal.measure.measurement import GroupedMeasurement, Measurement, noise_channels
+from armcal.measure.measurement import GroupedMeasurement, noise_channels
 from armcal.measure.missing import with_absent
 from armcal.measure.reader import ReadRequest, RequestedChannel
 
@@ -42,14 +41,6 @@ class MukcaSettings(Settings):
     path: InputPath
     arm: str | None = None
     weights: Literal["positions", "postures"] = "postures"
-
-
-@dataclass(frozen=True)
-class _Rows:
-    """The postures of one file: their lines (from 1), and the joints' displacements (lines x joints)."""
-
-    lines: tuple[int, ...]
-    joints: Array
 
 
 class MukcaReader:
@@ -73,13 +64,17 @@ class MukcaReader:
         """
         folder = self._settings.path
         files, warnings = found_files(folder)
-        arm = self._arm(request)
+        try:
+            arm = request.arms[named_arm(self._settings.arm, tuple(request.arms))]
+        except ValueError as fault:
+            hint = "Set arm: NAME in the data section."
+            raise DataError(f"{fault}.", where=Location(str(folder), field="arm"), hint=hint) from fault
         requested_channels = [
             w for w in request.wanted if w.channel in {f"{arm.name}.{joint}" for joint in arm.commanded}
         ]
         tables = [_rows(file, requested_channels) for file in files]
-        names = [(file, line) for file, rows in zip(files, tables, strict=True) for line in rows.lines]
-        joints = np.concatenate([rows.joints for rows in tables])
+        names = [(file, line) for file, (lines, _) in zip(files, tables, strict=True) for line in lines]
+        joints = np.concatenate([joints for _, joints in tables])
         dataset = Dataset(
             tuple(f"{file.position}/{file.socket}/{line}" for file, line in names),
             {w.channel: joints[:, i] for i, w in enumerate(requested_channels)},
@@ -94,18 +89,11 @@ class MukcaReader:
         checked = check_dataset(dataset, replace(layout, by_id=True))
         return _weighed(checked, request) if self._settings.weights == "positions" else checked
 
-    def _arm(self, request: ReadRequest) -> Arm:
-        try:
-            return request.arms[named_arm(self._settings.arm, tuple(request.arms))]
-        except ValueError as fault:
-            hint = "Set arm: NAME in the data section."
-            raise DataError(f"{fault}.", where=Location(str(self._settings.path), field="arm"), hint=hint) from fault
 
-
-def _rows(file: SocketFile, requested_channels: Sequence[RequestedChannel]) -> _Rows:
-    """A file's rows as numbers, of as many columns as the arm has joints."""
+def _rows(file: SocketFile, requested_channels: Sequence[RequestedChannel]) -> tuple[list[int], Array]:
+    """The lines (from 1) of a file's postures, and the joints' displacements (lines x joints)."""
     path, lines, numbers, first = file.path, [], [], 0
-    for line, text in enumerate(file.content.split("\n"), start=1):
+    for line, text in enumerate(file.text.split("\n"), start=1):
         if not text.strip():
             continue
         cells = text.split(",")
@@ -115,15 +103,15 @@ def _rows(file: SocketFile, requested_channels: Sequence[RequestedChannel]) -> _
             _refuse(path, f"found {len(cells)} numbers, expected {first} as in the first row.", mend, line)
         if len(cells) != len(requested_channels):
             arm = requested_channels[0].channel.partition(".")[0] if requested_channels else "arm"
-            found = (
+            message = (
                 f"found {len(cells)} columns, expected {len(requested_channels)}: a joint angle of the arm {arm} each."
             )
-            _refuse(path, found, "Give this arm's recordings, comma separated.", line)
+            _refuse(path, message, "Give this arm's recordings, comma separated.", line)
         lines.append(line)
         numbers.append([_number(path, line, i, cell, requested_channels) for i, cell in enumerate(cells)])
     if not lines:
         _refuse(path, "it is empty.", "Give a row a posture, or remove the file.")
-    return _Rows(tuple(lines), np.array(numbers))
+    return lines, np.array(numbers)
 
 
 def _number(path: Path, line: int, index: int, cell: str, requested_channels: Sequence[RequestedChannel]) -> float:
@@ -138,8 +126,8 @@ def _number(path: Path, line: int, index: int, cell: str, requested_channels: Se
         _refuse(path, f"found {text[:40]!r}, expected a number.", mend, line, column)
     value = float(text)
     if joint.dimension == "angle" and not joint.is_endless and _FULL_TURN * (1 + 1e-9) < abs(value) < math.inf:
-        found = f"found {value:.10g} rad, more than one turn (2 pi rad): are these degrees?"
-        _refuse(path, found, "Write the angles in rad.", line, column)
+        message = f"found {value:.10g} rad, more than one turn (2 pi rad): are these degrees?"
+        _refuse(path, message, "Write the angles in rad.", line, column)
     return value
 
 
@@ -149,21 +137,15 @@ def _refuse(path: Path, message: str, hint: str, line: int | None = None, column
 
 def _weighed(dataset: Dataset, request: ReadRequest) -> Dataset:
     """The dataset with a standard deviation for each ball, by which every position weighs the same."""
-    known = {w.channel for w in request.wanted}
-    noises = {f"{name}.{_NOISE}": _declared(measurement) for name, measurement in request.measurements.items()}
+    known = {channel.channel for channel in request.wanted}
     postures = Counter(dataset.extra[POSITION])
     roots = np.sqrt([postures[position] for position in dataset.extra[POSITION]])
-    found = {channel: noise * roots for channel, noise in noises.items() if noise is not None and channel in known}
-    return replace(dataset, channels={**dataset.channels, **found})
-
-
-def _declared(measurement: Measurement) -> float | None:
-    """The noise of a measurement whose groups lie at positions, and which may be told by records."""
-    if not isinstance(measurement, GroupedMeasurement) or measurement.group_labels[:1] != (POSITION,):
-        return None
-    told = [sd for sd, own in zip(measurement.noise(), noise_channels(measurement), strict=False) if _takes(own)]
-    return told[0] if told else None
-
-
-def _takes(channels: Sequence[Any]) -> bool:
-    return any(channel.name == _NOISE for channel in channels)
+    noises: dict[str, Array] = {}
+    for name, measurement in request.measurements.items():
+        at_positions = isinstance(measurement, GroupedMeasurement) and measurement.group_labels[:1] == (POSITION,)
+        if not at_positions or f"{name}.{_NOISE}" not in known:
+            continue
+        for sd, channels in zip(measurement.noise(), noise_channels(measurement), strict=False):
+            if any(channel.name == _NOISE for channel in channels):  # records may give it
+                noises.setdefault(f"{name}.{_NOISE}", sd * roots)
+    return replace(dataset, channels={**dataset.channels, **noises})

@@ -11,7 +11,7 @@ import numpy as np
 from armcal.base.units import from_unit
 from armcal.devices.clock import Clock
 from armcal.devices.joint_stream import JointSample, JointStream
-from armcal.devices.line_source import Begin, LineSource, SourceName, open_lines
+from armcal.devices.line_source import Begin, FileLines, LineSource, SourceName, open_lines
 from armcal.devices.rest_stream import RestStream
 from armcal.errors import ConfigError, DataError
 from typing_extensions import override
@@ -54,8 +54,8 @@ class TwoArmLogStream(JointStream, RestStream):
         self._refused: Counter[str] = Counter()
 
     @property
+    @override
     def gives_rests(self) -> bool:
-        """See ``armcal.devices.rest_stream.RestStream``."""
         return self._settings.still is not None
 
     @property
@@ -81,9 +81,8 @@ class TwoArmLogStream(JointStream, RestStream):
         self._table = LiveTable(Path(s.source), s.delimiter, columns, list(s.labels.values()))
         self._rests = None if s.still is None else LiveRests(s.still)
         self._source, self._clock = open_lines(s.source, s.begin), clock
-        if s.begin == "end" and Path(s.source).is_file():
-            with Path(s.source).open("rb") as file:  # its header, if it has one
-                self._row(file.readline().rstrip(b"\r\n") or None)
+        if s.begin == "end" and isinstance(self._source, FileLines) and self._source.header is not None:
+            self._row(self._source.header)
             self._refused.clear()
 
     @override
@@ -93,7 +92,10 @@ class TwoArmLogStream(JointStream, RestStream):
         rows = [row for line in self._source.lines() if (row := self._row(line)) is not None]
         if not rows:
             return []
-        whole = self._rows(rows)
+        table, count, s = np.array([row.numbers for row in rows]).T, len(self._channels), self._settings
+        time = None if s.time is None else from_unit(table[count], s.time_unit)
+        texts = tuple(tuple(row.texts[i] for row in rows) for i in range(len(s.labels)))
+        whole = Rows(table[:count] / self._ratios[:, None], time, texts)
         if self._rests is None:
             return self._samples([whole.part(i, i + 1) for i in range(len(whole))])
         return self._samples(self._rests.add(whole))
@@ -118,18 +120,11 @@ class TwoArmLogStream(JointStream, RestStream):
             self._refuse(fault.message.rstrip("."))
             return None
 
-    def _rows(self, rows: Sequence[Row]) -> Rows:
-        table = np.array([row.numbers for row in rows]).T
-        count = len(self._channels)
-        time = None if self._settings.time is None else from_unit(table[count], self._settings.time_unit)
-        texts = tuple(tuple(row.texts[i] for row in rows) for i in range(len(self._settings.labels)))
-        return Rows(table[:count] / self._ratios[:, None], time, texts)
-
-    def _samples(self, found: Sequence[Rows]) -> list[JointSample]:
-        """The mean of each."""
+    def _samples(self, parts: Sequence[Rows]) -> list[JointSample]:
+        """The mean of each part."""
         now = self._clock.now() if self._clock else 0.0
         samples = []
-        for rows in found:
+        for rows in parts:
             angles = dict(zip(self._channels, rows.joints.mean(axis=1).tolist(), strict=True))
             lacking = next((channel for channel, angle in angles.items() if not np.isfinite(angle)), None)
             if lacking is not None:
@@ -155,8 +150,8 @@ def _check(settings: TwoArmStreamSettings, names: Sequence[str], channels: Seque
         )
     for name in names:
         count = sum(channel.partition(".")[0] == name for channel in channels)
-        found = len(settings.arms[name].columns) if name in settings.arms else 0
-        if found != count:
+        columns = len(settings.arms[name].columns) if name in settings.arms else 0
+        if columns != count:
             raise ConfigError(
-                f"bench.joints.arms: found {found} columns for the arm {name}, which has {count} joints.", hint=hint
+                f"bench.joints.arms: found {columns} columns for the arm {name}, which has {count} joints.", hint=hint
             )

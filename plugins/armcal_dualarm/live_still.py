@@ -67,20 +67,20 @@ class LiveRests:
         rows = self._rows
         if rows is None or not len(rows):
             return []
-        found = rests(rows.joints, rows.texts, rows.time, self._settings)
-        over = [rest for rest in found if rest.stop < len(rows)]
-        if len(over) < len(found):
-            start = found[-1].start
+        searched = rests(rows.joints, rows.texts, rows.time, self._settings)
+        over = [rest for rest in searched if rest.stop < len(rows)]
+        if len(over) < len(searched):
+            start = searched[-1].start
             self._later = [rows.part(start, len(rows))]
             self._rows = None
         else:
-            self._rows = rows.part(self._first_open(rows, found), len(rows))
+            self._rows = rows.part(self._first_open(rows, searched), len(rows))
         return [rows.part(rest.start, rest.stop) for rest in over]
 
-    def _first_open(self, rows: Rows, found: Sequence[Rest]) -> int:
+    def _first_open(self, rows: Rows, searched: Sequence[Rest]) -> int:
         """The first row that may begin a rest when more come."""
         ends = np.flatnonzero(breaks_of(rows.joints, rows.texts, rows.time, self._settings))
-        first = max(int(ends[-1]) if len(ends) else 0, found[-1].stop if found else 0)
+        first = max(int(ends[-1]) if len(ends) else 0, searched[-1].stop if searched else 0)
         if self._settings.samples is not None or rows.time is None or self._settings.window is None:
             return max(first, len(rows) - (self._settings.samples or 2) + 1)
         alive = np.flatnonzero(rows.time[first:] + self._settings.window > rows.time[-1])
@@ -98,7 +98,7 @@ class LiveRests:
         lows = np.minimum.accumulate(np.column_stack([lowest, joints]), axis=1)[:, 1:]
         highs = np.maximum.accumulate(np.column_stack([highest, joints]), axis=1)[:, 1:]
         beyond = np.flatnonzero((highs - lows > self._settings.spread).any(axis=0))
-        return min(int(each[0]) if len(each) else len(rows) for each in (breaks, beyond))
+        return min(int(ends[0]) if len(ends) else len(rows) for ends in (breaks, beyond))
 
     def _whole(self, end: Rows | None) -> Rows:
         parts = [*self._later, end] if end is not None and len(end) else self._later

@@ -37,7 +37,7 @@ class LiveTable:
     Args:
         source: what the log is called in messages.
         delimiter: or ``auto``.
-        numbers, texts: the columns that are wanted.
+        numbers, texts: the columns to read.
     """
 
     def __init__(self, source: Path, delimiter: str, numbers: Sequence[Column], texts: Sequence[Column]) -> None:
@@ -60,7 +60,11 @@ class LiveTable:
         if "\0" in text:
             raise DataError("found a NUL byte, expected text.")
         if self._form is None:
-            self._form = self._found(text)
+            delimiter = delimiter_of(text) if self._delimiter == "auto" else self._delimiter
+            cells = cells_of(text, delimiter)
+            header = tuple(cells) if is_header(cells, self._numbers, self._texts) else ()
+            places = [place_of(self._source, None, header, len(cells), c) for c in (*self._numbers, *self._texts)]
+            self._form = _Form(delimiter, header, len(cells), tuple(places))
         form = self._form
         cells = cells_of(text, form.delimiter)
         if form.header and tuple(cells) == form.header:
@@ -72,10 +76,3 @@ class LiveTable:
         named = zip(chosen[:count], self._numbers, strict=True)
         numbers = [number_of(self._source, None, cell, f"column {name}") for cell, name in named]
         return Row(np.array(numbers), tuple(chosen[count:]))
-
-    def _found(self, text: str) -> _Form:
-        delimiter = delimiter_of(text) if self._delimiter == "auto" else self._delimiter
-        cells = cells_of(text, delimiter)
-        header = tuple(cells) if is_header(cells, self._numbers, self._texts) else ()
-        places = [place_of(self._source, None, header, len(cells), c) for c in (*self._numbers, *self._texts)]
-        return _Form(delimiter, header, len(cells), tuple(places))

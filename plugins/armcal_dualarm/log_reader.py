@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import ClassVar, NoReturn
 
 import numpy as np
-from armcal.arm.assembly import Arm
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.base.settings import InputPath
@@ -29,16 +27,6 @@ class TwoArmLogSettings(LogColumns):
     """Which file, and what its columns are: see ``LogColumns``."""
 
     path: InputPath
-
-
-@dataclass(frozen=True)
-class _Log:
-    """What was read: joints from the base, all arms one after the other (channels x N; rad)."""
-
-    table: LogTable
-    channels: tuple[str, ...]
-    joints: Array
-    time: Array | None
 
 
 class TwoArmLogReader:
@@ -65,59 +53,55 @@ class TwoArmLogReader:
         Raises:
             DataError: with file, line and column.
         """
-        arms = {name: self._arm(request, name) for name in self._settings.arms}
-        log = self._log(arms)
-        self._refuse_turns(log, {w.channel for w in request.wanted if w.dimension == "angle" and not w.is_endless})
-        dataset = with_absent(self._dataset(log), request.wanted)
-        names = dict(zip(log.channels, log.table.names, strict=False))
+        s, path = self._settings, self._settings.path
+        for name, arm in s.arms.items():
+            if name not in request.arms:
+                self._refuse(f"no arm is called {name!r}; the arms are {', '.join(request.arms)}.", "Correct the name.")
+            if len(arm.columns) != (joints := len(request.arms[name].commanded)):
+                text = f"found {len(arm.columns)} columns for the arm {name}, which has {joints} joints."
+                self._refuse(text, f"Give arms: {{{name}: {{columns: [...]}}}} a column for each joint.")
+        channels = [f"{name}.{joint}" for name in s.arms for joint in request.arms[name].commanded]
+        numbers = [column for arm in s.arms.values() for column in arm.from_base]
+        times = [] if s.time is None else [s.time]
+        table = read_table(path, s.delimiter, [*numbers, *times], list(s.labels.values()))
+        ratios = np.concatenate([arm.ratios for arm in s.arms.values()])
+        joint_angles = table.numbers[: len(numbers)] / ratios[:, None]
+        values = dict(zip(channels, joint_angles, strict=True))
+        names = dict(zip(channels, table.names, strict=False))
+        turning = {w.channel for w in request.wanted if w.dimension == "angle" and not w.is_endless}
+        self._refuse_turns(table, {channel: row for channel, row in values.items() if channel in turning}, names)
+        if times:
+            values["time"] = from_unit(table.numbers[len(numbers)], s.time_unit)
+        dataset = with_absent(self._dataset(table, joint_angles, values), request.wanted)
         return check_dataset(dataset, layout_of(request.wanted, dataset, names, {}, by_line=True))
 
-    def _arm(self, request: ReadRequest, name: str) -> Arm:
-        if name not in request.arms:
-            self._refuse(f"no arm is called {name!r}; the arms are {', '.join(request.arms)}.", "Correct the name.")
-        arm, count = request.arms[name], len(self._settings.arms[name].columns)
-        if count != len(arm.commanded):
-            text = f"found {count} columns for the arm {name}, which has {len(arm.commanded)} joints."
-            self._refuse(text, f"Give arms: {{{name}: {{columns: [...]}}}} a column for each joint.")
-        return arm
-
-    def _log(self, arms: Mapping[str, Arm]) -> _Log:
-        s = self._settings
-        numbers = [column for name in arms for column in s.arms[name].from_base]
-        times = [] if s.time is None else [s.time]
-        table = read_table(s.path, s.delimiter, [*numbers, *times], list(s.labels.values()))
-        ratios = np.concatenate([s.arms[name].ratios for name in arms])
-        channels = tuple(f"{name}.{joint}" for name, arm in arms.items() for joint in arm.commanded)
-        time = from_unit(table.numbers[len(numbers)], s.time_unit) if times else None
-        return _Log(table, channels, table.numbers[: len(numbers)] / ratios[:, None], time)
-
-    def _refuse_turns(self, log: _Log, turning: set[str]) -> None:
+    def _refuse_turns(self, table: LogTable, turning: Mapping[str, Array], names: Mapping[str, str]) -> None:
         """Angles of joints beyond a turn: wrong ratios, or other units."""
-        for channel, name, values in zip(log.channels, log.table.names, log.joints, strict=False):
+        for channel, values in turning.items():
             over = np.flatnonzero((np.abs(values) > _FULL_TURN * (1 + 1e-9)) & np.isfinite(values))
-            if channel in turning and over.size:
+            if over.size:
                 first = int(over[0])
                 text = f"{channel} would stand at {values[first]:.6g} rad there, more than one turn (2 pi rad)."
                 hint = "Check order and gear_ratios, both from the base, and that the log is in radians."
-                self._refuse(text, hint, log.table.lines[first], name)
+                self._refuse(text, hint, table.lines[first], names[channel])
 
-    def _dataset(self, log: _Log) -> Dataset:
-        """All rows, or the rests among them."""
-        s, table = self._settings, log.table
+    def _dataset(self, table: LogTable, joints: Array, values: Mapping[str, Array]) -> Dataset:
+        """All rows, or the means of the rests among them."""
+        s = self._settings
         still = [Rest(i, i + 1) for i in range(len(table.lines))]
         warnings: tuple[str, ...] = ()
         if s.still is not None:
-            still = rests(log.joints, table.texts, log.time, s.still)
+            still = rests(joints, table.texts, values.get("time"), s.still)
             if not still:
                 text = f"found no moment at which no joint moves by more than {np.degrees(s.still.spread):.3g} deg."
                 self._refuse(text, "Give a wider spread_deg or a shorter window under still.")
             used = sum(rest.stop - rest.start for rest in still)
             rows = f"{used} of {len(table.lines)} rows"
             warnings = (f"{s.path}: the log was reduced to {len(still)} still moments, the means of {rows}.",)
-        starts = np.array([rest.start for rest in still])
-        channels = {name: _means(values, still) for name, values in zip(log.channels, log.joints, strict=True)}
-        if log.time is not None:
-            channels["time"] = _means(log.time, still)
+        starts = [rest.start for rest in still]
+        channels = {
+            name: np.array([row[rest.start : rest.stop].mean() for rest in still]) for name, row in values.items()
+        }
         lines = tuple(table.lines[i] for i in starts)
         texts = {name: tuple(cells[i] for i in starts) for name, cells in zip(s.labels, table.texts, strict=True)}
         ids = tuple(map(str, lines))
@@ -125,7 +109,3 @@ class TwoArmLogReader:
 
     def _refuse(self, message: str, hint: str, line: int | None = None, column: str | None = None) -> NoReturn:
         raise DataError(message, where=Location(str(self._settings.path), line=line, field=column), hint=hint)
-
-
-def _means(values: Array, still: list[Rest]) -> Array:
-    return np.array([values[rest.start : rest.stop].mean() for rest in still])

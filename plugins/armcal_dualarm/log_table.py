@@ -7,14 +7,14 @@ import hashlib
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import islice
+from itertools import chain, islice
 from pathlib import Path
 from typing import NoReturn
 
 import numpy as np
 from armcal.base.domains import Array
 from armcal.errors import DataError, Location
-from armcal.io.cells import is_missing, is_number
+from armcal.io.cells import is_missing, is_number, plain_numbers
 from armcal.io.plain_files import input_bytes
 
 MAX_BYTES = 2 * 1024**3
@@ -53,7 +53,7 @@ def read_table(path: Path, delimiter: str, numbers: Sequence[Column], texts: Seq
         DataError: with file, line and column.
     """
     try:
-        raw = _read(path)
+        raw = input_bytes(path, MAX_BYTES, "a log")
     except OSError as fault:
         _refuse(path, f"it cannot be read ({fault.strerror or fault}).", "Check the path and its permissions.")
     rows = _rows(path, raw, delimiter)
@@ -63,16 +63,12 @@ def read_table(path: Path, delimiter: str, numbers: Sequence[Column], texts: Seq
     line, cells = first
     header = cells if is_header(cells, numbers, texts) else []
     places = [place_of(path, line, header, len(cells), column) for column in (*numbers, *texts)]
-    body = rows if header else _with_first(first, rows)
+    body = rows if header else chain([first], rows)
     names = [header[place] if header else f"column {place + 1}" for place in places]
     lines, columns, words = _load(path, body, len(cells), places[: len(numbers)], places[len(numbers) :], names)
     if not lines:
         _refuse(path, "found a header and no rows.", "Give a row a moment.", line)
     return LogTable(lines, columns, words, tuple(names[: len(numbers)]), hashlib.sha256(raw).hexdigest())
-
-
-def _read(path: Path) -> bytes:
-    return input_bytes(path, MAX_BYTES, "a log")
 
 
 def _rows(path: Path, raw: bytes, delimiter: str) -> Iterator[tuple[int, list[str]]]:
@@ -92,18 +88,13 @@ def _rows(path: Path, raw: bytes, delimiter: str) -> Iterator[tuple[int, list[st
 
 def delimiter_of(text: str) -> str:
     """What parts the cells of a row; a blank stands for any blanks."""
-    return next((each for each in _DELIMITERS if each in text), " ")
+    return next((delimiter for delimiter in _DELIMITERS if delimiter in text), " ")
 
 
 def cells_of(text: str, delimiter: str) -> list[str]:
     """The cells of a row."""
     parts = text.split() if delimiter == " " else text.split(delimiter)
     return [part.strip().strip('"').strip() for part in parts]
-
-
-def _with_first(first: tuple[int, list[str]], rows: Iterator[tuple[int, list[str]]]) -> Iterator[tuple[int, list[str]]]:
-    yield first
-    yield from rows
 
 
 def is_header(cells: Sequence[str], numbers: Sequence[Column], texts: Sequence[Column]) -> bool:
@@ -151,25 +142,20 @@ def _load(
         if ragged:
             mend = "Complete the row, or give the delimiter; numbers have a decimal point."
             _refuse(path, f"found {len(ragged[1])} cells, expected {count} as in the first row.", mend, ragged[0])
-        found = [line for line, _ in block]
+        block_lines = [line for line, _ in block]
         table = list(zip(*(cells for _, cells in block), strict=True))
-        blocks.append(
-            np.array([_numbers(path, found, table[at], name) for at, name in zip(numbers, names, strict=False)])
-        )
+        columns = []
+        for at, name in zip(numbers, names, strict=False):
+            column = plain_numbers(table[at])
+            if column is None:
+                pairs = zip(block_lines, table[at], strict=True)
+                column = np.array([number_of(path, line, cell, name) for line, cell in pairs])
+            columns.append(column)
+        blocks.append(np.array(columns))
         for own, at in zip(words, texts, strict=True):
             own += table[at]
-        lines += found
+        lines += block_lines
     return tuple(lines), np.hstack(blocks), tuple(tuple(own) for own in words)
-
-
-def _numbers(path: Path, lines: Sequence[int], cells: Sequence[str], name: str) -> Array:
-    joined = "".join(cells)
-    if joined.isascii() and "_" not in joined:
-        try:
-            return np.array(cells, dtype=np.float64)
-        except ValueError:  # a cell is empty, or is no number
-            pass
-    return np.array([number_of(path, line, cell, name) for line, cell in zip(lines, cells, strict=True)])
 
 
 def number_of(path: Path, line: int | None, cell: str, name: str) -> float:

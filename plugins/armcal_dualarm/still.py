@@ -56,12 +56,19 @@ def rests(joints: Array, labels: Sequence[Sequence[str]], time: Array | None, se
     """
     breaks = breaks_of(joints, labels, time, settings)
     edges = [0, *np.flatnonzero(breaks).tolist(), joints.shape[1]]
-    found: list[Rest] = []
+    stretches: list[Rest] = []
     for start, stop in pairwise(edges):
         part = np.nan_to_num(joints[:, start:stop])  # what is missing is so throughout, or there were a break
-        stops = _shortest(stop - start, None if time is None else time[start:stop], settings)
-        found += [Rest(start + rest.start, start + rest.stop) for rest in _within(part, stops, settings.spread)]
-    return found
+        # for each row that can begin a rest (the first ones), before which row the shortest such rest would end
+        count = stop - start
+        if settings.samples is not None or time is None or settings.window is None:
+            stops = np.arange(settings.samples or 2, count + 1)
+        else:
+            passing = time[start:stop]
+            stops = np.maximum(np.searchsorted(passing, passing + settings.window) + 1, np.arange(count) + 2)
+            stops = stops[stops <= count]
+        stretches += [Rest(start + rest.start, start + rest.stop) for rest in _within(part, stops, settings.spread)]
+    return stretches
 
 
 def breaks_of(joints: Array, labels: Sequence[Sequence[str]], time: Array | None, settings: StillSettings) -> Mask:
@@ -80,23 +87,22 @@ def breaks_of(joints: Array, labels: Sequence[Sequence[str]], time: Array | None
     return breaks
 
 
-def _shortest(count: int, time: Array | None, settings: StillSettings) -> Indices:
-    """For each row that can begin a rest (the first ones), before which row the shortest such rest would end."""
-    if settings.samples is not None or time is None or settings.window is None:
-        return np.arange(settings.samples or 2, count + 1)
-    stops = np.maximum(np.searchsorted(time, time + settings.window) + 1, np.arange(count) + 2)
-    return stops[stops <= count]
-
-
 def _within(joints: Array, stops: Indices, spread: float) -> list[Rest]:
     """The rests of a stretch without breaks: each begins where the shortest one holds, and goes on while it does."""
-    found: list[Rest] = []
+    stretches: list[Rest] = []
     end = 0
     for start in np.flatnonzero((_spreads(joints, stops) <= spread).all(axis=0)).tolist():
         if start >= end:
-            end = _end(joints, start, int(stops[start]), spread)
-            found.append(Rest(start, end))
-    return found
+            # the row before which a joint has moved by more than the spread since the start
+            end = int(stops[start])
+            low, high = joints[:, start:end].min(axis=1), joints[:, start:end].max(axis=1)
+            while end < joints.shape[1]:
+                low, high = np.minimum(low, joints[:, end]), np.maximum(high, joints[:, end])
+                if (high - low > spread).any():
+                    break
+                end += 1
+            stretches.append(Rest(start, end))
+    return stretches
 
 
 def _spreads(joints: Array, stops: Indices) -> Array:
@@ -104,7 +110,7 @@ def _spreads(joints: Array, stops: Indices) -> Array:
 
     From the extremes of stretches whose lengths are powers of two, each twice the last.
     """
-    found = np.zeros((len(joints), len(stops)))
+    spreads = np.zeros((len(joints), len(stops)))
     starts = np.arange(len(stops))
     levels = np.log2(np.maximum(stops - starts, 1)).astype(int)
     low = high = joints
@@ -112,16 +118,6 @@ def _spreads(joints: Array, stops: Indices) -> Array:
         width = 2**level
         first = starts[levels == level]
         last = stops[first] - width
-        found[:, first] = np.maximum(high[:, first], high[:, last]) - np.minimum(low[:, first], low[:, last])
+        spreads[:, first] = np.maximum(high[:, first], high[:, last]) - np.minimum(low[:, first], low[:, last])
         low, high = np.minimum(low[:, :-width], low[:, width:]), np.maximum(high[:, :-width], high[:, width:])
-    return found
-
-
-def _end(joints: Array, start: int, stop: int, spread: float) -> int:
-    """The row before which a joint has moved by more than the spread since ``start``; it has not before ``stop``."""
-    low, high = joints[:, start:stop].min(axis=1), joints[:, start:stop].max(axis=1)
-    for row in range(stop, joints.shape[1]):
-        low, high = np.minimum(low, joints[:, row]), np.maximum(high, joints[:, row])
-        if (high - low > spread).any():
-            return row
-    return joints.shape[1]
+    return spreads

@@ -12,11 +12,11 @@ def armcal_register_effects(register: Register) -> None:
         "springs about joint axes and at the base",
     )
     register("cubic_spring", "armcal_joints.springs:CubicSprings", "springs that soften or stiffen under load")
-    register("compliance", "armcal_joints.compliance:Compliances", "3x3 compliances at the joints and at the base")
+    register("compliance", "armcal_joints.springs:Compliances", "3x3 compliances at the joints and at the base")
     register("servo_map", "armcal_joints.servo_map:ServoMap", "a servo's gain, on either side of zero, and offset")
     register("approach_backlash", "armcal_joints.backlash:ApproachBacklash", "play, by the direction of approach")
     register("torque_backlash", "armcal_joints.backlash:TorqueBacklash", "play, by the sign of the torque")
     register("bearing_play", "armcal_joints.backlash:BearingPlay", "bearings that tilt with the moment they carry")
-    register("gear_error", "armcal_joints.gear:GearError", "harmonic errors, one and two periods a turn")
+    register("gear_error", "armcal_joints.servo_map:GearError", "harmonic errors, one and two periods a turn")
     register("quantisation", "armcal_joints.quantisation:Quantisation", "the angles that a servo board can set")
     register("thermal_length", "armcal_joints.thermal:ThermalLength", "links that lengthen with temperature")

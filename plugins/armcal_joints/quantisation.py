@@ -31,7 +31,7 @@ class PulseTableSettings(Settings):
 
 
 def _read_file(value: Any) -> Any:
-    """A servo file's name becomes what stands in it, so that the settings say everything themselves."""
+    """A servo file's name becomes its content, so that the settings are whole by themselves."""
     if not isinstance(value, str):
         return value
     try:
@@ -79,7 +79,7 @@ class QuantisationSettings(Settings):
 
 
 class Quantisation(SteppedEffect):
-    """The effect ``quantisation``: no parameters; the difference between what was told and what the board can set.
+    """The effect ``quantisation``: no parameters; the difference between the command and what the board can set.
 
     A joint without a table is not quantised. A servo file has all joints, and may have servos that are none.
     """
@@ -95,8 +95,8 @@ class Quantisation(SteppedEffect):
         missing = [joint for joint in joint_names if settings.servos and joint not in settings.servos]
         if missing:
             raise ValueError(f"the servo file has no servo {', '.join(missing)}; it has {', '.join(settings.servos)}")
-        found = settings.clocked()
-        self._servos = {joint_names.index(joint): found[joint] for joint in found if joint in joint_names}
+        clocked = settings.clocked()
+        self._servos = {joint_names.index(joint): clocked[joint] for joint in clocked if joint in joint_names}
         for table, clock in self._servos.values():
             longest, limit = max(table.pulses), clock.longest_pulse
             if longest > limit:

@@ -37,8 +37,8 @@ class ThermalLength(JointEffect):
     def __init__(self, settings: ThermalLengthSettings, joint_names: Sequence[str]) -> None:
         super().__init__(settings, joint_names)
         links = range(1, len(joint_names) + 2)
-        each = settings.links == "each"
-        self._names = tuple(f"expansion{link}" if each else "expansion" for link in links)
+        separate = settings.links == "each"
+        self._names = tuple(f"expansion{link}" if separate else "expansion" for link in links)
 
     def parameters(self) -> tuple[ParameterBlock, ...]:
         """Coefficients of linear expansion (1/K)."""

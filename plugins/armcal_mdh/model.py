@@ -75,7 +75,8 @@ class MdhSettings(Settings):
             raise ValueError(f"a joint name stands twice in {', '.join(self.joints)}")
         if any(step.frame for step in self.base):
             raise ValueError("base: a frame cannot be named here; the frame at its end is called 'mount'")
-        names = [step.frame for _, steps in _places(self) for step in steps if step.frame]
+        steps = [*(step for row in self.rows for step in (*row.before, *row.after)), *self.tool]
+        names = [step.frame for step in steps if step.frame]
         reserved = {"mount", "tool", *(f"row{i}" for i in range(1, len(self.rows) + 1))}
         taken = [n for n in names if names.count(n) > 1 or n in reserved]
         if taken:
@@ -171,13 +172,6 @@ class MdhModel:
             turns = kind.startswith("r")
             here = here @ (se3.rotation_about(kind[1], value) if turns else se3.translation_along(kind, value))
         return here
-
-
-def _places(settings: MdhSettings) -> Iterator[tuple[str, tuple[Step, ...]]]:
-    for i, row in enumerate(settings.rows, start=1):
-        yield f"before{i}", row.before
-        yield f"after{i}", row.after
-    yield "tool", settings.tool
 
 
 def _block(name: str, value: float) -> ParameterBlock:

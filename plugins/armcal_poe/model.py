@@ -6,7 +6,7 @@ joint, so that a joint may have pitch and scale.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import casadi as ca
@@ -18,10 +18,9 @@ from armcal.base.domains import ScrewAxis
 from armcal.base.parameters import ParameterBlock, scalar
 from armcal.base.pose_blocks import pose_transform
 from armcal.base.quaternions import rotation_matrix
-from armcal.base.se3 import Expression, Transform
 
 from armcal_poe.placement import NominalAxis, constant
-from armcal_poe.settings import PoeSettings, PrismaticSettings, RevoluteSettings
+from armcal_poe.settings import PoeSettings, RevoluteSettings
 
 AXIS_SCALE = 0.02
 """rad and m: an increment of an axis has both."""
@@ -63,9 +62,17 @@ class PoeModel:
         """Every joint's axis and offset, and the tool."""
         blocks: list[ParameterBlock] = []
         for i, (joint, axis) in enumerate(zip(self._settings.joints, self._axes, strict=True), start=1):
-            blocks += _axis_blocks(i, joint, axis) if self._is_minimal else _twist_blocks(i, joint, axis)
             turns = isinstance(joint, RevoluteSettings)
             unit, scale = ("rad", ANGLE_SCALE_RAD) if turns else ("m", LENGTH_SCALE_M)
+            if self._is_minimal:
+                nominal, domain = (axis.twist, ScrewAxis()) if turns else (axis.direction, Direction())
+                blocks.append(ParameterBlock(f"axis{i}", "1", tuple(map(float, nominal)), domain, AXIS_SCALE))
+            else:
+                nominal = axis.twist if turns else np.concatenate([np.zeros(3), axis.direction])
+                linear = ("m", LENGTH_SCALE_M) if turns else ("1", ANGLE_SCALE_RAD)
+                kinds = [("1", ANGLE_SCALE_RAD)] * 3 + [linear] * 3
+                for entry, value, kind in zip(TWIST, nominal, kinds, strict=True):
+                    blocks.append(scalar(f"twist{i}_{entry}", kind[0], value, kind[1]))
             blocks.append(scalar(f"offset{i}", unit, joint.offset, scale))
         return (*blocks, *self._settings.tool.blocks("tool"))
 
@@ -74,9 +81,20 @@ class PoeModel:
         mount = self._settings.mount
         base_T_mount = constant(rotation_matrix(np.array(mount.unit_quaternion)), np.array(mount.position))
         here, joints = base_T_mount, []
-        for i, joint in enumerate(self._settings.joints, start=1):
-            base_T_joint = self._frame(i, values)
-            joints.append(self._joint(i, joint, here.inverse() @ base_T_joint, values))
+        for i, (joint, axis) in enumerate(zip(self._settings.joints, self._axes, strict=True), start=1):
+            turns = isinstance(joint, RevoluteSettings)
+            base_T_joint, twist = axis.frame, None
+            if not self._is_minimal:
+                entries = [values[f"twist{i}_{entry}"] for entry in TWIST]
+                twist = axis.in_frame(ca.vertcat(*entries[:3]), ca.vertcat(*entries[3:]))
+            elif turns:
+                base_T_joint = axis.frame_on_screw(values[f"axis{i}"])
+            else:
+                direction = values[f"axis{i}"]
+                base_T_joint = axis.frame_on(direction / ca.norm_2(direction), axis.frame.translation)
+            angular, linear = (_Z, _STILL) if turns else (_STILL, _Z)
+            parent_T_joint, offset = here.inverse() @ base_T_joint, values[f"offset{i}"]
+            joints.append(Joint(self.joint_names[i - 1], parent_T_joint, angular, linear, offset, twist=twist))
             here = base_T_joint
         count = len(joints)
         frames = {f"joint{i}": Attachment(i, se3.identity()) for i in range(1, count + 1)}
@@ -86,50 +104,3 @@ class PoeModel:
     @property
     def _is_minimal(self) -> bool:
         return self._settings.parametrisation == "minimal"
-
-    def _frame(self, i: int, values: Mapping[str, Any]) -> Transform:
-        axis, joint = self._axes[i - 1], self._settings.joints[i - 1]
-        if not self._is_minimal:
-            return axis.frame
-        if isinstance(joint, RevoluteSettings):
-            return axis.frame_on_screw(values[f"axis{i}"])
-        direction = values[f"axis{i}"]
-        return axis.frame_on(direction / ca.norm_2(direction), axis.frame.translation)
-
-    def _joint(
-        self, i: int, joint: RevoluteSettings | PrismaticSettings, parent_T_joint: Transform, values: Mapping[str, Any]
-    ) -> Joint:
-        turns = isinstance(joint, RevoluteSettings)
-        twist = None if self._is_minimal else self._axes[i - 1].in_frame(*_twist(i, values))
-        return Joint(
-            self.joint_names[i - 1],
-            parent_T_joint,
-            angular=_Z if turns else _STILL,
-            linear=_STILL if turns else _Z,
-            offset=values[f"offset{i}"],
-            twist=twist,
-        )
-
-
-def _axis_blocks(i: int, joint: RevoluteSettings | PrismaticSettings, axis: NominalAxis) -> Sequence[ParameterBlock]:
-    if isinstance(joint, RevoluteSettings):
-        return [ParameterBlock(f"axis{i}", "1", _floats(axis.twist), ScrewAxis(), AXIS_SCALE)]
-    return [ParameterBlock(f"axis{i}", "1", _floats(axis.direction), Direction(), AXIS_SCALE)]
-
-
-def _twist_blocks(i: int, joint: RevoluteSettings | PrismaticSettings, axis: NominalAxis) -> Sequence[ParameterBlock]:
-    turns = isinstance(joint, RevoluteSettings)
-    nominal = axis.twist if turns else np.concatenate([np.zeros(3), axis.direction])
-    linear = ("m", LENGTH_SCALE_M) if turns else ("1", ANGLE_SCALE_RAD)
-    kinds = [("1", ANGLE_SCALE_RAD)] * 3 + [linear] * 3
-    numbered = zip(TWIST, nominal, kinds, strict=True)
-    return [scalar(f"twist{i}_{entry}", unit, value, scale) for entry, value, (unit, scale) in numbered]
-
-
-def _twist(i: int, values: Mapping[str, Any]) -> tuple[Expression, Expression]:
-    entries = [values[f"twist{i}_{entry}"] for entry in TWIST]
-    return ca.vertcat(*entries[:3]), ca.vertcat(*entries[3:])
-
-
-def _floats(values: Sequence[float]) -> tuple[float, ...]:
-    return tuple(float(x) for x in values)

@@ -1,4 +1,4 @@
-"""What a configuration says of an arm in screws."""
+"""The settings of an arm in screws."""
 
 from __future__ import annotations
 

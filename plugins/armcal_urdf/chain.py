@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -12,6 +11,7 @@ from armcal.arm.assembly import MassSpec
 from armcal.arm.model import Mimic
 from armcal.arm.statics import MOUNT_FRAME, TOOL_FRAME
 from armcal.base.domains import Array
+from scipy.spatial.transform import Rotation
 
 from armcal_urdf.robot import FREE, MOVING, Robot, UrdfJoint
 
@@ -58,8 +58,8 @@ def chain_of(robot: Robot, root: str | None, tip: str | None) -> UrdfChain:
     """The chain from a link (None: the tree's root) out to another (None: the only leaf).
 
     Raises:
-        ValueError: no such link, no such way, or several leaves.
-        ConfigError: a joint on the way is none that a chain can have; with file and line.
+        ValueError: no such link, no such path, or several leaves.
+        ConfigError: a joint on the path is none that a chain can have; with file and line.
     """
     root, tip = ends(robot, root, tip)
     path = robot.path(root, tip) or ()
@@ -129,12 +129,12 @@ def _independent(joint: UrdfJoint, path: tuple[UrdfJoint, ...], names: Mapping[s
     if joint.mimic is None:
         return None
     moving = {urdf_joint.name: urdf_joint for urdf_joint in path if urdf_joint.kind in MOVING}
-    result, passed = joint.mimic, [joint.name]
+    mimic, passed = joint.mimic, [joint.name]
     while True:
-        master = moving.get(result.master)
+        master = moving.get(mimic.master)
         if master is None:
             joint.element.refuse(
-                f"joint {joint.name!r} follows {result.master!r}, which is no moving joint of the chain.",
+                f"joint {joint.name!r} follows {mimic.master!r}, which is no moving joint of the chain.",
                 f"The chain has {', '.join(moving)}; choose root and tip so that it has both, or neither.",
             )
         if master.name in passed:
@@ -142,28 +142,28 @@ def _independent(joint: UrdfJoint, path: tuple[UrdfJoint, ...], names: Mapping[s
                 f"joints follow one another in a circle: {', '.join([*passed, master.name])}.", "Free one of them."
             )
         if master.mimic is None:
-            return replace(result, master=names[result.master])
+            return replace(mimic, master=names[mimic.master])
         passed.append(master.name)
         beyond = master.mimic
-        offset = result.multiplier * beyond.offset + result.offset
-        result = Mimic(beyond.master, result.multiplier * beyond.multiplier, offset)
+        offset = mimic.multiplier * beyond.offset + mimic.offset
+        mimic = Mimic(beyond.master, mimic.multiplier * beyond.multiplier, offset)
 
 
 def _masses(robot: Robot, joints: tuple[ChainJoint, ...]) -> tuple[MassSpec, ...]:
     """What the chain moves, links that hang on it by joints off the chain (at zero) too."""
     on_chain = {joint.urdf.name for joint in joints}
-    found: list[tuple[str, float, Array, str]] = []
+    masses: list[tuple[str, float, Array, str]] = []
     moved = False
     for joint in joints:
         moved = moved or joint.moves
         for link, pose in _hanging(robot, joint.urdf.child, on_chain) if moved else ():
             stated = robot.links[link]
             if stated.mass > 0:
-                found.append((link, stated.mass, pose[:3, :3] @ np.array(stated.com) + pose[:3, 3], joint.frame))
-    names = _fitting("link", [link for link, *_ in found])
+                masses.append((link, stated.mass, pose[:3, :3] @ np.array(stated.com) + pose[:3, 3], joint.frame))
+    names = _fitting("link", [link for link, *_ in masses])
     return tuple(
         MassSpec(names[link], mass, (float(com[0]), float(com[1]), float(com[2])), frame)
-        for link, mass, com, frame in found
+        for link, mass, com, frame in masses
     )
 
 
@@ -174,17 +174,11 @@ def _hanging(robot: Robot, link: str, on_chain: set[str]) -> Iterator[tuple[str,
         here, pose = waiting.pop(0)
         yield here, pose
         beyond = (joint for joint in robot.below[here] if joint.name not in on_chain)
-        waiting += [(joint.child, pose @ origin(joint)) for joint in beyond]
+        waiting += [(joint.child, pose @ _origin(joint)) for joint in beyond]
 
 
-def origin(joint: UrdfJoint) -> Array:
+def _origin(joint: UrdfJoint) -> Array:
     """The pose (4x4) of a joint at zero in its parent's frame."""
-    (cr, cp, cy), (sr, sp, sy) = ([f(angle) for angle in joint.rpy] for f in (math.cos, math.sin))
     pose = np.eye(4)
-    pose[:3, :3] = [
-        [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
-        [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
-        [-sp, cp * sr, cp * cr],
-    ]
-    pose[:3, 3] = joint.xyz
+    pose[:3, :3], pose[:3, 3] = Rotation.from_euler("xyz", joint.rpy).as_matrix(), joint.xyz
     return pose

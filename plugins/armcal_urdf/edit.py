@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from operator import itemgetter
 
-from armcal_urdf.elements import UTF8, Element
+from armcal_urdf.elements import UTF8
 from armcal_urdf.numbers import Three, words_of
 from armcal_urdf.robot import UrdfJoint
 
@@ -29,13 +30,8 @@ class Placed:
         return {name: now for name, (before, now) in pairs.items() if before != now}
 
 
-@dataclass(frozen=True)
-class _Edit:
-    """Bytes from ``start`` to before ``end`` become ``new``."""
-
-    start: int
-    end: int
-    new: bytes
+Edit = tuple[int, int, bytes]
+"""Bytes from an offset to before another become new ones."""
 
 
 @dataclass(frozen=True)
@@ -50,38 +46,34 @@ class _StartTag:
 def with_origins(text: str, placed: Iterable[Placed]) -> str:
     """The text with other origins of joints; ``placed`` has joints that were read from this very text."""
     data = text.encode(UTF8)
-    edits = sorted((edit for each in placed for edit in _edits(data, each)), key=lambda edit: edit.start)
+    edits = sorted((edit for joint in placed for edit in _edits(data, joint)), key=itemgetter(0))
     parts, here = [], 0
-    for edit in edits:
-        parts += [data[here : edit.start], edit.new]
-        here = edit.end
+    for start, end, new in edits:
+        parts += [data[here:start], new]
+        here = end
     return b"".join([*parts, data[here:]]).decode(UTF8)
 
 
-def _edits(data: bytes, placed: Placed) -> list[_Edit]:
+def _edits(data: bytes, placed: Placed) -> list[Edit]:
     element, changed = placed.joint.element, placed.changed
     origin = element.one("origin")
     if not changed:
         return []
     if origin is None:
-        return [_new_origin(data, element, changed)]
+        # as the joint's first element, on a line of its own if the next thing in it stands on one
+        end = _start_tag(data, element.start).end
+        inside = data[end:]
+        lead = inside[: len(inside) - len(inside.lstrip(_WHITE))].decode(UTF8)
+        attributes = " ".join(f'{name}="{_written(numbers, [])}"' for name, numbers in changed.items())
+        return [(end, end, f"{lead}<origin {attributes}/>".encode())]
     tag = _start_tag(data, origin.start)
     edits = []
     for name, numbers in changed.items():
         if name in tag.values:
-            edits.append(_Edit(*tag.values[name], _written(numbers, words_of(origin.attributes[name])).encode()))
+            edits.append((*tag.values[name], _written(numbers, words_of(origin.attributes[name])).encode()))
         else:
-            edits.append(_Edit(tag.name_end, tag.name_end, f' {name}="{_written(numbers, [])}"'.encode()))
+            edits.append((tag.name_end, tag.name_end, f' {name}="{_written(numbers, [])}"'.encode()))
     return edits
-
-
-def _new_origin(data: bytes, joint: Element, changed: Mapping[str, Three]) -> _Edit:
-    """As the joint's first element, on a line of its own if the next thing in it stands on one."""
-    end = _start_tag(data, joint.start).end
-    inside = data[end:]
-    lead = inside[: len(inside) - len(inside.lstrip(_WHITE))].decode(UTF8)
-    attributes = " ".join(f'{name}="{_written(numbers, [])}"' for name, numbers in changed.items())
-    return _Edit(end, end, f"{lead}<origin {attributes}/>".encode())
 
 
 def _written(numbers: Three, before: list[str]) -> str:

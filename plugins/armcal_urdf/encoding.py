@@ -79,7 +79,7 @@ def declared(text: str, label: str) -> Encoding | None:
         return None
     name = match[1].lower()
     name = _OTHER_NAMES.get(name, name)
-    known = {each: each for each in get_args(Encoding)}
+    known = {encoding: encoding for encoding in get_args(Encoding)}
     if name not in known or name.startswith("utf-16"):
         raise ConfigError(
             f"found the encoding {match[1]!r}, expected UTF-8, UTF-16, ISO-8859-1 or US-ASCII and a text in it.",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
@@ -16,6 +15,7 @@ from armcal.base.settings import Settings
 from armcal.calibration.exporter import Exported, ExportRequest, random_commands
 from armcal.calibration.rigid_chain import numeric_chain, rigid_chain, rpy_of
 from armcal.errors import ConfigError, ProblemError
+from scipy.spatial.transform import Rotation
 
 from armcal_urdf.edit import Placed, with_origins
 from armcal_urdf.encoding import encode
@@ -62,14 +62,20 @@ class UrdfExporter:
         ]
         old = model.settings
         text = with_origins(old.text, placed)
-        _compare(request, model, _read_again(old, text), values)
+        written = UrdfModel(UrdfSettings.model_validate({**old.to_config(), "text": text}))
+        _compare(request, model, written, values)
         changed = sum(
             before != now
-            for each in placed
-            for before, now in zip((*each.joint.xyz, *each.joint.rpy), (*each.xyz, *each.rpy), strict=True)
+            for joint in placed
+            for before, now in zip((*joint.joint.xyz, *joint.joint.rpy), (*joint.xyz, *joint.rpy), strict=True)
         )
+        # what of the calibrated arm is no origin of a joint
+        nominal = {block.name: block.nominal for block in request.arm.parameters()}
+        moved = [name for name, value in request.values.items() if tuple(value) != nominal[name]]
+        masses = sorted({name.split(".")[2] for name in moved if name.startswith(f"{request.name}.links.")})
+        left_out = (*request.arm.effects, *(f"the mass of {link}" for link in masses))
         remarks = _placed(request) or _base_moved(model, values)
-        return Exported(encode(text, old.encoding or "utf-8"), changed, _left_out(request), remarks=remarks)
+        return Exported(encode(text, old.encoding or "utf-8"), changed, left_out, remarks=remarks)
 
 
 def _three(joint: str, names: tuple[str, ...], values: Mapping[str, float]) -> Three:
@@ -77,22 +83,8 @@ def _three(joint: str, names: tuple[str, ...], values: Mapping[str, float]) -> T
     return x, y, z
 
 
-def _read_again(old: UrdfSettings, text: str) -> UrdfModel:
-    content = {**old.to_config(), "text": text}
-    return UrdfModel(UrdfSettings.model_validate(content))
-
-
 def _nominal(model: UrdfModel) -> dict[str, float]:
     return {block.name: float(block.nominal[0]) for block in model.parameters()}
-
-
-def _first(model: UrdfModel, values: Mapping[str, float]) -> Array:
-    """base_T_joint of the first joint that moves (4 x 4)."""
-    return (
-        rigid_chain(numeric_chain(model, {name: np.array(value) for name, value in values.items()}))
-        .joints[0]
-        .base_T_joint
-    )
 
 
 def _compare(request: ExportRequest, model: UrdfModel, written: UrdfModel, values: Mapping[str, float]) -> None:
@@ -117,18 +109,8 @@ def _frames(arm: Arm, model: UrdfModel, values: Mapping[str, float], commands: A
     frames = forward(chain, arm.joint_commands(ca.vertsplit(expression)), {})
     poses = [frames.base_T_tool, *frames.named.values()]
     stacked = ca.vertcat(*[ca.vec(ca.densify(pose.matrix())) for pose in poses])
-    found = np.asarray(
-        ca.Function("frames", [expression], [stacked], {"cse": True}).map(commands.shape[1])(commands).full()
-    )
-    return found.T.reshape(commands.shape[1], len(poses), 4, 4).swapaxes(-1, -2)
-
-
-def _left_out(request: ExportRequest) -> tuple[str, ...]:
-    """What of the calibrated arm is no origin of a joint."""
-    arm, nominal = request.arm, {block.name: block.nominal for block in request.arm.parameters()}
-    moved = [name for name, value in request.values.items() if tuple(value) != nominal[name]]
-    masses = sorted({name.split(".")[2] for name in moved if name.startswith(f"{request.name}.links.")})
-    return (*arm.effects, *(f"the mass of {link}" for link in masses))
+    function = ca.Function("frames", [expression], [stacked], {"cse": True}).map(commands.shape[1])
+    return np.asarray(function(commands).full()).T.reshape(commands.shape[1], len(poses), 4, 4).swapaxes(-1, -2)
 
 
 def _placed(request: ExportRequest) -> tuple[str, ...]:
@@ -146,10 +128,14 @@ def _placed(request: ExportRequest) -> tuple[str, ...]:
 
 def _base_moved(model: UrdfModel, values: Mapping[str, float]) -> tuple[str, ...]:
     """Whether the first joint that moves stands elsewhere than in the file, by more than an arm is made wrong."""
-    before, now = (_first(model, {**_nominal(model), **changed}) for changed in ({}, values))
+    nominal = _nominal(model)
+    chains = [
+        numeric_chain(model, {name: np.array(value) for name, value in {**nominal, **changed}.items()})
+        for changed in ({}, values)
+    ]
+    before, now = (rigid_chain(chain).joints[0].base_T_joint for chain in chains)
     shift = 1000 * float(np.linalg.norm(now[:3, 3] - before[:3, 3]))
-    cosine = (float(np.trace(before[:3, :3].T @ now[:3, :3])) - 1) / 2
-    turn = math.degrees(math.acos(min(1.0, max(-1.0, cosine))))
+    turn = float(np.degrees(Rotation.from_matrix(before[:3, :3].T @ now[:3, :3]).magnitude()))
     if shift <= MOST_SHIFT_MM and turn <= MOST_TURN_DEG:
         return ()
     first = model.urdf_chain.moving[0].name

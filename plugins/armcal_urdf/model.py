@@ -10,11 +10,10 @@ from armcal.arm.assembly import MassSpec
 from armcal.arm.model import Attachment, Chain, Joint, Vector3
 from armcal.base import se3
 from armcal.base.parameters import ParameterBlock, scalar
-from armcal.base.se3 import Transform
 from armcal.base.settings import InputPath, Settings
 from pydantic import model_validator
 
-from armcal_urdf.chain import ChainJoint, UrdfChain, chain_of, ends
+from armcal_urdf.chain import UrdfChain, chain_of, ends
 from armcal_urdf.encoding import MAX_BYTES, Encoding, declared, encode, read_text
 from armcal_urdf.robot import Robot, read_robot
 
@@ -98,7 +97,7 @@ class UrdfSettings(Settings):
 
     @property
     def robot(self) -> Robot:
-        """What the URDF says."""
+        """Its links and joints."""
         return read_robot(self.text, self.file)
 
     @property
@@ -148,30 +147,18 @@ class UrdfModel:
         frames = {self.urdf_chain.root_frame: Attachment(0, se3.identity())}
         here = se3.identity()
         for joint in self.urdf_chain.joints:
-            here = here @ _origin(joint.name, values)
+            # translation, then Rz(yaw) Ry(pitch) Rx(roll) [URDF]
+            shift = se3.translation(*[values[f"{joint.name}_{axis}"] for axis in XYZ])
+            roll, pitch, yaw = (values[f"{joint.name}_{angle}"] for angle in RPY)
+            turn = se3.rotation_about("z", yaw) @ se3.rotation_about("y", pitch) @ se3.rotation_about("x", roll)
+            here = here @ (shift @ turn)
             if joint.moves:
-                joints.append(_moving(joint, here))
+                urdf, slides = joint.urdf, joint.urdf.kind == "prismatic"
+                angular, linear = (_STILL, urdf.axis) if slides else (urdf.axis, _STILL)
+                endless = urdf.kind == "continuous"
+                joints.append(
+                    Joint(joint.name, here, angular, linear, limits=urdf.limits, endless=endless, mimic=joint.mimic)
+                )
                 here = se3.identity()
             frames[joint.frame] = Attachment(len(joints), here)
         return Chain(se3.identity(), tuple(joints), Attachment(len(joints), here), frames)
-
-
-def _origin(name: str, values: Mapping[str, Any]) -> Transform:
-    """Translation, then Rz(yaw) Ry(pitch) Rx(roll). [URDF]"""
-    shift = se3.translation(*[values[f"{name}_{axis}"] for axis in XYZ])
-    roll, pitch, yaw = (values[f"{name}_{angle}"] for angle in RPY)
-    turn = se3.rotation_about("z", yaw) @ se3.rotation_about("y", pitch) @ se3.rotation_about("x", roll)
-    return shift @ turn
-
-
-def _moving(joint: ChainJoint, parent_T_joint: Transform) -> Joint:
-    slides = joint.urdf.kind == "prismatic"
-    return Joint(
-        joint.name,
-        parent_T_joint,
-        angular=_STILL if slides else joint.urdf.axis,
-        linear=joint.urdf.axis if slides else _STILL,
-        limits=joint.urdf.limits,
-        endless=joint.urdf.kind == "continuous",
-        mimic=joint.mimic,
-    )

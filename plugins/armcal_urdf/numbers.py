@@ -56,7 +56,17 @@ def numbers(element: Element, name: str, default: tuple[float, ...], largest: fl
         element.refuse(
             f"found {len(words)} in {_shown(element, name)}, expected {count}.", "Separate them by single spaces."
         )
-    return tuple(_one(element, name, word, largest) for word in words)
+    for word in words:
+        if not (word.isascii() and _NUMBER.fullmatch(word)):
+            xacro = "${" in element.attributes[name]
+            hint = "Run the file through xacro first." if xacro else "Write a decimal number with a point: 0.25."
+            element.refuse(f"found {word[:40]!r} in {_shown(element, name)}, expected a number.", hint)
+        if not abs(float(word)) <= largest:
+            element.refuse(
+                f"found {word[:40]} in {_shown(element, name)}, expected a number of size {largest:g} at most.",
+                "Lengths are in m, angles in rad, masses in kg.",
+            )
+    return tuple(map(float, words))
 
 
 def unit_axis(element: Element | None) -> Three:
@@ -74,20 +84,6 @@ def unit_axis(element: Element | None) -> Three:
             f"found an axis of length {length:g} in {_shown(element, 'xyz')}.", 'Give a direction, xyz="0 0 1".'
         )
     return x / length, y / length, z / length
-
-
-def _one(element: Element, name: str, word: str, largest: float) -> float:
-    if not (word.isascii() and _NUMBER.fullmatch(word)):
-        xacro = "${" in element.attributes[name]
-        hint = "Run the file through xacro first." if xacro else "Write a decimal number with a point: 0.25."
-        element.refuse(f"found {word[:40]!r} in {_shown(element, name)}, expected a number.", hint)
-    value = float(word)
-    if not abs(value) <= largest:
-        element.refuse(
-            f"found {word[:40]} in {_shown(element, name)}, expected a number of size {largest:g} at most.",
-            "Lengths are in m, angles in rad, masses in kg.",
-        )
-    return value
 
 
 def _shown(element: Element, name: str) -> str:

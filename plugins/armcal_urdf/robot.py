@@ -1,4 +1,4 @@
-"""What a URDF says, checked: links with their masses, and joints that make one tree of them. [URDF]"""
+"""A URDF, checked: links with their masses, and joints that make one tree of them. [URDF]"""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ class Robot:
         return next(name for name in self.links if name not in self.above)
 
     def path(self, root: str, tip: str) -> tuple[UrdfJoint, ...] | None:
-        """The joints from one link out to another; None if the way is not outward all along."""
+        """The joints from one link out to another; None if the path is not outward all along."""
         joints: list[UrdfJoint] = []
         here = tip
         while here != root:
@@ -102,16 +102,16 @@ class Robot:
 
     def leaves(self, root: str) -> tuple[str, ...]:
         """The links beyond a link, or itself, that carry no joint."""
-        texts, waiting = [], [root]
+        leaves, waiting = [], [root]
         while waiting:
             link = waiting.pop(0)
             waiting += [joint.child for joint in self.below[link]]
-            texts += [] if self.below[link] else [link]
-        return tuple(texts)
+            leaves += [] if self.below[link] else [link]
+        return tuple(leaves)
 
 
 def read_robot(text: str, label: str) -> Robot:
-    """What a URDF says.
+    """The links and joints of a URDF.
 
     Args:
         text: the URDF.
@@ -182,10 +182,10 @@ def _joint(element: Element) -> UrdfJoint:
 
 
 def _named_link(element: Element, which: str, joint: str) -> str:
-    found = element.one(which)
-    if found is None:
+    end = element.one(which)
+    if end is None:
         element.refuse(f"found no <{which}> in joint {joint!r}.", f'Write <{which} link="NAME"/>.')
-    return found.text("link")
+    return end.text("link")
 
 
 def _limits(element: Element | None, joint: str) -> tuple[float, float] | None:

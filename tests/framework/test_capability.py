@@ -16,17 +16,14 @@ from armcal.measure.contact import ArmsAlone
 from armcal.problem.problem import Problem
 from armcal_capability.accuracy import steps_at, with_accuracy
 from armcal_capability.areas import AreaSearch, cells_of
-from armcal_capability.designs import load_designs
-from armcal_capability.dexterity import dexterity, moves, singular_values, weighted
 from armcal_capability.inverse import Pointing
-from armcal_capability.loading import Task, load_task
+from armcal_capability.loading import Task, load_designs, load_task
 from armcal_capability.mechanics import MechanicsFunction
-from armcal_capability.quantities import Weights, postures_at
-from armcal_capability.sampling import spread
+from armcal_capability.quantities import Weights, dexterity, moves, postures_at, singular_values, weighted
 from armcal_capability.settings import AreaSettings, CapabilitySettings, LoadSettings, ToolDirectionSettings
 from armcal_capability.subject import Subject
 from armcal_capability.summary import design_summaries
-from armcal_capability.survey import Survey, outline, survey
+from armcal_capability.survey import Survey, outline, spread, survey
 from armcal_capability.voxels import grouped, voxels_of
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs" / "lrm_arm"

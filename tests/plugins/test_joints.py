@@ -22,10 +22,8 @@ from armcal.cli.main import cli
 from armcal.problem.problem import Problem
 from armcal.run.experiment import Experiment
 from armcal_joints.backlash import ApproachBacklash, BearingPlay, TorqueBacklash
-from armcal_joints.compliance import Compliances
-from armcal_joints.gear import GearError
-from armcal_joints.servo_map import ServoMap
-from armcal_joints.springs import CubicSprings, TorsionalSprings
+from armcal_joints.servo_map import GearError, ServoMap
+from armcal_joints.springs import Compliances, CubicSprings, TorsionalSprings
 from armcal_joints.thermal import ThermalLength
 from armcal_tracker.position import TipPosition, TipPositionSettings
 from click.testing import CliRunner
