@@ -137,6 +137,9 @@ class FakeLog:
         if self.dies_after is not None and len(self.entries) >= self.dies_after:
             raise KilledError
 
+    def note_angles(self, angles: Mapping[str, float], thermal_state: Mapping[str, Any], wall: float) -> None:
+        pass
+
     def kinds(self) -> list[str]:
         return [kind for kind, _ in self.entries]
 

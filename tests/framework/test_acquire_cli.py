@@ -52,10 +52,11 @@ def there(run: BenchRun) -> tuple[str, ...]:
     return (*overrides_for(run.bench), f"bench.tracker.port={tracker_port(run)}")
 
 
-def quiet_course(run: BenchRun, **changes: object) -> RunOptions:
-    told = {"asked_to_end": lambda: False, "may_energise": lambda start: True, "told": lambda progress: None}
-    told["unchecked"] = True
-    return RunOptions(**{"folder": run.out, "start": "anew", **told, **changes})  # type: ignore[arg-type]
+def quiet_options(run: BenchRun, **changes: object) -> RunOptions:
+    answers = {"asked_to_end": lambda: False, "may_energise": lambda start: True}
+    options = {"folder": run.out, "start": "anew", "unchecked": True, "on_progress": lambda progress: None, **answers}
+    options |= changes
+    return RunOptions(**options)  # type: ignore[arg-type]
 
 
 class TestDryRun:
@@ -167,11 +168,11 @@ class TestRefusedBeforeAnythingMoves:
     def test_a_folder_with_a_run_unless_it_is_resumed_and_one_without_if_it_is(self, run: BenchRun, plan: Path) -> None:
         prepared = run.prepared()
         with pytest.raises(InputError, match="no run to resume"), run.simulated():
-            acquire(prepared, run.plan, quiet_course(run, start="resume"))
+            acquire(prepared, run.plan, quiet_options(run, start="resume"))
         with run.simulated():
             run.acquire(lambda: True)
             with pytest.raises(InputError, match="--resume"):
-                acquire(prepared, run.plan, quiet_course(run))
+                acquire(prepared, run.plan, quiet_options(run))
             run.plan.write_text(run.plan.read_text().replace("40,", "41,"))
             with pytest.raises(InputError, match="another plan"):
                 run.acquire()

@@ -327,7 +327,7 @@ class TestBoard:
     def test_pulses_that_are_not_those_that_were_told_are_not_measured(self) -> None:
         """Another program, or a chip that lost its supply and nothing else."""
         run = Run()
-        recovery = run.acquisition()._parts.recovery
+        recovery = run.acquisition()._recovery
         run.device.running = {"q1": 0.0, "q2": 0.0}
         assert recovery.standing() == {"q1": 0.0, "q2": 0.0}
         run.device.running["q1"] = 5 * COUNT_RAD
@@ -347,9 +347,9 @@ class TestBoard:
     def test_the_board_is_never_left_with_the_way_home_of_another_leg(self) -> None:
         run = Run()
         made = run.acquisition()
-        made._parts.drive._planner.find = lambda start, goal: None  # type: ignore[method-assign]
-        made._parts.drive.found({"q1": 0.4, "q2": 0.2})
-        made._parts.drive.guard_here()
+        made._drive._planner.find = lambda start, goal: None  # type: ignore[method-assign]
+        made._drive.take_over({"q1": 0.4, "q2": 0.2})
+        made._drive.guard_here()
         assert run.device.guards[-1] == [{"q1": 0.4, "q2": 0.2}]
 
     @pytest.mark.slow
@@ -555,8 +555,8 @@ class TestHeat:
         run = Run(heat={joint: ServoHeatSettings.si(continuous=1.3) for joint in ("q1", "q2")})
         run.clock.at.append((3600.0, lambda: pytest.fail("it rests for ever")))
         acquisition = run.acquisition()
-        drive = acquisition._parts.drive
-        drive.found({"q1": 0.0, "q2": 0.0})
+        drive = acquisition._drive
+        drive.take_over({"q1": 0.0, "q2": 0.0})
         run.device.running = {"q1": 0.0, "q2": 0.0}
         expected = drive._model.after(np.array([[0.90, 0.5], [0.0, 0.0]]), torques(drive.at), 20.0)
         drive.thermal_state = np.array([[0.95, 0.5], [0.0, 0.0]])
@@ -587,7 +587,7 @@ class TestPlans:
         run = self.sub(tmp_path, ((-100, 0, 0, 0, 0, 0), (100, 0, 0, 0, 0, 10)), *wide, park)
         prepared = run.prepared()
         device = prepared.device
-        for pose in prepared.planner._roadmap:
+        for pose in prepared.scheduler.planner._roadmap:
             device.standing(dict(zip(device.joint_names, pose.tolist(), strict=True)))
         with run.simulated() as clock:
             assert run.acquire(prepared=prepared).ending.how == "done"

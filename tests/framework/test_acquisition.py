@@ -8,15 +8,15 @@ from functools import partial
 import numpy as np
 import pytest
 from armcal.devices.faults import DeviceError, DeviceLostError
-from armcal_bench.acquisition.acquisition_run import AcquisitionRun, Parts
+from armcal_bench.acquisition.acquisition_run import AcquisitionRun
 from armcal_bench.acquisition.drive import Drive
 from armcal_bench.acquisition.heat import HeatModel
+from armcal_bench.acquisition.motion_gate import MotionGate
 from armcal_bench.acquisition.path_planner import PathPlanner
 from armcal_bench.acquisition.progress import Progress
 from armcal_bench.acquisition.recovery import Recovery
 from armcal_bench.acquisition.schedule import Scheduler
 from armcal_bench.acquisition.settings import AcquisitionSettings, ServoHeatSettings
-from armcal_bench.acquisition.watch import Patient, Watch
 
 from tests.bench_fakes import COUNT_RAD, FakeClock, FakeDevice, FakeLog, FakeTrackerMonitor, KilledError
 
@@ -46,26 +46,11 @@ class Run:
     def acquisition(self) -> AcquisitionRun:
         settings, clock, device = self.settings, self.clock, self.device
         planner = PathPlanner(None, np.array([[-2.0, 2.0]] * 2), self.poses, 0.02)
-        drive = Drive(device, clock, planner, settings, (self.model, torques), lambda angles, thermal_state: None)
+        drive = Drive(device, clock, planner, settings, (self.model, torques), self.log)
         scheduler = Scheduler(self.poses, IDS, drive.park, planner, self.model, torques, RATE, 2.0, settings.order)
-        recovery = Recovery(device, drive, clock, settings, self.announce, lambda: self.asked)
-        recovery.open()
-        parts = Parts(
-            drive=drive,
-            recovery=recovery,
-            scheduler=scheduler,
-            monitor=self.monitor,
-            clock=clock,
-            settings=settings,
-            log=self.log,
-            watch=Watch(clock, self.monitor, settings.lost, lambda: self.asked),
-            patient=Patient(self.monitor, lambda: self.asked),
-            told=lambda progress: None,
-        )
-        return AcquisitionRun(parts, self.progress)
-
-    def announce(self, joint: str, angle: float) -> None:
-        self.log.record("energised", {"joint": joint, "angle": angle, "at": self.clock.wall()})
+        gate = MotionGate(self.monitor, clock, settings.lost, lambda: self.asked)
+        recovery = Recovery(device, drive, gate, self.log, device.open(clock))
+        return AcquisitionRun(drive, recovery, scheduler, gate, self.log, self.progress, lambda progress: None)
 
     def run(self) -> str:
         self.made = self.acquisition()

@@ -197,6 +197,12 @@ def correlations(covariance: Array) -> Array:
         return np.asarray(np.nan_to_num(covariance / np.outer(deviation, deviation)))
 
 
+def numerical_rank(scaled: Array) -> int:
+    """The rank of R (m x n, columns scaled) by singular values or by QR with pivoting, whichever finds more."""
+    diagonal = np.diag(qr(scaled, pivoting=True, mode="r")[0])
+    return max(_count_above(np.asarray(np.linalg.svd(scaled, compute_uv=False))), _count_above(np.abs(diagonal)))
+
+
 def _count_above(values: Array) -> int:
     """How many stand above the rank tolerance."""
     largest = float(values.max(initial=0.0))

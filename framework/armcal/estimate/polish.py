@@ -60,8 +60,10 @@ def polish(posed: PosedProblem, x: Array) -> Array:
     return kept
 
 
-def descended(posed: PosedProblem, x: Array, most_steps: int, damping: float) -> Array:
+def descended(posed: PosedProblem, x: Array, most_steps: int, damping: float, enough: float = 0.0) -> Array:
     """Damped Gauss-Newton steps [Nocedal2006] within the bounds, until nothing moves or no step lowers the cost.
+
+    A step that lowers the cost by less than ``enough`` of it, or of one, is the last.
 
     Raises:
         NotConvergedError: a record has no elastic equilibrium at ``x`` itself.
@@ -71,9 +73,11 @@ def descended(posed: PosedProblem, x: Array, most_steps: int, damping: float) ->
         diagonal = np.maximum(np.diag(model.hessian), 1e-12 * max(float(np.trace(model.hessian)), 1e-300))
         step = -np.linalg.solve(model.hessian + damping * np.diag(diagonal), model.gradient)
         there = np.clip(x + step, lower, upper)
-        tried = posed.model(there) if posed.cost(there) <= model.cost * (1 + _ROUNDING) else None
-        if tried is not None:
-            x, model, damping = there, tried, max(damping * 0.1, _ROUNDING)
+        gain = model.cost - posed.cost(there)
+        if gain >= -_ROUNDING * model.cost:
+            if enough and gain < enough * max(model.cost, 1.0):
+                return np.asarray(there)
+            x, model, damping = there, posed.model(there), max(damping * 0.1, _ROUNDING)
         else:
             damping = max(damping * 10, _LEAST_RETRY)
         if float(np.abs(step).max(initial=0.0)) < _STILL or damping > _MOST_DAMPING:

@@ -4,86 +4,70 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
-from typing import Any, Protocol, TypeVar
+from dataclasses import dataclass
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from armcal.base.domains import Array
-from armcal.devices.clock import Clock
 from armcal.devices.faults import DeviceError
 
 from armcal_bench.acquisition import progress as entry
 from armcal_bench.acquisition.arrival import Arrival
-from armcal_bench.acquisition.drive import Drive
-from armcal_bench.acquisition.endings import Ending, ParkRequested, ThermalLimit, TrackerLost
+from armcal_bench.acquisition.drive import Drive, ThermalLimit
+from armcal_bench.acquisition.motion_gate import MotionGate, ParkRequested, TrackerLost, unguarded
 from armcal_bench.acquisition.progress import Progress
 from armcal_bench.acquisition.recovery import DeviceLost, Recovery
+from armcal_bench.acquisition.run_log import RunLog
 from armcal_bench.acquisition.schedule import LeaveOut, Measure, Rest, Scheduler
-from armcal_bench.acquisition.settings import AcquisitionSettings
-from armcal_bench.acquisition.watch import Blind, Patient, Watch
 from armcal_bench.settling import Settled
-from armcal_bench.waiting import Waits
 
 T = TypeVar("T")
 _TRIES = 2
 
 
-class Log(Protocol):
-    """The journal of a run."""
-
-    def record(self, kind: str, content: Mapping[str, Any]) -> None:
-        """Write an entry that outlasts a power loss."""
-
-
-class TrackerMonitor(Protocol):
-    """The tracker, as a run uses it."""
-
-    def look(self) -> None:
-        """Take in the frames that came."""
-
-    def trouble(self) -> tuple[float, str]:
-        """See ``Sight``."""
-
-    def begin(self) -> None:
-        """The arm has just been told to stand."""
-
-    def settled(self) -> Settled | None:
-        """The mean, once the arm stands; else None, and ``why`` says why."""
-
-    @property
-    def why(self) -> str:
-        """Why there is no mean yet."""
-
-
 @dataclass(frozen=True)
-class Parts:
-    """What a run is made of."""
+class Ending:
+    """How a run ended, and a sentence why."""
 
-    drive: Drive
-    recovery: Recovery
-    scheduler: Scheduler
-    monitor: TrackerMonitor
-    clock: Clock
-    settings: AcquisitionSettings
-    log: Log
-    watch: Watch
-    patient: Patient
-    told: Callable[[Progress], None]
-    arrival: Arrival | None = None
-    waits: Waits = field(default_factory=Waits)
+    how: Literal["done", "held", "parked"]
+    sentence: str
 
 
 class AcquisitionRun:
-    """One run over one plan, from its progress on."""
+    """One run over one plan, from its progress on.
 
-    def __init__(self, parts: Parts, progress: Progress) -> None:
-        self._parts, self.progress = parts, progress
+    Args:
+        drive: the arm.
+        recovery: brings the device back after a fault.
+        scheduler: decides what comes next.
+        gate: asked between two steps of the arm.
+        log: the journal, in which every step is written as it is made.
+        progress: of an earlier part of the run.
+        on_progress: called after each pose.
+        arrival: whether the arm stands where it was commanded to; None checks nothing.
+
+    Attributes:
+        progress: where the run stands now.
+    """
+
+    def __init__(
+        self,
+        drive: Drive,
+        recovery: Recovery,
+        scheduler: Scheduler,
+        gate: MotionGate,
+        log: RunLog,
+        progress: Progress,
+        on_progress: Callable[[Progress], None],
+        arrival: Arrival | None = None,
+    ) -> None:
+        self._drive, self._recovery, self._scheduler, self._gate = drive, recovery, scheduler, gate
+        self._log, self.progress, self._on_progress, self._arrival = log, progress, on_progress, arrival
+        self._ids, self._settings = scheduler.ids, drive.settings
         self._tries: dict[int, int] = {}
         self._astray = 0
-        ids = parts.scheduler.ids
-        self._left = [
-            i for i, name in enumerate(ids) if name not in progress.measured and name not in progress.left_out
-        ]
+        done = {*progress.measured, *progress.left_out}
+        self._left = [i for i, name in enumerate(self._ids) if name not in done]
 
     def run(self) -> Ending:
         """To its end; whatever happens on the way, the arm is held or parked.
@@ -92,43 +76,38 @@ class AcquisitionRun:
             ArmcalError: the journal cannot be written, for one; the arm is parked by then, where it can be.
         """
         try:
-            return self._to_its_end()
+            try:
+                self._persist(self._energise)
+                while self._left:
+                    self._persist(self._step)
+                left_out, total = len(self.progress.left_out), len(self._ids)
+                some = f"{total - left_out} of {total} poses are measured, {left_out} were left out"
+                return self._park_and_end("done", some if left_out else "all poses are measured")
+            except ParkRequested as request:
+                return self._park_and_end("parked", str(request))
+            except DeviceLost as loss:
+                return self._end(Ending("held", str(loss)))
         except Exception as fault:
             # Nothing is known of what went wrong here, but an arm that is left standing heats up.
             with suppress(Exception):
-                self._home("parked", str(fault))
+                self._park_and_end("parked", str(fault))
             raise
 
-    def _to_its_end(self) -> Ending:
-        try:
-            self._persist(self._energised)
-            while self._left:
-                self._persist(self._step)
-            return self._home("done", "all poses are measured" if not self.progress.left_out else self._left_out())
-        except ParkRequested as wish:
-            return self._home("parked", str(wish))
-        except DeviceLost as loss:
-            return self._end(Ending("held", str(loss)))
+    def _energise(self) -> None:
+        self._recovery.energise(self.progress.angles)
 
-    def _energised(self) -> None:
-        self._parts.recovery.energise(self.progress.angles)
-
-    def _persist(self, action: Callable[[], T], again: Callable[[DeviceError], None] | None = None) -> T:
-        """Do it; when the device fails, hold until it is back, and do it again from where the arm is then."""
+    def _persist(self, action: Callable[[], T], afterwards: Callable[[], None] | None = None) -> T:
+        """Do it; when the device fails, hold until it is back and energised (or ``afterwards``), and do it again."""
         while True:
             try:
                 return action()
             except DeviceError as fault:
-                self._told("trouble", str(fault))
-                (again or self._energised_again)(fault)
-                self._told("back", "the device is back")
-
-    def _energised_again(self, fault: DeviceError) -> None:
-        self._parts.recovery.back(fault, self.progress.angles)
+                self._notice("trouble", str(fault))
+                self._recovery.reopen(fault, afterwards or self._energise)
+                self._notice("back", "the device is back")
 
     def _step(self) -> None:
-        drive = self._parts.drive
-        step = self._parts.scheduler.next(drive.at, drive.thermal_state, self._left)
+        step = self._scheduler.next(self._drive.at, self._drive.thermal_state, self._left)
         if isinstance(step, LeaveOut):
             self._leave_out(step.pose, step.why)
         elif isinstance(step, Rest):
@@ -137,107 +116,100 @@ class AcquisitionRun:
             self._measure(step)
 
     def _rest(self, step: Rest) -> None:
-        drive, waits, now = self._parts.drive, self._parts.waits, self._parts.clock.now
+        drive, waits, now = self._drive, self._gate.waits, self._gate.clock.now
         until, why = now() + step.seconds, f"the servos rest where the arm parks: {drive.hottest}"
-        self._told("rest", f"the servos rest for {step.seconds / 60:.1f} min")
+        self._notice("rest", f"the servos rest for {step.seconds / 60:.1f} min")
         waits.goes_on("rest", why, step.seconds, now())
-        drive.go(step.path, self._parts.patient)
+        drive.go(step.path, self._gate.resting)
         drive.note()
         while True:  # a second at least: whoever comes to rest here again and again must let time pass
-            drive.stand(1.0, self._parts.patient)
+            drive.stand(1.0, self._gate.resting)
             if not drive.hotter_than(step.thermal_state):
                 waits.over("rest", now())
                 return
             waits.goes_on("rest", why, max(until - now(), 1.0), now())
 
     def _measure(self, step: Measure) -> None:
-        drive, name = self._parts.drive, self._parts.scheduler.ids[step.pose]
-        self._record(entry.GOING, {"pose": name, **self._here()})
+        drive, gate, settled = self._drive, self._gate, None
+        self._record(entry.GOING, {"pose": self._ids[step.pose], **self._here()})
         try:
-            drive.go(step.path, self._parts.watch)
-            drive.preload_backlash(self._parts.watch)
+            drive.go(step.path, gate.measuring)
+            drive.preload_backlash(gate.measuring)
             drive.note()
-            capture = self._capture()
-        except ThermalLimit as heat:
-            self._try_later(step.pose, str(heat))
-            return
-        except TrackerLost as wish:
-            self._seen_again(wish)
-            self._try_later(step.pose, str(wish))
-            return
-        if capture is None:
-            self._try_later(step.pose, self._parts.monitor.why or "the arm did not come to stand")
-            return
-        content = self._written(capture)
-        doubt = self._doubt(step.pose, capture)
-        if doubt:
-            self._astray += 1
-            self._try_later(step.pose, doubt)
-            if self._astray >= self._parts.settings.arrival.in_a_row:
-                raise ParkRequested(f"{doubt}, {self._astray} times in a row; look at servos, gears and bodies")
-            return
-        self._astray = 0
-        self._record(entry.MEASURED, {"pose": name, **self._here(), **content})
-        self._left.remove(step.pose)
-        self._parts.told(self.progress)
+            settled = self._settled()
+            why = gate.monitor.why or "the arm did not come to stand"
+        except ThermalLimit as limit:
+            why = str(limit)
+        except TrackerLost as loss:
+            # If the tracker is well where the arm parks, it was the pose, or the path to it, that hid the body.
+            if not self._persist(self._park) or not self._sees_again():
+                raise
+            why = str(loss)
+        if settled is None:
+            self._try_later(step.pose, why)
+        else:
+            self._accept(step.pose, settled)
 
-    def _seen_again(self, wish: TrackerLost) -> None:
-        """Park, and look whether the tracker is well there: then it was the pose, or the way to it, that hid the body.
-
-        Raises:
-            ParkRequested: it is not.
-        """
-        if not self._persist(self._parked):
-            raise wish
-        until = self._parts.clock.now() + self._parts.settings.settle.longest
-        while self._parts.clock.now() < until:
-            self._parts.drive.tick(self._parts.patient)
-            if not self._parts.monitor.trouble()[0]:
-                return
-        raise wish
-
-    def _capture(self) -> Settled | None:
-        drive, monitor, settle = self._parts.drive, self._parts.monitor, self._parts.settings.settle
+    def _settled(self) -> Settled | None:
+        """Where the target stands, once the arm does; None if it does not come to stand in time."""
+        monitor, now, longest = self._gate.monitor, self._gate.clock.now, self._settings.settle.longest
         monitor.begin()
-        now = self._parts.clock.now
-        until, last = now() + settle.longest, now() + settle.longest + self._parts.settings.lost.park
+        until, last = now() + longest, now() + longest + self._settings.lost.park
         while now() < min(until, last):
-            goes_on = drive.tick(self._parts.watch)
-            drive.check_heat()
-            if not goes_on:  # a tracker that comes and goes must not keep the arm here for ever: hence the last
-                until = now() + settle.longest
+            is_seen = self._drive.tick(self._gate.measuring)
+            self._drive.check_heat()
+            if not is_seen:  # a tracker that comes and goes must not keep the arm here for ever: hence the last
+                until = now() + longest
                 monitor.begin()
-                continue
-            capture = monitor.settled()
-            if capture is not None:
-                return capture
+            elif (settled := monitor.settled()) is not None:
+                return settled
         return None
 
-    def _doubt(self, pose: int, settled: Settled) -> str:
-        """Why the arm is not where it was told to be; empty if nothing speaks against it."""
-        if self._parts.arrival is None:
-            return ""
-        ids, measured = self._parts.scheduler.ids, self.progress.measured
-        known = {i: _pose_of(measured[name]) for i, name in enumerate(ids) if name in measured}
-        return self._parts.arrival.doubt(pose, settled.base_T_target, known)
+    def _sees_again(self) -> bool:
+        """Whether the tracker is well, or soon, while the arm rests."""
+        until = self._gate.clock.now() + self._settings.settle.longest
+        while self._gate.clock.now() < until:
+            self._drive.tick(self._gate.resting)
+            if not self._gate.monitor.trouble()[0]:
+                return True
+        return False
 
-    def _written(self, settled: Settled) -> dict[str, Any]:
-        joints = list(self._parts.drive.angles)
-        pose = settled.base_T_target
-        return {
-            "position": pose[:3, 3].tolist(),
-            "rotation": None if np.isnan(pose[:3, :3]).any() else pose[:3, :3].tolist(),
+    def _accept(self, pose: int, settled: Settled) -> None:
+        """Write down where the arm stands, unless that is not where it was commanded to.
+
+        Raises:
+            DeviceError: its pulses are not those that were commanded.
+            ParkRequested: it stood elsewhere several times in a row.
+        """
+        drive, base_T_target, measured = self._drive, settled.base_T_target, self.progress.measured
+        record = {
+            "pose": self._ids[pose],
+            **self._here(),
+            "position": base_T_target[:3, 3].tolist(),
+            "rotation": None if np.isnan(base_T_target[:3, :3]).any() else base_T_target[:3, :3].tolist(),
             "deviation": settled.deviations[:3].tolist(),
             "frames": settled.frames,
             "rejected": settled.rejected,
-            "temperature": self._parts.settings.temperature,
-            "standing": self._parts.recovery.standing(),
-            "approach": dict(zip(joints, self._parts.drive.approach.tolist(), strict=True)),
+            "temperature": self._settings.temperature,
+            "standing": self._recovery.standing(),
+            "approach": dict(zip(drive.angles, drive.approach.tolist(), strict=True)),
         }
+        others = {i: _pose_of(measured[name]) for i, name in enumerate(self._ids) if name in measured}
+        doubt = self._arrival.doubt(pose, base_T_target, others) if self._arrival else ""
+        if doubt:
+            self._astray += 1
+            self._try_later(pose, doubt)
+            if self._astray >= self._settings.arrival.in_a_row:
+                raise ParkRequested(f"{doubt}, {self._astray} times in a row; look at servos, gears and bodies")
+            return
+        self._astray = 0
+        self._record(entry.MEASURED, record)
+        self._left.remove(pose)
+        self._on_progress(self.progress)
 
     def _here(self) -> dict[str, Any]:
-        drive = self._parts.drive
-        return {"angles": drive.angles, "warmth": drive.named_thermal_state(), "at": self._parts.clock.wall()}
+        drive = self._drive
+        return {"angles": drive.angles, "warmth": drive.named_thermal_state(), "at": self._gate.clock.wall()}
 
     def _try_later(self, pose: int, why: str) -> None:
         """At the end of what is left; after the last try it is left out."""
@@ -245,51 +217,46 @@ class AcquisitionRun:
         if self._tries[pose] >= _TRIES:
             self._leave_out(pose, why)
             return
-        sentence = f"pose {self._parts.scheduler.ids[pose]} is tried again later: {why}"
-        self._told("later", sentence)
-        self._parts.waits.say(f"{sentence}.")
+        sentence = f"pose {self._ids[pose]} is tried again later: {why}"
+        self._notice("later", sentence)
+        self._gate.waits.say(f"{sentence}.")
         self._left.remove(pose)
         self._left.append(pose)
 
     def _leave_out(self, pose: int, why: str) -> None:
-        self._record(entry.LEFT_OUT, {"pose": self._parts.scheduler.ids[pose], "why": why})
+        self._record(entry.LEFT_OUT, {"pose": self._ids[pose], "why": why})
         self._left.remove(pose)
-        self._parts.told(self.progress)
+        self._on_progress(self.progress)
 
-    def _left_out(self) -> str:
-        count, total = len(self.progress.left_out), len(self._parts.scheduler.ids)
-        return f"{total - count} of {total} poses are measured, {count} were left out"
-
-    def _home(self, how: str, why: str) -> Ending:
-        """Park, and let the servos go where that is wished; the arm holds where no way home is found."""
+    def _park_and_end(self, how: Literal["done", "parked"], why: str) -> Ending:
+        """Park, and release the servos where the settings ask for it; the arm holds where no path home is found."""
         try:
-            parked = self._persist(self._parked)
-            if not parked:
-                return self._end(Ending("held", f"{why}; no clear way to where it parks was found"))
-            if self._parts.settings.at_end == "release":
-                self._persist(self._parts.recovery.release, self._parts.recovery.reopened)
+            if not self._persist(self._park):
+                return self._end(Ending("held", f"{why}; no clear path to where it parks was found"))
+            if self._settings.at_end == "release":  # a device that comes back must not energise what hangs by then
+                self._persist(self._recovery.release, lambda: None)
         except DeviceLost as loss:
             return self._end(Ending("held", f"{why}; then {loss}"))
-        return self._end(Ending("done" if how == "done" else "parked", why))
+        return self._end(Ending(how, why))
 
-    def _parked(self) -> bool:
-        drive = self._parts.drive
-        way = drive.path_home(drive.at)
-        if way is None:
+    def _park(self) -> bool:
+        """Whether a clear path to where the arm parks was found, and gone."""
+        path = self._drive.path_home(self._drive.at)
+        if path is None:
             return False
-        drive.go(way, Blind())
-        drive.note()
+        self._drive.go(path, unguarded)
+        self._drive.note()
         return True
 
     def _end(self, ending: Ending) -> Ending:
         self._record(entry.ENDED, {"how": ending.how, "sentence": ending.sentence, **self._here()})
         return ending
 
-    def _told(self, what: str, sentence: str) -> None:
-        self._record(entry.TOLD, {"what": what, "sentence": sentence, "at": self._parts.clock.wall()})
+    def _notice(self, what: str, sentence: str) -> None:
+        self._record(entry.NOTICE, {"what": what, "sentence": sentence, "at": self._gate.clock.wall()})
 
     def _record(self, kind: str, content: Mapping[str, Any]) -> None:
-        self._parts.log.record(kind, content)
+        self._log.record(kind, content)
         self.progress = self.progress.after(kind, content)
 
 

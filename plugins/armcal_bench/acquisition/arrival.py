@@ -1,4 +1,4 @@
-"""Whether the arm is where it was told to be, as far as a tracker can tell: servos tell nobody."""
+"""Whether the arm stands where it was commanded to, as far as a tracker can see: hobby servos report nothing."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ _ENOUGH = 5
 class Arrival:
     """Compares how far apart the target stood in two poses, and by how much it was turned, with the nominal arm.
 
-    Neither needs to be told where the tracker's frame, the base body and the tool body are. What is not known of the
-    arm, and a target that is not at its nominal place, make them differ as well: the limits have to be generous.
+    Neither depends on where the tracker's frame, the base body and the tool body are. What is not known of the arm, and
+    a target that is not at its nominal place, make them differ as well: the limits have to be generous.
 
     Attributes:
         expected: ``base_T_tool`` of the nominal, rigid arm in each pose of the plan (N x 4 x 4, m).
@@ -32,7 +32,7 @@ class Arrival:
     settings: ArrivalSettings
 
     def doubt(self, pose: int, seen: Array, measured: Mapping[int, Array]) -> str:
-        """Why the arm is not where it was told to be, a sentence; empty if nothing speaks against it.
+        """Why the arm is not where it was commanded to be, a sentence; empty if it may be there.
 
         Args:
             pose: its index.
@@ -43,9 +43,9 @@ class Arrival:
         others = [other for other in measured if other != pose]
         if not others:
             return ""
-        before, told = np.array([measured[other] for other in others]), self.expected[others]
-        far = _worst(_distances(before, seen) - _distances(told, self.expected[pose]))
-        turned = _worst(_turns(before, seen) - _turns(told, self.expected[pose]))
+        before, expected = np.array([measured[other] for other in others]), self.expected[others]
+        far = _worst(_distances(before, seen) - _distances(expected, self.expected[pose]))
+        turned = _worst(_turns(before, seen) - _turns(expected, self.expected[pose]))
         if far <= self.settings.astray and not turned > self.settings.astray_turned:
             return ""
         angle = "" if np.isnan(turned) else f" and {np.rad2deg(turned):.0f} deg"
@@ -59,13 +59,13 @@ def tool_poses(arm: Arm, joint_angles: Array) -> Array:
     """``base_T_tool`` of the nominal, rigid arm (N x 4 x 4, m) at commands (N x joints, rad)."""
     chain = arm.nominal_chain
     commands = ca.SX.sym("commands", len(arm.commanded))
-    told = arm.joint_commands(ca.vertsplit(commands))
-    tool = forward(chain, [joint.offset + told[i] for i, joint in enumerate(chain.joints)], {}).base_T_tool
+    displacements = arm.joint_commands(ca.vertsplit(commands))
+    tool = forward(chain, [joint.offset + displacements[i] for i, joint in enumerate(chain.joints)], {}).base_T_tool
     function = ca.Function("tool", [commands], [ca.densify(ca.horzcat(tool.rotation, tool.translation))])
-    found = np.tile(np.eye(4), (len(joint_angles), 1, 1))
-    for matrix, pose in zip(found, joint_angles, strict=True):
-        matrix[:3] = function(pose).full()
-    return found
+    poses = np.tile(np.eye(4), (len(joint_angles), 1, 1))
+    for pose, angles in zip(poses, joint_angles, strict=True):
+        pose[:3] = function(angles).full()
+    return poses
 
 
 def _distances(poses: Array, pose: Array) -> Array:
@@ -73,7 +73,7 @@ def _distances(poses: Array, pose: Array) -> Array:
 
 
 def _turns(poses: Array, pose: Array) -> Array:
-    """By which angle each is turned from one (rad); what frames they are told in does not matter."""
+    """By which angle each is turned from one (rad), whatever frames they are given in."""
     traces = np.einsum("nij,ij->n", poses[:, :3, :3], pose[:3, :3])
     return np.asarray(np.arccos(np.clip((traces - 1) / 2, -1.0, 1.0)))
 

@@ -48,13 +48,13 @@ class HeatModel:
         """
         if fault := unknown_joint(settings, joints):
             raise ValueError(fault)
-        given = [settings.get(joint) for joint in joints]
+        servos = [settings.get(joint) for joint in joints]
         usual = ServoHeatSettings.si(continuous=1.0)
         return cls(
-            np.array([s.continuous if s else NEVER for s in given]),
-            np.array([[(s or usual).winding_time, (s or usual).case_time] for s in given]),
-            np.array([[(s or usual).winding_share, 1 - (s or usual).winding_share] for s in given]),
-            np.array([s.budget if s else NEVER for s in given]),
+            np.array([s.continuous if s else NEVER for s in servos]),
+            np.array([[(s or usual).winding_time, (s or usual).case_time] for s in servos]),
+            np.array([[(s or usual).winding_share, 1 - (s or usual).winding_share] for s in servos]),
+            np.array([s.budget if s else NEVER for s in servos]),
         )
 
     @property
@@ -84,11 +84,11 @@ class HeatModel:
         over = self.steady(torque)[:, 0] > part * self.budget
         return int(np.argmax(over)) if over.any() else None
 
-    def cooled_in(self, thermal_state: Array, torque: Array, wanted: Array) -> float:
-        """Seconds of holding a torque until no heat is above what is wanted (joints); infinite if it never comes so."""
+    def cooled_in(self, thermal_state: Array, torque: Array, limits: Array) -> float:
+        """Seconds of holding a torque until no heat is above its limit (joints); infinite if it never comes so."""
 
         def hot(seconds: float) -> bool:
-            return bool(np.any(self.heat(self.after(thermal_state, torque, seconds)) > wanted))
+            return bool(np.any(self.heat(self.after(thermal_state, torque, seconds)) > limits))
 
         if not hot(0.0):
             return 0.0

@@ -15,6 +15,7 @@ from armcal.errors import ConfigError
 from armcal.io.journal.files import REAL_FILES, write_whole
 from armcal.measure.csv_writer import write_csv
 from armcal.run.experiment import Experiment
+from scipy.spatial.transform import Rotation
 
 from armcal_bench.acquisition.progress import Progress
 
@@ -31,19 +32,19 @@ def measured_by(experiment: Experiment) -> tuple[str, tuple[str, ...]]:
     Raises:
         ConfigError: none of the measurements is a position or a pose, or several are.
     """
-    found = []
+    candidates = []
     for name, measurement in experiment.system.measurements.items():
         channels = tuple(channel.name for channel in measurement.channels())
         if channels in (_POSITION, (*_POSITION, *_QUATERNION)):
-            found.append((name, channels))
-    if len(found) != 1:
-        names = ", ".join(name for name, _ in found) or "none"
+            candidates.append((name, channels))
+    if len(candidates) != 1:
+        names = ", ".join(name for name, _ in candidates) or "none"
         raise ConfigError(
             f"found {names} among the measurements, expected one tip_position or tip_pose.",
             where=experiment.source.where(("measurements",)),
             hint="Configure the one that the bench's tracker measures.",
         )
-    return found[0]
+    return candidates[0]
 
 
 def dataset_of(experiment: Experiment, progress: Progress, digests: Mapping[str, str]) -> Dataset:
@@ -55,8 +56,13 @@ def dataset_of(experiment: Experiment, progress: Progress, digests: Mapping[str,
     for joint in records[0]["standing"] if records else ():
         channels[f"{arm}.{joint}"] = np.array([r["standing"][joint] for r in records])
         channels[f"{arm}.approach.{joint}"] = np.array([float(r["approach"][joint]) for r in records])
-    rows = np.array([_values(record, len(local)) for record in records]).reshape(len(records), len(local))
-    channels |= {f"{instance}.{name}": rows[:, i] for i, name in enumerate(local)}
+    poses = np.full((len(records), len(_POSITION) + len(_QUATERNION)), np.nan)
+    for pose, record in zip(poses, records, strict=True):
+        pose[:3] = record["position"]
+        if record["rotation"] is not None:
+            x, y, z, w = Rotation.from_matrix(record["rotation"]).as_quat(canonical=True)
+            pose[3:] = w, x, y, z
+    channels |= {f"{instance}.{name}": poses[:, i] for i, name in enumerate(local)}
     if in_order(progress):
         channels["time"] = np.array([float(r["at"]) for r in records])
     channels["sequence"] = np.arange(1.0, len(records) + 1)
@@ -87,15 +93,3 @@ def write_outputs(folder: Path, experiment: Experiment, progress: Progress, summ
         dataset = dataset_of(experiment, progress, summary["digests"])
         write_csv(folder / DATASET, dataset, experiment.request(measured=True).wanted)
     write_whole(REAL_FILES, folder / SUMMARY, (json.dumps(summary, indent=2) + "\n").encode())
-
-
-def _values(record: Mapping[str, Any], count: int) -> list[float]:
-    """A record's channels (SI)."""
-    if count == len(_POSITION):
-        return list(record["position"])
-    if record["rotation"] is None:
-        return [*record["position"], *[float("nan")] * 4]
-    from scipy.spatial.transform import Rotation
-
-    x, y, z, w = Rotation.from_matrix(record["rotation"]).as_quat(canonical=True).tolist()
-    return [*record["position"], w, x, y, z]

@@ -1,4 +1,4 @@
-"""Ways between poses on which nothing comes too near."""
+"""Paths between poses on which nothing comes too near."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ JointPath = tuple[Array, ...]
 
 
 class PathPlanner:
-    """Straight lines where they are clear; else the shortest way through known poses and poses spread over joint space.
+    """Straight lines where they are clear; else the shortest path through known poses and others all over joint space.
 
-    A lazy roadmap: a line is checked only when a shortest way would use it. [Bohlin2000]
+    A lazy roadmap: a line is checked only when a shortest path would use it. [Bohlin2000]
 
     Attributes:
-        meanwhile: called now and then while a way is looked for, which may take seconds.
+        meanwhile: called now and then during a search, which may take seconds.
     """
 
     def __init__(self, check: ClearanceCheck | None, limits: Array, known: Array, step: float, seed: int = 0) -> None:
@@ -68,33 +68,24 @@ class PathPlanner:
         return np.asarray(start[:, None] + np.linspace(0.0, 1.0, max(count, 2)) * (goal - start)[:, None])
 
     def find(self, start: Array, goal: Array) -> JointPath | None:
-        """A clear way, or None if there is none that was found.
+        """A clear path, or None if none was found.
 
-        An arm that stands too near to something, by a board's rounding or after a fault, goes away from it first.
+        An arm that stands too near to something, by a board's rounding or after a fault, first goes straight to a pose
+        that is clear, on a line that comes nowhere nearer than where the arm stands.
         """
-        if self.clear(start, goal):
+        if self._check is None or self.clear(start, goal):
             return (start, goal)
-        if not self.allowed(start):
-            return self._escape(start, goal)
-        nodes = np.vstack([start[None], goal[None], self._roadmap])
-        return self._shortest(nodes)
-
-    def _escape(self, start: Array, goal: Array) -> JointPath | None:
-        """Straight to a pose that is clear, on a line that comes nowhere nearer than where the arm stands."""
+        if self.allowed(start):
+            return self._shortest(np.vstack([start[None], goal[None], self._roadmap]))
         nodes = np.vstack([goal[None], self._roadmap])
         away = np.max(np.abs(nodes - start), axis=1)
-        for there in np.argsort(away, kind="stable")[:_ESCAPES]:
-            if self.allowed(nodes[there]) and self._leads_away(start, nodes[there]):
-                onward = self.find(nodes[there], goal)
-                if onward is not None:
-                    return (start, *onward)
+        for node in nodes[np.argsort(away, kind="stable")[:_ESCAPES]]:
+            if not self.allowed(node):
+                continue
+            margins = np.minimum(self._check(self._line(start, node)).margins, 0.0)
+            if np.all(np.diff(margins, axis=1) >= -_NEARER_M) and (onward := self.find(node, goal)) is not None:
+                return (start, *onward)
         return None
-
-    def _leads_away(self, start: Array, goal: Array) -> bool:
-        if self._check is None:
-            return True
-        margins = np.minimum(self._check(self._line(start, goal)).margins, 0.0)
-        return bool(np.all(np.diff(margins, axis=1) >= -_NEARER_M))
 
     @cached_property
     def _roadmap(self) -> Array:
@@ -110,38 +101,29 @@ class PathPlanner:
     def _shortest(self, nodes: Array) -> JointPath | None:
         """A* from the first node to the second; the length of a line is that of the joint that turns most."""
         left = np.max(np.abs(nodes - nodes[1]), axis=1)
-        best, came, done = {0: 0.0}, {0: 0}, set()
+        best, before, done = {0: 0.0}, {0: 0}, set()
         queue = [(float(left[0]), 0)]
         while queue:
             _, here = heapq.heappop(queue)
             if here == 1:
-                return _traced(nodes, came)
+                path = [here]
+                while path[-1] != 0:
+                    path.append(before[path[-1]])
+                return tuple(nodes[i] for i in reversed(path))
             if here in done:
                 continue
             done.add(here)
             away = np.max(np.abs(nodes - nodes[here]), axis=1)
-            for there in _nearest(away, _TRIED_AT_ONCE):
+            nearest = [int(i) for i in np.argsort(away, kind="stable")[1 : _TRIED_AT_ONCE + 1]]
+            for there in nearest if 1 in nearest else [*nearest, 1]:
                 length = best[here] + float(away[there])
                 if there in done or length >= best.get(there, np.inf) or not self.clear(nodes[here], nodes[there]):
                     continue
-                best[there], came[there] = length, here
+                best[there], before[there] = length, here
                 heapq.heappush(queue, (length + float(left[there]), there))
         return None
 
 
-def _nearest(away: Array, count: int) -> list[int]:
-    """The nearest nodes; the goal (1) is always among them."""
-    order = [int(i) for i in np.argsort(away, kind="stable")[1 : count + 1]]
-    return order if 1 in order else [*order, 1]
-
-
-def _traced(nodes: Array, came: dict[int, int]) -> JointPath:
-    path = [1]
-    while path[-1] != 0:
-        path.append(came[path[-1]])
-    return tuple(nodes[i] for i in reversed(path))
-
-
 def travel(path: Sequence[Array]) -> float:
-    """How far a way goes: of each leg, the joint that turns most (rad)."""
+    """How far a path goes: of each leg, the joint that turns most (rad)."""
     return float(sum(np.max(np.abs(b - a)) for a, b in pairwise(path)))

@@ -37,10 +37,8 @@ class Prepared:
 
     Attributes:
         plan: joint commands and the plan's ids, in its order.
-        scheduler: over the angles that the device can set nearest to them.
-        planner: between poses.
-        heat: the servos' model, and the torques that heat them.
-        arrival: whether the arm is where it was told to be.
+        scheduler: over the angles that the device can set nearest to them; with the planner and the heat model.
+        arrival: whether the arm stands where it was commanded to.
         judge: of what is dangerous in the first motions and the last.
     """
 
@@ -48,8 +46,6 @@ class Prepared:
     device: JointDevice
     plan: Dataset
     scheduler: Scheduler
-    planner: PathPlanner
-    heat: tuple[HeatModel, Torques]
     arrival: Arrival
     judge: HazardJudge
 
@@ -67,41 +63,42 @@ def prepare(experiment: Experiment, plan: Path) -> Prepared:
         DataError: the plan is refused, with the row of the first pose that the arm must not go to.
     """
     bench = Bench.of(experiment)
-    settings, arm = bench.settings.acquisition, bench.arm
+    settings, arm, device = bench.settings.acquisition, bench.arm, bench.device()
     space = JointSpace.of(experiment)
     commands = commands_of(read_poses(experiment, plan), space)
-    device = bench.device()
     limits = run_limits(experiment, settings, arm)
+    poses = _settable_poses(device, commands.stacked(space.channels).T, limits, plan, commands)
+    park = _settable_park(experiment, settings, device, limits)
+    settable = np.array(
+        [
+            [_last_settable(device, joint, float(inside), float(end)) for end in ends]
+            for joint, inside, ends in zip(device.joint_names, park, limits, strict=True)
+        ]
+    )
     check = clearance_of(experiment, arm)
-    asked = commands.stacked(space.channels).T
-    _within(device.joint_names, asked, limits, plan, commands)
-    poses, standing_park = _standing(device, asked, plan, commands), _park(experiment, settings, device, limits)
-    settable = _settable(device, limits, standing_park)
-    planner = PathPlanner(check, settable, np.vstack([standing_park, poses]), settings.path_step, settings.seed)
-    _all_allowed(planner, poses, commands, plan)
-    if not planner.allowed(standing_park):
-        raise ConfigError(
-            "the pose where the arm parks is too near to something.",
-            where=experiment.source.where((*_AT, "park")),
-            hint="Choose another.",
-        )
-    heat = heat_of(experiment, settings, arm)
-    _rests_cool(experiment, device.joint_names, heat, standing_park)
-    settle = settings.settle
+    planner = PathPlanner(check, settable, np.vstack([park, poses]), settings.path_step, settings.seed)
+    for row, pose in enumerate(poses):
+        if not planner.allowed(pose):
+            raise DataError(
+                f"pose {commands.ids[row]} is too near to something.",
+                where=_row(plan, commands, row),
+                hint="Nothing was moved. Plan anew with this clearance, or take the pose out.",
+            )
+    model, torques = heat_of(experiment, settings, arm)
+    _check_park(experiment, planner, (model, torques), park, device.joint_names)
     scheduler = Scheduler(
         poses=poses,
         ids=commands.ids,
-        park=standing_park,
+        park=park,
         planner=planner,
-        model=heat[0],
-        torques=heat[1],
+        model=model,
+        torques=torques,
         rate=float(np.deg2rad(settings.rate_deg_per_s)),
-        capture=settle.wait + settle.window + 0.5,
+        capture=settings.settle.wait + settings.settle.window + 0.5,
         order=settings.order,
     )
-    arrival = Arrival(tool_poses(arm, poses), settings.arrival)
-    judge = HazardJudge(device.joint_names, device.joint_names, limits, heat[1], standing_park)
-    return Prepared(bench, device, commands, scheduler, planner, heat, arrival, judge)
+    judge = HazardJudge(device.joint_names, device.joint_names, limits, torques, park)
+    return Prepared(bench, device, commands, scheduler, Arrival(tool_poses(arm, poses), settings.arrival), judge)
 
 
 def run_limits(experiment: Experiment, settings: AcquisitionSettings, arm: Arm) -> Array:
@@ -131,7 +128,8 @@ def run_limits(experiment: Experiment, settings: AcquisitionSettings, arm: Arm) 
     return np.array([ends for ends in limits.values() if ends is not None])
 
 
-def _park(experiment: Experiment, settings: AcquisitionSettings, device: JointDevice, limits: Array) -> Array:
+def _settable_park(experiment: Experiment, settings: AcquisitionSettings, device: JointDevice, limits: Array) -> Array:
+    """The angles (joints, rad) that the device can set nearest to the park pose."""
     where, joints = experiment.source.where((*_AT, "park")), device.joint_names
     if fault := unknown_joint(settings.park, joints):
         raise ConfigError(f"{fault}.", where=where)
@@ -139,33 +137,35 @@ def _park(experiment: Experiment, settings: AcquisitionSettings, device: JointDe
     if (outside := _outside(park, limits)).any():
         joint = joints[int(np.argmax(outside))]
         raise ConfigError(f"{joint} would park outside its limits.", where=where, hint="Choose another pose.")
-    standing = device.standing(dict(zip(joints, park.tolist(), strict=True)))
-    return np.array([standing[joint] for joint in joints])
+    return _nearest_settable(device, park)
 
 
-def _rests_cool(experiment: Experiment, joints: tuple[str, ...], heat: tuple[HeatModel, Torques], park: Array) -> None:
-    model, torques = heat
+def _check_park(
+    experiment: Experiment, planner: PathPlanner, heat: tuple[HeatModel, Torques], park: Array, joints: tuple[str, ...]
+) -> None:
+    """Refuse a park pose (joints, rad) that is too near to something, or in which a servo would not cool."""
+    where, (model, torques) = experiment.source.where((*_AT, "park")), heat
+    if not planner.allowed(park):
+        raise ConfigError("the pose where the arm parks is too near to something.", where=where, hint="Choose another.")
     torque = torques(park)
     if (hot := model.too_hot_for_ever(torque)) is not None:
         share = 100 * float(model.steady(torque)[hot, 0] / model.budget[hot])
         raise ConfigError(
             f"the servo of {joints[hot]} would not cool where the arm parks: it carries {abs(torque[hot]):.2f} N m at "
             f"{np.rad2deg(park[hot]):.1f} deg, which heats it to {share:.0f} % of its budget.",
-            where=experiment.source.where((*_AT, "park")),
+            where=where,
             hint="Choose a pose in which it carries less.",
         )
 
 
-def _settable(device: JointDevice, limits: Array, inside: Array) -> Array:
-    """The part of the limits, around a pose inside, that the device has pulses for (joints x 2, rad)."""
-    found = limits.copy()
-    for row, joint in enumerate(device.joint_names):
-        for end in (0, 1):
-            found[row, end] = _last_settable(device, joint, float(inside[row]), float(limits[row, end]))
-    return found
+def _nearest_settable(device: JointDevice, pose: Array) -> Array:
+    """The angles (joints, rad) that the device can set nearest to a pose."""
+    standing = device.standing(dict(zip(device.joint_names, pose.tolist(), strict=True)))
+    return np.array([standing[joint] for joint in device.joint_names])
 
 
 def _last_settable(device: JointDevice, joint: str, inside: float, beyond: float) -> float:
+    """The angle (rad) nearest to ``beyond`` that the device has a pulse for, from an angle that it has one for."""
     try:
         device.standing({joint: beyond})
         return beyond
@@ -193,40 +193,27 @@ def clearance_of(experiment: Experiment, arm: Arm) -> ClearanceCheck | None:
     return clearance_check(plan.clearance, {arm.name: arm}, experiment.source)
 
 
-def _within(joints: tuple[str, ...], poses: Array, limits: Array, plan: Path, commands: Dataset) -> None:
-    """What is asked for lies within limits; half a count beyond is the board's affair."""
+def _settable_poses(device: JointDevice, poses: Array, limits: Array, plan: Path, commands: Dataset) -> Array:
+    """The angles (N x joints, rad) that the device can set nearest to poses within the limits.
+
+    Half a count beyond a limit is the board's affair.
+    """
+    settable = []
     for row, pose in enumerate(poses):
         if (outside := _outside(pose, limits)).any():
             joint = int(np.argmax(outside))
             low, high = np.rad2deg(limits[joint])
             raise DataError(
-                f"pose {commands.ids[row]} has {joints[joint]} at {np.rad2deg(pose[joint]):.1f} deg, "
+                f"pose {commands.ids[row]} has {device.joint_names[joint]} at {np.rad2deg(pose[joint]):.1f} deg, "
                 f"expected {low:.1f} to {high:.1f}.",
                 where=_row(plan, commands, row),
                 hint="Nothing was moved. Plan anew with these limits, or take the pose out.",
             )
-
-
-def _standing(device: JointDevice, poses: Array, plan: Path, commands: Dataset) -> Array:
-    """The angles that the device can set nearest to the poses (N x joints)."""
-    found = []
-    for row, pose in enumerate(poses):
         try:
-            standing = device.standing(dict(zip(device.joint_names, pose.tolist(), strict=True)))
+            settable.append(_nearest_settable(device, pose))
         except DeviceRefusedError as fault:
             raise DataError(fault.message, where=_row(plan, commands, row), hint=fault.hint) from fault
-        found.append([standing[joint] for joint in device.joint_names])
-    return np.array(found)
-
-
-def _all_allowed(planner: PathPlanner, poses: Array, commands: Dataset, plan: Path) -> None:
-    for row, pose in enumerate(poses):
-        if not planner.allowed(pose):
-            raise DataError(
-                f"pose {commands.ids[row]} is too near to something.",
-                where=_row(plan, commands, row),
-                hint="Nothing was moved. Plan anew with this clearance, or take the pose out.",
-            )
+    return np.array(settable)
 
 
 def _row(plan: Path, commands: Dataset, row: int) -> Location:

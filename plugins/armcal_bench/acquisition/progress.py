@@ -8,7 +8,7 @@ from typing import Any
 
 from armcal.io.journal.segment import Entry
 
-STARTED, ENERGISED, GOING, HERE, MEASURED, LEFT_OUT, TOLD, ENDED = (
+STARTED, ENERGISED, GOING, HERE, MEASURED, LEFT_OUT, NOTICE, ENDED = (
     "started",
     "energised",
     "going",

@@ -25,13 +25,13 @@ _LONGEST_SOCKET_PATH = 107
 
 
 def overrides_for(folder: Path) -> tuple[str, ...]:
-    """What a configuration must say instead to work with the simulated bench in a folder."""
+    """The overrides that make a configuration work with the simulated bench in a folder."""
     there = folder.absolute()
     return (f"bench.clock={{simulated: {there / CLOCK}}}", f"bench.link.port={there / BOARD}")
 
 
 def port_instead_of_adapter(experiment: Experiment) -> tuple[str, ...]:
-    """What it must say besides, if its link names an adapter: simulated ones have no serial number.
+    """Further overrides if its link names an adapter: simulated ones have no serial number.
 
     Raises:
         ConfigError: its link has no serial port, or there is no bench.
@@ -53,22 +53,33 @@ def port_instead_of_adapter(experiment: Experiment) -> tuple[str, ...]:
 
 @contextmanager
 def simulated_bench(config: Path, overrides: Sequence[str], folder: Path) -> Iterator[None]:
-    """A simulated bench, from when it answers until it is told to stop.
+    """A simulated bench in a folder, from when it answers until the context ends.
 
     Raises:
-        InputError: it does not start; its own words are told.
+        InputError: the folder cannot be used, or the bench does not start; its own words are in the message.
     """
-    _make(folder)
+    if len(os.fsencode(folder.absolute() / CLOCK)) > _LONGEST_SOCKET_PATH:
+        raise InputError(
+            f"the path of the simulated bench's socket would be longer than {_LONGEST_SOCKET_PATH} bytes.",
+            where=Location(str(folder)),
+            hint="Give --out a short path.",
+        )
+    make_bench_folder(folder)
     sets = [word for text in overrides for word in ("--set", text)]
     # -P: a file of the working directory called like a library is not taken for it, as it is not by the command.
     command = [sys.executable, "-P", "-m", "armcal.cli", "simulated-bench", str(config), "--dir", str(folder), *sets]
-    with (folder / "said.txt").open("w+", encoding="utf-8") as said:
-        process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=said, stderr=said)
+    with (folder / "said.txt").open("w+", encoding="utf-8") as output:
+        process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=output, stderr=output)
         try:
-            _wait_for(process, folder, folder / "said.txt")
+            _wait_for(process, folder)
             yield
         finally:
-            _stop(process, folder)
+            process.terminate()
+            try:
+                process.wait(_ENDED_IN_S)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
 
 
 def truth(folder: Path) -> dict[str, Any]:
@@ -84,29 +95,29 @@ def truth(folder: Path) -> dict[str, Any]:
         clock.close()
 
 
-def _make(folder: Path) -> None:
-    """Make the folder, where sockets can be."""
-    where = Location(str(folder))
-    if len(os.fsencode(folder.absolute() / CLOCK)) > _LONGEST_SOCKET_PATH:
-        raise InputError(
-            f"the path of the simulated bench's socket would be longer than {_LONGEST_SOCKET_PATH} bytes.",
-            where=where,
-            hint="Give --out a short path.",
-        )
+def make_bench_folder(folder: Path) -> None:
+    """Make the folder of a simulated bench.
+
+    Raises:
+        InputError: it cannot be made.
+    """
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as fault:
         raise InputError(
-            f"it cannot be made ({fault.strerror}).", where=where, hint="Give --out a folder that can be written."
+            f"the folder cannot be made ({fault.strerror or fault}).",
+            where=Location(str(folder)),
+            hint="Give a folder that can be written.",
         ) from fault
 
 
-def _wait_for(process: subprocess.Popen[bytes], folder: Path, said: Path) -> None:
+def _wait_for(process: subprocess.Popen[bytes], folder: Path) -> None:
+    """Until the simulated bench in a folder answers."""
     until = time.monotonic() + _STARTED_IN_S
     while time.monotonic() < until:
         if process.poll() is not None:
             fault = InputError if process.returncode == EXIT_BAD_INPUT else ArmcalError
-            words = said.read_text(encoding="utf-8").strip()[-2000:]
+            words = (folder / "said.txt").read_text(encoding="utf-8").strip()[-2000:]
             raise fault(f"the simulated bench ended before it began: {words}")
         if (folder / CLOCK).exists():
             try:
@@ -116,12 +127,3 @@ def _wait_for(process: subprocess.Popen[bytes], folder: Path, said: Path) -> Non
                 pass
         time.sleep(0.05)
     raise ArmcalError(f"the simulated bench did not start in {_STARTED_IN_S:.0f} s.")
-
-
-def _stop(process: subprocess.Popen[bytes], folder: Path) -> None:
-    process.terminate()
-    try:
-        process.wait(_ENDED_IN_S)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        process.wait()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Literal
 
@@ -39,7 +39,7 @@ class RunLog:
             self._journal.record(kind, dict(content))
 
     def note_angles(self, angles: Mapping[str, float], thermal_state: Mapping[str, Any], wall: float) -> None:
-        """Write where the arm is told to be; a power loss may take the last of these. See ``record``."""
+        """Write the commanded angles (rad); a power loss may take the last of these. See ``record``."""
         with self._once():
             self._journal.note(HERE, {"angles": dict(angles), "warmth": dict(thermal_state), "at": wall})
 
@@ -58,8 +58,8 @@ def opened_log(folder: Path, start: Start, header: Mapping[str, Any]) -> Iterato
     """The journal in a run's folder.
 
     Raises:
-        InputError: there is a run and it was not said to resume it, or none and it was; or it was begun with another
-            plan or configuration.
+        InputError: there is a run and ``start`` is not to resume it, or there is none to resume; or it was begun with
+            another plan or configuration.
         JournalDamagedError: it cannot be read.
     """
     where = Location(str(folder))
@@ -69,9 +69,12 @@ def opened_log(folder: Path, start: Start, header: Mapping[str, Any]) -> Iterato
         raise InputError(
             f"it cannot be used ({fault.strerror}).", where=where, hint="Give a folder that can be written."
         ) from fault
-    if there and start == "anew" and _began_nothing(folder / JOURNAL):
-        shutil.rmtree(folder / JOURNAL)
-        there = False
+    if there and start == "anew":
+        with suppress(ArmcalError):  # one that is damaged or in use is kept
+            with Journal.open(folder / JOURNAL, {}) as journal:
+                there = bool(journal.recovered.entries) or journal.recovered.checkpoint is not None
+            if not there:  # its run was refused before anything moved
+                shutil.rmtree(folder / JOURNAL)
     if there and start == "anew":
         raise InputError(
             "it holds a measuring run already.",
@@ -90,12 +93,3 @@ def opened_log(folder: Path, start: Start, header: Mapping[str, Any]) -> Iterato
                     f"it was begun with another {name}.", where=where, hint=f"Give the same {name}, or another --out."
                 )
         yield RunLog(journal)
-
-
-def _began_nothing(folder: Path) -> bool:
-    """Whether a journal has no entries: its run was refused before anything moved. One in use or damaged is kept."""
-    try:
-        with Journal.open(folder, {}) as journal:
-            return not journal.recovered.entries and journal.recovered.checkpoint is None
-    except ArmcalError:
-        return False

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import TypeGuard
 
 import numpy as np
 from armcal.base.domains import Array
@@ -73,63 +74,62 @@ class Scheduler:
 
     def next(self, at: Array, thermal_state: Array, left: Sequence[int]) -> Next:
         """What to do now; ``left`` are indices of poses, in the plan's order, at least one."""
-        chosen = left[:1] if self.order == "plan" else self._near(at, left)
-        found = [self._measure(at, thermal_state, pose) for pose in chosen]
-        fitting = [step for step in found if isinstance(step, Measure) and self._fits(step)]
+        candidates = left[:1]
+        if self.order == "cool":
+            away = np.max(np.abs(self.poses[list(left)] - at), axis=1)
+            candidates = [left[i] for i in np.argsort(away, kind="stable")[:_CONSIDERED]]
+
+        def cost(step: Measure) -> float:
+            """Its own time, and the time that its heat will take to go again (s)."""
+            warmed = np.maximum(self.model.shares * (step.thermal_state - thermal_state), 0.0)
+            return step.seconds + float(np.max((warmed / self.model.budget[:, None] * self.model.times).sum(axis=1)))
+
+        steps = [self._measured(at, thermal_state, pose) for pose in candidates]
+        fitting = [step for step in steps if self._fits(step)]
         if fitting:
-            return min(fitting, key=lambda step: self._cost(thermal_state, step))
-        return self._rested(at, thermal_state, chosen[0], found[0])
+            return min(fitting, key=cost)
+        return steps[0] if isinstance(steps[0], LeaveOut) else self._rested(at, thermal_state, candidates[0])
 
-    def _near(self, at: Array, left: Sequence[int]) -> Sequence[int]:
-        away = np.max(np.abs(self.poses[list(left)] - at), axis=1)
-        return [left[i] for i in np.argsort(away, kind="stable")[:_CONSIDERED]]
-
-    def _measure(self, at: Array, thermal_state: Array, pose: int) -> Measure | LeaveOut:
+    def _measured(self, at: Array, thermal_state: Array, pose: int) -> Measure | LeaveOut:
         path = self.planner.find(at, self.poses[pose])
         if path is None:
-            return LeaveOut(pose, f"no clear way to pose {self.ids[pose]} was found")
+            return LeaveOut(pose, f"no clear path to pose {self.ids[pose]} was found")
         there = self.model.after(thermal_state, self._effective(path), travel(path) / self.rate)
         after = self.model.after(there, self.torques(self.poses[pose]), self.capture)
         return Measure(pose, path, travel(path) / self.rate + self.capture, np.maximum(there, after))
 
-    def _fits(self, step: Measure) -> bool:
-        """Within the budget there, and on the way to where it rests."""
+    def _fits(self, step: Measure | LeaveOut) -> TypeGuard[Measure]:
+        """Within the budget there, and on the path to where it rests."""
+        if isinstance(step, LeaveOut) or self.model.over(step.thermal_state):
+            return False
         back = self.planner.find(step.path[-1], self.park)
         if back is None:
-            return not self.model.over(step.thermal_state)
+            return True
         home = self.model.after(step.thermal_state, self._effective(back), travel(back) / self.rate)
-        return not (self.model.over(step.thermal_state) or self.model.over(home))
+        return not self.model.over(home)
 
-    def _rested(self, at: Array, thermal_state: Array, pose: int, found: Measure | LeaveOut) -> Next:
-        if isinstance(found, LeaveOut):
-            return found
+    def _rested(self, at: Array, thermal_state: Array, pose: int) -> Rest | LeaveOut:
+        """A rest down to a part of the budget, and on until the pose fits."""
         path = self.planner.find(at, self.park)
         if path is None:
-            return LeaveOut(pose, "no clear way to where the arm parks was found")
+            return LeaveOut(pose, "no clear path to where the arm parks was found")
         home = self.model.after(thermal_state, self._effective(path), travel(path) / self.rate)
         at_rest = self.torques(self.park)
-        cold = self._measure(self.park, np.minimum(self.model.cold + self.model.steady(at_rest), thermal_state), pose)
-        if not isinstance(cold, Measure) or not self._fits(cold):
+        steady = self.model.steady(at_rest)
+        if not self._fits(self._measured(self.park, np.minimum(self.model.cold + steady, thermal_state), pose)):
             return LeaveOut(pose, f"pose {self.ids[pose]} needs more torque than the servos bear, even from cold")
-        seconds = self._rest_for(home, at_rest, pose)
-        if seconds == NEVER:
-            return LeaveOut(pose, f"the servos do not cool enough for pose {self.ids[pose]} where the arm parks")
-        return Rest(path, travel(path) / self.rate + seconds, self.model.after(home, at_rest, seconds))
-
-    def _rest_for(self, thermal_state: Array, at_rest: Array, pose: int) -> float:
-        """Down to a part of the budget, and on until the pose fits."""
         for part in (_COOLED_TO, 0.25, 0.1, 0.02):
-            wanted = np.maximum(part * self.model.budget, 1.02 * self.model.steady(at_rest)[:, 0] + 1e-6)
-            seconds = self.model.cooled_in(thermal_state, at_rest, wanted)
+            limits = np.maximum(part * self.model.budget, 1.02 * steady[:, 0] + 1e-6)
+            seconds = self.model.cooled_in(home, at_rest, limits)
             if seconds == NEVER:
-                return NEVER
-            step = self._measure(self.park, self.model.after(thermal_state, at_rest, seconds), pose)
-            if isinstance(step, Measure) and self._fits(step):
-                return seconds
-        return NEVER
+                break
+            cooled = self.model.after(home, at_rest, seconds)
+            if self._fits(self._measured(self.park, cooled, pose)):
+                return Rest(path, travel(path) / self.rate + seconds, cooled)
+        return LeaveOut(pose, f"the servos do not cool enough for pose {self.ids[pose]} where the arm parks")
 
     def _effective(self, path: JointPath) -> Array:
-        """The torque that heats as the way does on average (joints, N m)."""
+        """The torque that heats as the path does on average (joints, N m)."""
         squares, lengths = [], []
         for start, goal in pairwise(path):
             parts = [self.torques(start + t * (goal - start)) ** 2 for t in (np.arange(_SAMPLES) + 0.5) / _SAMPLES]
@@ -138,11 +138,6 @@ class Scheduler:
         if not sum(lengths):
             return self.torques(path[-1])
         return np.asarray(np.sqrt(np.average(squares, axis=0, weights=lengths)))
-
-    def _cost(self, thermal_state: Array, step: Measure) -> float:
-        """Its own time, and the time that its heat will take to go again."""
-        added = np.maximum(self.model.shares * (step.thermal_state - thermal_state), 0.0) / self.model.budget[:, None]
-        return step.seconds + float(np.max((added * self.model.times).sum(axis=1)))
 
 
 @dataclass(frozen=True)

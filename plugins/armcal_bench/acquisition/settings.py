@@ -45,7 +45,7 @@ class SettleSettings(Settings):
 
 
 class ArrivalSettings(Settings):
-    """How far the arm may be from where it was told to be, by distances and turns between measured poses.
+    """How far the arm may be from where it was commanded to be, by distances and turns between measured poses.
 
     More than ``astray``, or ``astray_turned``, is no error of the model but a servo that failed, stalls or lost a
     tooth, or a body that slipped: such a pose is tried again, then left out. After ``in_a_row`` of them the arm parks

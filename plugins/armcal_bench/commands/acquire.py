@@ -3,42 +3,43 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import click
 import numpy as np
-from armcal.cli.common import Console, overrides, speaking
+from armcal.cli.common import Console
 from armcal.errors import EXIT_DONE, EXIT_INCOMPLETE, EXIT_STOPPED, InputError
-from armcal.estimate.estimator import Progress as ShowProgress
 from armcal.io.signals import Signals
-from armcal.plugins import discover
-from armcal.run.experiment import Experiment
 
 from armcal_bench.acquisition.outputs import DATASET
 from armcal_bench.acquisition.preparation import Prepared, prepare
 from armcal_bench.acquisition.progress import Progress
 from armcal_bench.acquisition.run_log import Start
-from armcal_bench.acquisition.schedule import LeaveOut, Measure, ScheduleForecast, forecast_schedule
+from armcal_bench.acquisition.schedule import LeaveOut, Rest, ScheduleForecast, forecast_schedule
 from armcal_bench.acquisition.session import Outcome, RunOptions, acquire
-from armcal_bench.commands.energising import Question, energise_option, show_hazards, waits, warned
+from armcal_bench.commands.common import (
+    FILE,
+    Question,
+    energise_option,
+    load,
+    on_bench,
+    plan_option,
+    show_hazards,
+    waits,
+    warned,
+)
+from armcal_bench.waiting import duration
 from armcal_bench.wiring import check_wiring
-
-_FILE = click.Path(path_type=Path)
-_ANGLE = 180 / np.pi
 
 
 @click.command("acquire")
-@click.argument("config", type=_FILE)
-@click.option("--plan", required=True, type=_FILE, help="The poses to measure: a CSV, as armcal plan writes it.")
-@click.option("--out", type=_FILE, help="The folder to keep data and journal in.")
+@plan_option
+@click.option("--out", type=FILE, help="The folder to keep data and journal in.")
 @click.option("--resume", is_flag=True, help="Go on with the run in that folder.")
 @click.option("--dry-run", is_flag=True, help="Say what the run would take, and open nothing.")
 @click.option("--unchecked", is_flag=True, help="Drive servos too that armcal servo --check has not seen to be right.")
 @energise_option
-@overrides
-@speaking
+@on_bench
 def acquire_command(
     console: Console,
     config: Path,
@@ -51,20 +52,16 @@ def acquire_command(
     overrides: tuple[str, ...],
 ) -> None:
     """Drive a plan's poses with the bench of CONFIG, and measure each when the arm stands."""
-    registry = discover()
-    console.plugin_faults(registry)
-    experiment = Experiment.load(config, overrides, registry=registry)
-    prepared = prepare(experiment, plan)
+    prepared = prepare(load(console, config, overrides), plan)
     forecast = schedule_forecast(prepared)
     if dry_run:
-        _forecast(console, prepared, forecast)
+        _show_dry_run(console, prepared, forecast)
         return
     if out is None:
         raise InputError("found no --out.", hint="Say where data and journal are to be kept, or give --dry-run.")
     if not console.json:
         show_forecast(console, prepared, forecast)
-    start: Start = "resume" if resume else "anew"
-    outcome = driven(console, prepared, plan, (out, start), may_energise, unchecked=unchecked)
+    outcome = driven(console, prepared, plan, (out, "resume" if resume else "anew"), may_energise, unchecked=unchecked)
     show_outcome(console, outcome, config, out)
     sys.exit(exit_code_of(outcome))
 
@@ -87,31 +84,30 @@ def driven(
 ) -> Outcome:
     """The run, into a folder, with a progress line, and signals that park the arm."""
     with Signals() as signals, console.progress() as show:
-        tell = _teller(prepared, show)
-        options = RunOptions(*to, lambda: signals.finish, warned(console, question), tell, unchecked, waits(console))
+
+        def on_progress(progress: Progress) -> None:
+            show("measuring", (len(progress.measured) + len(progress.left_out)) / len(prepared.plan))
+
+        may_energise = warned(console, question)
+        options = RunOptions(*to, lambda: signals.finish, may_energise, on_progress, unchecked, waits(console))
         return acquire(prepared, plan, options)
 
 
 def show_forecast(console: Console, prepared: Prepared, forecast: ScheduleForecast) -> None:
     """Time, travel and heat, in a few lines."""
-    rests = sum(not isinstance(step, Measure | LeaveOut) for step in forecast.steps)
-    left_out = [step.why for step in forecast.steps if isinstance(step, LeaveOut)]
+    rests = sum(isinstance(step, Rest) for step in forecast.steps)
     lines = [
-        f"{len(prepared.plan)} poses in about {_minutes(forecast.seconds)}; the joints turn "
-        f"{forecast.travel * _ANGLE:.0f} deg in all; {rests} rest{'s' * (rests != 1)}, "
-        f"{_minutes(forecast.resting)} together."
+        f"{len(prepared.plan)} poses in about {duration(forecast.seconds)}; the joints turn "
+        f"{np.rad2deg(forecast.travel):.0f} deg in all; {rests} rest{'s' * (rests != 1)}, "
+        f"{duration(forecast.resting)} together."
     ]
-    budget = prepared.heat[0].budget
-    if np.isfinite(budget).any():
-        names = prepared.device.joint_names
-        hot = [
-            f"{name} {100 * heat:.0f} %"
-            for name, heat, b in zip(names, forecast.hottest, budget, strict=True)
-            if b < np.inf
-        ]
+    budgets = prepared.scheduler.model.budget
+    servos = zip(prepared.device.joint_names, forecast.hottest, budgets, strict=True)
+    if hot := [f"{joint} {100 * heat:.0f} %" for joint, heat, budget in servos if np.isfinite(budget)]:
         lines.append(f"hottest, of what each servo bears: {', '.join(hot)}.")
-    for text in (*lines, *(f"left out: {why}." for why in left_out)):
-        console.out.print(text, markup=False, soft_wrap=True)
+    lines += [f"left out: {step.why}." for step in forecast.steps if isinstance(step, LeaveOut)]
+    for line in lines:
+        console.out.print(line, markup=False, soft_wrap=True)
     for skipped in prepared.plan.set_aside:
         console.warn(
             f"row {skipped.row} of the plan, pose {skipped.record_id}, is set aside and not driven: {skipped.reason}"
@@ -121,14 +117,12 @@ def show_forecast(console: Console, prepared: Prepared, forecast: ScheduleForeca
 def show_outcome(console: Console, outcome: Outcome, config: Path, out: Path) -> None:
     """How it ended, and what to do next."""
     console.result(outcome.summary)
-    summary = outcome.summary
-    text = (
-        f"{outcome.ending.how}: {outcome.ending.sentence}. {summary['measured']} of {summary['poses']} poses measured."
-    )
+    summary, ending = outcome.summary, outcome.ending
+    text = f"{ending.how}: {ending.sentence}. {summary['measured']} of {summary['poses']} poses measured."
     console.out.print(text, markup=False, soft_wrap=True)
     for name, why in summary["left_out"].items():
         console.warn(f"pose {name} was left out: {why}.")
-    if outcome.ending.how != "done":
+    if ending.how != "done":
         console.out.print("Go on with --resume.", markup=False)
         return
     if summary["left_out"]:
@@ -140,45 +134,29 @@ def show_outcome(console: Console, outcome: Outcome, config: Path, out: Path) ->
         console.out.print(f"next: armcal run {config} --data {out / DATASET} --out DIR", markup=False, soft_wrap=True)
 
 
-def _teller(prepared: Prepared, show: ShowProgress) -> Callable[[Progress], None]:
-    total = len(prepared.plan)
-
-    def tell(progress: Progress) -> None:
-        show("measuring", (len(progress.measured) + len(progress.left_out)) / total)
-
-    return tell
-
-
-def _forecast(console: Console, prepared: Prepared, forecast: ScheduleForecast) -> None:
+def _show_dry_run(console: Console, prepared: Prepared, forecast: ScheduleForecast) -> None:
     """What a run would take, and what is dangerous in it, as far as that is known without a device."""
     hazards = prepared.judge.first_motion({}, {}, releases=prepared.settings.at_end == "release").hazards
-    unchecked = ""
+    joints, unchecked = prepared.device.joint_names, ""
     try:
-        check_wiring(prepared.bench, prepared.device.joint_names)
+        check_wiring(prepared.bench, joints)
     except InputError as fault:
         unchecked = str(fault)
-    dangers = {"hazards": [hazard.content for hazard in hazards], "unchecked": unchecked}
-    console.result({**_forecasts(prepared, forecast), **dangers})
+    content = {
+        "poses": len(prepared.plan),
+        "seconds": forecast.seconds,
+        "travel_deg": float(np.rad2deg(forecast.travel)),
+        "resting_s": forecast.resting,
+        "hottest": dict(zip(joints, forecast.hottest.tolist(), strict=True)),
+        "left_out": [step.why for step in forecast.steps if isinstance(step, LeaveOut)],
+        "set_aside": {row.record_id: row.reason for row in prepared.plan.set_aside},
+        "hazards": [hazard.content for hazard in hazards],
+        "unchecked": unchecked,
+    }
+    console.result(content)
     show_forecast(console, prepared, forecast)
     if console.json:  # the dangers stand in the result
         return
     show_hazards(console, hazards)
     if unchecked:
         console.warn(f"armcal acquire would refuse this: {unchecked}")
-
-
-def _forecasts(prepared: Prepared, forecast: ScheduleForecast) -> dict[str, Any]:
-    names = prepared.device.joint_names
-    return {
-        "poses": len(prepared.plan),
-        "seconds": forecast.seconds,
-        "travel_deg": forecast.travel * _ANGLE,
-        "resting_s": forecast.resting,
-        "hottest": dict(zip(names, forecast.hottest.tolist(), strict=True)),
-        "left_out": [step.why for step in forecast.steps if isinstance(step, LeaveOut)],
-        "set_aside": {row.record_id: row.reason for row in prepared.plan.set_aside},
-    }
-
-
-def _minutes(seconds: float) -> str:
-    return f"{seconds:.0f} s" if seconds < 120 else f"{seconds / 60:.0f} min"

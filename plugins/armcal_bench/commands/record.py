@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -13,28 +13,30 @@ from typing import Any, Literal
 
 import click
 from armcal.base.config_text import ConfigText
-from armcal.cli.common import Console, overrides, speaking
+from armcal.cli.common import Console
 from armcal.cli.outlet import say
-from armcal.config.yaml_source import ConfigSource, load_config
+from armcal.config.yaml_source import ConfigSource
 from armcal.devices.line_source import KINDS, STANDARD_INPUT
 from armcal.errors import InputError, Location
 from armcal.io.signals import Signals
-from armcal.plugins import discover
 from armcal.run.experiment import Experiment
 
 from armcal_bench.bench import SECTION, Bench
+from armcal_bench.commands.common import FILE, load, on_bench
 from armcal_bench.recording.keys import Keys, LineKeys, NoKeys, TerminalKeys
 from armcal_bench.recording.messages import Message
+from armcal_bench.recording.posture import DATASET
 from armcal_bench.recording.recorder import KEYS
-from armcal_bench.recording.recording_log import DATASET
 from armcal_bench.recording.session import RecordingOptions, record
+from armcal_bench.terminal import single_keys
 
 _TERMINAL = Path("/dev/tty")
+_AS_CSV = "--set 'data={type: csv}' "
+"""For a run whose configuration reads another kind of data."""
 
 
 @click.command("record")
-@click.argument("config", type=click.Path(path_type=Path))
-@click.option("--out", required=True, type=click.Path(path_type=Path), help="The folder to keep data and journal in.")
+@click.option("--out", required=True, type=FILE, help="The folder to keep data and journal in.")
 @click.option("--resume", is_flag=True, help="Go on with the recording in that folder.")
 @click.option("--from", "source", metavar="SOURCE", help=f"Where joint readings come from: {KINDS}.")
 @click.option(
@@ -44,8 +46,7 @@ _TERMINAL = Path("/dev/tty")
     show_default=True,
     help="Capture at a key, or whenever the arm has stood still for a while.",
 )
-@overrides
-@speaking
+@on_bench
 def record_command(
     console: Console,
     config: Path,
@@ -56,26 +57,33 @@ def record_command(
     overrides: tuple[str, ...],
 ) -> None:
     """Record postures of CONFIG's arms while they are guided by hand; keys say when. Each is judged at once."""
-    registry = discover()
-    console.plugin_faults(registry)
-    experiment = Experiment.of(_with_source(load_config(config, overrides), source), registry=registry)
+    experiment = load(console, config, overrides)
+    if source is not None:
+        experiment = Experiment.of(_with_source(experiment.source, source), registry=experiment.registry)
     bench = Bench.of(experiment)
-    tell = _teller(console)
+
+    def show(message: Message) -> None:
+        """A JSON line, or a sentence; flushed, so that who reads it knows at once what is safe."""
+        if console.json:
+            click.echo(json.dumps({"event": message.kind, **message.content, "sentence": message.sentence}))
+        elif not console.quiet:
+            say(message.sentence)
+
     with Signals() as signals, _keys(bench, capture) as (keys, is_terminal):
         if is_terminal and not console.quiet:
             click.echo(f"{KEYS}.", err=True)
         start: Literal["anew", "resume"] = "resume" if resume else "anew"
-        options = RecordingOptions(out, start, capture, keys, lambda: signals.finish or signals.rotate, tell)
+        options = RecordingOptions(out, start, capture, keys, lambda: signals.finish or signals.rotate, show)
         ending = record(bench, options)
-    tell(ending)
+    show(ending)
     if ending.content["postures"] and not (console.json or console.quiet):
-        say(f"next: armcal run {config} {_data(experiment, out / DATASET)} --out DIR")
+        data = experiment.settings.data or {}
+        is_read = data.get("type", "csv") == "csv" and not data.get("columns")
+        say(f"next: armcal run {config} {'' if is_read else _AS_CSV}--data {out / DATASET} --out DIR")
 
 
-def _with_source(source: ConfigSource, name: str | None) -> ConfigSource:
+def _with_source(source: ConfigSource, name: str) -> ConfigSource:
     """The configuration with another source of joint readings; a stream of JSON lines where none is configured."""
-    if name is None:
-        return source
     bench = source.data.get(SECTION)
     joints = bench.get("joints") if isinstance(bench, dict) else None
     section: dict[str, Any] = dict(joints) if isinstance(joints, dict) else {"type": ConfigText("json_lines")}
@@ -91,11 +99,9 @@ def _keys(bench: Bench, capture: str) -> Iterator[tuple[Keys, bool]]:
     Raises:
         InputError: nobody could say when to capture.
     """
-    joints = bench.settings.joints or {}
-    is_taken = joints.get("source") == STANDARD_INPUT
+    is_taken = (bench.settings.joints or {}).get("source") == STANDARD_INPUT
     if not is_taken and not sys.stdin.isatty():
-        with LineKeys(sys.stdin.fileno()) as keys:
-            yield keys, False
+        yield LineKeys(sys.stdin.fileno()), False
         return
     descriptor = os.dup(sys.stdin.fileno()) if not is_taken else _terminal()
     if descriptor is None:
@@ -104,12 +110,11 @@ def _keys(bench: Bench, capture: str) -> Iterator[tuple[Keys, bool]]:
                 "standard input gives the joint readings and there is no terminal, so nobody can say when to capture.",
                 hint="Give --capture still, or let the readings come from udp:PORT or a file.",
             )
-        with NoKeys() as none:
-            yield none, False
+        yield NoKeys(), False
         return
     try:
-        with TerminalKeys(descriptor, lambda text: click.echo(text, err=True, nl=False)) as terminal:
-            yield terminal, True
+        with single_keys(descriptor):
+            yield TerminalKeys(descriptor, lambda text: click.echo(text, err=True, nl=False)), True
     finally:
         os.close(descriptor)
 
@@ -122,23 +127,3 @@ def _terminal() -> int | None:
         return os.open(_TERMINAL, os.O_RDWR | os.O_CLOEXEC)
     except OSError:
         return None
-
-
-def _teller(console: Console) -> Callable[[Message], None]:
-    """JSON lines, or sentences; flushed, so that who reads them knows at once what is safe."""
-
-    def tell(told: Message) -> None:
-        if console.json:
-            click.echo(json.dumps({"event": told.kind, **told.content, "sentence": told.sentence}))
-        elif not console.quiet:
-            say(told.sentence)
-
-    return tell
-
-
-def _data(experiment: Experiment, dataset: Path) -> str:
-    """How the dataset is given to a run."""
-    configured = experiment.settings.data or {}
-    if configured.get("type", "csv") == "csv" and not configured.get("columns"):
-        return f"--data {dataset}"
-    return f"--set 'data={{type: csv}}' --data {dataset}"

@@ -10,17 +10,14 @@ from pathlib import Path
 from typing import Any
 
 import click
-from armcal.cli.common import Console, overrides, speaking
+from armcal.cli.common import Console
 from armcal.cli.outlet import say
 from armcal.devices.faults import DeviceError
 from armcal.errors import EXIT_FAULT, EXIT_INCOMPLETE, EXIT_STOPPED, InputError
-from armcal.estimate.estimator import Progress
 from armcal.io.signals import Signals
-from armcal.plugins import discover
-from armcal.run.experiment import Experiment
 from rich.table import Table
 
-from armcal_bench.commands.energising import Question, energise_option, waits, warned
+from armcal_bench.commands.common import FILE, Question, energise_option, load, on_bench, waits, warned
 from armcal_bench.servo.keys import wishes_from
 from armcal_bench.servo.mover import StoppedError
 from armcal_bench.servo.outcome import Outcome
@@ -31,14 +28,9 @@ from armcal_bench.servo.setup import Setup
 from armcal_bench.servo.trial import Verdict, swapped
 from armcal_bench.wiring import carry_over
 
-_FOLDER = click.Path(path_type=Path)
-
 
 @click.command("servo")
-@click.argument("config", type=_FOLDER)
-@click.option(
-    "--out", type=_FOLDER, help="The folder to keep what is measured in; what it holds is not measured again."
-)
+@click.option("--out", type=FILE, help="The folder to keep what is measured in; what it holds is not measured again.")
 @click.option("--guided", is_flag=True, help="Without a tracker: you say when a joint is at an angle.")
 @click.option("--check", is_flag=True, help="Only move each joint a little, and say whether it is the right one.")
 @click.option("--park", "parks", is_flag=True, help="Only bring the servos to the base pose.")
@@ -46,8 +38,7 @@ _FOLDER = click.Path(path_type=Path)
 @click.option("--evaluate", is_flag=True, help="Measure nothing: fit what the folder holds, and write the tables.")
 @click.option("--keep", is_flag=True, help="Leave the servo file as it is.")
 @energise_option
-@overrides
-@speaking
+@on_bench
 def servo(
     console: Console,
     config: Path,
@@ -62,45 +53,50 @@ def servo(
     overrides: tuple[str, ...],
 ) -> None:
     """Find which pulse makes which angle of each servo on the bench of CONFIG, and write the servo file."""
-    registry = discover()
-    console.plugin_faults(registry)
-    setup = Setup.of(Experiment.load(config, overrides, registry=registry))
+    setup = Setup.of(load(console, config, overrides))
     how = "guided" if guided else "automatic"
-    with _talking(console, setup, may_energise) as talk:
+    with _conversation(console, may_energise) as talk:
         if check:
-            _checked(console, setup, talk, "somebody" if guided else "tracker")
+            _check(console, setup, talk, "somebody" if guided else "tracker")
         elif not parks and not (release and out is None):
-            _calibrated(console, setup, _given(out), None if evaluate else how, keep, talk)
+            if out is None:
+                raise InputError("found no --out.", hint="Say where what is measured is to be kept, or give --check.")
+            if not evaluate:
+                _stoppable(console, lambda: measure(setup, out, talk, how))
+            _evaluate(console, setup, out, keep)
         if parks or release:
             _stoppable(console, lambda: park(setup, talk, "release" if release else "hold"))
 
 
-def _given(out: Path | None) -> Path:
-    if out is None:
-        raise InputError("found no --out.", hint="Say where what is measured is to be kept, or give --check.")
-    return out
+@contextmanager
+def _conversation(console: Console, may_energise: Question) -> Iterator[Conversation]:
+    def say_line(text: str) -> None:
+        say(text, err=console.json)
+
+    with Signals() as signals, console.progress() as show:
+
+        def on_progress(joint: str, done: int, planned: int) -> None:
+            show(f"measuring {joint}", done / max(planned, 1))
+
+        question = warned(console, may_energise)
+        yield Conversation(
+            lambda: signals.finish, question, on_progress, say_line, lambda: wishes_from(0), waits(console)
+        )
 
 
-def _calibrated(console: Console, setup: Setup, out: Path, how: str | None, keep: bool, talk: Conversation) -> None:
-    if how is not None:
-        _stoppable(console, lambda: measure(setup, out, talk, how))
+def _evaluate(console: Console, setup: Setup, out: Path, keep: bool) -> None:
+    """Fit what a folder holds, and write the tables. Missing ones must not look like a success to a script."""
     outcome = evaluated(setup, out)
     changed = improved(setup.file, outcome, adapter_of(out))
     content = results(outcome, changed)
     write_results(out, content)
-    kept = None if keep else write_servo_file(setup.path, changed)
-    if kept is not None:
+    earlier = None if keep else write_servo_file(setup.path, changed)
+    if earlier is not None:
         carry_over(setup.path, setup.file, changed)
-    written = {"servo_file": str(setup.path), "before": None if kept is None else str(kept)}
-    console.result({**content, **written})
+    console.result({**content, "servo_file": str(setup.path), "before": None if earlier is None else str(earlier)})
     _show(console, outcome, content)
-    if kept is not None:
-        console.out.print(f"{setup.path}: written; the one before is {kept.name}", markup=False, soft_wrap=True)
-    _exit_if_incomplete(console, setup, content)
-
-
-def _exit_if_incomplete(console: Console, setup: Setup, content: Mapping[str, Any]) -> None:
-    """Tables that were asked for and are not there must not look like a success to a script."""
+    if earlier is not None:
+        console.out.print(f"{setup.path}: written; the one before is {earlier.name}", markup=False, soft_wrap=True)
     left = [joint for joint in setup.joints if not content["servos"].get(joint, {"written": False})["written"]]
     if left:
         count = len(setup.joints) - len(left)
@@ -111,7 +107,7 @@ def _exit_if_incomplete(console: Console, setup: Setup, content: Mapping[str, An
         sys.exit(EXIT_INCOMPLETE)
 
 
-def _checked(console: Console, setup: Setup, talk: Conversation, seen: str) -> None:
+def _check(console: Console, setup: Setup, talk: Conversation, seen: str) -> None:
     verdicts: list[Verdict] = []
     _stoppable(console, lambda: verdicts.extend(tried(setup, talk, seen)))
     pairs = swapped(verdicts)
@@ -143,33 +139,14 @@ def _stoppable(console: Console, action: Callable[[], None]) -> None:
         raise type(fault)(fault.message, where=fault.where, hint=hint) from fault
 
 
-@contextmanager
-def _talking(console: Console, setup: Setup, may_energise: Question) -> Iterator[Conversation]:
-    def heard(text: str) -> None:
-        say(text, err=console.json)
-
-    with Signals() as signals, console.progress() as show:
-        may_move = warned(console, may_energise)
-        yield Conversation(
-            lambda: signals.finish, may_move, _teller(show), heard, lambda: wishes_from(0), waits(console)
-        )
-
-
-def _teller(show: Progress) -> Callable[[str, int, int], None]:
-    def tell(joint: str, done: int, planned: int) -> None:
-        show(f"measuring {joint}", done / max(planned, 1))
-
-    return tell
-
-
 def _show(console: Console, outcome: Outcome, content: Mapping[str, Any]) -> None:
     table = Table(title="Pulses at angles, and what changed", title_justify="left")
     for column in ("servo", "deg", "us", "sd", "before", "change, us", "change, deg", "backlash, deg"):
         table.add_column(column, justify="left" if column == "servo" else "right")
-    for joint, found in content["servos"].items():
-        for i, knot in enumerate(found["knots"]):
-            lag = found["backlash_deg"]
-            play = "-" if lag is None else f"{lag:.2f} +- {found['backlash_sd_deg'] or 0:.2f}"
+    for joint, servo in content["servos"].items():
+        half_width = servo["backlash_deg"]
+        backlash = "-" if half_width is None else f"{half_width:.2f} +- {servo['backlash_sd_deg'] or 0:.2f}"
+        for i, knot in enumerate(servo["knots"]):
             table.add_row(
                 joint if i == 0 else "",
                 f"{knot['angle_deg']:g}",
@@ -178,7 +155,7 @@ def _show(console: Console, outcome: Outcome, content: Mapping[str, Any]) -> Non
                 f"{knot['before_us']:.1f}",
                 f"{knot['change_us']:+.1f}",
                 f"{knot['change_deg']:+.2f}",
-                play if i == 0 else "",
+                backlash if i == 0 else "",
             )
     console.out.print(table)
     for name, board in content["boards"].items():

@@ -46,7 +46,7 @@ class Offset:
 
 @dataclass(frozen=True)
 class Agreement:
-    """What was found of all postures.
+    """Which postures agree.
 
     Attributes:
         doubtful: those that disagree, by place (from 0).
@@ -76,12 +76,18 @@ class AgreementJudge:
         if not before.any():
             return Agreement()
         fitted = self._fitter.fit(before)
-        newest = self._told(fitted, self._last)
+        newest = self._predicted(fitted, self._last)
         candidates = [*doubtful] if newest is None else [*doubtful, self._last]
-        by_majority = {one for one in candidates if self._disagrees(fitted, one, _CHANCE)}
-        by_majority = self._by_majority(by_majority)
-        agreement = self._settled(by_majority)
-        return replace(agreement, newest=None if newest is None else _offset(newest))
+        disagreeing = {one for one in candidates if self._disagrees(fitted, one, _CHANCE)}
+        own = {int(i) for i in np.flatnonzero(self._groups == self._groups[self._last])}
+        majority = own & disagreeing
+        if len(majority) > len(own - disagreeing):  # more of the group in doubt than not: they are right if they agree
+            others = (disagreeing - majority) | (own - disagreeing)
+            fitted = self._fitter.fit(self._active(others))
+            left_out = self._fitter.left_out(fitted)
+            if not any(_is_beyond(*left_out[one], fitted.freedom, _CHANCE) for one in majority):
+                disagreeing = others
+        return replace(self._settled(disagreeing), newest=None if newest is None else _offset(newest))
 
     def anew(self) -> Agreement:
         """Judge all, of which none was in doubt."""
@@ -92,53 +98,34 @@ class AgreementJudge:
         used[list(doubtful)] = False
         return used
 
-    def _told(self, fitted: Fitted, one: int) -> PredictedResidual | None:
+    def _predicted(self, fitted: Fitted, one: int) -> PredictedResidual | None:
         """None for a posture in whose group nothing was fitted."""
         alike = (self._groups == self._groups[one]) & fitted.used
-        return self._fitter.told(fitted, one) if alike.any() else None
+        return self._fitter.predicted(fitted, one) if alike.any() else None
 
     def _disagrees(self, fitted: Fitted, one: int, chance: float) -> bool:
-        told = self._told(fitted, one)
-        return told is not None and _is_beyond(told.distance, len(told.residual), fitted.freedom, chance)
-
-    def _by_majority(self, doubtful: set[int]) -> set[int]:
-        """In the last posture's group, those in doubt and the others changed over if that leaves fewer in doubt."""
-        own = {int(i) for i in np.flatnonzero(self._groups == self._groups[self._last])}
-        minority, majority = own - doubtful, own & doubtful
-        if len(majority) <= len(minority):
-            return doubtful
-        other = (doubtful - majority) | minority
-        fitted = self._fitter.fit(self._active(other))
-        left_out = self._fitter.left_out(fitted)
-        off = [_is_beyond(*left_out[one], fitted.freedom, _CHANCE) for one in majority]
-        return doubtful if any(off) else other
+        predicted = self._predicted(fitted, one)
+        return predicted is not None and _is_beyond(predicted.distance, len(predicted.residual), fitted.freedom, chance)
 
     def _settled(self, doubtful: set[int]) -> Agreement:
-        """Drop fitted postures that disagree with the rest, the farthest first."""
+        """Drop fitted postures that disagree with the others of their group, the farthest first."""
         rounds = _MOST_DROPPED_AT_ONCE if doubtful or self._last < 0 else max(_MOST_DROPPED_AT_ONCE, self._last // 3)
         fitted = self._fitter.fit(self._active(doubtful))
         for _ in range(rounds):
-            worst = self._farthest(fitted)
-            if worst is None:
+            ratios = {
+                one: distance / _limit(numbers, fitted.freedom, _LOOKED_AT)
+                for one, (distance, numbers) in self._fitter.left_out(fitted).items()
+                if np.sum((self._groups == self._groups[one]) & fitted.used) >= 2
+            }
+            worst = max(ratios, key=lambda one: ratios[one], default=None)
+            if worst is None or ratios[worst] <= 1:
                 break
-            tried = self._fitter.fit(self._active(doubtful | {worst}))
-            if not self._disagrees(tried, worst, _CHANCE_LATER):
+            without = self._fitter.fit(self._active(doubtful | {worst}))
+            if not self._disagrees(without, worst, _CHANCE_LATER):
                 break
-            doubtful, fitted = doubtful | {worst}, tried
-        offsets = {one: self._fitter.told(fitted, one) for one in sorted(doubtful)}
-        found = {one: _offset(offset) for one, offset in offsets.items()}
-        return Agreement(found, values=self._fitter.free_values(fitted))
-
-    def _farthest(self, fitted: Fitted) -> int | None:
-        """The fitted posture that is likeliest wrong, of groups with others in them; None if none looks so."""
-        worst, largest = None, 1.0
-        for one, (distance, numbers) in self._fitter.left_out(fitted).items():
-            if np.sum((self._groups == self._groups[one]) & fitted.used) < 2:
-                continue
-            ratio = distance / _limit(numbers, fitted.freedom, _LOOKED_AT)
-            if ratio > largest:
-                worst, largest = one, ratio
-        return worst
+            doubtful, fitted = doubtful | {worst}, without
+        offsets = {one: _offset(self._fitter.predicted(fitted, one)) for one in sorted(doubtful)}
+        return Agreement(offsets, values=self._fitter.free_values(fitted))
 
 
 def _is_beyond(distance: float, numbers: int, freedom: float, chance: float) -> bool:
@@ -149,13 +136,11 @@ def _limit(numbers: int, freedom: float, chance: float) -> float:
     return float(numbers * f_distribution.isf(chance, numbers, max(freedom, 1.0)))
 
 
-def _offset(told: PredictedResidual) -> Offset:
-    deviations = np.diag(told.covariance)
-    off, expected = [], []
-    for which in (told.lengths, ~told.lengths):
-        off.append(float(np.linalg.norm(told.residual[which])))
-        expected.append(float(np.sqrt(deviations[which].sum())))
-    return Offset(1000 * off[0], 1000 * expected[0], float(np.degrees(off[1])), float(np.degrees(expected[1])))
+def _offset(predicted: PredictedResidual) -> Offset:
+    variances, lengths = np.diag(predicted.covariance), predicted.lengths
+    off, off_turn = (float(np.linalg.norm(predicted.residual[which])) for which in (lengths, ~lengths))
+    expected, expected_turn = (float(np.sqrt(variances[which].sum())) for which in (lengths, ~lengths))
+    return Offset(1000 * off, 1000 * expected, float(np.degrees(off_turn)), float(np.degrees(expected_turn)))
 
 
 def _short(number: float) -> str:

@@ -5,20 +5,23 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
+from armcal.base.dataset import Dataset
 from armcal.errors import ArmcalError, ConfigError
 from armcal.measure.measurement import Measurement
 from armcal.run.experiment import Experiment
 
 from armcal_bench.recording.agreement import Agreement, AgreementJudge, Offset
 from armcal_bench.recording.knowledge import Knowledge, explained, knowledge
-from armcal_bench.recording.outputs import dataset_of
-from armcal_bench.recording.posture import Posture
+from armcal_bench.recording.posture import Posture, dataset_of
 from armcal_bench.recording.quick_fit import QuickFitter
+
+_UNFIT = (ArmcalError, ArithmeticError, ValueError)
+"""Faults of postures that no fit can take."""
 
 
 @dataclass(frozen=True)
 class Assessment:
-    """What was found.
+    """What the postures determine, and which of them disagree.
 
     Attributes:
         newest: how the last posture lies to the others; None where there is nothing to compare it with.
@@ -72,27 +75,28 @@ class Assessor:
         """Everything that is not determined yet, and why; it takes a moment."""
         if not postures:
             return ()
-        dataset = dataset_of(postures, {})
         try:
-            experiment = self._experiment.of_records(dataset)
-            fitter = QuickFitter(experiment, self._contacts, dataset)
+            experiment, dataset, fitter = self._fitter(postures)
             return explained(experiment, fitter.problem, fitter.records, dataset)
-        except (ArmcalError, ArithmeticError, ValueError) as fault:
+        except _UNFIT as fault:
             return (str(fault),)
 
     def _assessed(self, postures: Sequence[Posture], judge: Callable[[AgreementJudge], Agreement]) -> Assessment:
         if not postures:
             return Assessment()
-        dataset = dataset_of(postures, {})
         try:
-            experiment = self._experiment.of_records(dataset)
-            fitter = QuickFitter(experiment, self._contacts, dataset)
+            experiment, dataset, fitter = self._fitter(postures)
             fitter.begin_from(self._values)
             agreement = judge(AgreementJudge(fitter, [p.place for p in postures]))
             known = knowledge(experiment, fitter.problem, fitter.records, dataset)
-        except (ArmcalError, ArithmeticError, ValueError) as fault:  # what was captured is safe, and so is what comes
+        except _UNFIT as fault:  # what was captured is safe, and so is what comes
             return Assessment(why_not=str(fault))
         doubts = {postures[place].name: offset for place, offset in agreement.doubtful.items()}
         self._doubtful = frozenset(doubts)
         self._values = agreement.values or self._values
         return Assessment(agreement.newest, doubts, known)
+
+    def _fitter(self, postures: Sequence[Posture]) -> tuple[Experiment, Dataset, QuickFitter]:
+        dataset = dataset_of(postures)
+        experiment = self._experiment.of_records(dataset)
+        return experiment, dataset, QuickFitter(experiment, self._contacts, dataset)

@@ -5,12 +5,12 @@ from __future__ import annotations
 import os
 import select
 from collections.abc import Callable
-from types import TracebackType
-from typing import Protocol, Self
+from typing import Protocol
 
 from armcal.io.line_cutter import LineCutter
+from typing_extensions import override
 
-from armcal_bench.terminal import keep_single_keys, single_keys
+from armcal_bench.terminal import keep_single_keys
 
 END = "q"
 _END_OF_INPUT, _ERASE, _ESCAPE = "\x04", "\x7f\b", "\x1b"
@@ -20,64 +20,38 @@ _LONGEST = 1024
 class Keys(Protocol):
     """Commands as ``Recorder.command`` takes them."""
 
+    ended: bool
+    """Whether there will never be another one."""
+
     def commands(self) -> list[str]:
         """All that came since the last call; it never waits."""
 
-    @property
-    def ended(self) -> bool:
-        """Whether there will never be another one."""
 
-    def __enter__(self) -> Self: ...
-
-    def __exit__(
-        self, kind: type[BaseException] | None, fault: BaseException | None, at: TracebackType | None
-    ) -> None: ...
-
-
-class NoKeys:
+class NoKeys(Keys):
     """Nobody can type."""
 
     ended = True
 
+    @override
     def commands(self) -> list[str]:
-        """None."""
         return []
 
-    def __enter__(self) -> Self:
-        return self
 
-    def __exit__(self, kind: type[BaseException] | None, fault: BaseException | None, at: TracebackType | None) -> None:
-        return None
-
-
-class LineKeys:
+class LineKeys(Keys):
     """A command a line, from a pipe."""
 
     def __init__(self, descriptor: int) -> None:
         self._descriptor, self._cutter = descriptor, LineCutter(_LONGEST)
         self.ended = False
 
+    @override
     def commands(self) -> list[str]:
-        """See ``Keys``."""
-        found: list[bytes | None] = []
-        while not self.ended and select.select([self._descriptor], [], [], 0)[0]:
-            try:
-                data = os.read(self._descriptor, _LONGEST)
-            except OSError:
-                data = b""
-            self.ended = not data
-            found += self._cutter.feed(data)
-        return [line.decode("utf-8", "replace") for line in found if line is not None]
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, fault: BaseException | None, at: TracebackType | None) -> None:
-        return None
+        data, self.ended = _typed(self._descriptor, self.ended)
+        return [line.decode("utf-8", "replace") for line in self._cutter.feed(data) if line is not None]
 
 
-class TerminalKeys:
-    """Single keys. While it is entered the terminal shows no keys and waits for no Enter; afterwards it is as before.
+class TerminalKeys(Keys):
+    """Single keys of a terminal; see ``terminal.single_keys`` for the mode that it must be in.
 
     Args:
         descriptor: of the terminal.
@@ -86,57 +60,54 @@ class TerminalKeys:
 
     def __init__(self, descriptor: int, echo: Callable[[str], None]) -> None:
         self._descriptor, self._echo = descriptor, echo
-        self._typed: str | None = None
+        self._name: str | None = None
+        """What was typed of a name; None while none is typed."""
         self.ended = False
 
-    def __enter__(self) -> Self:
-        self._mode = single_keys(self._descriptor)
-        self._mode.__enter__()
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, fault: BaseException | None, at: TracebackType | None) -> None:
-        self._mode.__exit__(kind, fault, at)
-
+    @override
     def commands(self) -> list[str]:
-        """See ``Keys``."""
         keep_single_keys(self._descriptor)
-        texts = []
-        while not self.ended and select.select([self._descriptor], [], [], 0)[0]:
-            try:
-                data = os.read(self._descriptor, _LONGEST)
-            except OSError:
-                data = b""
-            self.ended = not data
-            texts += [command for key in data.decode("utf-8", "replace") if (command := self._key(key)) is not None]
-        return texts
+        data, self.ended = _typed(self._descriptor, self.ended)
+        pressed = [self._pressed(key) for key in data.decode("utf-8", "replace")]
+        return [command for command in pressed if command is not None]
 
-    def _key(self, key: str) -> str | None:
+    def _pressed(self, key: str) -> str | None:
         """The command that a key completes."""
-        if self._typed is not None:
-            return self._letter(key, self._typed)
+        if self._name is not None:
+            return self._letter(key, self._name)
         if key in "\r\n":
             return "c"
         if key == _END_OF_INPUT:
             return END
         if key == "g":
-            self._typed = ""
+            self._name = ""
             self._echo("name: ")
             return None
         return key if key.isprintable() and not key.isspace() else None
 
-    def _letter(self, key: str, typed: str) -> str | None:
-        """A letter of a name."""
-        if key in "\r\n":
-            self._typed = None
+    def _letter(self, key: str, name: str) -> str | None:
+        """The command that a letter of a name completes."""
+        if key in "\r\n" or key in (_ESCAPE, _END_OF_INPUT):
+            self._name = None
             self._echo("\n")
-            return f"g {typed}" if typed.strip() else None
-        if key in (_ESCAPE, _END_OF_INPUT):
-            self._typed = None
-            self._echo("\n")
-        elif key in _ERASE:
-            self._typed = typed[:-1]
-            self._echo("\b \b" if typed else "")
+            return f"g {name}" if key in "\r\n" and name.strip() else None
+        if key in _ERASE:
+            self._name = name[:-1]
+            self._echo("\b \b" if name else "")
         elif key.isprintable():
-            self._typed = typed + key
+            self._name = name + key
             self._echo(key)
         return None
+
+
+def _typed(descriptor: int, ended: bool) -> tuple[bytes, bool]:
+    """All that can be read without waiting, and whether the input has ended."""
+    data = b""
+    while not ended and select.select([descriptor], [], [], 0)[0]:
+        try:
+            read = os.read(descriptor, _LONGEST)
+        except OSError:
+            read = b""
+        ended = not read
+        data += read
+    return data, ended

@@ -1,4 +1,4 @@
-"""What the postures so far determine of the free parameters, and what would tell more."""
+"""What the postures so far determine of the free parameters, and which joints to vary for more."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.errors import ArmcalError
-from armcal.estimate.identifiability import RANK_TOLERANCE
+from armcal.estimate.identifiability import numerical_rank
 from armcal.estimate.nuisance import restricted
 from armcal.estimate.scale import GIVE_A_LENGTH, UNSEEN_SCALE, scale_is_unseen
 from armcal.estimate.structure import explain, identify_from
@@ -18,7 +18,6 @@ from armcal.problem.problem import FactorRecords, Problem
 from armcal.problem.projection import factor_at_zero, projected
 from armcal.run.experiment import Experiment
 from armcal.run.groups import labels_of
-from scipy.linalg import qr
 
 FEW = 6
 """So many undetermined combinations are named at most."""
@@ -28,7 +27,7 @@ _ABOUT = 6
 """So many of the newest postures are varied, joint by joint."""
 _RIDGE = 1e-6
 _WORTH = 0.7
-"""Joints that tell nearly as much as the best one are named too."""
+"""Joints that add nearly as much as the best one are named too."""
 _MOST_NAMED = 3
 
 
@@ -39,8 +38,8 @@ class Knowledge:
     Attributes:
         rank, free: determined combinations, of so many numbers.
         records: how many postures train.
-        missing: the undetermined combinations, once they are few: to name many takes long, and tells little.
-        vary: joints that would tell most if they were moved more, the best first.
+        missing: the undetermined combinations, once they are few: to name many takes long, and helps little.
+        vary: joints that would add most if they were moved more, the best first.
     """
 
     rank: int
@@ -64,27 +63,17 @@ def knowledge(
         return Knowledge(0, 0, len(train), (), ())
     triangle = factor_at_zero(problem, problem.parameters.nominal(), training)
     scaled = triangle * problem.parameters.scales()
-    rank, free = _rank(scaled), scaled.shape[1]
+    rank, free = numerical_rank(scaled), scaled.shape[1]
     missing: tuple[str, ...] = ()
     if free - rank <= FEW:
         missing = tuple(map(str, identify_from(triangle, problem.parameters).undetermined))
     return Knowledge(rank, free, len(train), missing, _joints_to_vary(problem, dataset.subset(train), scaled, rank))
 
 
-def _rank(scaled: Array) -> int:
-    """As ``identifiability.analyse`` decides it."""
-    diagonal = np.abs(np.diag(qr(scaled, pivoting=True, mode="r")[0]))
-    counts = []
-    for values in (np.linalg.svd(scaled, compute_uv=False), diagonal):
-        largest = float(values.max(initial=0.0))
-        counts.append(int(np.sum(values > RANK_TOLERANCE * largest)) if largest > 0 else 0)
-    return max(counts)
-
-
 def explained(
     experiment: Experiment, problem: Problem, records: Sequence[FactorRecords], dataset: Dataset
 ) -> tuple[str, ...]:
-    """Everything that is not determined, or hardly, with why: gauges too, which no posture would tell.
+    """Everything that is not determined, or hardly, with why: gauges too, which no posture would determine.
 
     Raises:
         ArmcalError: it cannot be judged.
@@ -103,19 +92,13 @@ def explained(
 
 def _training(experiment: Experiment, dataset: Dataset) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
     """The postures that a run would train on; all while none would be."""
-    validation_settings, everything = experiment.settings.validation, np.arange(len(dataset), dtype=np.intp)
-    if validation_settings.train_groups:
+    settings, chosen = experiment.settings.validation, np.arange(len(dataset), dtype=np.intp)
+    if settings.train_groups:
         labels = labels_of(experiment, dataset)
-        chosen = np.array(
-            [i for i, label in enumerate(labels) if label in validation_settings.train_groups], dtype=np.intp
-        )
-    elif validation_settings.holdout and validation_settings.train_ids is None and len(dataset) > 2:
-        chosen = hold_out(
-            len(dataset), validation_settings.holdout, validation_settings.seed, experiment.poses(dataset)
-        ).train
-    else:
-        chosen = everything
-    return chosen if len(chosen) else everything
+        chosen = np.flatnonzero([label in settings.train_groups for label in labels])
+    elif settings.holdout and settings.train_ids is None and len(dataset) > 2:
+        chosen = hold_out(len(dataset), settings.holdout, settings.seed, experiment.poses(dataset)).train
+    return chosen if len(chosen) else np.arange(len(dataset), dtype=np.intp)
 
 
 def _restricted(
@@ -132,14 +115,17 @@ def _joints_to_vary(problem: Problem, dataset: Dataset, scaled: Array, rank: int
         for name, arm in problem.blueprint.arms.items()
         for joint, kind in arm.commanded.items()
     }
-    about = dataset.subset(range(max(0, len(dataset) - _ABOUT), len(dataset)))
+    newest = range(max(0, len(dataset) - _ABOUT), len(dataset))
+    both = replace(dataset.subset([*newest, *newest]), ids=tuple(str(i) for i in range(2 * len(newest))))
+    signs = np.repeat([1.0, -1.0], len(newest))
     scales, values = problem.parameters.scales(), problem.parameters.nominal()
     base = scaled.T @ scaled
     base += np.eye(len(scales)) * _RIDGE * max(float(np.trace(base)) / max(rank, 1), 1e-300)
     gains: dict[str, float] = {}
     for channel, step in joints.items():
         try:
-            moved = projected(problem, values, problem.records(_moved(about, channel, step)))
+            channels = {**both.channels, channel: both.column(channel) + step * signs}
+            moved = projected(problem, values, problem.records(replace(both, channels=channels)))
             rows = problem.triangular_factor(values, moved) * scales
         except ArmcalError:
             continue
@@ -148,11 +134,3 @@ def _joints_to_vary(problem: Problem, dataset: Dataset, scaled: Array, rank: int
     ranked = sorted((c for c, gain in gains.items() if gain > _WORTH * best > 0), key=lambda c: -gains[c])
     alone = len(problem.blueprint.arms) == 1
     return tuple(c.partition(".")[2] if alone else c for c in ranked[:_MOST_NAMED])
-
-
-def _moved(about: Dataset, channel: str, step: float) -> Dataset:
-    """The postures with one joint moved to either side."""
-    both = about.subset([*range(len(about)), *range(len(about))])
-    signs = np.repeat([1.0, -1.0], len(about))
-    channels = {**both.channels, channel: both.column(channel) + step * signs}
-    return replace(both, ids=tuple(str(i) for i in range(len(both))), channels=channels)

@@ -1,4 +1,4 @@
-"""What a recording tells its user: a kind, a sentence for people, and the same as numbers for programs."""
+"""Messages of a recording: a kind, a sentence for people, and the same as numbers for programs."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _MOST_MISSING = 1
 
 @dataclass(frozen=True)
 class Message:
-    """One thing that is told.
+    """One event of a recording.
 
     Attributes:
         kind: ``captured``, ``refused``, ``undone``, ``named``, ``disagrees``, ``agrees_again``, ``known``, ``status``,
@@ -74,11 +74,7 @@ def known(knowledge: Knowledge) -> Message:
     elif knowledge.rank < knowledge.free:
         sentence += f"; {knowledge.free - knowledge.rank} combinations are missing, which s lists"
     if knowledge.vary:
-        sentence += (
-            f". {_joined(knowledge.vary)} would tell most: vary {'it' if len(knowledge.vary) == 1 else 'them'} more"
-        )
+        *others, last = knowledge.vary
+        joints = f"{', '.join(others)} and {last}" if others else last
+        sentence += f". {joints} would add most: vary {'them' if others else 'it'} more"
     return Message("known", f"{sentence}.", knowledge.__dict__)
-
-
-def _joined(words: Sequence[str]) -> str:
-    return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)

@@ -1,10 +1,18 @@
-"""A posture as it was captured."""
+"""Postures as they were captured, and the dataset that they make."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
+
+import numpy as np
+from armcal.base.dataset import Dataset
+from armcal.measure.csv_writer import write_csv
+from armcal.run.experiment import Experiment
+
+DATASET = "dataset.csv"
 
 
 @dataclass(frozen=True)
@@ -35,10 +43,28 @@ class Posture:
         return "/".join(self.labels.values())
 
     def as_dict(self) -> dict[str, Any]:
-        """As JSON; numbers read back bit for bit."""
+        """As JSON, to be read back by ``Posture(**content)``, numbers bit for bit."""
         return {**self.__dict__, "angles": dict(self.angles), "labels": dict(self.labels)}
 
-    @classmethod
-    def from_dict(cls, content: Mapping[str, Any]) -> Posture:
-        """What ``as_dict`` wrote."""
-        return cls(**content)
+
+def dataset_of(postures: Sequence[Posture], doubts: Mapping[str, str] | None = None) -> Dataset:
+    """The postures in the order of capture, at least one; ``doubts`` say why one is not to be trusted, by name."""
+    first = postures[0]
+    channels = {name: np.array([p.angles[name] for p in postures]) for name in first.angles}
+    channels["time"] = np.array([p.at for p in postures])
+    extra = {name: tuple(p.labels[name] for p in postures) for name in first.labels}
+    extra["readings"] = tuple(str(p.readings) for p in postures)
+    extra["doubt"] = tuple((doubts or {}).get(p.name, "") for p in postures)
+    return Dataset(tuple(p.name for p in postures), channels, extra, source="recorded")
+
+
+def write_dataset(folder: Path, experiment: Experiment, postures: Sequence[Posture], doubts: Mapping[str, str]) -> None:
+    """Replace the dataset, whole; without postures there is none.
+
+    Raises:
+        DataError: it cannot be written.
+    """
+    if not postures:
+        (folder / DATASET).unlink(missing_ok=True)
+        return
+    write_csv(folder / DATASET, dataset_of(postures, doubts), experiment.request(measured=True).wanted)

@@ -1,31 +1,33 @@
-"""A quick fit of the postures so far, whatever they determine, and what it says of a posture that it did not see.
+"""A quick fit of the postures so far, whatever they determine, and what it predicts of a posture that it did not see.
 
-Where postures do not tell, weak priors of a typical scale about the nominal values do: an unknown that is not
-determined yet makes the expected error large, not the answer impossible.
+Weak priors about the nominal values stand in for what the postures do not determine: an unknown that is not determined
+yet makes the expected error large, not the answer impossible.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
-from armcal.base.parameters import Parameters
 from armcal.estimate.nuisance import started
+from armcal.estimate.polish import descended
 from armcal.measure.measurement import Measurement
 from armcal.problem.joint_noise import with_joint_noise
 from armcal.problem.linearised import BLOCK_RECORDS
 from armcal.problem.posed import PosedProblem
-from armcal.problem.problem import FactorRecords, Problem
+from armcal.problem.problem import Problem
 from armcal.problem.whitening import declared
 from armcal.run.experiment import Experiment
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 
 _FAR = 100.0
 """Ordinary sizes within which a group (a socket) is looked for."""
 _MOST_STEPS = 30
+_DAMPING = 1e-9
 _AT_REST = 1e-5
 """A step that lowers half the sum of squares by less than this part of it is the last."""
 _LEAST_LEFT = 1e-6
@@ -36,7 +38,7 @@ _LEAST_SCALE = 0.05
 
 @dataclass(frozen=True)
 class PredictedResidual:
-    """What a fit says of one posture that it did not see.
+    """What a fit predicts of one posture that it did not see.
 
     Attributes:
         residual: raw (n; m or rad).
@@ -57,7 +59,7 @@ class Fitted:
 
     Attributes:
         half: a root of the covariance by coordinates (n x n).
-        freedom: how many numbers told the noise.
+        freedom: how many numbers the noise was estimated from.
         used: which postures were fitted (N).
     """
 
@@ -88,7 +90,12 @@ class QuickFitter:
         self.problem = started(problem, records)
         nominal = self.problem.parameters.nominal()
         self.records = with_joint_noise(self.problem, records, nominal)
-        self._weak = replace(self.problem, parameters=_weakly_held(self.problem.parameters))
+        weak_priors = {
+            block.name: replace(block, prior_sd=block.scale * (_FAR if block.nuisance else 1.0))
+            for block in self.problem.parameters.free
+            if block.prior_sd is None
+        }
+        self._weak = replace(self.problem, parameters=self.problem.parameters.replaced(weak_priors))
         self._x = np.zeros(len(self._weak.parameters.increment_scales()))
 
     def begin_from(self, values: Mapping[str, tuple[float, ...]]) -> None:
@@ -104,117 +111,65 @@ class QuickFitter:
         parameters = self._weak.parameters
         return {b.name: tuple(fitted.values[parameters.entries_of(b.name)].tolist()) for b in parameters.free}
 
-    @property
-    def count(self) -> int:
-        """How many postures there are."""
-        return self.records[0].count
-
     def fit(self, used: NDArray[np.bool_]) -> Fitted:
         """Fit some of the postures (N), from where the last fit ended."""
+        parameters = self._weak.parameters
         records = self._weak.weighted(self.records, [used.astype(float)] * len(self.records))
         posed = PosedProblem(self._weak, records)
-        self._x = _lowest(posed, self._x)
-        values = posed.values(self._x)
-        return self._described(values, records, used)
+        self._x = descended(posed, self._x, _MOST_STEPS, _DAMPING, _AT_REST)
+        values, scales = posed.values(self._x), parameters.scales()
+        data = self._weak.normal_equations(values, records).chained(parameters.entries_jacobian(values) * scales)
+        prior = parameters.prior_information() * scales**2
+        identified_by_data = float(np.trace(np.linalg.solve(data.hessian + np.diag(prior), data.hessian)))
+        freedom = max(self._weak.equations(records) - identified_by_data, 0.0) + _DECLARED_COUNTS
+        scale = max(float(np.sqrt((2 * data.cost + _DECLARED_COUNTS) / freedom)), _LEAST_SCALE)
+        known, directions = np.linalg.eigh(data.hessian / scale**2 + np.diag(prior))
+        half = scales[:, None] * directions / np.sqrt(np.maximum(known, prior.min(initial=1.0)))
+        return Fitted(values, half, scale, freedom, used)
 
-    def told(self, fitted: Fitted, one: int) -> PredictedResidual:
+    def predicted(self, fitted: Fitted, one: int) -> PredictedResidual:
         """Of a posture that was not fitted."""
         records = self._weak.subset(self.records, np.array([one], dtype=np.intp))
-        residual, jacobian, whitening, lengths = self._rows(fitted.values, records)
-        reach = jacobian @ fitted.half
-        covariance = fitted.scale**2 * np.eye(len(residual)) + reach @ reach.T
-        distance = float(residual @ np.linalg.solve(covariance, residual))
-        back = np.linalg.inv(whitening)
-        return PredictedResidual(back @ residual, back @ covariance @ back.T, distance, lengths)
+        to_half = self._weak.parameters.entries_jacobian(fitted.values) @ fitted.half
+        factors = zip(
+            [kernel.factor for kernel in self._weak.kernels],
+            records,
+            self._weak.whitened_residuals(fitted.values, records),
+            self._weak.jacobians(fitted.values, records),
+            strict=True,
+        )
+        residuals, reaches, whitenings = [], [], []
+        dimensions: list[str] = []
+        for factor, record, residual, jacobian in factors:
+            if record.weight[0] > 0:
+                residuals.append(residual[:, 0])
+                reaches.append(jacobian[:, :, 0] @ to_half)
+                whitenings.append(declared(factor.noise) if record.whitening is None else record.whitening[:, :, 0])
+                dimensions += factor.dimensions
+        whitened, reach = np.concatenate(residuals), np.concatenate(reaches)
+        covariance = fitted.scale**2 * np.eye(len(whitened)) + reach @ reach.T
+        distance = float(whitened @ np.linalg.solve(covariance, whitened))
+        back = np.linalg.inv(block_diag(*whitenings))
+        lengths = np.array(dimensions) == "length"
+        return PredictedResidual(back @ whitened, back @ covariance @ back.T, distance, lengths)
 
     def left_out(self, fitted: Fitted) -> dict[int, tuple[float, int]]:
         """Of each fitted posture how far it lies from a fit without it, to first order: the square in units of what is
         expected, and how many numbers that are."""
-        chain = self._weak.parameters.entries_jacobian(fitted.values)
+        to_half = self._weak.parameters.entries_jacobian(fitted.values) @ fitted.half / fitted.scale
         residuals = self._weak.whitened_residuals(fitted.values, self.records)
         blocks = self._weak.jacobians(fitted.values, self.records)
         rows: dict[int, list[tuple[Array, Array]]] = {}
         for record, residual in zip(self.records, residuals, strict=True):
             for start in range(0, record.record.shape[1], BLOCK_RECORDS):
-                reach = np.einsum("rvb,vc->brc", next(blocks), chain @ fitted.half / fitted.scale)
-                for one in range(start, min(start + BLOCK_RECORDS, self.count)):
+                reach = np.einsum("rvb,vc->brc", next(blocks), to_half)
+                for one in range(start, min(start + BLOCK_RECORDS, record.count)):
                     if fitted.used[one] and record.weight[one] > 0:
                         rows.setdefault(one, []).append((residual[:, one], reach[one - start]))
-        return {one: _left_out(parts, fitted.scale) for one, parts in rows.items()}
-
-    def _described(self, values: Array, records: Sequence[FactorRecords], used: NDArray[np.bool_]) -> Fitted:
-        parameters = self._weak.parameters
-        chain = parameters.entries_jacobian(values)
-        data = self._weak.normal_equations(values, records).chained(chain * parameters.scales())
-        prior = parameters.prior_information() * parameters.scales() ** 2
-        numbers = self._weak.equations(records)
-        identified_by_data = float(np.trace(np.linalg.solve(data.hessian + np.diag(prior), data.hessian)))
-        freedom = max(numbers - identified_by_data, 0.0)
-        squares = 2 * data.cost
-        scale = max(float(np.sqrt((squares + _DECLARED_COUNTS) / (freedom + _DECLARED_COUNTS))), _LEAST_SCALE)
-        known, directions = np.linalg.eigh(data.hessian / scale**2 + np.diag(prior))
-        half = parameters.scales()[:, None] * directions / np.sqrt(np.maximum(known, prior.min(initial=1.0)))
-        return Fitted(values, half, scale, freedom + _DECLARED_COUNTS, used)
-
-    def _rows(self, values: Array, records: Sequence[FactorRecords]) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
-        """Of one posture: whitened residual (n), Jacobian by coordinates (n x c), whitening, which are lengths."""
-        chain = self._weak.parameters.entries_jacobian(values)
-        residuals = self._weak.whitened_residuals(values, records)
-        parts = zip(self._weak.kernels, records, residuals, self._weak.jacobians(values, records), strict=True)
-        found = []
-        for kernel, factor_records, residual, jacobian in parts:
-            if factor_records.weight[0] > 0:
-                own = (
-                    declared(kernel.factor.noise)
-                    if factor_records.whitening is None
-                    else factor_records.whitening[:, :, 0]
-                )
-                lengths = np.array([kind == "length" for kind in kernel.factor.dimensions], dtype=bool)
-                found.append((residual[:, 0], jacobian[:, :, 0] @ chain, own, lengths))
-        whole = [np.concatenate([entry[i] for entry in found]) for i in (0, 1, 3)]
-        whitening = np.zeros((len(whole[0]), len(whole[0])))
-        start = 0
-        for _, _, own, _ in found:
-            whitening[start : start + len(own), start : start + len(own)] = own
-            start += len(own)
-        return whole[0], whole[1], whitening, whole[2].astype(bool)
-
-
-def _left_out(parts: Sequence[tuple[Array, Array]], scale: float) -> tuple[float, int]:
-    """From residuals and what the fit's own uncertainty does to them, both whitened."""
-    residual, reach = (np.concatenate([part[i] for part in parts]) for i in (0, 1))
-    values, vectors = np.linalg.eigh(np.eye(len(residual)) - reach @ reach.T)
-    squares = (vectors.T @ residual) ** 2 / np.maximum(values, _LEAST_LEFT)
-    return float(squares.sum()) / scale**2, len(residual)
-
-
-def _weakly_held(parameters: Parameters) -> Parameters:
-    """Priors for all that is free and has none."""
-    return parameters.replaced(
-        {
-            block.name: replace(block, prior_sd=block.scale * (_FAR if block.nuisance else 1.0))
-            for block in parameters.free
-            if block.prior_sd is None
-        }
-    )
-
-
-def _lowest(posed: PosedProblem, x: Array) -> Array:
-    """Levenberg and Marquardt's steps from ``x``, kept within bounds."""
-    lower, upper = posed.bounds()
-    model, damping = posed.model(x), 1e-9
-    for _ in range(_MOST_STEPS):
-        diagonal = np.maximum(np.diag(model.hessian), 1e-12 * max(float(np.trace(model.hessian)), 1e-300))
-        step = -np.linalg.solve(model.hessian + damping * np.diag(diagonal), model.gradient)
-        tried_x = np.clip(x + step, lower, upper)
-        gained = model.cost - posed.cost(tried_x)
-        if gained >= -1e-12 * model.cost:
-            x, damping = tried_x, max(damping * 0.1, 1e-12)
-            if gained < _AT_REST * max(model.cost, 1.0):
-                break
-            model = posed.model(x)
-        else:
-            damping = max(damping * 10, 1e-6)
-        if damping > 1e6:
-            break
-    return x
+        distances = {}
+        for one, parts in rows.items():
+            whitened, taken_up = (np.concatenate(part) for part in zip(*parts, strict=True))
+            remaining, directions = np.linalg.eigh(np.eye(len(whitened)) - taken_up @ taken_up.T)
+            squares = (directions.T @ whitened) ** 2 / np.maximum(remaining, _LEAST_LEFT)
+            distances[one] = float(squares.sum()) / fitted.scale**2, len(whitened)
+        return distances

@@ -12,9 +12,9 @@ from armcal.errors import InputError, Location
 from armcal.io.folder import check_folder
 from armcal.io.journal.journal import Journal
 
-from armcal_bench.recording.posture import Posture
+from armcal_bench.recording.posture import DATASET, Posture
 
-DATASET, JOURNAL = "dataset.csv", "journal"
+JOURNAL = "journal"
 OURS = (DATASET, JOURNAL)
 CAPTURED, UNDONE = "captured", "undone"
 Start = Literal["anew", "resume"]
@@ -34,7 +34,7 @@ class RecordingLog:
         self._count = 0
         for entry in journal.recovered.entries:
             if entry.kind == CAPTURED:
-                self._take(Posture.from_dict(entry.content))
+                self._take(Posture(**entry.content))
             elif entry.kind == UNDONE:
                 self._postures.pop(entry.content["name"], None)
 
@@ -73,8 +73,8 @@ def opened_recording_log(
     """The journal in a recording's folder.
 
     Raises:
-        InputError: there is a recording and it was not said to go on with it, or none and it was; or it is of other
-            joints or labels.
+        InputError: there is a recording and ``start`` is not to resume it, or there is none to resume; or it is of
+            other joints or labels.
         JournalDamagedError: it cannot be read.
     """
     where, there = Location(str(folder)), (folder / JOURNAL).is_dir()
@@ -88,9 +88,9 @@ def opened_recording_log(
         begun = journal.recovered.header
         for key in header if begun else ():
             if list(begun.get(key, ())) != header[key]:
-                text, expected = (", ".join(map(str, each)) or "none" for each in (begun.get(key, ()), header[key]))
+                names = ", ".join(map(str, begun.get(key, ()))) or "none"
                 raise InputError(
-                    f"it was begun with the {key} {text}; the configuration has {expected}.",
+                    f"it was begun with the {key} {names}; the configuration has {', '.join(header[key]) or 'none'}.",
                     where=where,
                     hint="Give the configuration that it was begun with, or another --out.",
                 )

@@ -7,8 +7,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from armcal.devices.clock import Clock
 from armcal.devices.joint_stream import JointStream
-from armcal.devices.line_source import refused_lines_text
 from armcal.devices.rest_stream import RestStream
 from armcal.errors import ConfigError
 
@@ -17,7 +17,7 @@ from armcal_bench.recording.assessor import contacts_of
 from armcal_bench.recording.keys import END, Keys
 from armcal_bench.recording.labels import Labels
 from armcal_bench.recording.messages import Message
-from armcal_bench.recording.recorder import Capture, Recorder, Task
+from armcal_bench.recording.recorder import Capture, Recorder
 from armcal_bench.recording.recording_log import Start, opened_recording_log
 from armcal_bench.recording.window import JointKinds
 
@@ -26,23 +26,23 @@ _PERIOD_S = 0.02
 
 @dataclass(frozen=True)
 class RecordingOptions:
-    """What a recording is told, and whom it tells.
+    """How a recording is done, and who hears of it.
 
     Attributes:
         folder: where everything of it is kept.
         start: ``anew``, or ``resume`` what is there.
-        asked: what makes a posture be captured.
+        capture: what makes a posture be captured.
         keys: what a person types.
         asked_to_end: whether somebody wants it to end.
-        tell: called with everything that there is to say.
+        show: called with every message.
     """
 
     folder: Path
     start: Start
-    asked: Capture
+    capture: Capture
     keys: Keys
     asked_to_end: Callable[[], bool]
-    tell: Callable[[Message], None]
+    show: Callable[[Message], None]
 
 
 def record(bench: Bench, options: RecordingOptions) -> Message:
@@ -50,70 +50,50 @@ def record(bench: Bench, options: RecordingOptions) -> Message:
 
     Raises:
         InputError: the configuration, the folder or the stream is refused.
-        ArmcalError: the journal cannot be written; all that was told to be kept is.
+        ArmcalError: the journal cannot be written; all postures that were said to be kept are.
     """
-    experiment = bench.experiment
-    contacts_of(experiment)
-    kinds = JointKinds.of(experiment.system.arms)
-    columns = Labels(experiment.system.measurements, ()).columns
-    stream = bench.joints()
-    capture = _capture(bench, stream, options.asked)
+    contacts_of(bench.experiment)
+    channels = JointKinds.of(bench.experiment.system.arms).channels
+    columns = Labels(bench.experiment.system.measurements, ()).columns
+    stream, capture = bench.joints(), options.capture
+    if isinstance(stream, RestStream) and stream.gives_rests:
+        if capture == "keys":
+            raise ConfigError(
+                "the stream gives a sample only when a rest is over, so no key can capture one.",
+                where=bench.experiment.source.where((SECTION, "joints", "still")),
+                hint="Give --capture still, or leave still out.",
+            )
+        capture = "rests"
     with bench.clock() as clock:
         try:
-            stream.open(clock, kinds.channels)
-            with opened_recording_log(options.folder, options.start, kinds.channels, columns) as log:
-                task = Task(
-                    experiment,
-                    bench.settings.recording,
-                    capture,
-                    options.folder,
-                    lambda: refused_lines_text(stream.refused),
-                )
-                recorder = Recorder(task, log, clock)
-                _tell(options, recorder.begin())
-                typed: deque[str] = deque()
-                while _goes_on(options, recorder, stream, typed):
-                    clock.sleep(_PERIOD_S)
-                _tell(options, _rest(recorder, stream))
-                return recorder.finished()
+            stream.open(clock, channels)
+            with opened_recording_log(options.folder, options.start, channels, columns) as log:
+                recorder = Recorder(bench, stream, capture, options.folder, log, clock)
+                return _recorded(recorder, stream, options, clock)
         finally:
             stream.close()
 
 
-def _capture(bench: Bench, stream: JointStream, asked: Capture) -> Capture:
-    """A stream that gives rests is captured rest by rest, and not otherwise."""
-    if not (isinstance(stream, RestStream) and stream.gives_rests):
-        return asked
-    if asked == "keys":
-        raise ConfigError(
-            "the stream gives a sample only when a rest is over, so no key can capture one.",
-            where=bench.experiment.source.where((SECTION, "joints", "still")),
-            hint="Give --capture still, or leave still out.",
-        )
-    return "rests"
+def _recorded(recorder: Recorder, stream: JointStream, options: RecordingOptions, clock: Clock) -> Message:
+    def show(messages: list[Message]) -> None:
+        for message in messages:
+            options.show(message)
 
-
-def _goes_on(options: RecordingOptions, recorder: Recorder, stream: JointStream, typed: deque[str]) -> bool:
-    """One round; whether there is to be another."""
-    has_ended = stream.ended  # before its last samples are taken
-    _tell(options, recorder.take(stream.samples()))
-    typed.extend(options.keys.commands())
-    if typed:  # one a round, so that each finds fresh readings
-        command = typed.popleft()
-        if command.strip() == END:
-            return False
-        _tell(options, recorder.command(command))
-    is_unattended = options.keys.ended and options.asked == "keys"
-    return not options.asked_to_end() and (bool(typed) or not (has_ended or is_unattended))
-
-
-def _rest(recorder: Recorder, stream: JointStream) -> list[Message]:
-    """What came to rest last."""
+    show(recorder.begin())
+    typed: deque[str] = deque()
+    while True:
+        has_ended = stream.ended  # before its last samples are taken
+        show(recorder.take(stream.samples()))
+        typed.extend(options.keys.commands())
+        if typed:  # one a round, so that each finds fresh readings
+            command = typed.popleft()
+            if command.strip() == END:
+                break
+            show(recorder.command(command))
+        is_over = has_ended or (options.keys.ended and options.capture == "keys")
+        if options.asked_to_end() or (is_over and not typed):
+            break
+        clock.sleep(_PERIOD_S)
     if isinstance(stream, RestStream) and stream.gives_rests:
-        return recorder.take(stream.lasting())
-    return []
-
-
-def _tell(options: RecordingOptions, messages: list[Message]) -> None:
-    for each in messages:
-        options.tell(each)
+        show(recorder.take(stream.lasting()))
+    return recorder.finished()

@@ -1,21 +1,43 @@
-"""The question before the arm moves for the first time."""
+"""What the commands of a bench share: options, and the question before the arm moves for the first time."""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterable
+from pathlib import Path
 from typing import Any, TypeVar
 
 import click
-from armcal.cli.common import Console
+from armcal.cli.common import Console, overrides, speaking
 from armcal.errors import InputError
+from armcal.plugins import discover
+from armcal.run.experiment import Experiment
 
 from armcal_bench.hazards import FirstMotion, Hazard
 from armcal_bench.waiting import Waits
 
 F = TypeVar("F", bound=Callable[..., Any])
+FILE = click.Path(path_type=Path)
 Question = Callable[[FirstMotion], bool]
 """Whether the arm may be moved."""
+
+
+def on_bench(command: F) -> F:
+    """The argument CONFIG and the options that all commands have, as ``config``, ``overrides`` and ``console``."""
+    return click.argument("config", type=FILE)(overrides(speaking(command)))
+
+
+def plan_option(command: F) -> F:
+    """The option --plan."""
+    text = "The poses to measure: a CSV, as armcal plan writes it."
+    return click.option("--plan", required=True, type=FILE, help=text)(command)
+
+
+def load(console: Console, config: Path, overrides: tuple[str, ...]) -> Experiment:
+    """The experiment of CONFIG; plugins that are broken are named."""
+    registry = discover()
+    console.plugin_faults(registry)
+    return Experiment.load(config, overrides, registry=registry)
 
 
 def always(motion: FirstMotion) -> bool:
@@ -37,7 +59,7 @@ def asked(motion: FirstMotion) -> bool:
             hint="Stand clear of the arm and give --yes.",
         )
     jumps = (
-        "A servo tells nobody where it stands, so each may jump when its first pulse comes, one after the other."
+        "A servo does not report where it stands, so each may jump when its first pulse comes, one after the other."
         if motion.free
         else "The arm moves as soon as you say yes."
     )
@@ -56,7 +78,7 @@ def warned(console: Console, question: Question) -> Question:
 
 
 def waits(console: Console) -> Waits:
-    """What is waited for, on standard error: a progress bar alone does not say that."""
+    """Lines about what is waited for, on standard error: a progress bar alone does not say that."""
     return Waits(lambda text: console.err.print(text, markup=False, soft_wrap=True))
 
 
