@@ -34,7 +34,7 @@ def main() -> None:
     """The command line."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the numbers here as well")
-    parser.add_argument("--long", action="store_true", help="100,000 poses in the virtual machine too")
+    parser.add_argument("--long", action="store_true", help="100,000 poses in the interpreter too")
     parser.add_argument("--only", default="*", metavar="GLOB", help="some, by name")
     chosen = parser.parse_args()
     benchmarks: dict[str, Callable[[], Iterator[Row]]] = {

@@ -19,8 +19,8 @@ from armcal.base.parameters import Parameters
 from armcal.estimate.estimator import Estimate, estimate
 from armcal.estimate.nuisance import started
 from armcal.estimate.simulation import SimulationRequest
-from armcal.problem.joint_noise import with_joint_noise
 from armcal.problem.problem import Problem
+from armcal.problem.readings import with_joint_noise
 from armcal.run.experiment import Experiment
 from numpy.typing import NDArray
 

@@ -26,7 +26,7 @@ JointPath = Literal["compiled", "interpreted", "scipy"]
 
 
 def run(*, long: bool = False) -> Iterator[Row]:
-    """Rows of this benchmark; ``long`` adds the virtual machine."""
+    """Rows of this benchmark; ``long`` adds the interpreter."""
     scipy = _in_a_process("scipy")
     for way in ("compiled", "interpreted") if long else ("compiled",):
         ours = _in_a_process(way)

@@ -18,8 +18,8 @@ from armcal.config.yaml_source import load_config
 from armcal.estimate.estimator import estimate, require_solvable
 from armcal.estimate.nuisance import started
 from armcal.estimate.simulation import SimulationRequest
-from armcal.problem.joint_noise import with_joint_noise
 from armcal.problem.problem import Problem
+from armcal.problem.readings import with_joint_noise
 from armcal.run.experiment import Experiment
 
 ROOT = Path(__file__).resolve().parents[1]

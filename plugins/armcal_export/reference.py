@@ -1,4 +1,4 @@
-"""The arm in elastic equilibrium by CasADi's virtual machine: what every exported form of it is compared with."""
+"""The arm in elastic equilibrium by CasADi's interpreter: what every exported form of it is compared with."""
 
 from __future__ import annotations
 

@@ -12,8 +12,7 @@ from armcal.arm.joints import Limits, by_dimension, joint_limits, unknown_joint
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.errors import ConfigError
-from armcal.estimate.mission_truth import DAY_S, Mission
-from armcal.estimate.simulation import SimulationRequest, with_channels
+from armcal.estimate.simulation import DAY_S, Mission, SimulationRequest, with_channels
 from armcal.testing import EXAMPLE_TRUTH
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation

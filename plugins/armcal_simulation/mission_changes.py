@@ -11,7 +11,7 @@ from armcal.base.domains import Array
 from armcal.base.parameters import Parameters
 from armcal.config.selection import quantity
 from armcal.errors import ConfigError
-from armcal.estimate.mission_truth import DAY_S, MissionEvent
+from armcal.estimate.simulation import DAY_S, MissionEvent
 from scipy.spatial.transform import Rotation
 
 from armcal_simulation.mission_settings import (

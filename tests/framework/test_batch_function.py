@@ -1,4 +1,4 @@
-"""A function over many records: C and the virtual machine alike, for any number of records and any storage."""
+"""A function over many records: C and the interpreter alike, for any number of records and any storage."""
 
 from __future__ import annotations
 

@@ -193,7 +193,7 @@ def test_json_is_one_document(said: Result) -> None:
 
 def test_verbose_says_how_long_each_stage_took_and_plain_does_not(said: Result, tmp_path: Path) -> None:
     plain, verbose = said, armcal("run", DEMO, "--out", str(tmp_path / "v"), "-v", *FAST)
-    for word in ("fit: ", "build: ", "evaluated by: virtual machine"):
+    for word in ("fit: ", "build: ", "evaluated by: interpreted"):
         assert word in verbose.stderr and word not in plain.stderr
 
 

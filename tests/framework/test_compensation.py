@@ -118,7 +118,7 @@ def test_where_the_arm_stands_is_its_own_nearest_command() -> None:
 
 
 @pytest.mark.skipif(find_compiler() is None, reason="no C compiler is here")
-def test_c_and_the_virtual_machine_find_the_same() -> None:
+def test_c_and_the_interpreter_find_the_same() -> None:
     interpreted = compensator("rigid")
     compiled = calibration("rigid").compensator(choice="compiled")
     assert compiled._equilibrium._function.compiled

@@ -143,8 +143,9 @@ def test_compiled_and_interpreted_evaluators_agree(counts):
     assert other.cost == pytest.approx(one.cost, rel=1e-11)
     np.testing.assert_allclose(other.hessian, one.hessian, rtol=1e-9, atol=1e-11 * np.abs(one.hessian).max())
     np.testing.assert_allclose(other.gradient, one.gradient, rtol=1e-9, atol=1e-9 * np.abs(one.gradient).max())
-    for said, heard in zip(problem.told(values, records), compiled.told(values, own), strict=True):
-        np.testing.assert_allclose(said, heard, atol=1e-13)
+    starts = zip(problem.nuisance_starts(values, records), compiled.nuisance_starts(values, own), strict=True)
+    for interpreted, of_compiled in starts:
+        np.testing.assert_allclose(interpreted, of_compiled, atol=1e-13)
 
 
 # ---------------------------------------------------------------- laws

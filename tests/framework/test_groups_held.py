@@ -10,7 +10,7 @@ import pytest
 from armcal.errors import InputError
 from armcal.estimate.nuisance import restricted, settled, started, untrained
 from armcal.estimate.validation import record_errors
-from armcal.problem.joint_noise import with_joint_noise
+from armcal.problem.readings import with_joint_noise
 from armcal_ipopt.estimator import IpoptEstimator
 from armcal_tracker.position import TipPosition, TipPositionSettings
 from contact_oracle import (
@@ -125,7 +125,7 @@ def test_sockets_that_only_judge_settle_at_the_mean_of_their_balls(data):
     inner, values = restricted(problem, train), near(problem)
     found = co.by_name(problem.parameters, settled(inner, values, held))
     before = co.by_name(problem.parameters, values)
-    told, seen = problem.told(values, records), set()
+    told, seen = problem.nuisance_starts(values, records), set()
     for key in SPOTS:
         position, socket = key.split("/")
         inside = [
@@ -219,7 +219,7 @@ def test_a_mean_is_that_of_the_postures_whatever_is_known_of_their_noise(how):
         weights = np.random.default_rng(1).uniform(0.0, 1.0, len(data)) * (np.arange(len(data)) % 4 > 0)
         records = problem.weighted(records, [weights])
     problem, values = solved(problem, records)
-    found, told = co.by_name(problem.parameters, values), problem.told(values, records)[0]
+    found, told = co.by_name(problem.parameters, values), problem.nuisance_starts(values, records)[0]
     for socket in ("hole_0", "hole_1"):
         own = weights * (np.array(data.extra["socket"]) == socket)
         mean = told @ own / own.sum()

@@ -10,7 +10,7 @@ import oracle
 import pytest
 from armcal.estimate.estimator import estimate
 from armcal.estimate.nuisance import started
-from armcal.problem.joint_noise import with_joint_noise
+from armcal.problem.readings import with_joint_noise
 from armcal_contact.distance import TipDistance
 from armcal_ipopt.estimator import IpoptEstimator
 from armcal_tracker.position import TipPosition, TipPositionSettings

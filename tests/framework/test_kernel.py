@@ -1,4 +1,4 @@
-"""Compiled kernels: the same numbers as the virtual machine, for any records, in any company, or none at all."""
+"""Compiled kernels: the same numbers as the interpreter, for any records, in any company, or none at all."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from armcal.errors import NotConvergedError
 from armcal.functions import c_source, compiler
 from armcal.problem import kernel
 from armcal.problem.factor import Factor
+from armcal.problem.grouped_kernel import BLOCK_RECORDS
 from armcal.problem.kernel import build_kernel, kernel_source
-from armcal.problem.linearised import BLOCK_RECORDS
 
 AGREEMENT = 1e-12
 needs_compiler = pytest.mark.skipif(compiler.find_compiler() is None, reason="no C compiler on this machine")
@@ -117,7 +117,7 @@ def lrm_case(lrm, count, seed=0, evaluator="compiled", noise=0.01, **channels):
     measured = oracle.tip(oracle.published(), q) + np.random.default_rng(seed).normal(0, noise, (count, 3))
     dataset = lrm.dataset(q, measured, **channels)
     problem = lrm.problem(lrm.experiment(), dataset, evaluator)
-    assert problem.backend == {"compiled": "compiled", "interpreted": "virtual machine"}[evaluator]
+    assert problem.backend == evaluator
     return problem, problem.records(dataset), lrm.vector(problem.parameters, oracle.PUBLISHED), dataset
 
 
@@ -144,7 +144,7 @@ def test_every_operation_that_the_writer_knows_has_an_expression_here():
 
 @needs_compiler
 @pytest.mark.parametrize("names", [tuple(OPERATIONS)[i::3] for i in range(3)], ids=lambda n: f"{n[0]} and others")
-def test_every_operation_gives_the_virtual_machines_number_for_parameters_and_records(names):
+def test_every_operation_gives_the_interpreters_number_for_parameters_and_records(names):
     values, record = ca.SX.sym("u", 2), ca.SX.sym("x", 2)
     residual = []
     for name in names:
@@ -161,7 +161,7 @@ def test_every_operation_gives_the_virtual_machines_number_for_parameters_and_re
     for _ in range(5):
         at, given = random.uniform(0.1, 0.9, 2), random.uniform(0.1, 0.9, (2, 40))
         found = evaluated(built.backend, factor, at, given)
-        expected = evaluated(kernel.VirtualMachine(factor), factor, at, given)
+        expected = evaluated(kernel.Interpreter(factor), factor, at, given)
         for a, b in zip(found, expected, strict=True):
             np.testing.assert_allclose(a, b, rtol=AGREEMENT, atol=AGREEMENT)
 
@@ -175,14 +175,14 @@ def test_any_constant_can_be_written_in_c(constant):
     built = compiled_kernel(factor)
     record = np.linspace(-2, 2, 8)[None, :]
     found, expected = (
-        evaluated(b, factor, np.array([0.5]), record)[0] for b in (built.backend, kernel.VirtualMachine(factor))
+        evaluated(b, factor, np.array([0.5]), record)[0] for b in (built.backend, kernel.Interpreter(factor))
     )
     np.testing.assert_array_equal(found, expected)
     np.testing.assert_array_equal(np.signbit(found), np.signbit(expected))
 
 
 @needs_compiler
-def test_special_numbers_pass_through_as_in_the_virtual_machine():
+def test_special_numbers_pass_through_as_in_the_interpreter():
     """Not-a-number in one record must neither be hidden nor reach another record."""
     values, record = ca.SX.sym("u", 1), ca.SX.sym("x", 2)
     x, y = record[0], record[1]
@@ -191,26 +191,24 @@ def test_special_numbers_pass_through_as_in_the_virtual_machine():
     built = compiled_kernel(factor)
     special = np.array([0.0, -0.0, np.inf, -np.inf, np.nan, 1.0, -1.0, 1e-310])
     given = np.stack([np.repeat(special, 8), np.tile(special, 8)])
-    found, expected = (
-        evaluated(b, factor, np.ones(1), given)[0] for b in (built.backend, kernel.VirtualMachine(factor))
-    )
+    found, expected = (evaluated(b, factor, np.ones(1), given)[0] for b in (built.backend, kernel.Interpreter(factor)))
     np.testing.assert_array_equal(found, expected)
 
 
 @needs_compiler
-def test_an_operation_without_a_c_form_leaves_the_virtual_machine_and_no_litter():
+def test_an_operation_without_a_c_form_leaves_the_interpreter_and_no_litter():
     values, record = ca.SX.sym("u", 1), ca.SX.sym("x", 1)
     factor = made_up_factor([ca.hypot(record[0], 1.0) * values[0]], values, record)
     with pytest.raises(c_source.UnsupportedExpressionError):
         kernel_source(factor, factor.pass_function(), factor.linearise_function())
     before = set(compiler.cache_directory().glob(".build-*"))
     built = build_kernel(factor, 1, "compiled")
-    assert built.backend.name == "virtual machine"
+    assert built.backend.name == "interpreted"
     assert set(compiler.cache_directory().glob(".build-*")) == before
 
 
 @needs_compiler
-def test_random_expressions_give_the_virtual_machines_numbers():
+def test_random_expressions_give_the_interpreters_numbers():
     """Forty operations deep, parameters and records mixed; chosen so that numbers stay near one."""
     tame = ["ADD", "SUB", "MUL", "SQ", "TANH", "SIN", "COS", "ATAN", "ERF", "FABS", "FMIN", "FMAX", "ATAN2"]
     for seed in range(3):
@@ -224,7 +222,7 @@ def test_random_expressions_give_the_virtual_machines_numbers():
         built = compiled_kernel(factor)
         at, given = random.normal(size=3), random.normal(size=(3, 24))
         found = evaluated(built.backend, factor, at, given)
-        expected = evaluated(kernel.VirtualMachine(factor), factor, at, given)
+        expected = evaluated(kernel.Interpreter(factor), factor, at, given)
         for a, b in zip(found, expected, strict=True):
             np.testing.assert_allclose(a, b, rtol=0, atol=AGREEMENT * max(1.0, np.abs(b).max()))
 
@@ -304,7 +302,7 @@ def test_the_key_of_a_library_covers_the_number_of_lanes(monkeypatch, lrm):
 
 
 @needs_compiler
-def test_c_and_virtual_machine_agree_on_every_output_of_the_arm(lrm):
+def test_c_and_interpreter_agree_on_every_output_of_the_arm(lrm):
     fast, fast_records, values, dataset = lrm_case(lrm, 203, 1)
     slow, slow_records, _, _ = lrm_case(lrm, 203, 1, "interpreted")
     one, two = fast.residuals(values, fast_records)[0], slow.residuals(values, slow_records)[0]
@@ -582,10 +580,10 @@ def finish(process):
 
 @pytest.fixture(scope="module")
 def reference_cost(repository, tmp_path_factory):
-    """What the virtual machine says, in a process without a compiler."""
+    """What the interpreter says, in a process without a compiler."""
     cache = tmp_path_factory.mktemp("unused") / "cache"
     backend, cost = finish(start(repository, cache, ARMCAL_CC="none"))
-    assert backend == "virtual machine"
+    assert backend == "interpreted"
     assert not cache.exists(), "without a compiler nothing is cached"
     return cost
 
@@ -616,7 +614,7 @@ def test_without_a_compiler_everything_works(reference_cost):
 def test_a_compiler_that_does_not_exist_or_fails_is_done_without(repository, tmp_path, reference_cost):
     processes = [start(repository, tmp_path / name, ARMCAL_CC=cc) for name, cc in (("a", "no-such-cc"), ("b", "false"))]
     for process in processes:
-        assert finish(process) == ("virtual machine", pytest.approx(reference_cost, rel=AGREEMENT))
+        assert finish(process) == ("interpreted", pytest.approx(reference_cost, rel=AGREEMENT))
     assert not list((tmp_path / "b").glob(".build-*"))
 
 
@@ -653,7 +651,7 @@ def test_a_damaged_or_foreign_library_in_the_cache_is_replaced(repository, built
 def test_a_cache_that_others_may_write_to_is_not_trusted(repository, built, reference_cost, mode):
     built.parent.chmod(mode)
     backend, cost = finish(start(repository, built.parent))
-    assert (backend, cost) == ("virtual machine", pytest.approx(reference_cost, rel=AGREEMENT))
+    assert (backend, cost) == ("interpreted", pytest.approx(reference_cost, rel=AGREEMENT))
 
 
 def test_a_library_that_others_may_write_to_is_made_anew(repository, built, reference_cost):
@@ -669,7 +667,7 @@ def test_a_cache_that_cannot_be_made_is_done_without(repository, tmp_path, refer
     blocked = tmp_path / "file"
     blocked.write_text("", encoding="utf-8")
     backend, cost = finish(start(repository, blocked / "cache"))
-    assert (backend, cost) == ("virtual machine", pytest.approx(reference_cost, rel=AGREEMENT))
+    assert (backend, cost) == ("interpreted", pytest.approx(reference_cost, rel=AGREEMENT))
 
 
 @needs_compiler
@@ -764,7 +762,7 @@ def test_a_new_library_is_tried_in_a_process_of_its_own(tmp_path, monkeypatch, b
 
 @needs_compiler
 def test_a_miscompiled_kernel_of_the_arm_is_not_used(lrm, tmp_path, monkeypatch):
-    """A compiler that gets one function wrong: the arm is evaluated by the virtual machine, with the right numbers."""
+    """A compiler that gets one function wrong: the arm is evaluated by the interpreter, with the right numbers."""
     monkeypatch.setenv("ARMCAL_CACHE_DIR", str(tmp_path))
     tmp_path.chmod(0o700)
     whole = kernel.driver_source()
@@ -772,5 +770,5 @@ def test_a_miscompiled_kernel_of_the_arm_is_not_used(lrm, tmp_path, monkeypatch)
     assert wrong != whole
     monkeypatch.setattr(kernel, "driver_source", lambda: wrong)
     problem = lrm.problem(lrm.experiment(), lrm.dataset(oracle.random_poses(3, 0)), "compiled")
-    assert problem.backend == "virtual machine"
+    assert problem.backend == "interpreted"
     assert not list(tmp_path.iterdir()), "no later run meets it"

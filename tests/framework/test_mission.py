@@ -17,8 +17,7 @@ from armcal.base.dataset import Dataset
 from armcal.calibration.calibration import Calibration
 from armcal.cli.main import cli
 from armcal.errors import ConfigError, InputError
-from armcal.estimate.mission_truth import DAY_S, Mission
-from armcal.estimate.simulation import SimulationRequest, measured_without_noise
+from armcal.estimate.simulation import DAY_S, Mission, SimulationRequest, measured_without_noise
 from armcal_online.mission.errors import error_curve, random_poses
 from armcal_online.mission.figure import mission_figure
 from armcal_online.mission.files import curve_text, figures, schedule, truth_text, write_files

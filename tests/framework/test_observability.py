@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from armcal.planning.observability import observability
+from armcal.planning.criterion import observability
 
 
 def _jacobian(seed: int = 0, rows: int = 30, columns: int = 5) -> np.ndarray:

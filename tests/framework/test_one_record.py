@@ -32,7 +32,7 @@ def made(evaluator: EvaluatorChoice) -> tuple[Problem, OneRecord, Array, Array]:
     )
     values = experiment.parameters.nominal()
     values[[experiment.parameters.entries_of(f"arm.spring.k{i}").start for i in range(7)]] = COMPLIANCE
-    own = values[problem.slots[0].entries[0]]
+    own = values[problem.grouped[0].entries[0]]
     return problem, OneRecord(problem.kernels[0]), own, data.stacked(problem.kernels[0].factor.channels).T
 
 

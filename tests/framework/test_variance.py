@@ -12,7 +12,7 @@ from armcal.errors import ProblemError
 from armcal.estimate.likelihood import Term, _evaluate, maximise
 from armcal.estimate.variance import apply_components, estimate_components
 from armcal.estimate.weighing import NoiseSettings, fit, weighed
-from armcal.problem.whitening import by_covariance, transformed
+from armcal.problem.factor_records import by_covariance, transformed
 from armcal_ipopt.estimator import IpoptEstimator
 from noise_cases import NOISE_M, deviations_off, measured, posed
 

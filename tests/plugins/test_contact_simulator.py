@@ -14,7 +14,7 @@ from armcal.estimate.nuisance import started
 from armcal.estimate.simulation import SimulationRequest
 from armcal.measure.csv_writer import write_csv
 from armcal.measure.reader import ReadRequest, requested_channels
-from armcal.problem.joint_noise import with_joint_noise
+from armcal.problem.readings import with_joint_noise
 from armcal_contact.clamp import ClampedTool
 from armcal_contact.plane import PlaneContact
 from armcal_dualarm.closure import ClosedChain

@@ -11,7 +11,7 @@ from armcal.base import se3
 from armcal.errors import InputError
 from armcal.estimate.estimator import require_solvable
 from armcal.estimate.nuisance import restricted, settled, started, untrained
-from armcal.problem.joint_noise import with_joint_noise
+from armcal.problem.readings import with_joint_noise
 from armcal_contact.ball import BallInSocket
 from armcal_contact.clamp import ClampedTool
 from armcal_contact.plane import PlaneContact
@@ -245,7 +245,7 @@ def test_a_closed_chain_leaves_open_how_the_clamp_is_off(labels):
     found = problem.residuals(problem.parameters.nominal(), records)[0]
     left, right = both_poses(q_left, q_right)
     np.testing.assert_allclose(found, difference(left @ matrix(*pose), right).T, atol=1e-9)
-    told, _ = problem.told(problem.parameters.nominal(), records), None
+    told, _ = problem.nuisance_starts(problem.parameters.nominal(), records), None
     between = np.linalg.inv(left) @ right
     np.testing.assert_allclose(told[0][:3].T, between[:, :3, 3], atol=1e-12)
     turned = Rotation.from_quat(told[0][[4, 5, 6, 3]].T).as_matrix()

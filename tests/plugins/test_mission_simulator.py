@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from armcal.errors import ConfigError
-from armcal.estimate.mission_truth import DAY_S, Mission, MissionSimulator
-from armcal.estimate.simulation import SimulationRequest, measured_without_noise
+from armcal.estimate.simulation import DAY_S, Mission, MissionSimulator, SimulationRequest, measured_without_noise
 from armcal.run.experiment import Experiment
 from armcal_simulation.mission import Stands
 from armcal_simulation.mission_settings import MissionSettings, TiltSettings, parsed_creep

@@ -15,8 +15,8 @@ from armcal.diagnose.minimal import Dropped, MinimalSet, minimal_set
 from armcal.errors import ConfigError, Location
 from armcal.estimate.combination import Combination
 from armcal.estimate.identifiability import CORRELATED, Identifiability, correlated_pairs, expected_covariance
-from armcal.estimate.structure import SAID, explain, held_by_nothing, identify_from
-from armcal.planning.observability import observability
+from armcal.estimate.structure import CAUSES, explain, held_by_nothing, identify_from
+from armcal.planning.criterion import observability
 from armcal.plugins import discover
 from armcal.problem.projection import factor_at_zero
 from armcal.run.experiment import Experiment
@@ -172,13 +172,13 @@ def _show(console: Console, content: dict[str, Any]) -> None:
 
 
 def _show_undetermined(console: Console, content: dict[str, Any]) -> None:
-    for cause, said in SAID.items():
+    for cause, words in CAUSES.items():
         found = [
             each["text"] + (f", held by the prior of {' and '.join(each['priors'])}" if each["priors"] else "")
             for each in content["undetermined"]
             if each["cause"] == cause
         ]
-        _section(console, f"Undetermined, {said} ({len(found)}):", found)
+        _section(console, f"Undetermined, {words} ({len(found)}):", found)
     free = content["held_by_nothing"]
     if not content["undetermined"]:
         _line(console, "No combination is undetermined.", "green")

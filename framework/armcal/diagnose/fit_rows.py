@@ -37,7 +37,7 @@ class FitRows:
         values, parameters = estimate.values, problem.parameters
         count, scales = records[0].count, parameters.scales()
         chain = parameters.entries_jacobian(values) * scales
-        parts = [np.einsum("rvn,vc->rnc", block, chain) for block in _by_factor(problem, values, records)]
+        parts = [np.einsum("rvn,vc->rnc", block, chain) for block in problem.jacobians(values, records)]
         weighted = problem.weighted_residuals(values, records)
         shared = records[0].correlation
         drifted = [np.zeros((*r.shape, 0)) for r in weighted] if shared is None else shared.shared()
@@ -93,17 +93,6 @@ class FitRows:
             squares.append(np.sum(raw**2, axis=0))
             place += size * count
         return np.asarray(np.sqrt(np.mean(squares, axis=0)))
-
-
-def _by_factor(problem: Problem, values: Array, records: Sequence[FactorRecords]) -> list[Array]:
-    """Whitened, weighted Jacobians by free entries, one (n_r x n_v x N) a factor."""
-    blocks, whole = problem.jacobians(values, records), []
-    for record in records:
-        parts: list[Array] = []
-        while sum(part.shape[2] for part in parts) < record.record.shape[1]:
-            parts.append(next(blocks))
-        whole.append(np.concatenate(parts, axis=2)[:, :, : record.count])
-    return whole
 
 
 def _innovations(residuals: Sequence[Array], slopes: Sequence[Array]) -> Array:

@@ -17,8 +17,7 @@ from armcal.estimate.combination import Measure
 from armcal.estimate.estimator import Estimate
 from armcal.estimate.structure import random_records
 from armcal.problem.problem import FactorRecords, Problem
-from armcal.problem.rigid import rigid_fit, spread_of
-from armcal.problem.tool_motion import along, apart_from, tools, unseen_motions
+from armcal.problem.tool_motion import along, apart_from, rigid_fit, spread_of, tools, unseen_motions
 
 BEYOND, FAR_BEYOND = 4.0, 20.0
 """Standard deviations of a prior, or typical corrections where there is none: what is worth a look, what is gross."""

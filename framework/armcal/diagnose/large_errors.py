@@ -154,12 +154,9 @@ def _leverage(problem: Problem, records: Sequence[FactorRecords], estimate: Esti
         return np.zeros(count)
     values, vectors = np.linalg.eigh(estimate.covariance)
     root = vectors * np.sqrt(np.maximum(values, 0.0))
-    total, place, width = np.zeros(count), 0, records[0].record.shape[1]
-    for block in problem.jacobians(estimate.values, records):
-        spread = np.sum((np.swapaxes(block, 1, 2) @ root) ** 2, axis=(0, 2))
-        here = slice(place, min(place + block.shape[2], count))
-        total[here] += spread[: max(0, here.stop - here.start)]
-        place = (place + block.shape[2]) % width
+    total = np.zeros(count)
+    for jacobian in problem.jacobians(estimate.values, records):
+        total += np.sum((np.swapaxes(jacobian, 1, 2) @ root) ** 2, axis=(0, 2))
     return total
 
 

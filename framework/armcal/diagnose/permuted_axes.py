@@ -21,9 +21,8 @@ from armcal.diagnose.permuted_columns import Wires, axes_words, several_joints, 
 from armcal.errors import NotConvergedError
 from armcal.measure.partners import OTHER
 from armcal.problem.factor_records import subset
-from armcal.problem.linearised import linearised
 from armcal.problem.problem import FactorRecords, Problem
-from armcal.problem.rigid import rigid_fit, spread_of
+from armcal.problem.tool_motion import rigid_fit, spread_of
 
 MUCH_BETTER = 3.0
 """A permutation leaves so many times less than the data as they stand."""
@@ -190,7 +189,7 @@ def _positions(problem: Problem, seen: _Seen, read_as: Wires) -> _Positions | No
     kernel, own, parameters = problem.kernels[seen.kernel], seen.records, problem.parameters
     records = replace(own, record=_rewired(own.record, kernel.factor.channels, read_as), state=np.zeros_like(own.state))
     try:
-        blocks = list(linearised(kernel, problem.slots[seen.kernel], records, parameters.nominal()))
+        blocks = list(problem.grouped[seen.kernel].linearised(parameters.nominal(), records))
     except NotConvergedError:
         return None
     noise = np.array(kernel.factor.noise[:3])[:, None]

@@ -1,4 +1,4 @@
-"""Whether the C compiler makes a kernel with the virtual machine's numbers, and how much faster it is."""
+"""Whether the C compiler makes a kernel with the interpreter's numbers, and how much faster it is."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _TIMES = 3
 
 
 def kernel() -> dict[str, Any]:
-    """A small elastic arm, compiled to a place of its own and compared with the virtual machine; both timed.
+    """A small elastic arm, compiled to a place of its own and compared with the interpreter; both timed.
 
     Raises:
         ArithmeticError: the compiled numbers differ.
@@ -74,4 +74,4 @@ def _explain() -> None:
     said = next((line.strip() for line in done.stderr.splitlines() if line.strip()), "")
     if done.returncode:
         raise RuntimeError(f"the compiler ended with {done.returncode}: {said[:160]}")
-    raise ArithmeticError("the compiled kernel does not build, or gives other numbers than the virtual machine")
+    raise ArithmeticError("the compiled kernel does not build, or gives other numbers than the interpreter")

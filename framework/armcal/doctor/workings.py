@@ -96,7 +96,7 @@ def compiler(ask: Ask) -> Finding:
     from armcal.doctor.machine import compiler_path
 
     path = compiler_path()
-    slower = "every fit runs on the virtual machine, with the same numbers: large data take 40 times as long"
+    slower = "every fit is interpreted by CasADi, with the same numbers: large data take 40 times as long"
     if path is None:
         hint = "If fits are slow: install gcc or clang."
         return Finding("compiler", "C compiler", "note", f"none found, and none is needed; {slower}", hint)

@@ -9,6 +9,7 @@ import math
 from typing import Literal
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from armcal.base.domains import Array
@@ -16,11 +17,11 @@ from armcal.base.domains import Array
 BlockLength = int | Literal["auto"]
 _SIGNIFICANT = 2.0
 _FEW = 8
-"""Series shorter than this tell nothing of their own correlation."""
+"""Series shorter than this do not determine their own correlation."""
 
 
 def automatic_block_length(series: Array) -> int:
-    """The block length that a series (..., N) asks for, the longest of its rows'. [Politis2004] [Patton2009]
+    """The block length for a series (..., N), the longest of its rows'. [Politis2004] [Patton2009]
 
     Autocovariances count up to twice the lag behind which they are noise, by a flat-top window.
     """
@@ -36,7 +37,11 @@ def _row_length(row: Array) -> int:
     window = max(5, math.ceil(math.sqrt(math.log10(count))))
     most_lag = min(math.ceil(math.sqrt(count)) + window, count - 1)
     covariance = np.array([centred[lag:] @ centred[: count - lag] / count for lag in range(most_lag + 1)])
-    reach = min(2 * max(_last_lag(covariance / covariance[0], count, window), 1), most_lag)
+    # The lag behind which a window of them is no larger than chance; the last larger one if there is none.
+    large = np.abs(covariance[1:] / covariance[0]) >= _SIGNIFICANT * math.sqrt(math.log10(count) / count)
+    quiet = np.flatnonzero(~sliding_window_view(large, window).any(axis=1))
+    last = int(quiet[0]) if len(quiet) else int(np.flatnonzero(large).max(initial=0)) + 1
+    reach = min(2 * max(last, 1), most_lag)
     lags = np.arange(1, reach + 1)
     flat_top = np.minimum(1.0, 2 * (1 - lags / reach))
     weighted = flat_top * covariance[1 : reach + 1]
@@ -47,15 +52,6 @@ def _row_length(row: Array) -> int:
     length = (1.5 * (slope / spectrum) ** 2 * count) ** (1 / 3)
     most = min(3 * math.sqrt(count), count / 3)
     return int(np.clip(round(length), 1, max(1, math.floor(most))))
-
-
-def _last_lag(correlation: Array, count: int, window: int) -> int:
-    """The lag behind which so many in a row are no larger than chance; the last larger one if there is none."""
-    large = np.abs(correlation[1:]) >= _SIGNIFICANT * math.sqrt(math.log10(count) / count)
-    for lag in range(len(large) - window + 1):
-        if not large[lag : lag + window].any():
-            return lag
-    return int(np.flatnonzero(large)[-1]) + 1 if large.any() else 1
 
 
 def standard_error_of_mean(series: Array, block: int) -> float:

@@ -2,7 +2,7 @@
 
 ``blocks`` draws records with replacement, in circular blocks of neighbours whose errors resemble one another
 [Politis1992]; blocks of one record draw independent ones. What is wrong with the model stays in the records, so that
-the spread counts it. ``parametric`` makes the measured values up from the fitted model and its noise: the spread if
+the spread counts it. ``parametric`` simulates the measured values by the fitted model and its noise: the spread if
 the model were true.
 """
 
@@ -19,9 +19,10 @@ from pydantic import Field
 from armcal.base.domains import Array
 from armcal.base.settings import Settings
 from armcal.errors import NotConvergedError, ProblemError
-from armcal.estimate.blocks import BlockLength, automatic_block_length, draw_weights
+from armcal.estimate.blocks import automatic_block_length, draw_weights
 from armcal.estimate.estimator import CONFIDENCE, Estimate, Estimator, Progress, no_progress
 from armcal.io.parallel import Executor, Sequential
+from armcal.problem.factor_records import whitening_of
 from armcal.problem.problem import FactorRecords, Problem
 from armcal.problem.projection import predicted_records
 from armcal.problem.readings import disturbed_records, reading_slopes
@@ -109,9 +110,13 @@ def bootstrap(
     count, random = records[0].count, np.random.default_rng(settings.seed)
     poses = np.arange(count) if poses is None else poses
     parametric = settings.method == "parametric"
-    block = 1 if parametric else _block(problem, records, estimate, settings.blocks)
     if parametric:
         _require_measured(problem, records, estimate.values)
+        block = 1
+    elif settings.blocks == "auto":  # the longest that any residual component asks for
+        block = max(automatic_block_length(rows) for rows in problem.whitened_residuals(estimate.values, records))
+    else:
+        block = min(settings.blocks, count)
     tasks = []
     for _ in range(settings.bootstrap):
         weights = np.ones(count) if parametric else draw_weights(int(poses.max()) + 1, block, random)[poses]
@@ -125,20 +130,18 @@ def bootstrap(
     return Bootstrap(estimate.names, values, settings.method, block, sum(values is None for values in refits))
 
 
-def _block(problem: Problem, records: Sequence[FactorRecords], estimate: Estimate, asked: BlockLength) -> int:
-    """The longest block that any residual component asks for."""
-    if asked != "auto":
-        return min(asked, records[0].count)
-    whitened = problem.whitened_residuals(estimate.values, records)
-    return max(automatic_block_length(each) for each in whitened)
-
-
 def _refit(task: _Refit) -> Array | None:
     """The values of one refit; None if it did not converge."""
     problem = task.problem
     records = problem.subset(task.records, task.chosen)
     if task.seed is not None:
-        records = _made_up(problem, task.start, records, task.noise_scale, np.random.default_rng(task.seed))
+        random, noise = np.random.default_rng(task.seed), []
+        for kernel, record in zip(problem.kernels, records, strict=True):
+            white = task.noise_scale * random.normal(size=(len(kernel.factor.noise), record.count))
+            inverse = np.linalg.inv(np.moveaxis(whitening_of(kernel.factor, record)[:, :, : record.count], 2, 0))
+            noise.append(np.einsum("wrs,sw->rw", inverse, white))
+        predicted = predicted_records(problem, task.start, records)
+        records = disturbed_records(problem, task.start, predicted, noise)
     records = problem.weighted(records, [task.weights] * len(records))
     try:
         solution = task.estimator.solve(problem, records, task.start)
@@ -147,31 +150,11 @@ def _refit(task: _Refit) -> Array | None:
     return solution.values if solution.verdict.converged else None
 
 
-def _made_up(
-    problem: Problem,
-    values: Array,
-    records: Sequence[FactorRecords],
-    noise_scale: float,
-    random: np.random.Generator,
-) -> tuple[FactorRecords, ...]:
-    """The records with measured values of the model, and noise as it was declared and found."""
-    predicted = predicted_records(problem, values, records)
-    noise = []
-    for kernel, record in zip(problem.kernels, records, strict=True):
-        white = noise_scale * random.normal(size=(len(kernel.factor.noise), record.count))
-        if record.whitening is None:
-            noise.append(white * np.array(kernel.factor.noise)[:, None])
-        else:
-            inverse = np.linalg.inv(np.moveaxis(record.whitening[:, :, : record.count], 2, 0))
-            noise.append(np.einsum("wrs,sw->rw", inverse, white))
-    return disturbed_records(problem, values, predicted, noise)
-
-
 def _require_measured(problem: Problem, records: Sequence[FactorRecords], values: Array) -> None:
     slopes = reading_slopes(problem, values, predicted_records(problem, values, records))
     for kernel, record, slope in zip(problem.kernels, records, slopes, strict=True):
         if slope is None or record.correlation is not None:
             raise ProblemError(
-                f"{kernel.factor.name} has no measured values of its own noise to make up.",
+                f"{kernel.factor.name} has no measured values of its own noise to simulate.",
                 hint="Use uncertainty.method: blocks.",
             )

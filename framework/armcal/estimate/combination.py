@@ -11,12 +11,12 @@ from armcal.base.domains import Array
 from armcal.base.units import DIMENSIONLESS, UNITS, display_unit
 
 MOST_NAMES = 6
-"""A longer combination is cut when it is told; ``terms`` has all of it."""
+"""A longer combination is cut when it is shown; ``terms`` has all of it."""
 
 
 @dataclass(frozen=True)
 class Measure:
-    """How one parameter is told: its SI unit, and its typical scale in it."""
+    """How one parameter is shown: its SI unit, and its typical scale in it."""
 
     unit: str
     scale: float
@@ -36,7 +36,7 @@ class Combination:
 
     Attributes:
         terms: (name, coefficient in typical scales of the parameter), the largest first.
-        measures: one a term; empty to tell coefficients in typical scales.
+        measures: one a term; empty to show coefficients in typical scales.
     """
 
     terms: tuple[tuple[str, float], ...]

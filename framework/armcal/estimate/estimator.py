@@ -14,8 +14,16 @@ from armcal.base.domains import Array
 from armcal.base.parameters import Parameters
 from armcal.errors import NotConvergedError, ProblemError
 from armcal.estimate.identifiability import POOR_CONDITION, Identifiability, InverseInformation
-from armcal.estimate.scale import GIVE_A_LENGTH, UNSEEN_SCALE, scale_is_unseen
-from armcal.estimate.structure import Undetermined, explain, held_by_nothing, identify, identify_from
+from armcal.estimate.structure import (
+    GIVE_A_LENGTH,
+    UNSEEN_SCALE,
+    Undetermined,
+    explain,
+    held_by_nothing,
+    identify,
+    identify_from,
+    scale_is_unseen,
+)
 from armcal.io.parallel import Executor
 from armcal.problem.problem import FactorRecords, Problem, triangular
 from armcal.problem.projection import factor_at_zero
@@ -23,10 +31,10 @@ from armcal.problem.projection import factor_at_zero
 CONFIDENCE = 0.95
 NEAR_A_BOUND_SD = 3.0
 """Within so many standard deviations of a bound an interval is one-sided."""
-MOST_TOLD = 5
+MOST_LISTED = 5
 """So many undetermined combinations are listed in one message."""
 FEW_HELD = 2
-"""Combinations under priors that are told in full: they do no harm, and more of them bury the rest."""
+"""Combinations under priors that are listed in full: they do no harm, and more of them bury the rest."""
 SMALLEST_SPREAD = 1e-12
 AT_BOUND = 1e-6
 """In typical scales of the parameter: closer than this, a parameter lies on its bound."""
@@ -38,16 +46,16 @@ CHECK_THE_DATA = (
 """What to do about a fit that leads nowhere."""
 
 Progress = Callable[[str, float], None]
-"""Told what is being done, and which fraction of it is."""
+"""Called with what is being done, and which fraction of it is."""
 
 
 def no_progress(what: str, fraction: float) -> None:
-    """Says nothing."""
+    """Shows nothing."""
 
 
 @dataclass(frozen=True)
 class SolverVerdict:
-    """What a solver says of its own work; ``status`` in its own words."""
+    """How a solver ended; ``status`` in its own words."""
 
     name: str
     status: str
@@ -59,7 +67,7 @@ class SolverVerdict:
 
 
 def gave_up(verdict: SolverVerdict) -> NotConvergedError:
-    """What to say of a fit that ended where not even its residuals can be taken."""
+    """The error of a fit that ended where not even its residuals can be taken."""
     return NotConvergedError(
         f"{verdict.name} did not converge ({verdict.status}): the fit was driven to where springs do not hold the arm.",
         hint=f"{CHECK_THE_DATA} If all is right, bound the compliances.",
@@ -169,8 +177,8 @@ class Estimate:
     def at_bound(self) -> tuple[str, ...]:
         """Free entries that ended on a bound."""
         lower, upper = _entry_bounds(self.parameters)
-        scale = _entry_scales(self.parameters)
-        value = self.values[list(self.free_entries)]
+        scale = np.array([block.scale for block in self.parameters.free for _ in range(block.size)])
+        value = self.free_values
         on = (value - lower <= AT_BOUND * scale) | (upper - value <= AT_BOUND * scale)
         return tuple(name for name, flag in zip(self.names, on, strict=True) if flag)
 
@@ -181,14 +189,24 @@ class Estimate:
         Within 3 deviations of a bound, or beyond it, an interval reaches from the bound to the other end of the
         two-sided one about the estimate without bounds, or about the bound where that lies beyond it. A
         one-sided quantile there would be shorter, but choosing between the two kinds by the estimate itself
-        would then hold the truth in less than 95 % of cases [Feldman1998].
+        would then cover the truth in less than 95 % of cases [Feldman1998].
         """
-        lower, upper = _entry_bounds(self.parameters)
-        freedom = max(self.degrees_of_freedom, 1.0)
-        quantile = float(stdtrit(freedom, 0.5 + CONFIDENCE / 2))
-        value = self.values[list(self.free_entries)]
-        rows = zip(value, self.unconstrained, self.deviations, lower, upper, strict=True)
-        return tuple(_interval(*row, quantile) for row in rows)
+        quantile, intervals = float(stdtrit(max(self.degrees_of_freedom, 1.0), 0.5 + CONFIDENCE / 2)), []
+        rows = zip(self.free_values, self.unconstrained, self.deviations, *_entry_bounds(self.parameters), strict=True)
+        for value, unconstrained, sd, lower, upper in rows:
+            # Beyond a bound the interval starts there: an estimate that noise pushed far out is no surer than one at
+            # the bound.
+            low, high = min(unconstrained, upper) - quantile * sd, max(unconstrained, lower) + quantile * sd
+            if not np.isfinite(sd):
+                interval = Interval95(lower, upper, False)
+            elif unconstrained - lower < NEAR_A_BOUND_SD * sd and unconstrained - lower <= upper - unconstrained:
+                interval = Interval95(lower, float(np.clip(high, lower, upper)), True)
+            elif upper - unconstrained < NEAR_A_BOUND_SD * sd:
+                interval = Interval95(float(np.clip(low, lower, upper)), upper, True)
+            else:
+                interval = Interval95(float(value - quantile * sd), float(value + quantile * sd), False)
+            intervals.append(interval)
+        return tuple(intervals)
 
 
 @dataclass(frozen=True)
@@ -207,6 +225,12 @@ class Influence:
     slope: float
     noise_scale: float
 
+    @classmethod
+    def of_least_squares(cls, cost: float, freedom: float) -> Influence:
+        """All alike; with less than one degree of freedom the declared noise is believed."""
+        noise_scale = float(np.sqrt(2 * cost / freedom)) if freedom >= 1 else 1.0
+        return cls(None, noise_scale, 1.0, noise_scale)
+
 
 def estimate(
     problem: Problem, records: Sequence[FactorRecords], solution: Solution, influence: Influence | None = None
@@ -224,32 +248,33 @@ def estimate(
     """
     problem.require_held(solution.values, records)
     parameters = problem.parameters
-    scales, prior = parameters.scales(), parameters.prior_information()
-    slope = 1.0 if influence is None else influence.slope
-    moved = parameters.coordinates(parameters.local(solution.values))
+    prior, slope = parameters.prior_information(), 1.0 if influence is None else influence.slope
     chain = parameters.entries_jacobian(solution.values)
-    equations = problem.normal_equations(solution.values, _acting(problem, records, influence)).chained(chain)
+    acting = problem.weighted(records, influence.weights) if influence and influence.weights else records
+    equations = problem.normal_equations(solution.values, acting).chained(chain)
     triangle = factor_at_zero(problem, solution.values, records)
     known = identify_from(triangle, parameters)
     inverse = InverseInformation.of(np.sqrt(slope) * triangle, parameters)
     half, freedom = inverse.root, problem.equations(records) - inverse.spent
-    influence = influence or _of_least_squares(equations.cost, freedom)
+    influence = influence or Influence.of_least_squares(equations.cost, freedom)
     by_data = influence.spread * half @ (half.T @ triangle.T)
     by_both = np.hstack([by_data, half @ (half.T * np.sqrt(prior))])
-    step = -(half @ (half.T @ (equations.gradient + prior * moved)))
+    pull = equations.gradient + prior * parameters.coordinates(parameters.local(solution.values))
+    step = -(half @ (half.T @ pull))
     unseen = np.linalg.norm(inverse.null, axis=0)
+    information = triangle * (influence.slope / max(influence.spread, SMALLEST_SPREAD))
     return Estimate(
         parameters=parameters,
         values=solution.values,
         free_entries=parameters.free_entries,
         covariance=chain @ (by_both @ by_both.T) @ chain.T,
         unconstrained=solution.values[list(parameters.free_entries)] + chain @ step,
-        square_root_information=_square_root(triangle, prior, influence),
+        square_root_information=triangular(np.vstack([information, np.diag(np.sqrt(prior))])),
         noise_scale=influence.noise_scale,
         degrees_of_freedom=freedom,
         identifiability=known,
         determined=tuple(bool(x) for x in ~(np.abs(chain) @ unseen > 1e-6)),
-        identified_by_data=_identified_by_data(chain, scales, known),
+        identified_by_data=_identified_by_data(chain, parameters.scales(), known),
         verdict=solution.verdict,
     )
 
@@ -261,22 +286,6 @@ def _identified_by_data(chain: Array, scales: Array, known: Identifiability) -> 
     moves = np.linalg.norm(chain @ (known.null * scales).T, axis=1)
     ordinary = np.linalg.norm(chain * scales, axis=1)
     return tuple(bool(x) for x in moves <= 1e-6 * np.where(ordinary > 0, ordinary, 1.0))
-
-
-def _acting(problem: Problem, records: Sequence[FactorRecords], influence: Influence | None) -> Sequence[FactorRecords]:
-    """The records with the weights that a loss gave them."""
-    return records if influence is None or influence.weights is None else problem.weighted(records, influence.weights)
-
-
-def _square_root(triangle: Array, prior: Array, influence: Influence) -> Array:
-    by_data = triangle * (influence.slope / max(influence.spread, SMALLEST_SPREAD))
-    return triangular(np.vstack([by_data, np.diag(np.sqrt(prior))]))
-
-
-def _of_least_squares(cost: float, freedom: float) -> Influence:
-    """With less than one degree of freedom the declared noise is believed."""
-    noise_scale = float(np.sqrt(2 * cost / freedom)) if freedom >= 1 else 1.0
-    return Influence(None, noise_scale, 1.0, noise_scale)
 
 
 def degrees_of_freedom(problem: Problem, values: Array, records: Sequence[FactorRecords], slope: float = 1.0) -> float:
@@ -307,15 +316,16 @@ def require_solvable(problem: Problem, records: Sequence[FactorRecords], start: 
     has_prior = parameters.prior_information() > 0
     warnings = []
     if count < unknown:
-        text = f"{count} equations ({_poses(records)} records) for {unknown} free parameters"
+        poses = max((record.count for record in records), default=0)
+        text = f"{count} equations ({poses} records) for {unknown} free parameters"
         if not has_prior.all():
             raise ProblemError(f"{text}.", hint="Measure more poses, fix parameters, or give every one a prior.")
-        warnings.append(f"{text}: what the data does not say comes from the priors.")
+        warnings.append(f"{text}: what the data does not determine comes from the priors.")
     known = identify(problem, start, records)
     if known.undetermined:
         explained = explain(problem, start, records, known)
-        listed = "; ".join(str(undetermined) for undetermined in explained[:MOST_TOLD])
-        more = len(explained) - MOST_TOLD
+        listed = "; ".join(str(undetermined) for undetermined in explained[:MOST_LISTED])
+        more = len(explained) - MOST_LISTED
         listed += f"; and {more} more, which armcal identify lists" if more > 0 else ""
         text = f"the data does not determine {len(explained)} combinations"
         unseen_scale = scale_is_unseen(problem, start, records, known)
@@ -324,9 +334,9 @@ def require_solvable(problem: Problem, records: Sequence[FactorRecords], start: 
             raise ProblemError(f"{first}{text}: {listed}.", hint=_sentence(f"{mend}{_mend(explained)}"))
         if unseen_scale:
             warnings.append(f"{UNSEEN_SCALE}; its priors hold it. To know it, {GIVE_A_LENGTH}.")
-        told = listed if len(explained) <= FEW_HELD else "armcal identify lists them"
+        listed = listed if len(explained) <= FEW_HELD else "armcal identify lists them"
         warnings.append(
-            f"at the nominal values {text}; their priors hold them: {told}. The verdict counts at the answer."
+            f"at the nominal values {text}; their priors hold them: {listed}. The verdict counts at the answer."
         )
     if known.condition > POOR_CONDITION and not has_prior.all():
         warnings.append(f"the scaled condition is {known.condition:.1e}: {known.weakest} is hardly determined.")
@@ -338,29 +348,13 @@ def _sentence(text: str) -> str:
 
 
 def _mend(undetermined: Sequence[Undetermined]) -> str:
-    causes = {each.cause for each in undetermined}
-    ways = ["fix one parameter of each", "give it a prior"]
+    causes = {combination.cause for combination in undetermined}
+    advice = ["fix one parameter of each", "give it a prior"]
     if "values" in causes:
-        ways.append("start from other values")
+        advice.append("start from other values")
     if causes & {"poses", "unknown"}:
-        ways.append("measure poses that tell them apart")
-    return _sentence(f"{', '.join(ways[:-1])}, or {ways[-1]}.")
-
-
-def _poses(records: Sequence[FactorRecords]) -> int:
-    return max((record.count for record in records), default=0)
-
-
-def _interval(value: float, unconstrained: float, sd: float, lower: float, upper: float, quantile: float) -> Interval95:
-    if not np.isfinite(sd):
-        return Interval95(lower, upper, False)
-    # Beyond a bound the interval starts there: an estimate that noise pushed far out is no surer than one at the bound.
-    low, high = min(unconstrained, upper) - quantile * sd, max(unconstrained, lower) + quantile * sd
-    if unconstrained - lower < NEAR_A_BOUND_SD * sd and unconstrained - lower <= upper - unconstrained:
-        return Interval95(lower, float(np.clip(high, lower, upper)), True)
-    if upper - unconstrained < NEAR_A_BOUND_SD * sd:
-        return Interval95(float(np.clip(low, lower, upper)), upper, True)
-    return Interval95(float(value - quantile * sd), float(value + quantile * sd), False)
+        advice.append("measure poses that separate them")
+    return _sentence(f"{', '.join(advice[:-1])}, or {advice[-1]}.")
 
 
 def _entry_bounds(parameters: Parameters) -> tuple[Array, Array]:
@@ -369,7 +363,3 @@ def _entry_bounds(parameters: Parameters) -> tuple[Array, Array]:
         lower += [getattr(block.domain, "lower", -np.inf)] * block.size
         upper += [getattr(block.domain, "upper", np.inf)] * block.size
     return np.array(lower), np.array(upper)
-
-
-def _entry_scales(parameters: Parameters) -> Array:
-    return np.array([block.scale for block in parameters.free for _ in range(block.size)])

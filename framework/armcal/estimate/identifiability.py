@@ -32,7 +32,7 @@ _LARGE_SHARE = 0.2
 
 @dataclass(frozen=True)
 class Identifiability:
-    """What the data says of the free parameters.
+    """What the data determines of the free parameters.
 
     Attributes:
         names: of the coordinates.
@@ -41,7 +41,7 @@ class Identifiability:
         rank: how many are determined.
         undetermined: combinations the data does not see.
         rank_by_qr: how many are determined by the diagonal of a QR decomposition with pivoting.
-        measures: how each coordinate is told; empty for coefficients in typical scales.
+        measures: how each coordinate is shown; empty for coefficients in typical scales.
     """
 
     names: tuple[str, ...]
@@ -89,18 +89,18 @@ class Identifiability:
         Those that stay uncertain by more than a typical scale, lie beyond a poor condition, or are determined by
         one of the two rank decisions alone; the worst first.
         """
-        found = []
+        combinations = []
         for i in reversed(range(self.rank)):
             value = float(self.singular_values[i])
             doubtful = i >= min(self.rank_by_qr, _count_above(self.singular_values))
             if value < HARDLY or value * POOR_CONDITION < self.singular_values[0] or doubtful:
                 combination = named(self.directions[i], self.names, self.measures, _LARGE_SHARE)
-                found.append((combination, 1 / value if value > 0 else float("inf")))
-        return tuple(found)
+                combinations.append((combination, 1 / value if value > 0 else float("inf")))
+        return tuple(combinations)
 
 
 def measures_of(parameters: Parameters) -> tuple[Measure, ...]:
-    """How each coordinate of the free blocks is told."""
+    """How each coordinate of the free blocks is shown."""
     return tuple(Measure(block.unit, block.scale) for block in parameters.free for _ in range(block.domain.dof))
 
 
@@ -109,9 +109,9 @@ def analyse(
 ) -> Identifiability:
     """Identifiability from R (m x n, m <= n) with R'R = J'J of the whitened residuals.
 
-    A combination is undetermined if both the singular values and the QR decomposition say so.
+    A combination is undetermined if it is by the singular values and by the QR decomposition.
     """
-    count, told = len(names), tuple(measures)
+    count = len(names)
     if not count:
         return Identifiability(names, np.zeros(0), np.zeros((0, 0)), 0, ())
     square = np.zeros((count, count))
@@ -120,8 +120,8 @@ def analyse(
     diagonal = np.abs(np.diag(qr(square, pivoting=True, mode="r")[0]))
     by_qr = _count_above(diagonal)
     rank = max(_count_above(values), by_qr)
-    undetermined = tuple(named(v, names, told, _NAMED) for v in sparse_basis(directions[rank:]))
-    return Identifiability(names, values, directions, rank, undetermined, by_qr, told)
+    undetermined = tuple(named(v, names, measures, _NAMED) for v in sparse_basis(directions[rank:]))
+    return Identifiability(names, values, directions, rank, undetermined, by_qr, tuple(measures))
 
 
 @dataclass(frozen=True)

@@ -69,7 +69,13 @@ def maximise(terms: Sequence[Term], prior: Array, floored: Array) -> LikelihoodM
     theta = np.full(count, max(total, 1e-300) / count)
     here = _evaluate(terms, prior, theta)
     for _ in range(MOST_STEPS):
-        step = _step(here, theta, lower)
+        # Towards the maximum of the local model, above the floors.
+        size = np.diag(here.information)
+        ridge = 1e-9 * np.diag(size) + (1e-12 * float(np.max(size, initial=1e-300))) * np.eye(count)
+        model = NormalEquations(0.0, -here.slope, here.information + ridge)
+        step = bounded_step(model, lower - theta, np.full(count, np.inf))
+        if step is None:
+            break
         length = max(float(step @ here.information @ step), 0.0) ** 0.5
         moved = _raised(terms, prior, theta, step, here)
         if moved is None:
@@ -82,15 +88,6 @@ def maximise(terms: Sequence[Term], prior: Array, floored: Array) -> LikelihoodM
     return LikelihoodMaximum(theta, covariance / np.outer(scale, scale), here.value)
 
 
-def _step(here: _Local, theta: Array, lower: Array) -> Array:
-    """Towards the maximum of the local model, above the floors."""
-    size = np.diag(here.information)
-    ridge = 1e-9 * np.diag(size) + (1e-12 * float(np.max(size, initial=1e-300))) * np.eye(len(theta))
-    model = NormalEquations(0.0, -here.slope, here.information + ridge)
-    step = bounded_step(model, lower - theta, np.full(len(theta), np.inf))
-    return np.zeros(len(theta)) if step is None else step
-
-
 def _raised(
     terms: Sequence[Term], prior: Array, theta: Array, step: Array, here: _Local
 ) -> tuple[Array, _Local] | None:
@@ -98,16 +95,19 @@ def _raised(
     for halving in range(_MOST_HALVINGS):
         there = theta + step * 0.5**halving
         try:
-            evaluate = _evaluate(terms, prior, there)
+            local = _evaluate(terms, prior, there)
         except np.linalg.LinAlgError:
             continue
-        if evaluate.value >= here.value:
-            return there, evaluate
+        if local.value >= here.value:
+            return there, local
     return None
 
 
 def _evaluate(terms: Sequence[Term], prior: Array, theta: Array) -> _Local:
-    inverses: list[Array] = [np.asarray(np.linalg.inv(_covariances(t, theta)), dtype=float) for t in terms]
+    covariances = [np.einsum("c,cnab->nab", theta, term.bases, optimize=True) for term in terms]
+    for own in covariances:
+        np.linalg.cholesky(own)  # raises where one is not positive definite
+    inverses: list[Array] = [np.linalg.inv(own) for own in covariances]
     information = np.diag(prior).astype(float)
     pull = np.zeros(len(prior))
     logarithm = 0.0
@@ -122,50 +122,21 @@ def _evaluate(terms: Sequence[Term], prior: Array, theta: Array) -> _Local:
     covariance = np.linalg.inv(scaled) / np.outer(scale, scale) if len(scale) else np.zeros((0, 0))
     logarithm += 2 * float(np.log(np.diag(root) * scale).sum())
     fit = covariance @ pull
-    projected = [
-        np.einsum("nab,nb->na", inverse, term.target - term.jacobian @ fit)
-        for term, inverse in zip(terms, inverses, strict=True)
-    ]
-    energy = sum(float(np.sum(t.target * p)) for t, p in zip(terms, projected, strict=True))
-    slope = _slope(terms, inverses, projected, covariance, len(theta))
-    return _Local(
-        -0.5 * (logarithm + energy), slope, _average_information(terms, inverses, projected, covariance, len(theta))
-    )
-
-
-def _slope(
-    terms: Sequence[Term], inverses: Sequence[Array], projected: Sequence[Array], covariance: Array, count: int
-) -> Array:
-    slope = np.zeros(count)
-    for term, inverse, p in zip(terms, inverses, projected, strict=True):
+    energy, slope = 0.0, np.zeros(len(theta))
+    curved, reached = np.zeros((len(theta),) * 2), np.zeros((len(theta), len(prior)))
+    for term, inverse in zip(terms, inverses, strict=True):
+        projected = np.einsum("nab,nb->na", inverse, term.target - term.jacobian @ fit)
+        energy += float(np.sum(term.target * projected))
         weighed = np.einsum("nab,nbc->nac", inverse, term.jacobian, optimize=True)
         reduced = inverse - np.einsum("nac,cd,nbd->nab", weighed, covariance, weighed, optimize=True)
-        slope += 0.5 * np.einsum("cnab,nab->c", term.bases, p[:, :, None] * p[:, None, :] - reduced, optimize=True)
-    return slope
-
-
-def _average_information(
-    terms: Sequence[Term], inverses: Sequence[Array], projected: Sequence[Array], covariance: Array, count: int
-) -> Array:
-    """1/2 u_c' P u_d with u_c = V_c P y."""
-    total, reached = np.zeros((count, count)), np.zeros((count, len(covariance)))
-    for term, inverse, p in zip(terms, inverses, projected, strict=True):
-        u = np.einsum("cnab,nb->cna", term.bases, p, optimize=True)
+        outer = projected[:, :, None] * projected[:, None, :]
+        slope += 0.5 * np.einsum("cnab,nab->c", term.bases, outer - reduced, optimize=True)
+        u = np.einsum("cnab,nb->cna", term.bases, projected, optimize=True)
         weighed = np.einsum("nab,cnb->cna", inverse, u, optimize=True)
-        total += np.einsum("cna,dna->cd", u, weighed, optimize=True)
+        curved += np.einsum("cna,dna->cd", u, weighed, optimize=True)
         reached += np.einsum("cna,nav->cv", weighed, term.jacobian, optimize=True)
-    return 0.5 * (total - reached @ covariance @ reached.T)
-
-
-def _covariances(term: Term, theta: Array) -> Array:
-    """S of each record (N x n_r x n_r).
-
-    Raises:
-        numpy.linalg.LinAlgError: one is not positive definite.
-    """
-    found = np.einsum("c,cnab->nab", theta, term.bases, optimize=True)
-    np.linalg.cholesky(found)
-    return np.asarray(found)
+    # The average information: 1/2 u_c' P u_d with u_c = V_c P y.
+    return _Local(-0.5 * (logarithm + energy), slope, 0.5 * (curved - reached @ covariance @ reached.T))
 
 
 def _least_squares(terms: Sequence[Term], prior: Array) -> float:
@@ -174,5 +145,5 @@ def _least_squares(terms: Sequence[Term], prior: Array) -> float:
     stacked = np.vstack([*rows, np.diag(np.sqrt(prior))])
     target = np.concatenate([*[term.target.ravel() for term in terms], np.zeros(len(prior))])
     scale = np.maximum(np.linalg.norm(stacked, axis=0), 1e-300)
-    found = np.linalg.lstsq(stacked / scale, target, rcond=None)[0]
-    return float(np.sum((target - stacked / scale @ found) ** 2))
+    fit = np.linalg.lstsq(stacked / scale, target, rcond=None)[0]
+    return float(np.sum((target - stacked / scale @ fit) ** 2))

@@ -59,7 +59,10 @@ class Loss:
 
     def gaussian_mean(self, of: Array) -> float:
         """Mean over Gaussian residuals of a function of the norm, given on ``norm_grid``."""
-        weighted = of * _norm_density(self.dimension)
+        grid, m = np.maximum(norm_grid(), 1e-300), self.dimension
+        # The density of the chi distribution.
+        logarithm = (m - 1) * np.log(grid) - grid**2 / 2 - gammaln(m / 2) - (m / 2 - 1) * np.log(2)
+        weighted = of * np.exp(logarithm)
         return float((weighted[:-1] + weighted[1:]).sum() / 2 * (_LARGEST_NORM / _STEPS))
 
 
@@ -84,13 +87,6 @@ def _efficiency(loss: Loss) -> float:
 def norm_grid() -> Array:
     """Norms on which means over Gaussian residuals are taken."""
     return np.linspace(0.0, _LARGEST_NORM, _STEPS + 1)
-
-
-def _norm_density(dimension: int) -> Array:
-    """Of the norm of so many standard Gaussian numbers (the chi distribution)."""
-    grid = np.maximum(norm_grid(), 1e-300)
-    logarithm = (dimension - 1) * np.log(grid) - grid**2 / 2 - gammaln(dimension / 2) - (dimension / 2 - 1) * np.log(2)
-    return np.asarray(np.exp(logarithm))
 
 
 def median_norm(dimension: int) -> float:

@@ -1,4 +1,4 @@
-"""Parameters of single groups: where they start, which of them records can tell, and what records not fitted say."""
+"""Parameters of single groups: where they start, which of them records determine, and what records not fitted give."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 
 from armcal.base.domains import Array
-from armcal.base.parameters import Parameters
 from armcal.estimate.polish import descended
 from armcal.measure.groups import group_name, owner_of
 from armcal.measure.measurement import GroupedMeasurement
@@ -20,24 +19,34 @@ _DAMPING = 1e-9
 
 
 def started(problem: Problem, records: Sequence[FactorRecords]) -> Problem:
-    """The problem with the free parameters of each group starting from what a middling record says of them.
+    """The problem with the free parameters of each group starting from what a middling record gives for them.
 
     Raises:
         NotConvergedError: a record has no elastic equilibrium at the nominal values.
     """
     if not problem.parameters.nuisances:
         return problem
-    nominal = problem.parameters.nominal()
-    for owner, key, factor, said in _sayings(problem, problem.told(nominal, records), records):
-        for local in dict.fromkeys(problem.kernels[factor].factor.nuisance_names):
-            name = group_name(owner, key, local)
-            if problem.parameters[name].free and problem.parameters[name].prior_sd is None:
-                rows = [
-                    i
-                    for i, nuisance_name in enumerate(problem.kernels[factor].factor.nuisance_names)
-                    if nuisance_name == local
-                ]
-                nominal[problem.parameters.entries_of(name)] = said[rows]
+    nominal, plan, done = problem.parameters.nominal(), problem.blueprint, set[tuple[str, str]]()
+    starts = problem.nuisance_starts(nominal, records)
+    parts = zip(problem.kernels, plan.measurements.items(), records, starts, strict=True)
+    for kernel, (instance, measurement), record, own in parts:
+        if not isinstance(measurement, GroupedMeasurement) or record.group is None or not len(own):
+            continue
+        owner, names = owner_of(instance, measurement), np.array(kernel.factor.nuisance_names)
+        group, counted = record.group[: record.count], record.weight[: record.count] > 0
+        for number in np.unique(group[(group >= 0) & counted]):
+            key = plan.groups[owner][number]
+            if (owner, key) in done:  # the first factor wins
+                continue
+            done.add((owner, key))
+            members = np.flatnonzero((group == number) & counted)
+            away = np.abs(own[:, members] - np.median(own[:, members], axis=1)[:, None]).sum(axis=0)
+            # Of two equally near ones their starts decide, not which stands first.
+            middling = members[np.lexsort((*own[:, members], away))[0]]
+            for local in dict.fromkeys(kernel.factor.nuisance_names):
+                name = group_name(owner, key, local)
+                if problem.parameters[name].free and problem.parameters[name].prior_sd is None:
+                    nominal[problem.parameters.entries_of(name)] = own[names == local, middling]
     return replace(problem, parameters=problem.parameters.with_nominal(nominal))
 
 
@@ -76,14 +85,11 @@ def settled(problem: Problem, values: Array, records: Sequence[FactorRecords]) -
     names = open_names & _present(problem, records)
     if not names:
         return values
-    parameters = _without_priors(problem.parameters.with_nominal(values)).with_free(names)
-    inner = replace(problem, parameters=parameters, known_ties=())
+    parameters = problem.parameters.with_nominal(values)
+    without_priors = {block.name: replace(block, prior_sd=None) for block in parameters.nuisances}
+    inner = replace(problem, parameters=parameters.replaced(without_priors).with_free(names), known_ties=())
     posed = PosedProblem(inner, records)
     return posed.values(descended(posed, np.zeros(len(posed.scales)), _MOST_STEPS, _DAMPING))
-
-
-def _without_priors(parameters: Parameters) -> Parameters:
-    return parameters.replaced({b.name: replace(b, prior_sd=None) for b in parameters.nuisances})
 
 
 def _present(problem: Problem, records: Sequence[FactorRecords]) -> set[str]:
@@ -98,27 +104,3 @@ def _present(problem: Problem, records: Sequence[FactorRecords]) -> set[str]:
                     key = plan.groups[owner][number]
                     names |= {group_name(owner, key, block.name) for block in measurement.group_parameters(key)}
     return names
-
-
-def _sayings(
-    problem: Problem, told: Sequence[Array], records: Sequence[FactorRecords]
-) -> list[tuple[str, str, int, Array]]:
-    """Owner, key, factor and what the record nearest the median says, of each group; the first factor wins."""
-    found: dict[tuple[str, str], tuple[str, str, int, Array]] = {}
-    plan = problem.blueprint
-    for factor, ((instance, measurement), factor_records) in enumerate(
-        zip(plan.measurements.items(), records, strict=True)
-    ):
-        if not isinstance(measurement, GroupedMeasurement) or factor_records.group is None or not len(told[factor]):
-            continue
-        owner = owner_of(instance, measurement)
-        group, weight = factor_records.group[: factor_records.count], factor_records.weight[: factor_records.count]
-        for number in np.unique(group[(group >= 0) & (weight > 0)]):
-            members = np.flatnonzero((group == number) & (weight > 0))
-            said = np.median(told[factor][:, members], axis=1)
-            away = np.abs(told[factor][:, members] - said[:, None]).sum(axis=0)
-            # Of two equally near ones what they say decides: not which stands first.
-            one = members[np.lexsort((*told[factor][:, members], away))[0]]
-            key = plan.groups[owner][number]
-            found.setdefault((owner, key), (owner, key, factor, told[factor][:, one]))
-    return list(found.values())

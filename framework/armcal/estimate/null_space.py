@@ -44,9 +44,11 @@ def sparse_basis(space: Array, nested: tuple[Array, ...] = (), within: float = E
         for vector in _candidates(part, space, sine):
             if len(chosen) == len(part):
                 break
-            if _adds(chosen, vector, sine):
+            basis = np.linalg.qr(chosen.T)[0]
+            left = vector - basis @ (basis.T @ vector)
+            if not len(chosen) or np.linalg.norm(left) > 10 * sine * np.linalg.norm(vector):
                 chosen = np.vstack([chosen, vector])
-    return np.array([_normalised(row) for row in chosen]).reshape(-1, space.shape[1])
+    return np.array([row / np.abs(row).max() for row in chosen]).reshape(-1, space.shape[1])
 
 
 def null_rows(matrix: Array, tolerance: float) -> Array:
@@ -66,11 +68,13 @@ def _candidates(part: Array, space: Array, sine: float) -> Iterator[Array]:
         if comb(len(taking_part), size) <= _MOST_SUBSETS:
             yield from _on_few(part, space, taking_part, size, sine)
     if 1 < len(part) <= _MOST_BY_SEARCH and len(taking_part) <= _MOST_WIDE:
-        found = [v for i in taking_part if (v := _least(part, space, int(i))) is not None]
+        least = [v for i in taking_part if (v := _least(part, space, int(i))) is not None]
         yield from sorted(
-            found, key=lambda v: (int(_support(v, EXACT).sum()), float(np.abs(v).sum() / np.abs(v).max()))
+            least, key=lambda v: (int(_support(v, EXACT).sum()), float(np.abs(v).sum() / np.abs(v).max()))
         )
-    yield from _echelon(part)
+    if len(part):  # reduced row echelon form
+        pivots = qr(part, pivoting=True, mode="economic")[2]
+        yield from np.linalg.solve(part[:, pivots[: len(part)]], part)
     yield from part
 
 
@@ -113,29 +117,8 @@ def _snapped(vector: Array, space: Array, present: Mask) -> Array | None:
     inside = null_rows(space[:, ~present].T, EXACT) @ space if not present.all() else space
     if not len(inside):
         return None
-    found = (inside @ vector) @ inside
-    return np.asarray(np.where(present, found, 0.0))
-
-
-def _echelon(part: Array) -> Array:
-    """Reduced row echelon form with pivoting."""
-    if not len(part):
-        return part
-    _, _, pivots = qr(part, pivoting=True, mode="economic")
-    return np.asarray(np.linalg.solve(part[:, pivots[: len(part)]], part))
+    return np.asarray(np.where(present, (inside @ vector) @ inside, 0.0))
 
 
 def _support(vector: Array, share: float) -> Mask:
     return np.asarray(np.abs(vector) > share * np.abs(vector).max())
-
-
-def _adds(chosen: Array, vector: Array, sine: float) -> bool:
-    if not len(chosen):
-        return True
-    basis = np.linalg.qr(chosen.T)[0]
-    left = vector - basis @ (basis.T @ vector)
-    return bool(np.linalg.norm(left) > 10 * sine * np.linalg.norm(vector))
-
-
-def _normalised(row: Array) -> Array:
-    return np.asarray(row / np.abs(row).max())

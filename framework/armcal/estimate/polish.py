@@ -1,36 +1,48 @@
-"""The last digits of a solution: Gauss-Newton steps within the bounds, until nothing moves.
+"""Gauss-Newton steps beside a solver: a short search before it, and the last digits of its solution. [Nocedal2006]
 
 A solver stops where its own tolerance lets it, which depends on scaling; what remains is small, but a weakly
 determined combination may still be visibly off, and a parameter that belongs on its bound beside it. After
-these steps an answer depends on the problem alone. [Nocedal2006]
+these steps an answer depends on the problem alone. Where a short search leaves positions as far off as they lie
+apart, a long one does too.
 """
 
 from __future__ import annotations
 
 import math
+import time
+from collections.abc import Sequence
 
 import numpy as np
 from scipy.optimize import lsq_linear
 
+from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.errors import NotConvergedError
+from armcal.estimate.estimator import Solution, SolverVerdict
+from armcal.measure.partners import OTHER
 from armcal.problem.posed import PosedProblem
-from armcal.problem.problem import NormalEquations
+from armcal.problem.problem import FactorRecords, NormalEquations, Problem
+from armcal.problem.tool_motion import spread_of
 
+HOPELESS = 0.12
+"""Of the spread of the measured positions: a typical residual beyond it is no calibration's. The nominal arm itself
+is some thousandths off."""
+_FEWEST, _MOST_RECORDS = 10, 60
+_SEARCH_STEPS, _SEARCH_DAMPING = 25, 1e-3
 MOST_STEPS = 50
 AT_REST = 1e-10
 """A step this many standard deviations long (of the noise found) changes nothing anybody can see."""
 _ROUNDING = 1e-12
 _LEAST_RETRY, _MOST_DAMPING, _STILL = 1e-6, 1e6, 1e-12
 _LINEAR, _FLAT = 0.1, 0.9
-"""Of a slope that a step leaves: below the one it did what it should, above the other it says nothing of how far."""
+"""Of a slope that a step leaves: below the one the step was right, above the other a secant is not reliable."""
 
 
 def polish(posed: PosedProblem, x: Array) -> Array:
     """A converged solution to its last digits; steps that would raise the cost are not taken.
 
     Where residuals curve, Gauss-Newton steps are too long or too short, and alone would come to rest slowly: the
-    slopes at both ends of a step tell how far it should have gone.
+    secant of the slopes at both ends of a step gives how far it should have gone.
     """
     (lower, upper), best, kept = posed.bounds(), np.inf, x
     equations = max(1, posed.problem.equations(posed.records))
@@ -43,10 +55,11 @@ def polish(posed: PosedProblem, x: Array) -> Array:
         raised = model.cost > best * (1 + _ROUNDING)
         if not raised:
             kept, best = x, min(model.cost, best)
-        length = None if tried is None else _secant(tried, model.gradient)
-        if tried is not None and length is not None:
-            x, tried = np.clip(tried[0] + length * tried[1], lower, upper), None
-            continue
+        if tried is not None and tried[2] < 0:
+            ratio = float(model.gradient @ tried[1]) / tried[2]
+            if abs(ratio) > _LINEAR and ratio < _FLAT:  # to where the cost has no slope along the step
+                x, tried = np.clip(tried[0] + 1 / (1 - ratio) * tried[1], lower, upper), None
+                continue
         if raised:
             return kept
         step = bounded_step(model, lower - x, upper - x)
@@ -85,15 +98,6 @@ def descended(posed: PosedProblem, x: Array, most_steps: int, damping: float, en
     return x
 
 
-def _secant(tried: tuple[Array, Array, float], gradient: Array) -> float | None:
-    """How much of a step leads to where the cost has no slope along it; None if nearly all of it does."""
-    _, step, before = tried
-    if not before < 0:
-        return None
-    ratio = float(gradient @ step) / before
-    return 1 / (1 - ratio) if abs(ratio) > _LINEAR and ratio < _FLAT else None
-
-
 def bounded_step(model: NormalEquations, lower: Array, upper: Array) -> Array | None:
     """The minimum of a quadratic model between bounds on the step, by an active-set method; None without a single one.
 
@@ -112,3 +116,39 @@ def bounded_step(model: NormalEquations, lower: Array, upper: Array) -> Array | 
         np.where(solution.active_mask > 0, upper, solution.x / size),
     )
     return np.asarray(np.clip(step, lower, upper))
+
+
+def hopeless(problem: Problem, records: Sequence[FactorRecords], dataset: Dataset, start: Array) -> Solution | None:
+    """The start, if a short search over some of the records says that no search leads on from there; else None.
+
+    Asked of measurements of positions in the base frame alone; ``records`` are those of the dataset, which train.
+    """
+    began = time.perf_counter()
+    chosen = np.arange(0, len(dataset), max(1, -(-len(dataset) // _MOST_RECORDS)))
+    some = problem.subset(records, chosen)
+    try:
+        if not problem.increments or _off(problem, some, dataset.subset(chosen), start) <= HOPELESS:
+            return None
+        posed = PosedProblem(problem, some)
+        values = posed.values(descended(posed, posed.x(start), _SEARCH_STEPS, _SEARCH_DAMPING))
+        off = _off(problem, some, dataset.subset(chosen), values)
+    except NotConvergedError:
+        return None
+    if off <= HOPELESS:
+        return None
+    status = f"given up: positions stay off by {100 * off:.0f} % of how far they spread, whatever the free parameters"
+    seconds = time.perf_counter() - began
+    return Solution(start, SolverVerdict("the first search", status, False, _SEARCH_STEPS, seconds))
+
+
+def _off(problem: Problem, records: Sequence[FactorRecords], dataset: Dataset, values: Array) -> float:
+    """Median residual by the spread of the measured positions, the worst of all measurements that read positions."""
+    worst = 0.0
+    for kernel, record, residual in zip(problem.kernels, records, problem.residuals(values, records), strict=True):
+        channels, seen = kernel.factor.output_channels[:3], record.measured[: len(dataset)]
+        positions = [channel.rpartition(".")[2] for channel in channels] == list("xyz")
+        if not positions or any(OTHER in name for name in kernel.factor.channels) or np.count_nonzero(seen) < _FEWEST:
+            continue
+        off = np.median(np.linalg.norm(residual[:3, seen], axis=0))
+        worst = max(worst, float(off) / max(spread_of(dataset.stacked(channels)[:, seen]), 1e-12))
+    return worst

@@ -1,16 +1,16 @@
-"""How far a measurement may lie from its prediction: by noise, by parameters not known exactly, by a drift not told.
+"""How far a measurement may lie from its prediction: by noise, by parameters not known exactly, by a drift not known.
 
 The residual of a record that took no part in a fit has the covariance s^2 N + H C H' + s^2 D. N is the noise declared
 of it, s the noise found in units of the declared one, C the covariance of the values and H the slope of its residual
 by them. D is what a drift does: in another recording than the fit's, where nothing is known of it, its full variance;
 in the same one G K G', with the slope G of the residual by the drift's states there and their covariance K after the
-training records. What those tell of the drift depends on the values as well: H has what they make of the drift taken
+training records. The drift that those determine depends on the values as well: H has what they make of the drift taken
 off. (Gaussian processes with explicit basis functions, [Rasmussen2006].)
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -18,6 +18,7 @@ import numpy as np
 from scipy.special import fdtri, stdtrit
 
 from armcal.base.domains import Array
+from armcal.problem.factor_records import whitening_of
 from armcal.problem.kernel import Kernel
 from armcal.problem.problem import FactorRecords, Problem
 
@@ -28,13 +29,13 @@ STATED = 0.9
 RADIUS_LEVEL = 0.95
 _POSITION = ["x", "y", "z"]
 _LEAST_LEFT = 1e-3
-"""Of the information on a direction that a record alone tells: without it next to nothing would be known."""
+"""Of the information on a direction that a record alone gives: without it next to nothing would be known."""
 _Parts = tuple[Array, Array, Array]
 
 
 @dataclass(frozen=True)
 class Spread:
-    """How residuals of one factor are expected to scatter.
+    """How residuals of one factor are expected to vary.
 
     Attributes:
         covariance: of each record's residual (N x n_r x n_r; m^2 or rad^2).
@@ -50,15 +51,15 @@ class Spread:
         return np.asarray(np.sqrt(np.einsum("nrr->rn", self.covariance)))
 
     def half_widths(self, level: float) -> Array:
-        """Half the width of the interval that holds a residual number with this probability (n_r x N)."""
+        """Half the width of the interval that covers a residual number with this probability (n_r x N)."""
         return self.deviations * quantile(level, self.freedom)
 
     def radius(self, level: float = RADIUS_LEVEL) -> Array:
-        """The radius (N) that holds the length of a whole residual with this probability.
+        """The radius (N) that covers the length of a whole residual with this probability.
 
         The squared length is a sum of chi-squares, one an eigenvalue of the covariance. It is taken for a multiple of
         one chi-square of the same mean and variance, of (tr C)^2 / tr C^2 degrees of freedom [Satterthwaite1946], and
-        so for an F because the noise is estimated. At 95 % of three dimensions it holds 94.9 to 95.2 %.
+        so for an F because the noise is estimated. At 95 % of three dimensions it covers 94.9 to 95.2 %.
         """
         trace = np.einsum("nrr->n", self.covariance)
         dimensions = trace**2 / np.einsum("nrs,nsr->n", self.covariance, self.covariance)
@@ -72,7 +73,7 @@ def quantile(level: float, freedom: float | Array) -> Array:
 
 @dataclass(frozen=True)
 class KnownDrift:
-    """What the records of a fit tell of a drift.
+    """A drift as the records of a fit determine it.
 
     Attributes:
         states: the most likely ones (n_k x n_s x 1).
@@ -90,10 +91,9 @@ class KnownDrift:
         shared = records[0].correlation if records else None
         if shared is None:
             return None
-        blocks = problem.jacobians(values, records)
-        jacobians = [np.moveaxis(_whole(blocks, record.record.shape[1]), 1, 2) for record in records]
-        told = shared.states([r[:, :, None] for r in problem.weighted_residuals(values, records)])
-        return cls(told, shared.states(jacobians), shared.covariance)
+        jacobians = [np.moveaxis(jacobian, 1, 2) for jacobian in problem.jacobians(values, records)]
+        states = shared.states([r[:, :, None] for r in problem.weighted_residuals(values, records)])
+        return cls(states, shared.states(jacobians), shared.covariance)
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,7 @@ class Predictor:
         covariance: of the free canonical entries.
         noise_scale: residuals in units of the declared noise.
         freedom: degrees of freedom of that.
-        drift: what the records of the fit tell of a drift; None where nothing drifts.
+        drift: as the records of the fit determine it; None where nothing drifts.
     """
 
     problem: Problem
@@ -122,27 +122,32 @@ class Predictor:
         return any(block.drift is not None for block in self.problem.parameters.free)
 
     def residuals(self, records: Sequence[FactorRecords]) -> tuple[Array, ...]:
-        """Raw residuals less the drift told, one (n_r x N) a factor; records as ``in_recording`` takes them."""
-        found, here = self.problem.residuals(self.values, records), records[0].correlation
+        """Raw residuals less the known drift, one (n_r x N) a factor; records as ``in_recording`` takes them."""
+        raw, here = self.problem.residuals(self.values, records), records[0].correlation
         if here is None or self.drift is None:
-            return found
+            return raw
         states = self.drift.states
-        return tuple(r - here.shift(i, states)[:, : r.shape[1], 0] for i, r in enumerate(found))
+        return tuple(r - here.shift(i, states)[:, : r.shape[1], 0] for i, r in enumerate(raw))
 
     def in_new_recording(self, records: Sequence[FactorRecords]) -> tuple[Spread, ...]:
-        """Scatter about predictions without drift, where nothing is known of it; one a factor."""
-        return tuple(Spread(noise + values + drift, self.freedom) for noise, values, drift in self._unknown(records))
+        """Spread about predictions without drift, where nothing is known of it; one a factor."""
+        return tuple(
+            Spread(noise + values + drift, self.freedom)
+            for noise, values, drift in self._parts_in_new_recording(records)
+        )
 
     def in_recording(self, records: Sequence[FactorRecords]) -> tuple[Spread, ...]:
-        """Scatter about predictions with the drift that the recording of the fit tells; one a factor.
+        """Spread about predictions with the drift of the recording of the fit; one a factor.
 
         The records must be on the same chain as those of the fit.
         """
-        return tuple(Spread(noise + values + drift, self.freedom) for noise, values, drift in self._told(records))
+        return tuple(
+            Spread(noise + values + drift, self.freedom) for noise, values, drift in self._parts_in_recording(records)
+        )
 
     def left_out_of_recording(self, fitted: Sequence[FactorRecords]) -> tuple[Spread, ...]:
         """As ``in_recording`` of the fit's own records, each as if the fit had done without it."""
-        parts = zip(fitted, self._told(fitted), strict=True)
+        parts = zip(fitted, self._parts_in_recording(fitted), strict=True)
         return tuple(
             Spread(_without_itself(noise, values + drift, factor_records), self.freedom)
             for factor_records, (noise, values, drift) in parts
@@ -151,26 +156,28 @@ class Predictor:
     def left_out_of_new_recording(self, fitted: Sequence[FactorRecords]) -> tuple[Spread, ...]:
         """As ``in_new_recording`` of the fit's own records, each as if the fit had done without it.
 
-        As if each record told of the values alone, though neighbours share their drift: a little too narrow.
+        As if each record were evidence of the values alone, though neighbours share their drift: a little too narrow.
         """
-        parts = zip(fitted, self._unknown(fitted), strict=True)
+        parts = zip(fitted, self._parts_in_new_recording(fitted), strict=True)
         return tuple(
             Spread(_without_itself(noise + drift, values, factor_records), self.freedom)
             for factor_records, (noise, values, drift) in parts
         )
 
-    def _unknown(self, records: Sequence[FactorRecords]) -> list[_Parts]:
-        """What scatter comes from, in a recording whose drift is not known."""
+    def _parts_in_new_recording(self, records: Sequence[FactorRecords]) -> list[_Parts]:
+        """Covariances in a recording whose drift is not known."""
         slopes = self._slopes(records)
-        variance = self.noise_scale**2 * self._drift_variances()
+        blocks = self.problem.parameters.free
+        drifting = np.array([0.0 if b.drift is None else b.drift.sd**2 for b in blocks for _ in range(b.size)])
+        variance = self.noise_scale**2 * drifting
         drift = [np.einsum("rvn,v,svn->nrs", slope, variance, slope, optimize=True) for slope in slopes]
         return self._parts(records, slopes, drift)
 
-    def _told(self, records: Sequence[FactorRecords]) -> list[_Parts]:
-        """What scatter comes from, in the recording whose drift was told."""
+    def _parts_in_recording(self, records: Sequence[FactorRecords]) -> list[_Parts]:
+        """Covariances in the recording of the fit, whose records determine its drift."""
         here, there = records[0].correlation, self.drift
         if here is None or there is None:
-            return self._unknown(records)
+            return self._parts_in_new_recording(records)
         slopes, spreads = [], []
         for i, slope in enumerate(self._slopes(records)):
             count = slope.shape[2]
@@ -182,27 +189,20 @@ class Predictor:
 
     def _parts(self, records: Sequence[FactorRecords], slopes: Sequence[Array], drift: Sequence[Array]) -> list[_Parts]:
         """Covariances by noise, by values and by drift (N x n_r x n_r each), one of each a factor."""
-        found = []
+        parts = []
         for kernel, record, slope, moved in zip(self.problem.kernels, records, slopes, drift, strict=True):
             values = np.einsum("rvn,vw,swn->nrs", slope, self.covariance, slope, optimize=True)
-            found.append((self.noise_scale**2 * _noise(kernel, record), values, moved))
-        return found
+            inverse = np.linalg.inv(np.moveaxis(whitening_of(kernel.factor, record)[:, :, : record.count], 2, 0))
+            parts.append((self.noise_scale**2 * (inverse @ inverse.transpose(0, 2, 1)), values, moved))
+        return parts
 
     def _slopes(self, records: Sequence[FactorRecords]) -> list[Array]:
         """Residuals by free canonical entries, raw, one (n_r x n_v x N) a factor."""
         bare = [
             replace(record, weight=np.ones_like(record.weight), whitening=None, correlation=None) for record in records
         ]
-        blocks = self.problem.jacobians(self.values, bare)
-        return [
-            _whole(blocks, record.record.shape[1])[:, :, : record.count] * np.array(kernel.factor.noise)[:, None, None]
-            for kernel, record in zip(self.problem.kernels, records, strict=True)
-        ]
-
-    def _drift_variances(self) -> Array:
-        """Of each free canonical entry; zero where it does not drift."""
-        blocks = self.problem.parameters.free
-        return np.array([0.0 if b.drift is None else b.drift.sd**2 for b in blocks for _ in range(b.size)])
+        pairs = zip(self.problem.kernels, self.problem.jacobians(self.values, bare), strict=True)
+        return [jacobian * np.array(kernel.factor.noise)[:, None, None] for kernel, jacobian in pairs]
 
 
 def is_position(kernel: Kernel) -> bool:
@@ -223,21 +223,3 @@ def _without_itself(noise: Array, known: Array, factor_records: FactorRecords) -
     left = np.maximum(1.0 - factor_records.weight[: factor_records.count, None] * sizes, _LEAST_LEFT)
     turned = root @ axes
     return np.asarray(noise + np.einsum("nrk,nk,nsk->nrs", turned, sizes / left, turned))
-
-
-def _whole(blocks: Iterator[Array], width: int) -> Array:
-    """The blocks of one factor, put together (n_r x n_v x width)."""
-    parts = [next(blocks)]
-    while sum(part.shape[2] for part in parts) < width:
-        parts.append(next(blocks))
-    return np.concatenate(parts, axis=2)
-
-
-def _noise(kernel: Kernel, factor_records: FactorRecords) -> Array:
-    """Declared covariance of each record's residual (N x n_r x n_r)."""
-    if factor_records.whitening is None:
-        return np.broadcast_to(
-            np.diag(np.square(kernel.factor.noise)), (factor_records.count, *(len(kernel.factor.noise),) * 2)
-        )
-    inverse = np.linalg.inv(np.moveaxis(factor_records.whitening[:, :, : factor_records.count], 2, 0))
-    return np.asarray(inverse @ inverse.transpose(0, 2, 1))

@@ -195,14 +195,12 @@ class _Search:
                 return bound, "bound"
             if abs(outside - self.value) > _FARTHEST * self._step:
                 return outside, "open"
-            width = self._next_width(abs(outside - self.value), rise, width)
+            # To where a parabola would pass the quantile, and somewhat beyond; at most twice as far as before.
+            reached = abs(outside - self.value)
+            ahead = reached * (np.sqrt(self.quantile / rise) - 1) if rise > 0 else np.inf
+            width = float(np.clip(1.1 * ahead, 0.2 * self._step, max(2 * width, reached)))
             inside = outside
         return inside, "open"
-
-    def _next_width(self, reached: float, rise: float, width: float) -> float:
-        """To where a parabola would pass the quantile, and somewhat beyond; at most twice as far as before."""
-        ahead = reached * (np.sqrt(self.quantile / rise) - 1) if rise > 0 else np.inf
-        return float(np.clip(1.1 * ahead, 0.2 * self._step, max(2 * width, reached)))
 
     def _crossing(self, inside: float, outside: float) -> float:
         """Between a place below the quantile and one above: by secants of the root of the rise, kept between."""
@@ -231,7 +229,12 @@ class _Search:
             nearest = min(self._fits, key=lambda known: abs(known - place))
             start = self._fits[nearest].copy()
             start[self._place] = place
-            problem = _pinned(task.problem, task.name, place)
+            # The same compiled functions, one parameter held; its own prior is a constant, which ``_cost`` counts.
+            parameters = task.problem.parameters
+            nominal = parameters.nominal()
+            nominal[self._place] = place
+            free = {block.name for block in parameters.free} - {task.name}
+            problem = replace(task.problem, parameters=parameters.with_nominal(nominal).with_free(free))
             try:
                 solution = task.estimator.solve(problem, task.records, start)
                 converged = solution.verdict.converged
@@ -244,74 +247,6 @@ class _Search:
             self._fits[place] = solution.values
             self.rises[place] = min(2 * (cost - self._cost) / self._unit, _MOST_RISE)
         return self.rises[place]
-
-
-@dataclass(frozen=True)
-class Pinned:
-    """The domain of a number that is held at a place: it has no increments, so that no solver sees it."""
-
-    place: float
-
-    @property
-    def entries(self) -> tuple[str, ...]:
-        """One entry, without a suffix."""
-        return ("",)
-
-    @property
-    def dof(self) -> int:
-        """None."""
-        return 0
-
-    def check(self, value: Array) -> str:
-        """Nothing is wrong with any."""
-        return ""
-
-    def retract(self, base: Array, delta: Array) -> Array:
-        """The place."""
-        return np.array([self.place])
-
-    def local(self, base: Array, value: Array) -> Array:
-        """Nothing moves."""
-        return np.zeros(0)
-
-    def retract_jacobian(self, base: Array, delta: Array) -> Array:
-        """Nothing moves."""
-        return np.zeros((1, 0))
-
-    def increment_scale(self, scale: float) -> float:
-        """Of no increment."""
-        return scale
-
-    @property
-    def increments(self) -> tuple[str, ...]:
-        """None."""
-        return ()
-
-    def coordinates(self, base: Array, delta: Array) -> Array:
-        """None."""
-        return np.zeros(0)
-
-    def from_coordinates(self, base: Array, coordinates: Array) -> Array:
-        """None."""
-        return np.zeros(0)
-
-    def coordinates_jacobian(self, base: Array, delta: Array) -> Array:
-        """None by none."""
-        return np.zeros((0, 0))
-
-    def entries_jacobian(self, base: Array, delta: Array) -> Array:
-        """Nothing moves."""
-        return np.zeros((1, 0))
-
-    def curvature(self, gradient: Array) -> Array | None:
-        """None."""
-        return None
-
-
-def _pinned(problem: Problem, name: str, place: float) -> Problem:
-    """The same compiled functions, one parameter held; its own prior is a constant, which ``_cost`` counts."""
-    block = replace(problem.parameters[name], domain=Pinned(place))
-    return replace(problem, parameters=problem.parameters.replaced({name: block}))
 
 
 def _cost(problem: Problem, records: Sequence[FactorRecords], values: Array) -> float:

@@ -7,7 +7,7 @@ residual is s^2 (I - (2 w - 1) H): I - H for one that took part, I + H for one t
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -55,18 +55,22 @@ def studentised_distances(
     counted = problem.weighted(records, weights)
     inverse = InverseInformation.of(problem.triangular_factor(values, counted), problem.parameters)
     residuals = remaining(problem, values, records, weights)
-    lengths = [np.zeros(record.count) for record in records]
-    for factor, part, reached in _reached(problem, values, records, inverse.root):
+    directions = problem.parameters.entries_jacobian(values) @ inverse.root
+    lengths = []
+    for residual, jacobian, weight in zip(residuals, problem.jacobians(values, records), weights, strict=True):
+        reached = np.einsum("avn,vk->akn", jacobian, directions)
         hat = np.einsum("avn,bvn->nab", reached, reached)
-        spread = np.eye(len(reached)) - (2 * weights[factor][part, None, None] - 1) * hat
-        lengths[factor][part] = _lengths(residuals[factor][:, part], spread)
+        sizes, axes = np.linalg.eigh(np.eye(len(reached)) - (2 * weight[:, None, None] - 1) * hat)
+        # sqrt(r' S^-1 r) of each record; directions that nothing controls are left out.
+        along, controlled = np.einsum("nab,an->nb", axes, residual), sizes > UNCONTROLLED
+        squares = np.where(controlled, along**2 / np.where(controlled, sizes, 1.0), 0.0)
+        lengths.append(np.sqrt(np.sum(squares, axis=1)))
     freedom = max(1.0, problem.equations(counted) - inverse.spent)
     tests = sum(len(length) for length in lengths)
-    sizes = [len(residual) for residual in residuals]
-    scales = [
-        max(float(np.median(length)) / median_norm(m), SMALLEST_SCALE) for length, m in zip(lengths, sizes, strict=True)
-    ]
-    limits = [float(np.sqrt(m * fdtri(m, freedom, 1 - LEVEL / max(1, tests)))) for m in sizes]
+    rows = [len(residual) for residual in residuals]
+    typical = [float(np.median(length)) / median_norm(m) for length, m in zip(lengths, rows, strict=True)]
+    scales = [max(scale, SMALLEST_SCALE) for scale in typical]
+    limits = [float(np.sqrt(m * fdtri(m, freedom, 1 - LEVEL / max(1, tests)))) for m in rows]
     studentised = [length / scale for length, scale in zip(lengths, scales, strict=True)]
     return Distances(tuple(studentised), tuple(limits), tuple(scales))
 
@@ -76,35 +80,12 @@ def remaining(
 ) -> tuple[Array, ...]:
     """Whitened residuals (n_r x N) times the roots of the records' own weights.
 
-    Of drifting records less the drift that they tell of with these further weights (N each).
+    Of drifting records less the drift that they determine with these further weights (N each).
     """
-    found, shared = problem.weighted_residuals(values, records), records[0].correlation
-    told_by = problem.weighted(records, weights) if shared is not None else records
-    correlation = told_by[0].correlation
+    residuals, shared = problem.weighted_residuals(values, records), records[0].correlation
+    weighed = problem.weighted(records, weights) if shared is not None else records
+    correlation = weighed[0].correlation
     if shared is None or correlation is None:
-        return found
-    states = correlation.states([r[:, :, None] for r in problem.weighted_residuals(values, told_by)])
-    return tuple(r - shared.taken_up(i, states)[:, : r.shape[1], 0] for i, r in enumerate(found))
-
-
-def _reached(
-    problem: Problem, values: Array, records: Sequence[FactorRecords], half: Array
-) -> Iterator[tuple[int, slice, Array]]:
-    """J B of each block of records (n_r x k x B), with its factor and place; records are those of weight one."""
-    to_directions = problem.parameters.entries_jacobian(values) @ half
-    blocks = problem.jacobians(values, records)
-    for factor, record in enumerate(records):
-        start = 0
-        while start < record.record.shape[1]:
-            jacobian = next(blocks)
-            stop = min(start + jacobian.shape[2], record.count)
-            yield factor, slice(start, stop), np.einsum("avn,vk->akn", jacobian[:, :, : stop - start], to_directions)
-            start += jacobian.shape[2]
-
-
-def _lengths(residuals: Array, spread: Array) -> Array:
-    """sqrt(r' S^-1 r) of each record; directions that nothing controls are left out."""
-    sizes, axes = np.linalg.eigh(spread)
-    along = np.einsum("nab,an->nb", axes, residuals)
-    controlled = sizes > UNCONTROLLED
-    return np.asarray(np.sqrt(np.sum(np.where(controlled, along**2 / np.where(controlled, sizes, 1.0), 0.0), axis=1)))
+        return residuals
+    states = correlation.states([r[:, :, None] for r in problem.weighted_residuals(values, weighed)])
+    return tuple(r - shared.taken_up(i, states)[:, : r.shape[1], 0] for i, r in enumerate(residuals))

@@ -25,7 +25,7 @@ from armcal.problem.factor_records import correlation_of
 from armcal.problem.problem import FactorRecords, Problem
 
 _FEWEST = 20
-_TOLD_SD = 3.0
+_SIGNIFICANT_SD = 3.0
 _LONGEST = 50.0
 _WEIGHTS = np.geomspace(1.0, 1e5, 51)
 """Of the declared noise, in records: those that are tried."""
@@ -70,6 +70,8 @@ def residual_spread(
         return {name: ResidualSpread(np.diag(sd**2), 0.0, 1.0, freedom=known) for name, sd in noise.items()}
     # Parameters that were fitted make residuals too small.
     freedom = known / max(problem.equations(records), 1)
+    channel = "sequence" if dataset.has("sequence") else "record"
+    places = dataset.column("sequence") if dataset.has("sequence") else np.arange(len(dataset), dtype=float)
     residual_spreads, residuals = {}, problem.residuals(estimate.values, records)
     for kernel, record, residual in zip(problem.kernels, records, residuals, strict=True):
         weight = np.minimum(record.weight[: record.count], 1.0) * record.measured
@@ -79,11 +81,11 @@ def residual_spread(
         roots = residual[:, kept] * np.sqrt(weight[kept])
         count = float(weight.sum()) * freedom
         covariance, weighed = _shrunk(roots @ roots.T, count, np.array(kernel.factor.noise), estimate.noise_scale)
-        whitened = _whitened(covariance, residual[:, kept])
-        share, over = _shared(whitened, _places(dataset)[kept])
-        residual_spreads[kernel.factor.name] = ResidualSpread(
-            covariance, share, over, "sequence" if dataset.has("sequence") else "record", min(weighed, known)
-        )
+        size, directions = np.linalg.eigh(covariance)
+        inverse = np.where(size > 1e-12 * size[-1], 1 / np.sqrt(np.maximum(size, 1e-300)), 0.0)
+        share, over = _shared((directions * inverse).T @ residual[:, kept], places[kept])
+        spread = ResidualSpread(covariance, share, over, channel, min(weighed, known))
+        residual_spreads[kernel.factor.name] = spread
     return residual_spreads
 
 
@@ -109,16 +111,6 @@ def _shrunk(products: Array, count: float, noise: Array, scale: float) -> tuple[
     return covariance, min(weight + count, max(rows * count, 1.0))
 
 
-def _places(dataset: Dataset) -> Array:
-    return dataset.column("sequence") if dataset.has("sequence") else np.arange(len(dataset), dtype=float)
-
-
-def _whitened(covariance: Array, residual: Array) -> Array:
-    size, directions = np.linalg.eigh(covariance)
-    inverse = np.where(size > 1e-12 * size[-1], 1 / np.sqrt(np.maximum(size, 1e-300)), 0.0)
-    return np.asarray((directions * inverse).T @ residual)
-
-
 def _shared(whitened: Array, places: Array) -> tuple[float, float]:
     """Share and distance; none where chance may have made the correlation."""
     order = np.argsort(places, kind="stable")
@@ -128,7 +120,7 @@ def _shared(whitened: Array, places: Array) -> tuple[float, float]:
     total = float(np.sum(series**2)) / count
     first, second = (float(np.sum(series[:, lag:] * series[:, :-lag])) / (count - lag) / total for lag in (1, 2))
     spacing = float(np.median(np.diff(places[order]))) or 1.0
-    if first < _TOLD_SD / np.sqrt(count * len(series)):
+    if first < _SIGNIFICANT_SD / np.sqrt(count * len(series)):
         return 0.0, 1.0
     decay = float(np.clip(second / first, np.exp(-1.0), np.exp(-1.0 / _LONGEST)))
     return float(np.clip(first / decay, 0.0, 0.95)), float(-spacing / np.log(decay))

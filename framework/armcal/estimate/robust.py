@@ -86,12 +86,12 @@ def scales_of(
     count = problem.equations(records)
     if freedom < 1:
         return (1.0,) * len(records)
-    found: list[float] = []
+    scales: list[float] = []
     for kernel, record, length in zip(problem.kernels, records, lengths, strict=True):
         counted = length[record.weight[: record.count] > 0]
         typical = float(np.median(counted)) / median_norm(kernel.factor.residual.numel()) if len(counted) else 1.0
-        found.append(max(typical * float(np.sqrt(count / freedom)), SMALLEST_SCALE))
-    return tuple(found)
+        scales.append(max(typical * float(np.sqrt(count / freedom)), SMALLEST_SCALE))
+    return tuple(scales)
 
 
 def robust_cost(
@@ -127,20 +127,21 @@ def reweighted(
         if not number:
             freedom = degrees_of_freedom(problem, solution.values, records)
         if settling:
-            found = scales_of(problem, lengths, records, freedom)
-            settling = number < MOST_SCALE_ROUNDS and not np.allclose(found, scales, rtol=SCALE_SETTLED, atol=0)
-            scales = found
+            before, scales = scales, scales_of(problem, lengths, records, freedom)
+            settling = number < MOST_SCALE_ROUNDS and not np.allclose(scales, before, rtol=SCALE_SETTLED, atol=0)
         following = tuple(loss.weight(u / s) for loss, u, s in zip(kinds, lengths, scales, strict=True))
         moved = max(float(np.abs(a - b).max(initial=0.0)) for a, b in zip(weights, following, strict=True))
         cost = robust_cost(problem, solution.values, lengths, scales, kinds)
         rounds.append(Round("scale" if settling else "weights", cost, moved))
         if not settling and moved <= WEIGHTS_SETTLED:
-            return RobustFit(_told(solution, f"{name} settled after {number} rounds"), weights, scales, tuple(rounds))
+            return RobustFit(
+                _with_status(solution, f"{name} settled after {number} rounds"), weights, scales, tuple(rounds)
+            )
         weights = following
         progress(f"{name} loss", number / MOST_ROUNDS)
         solution = _continued(solution, problem, problem.weighted(records, weights), estimator)
     text = f"{name}: weights still moved by {rounds[-1].moved:.1e} after {MOST_ROUNDS} rounds"
-    return RobustFit(_told(solution, text, converged=False), weights, scales, tuple(rounds))
+    return RobustFit(_with_status(solution, text, converged=False), weights, scales, tuple(rounds))
 
 
 def selected(
@@ -161,36 +162,30 @@ def selected(
         if not fit.solution.verdict.converged:
             return fit
         distances = studentised_distances(problem, fit.solution.values, records, fit.weights)
-        following, told = _selection(distances.beyond(), most)
-        key = b"".join(each.tobytes() for each in following)
+        following, warning = _selection(distances.beyond(), most)
+        key = b"".join(weights.tobytes() for weights in following)
         fit = replace(fit, scales=distances.scales)
         if seen and key == seen[-1]:
             return _noted(fit, f"selection settled after {number} rounds")
         if key in seen:
-            told = "which records are set aside did not settle: some come and go. The last choice was kept."
-            return _noted(fit, "selection goes round in circles", told)
+            warning = "which records are set aside did not settle: some come and go. The last choice was kept."
+            return _noted(fit, "selection goes round in circles", warning)
         seen.append(key)
         progress("reject", number / MOST_SELECTIONS)
-        fit = _selected_once(problem, records, estimator, fit, following)
-        if told:
-            return _noted(fit, "selection ended at the most that may be set aside", told)
+        kept = problem.weighted(records, following)
+        moved = max(float(np.abs(a - b).max(initial=0.0)) for a, b in zip(fit.weights, following, strict=True))
+        solution = _continued(fit.solution, problem, kept, estimator)
+        rounds = (*fit.rounds, Round("selection", problem.cost(solution.values, kept), moved))
+        fit = replace(fit, solution=solution, weights=following, rounds=rounds)
+        if warning:
+            return _noted(fit, "selection ended at the most that may be set aside", warning)
     text = f"selection did not settle in {MOST_SELECTIONS} rounds"
-    return replace(fit, solution=_told(fit.solution, text, converged=False))
-
-
-def _selected_once(
-    problem: Problem, records: Sequence[FactorRecords], estimator: Estimator, before: RobustFit, weights: Weights
-) -> RobustFit:
-    kept = problem.weighted(records, weights)
-    moved = max(float(np.abs(a - b).max(initial=0.0)) for a, b in zip(before.weights, weights, strict=True))
-    solution = _continued(before.solution, problem, kept, estimator)
-    done = Round("selection", problem.cost(solution.values, kept), moved)
-    return RobustFit(solution, weights, before.scales, (*before.rounds, done), before.warnings)
+    return replace(fit, solution=_with_status(fit.solution, text, converged=False))
 
 
 def _noted(fit: RobustFit, status: str, warning: str = "") -> RobustFit:
     warnings = (*fit.warnings, warning) if warning else fit.warnings
-    return replace(fit, solution=_told(fit.solution, status), warnings=warnings)
+    return replace(fit, solution=_with_status(fit.solution, status), warnings=warnings)
 
 
 def influence(
@@ -221,7 +216,7 @@ def _selection(beyond: Weights, most: float) -> tuple[Weights, str]:
     every = np.concatenate(beyond)
     count, allowed = int(np.sum(every > 1)), int(most * len(every))
     if count <= allowed:
-        return tuple(np.where(each > 1, 0.0, 1.0) for each in beyond), ""
+        return tuple(np.where(limits > 1, 0.0, 1.0) for limits in beyond), ""
     aside = np.argsort(-every, kind="stable")[:allowed]
     kept = np.ones(len(every))
     kept[aside] = 0.0
@@ -229,7 +224,7 @@ def _selection(beyond: Weights, most: float) -> tuple[Weights, str]:
         f"{count} of {len(every)} records lie beyond the limit and only {allowed} ({most:.0%}) may be set aside: these "
         "are no few outliers. Look at the model, the noise and the data before raising noise.most_rejected."
     )
-    return tuple(np.split(kept, np.cumsum([len(each) for each in beyond])[:-1])), text
+    return tuple(np.split(kept, np.cumsum([len(limits) for limits in beyond])[:-1])), text
 
 
 def _continued(before: Solution, problem: Problem, records: Sequence[FactorRecords], estimator: Estimator) -> Solution:
@@ -238,17 +233,11 @@ def _continued(before: Solution, problem: Problem, records: Sequence[FactorRecor
     A solver that starts at its answer may find no direction to go; if no step would gain anything, it is there.
     """
     after, past = estimator.solve(problem, records, before.values), before.verdict
-    solver_verdict = after.verdict
-    if not solver_verdict.converged and _at_rest(problem, records, after.values):
-        solver_verdict = replace(
-            solver_verdict, converged=True, status=f"{solver_verdict.status} (no step gains anything)"
-        )
-    solver_verdict = replace(
-        solver_verdict,
-        iterations=past.iterations + solver_verdict.iterations,
-        seconds=past.seconds + solver_verdict.seconds,
-    )
-    return Solution(after.values, solver_verdict)
+    verdict = after.verdict
+    if not verdict.converged and _at_rest(problem, records, after.values):
+        verdict = replace(verdict, converged=True, status=f"{verdict.status} (no step gains anything)")
+    iterations, seconds = past.iterations + verdict.iterations, past.seconds + verdict.seconds
+    return Solution(after.values, replace(verdict, iterations=iterations, seconds=seconds))
 
 
 def _at_rest(problem: Problem, records: Sequence[FactorRecords], values: Array) -> bool:
@@ -266,8 +255,8 @@ def _at_rest(problem: Problem, records: Sequence[FactorRecords], values: Array) 
     return float(step @ model.hessian @ step) <= (AT_REST * noise) ** 2
 
 
-def _told(solution: Solution, text: str, converged: bool | None = None) -> Solution:
-    """The solution with a word added to its status."""
+def _with_status(solution: Solution, text: str, converged: bool | None = None) -> Solution:
+    """The solution with a text added to its status."""
     past = solution.verdict
     done = past.converged if converged is None else past.converged and converged
     return Solution(solution.values, replace(past, status=f"{past.status}; {text}", converged=done))

@@ -1,12 +1,13 @@
-"""Simulators: datasets from a stated truth, through the same model that is calibrated."""
+"""Simulators: datasets, or whole missions with a truth over time, through the same model that is calibrated."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
+from numpy.typing import NDArray
 
 from armcal.arm.assembly import Arm
 from armcal.arm.environment import Environment
@@ -16,6 +17,9 @@ from armcal.base.parameters import Parameters
 from armcal.measure.measurement import Measurement
 from armcal.problem.problem import Problem
 from armcal.problem.readings import disturbed_records
+
+DAY_S = 86400.0
+EventKind = Literal["slip", "swap", "bump"]
 
 
 @dataclass(frozen=True)
@@ -29,7 +33,7 @@ class SimulationRequest:
 
 
 class Simulator(Protocol):
-    """What a plugin provides to make datasets up."""
+    """What a plugin provides to simulate datasets."""
 
     def simulate(self, request: SimulationRequest) -> Dataset:
         """Records with a known truth; the same request gives the same records."""
@@ -90,3 +94,79 @@ def measured_with_noise(
 def with_channels(dataset: Dataset, channels: Mapping[str, Array]) -> Dataset:
     """The dataset with channels added or exchanged."""
     return replace(dataset, channels={**dataset.channels, **{k: np.asarray(v) for k, v in channels.items()}})
+
+
+@dataclass(frozen=True)
+class MissionEvent:
+    """Something that happened to the arm or the camera.
+
+    Attributes:
+        kind: ``slip`` (a horn slipped on its shaft), ``swap`` (a servo was replaced), ``bump`` (the camera moved).
+        time: s since the mission began.
+        joint: whose, ``arm.q3``; empty for the camera.
+        label: a few words for figures and tables.
+    """
+
+    kind: EventKind
+    time: float
+    joint: str
+    label: str
+
+
+class MissionTruth(Protocol):
+    """The truth at any time of the mission (s since it began)."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The canonical entries of all parameters."""
+
+    @property
+    def moving(self) -> tuple[str, ...]:
+        """Those that change over the mission."""
+
+    def values_at(self, times: Array) -> Array:
+        """Value vectors (N x entries, SI)."""
+
+    def camera_T_base_at(self, times: Array) -> Array:  # noqa: N802
+        """Where what is measured in the base frame is seen, once the camera has moved (N x 4 x 4, m)."""
+
+    def temperature_at(self, times: Array) -> Array:
+        """N, degrees Celsius."""
+
+
+@dataclass(frozen=True)
+class Mission:
+    """A simulated mission.
+
+    Attributes:
+        records: what arrived, in order.
+        times: of the records, s since the mission began (N).
+        outliers: which measurements were made wrong (N).
+        truth: at any time.
+        events: in order.
+        power_cuts: s since the mission began, in order.
+        began: what the records' clock showed when the mission began, s.
+        seconds: how long it lasts.
+        lost: how many records never arrived.
+    """
+
+    records: Dataset
+    times: Array
+    outliers: NDArray[np.bool_]
+    truth: MissionTruth
+    events: tuple[MissionEvent, ...]
+    power_cuts: tuple[float, ...]
+    began: float
+    seconds: float
+    lost: int
+
+
+@runtime_checkable
+class MissionSimulator(Protocol):
+    """A simulator that knows the truth over time."""
+
+    def simulate(self, request: SimulationRequest) -> Dataset:
+        """The records alone."""
+
+    def mission(self, request: SimulationRequest) -> Mission:
+        """Records and truth; the same request gives the same mission."""

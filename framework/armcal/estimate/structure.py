@@ -1,4 +1,4 @@
-"""Why a combination is undetermined: no poses could tell, these poses do not, or only not at these values.
+"""Why a combination is undetermined: no poses determine it, these poses do not, or only not at these values.
 
 A model is analytic, so its rank is the same almost everywhere; random poses at a point near the values at hand show
 it with probability one, and what is undetermined there is a gauge.
@@ -7,6 +7,7 @@ it with probability one, and what is undetermined there is a gauge.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -18,12 +19,12 @@ from armcal.errors import NotConvergedError
 from armcal.estimate.combination import Combination, named
 from armcal.estimate.identifiability import RANK_TOLERANCE, Identifiability, analyse, measures_of
 from armcal.estimate.null_space import null_rows, sparse_basis
-from armcal.problem.factor import Factor
 from armcal.problem.problem import FactorRecords, Problem
 from armcal.problem.projection import approach_channels, factor_at_zero, fits, joint_channels, projected
+from armcal.problem.tool_motion import along, apart_from, tools, unseen_motions
 
 Cause = Literal["gauge", "values", "poses", "unknown"]
-SAID: dict[Cause, str] = {
+CAUSES: dict[Cause, str] = {
     "gauge": "a gauge: no poses would tell",
     "values": "not seen at these values, only away from them",
     "poses": "these poses do not tell, others would",
@@ -38,6 +39,11 @@ _BEYOND = 0.7
 _WITHIN = 1e-2
 """Sine of the angle within which a direction is the one that is undetermined there."""
 _NAMED = 1e-4
+UNSEEN_SCALE = "scale is not observable: the same arm, larger or smaller with all it touches, fits as well"
+GIVE_A_LENGTH = "give one length: a known distance, a tracker's record, or a dimension of the arm that is held"
+_GROWTH_LEFT = 1e-4
+"""Of the size of the workspace: what may be left of a growth of all tool positions in proportion."""
+_POSES = 60
 
 
 @dataclass(frozen=True)
@@ -49,7 +55,7 @@ class Undetermined:
     priors: tuple[str, ...]
 
     def __str__(self) -> str:
-        return f"{self.combination}: {SAID[self.cause]}"
+        return f"{self.combination}: {CAUSES[self.cause]}"
 
 
 def identify(problem: Problem, values: Array, records: Sequence[FactorRecords]) -> Identifiability:
@@ -75,7 +81,15 @@ def explain(
         return ()
     held = problem.parameters.prior_information() > 0
     priors = {name for name, has in zip(known.names, held, strict=True) if has}
-    vectors, causes = _by_cause(problem, values, records, null)
+    causes: list[Cause] = ["unknown"] * len(null)
+    nested: tuple[Array, ...] = ()
+    with suppress(NotConvergedError):
+        if all(record.count for record in records):
+            gauge, here = nested = _nested(problem, values, records, null)
+            causes = ["gauge"] * len(gauge)
+            causes += ["values"] * (len(here) - len(gauge))
+            causes += ["poses"] * (len(null) - len(here))
+    vectors = sparse_basis(null, nested, _WITHIN)
     combinations = [named(vector, known.names, known.measures, _NAMED) for vector in vectors]
     return tuple(
         Undetermined(combination, cause, tuple(name for name in combination.names if name in priors))
@@ -112,38 +126,14 @@ def random_records(problem: Problem, records: Sequence[FactorRecords], seed: int
         rows = np.flatnonzero(factor_records.weight[: factor_records.count])
         chosen = random.choice(rows if len(rows) else np.arange(factor_records.count), count)
         (drawn,) = Problem.subset([factor_records], chosen.astype(np.intp))
-        record = _spread(kernel.factor, factor_records, drawn.record.copy(), random)
+        record, joints = drawn.record.copy(), list(joint_channels(kernel.factor))
+        seen, approaches = factor_records.record[joints, : factor_records.count], list(approach_channels(kernel.factor))
+        lowest, highest = seen.min(axis=1) - _BEYOND, seen.max(axis=1) + _BEYOND
+        record[joints] = random.uniform(lowest[:, None], highest[:, None], (len(joints), record.shape[1]))
+        record[approaches] = random.choice([-1.0, 1.0], (len(approaches), record.shape[1]))
         weight = (np.arange(record.shape[1]) < count).astype(float)
         result.append(replace(drawn, record=record, weight=weight, state=np.zeros_like(drawn.state)))
     return tuple(result)
-
-
-def _spread(factor: Factor, factor_records: FactorRecords, record: Array, random: np.random.Generator) -> Array:
-    joints, approaches = list(joint_channels(factor)), list(approach_channels(factor))
-    seen = factor_records.record[joints, : factor_records.count]
-    lowest, highest = seen.min(axis=1) - _BEYOND, seen.max(axis=1) + _BEYOND
-    record[joints] = random.uniform(lowest[:, None], highest[:, None], (len(joints), record.shape[1]))
-    record[approaches] = random.choice([-1.0, 1.0], (len(approaches), record.shape[1]))
-    return record
-
-
-def _by_cause(
-    problem: Problem, values: Array, records: Sequence[FactorRecords], null: Array
-) -> tuple[Array, list[Cause]]:
-    causes: list[Cause] = ["unknown"] * len(null)
-    if not all(record.count for record in records):
-        return sparse_basis(null), causes
-    try:
-        gauge, here = _nested(problem, values, records, null)
-    except NotConvergedError:
-        return sparse_basis(null), causes
-    counts: dict[Cause, int] = {
-        "gauge": len(gauge),
-        "values": len(here) - len(gauge),
-        "poses": len(null) - len(here),
-    }
-    causes = [cause for cause, count in counts.items() for _ in range(count)]
-    return sparse_basis(null, (gauge, here), _WITHIN), causes
 
 
 def _nested(problem: Problem, values: Array, records: Sequence[FactorRecords], null: Array) -> tuple[Array, Array]:
@@ -173,3 +163,23 @@ def _scaled(problem: Problem, values: Array, poses: Sequence[FactorRecords]) -> 
 
 def _largest(matrix: Array) -> float:
     return float(np.linalg.norm(matrix, 2)) if matrix.size else 0.0
+
+
+def scale_is_unseen(problem: Problem, values: Array, records: Sequence[FactorRecords], known: Identifiability) -> bool:
+    """Whether some undetermined combination makes all tools' positions grow in proportion.
+
+    Contacts fit a smaller arm in a smaller world just as well. The tools decide, not the parameters: which numbers
+    take part in a growth differs from model to model. A growth may go along with a motion of everything, and with
+    another point of a tool being the one that is meant.
+
+    Raises:
+        NotConvergedError: a pose has no elastic equilibrium.
+    """
+    if not len(known.null):
+        return False
+    poses = problem.subset(random_records(problem, records), np.arange(_POSES, dtype=np.intp))
+    at, axes = tools(problem, values, poses)
+    moves = [along(problem, values, poses, direction) for direction in known.null]
+    growth = (at - at.mean(axis=(0, 2), keepdims=True)).ravel()
+    left = apart_from(np.array([move.ravel() for move in moves] + unseen_motions(at, axes)).T, growth[:, None])
+    return bool(np.linalg.norm(left) < _GROWTH_LEFT * np.linalg.norm(growth))

@@ -61,20 +61,20 @@ def summarise(errors: Array) -> ErrorSummary:
 
 
 def record_errors(
-    problem: Problem, values: Array, records: Sequence[FactorRecords], told_by: Sequence[FactorRecords] | None = None
+    problem: Problem, values: Array, records: Sequence[FactorRecords], training: Sequence[FactorRecords] | None = None
 ) -> Array:
     """How far each record's measurement lies from the prediction; root mean square over several measurements (N).
 
     In m, angles left out; in rad where nothing measured is a length (``error_unit``). Groups that the problem holds,
     as those that no training record touched, are fitted to these records first: what is left is how far the records
-    of a group disagree. ``told_by`` are the records that tell how far drifting parameters had drifted; without them
-    they are at rest.
+    of a group disagree. ``training`` are the records that determine how far drifting parameters had drifted; without
+    them they are at rest.
     """
     values = settled(problem, values, records)
-    found = problem.residuals(values, records) if told_by is None else residuals(problem, values, records, told_by)
+    raw = problem.residuals(values, records) if training is None else residuals(problem, values, records, training)
     squares, count = np.zeros((2, records[0].count))
     counted = error_dimension(problem)
-    for kernel, record, residual in zip(problem.kernels, records, found, strict=True):
+    for kernel, record, residual in zip(problem.kernels, records, raw, strict=True):
         rows = np.array([dimension == counted for dimension in kernel.factor.dimensions], dtype=bool)
         if rows.any():
             squares += np.where(record.measured, np.sum(residual[rows] ** 2, axis=0), 0.0)
@@ -94,7 +94,7 @@ def in_unit(content: Any, unit: str) -> Any:
         return content
     if isinstance(content, Mapping):
         return {re.sub("_mm$", f"_{unit}", str(key)): in_unit(value, unit) for key, value in content.items()}
-    return [in_unit(each, unit) for each in content] if isinstance(content, list | tuple) else content
+    return [in_unit(value, unit) for value in content] if isinstance(content, list | tuple) else content
 
 
 def error_dimension(problem: Problem) -> str:
@@ -123,14 +123,14 @@ def split_by_id(ids: Sequence[str], train_ids: Sequence[str]) -> Split:
     Raises:
         ProblemError: an id is not among the records, or none is left to train on.
     """
-    texts = set(train_ids)
-    missing = sorted(texts - set(ids))
+    training = set(train_ids)
+    missing = sorted(training - set(ids))
     if missing:
         raise ProblemError(
-            f"{len(missing)} of {len(texts)} training ids are not in the data, the first: {missing[0]}.",
+            f"{len(missing)} of {len(training)} training ids are not in the data, the first: {missing[0]}.",
             hint="Check that the list belongs to this dataset; records set aside on reading cannot train.",
         )
-    inside = np.array([record in texts for record in ids], dtype=bool)
+    inside = np.array([record in training for record in ids], dtype=bool)
     return Split(np.flatnonzero(inside), np.flatnonzero(~inside))
 
 
@@ -179,7 +179,8 @@ class FitTask:
         return train, held
 
     def trained(self) -> FitTask:
-        """The task with what its training records can tell of groups."""
+        """The task without the groups that no training record belongs to."""
+
         train, _ = self.parts()
         return replace(self, problem=restricted(self.problem, train))
 
@@ -228,7 +229,7 @@ def judged_fit(
     held: Sequence[FactorRecords],
     began: float,
 ) -> JudgedFit:
-    """What a solution on the training records says of the others.
+    """Errors of the other records by a solution on the training records.
 
     Raises:
         NotConvergedError: a record has no elastic equilibrium there.
@@ -241,7 +242,7 @@ def judged_fit(
 
 
 def failed_fit(task: FitTask, began: float) -> JudgedFit:
-    """Nothing is known."""
+    """Errors that are not known: nan."""
     nothing = np.full(len(task.split.holdout), np.nan)
     return JudgedFit(nothing, nothing, False, time.perf_counter() - began)
 

@@ -8,7 +8,7 @@ took out of the residuals, by average-information steps [Gilmour1995] kept above
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -20,9 +20,8 @@ from armcal.errors import ProblemError
 from armcal.estimate.estimator import CONFIDENCE, degrees_of_freedom
 from armcal.estimate.identifiability import CORRELATED
 from armcal.estimate.likelihood import Term, maximise
-from armcal.problem.kernel import Kernel
+from armcal.problem.factor_records import by_covariance, transformed, whitening_of
 from armcal.problem.problem import FactorRecords, Problem
-from armcal.problem.whitening import by_covariance, declared, transformed
 
 Axes = Literal["together", "apart"]
 
@@ -32,7 +31,7 @@ SMALLEST_SHARE = 1e-6
 
 @dataclass(frozen=True)
 class Component:
-    """One source of scatter.
+    """One source of variance.
 
     Attributes:
         name: an instrument (``tracker``), one of its axes (``tracker.x``) or a joint (``arm.q3``).
@@ -58,7 +57,7 @@ class Component:
 
 @dataclass(frozen=True)
 class VarianceComponents:
-    """What was found.
+    """How much of the residuals is whose.
 
     Attributes:
         components: in the order of instruments, then joints.
@@ -96,33 +95,22 @@ def estimate_components(
     Raises:
         ProblemError: there are not more equations than parameters and components, or parameters drift.
     """
-    names, kinds, bases = _bases(problem, values, records, axes)
-    sizes = np.array([_mean_variance(base, records) for base in bases])
-    joints = np.array([kind == "joint" for kind in kinds])
-    largest = float(sizes[joints].max(initial=0.0))
-    seen = ~joints | (sizes > SMALLEST_SHARE * largest)
+    sources = _sources(problem, values, records, axes)
+    sizes = np.array([_mean_variance(source.bases, records) for source in sources])
+    joints = np.array([source.kind == "joint" for source in sources])
+    seen = ~joints | (sizes > SMALLEST_SHARE * float(sizes[joints].max(initial=0.0)))
     _require_freedom(problem, values, records, int(seen.sum()))
-    chosen = [i for i in range(len(names)) if seen[i]]
-    terms = _terms(problem, values, records, [bases[i] for i in chosen], sizes[chosen])
-    prior = problem.parameters.prior_information()
-    likelihood_maximum = maximise(terms, prior, ~joints[chosen])
-    shares = likelihood_maximum.theta / likelihood_maximum.theta.sum()
-    rms = np.sqrt(likelihood_maximum.theta) * _typical_noise(problem, records)
-    components = tuple(
-        _component(
-            names[i],
-            kinds[i],
-            problem,
-            float(likelihood_maximum.theta[n] / sizes[i]),
-            float(_deviation(likelihood_maximum.covariance, n) / sizes[i]),
-        )
-        for n, i in enumerate(chosen)
-    )
+    chosen, sizes = [source for source, moves in zip(sources, seen, strict=True) if moves], sizes[seen]
+    terms = _terms(problem, values, records, [source.bases for source in chosen], sizes)
+    maximum = maximise(terms, problem.parameters.prior_information(), ~joints[seen])
+    rms = np.sqrt(maximum.theta) * _typical_noise(problem, records)
+    deviations = np.sqrt(np.maximum(np.diag(maximum.covariance), 0.0)) / sizes
+    rows = zip(chosen, maximum.theta / sizes, deviations, maximum.theta / maximum.theta.sum(), rms, strict=True)
     return VarianceComponents(
-        tuple(replace(c, share=float(s), rms=float(r)) for c, s, r in zip(components, shares, rms, strict=True)),
-        _inseparable(likelihood_maximum.covariance, likelihood_maximum.theta, [names[i] for i in chosen]),
-        tuple(names[i] for i in range(len(names)) if not seen[i]),
-        likelihood_maximum.log_likelihood,
+        tuple(_component(source, *map(float, numbers)) for source, *numbers in rows),
+        _inseparable(maximum.covariance, [source.name for source in chosen]),
+        tuple(source.name for source, moves in zip(sources, seen, strict=True) if not moves),
+        maximum.log_likelihood,
     )
 
 
@@ -134,74 +122,56 @@ def apply_components(
     axes: Axes,
 ) -> tuple[FactorRecords, ...]:
     """The same records (which carry the declared noise), whitened by the estimated covariances."""
-    names, _, bases = _bases(problem, values, records, axes)
+    sources = _sources(problem, values, records, axes)
     variance = {c.name: c.sd**2 for c in variance_components.components}
     result = []
     for place, (kernel, factor_records) in enumerate(zip(problem.kernels, records, strict=True)):
-        width = factor_records.record.shape[1]
-        total = sum((variance.get(n, 0.0) * basis[place] for n, basis in zip(names, bases, strict=True)), np.array(0.0))
-        padded = np.concatenate([total, np.repeat(total[:, :, -1:], width - factor_records.count, axis=2)], axis=2)
-        base = _declared(kernel.factor.noise, factor_records)
+        base = whitening_of(kernel.factor, factor_records)
+        total = sum((variance.get(s.name, 0.0) * s.bases[place] for s in sources), np.array(0.0))
+        padded = np.pad(total, ((0, 0), (0, 0), (0, base.shape[2] - factor_records.count)), mode="edge")
         result.append(replace(factor_records, whitening=transformed(by_covariance(padded), base)))
     return tuple(result)
 
 
-def _declared(noise: Sequence[float], factor_records: FactorRecords) -> Array:
-    """Whitening by the declared noise (n_r x n_r x width)."""
-    if factor_records.whitening is not None:
-        return factor_records.whitening
-    return np.repeat(declared(noise)[:, :, None], factor_records.record.shape[1], axis=2)
+@dataclass(frozen=True)
+class _Source:
+    """What a component may come from, and its V by factor (n_r x n_r x N), in units of the declared noise."""
+
+    name: str
+    kind: Literal["instrument", "joint"]
+    unit: str
+    bases: list[Array]
 
 
-def _bases(
-    problem: Problem, values: Array, records: Sequence[FactorRecords], axes: Axes
-) -> tuple[list[str], list[Literal["instrument", "joint"]], list[list[Array]]]:
-    """Names, kinds, and V by component and factor (n_r x n_r x N), in units of the declared noise."""
-    names: list[str] = []
-    kinds: list[Literal["instrument", "joint"]] = []
-    bases: list[list[Array]] = []
-    nothing = [np.zeros((k.factor.residual.numel(),) * 2 + (e.count,)) for k, e in _pairs(problem, records)]
-    for place, (kernel, each) in enumerate(_pairs(problem, records)):
-        for label, diagonal in _groups(problem, kernel.factor.name, kernel.factor.residual.numel(), axes):
-            own = np.repeat(np.diag(diagonal)[:, :, None], each.count, axis=2)
-            names.append(label)
-            kinds.append("instrument")
-            bases.append([own if i == place else none for i, none in enumerate(nothing)])
-    joints = _joints(problem)
-    slopes = problem.channel_slopes(values, records, joints)
+def _sources(problem: Problem, values: Array, records: Sequence[FactorRecords], axes: Axes) -> list[_Source]:
+    """Instruments, or their axes, then joints."""
+    pairs = list(zip(problem.kernels, records, strict=True))
+    nothing = [np.zeros((kernel.factor.residual.numel(),) * 2 + (record.count,)) for kernel, record in pairs]
+    sources = []
+    for place, (kernel, record) in enumerate(pairs):
+        name, count = kernel.factor.name, kernel.factor.residual.numel()
+        parts = [(name, np.ones(count))]
+        if axes == "apart":
+            channels = [channel.name for channel in problem.blueprint.measurements[name].channels()]
+            labels = channels if len(channels) == count else [str(i) for i in range(1, count + 1)]
+            parts = [(f"{name}.{label}", row) for label, row in zip(labels, np.eye(count), strict=True)]
+        for label, diagonal in parts:
+            own = np.repeat(np.diag(diagonal)[:, :, None], record.count, axis=2)
+            bases = [own if i == place else none for i, none in enumerate(nothing)]
+            sources.append(_Source(label, "instrument", "1", bases))
+    joints = {
+        f"{arm.name}.{joint}": "rad" if dimension == "angle" else "m"
+        for arm in problem.blueprint.arms.values()
+        for joint, dimension in arm.commanded.items()
+    }
+    slopes = problem.channel_slopes(values, records, list(joints))
     whitened = [
-        transformed(_declared(kernel.factor.noise, factor_records)[:, :, : factor_records.count], slope)
-        for (kernel, factor_records), slope in zip(_pairs(problem, records), slopes, strict=True)
+        transformed(whitening_of(kernel.factor, record)[:, :, : record.count], slope)
+        for (kernel, record), slope in zip(pairs, slopes, strict=True)
     ]
-    for number, joint in enumerate(joints):
-        names.append(joint)
-        kinds.append("joint")
-        bases.append([w[:, None, number] * w[None, :, number] for w in whitened])
-    return names, kinds, bases
-
-
-def _pairs(problem: Problem, records: Sequence[FactorRecords]) -> Iterable[tuple[Kernel, FactorRecords]]:
-    return zip(problem.kernels, records, strict=True)
-
-
-def _groups(problem: Problem, name: str, count: int, axes: Axes) -> list[tuple[str, Array]]:
-    """The parts of an instrument: label, and which residual entries (1 or 0)."""
-    if axes == "together":
-        return [(name, np.ones(count))]
-    channels = [channel.name for channel in problem.blueprint.measurements[name].channels()]
-    labels = channels if len(channels) == count else [str(i) for i in range(1, count + 1)]
-    return [(f"{name}.{label}", row) for label, row in zip(labels, np.eye(count), strict=True)]
-
-
-def _joints(problem: Problem) -> list[str]:
-    """Joint channels of all arms."""
-    return [f"{arm.name}.{joint}" for arm in problem.blueprint.arms.values() for joint in arm.commanded]
-
-
-def _joint_unit(problem: Problem, channel: str) -> str:
-    arm, _, joint = channel.rpartition(".")
-    found = next(a for a in problem.blueprint.arms.values() if a.name == arm)
-    return "rad" if found.commanded[joint] == "angle" else "m"
+    for number, (joint, unit) in enumerate(joints.items()):
+        sources.append(_Source(joint, "joint", unit, [w[:, None, number] * w[None, :, number] for w in whitened]))
+    return sources
 
 
 def _mean_variance(basis: Sequence[Array], records: Sequence[FactorRecords]) -> float:
@@ -220,13 +190,10 @@ def _terms(
     """Residuals, Jacobians and bases (of mean variance one) of the records that count."""
     parameters = problem.parameters
     chain, moved = parameters.entries_jacobian(values), parameters.coordinates(parameters.local(values))
-    residuals, blocks, terms = problem.whitened_residuals(values, records), problem.jacobians(values, records), []
+    residuals, jacobians, terms = problem.whitened_residuals(values, records), problem.jacobians(values, records), []
     for place, record in enumerate(records):
-        parts: list[Array] = []
-        while sum(part.shape[2] for part in parts) < record.record.shape[1]:
-            parts.append(next(blocks))
         used = np.flatnonzero(record.weight[: record.count] > 0)
-        jacobian = np.einsum("avn,vc->nac", np.concatenate(parts, axis=2)[:, :, used], chain, optimize=True)
+        jacobian = np.einsum("avn,vc->nac", jacobians[place][:, :, used], chain, optimize=True)
         own = np.stack([basis[place][:, :, used] / size for basis, size in zip(bases, sizes, strict=True)])
         target = residuals[place][:, used].T + jacobian @ moved
         terms.append(Term(target, jacobian, np.moveaxis(own, 3, 1)))
@@ -251,33 +218,24 @@ def _require_freedom(problem: Problem, values: Array, records: Sequence[FactorRe
 def _typical_noise(problem: Problem, records: Sequence[FactorRecords]) -> float:
     """Root mean square of the declared noise of the first measurement."""
     kernel, factor_records = problem.kernels[0], records[0]
-    inverse = np.linalg.inv(
-        np.moveaxis(_declared(kernel.factor.noise, factor_records)[:, :, : factor_records.count], 2, 0)
-    )
+    whitening = whitening_of(kernel.factor, factor_records)[:, :, : factor_records.count]
+    inverse = np.linalg.inv(np.moveaxis(whitening, 2, 0))
     return float(np.sqrt(np.mean(np.sum(inverse**2, axis=2))))
 
 
-def _deviation(covariance: Array, place: int) -> float:
-    return float(np.sqrt(max(covariance[place, place], 0.0)))
-
-
-def _component(
-    name: str, kind: Literal["instrument", "joint"], problem: Problem, theta: float, deviation: float
-) -> Component:
+def _component(source: _Source, variance: float, deviation: float, share: float, rms: float) -> Component:
     """From a variance and its deviation; the interval is made on the variance, where the estimate is nearly normal."""
-    reach = float(ndtri(0.5 + CONFIDENCE / 2)) * deviation
-    sd = float(np.sqrt(theta))
+    reach, sd = float(ndtri(0.5 + CONFIDENCE / 2)) * deviation, float(np.sqrt(variance))
     error = deviation / (2 * sd) if sd > 0 else float("nan")
-    lower, upper = float(np.sqrt(max(theta - reach, 0.0))), float(np.sqrt(theta + reach))
-    unit = "1" if kind == "instrument" else _joint_unit(problem, name)
-    return Component(name, kind, unit, sd, error, lower, upper, 0.0, 0.0)
+    lower, upper = float(np.sqrt(max(variance - reach, 0.0))), float(np.sqrt(variance + reach))
+    return Component(source.name, source.kind, source.unit, sd, error, lower, upper, share, rms)
 
 
-def _inseparable(covariance: Array, theta: Array, names: Sequence[str]) -> tuple[tuple[str, str, float], ...]:
-    """Pairs whose estimates hardly differ in what they say of the data."""
+def _inseparable(covariance: Array, names: Sequence[str]) -> tuple[tuple[str, str, float], ...]:
+    """Pairs of components whose estimates are correlated."""
     deviation = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
     correlation = covariance / np.outer(deviation, deviation)
-    rows, columns = np.triu_indices(len(theta), 1)
+    rows, columns = np.triu_indices(len(names), 1)
     return tuple(
         (names[i], names[j], float(correlation[i, j]))
         for i, j in zip(rows.tolist(), columns.tolist(), strict=True)

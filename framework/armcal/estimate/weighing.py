@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Literal
 
 import numpy as np
@@ -33,7 +33,7 @@ MOST_ESTIMATES = 10
 
 
 class NoiseSettings(Settings):
-    """What is believed of the noise.
+    """What is assumed of the noise.
 
     ``loss``: ``none`` is least squares; ``huber`` and ``cauchy`` weigh large residuals less; ``reject`` sets records
     aside and fits the rest, at most the fraction ``most_rejected``. ``estimate`` finds variance components, of each
@@ -48,7 +48,7 @@ class NoiseSettings(Settings):
 
 @dataclass(frozen=True)
 class Suspect:
-    """A record that lies farther from the fit than noise alone takes one record in a hundred experiments.
+    """A record farther from the fit than noise alone takes any record in 99 % of experiments.
 
     Attributes:
         record: its place among the records of the fit.
@@ -128,19 +128,24 @@ class Weighing:
     ) -> WeighedFit:
         """Values, and everything that is known of how records weighed."""
         robust, whitened, components = self._weighed(problem, tuple(records), start, progress)
-        loss, acting = self.settings.loss, None
-        suspects = () if loss == "none" else _suspects(problem, robust, whitened)
+        loss, acting, suspects = self.settings.loss, None, list[Suspect]()
+        if loss != "none":
+            distances = studentised_distances(problem, robust.solution.values, whitened, robust.weights)
+            rows = zip(problem.kernels, distances.studentised, distances.limits, robust.weights, strict=True)
+            for kernel, lengths, limit, weights in rows:
+                for i in np.flatnonzero((lengths > limit) | (weights == 0)):
+                    weight = float(weights[i])
+                    suspects.append(Suspect(int(i), kernel.factor.name, float(lengths[i]), limit, weight))
         if loss == "huber" or loss == "cauchy":
             acting = influence(problem, whitened, robust, loss, self._trusted(problem, whitened, robust))
         elif loss == "reject":
             whitened = problem.weighted(whitened, robust.weights)
-        found = _estimate(problem, whitened, robust.solution, acting)
         return WeighedFit(
             robust.solution,
-            found,
+            _estimate(problem, whitened, robust.solution, acting),
             whitened,
             robust.weights,
-            suspects,
+            tuple(sorted(suspects, key=lambda suspect: -suspect.distance)),
             components,
             loss,
             robust.rounds,
@@ -150,11 +155,26 @@ class Weighing:
     def _weighed(
         self, problem: Problem, records: tuple[FactorRecords, ...], start: Array, progress: Progress
     ) -> tuple[RobustFit, tuple[FactorRecords, ...], VarianceComponents | None]:
-        first = self.inner.solve(problem, records, start, progress)
-        robust = self._robust(problem, records, first, progress)
-        if not self.settings.estimate:
-            return robust, records, None
-        return self._with_components(problem, records, robust, progress)
+        """The fit, its records whitened, and components: these and values in turn, until the components rest.
+
+        Suspects are no evidence of the variances.
+        """
+        robust = self._robust(problem, records, self.inner.solve(problem, records, start, progress), progress)
+        axes, whitened, before = self.settings.axes, records, None
+        for number in range(MOST_ESTIMATES if self.settings.estimate else 0):
+            if not robust.solution.verdict.converged:
+                break
+            progress("variance components", number / MOST_ESTIMATES)
+            counted = problem.weighted(records, self._trusted(problem, whitened, robust))
+            components = estimate_components(problem, robust.solution.values, counted, axes)
+            components = replace(components, rounds=number + 1)
+            if before is not None and components.close_to(before):
+                return robust, whitened, components
+            before = components
+            whitened = apply_components(problem, robust.solution.values, records, components, axes)
+            again = self.inner.solve(problem, whitened, robust.solution.values)
+            robust = self._robust(problem, whitened, again, progress)
+        return robust, whitened, before
 
     def _robust(
         self, problem: Problem, records: tuple[FactorRecords, ...], first: Solution, progress: Progress
@@ -170,34 +190,8 @@ class Weighing:
             return reweighted(problem, records, self.inner, huber.solution, "cauchy", progress)
         return selected(problem, records, self.inner, huber, self.settings.most_rejected, progress)
 
-    def _with_components(
-        self, problem: Problem, records: tuple[FactorRecords, ...], robust: RobustFit, progress: Progress
-    ) -> tuple[RobustFit, tuple[FactorRecords, ...], VarianceComponents | None]:
-        """Components and values in turn, until the components rest; suspects tell nothing of the variances."""
-        axes, whitened, before = self.settings.axes, records, None
-        for number in range(MOST_ESTIMATES):
-            if not robust.solution.verdict.converged:
-                return robust, whitened, before
-            progress("variance components", number / MOST_ESTIMATES)
-            counted = problem.weighted(records, self._trusted(problem, whitened, robust))
-            variance_components = estimate_components(problem, robust.solution.values, counted, axes)
-            variance_components = VarianceComponents(
-                variance_components.components,
-                variance_components.inseparable,
-                variance_components.unseen,
-                variance_components.log_likelihood,
-                number + 1,
-            )
-            if before is not None and variance_components.close_to(before):
-                return robust, whitened, variance_components
-            before = variance_components
-            whitened = apply_components(problem, robust.solution.values, records, variance_components, axes)
-            again = self.inner.solve(problem, whitened, robust.solution.values)
-            robust = self._robust(problem, whitened, again, progress)
-        return robust, whitened, before
-
     def _trusted(self, problem: Problem, records: tuple[FactorRecords, ...], robust: RobustFit) -> tuple[Array, ...]:
-        """1 for records that may tell of the variances, 0 for suspects of a robust fit."""
+        """1 for records that are evidence of the variances, 0 for suspects of a robust fit."""
         if self.settings.loss == "none":
             return robust.weights
         distances = studentised_distances(problem, robust.solution.values, records, robust.weights)
@@ -205,7 +199,7 @@ class Weighing:
 
 
 def weighed(estimator: Estimator, settings: NoiseSettings) -> Estimator:
-    """The estimator as it is where plain least squares is asked for, else one that weighs records."""
+    """The estimator itself for plain least squares, else one that weighs records."""
     return estimator if settings.loss == "none" and not settings.estimate else Weighing(estimator, settings)
 
 
@@ -235,15 +229,3 @@ def _estimate(
         return estimate(problem, records, solution, acting)
     except NotConvergedError as fault:
         raise fault if solution.verdict.converged else gave_up(solution.verdict) from fault
-
-
-def _suspects(problem: Problem, robust: RobustFit, records: tuple[FactorRecords, ...]) -> tuple[Suspect, ...]:
-    """All records beyond their limit, and all that were set aside."""
-    distances = studentised_distances(problem, robust.solution.values, records, robust.weights)
-    suspects = []
-    rows = zip(problem.kernels, distances.studentised, distances.limits, robust.weights, strict=True)
-    for kernel, lengths, limit, weights in rows:
-        for i in np.flatnonzero((lengths > limit) | (weights == 0)):
-            suspect = Suspect(int(i), kernel.factor.name, float(lengths[i]), limit, float(weights[i]))
-            suspects.append(suspect)
-    return tuple(sorted(suspects, key=lambda s: -s.distance))

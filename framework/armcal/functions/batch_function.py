@@ -1,4 +1,4 @@
-"""A CasADi function over many records at once: generated C where a compiler is found, the virtual machine elsewhere.
+"""A CasADi function over many records at once: generated C where a compiler is found, the interpreter elsewhere.
 
 Arrays are stored channel by channel, (entries x records).
 """
@@ -24,7 +24,7 @@ EvaluatorChoice = Literal["auto", "compiled", "interpreted"]
 _ENTRY, _VECTOR = "armcal_evaluate", "armcal_evaluate_vector"
 _AGREEMENT = 1e-9
 _WORTH_COMPILING = 100_000
-"""Records that the virtual machine takes longer for than the compiler takes to make a library."""
+"""Records that the interpreter takes longer for than the compiler takes to make a library."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class BatchFunction:
 
     Attributes:
         function: the CasADi function (SX, dense inputs and outputs).
-        interpreted: the same by CasADi's virtual machine.
+        interpreted: the same by CasADi's interpreter.
         compiled: whether C serves it.
     """
 
@@ -66,7 +66,7 @@ class BatchFunction:
         choice: EvaluatorChoice = "auto",
         loop: Loop | None = None,
     ) -> None:
-        """Build it; ``sample`` are inputs (entries x 8 each) on which C must agree with the virtual machine.
+        """Build it; ``sample`` are inputs (entries x 8 each) on which C must agree with the interpreter.
 
         ``auto`` takes what was compiled before, and else lets the compiler work for the next time once so many records
         were asked for that it would have paid; ``compiled`` waits for it; ``interpreted`` does without. A ``loop`` is
@@ -149,7 +149,7 @@ def _library(
 
 
 def quietly(build: Callable[[], ctypes.CDLL | None]) -> ctypes.CDLL | None:
-    """What was built, or None: an expression without a C form is no fault, the virtual machine serves."""
+    """What was built, or None: an expression without a C form is no fault, the interpreter serves."""
     try:
         return build()
     except c_source.UnsupportedExpressionError:
@@ -193,7 +193,7 @@ def _trial(batch: BatchFunction, sample: Sequence[Array]) -> compiler.Trial:
 
 
 def _agreeing(batch: BatchFunction, library: ctypes.CDLL | None, sample: Sequence[Array]) -> Any:
-    """The library, if it gives the virtual machine's numbers; a miscompiled one is not used."""
+    """The library, if it gives the interpreter's numbers; a miscompiled one is not used."""
     if library is None:
         return None
     library.armcal_evaluate_vector.argtypes = [ctypes.c_void_p, ctypes.c_void_p]

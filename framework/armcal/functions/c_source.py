@@ -2,7 +2,7 @@
 
 CasADi's own generated C is scalar. Here its instruction list is written out over short vectors
 (GNU C vector extensions, understood by gcc and clang on every processor), with what depends on
-parameters alone hoisted out of the loop over records. The virtual machine stays the reference.
+parameters alone hoisted out of the loop over records. The interpreter stays the reference.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class CFunction:
 
 
 class UnsupportedExpressionError(Exception):
-    """An expression has an operation that the C writer does not know; the virtual machine serves."""
+    """An expression has an operation that the C writer does not know; the interpreter serves."""
 
 
 @dataclass(frozen=True)

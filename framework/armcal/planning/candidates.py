@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.base.parameters import Parameters
-from armcal.problem.linearised import BLOCK_RECORDS
 from armcal.problem.problem import Problem, triangular
 from armcal.problem.projection import as_predicted
 
@@ -106,24 +105,9 @@ def whitened_rows(problem: Problem, values: Array, dataset: Dataset) -> Array:
 
     Of poses that are only thought of nothing was measured: what the model predicts stands in for it.
     """
-    scales = problem.parameters.scales()
-    chain = problem.parameters.entries_jacobian(values) * scales
+    chain = problem.parameters.entries_jacobian(values) * problem.parameters.scales()
     records = as_predicted(problem, values, problem.records(dataset))
-    blocks = problem.jacobians(values, records)
-    parts: list[Array] = []
-    for record in records:
-        width = record.record.shape[1]
-        whole: Array | None = None
-        for start in range(0, width, BLOCK_RECORDS):
-            block = next(blocks)
-            if whole is None:
-                whole = np.empty((block.shape[0], record.count, len(scales)))
-            end = min(start + block.shape[2], record.count)
-            for row, jacobian in zip(whole, block, strict=True):
-                row[start:end] = jacobian[:, : max(0, end - start)].T @ chain
-        if whole is not None:
-            parts.append(whole)
-    return np.concatenate(parts) if len(parts) > 1 else parts[0]
+    return np.array([row.T @ chain for jacobian in problem.jacobians(values, records) for row in jacobian])
 
 
 def over_draws(problem: Problem, draws: Sequence[Array], dataset: Dataset) -> Array:

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+
+import numpy as np
 
 from armcal.arm.assembly import Arm
 from armcal.arm.environment import Environment
 from armcal.base.parameters import Parameters
 from armcal.functions.batch_function import EvaluatorChoice
-from armcal.measure.groups import Groups
-from armcal.measure.measurement import Measurement
+from armcal.measure.groups import Groups, group_name, owner_of, ties_of
+from armcal.measure.measurement import GroupedMeasurement, Measurement
 from armcal.problem.factor import build_factor
+from armcal.problem.grouped_kernel import HELD, GroupedKernel
 from armcal.problem.kernel import Kernel, build_kernel
+from armcal.problem.normal_equations import TieFunction
 
 
 @dataclass(frozen=True)
@@ -34,6 +38,34 @@ class Blueprint:
             build_kernel(build_factor(name, measurement, *shared), records, choices[name])
             for name, measurement in self.measurements.items()
         )
+
+    def grouped(self, kernels: Sequence[Kernel], parameters: Parameters) -> tuple[GroupedKernel, ...]:
+        """Each kernel with the places of its values; ``parameters`` are the same blocks with what is free now."""
+        names, compiled, width = parameters.entry_names, self.parameters, len(parameters.free_entries)
+        place = np.full(len(names), HELD, dtype=np.intp)
+        place[list(parameters.free_entries)] = np.arange(width)
+        entries_of = {b.name: range(len(names))[compiled.entries_of(b.name)] for b in compiled.blocks}
+        main = [i for b in compiled.blocks if b.free and not b.nuisance for i in entries_of[b.name]]
+        result = []
+        for kernel, (instance, measurement) in zip(kernels, self.measurements.items(), strict=True):
+            rows, spare = [main], np.zeros(0)
+            if isinstance(measurement, GroupedMeasurement):
+                owner, local = owner_of(instance, measurement), measurement.group_parameters("")
+                spare = np.array([x for block in local for x in block.nominal])
+                own = [
+                    [i for b in local for i in entries_of[group_name(owner, key, b.name)]]
+                    for key in self.groups.get(owner, ())
+                ]
+                rows = [[*main, *group] for group in own or [[HELD] * len(spare)]]
+            entries = np.array(rows, dtype=np.intp).reshape(len(rows), -1)
+            free = np.where(entries == HELD, HELD, place[entries])
+            result.append(GroupedKernel(kernel, entries, free, width, spare))
+        return tuple(result)
+
+    def ties(self) -> tuple[TieFunction, ...]:
+        """What is known between groups beside the records."""
+        owned = ties_of(self.measurements, self.groups)
+        return tuple(TieFunction.of(owned_tie, self.parameters) for owned_tie in owned)
 
     def bare(self) -> Blueprint:
         """The same, its arms without what they keep of their expressions, which cannot be pickled."""

@@ -4,12 +4,12 @@ What drifts are states of unit variance along a chain of nodes (the places of th
 node by itself (Ornstein-Uhlenbeck). With A, the whitened residuals by the states at their nodes, and K, the covariance
 of these, the residuals have the covariance I + A K A'. As the states are a Markov process, a Kalman filter along the
 chain makes the rows independent in time and memory that grow with the records alone, and the smoother on its way back
-tells the states [Rasmussen2006].
+gives the states [Rasmussen2006].
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -32,7 +32,7 @@ class _Node:
         left: how much of each state the node before passes on (n_s); none to the first.
         records: those at this node.
         slopes: their rows by the states (m x n_s).
-        covariance: of the states before these rows tell of them (n_s x n_s).
+        covariance: of the states before these rows are counted (n_s x n_s).
         whitening: inverse of the lower Cholesky factor of these rows' covariance (m x m).
         gain: what these rows change of the states (n_s x m).
     """
@@ -75,32 +75,32 @@ class Correlation:
     def states(self, rows: Sequence[Array]) -> Array:
         """The most likely states (n_k x n_s x k) if whitened and weighted rows are A times them and noise."""
         both = self._stacked(rows)
-        state, found, told = np.zeros((len(self._start), both.shape[2])), [], []
+        state, states, weighed = np.zeros((len(self._start), both.shape[2])), [], []
         for step in self._steps:
             state = step.left[:, None] * state
             new = both[step.records].reshape(-1, both.shape[2]) - step.slopes @ state
-            found.append(state)
-            told.append(step.whitening.T @ (step.whitening @ new))
+            states.append(state)
+            weighed.append(step.whitening.T @ (step.whitening @ new))
             state = state + step.gain @ new
         later = np.zeros_like(state)
-        for k in reversed(range(len(found))):
+        for k in reversed(range(len(states))):
             step = self._steps[k]
-            later = later + step.slopes.T @ (told[k] - step.gain.T @ later)
-            found[k] = found[k] + step.covariance @ later
+            later = later + step.slopes.T @ (weighed[k] - step.gain.T @ later)
+            states[k] = states[k] + step.covariance @ later
             later = step.left[:, None] * later
-        return np.array(found)
+        return np.array(states)
 
     @cached_property
     def covariance(self) -> Array:
-        """Of the states at each node after all rows told of them (n_k x n_s x n_s)."""
-        found, later = [], np.zeros((len(self._start),) * 2)
+        """Of the states at each node given all rows (n_k x n_s x n_s)."""
+        covariances, later = [], np.zeros((len(self._start),) * 2)
         for step in reversed(self._steps):
             passed = np.eye(len(later)) - step.gain @ step.slopes
             own = step.whitening @ step.slopes
             later = own.T @ own + passed.T @ later @ passed
-            found.append(step.covariance - step.covariance @ later @ step.covariance)
+            covariances.append(step.covariance - step.covariance @ later @ step.covariance)
             later = step.left[:, None] * later * step.left
-        return np.array(found[::-1])
+        return np.array(covariances[::-1])
 
     def taken_up(self, factor: int, states: Array) -> Array:
         """What states (n_k x n_s x k) make of a factor's whitened and weighted residuals (n_r x width x k)."""
@@ -127,7 +127,7 @@ class Correlation:
 
     def subset(self, chosen: NDArray[np.intp]) -> Correlation:
         """Some records of all; the same states."""
-        slopes, raw = (tuple(s[:, chosen] for s in each) for each in (self.slopes, self.raw))
+        slopes, raw = (tuple(s[:, chosen] for s in rows) for rows in (self.slopes, self.raw))
         return Correlation(slopes, raw, self.node[chosen], self.apart)
 
     def weighted(self, factors: Sequence[Array]) -> Correlation:
@@ -143,23 +143,20 @@ class Correlation:
 
     @cached_property
     def _steps(self) -> tuple[_Node, ...]:
-        """The filter, which hangs on slopes and places alone."""
-        return tuple(self._filtered())
-
-    def _filtered(self) -> Iterator[_Node]:
+        """The filter, which depends on slopes and places alone."""
         by_record, order = self._stacked(self.slopes), np.argsort(self.node, kind="stable")
         ends = np.searchsorted(self.node[order], np.arange(len(self.apart) + 2))
-        covariance = np.eye(len(self._start))
+        covariance, nodes = np.eye(len(self._start)), []
         for k, left in enumerate([self._start, *kept(self.apart)]):
             covariance = passed_on(covariance, left)
             records = order[ends[k] : ends[k + 1]]
             slopes = by_record[records].reshape(-1, len(left))
             across = slopes @ covariance
-            root = np.linalg.cholesky(np.eye(len(slopes)) + across @ slopes.T)
-            whitening = np.linalg.inv(root)
+            whitening = np.linalg.inv(np.linalg.cholesky(np.eye(len(slopes)) + across @ slopes.T))
             own = whitening @ across
-            yield _Node(left, records, slopes, covariance, whitening, own.T @ whitening)
+            nodes.append(_Node(left, records, slopes, covariance, whitening, own.T @ whitening))
             covariance = covariance - own.T @ own
+        return tuple(nodes)
 
     def _stacked(self, rows: Sequence[Array]) -> Array:
         """Rows of all factors, a record's together (width x R x k); zero where they end before the records."""
@@ -170,6 +167,6 @@ class Correlation:
     @staticmethod
     def _apart(stacked: Array, like: Sequence[Array]) -> tuple[Array, ...]:
         """Stacked rows factor by factor, as long as others."""
-        ends = np.cumsum([len(each) for each in like])[:-1]
+        ends = np.cumsum([len(rows) for rows in like])[:-1]
         parts = np.split(stacked.transpose(1, 0, 2), ends)
-        return tuple(part[:, : each.shape[1]] for part, each in zip(parts, like, strict=True))
+        return tuple(part[:, : rows.shape[1]] for part, rows in zip(parts, like, strict=True))

@@ -1,4 +1,4 @@
-"""One factor type as expressions: what one record says, as a function of values, record and elastic state.
+"""One factor type as expressions: residuals of one record as a function of values, record and elastic state.
 
 The elastic equilibrium ``state = pass(state)`` is never unrolled. At a state d near it, with pass F and
 residual r, everything follows from one pass and a small solve:
@@ -12,7 +12,7 @@ parameters, and r* is the residual in equilibrium up to the square of what is le
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,7 +22,7 @@ from armcal.arm.assembly import Arm, ArmInputs, ArmState, scoped
 from armcal.arm.environment import STATICS, Environment, Vector3, tilted
 from armcal.arm.statics import Load
 from armcal.base import se3
-from armcal.base.parameters import Parameters
+from armcal.base.parameters import ParameterBlock, Parameters
 from armcal.base.se3 import Expression
 from armcal.errors import ProblemError
 from armcal.measure.measurement import GroupedMeasurement, Measurement, noise_channels, residual_dimensions
@@ -46,8 +46,8 @@ class Factor:
         noise: standard deviation of each residual entry.
         noise_channels: of each residual entry, the channels that may carry a record's own one, the nearest first.
         dimensions: ``length`` or ``angle`` of each residual entry.
-        told: what the record alone says of these, to start from; empty where it says nothing.
-        nuisance_names: local names of the group's parameters that ``told`` holds the entries of, one an entry.
+        nuisance_starts: entries of the group's parameters by the record alone, to start from; empty for none.
+        nuisance_names: local names of the parameters of these entries, one an entry.
         mean_weight: how many times more the mean of a group's residuals weighs.
         springs: of each number of the state, what gives, in words.
         joints: channels of commanded joints, each with ``angle`` or ``length``.
@@ -66,7 +66,7 @@ class Factor:
     noise: tuple[float, ...]
     noise_channels: tuple[tuple[str, ...], ...] = ()
     dimensions: tuple[str, ...] = ()
-    told: Expression = None
+    nuisance_starts: Expression = None
     nuisance_names: tuple[str, ...] = ()
     mean_weight: float = 1.0
     springs: tuple[str, ...] = ()
@@ -86,8 +86,8 @@ class Factor:
         return ca.Function("outputs", self._inputs, [self.next_state, shown], {"cse": True})
 
     def nuisance_function(self) -> ca.Function:
-        """(values, record, state) -> (next state, what the record says of its group's parameters)."""
-        return ca.Function("told", self._inputs, [self.next_state, ca.densify(self.told)], {"cse": True})
+        """(values, record, state) -> (next state, where the record has its group's parameters start)."""
+        return ca.Function("starts", self._inputs, [self.next_state, ca.densify(self.nuisance_starts)], {"cse": True})
 
     def linearise_function(self) -> ca.Function:
         """(values, record, state) -> (next state, residual, Jacobian transposed), in equilibrium to second order."""
@@ -158,7 +158,7 @@ class Factor:
 
 
 class _Records:
-    """Hands out a symbol for each channel that is asked for, and remembers their order."""
+    """A symbol for each channel that an expression reads, in the order in which they are read first."""
 
     def __init__(self, available: frozenset[str]) -> None:
         self._available = available
@@ -193,26 +193,22 @@ def build_factor(
     available: frozenset[str],
 ) -> Factor:
     """The expressions of one measurement; ``available`` are the channels of the records, ``environment`` the rest."""
-    symbols, values = _value_expressions(parameters)
-    group, of_group = _group_expressions(measurement)
-    records = _Records(available)
-    load = tilted(_load(records, environment), scoped(values, f"{STATICS}."))
-    states, deflections = {}, []
-    for arm_name in measurement.arms:
-        arm = arms[arm_name.removesuffix(OTHER)]
-        deflections.append(ca.SX.sym(f"deflection_{arm_name}", arm.deflection_size))
-        which = arm_name.removeprefix(arm.name)
-        states[arm_name] = _arm_state(arm, which, values, records, load, deflections[-1])
+    symbols, values = _symbols("values", [block for block in parameters.free if not block.nuisance])
+    values |= {b.name: ca.SX(list(b.nominal)) for b in parameters.blocks if not (b.free or b.nuisance)}
+    groups = measurement if isinstance(measurement, GroupedMeasurement) else None
+    group, of_group = _symbols("group", groups.group_parameters("") if groups else ())
+    records, states, deflections = _arm_states(measurement, arms, values, environment, available)
     local = {**scoped(values, f"{name}."), **of_group}
     predicted = measurement.outputs(states, local)
     measured = {c.name: records.optional(f"{name}.{c.name}", 0.0) for c in measurement.channels()}
-    residual = measurement.residual(states, measured, local)
+    residual = _checked(name, measurement, measurement.residual(states, measured, local))
     next_state = ca.densify(ca.vertcat(*[states[a].next_deflection for a in measurement.arms]))
     outputs = ca.vertcat(*predicted.values())
     tools = ca.vertcat(*[ca.vec(states[a].base_T_tool.matrix()[:3, :]) for a in measurement.arms])
-    told, nuisance_names = _told(measurement, states, local)
-    _check_rows(name, measurement, residual)
-    used = records.used_by(ca.vertcat(residual, next_state, outputs, tools, told))
+    starts = {n: ca.SX(entries) for n, entries in groups.told(states, local).items()} if groups else {}
+    nuisance_starts = ca.densify(ca.vertcat(ca.SX(0, 1), *starts.values()))
+    used = records.used_by(ca.vertcat(residual, next_state, outputs, tools, nuisance_starts))
+    own = [(arm_name, arms[arm_name.removesuffix(OTHER)]) for arm_name in measurement.arms]
     return Factor(
         name=name,
         channels=tuple(used),
@@ -224,22 +220,26 @@ def build_factor(
         residual=residual,
         outputs=outputs,
         tools=tools,
-        told=told,
-        nuisance_names=nuisance_names,
-        **_of_arms(measurement, arms),
-        **_of_residual(name, measurement),
+        noise=tuple(measurement.noise()),
+        noise_channels=tuple(tuple(f"{name}.{c.name}" for c in row) for row in noise_channels(measurement)),
+        dimensions=residual_dimensions(measurement),
+        nuisance_starts=nuisance_starts,
+        nuisance_names=tuple(n for n, entries in starts.items() for _ in range(entries.numel())),
+        mean_weight=groups.mean_weight if groups else 1.0,
+        springs=tuple(spring for _, arm in own for spring in arm.spring_names),
+        joints=tuple((f"{a.name}.{j}{n.removeprefix(a.name)}", d) for n, a in own for j, d in a.commanded.items()),
     )
 
 
-def _check_rows(name: str, measurement: Measurement, residual: Expression) -> None:
-    """Refuse a measurement whose noise, dimensions or noise columns are not those of its residual's entries.
+def _checked(name: str, measurement: Measurement, residual: Expression) -> Expression:
+    """The residual of a measurement whose noise, dimensions and noise columns are those of its entries.
 
     Raises:
         ProblemError: with what differs.
     """
     rows, dimensions, own = residual.numel(), residual_dimensions(measurement), noise_channels(measurement)
-    found = {"noise": len(measurement.noise()), "dimensions": len(dimensions), "noise columns": len(own) or rows}
-    odd = [f"{kind} of {count} entries" for kind, count in found.items() if count != rows]
+    counts = {"noise": len(measurement.noise()), "dimensions": len(dimensions), "noise columns": len(own) or rows}
+    odd = [f"{kind} of {count} entries" for kind, count in counts.items() if count != rows]
     odd += [f"dimension {kind!r}" for kind in dimensions if kind not in ("length", "angle")]
     odd += [
         f"noise column {channel.name} of dimension {channel.dimension}"
@@ -252,82 +252,43 @@ def _check_rows(name: str, measurement: Measurement, residual: Expression) -> No
             f"the measurement {name} has a residual of {rows} entries ({', '.join(dimensions)}), and {', '.join(odd)}.",
             hint="Correct noise(), dimensions() or noise_channels() in its plugin.",
         )
+    return residual
 
 
-def _of_arms(measurement: Measurement, arms: Mapping[str, Arm]) -> dict[str, Any]:
-    """What a state's numbers and commanded joints are called."""
-    own = [(name, arms[name.removesuffix(OTHER)]) for name in measurement.arms]
-    joints = [(a.name + "." + j + n.removeprefix(a.name), dim) for n, a in own for j, dim in a.commanded.items()]
-    return {"springs": tuple(spring for _, arm in own for spring in arm.spring_names), "joints": tuple(joints)}
+def _symbols(name: str, blocks: Sequence[ParameterBlock]) -> tuple[Expression, dict[str, Expression]]:
+    """One symbol for all entries of some blocks, and the part of it that is each block's value."""
+    symbols, start, values = ca.SX.sym(name, sum(block.size for block in blocks)), 0, {}
+    for block in blocks:
+        values[block.name] = symbols[start : start + block.size]
+        start += block.size
+    return symbols, values
 
 
-def _of_residual(name: str, measurement: Measurement) -> dict[str, Any]:
-    """What a measurement says of its residual's entries."""
-    return {
-        "noise": tuple(measurement.noise()),
-        "noise_channels": tuple(tuple(f"{name}.{c.name}" for c in own) for own in noise_channels(measurement)),
-        "dimensions": residual_dimensions(measurement),
-        "mean_weight": measurement.mean_weight if isinstance(measurement, GroupedMeasurement) else 1.0,
-    }
-
-
-def _told(
-    measurement: Measurement, states: Mapping[str, ArmState], local: Mapping[str, Expression]
-) -> tuple[Expression, tuple[str, ...]]:
-    """What a record says of its group's parameters, and whose entries these are."""
-    if not isinstance(measurement, GroupedMeasurement):
-        return ca.SX(0, 1), ()
-    expressions = {name: ca.SX(entries) for name, entries in measurement.told(states, local).items()}
-    if not expressions:
-        return ca.SX(0, 1), ()
-    return ca.densify(ca.vertcat(*expressions.values())), tuple(
-        n for n, e in expressions.items() for _ in range(e.numel())
-    )
-
-
-def _load(records: _Records, environment: Environment) -> Load:
-    return Load(
+def _arm_states(
+    measurement: Measurement,
+    arms: Mapping[str, Arm],
+    values: Mapping[str, Expression],
+    environment: Environment,
+    available: frozenset[str],
+) -> tuple[_Records, dict[str, ArmState], list[Expression]]:
+    """Each arm in a record under its load, ``@other`` ones in the record's partner; and their deflections' symbols."""
+    records = _Records(available)
+    load = Load(
         gravity=records.vector("gravity", environment.gravity),
         payload_mass=records.optional("payload", environment.payload_mass),
         payload_com=records.vector("payload", environment.payload_com),
         force=records.vector("force", environment.force),
         torque=records.vector("torque", environment.torque),
     )
-
-
-def _value_expressions(parameters: Parameters) -> tuple[Expression, dict[str, Expression]]:
-    """Symbols for the free canonical entries, and every block's value with fixed ones as numbers; groups aside."""
-    main = [block for block in parameters.blocks if not block.nuisance]
-    symbols = ca.SX.sym("values", sum(block.size for block in main if block.free))
-    values, start = {}, 0
-    for block in main:
-        if block.free:
-            values[block.name] = symbols[start : start + block.size]
-            start += block.size
-        else:
-            values[block.name] = ca.SX(list(block.nominal))
-    return symbols, values
-
-
-def _group_expressions(measurement: Measurement) -> tuple[Expression, dict[str, Expression]]:
-    """Symbols for the entries of a group's parameters, whether free or not, and the parameters by local name."""
-    if not isinstance(measurement, GroupedMeasurement):
-        return ca.SX(0, 1), {}
-    blocks = [(block.name, block.size) for block in measurement.group_parameters("")]
-    symbols, start, values = ca.SX.sym("group", sum(size for _, size in blocks)), 0, {}
-    for name, size in blocks:
-        values[name] = symbols[start : start + size]
-        start += size
-    return symbols, values
-
-
-def _arm_state(
-    arm: Arm, which: str, values: Mapping[str, Expression], records: _Records, load: Load, deflection: Expression
-) -> ArmState:
-    """An arm in a record, or where ``which`` is ``@other`` in the record's partner."""
-    commands = [records.number(f"{arm.name}.{joint}{which}") for joint in arm.commanded]
-    approaches = [records.optional(f"{arm.name}.approach.{joint}{which}", 0.0) for joint in arm.commanded]
-    angles = ca.vertcat(*arm.joint_commands(commands))
-    approach = ca.vertcat(*arm.joint_approaches(approaches))
-    conditions = {name: records.number(name) for name in arm.conditions if records.has(name)}
-    return arm.state(values, ArmInputs(angles, approach, load, deflection, conditions))
+    load = tilted(load, scoped(values, f"{STATICS}."))
+    states, deflections = {}, []
+    for name in measurement.arms:
+        arm = arms[name.removesuffix(OTHER)]
+        which = name.removeprefix(arm.name)
+        deflections.append(ca.SX.sym(f"deflection_{name}", arm.deflection_size))
+        commands = [records.number(f"{arm.name}.{joint}{which}") for joint in arm.commanded]
+        approaches = [records.optional(f"{arm.name}.approach.{joint}{which}", 0.0) for joint in arm.commanded]
+        angles, approach = ca.vertcat(*arm.joint_commands(commands)), ca.vertcat(*arm.joint_approaches(approaches))
+        conditions = {channel: records.number(channel) for channel in arm.conditions if records.has(channel)}
+        states[name] = arm.state(values, ArmInputs(angles, approach, load, deflections[-1], conditions))
+    return records, states, deflections

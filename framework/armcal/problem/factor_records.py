@@ -1,4 +1,7 @@
-"""The records of one factor, as its kernel reads them."""
+"""The records of one factor, as its kernel reads them, and what whitens their residuals.
+
+A whitening W of a covariance S has W S W' = I; the inverse of its lower Cholesky factor is taken.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +17,6 @@ from armcal.functions.c_source import LANES
 from armcal.measure.groups import NO_GROUP
 from armcal.problem.correlation import Correlation
 from armcal.problem.factor import Factor
-from armcal.problem.whitening import by_deviation
 
 Indices = NDArray[np.intp]
 Mask = NDArray[np.bool_]
@@ -125,6 +127,23 @@ def weighted(records: Sequence[FactorRecords], weights: Sequence[Array]) -> tupl
     )
 
 
+def mean_shares(factor: Factor, factor_records: FactorRecords) -> list[Array]:
+    """Of each group whose mean weighs more than its records say, what each record adds to a row (width).
+
+    The shares go with residuals in units of the declared noise: the mean of a group is that of its records by their
+    weights alone, whatever is known of their own noise. Records of total weight n whose residuals have the mean m give
+    n |m|^2 to a sum of squares; with the row as many times more as the measurement says.
+    """
+    if factor.mean_weight <= 1 or factor_records.group is None:
+        return []
+    beyond, inside = np.sqrt(factor.mean_weight - 1), factor_records.weight > 0
+    shares = []
+    for number in np.unique(factor_records.group[inside & (factor_records.group != NO_GROUP)]):
+        weight = np.where(factor_records.group == number, factor_records.weight, 0.0)
+        shares.append(beyond * weight / np.sqrt(weight.sum()))
+    return shares
+
+
 def correlation_of(records: Sequence[FactorRecords]) -> Correlation | None:
     """What the records share."""
     return records[0].correlation if records else None
@@ -137,9 +156,48 @@ def _filled(chosen: Indices, last: int) -> Indices:
 
 def _whitening(factor: Factor, dataset: Dataset, fill: Indices) -> Array | None:
     """From the records' own noise; None if no record states any."""
-    choices = factor.noise_channels
-    stated = [next((channel for channel in own if dataset.has(channel)), None) for own in choices]
+    stated = [next((channel for channel in own if dataset.has(channel)), None) for own in factor.noise_channels]
     if not any(stated):
         return None
     pairs = zip(stated, factor.noise, strict=True)
     return by_deviation(np.array([dataset.column(c)[fill] if c else np.full(len(fill), sd) for c, sd in pairs]))
+
+
+def declared(noise: Sequence[float]) -> Array:
+    """From standard deviations that hold for every record (n_r x n_r)."""
+    return np.diag(1 / np.array(noise))
+
+
+def whitening_of(factor: Factor, records: FactorRecords) -> Array:
+    """What whitens each record, by the declared noise where the records state none (n_r x n_r x width)."""
+    if records.whitening is not None:
+        return records.whitening
+    return np.repeat(declared(factor.noise)[:, :, None], records.record.shape[1], axis=2)
+
+
+def by_deviation(deviations: Array) -> Array:
+    """From each record's own standard deviations (n_r x N), uncorrelated (n_r x n_r x N)."""
+    count = len(deviations)
+    whitening = np.zeros((count, *deviations.shape))
+    whitening[np.arange(count), np.arange(count)] = 1 / deviations
+    return whitening
+
+
+def by_covariance(covariances: Array) -> Array:
+    """From each record's covariance, given and returned as n_r x n_r x N.
+
+    Raises:
+        numpy.linalg.LinAlgError: one is not positive definite.
+    """
+    lower = np.linalg.cholesky(np.moveaxis(covariances, 2, 0))
+    identity = np.broadcast_to(np.eye(lower.shape[1]), lower.shape)
+    return np.ascontiguousarray(np.moveaxis(np.linalg.solve(lower, identity), 0, 2))
+
+
+def transformed(matrices: Array, rows: Array) -> Array:
+    """Each record's matrix (n_r x n_r x N) times its rows (n_r x ... x N)."""
+    result = np.zeros_like(rows)
+    for i in range(len(rows)):
+        for j, row in enumerate(rows):
+            result[i] += matrices[i, j] * row
+    return result

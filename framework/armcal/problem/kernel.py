@@ -1,6 +1,6 @@
 """Compiled functions of one factor: residuals and Jacobians of many records in elastic equilibrium.
 
-Two backends give the same numbers: CasADi's virtual machine, always there, and generated C, where a
+Two backends give the same numbers: CasADi's interpreter, always there, and generated C, where a
 compiler is found. Arrays are stored channel by channel, (channels x records).
 """
 
@@ -16,6 +16,7 @@ from typing import Any, NoReturn, Protocol
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
+from typing_extensions import override
 
 from armcal.arm.equilibrium import (
     MOST_DEFLECTION,
@@ -37,7 +38,7 @@ from armcal.problem.factor import Factor
 AS_IT_STANDS = 1e300
 """Any state is at rest: take the one given, to which repeated passes might not lead."""
 WORTH_COMPILING_RECORDS = 5000
-"""From this many records on, waiting for the compiler costs less than the virtual machine does."""
+"""From this many records on, waiting for the compiler costs less than the interpreter does."""
 
 
 class Backend(Protocol):
@@ -54,10 +55,10 @@ class Backend(Protocol):
         """Fill ``residual``, and ``jacobian`` (n_r * n_v x records, residual entry by residual entry)."""
 
 
-class VirtualMachine:
+class Interpreter(Backend):
     """CasADi's interpreter over blocks of records."""
 
-    name = "virtual machine"
+    name = "interpreted"
 
     def __init__(self, factor: Factor) -> None:
         self._factor = factor
@@ -71,14 +72,14 @@ class VirtualMachine:
     def _linearise(self) -> InterpretedFunction:
         return InterpretedFunction(self._factor.linearise_function(), 1)
 
+    @override
     def residuals(self, values: Array, record: Array, state: Array, residual: Array, rest: float = REST_RAD) -> int:
-        """As the protocol says."""
         return self._settle(values, record, state, residual, rest)
 
+    @override
     def linearise(
         self, values: Array, record: Array, state: Array, residual: Array, jacobian: Array, rest: float = NEAR_REST_RAD
     ) -> int:
-        """As the protocol says."""
         unsettled = 0
         if self._has_state:
             unsettled = self._settle(values, record, state, residual, rest)
@@ -96,7 +97,7 @@ class VirtualMachine:
         return int(moving.sum())
 
 
-class Compiled:
+class Compiled(Backend):
     """The same functions in C, several records at once."""
 
     name = "compiled"
@@ -105,15 +106,15 @@ class Compiled:
         self._residuals = _signature(library.armcal_residuals, outputs=1)
         self._linearise = _signature(library.armcal_linearise, outputs=2)
 
+    @override
     def residuals(self, values: Array, record: Array, state: Array, residual: Array, rest: float = REST_RAD) -> int:
-        """As the protocol says."""
         pointers = [*_pointers(values, record, state), residual.ctypes.data, _stride(residual)]
         return int(self._residuals(record.shape[1], _stride(record), *pointers, rest, MOST_PASSES))
 
+    @override
     def linearise(
         self, values: Array, record: Array, state: Array, residual: Array, jacobian: Array, rest: float = NEAR_REST_RAD
     ) -> int:
-        """As the protocol says."""
         return self.prepared(values, record, state, residual, jacobian, rest)()
 
     def prepared(
@@ -239,9 +240,9 @@ class Kernel:
         """
         self._in_equilibrium(self.outputs, values, record, state, shown)
 
-    def tell(self, values: Array, record: Array, state: Array, said: Array) -> None:
-        """What each record says of its group's parameters, in equilibrium (entries x records)."""
-        self._in_equilibrium(self.factor.nuisance_function(), values, record, state, said)
+    def nuisance_starts(self, values: Array, record: Array, state: Array, starts: Array) -> None:
+        """Where each record alone has its group's parameters start, in equilibrium (entries x records)."""
+        self._in_equilibrium(self.factor.nuisance_function(), values, record, state, starts)
 
     def _in_equilibrium(self, function: ca.Function, values: Array, record: Array, state: Array, shown: Array) -> None:
         mapped, before = InterpretedFunction(function, 1), state.copy()
@@ -266,9 +267,9 @@ def build_kernel(factor: Factor, records: int, choice: EvaluatorChoice = "auto")
     ``auto`` takes a cached library, else waits for the compiler only where that pays, else interprets and lets
     the compiler work for the next run. ``compiled`` waits; without a compiler it interprets.
     """
-    machine = VirtualMachine(factor)
+    interpreter = Interpreter(factor)
     if choice == "interpreted" or compiler.find_compiler() is None:
-        return Kernel(factor, machine)
+        return Kernel(factor, interpreter)
     functions = (factor.pass_function(), factor.linearise_function())
     text = "".join(f.serialize() for f in functions) + c_source.support_source() + driver_source()
     text += f"{c_source.LANES} lanes" + c_source.generator_source()
@@ -278,21 +279,21 @@ def build_kernel(factor: Factor, records: int, choice: EvaluatorChoice = "auto")
         return kernel_source(factor, *functions)
 
     def trial() -> compiler.Trial:
-        return kernel_trial.trial(factor, machine.linearise, (NEAR_REST_RAD, MOST_PASSES))
+        return kernel_trial.trial(factor, interpreter.linearise, (NEAR_REST_RAD, MOST_PASSES))
 
     library = compiler.load_cached(key)
     if library is None:
         if choice == "auto" and records < WORTH_COMPILING_RECORDS:
             quietly(lambda: compiler.compile_in_background(key, source, trial))
-            return Kernel(factor, machine)
+            return Kernel(factor, interpreter)
         library = quietly(lambda: compiler.compile_now(key, source, trial=trial))
     if library is None:
-        return Kernel(factor, machine)
+        return Kernel(factor, interpreter)
     compiled = Compiled(library)
     return (
         Kernel(factor, compiled, key)
-        if kernel_trial.agree(factor, machine.linearise, compiled.linearise)
-        else Kernel(factor, machine)
+        if kernel_trial.agree(factor, interpreter.linearise, compiled.linearise)
+        else Kernel(factor, interpreter)
     )
 
 

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from armcal.arm.assembly import Arm
 from armcal.arm.loading import LOAD_CHANNELS, SiteLoads, site_loads
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
@@ -43,11 +42,12 @@ class Motion:
         arms = problem.blueprint.arms
         channels = tuple(f"{name}.{joint}" for name, arm in arms.items() for joint in arm.commanded)
         blocks = {b.name: values[problem.parameters.entries_of(b.name)] for b in problem.parameters.blocks}
-        loads = {name: site_loads(arm, blocks, *_inputs(problem, arm, dataset)) for name, arm in arms.items()}
-        slopes, elastic = (
-            problem.channel_slopes(values, records, channels),
-            any(len(record.state) for record in records),
-        )
+        acting, loads = np.array(list(_acting(problem, dataset).values())), {}
+        for name, arm in arms.items():
+            commands = arm.joint_commands([dataset.column(f"{arm.name}.{joint}") for joint in arm.commanded])
+            loads[name] = site_loads(arm, blocks, np.array(commands), acting)
+        slopes = problem.channel_slopes(values, records, channels)
+        elastic = any(len(record.state) for record in records)
         return cls(channels, slopes, loads, _by_load(problem, values, records, dataset) if elastic else ())
 
     def subset(self, chosen: NDArray[np.intp]) -> Motion:
@@ -78,12 +78,6 @@ def recorded_position(dataset: Dataset) -> NDArray[np.intp]:
     position = np.empty(len(dataset), dtype=np.intp)
     position[np.argsort(recorded_order(dataset), kind="stable")] = np.arange(len(dataset))
     return position
-
-
-def _inputs(problem: Problem, arm: Arm, dataset: Dataset) -> tuple[Array, Array]:
-    """Commands and loads of each record."""
-    commands = [dataset.column(f"{arm.name}.{joint}") for joint in arm.commanded]
-    return np.array(arm.joint_commands(commands)), np.array(list(_acting(problem, dataset).values()))
 
 
 def _acting(problem: Problem, dataset: Dataset) -> dict[str, Array]:

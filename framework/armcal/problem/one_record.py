@@ -1,7 +1,7 @@
 """One record at a time: a factor's residual and Jacobian without the arrangements for many.
 
 The compiled functions work on a whole vector of records, so all its places hold the same one. Without a compiler
-CasADi's virtual machine evaluates a single record. The elastic equilibrium starts from rest each time: what comes out
+CasADi's interpreter evaluates a single record. The elastic equilibrium starts from rest each time: what comes out
 is a function of values and record alone, to the last bit.
 """
 

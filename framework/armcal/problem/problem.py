@@ -5,7 +5,7 @@ from __future__ import annotations
 import pickle
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache, partial
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -17,17 +17,15 @@ from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.base.parameters import Parameters
 from armcal.functions.batch_function import EvaluatorChoice
-from armcal.measure.groups import NO_GROUP, Groups, group_numbers, groups_of, refuse_lost, ties_of
+from armcal.measure.groups import NO_GROUP, Groups, group_numbers, groups_of, refuse_lost
 from armcal.measure.measurement import Measurement
 from armcal.measure.partners import with_partners
-from armcal.problem import factor_records, gather
+from armcal.problem import factor_records
 from armcal.problem.blueprint import Blueprint
-from armcal.problem.factor_records import FactorRecords, correlation_of
-from armcal.problem.gather import Slots
+from armcal.problem.factor_records import FactorRecords, correlation_of, mean_shares, transformed
+from armcal.problem.grouped_kernel import GroupedKernel
 from armcal.problem.kernel import Kernel
-from armcal.problem.linearised import linearised, linearised_means, mean_shares
 from armcal.problem.normal_equations import ExtraRows, NormalEquations, TieFunction, stacked
-from armcal.problem.whitening import declared, transformed
 
 __all__ = ["FactorRecords", "NormalEquations", "Problem", "triangular"]
 
@@ -63,9 +61,8 @@ class Problem:
         if groups is None:
             groups = groups_of(dataset, measurements) if parameters.nuisances else {}
         blueprint = Blueprint(arms, measurements, parameters, environment, frozenset(dataset.channels), groups)
-        choices = dict.fromkeys(measurements, evaluator)
-        kernels, ties = blueprint.kernels(len(dataset), choices), _ties(blueprint)
-        return cls(parameters, kernels, environment, blueprint, ties)
+        kernels = blueprint.kernels(len(dataset), dict.fromkeys(measurements, evaluator))
+        return cls(parameters, kernels, environment, blueprint, blueprint.ties())
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _from_bytes, (self._bytes,)
@@ -73,7 +70,7 @@ class Problem:
     @cached_property
     def _bytes(self) -> bytes:
         """The blueprint, and what evaluates each measurement."""
-        choices = {k.factor.name: "compiled" if k.backend.name == "compiled" else "interpreted" for k in self.kernels}
+        choices = {k.factor.name: k.backend.name for k in self.kernels}
         return pickle.dumps((self.blueprint.bare(), choices, self.parameters))
 
     def evaluated_by(self, evaluator: EvaluatorChoice) -> Problem:
@@ -83,7 +80,7 @@ class Problem:
 
     @property
     def backend(self) -> str:
-        """What evaluates it: ``compiled``, ``virtual machine`` or both."""
+        """What evaluates it: ``compiled``, ``interpreted`` or both."""
         return ", ".join(sorted({kernel.backend.name for kernel in self.kernels}))
 
     @property
@@ -97,13 +94,9 @@ class Problem:
         return tuple(self.parameters.entry_names[i] for i in self.parameters.free_entries)
 
     @cached_property
-    def slots(self) -> tuple[Slots, ...]:
-        """Where each kernel's values come from, and where its Jacobian goes."""
-        plan = self.blueprint
-        return tuple(
-            gather.slots_of(name, measurement, plan.parameters, self.parameters, plan.groups)
-            for name, measurement in plan.measurements.items()
-        )
+    def grouped(self) -> tuple[GroupedKernel, ...]:
+        """Each kernel with where its values come from, and where its Jacobian goes."""
+        return self.blueprint.grouped(self.kernels, self.parameters)
 
     @cached_property
     def ties(self) -> tuple[TieFunction, ...]:
@@ -159,12 +152,8 @@ class Problem:
             NotConvergedError: a record has no elastic equilibrium at these values.
         """
         self._check_fixed(values)
-        result = []
-        for kernel, slots, record in zip(self.kernels, self.slots, records, strict=True):
-            residual = np.empty((kernel.factor.residual.numel(), record.record.shape[1]))
-            gather.evaluated(slots, values, record.group, kernel.residuals, record.record, record.state, residual)
-            result.append(residual[:, : record.count])
-        return tuple(result)
+        pairs = zip(self.grouped, records, strict=True)
+        return tuple(grouped.residuals(values, record)[:, : record.count] for grouped, record in pairs)
 
     def require_held(self, values: Array, records: Sequence[FactorRecords]) -> None:
         """Refuse values at which springs do not hold the arm in every record.
@@ -173,8 +162,8 @@ class Problem:
             NotConvergedError: a record has no elastic equilibrium, or one that is not stable.
         """
         self.residuals(values, records)
-        for kernel, slots, record in zip(self.kernels, self.slots, records, strict=True):
-            gather.evaluated(slots, values, record.group, kernel.require_held, record.record, record.state)
+        for grouped, record in zip(self.grouped, records, strict=True):
+            grouped.require_held(values, record)
 
     def cost(self, values: Array, records: Sequence[FactorRecords]) -> float:
         """Half the weighted squared whitened residuals."""
@@ -212,13 +201,14 @@ class Problem:
     def normal_equations(self, values: Array, records: Sequence[FactorRecords]) -> NormalEquations:
         """Cost, gradient and Gauss-Newton Hessian, accumulated in blocks: memory does not grow with the records.
 
-        But where they are correlated, all are made independent at once.
+        Correlated records are made independent all at once.
         """
-        blocks = [_block_sums(*block) for block in self._independent_blocks(values, records)]
         entries = len(self.parameters.free_entries)
-        cost = sum((b[0] for b in blocks), 0.0)
-        gradient = sum((b[1] for b in blocks), np.zeros(entries))
-        hessian = sum((b[2] for b in blocks), np.zeros((entries, entries)))
+        cost, gradient, hessian = 0.0, np.zeros(entries), np.zeros((entries, entries))
+        for jacobian, residual in self._independent_blocks(values, records):
+            cost += 0.5 * float(np.sum(residual**2))
+            gradient = gradient + np.einsum("kvb,kb->v", jacobian, residual)
+            hessian = hessian + sum((part @ part.T for part in jacobian), np.zeros((entries, entries)))
         return self._extra(values, records).added_to(NormalEquations(cost, gradient, hessian))
 
     def triangular_factor(self, values: Array, records: Sequence[FactorRecords]) -> Array:
@@ -230,30 +220,27 @@ class Problem:
             triangle = triangular(np.vstack([triangle, rows]))
         return triangular(np.vstack([triangle, self._extra(values, records).jacobian @ chain]))
 
-    def jacobians(self, values: Array, records: Sequence[FactorRecords]) -> Iterator[Array]:
-        """Whitened Jacobians by free canonical entries, in blocks of records (n_r x n_v x B), factor by factor."""
-        return (jacobian for jacobian, _ in self._blocks(values, records))
+    def jacobians(self, values: Array, records: Sequence[FactorRecords]) -> tuple[Array, ...]:
+        """Whitened, weighted Jacobians by free canonical entries, one (n_r x n_v x N) array a factor."""
+        self._check_fixed(values)
+        blocks = (grouped.linearised(values, record) for grouped, record in zip(self.grouped, records, strict=True))
+        whole = (np.concatenate([jacobian for jacobian, _ in of_factor], axis=2) for of_factor in blocks)
+        return tuple(jacobian[:, :, : record.count] for jacobian, record in zip(whole, records, strict=True))
 
     def exact_hessian(self, values: Array, records: Sequence[FactorRecords]) -> Array:
         """The Hessian of ``cost`` by free canonical entries with the curvature of the residuals (n x n).
 
-        Of records that are correlated the Gauss-Newton one: their curvature would couple all of them. Nor has it the
+        Of correlated records the Gauss-Newton one: their curvature would couple all of them. Nor has it the
         curvature of groups' means, where these weigh more than their records say.
         """
         if correlation_of(records) is not None:
             return self.normal_equations(values, records).hessian
         self.residuals(values, records)
-        size = len(self.parameters.free_entries)
-        total = np.zeros((size, size))
-        for kernel, slots, record in zip(self.kernels, self.slots, records, strict=True):
-            for number, columns in slots.parts(record.group, record.count):
-                own, free = slots.values(values, number), slots.free[number]
-                seen = np.flatnonzero(free != gather.HELD)
-                for i in columns:
-                    whitening = declared(kernel.factor.noise) if record.whitening is None else record.whitening[:, :, i]
-                    one = kernel.hessian(own, record.record[:, i], record.state[:, i], whitening)
-                    total[np.ix_(free[seen], free[seen])] += record.weight[i] * np.asarray(one)[np.ix_(seen, seen)]
+        total = sum(
+            grouped.exact_hessian(values, record) for grouped, record in zip(self.grouped, records, strict=True)
+        )
         beside, places = self._extra(values, records).jacobian, self._places
+        size = len(places)
         bends = sum((tie.curvature(values, places, size) for tie in self.ties), np.zeros((size, size)))
         return total + beside.T @ beside + bends
 
@@ -262,41 +249,28 @@ class Problem:
     ) -> tuple[Array, ...]:
         """d residual / d record channels in equilibrium, one (n_r x channels x N) array a factor; raw, not whitened."""
         self.residuals(values, records)
-        result = []
-        for kernel, slots, record in zip(self.kernels, self.slots, records, strict=True):
-            slope = np.empty((kernel.factor.residual.numel() * len(channels), record.record.shape[1]))
-            evaluate = partial(kernel.channel_slopes, channels=channels)
-            gather.evaluated(slots, values, record.group, evaluate, record.record, record.state, slope)
-            result.append(slope.reshape(-1, len(channels), record.record.shape[1])[:, :, : record.count])
-        return tuple(result)
+        pairs = zip(self.grouped, records, strict=True)
+        return tuple(
+            grouped.channel_slopes(values, record, channels)[:, :, : record.count] for grouped, record in pairs
+        )
 
     def predict(self, values: Array, records: Sequence[FactorRecords]) -> tuple[Array, ...]:
         """Outputs and tool positions in equilibrium, one (n_o + 12 an arm x N) matrix a factor."""
         self._check_fixed(values)
-        result = []
-        for kernel, slots, record in zip(self.kernels, self.slots, records, strict=True):
-            shown = np.empty((kernel.outputs.numel_out(1), record.record.shape[1]))
-            gather.evaluated(slots, values, record.group, kernel.predict, record.record, record.state, shown)
-            result.append(shown[:, : record.count])
-        return tuple(result)
+        pairs = zip(self.grouped, records, strict=True)
+        return tuple(grouped.predict(values, record)[:, : record.count] for grouped, record in pairs)
 
-    def told(self, values: Array, records: Sequence[FactorRecords]) -> tuple[Array, ...]:
-        """What each record alone says of its group's parameters, one (entries x N) matrix a factor."""
-        result = []
-        for kernel, slots, record in zip(self.kernels, self.slots, records, strict=True):
-            said = np.empty((len(kernel.factor.nuisance_names), record.record.shape[1]))
-            if len(said):
-                gather.evaluated(slots, values, record.group, kernel.tell, record.record, record.state, said)
-            result.append(said[:, : record.count])
-        return tuple(result)
+    def nuisance_starts(self, values: Array, records: Sequence[FactorRecords]) -> tuple[Array, ...]:
+        """Where each record alone has its group's parameters start, one (entries x N) matrix a factor."""
+        pairs = zip(self.grouped, records, strict=True)
+        return tuple(grouped.nuisance_starts(values, record)[:, : record.count] for grouped, record in pairs)
 
     def _extra(self, values: Array, records: Sequence[FactorRecords]) -> ExtraRows:
         """The rows that belong to no single record."""
         places = self._places
         rows = [tie.rows(values, places, len(places)) for tie in self.ties]
-        for kernel, slots, record in zip(self.kernels, self.slots, records, strict=True):
-            means = linearised_means(kernel, slots, record, values)
-            rows += [ExtraRows(residual, jacobian) for jacobian, residual in means]
+        for grouped, record in zip(self.grouped, records, strict=True):
+            rows += [ExtraRows(residual, jacobian) for jacobian, residual in grouped.linearised_means(values, record)]
         return stacked(rows, len(places))
 
     @property
@@ -306,23 +280,18 @@ class Problem:
 
     def _independent_blocks(self, values: Array, records: Sequence[FactorRecords]) -> Iterator[tuple[Array, Array]]:
         """Blocks whose rows are independent: as they are, or made so where records are correlated."""
+        self._check_fixed(values)
         shared = correlation_of(records)
         if shared is None:
-            yield from self._blocks(values, records)
+            for grouped, record in zip(self.grouped, records, strict=True):
+                yield from grouped.linearised(values, record)
             return
-        self._check_fixed(values)
         rows = []
-        for kernel, slots, record in zip(self.kernels, self.slots, records, strict=True):
-            blocks = linearised(kernel, slots, record, values)
+        for grouped, record in zip(self.grouped, records, strict=True):
+            blocks = grouped.linearised(values, record)
             rows.append(np.concatenate([np.concatenate([j, r[:, None]], axis=1) for j, r in blocks], axis=2))
         for made in shared.independent([np.moveaxis(row, 1, 2) for row in rows]):
             yield np.moveaxis(made[:, :, :-1], 1, 2), made[:, :, -1]
-
-    def _blocks(self, values: Array, records: Sequence[FactorRecords]) -> Iterator[tuple[Array, Array]]:
-        """Whitened, weighted Jacobians (n_r x n_v x B) and residuals (n_r x B), in order."""
-        self._check_fixed(values)
-        for kernel, slots, record in zip(self.kernels, self.slots, records, strict=True):
-            yield from linearised(kernel, slots, record, values)
 
     def _check_fixed(self, values: Array) -> None:
         fixed = self._compiled_in
@@ -341,21 +310,9 @@ class Problem:
 def _from_bytes(written: bytes) -> Problem:
     """A problem that another process sent, compiled once here."""
     blueprint, choices, parameters = pickle.loads(written)
-    return Problem(parameters, blueprint.kernels(0, choices), blueprint.environment, blueprint, _ties(blueprint))
-
-
-def _ties(blueprint: Blueprint) -> tuple[TieFunction, ...]:
-    owned = ties_of(blueprint.measurements, blueprint.groups)
-    return tuple(TieFunction.of(owned_tie, blueprint.parameters) for owned_tie in owned)
+    return Problem(parameters, blueprint.kernels(0, choices), blueprint.environment, blueprint, blueprint.ties())
 
 
 def triangular(rows: Array) -> Array:
     """R of a QR decomposition."""
     return np.asarray(np.linalg.qr(rows, mode="r"))
-
-
-def _block_sums(jacobian: Array, residual: Array) -> tuple[float, Array, Array]:
-    """Cost, gradient and Hessian of a block."""
-    hessian = sum((part @ part.T for part in jacobian), np.zeros((jacobian.shape[1],) * 2))
-    gradient = np.einsum("kvb,kb->v", jacobian, residual)
-    return 0.5 * float(np.sum(residual**2)), gradient, hessian

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 
 import casadi as ca
 import numpy as np
@@ -16,8 +15,7 @@ from numpy.typing import NDArray
 
 from armcal.base.domains import Array
 from armcal.problem.factor import Factor
-from armcal.problem.gather import Slots, evaluated
-from armcal.problem.kernel import Kernel
+from armcal.problem.grouped_kernel import GroupedKernel
 from armcal.problem.problem import FactorRecords, Problem
 
 _MOST_STEPS = 12
@@ -37,8 +35,8 @@ def projected(problem: Problem, values: Array, records: Sequence[FactorRecords])
     """
     result = as_predicted(problem, values, records)
     return tuple(
-        _fitting_joints(kernel, slots, values, factor_records) if _measures_nothing(kernel.factor) else factor_records
-        for kernel, slots, factor_records in zip(problem.kernels, problem.slots, result, strict=True)
+        factor_records if _measured(grouped.kernel.factor) else _fitting_joints(grouped, values, factor_records)
+        for grouped, factor_records in zip(problem.grouped, result, strict=True)
     )
 
 
@@ -63,11 +61,15 @@ def predicted_records(problem: Problem, values: Array, records: Sequence[FactorR
     Raises:
         NotConvergedError: a record has no elastic equilibrium at these values.
     """
-    shown = problem.predict(values, records)
-    return tuple(
-        _with_readings(kernel.factor, record, outputs)
-        for kernel, record, outputs in zip(problem.kernels, records, shown, strict=True)
-    )
+    predicted = []
+    for kernel, before, outputs in zip(problem.kernels, records, problem.predict(values, records), strict=True):
+        record = before.record.copy()
+        for row in _measured(kernel.factor):
+            readings = outputs[kernel.factor.output_channels.index(kernel.factor.channels[row])]
+            record[row, : before.count] = readings
+            record[row, before.count :] = readings[-1] if before.count else 0.0
+        predicted.append(replace(before, record=record))
+    return tuple(predicted)
 
 
 def factor_at_zero(problem: Problem, values: Array, records: Sequence[FactorRecords]) -> Array:
@@ -83,9 +85,9 @@ def fits(problem: Problem, values: Array, records: Sequence[FactorRecords]) -> t
     """Which records a contact can be in at these values, one mask a factor; all of any other measurement."""
     residuals = problem.residuals(values, records)
     return tuple(
-        _whitened(kernel.factor, residual) < _AT_ZERO
-        if _measures_nothing(kernel.factor)
-        else np.ones(residual.shape[1], dtype=bool)
+        np.ones(residual.shape[1], dtype=bool)
+        if _measured(kernel.factor)
+        else _whitened(kernel.factor, residual) < _AT_ZERO
         for kernel, residual in zip(problem.kernels, residuals, strict=True)
     )
 
@@ -104,11 +106,8 @@ def approach_channels(factor: Factor) -> tuple[int, ...]:
 
 
 def _measured(factor: Factor) -> tuple[int, ...]:
+    """Which rows of a record are measured; none of a contact."""
     return tuple(i for i, c in enumerate(factor.channels) if c in factor.output_channels)
-
-
-def _measures_nothing(factor: Factor) -> bool:
-    return not _measured(factor)
 
 
 def _bilinear(factor: Factor) -> bool:
@@ -120,52 +119,24 @@ def _bilinear(factor: Factor) -> bool:
     return bool(ca.depends_on(by_measured, ca.vertcat(factor.values, factor.state)))
 
 
-def _with_readings(factor: Factor, factor_records: FactorRecords, outputs: Array) -> FactorRecords:
-    record = factor_records.record.copy()
-    for row in _measured(factor):
-        predicted = outputs[factor.output_channels.index(factor.channels[row])]
-        record[row, : factor_records.count] = predicted
-        record[row, factor_records.count :] = predicted[-1] if factor_records.count else 0.0
-    return replace(factor_records, record=record)
-
-
-def _fitting_joints(kernel: Kernel, slots: Slots, values: Array, factor_records: FactorRecords) -> FactorRecords:
+def _fitting_joints(grouped: GroupedKernel, values: Array, factor_records: FactorRecords) -> FactorRecords:
     """Joint angles moved by Gauss-Newton steps of least length until the residual is gone."""
-    rows = joint_channels(kernel.factor)
+    factor = grouped.kernel.factor
+    rows = list(joint_channels(factor))
     if not rows or not factor_records.count:
         return factor_records
     moved = replace(factor_records, record=factor_records.record.copy(), state=factor_records.state.copy())
+    joints = [factor.channels[row] for row in rows]
     for _ in range(_MOST_STEPS):
-        residual = _residual(kernel, slots, values, moved)
-        if (_whitened(kernel.factor, residual) < _AT_ZERO * 1e-3).all():
+        residual = grouped.residuals(values, moved)
+        if (_whitened(factor, residual) < _AT_ZERO * 1e-3).all():
             break
-        joints = [kernel.factor.channels[row] for row in rows]
-        inverse = np.linalg.pinv(channel_slopes(kernel, slots, values, moved, joints).transpose(2, 0, 1), rcond=1e-9)
-        step = np.einsum("nqr,rn->qn", inverse, residual)
+        slopes = grouped.channel_slopes(values, moved, joints)
+        step = np.einsum("nqr,rn->qn", np.linalg.pinv(slopes.transpose(2, 0, 1), rcond=1e-9), residual)
         longest = np.abs(step).max(axis=0)
-        moved.record[list(rows)] -= step * np.minimum(1.0, 0.3 / np.maximum(longest, 1e-300))
-    reached = _whitened(kernel.factor, _residual(kernel, slots, values, moved)) < _AT_ZERO
+        moved.record[rows] -= step * np.minimum(1.0, 0.3 / np.maximum(longest, 1e-300))
+    reached = _whitened(factor, grouped.residuals(values, moved)) < _AT_ZERO
     return replace(factor_records, record=np.where(reached, moved.record, factor_records.record))
-
-
-def channel_slopes(
-    kernel: Kernel, slots: Slots, values: Array, factor_records: FactorRecords, channels: Sequence[str]
-) -> Array:
-    """d residual / d channels at states in equilibrium (n_r x channels x N, filled up as the records are)."""
-    size, width = kernel.factor.residual.numel(), factor_records.record.shape[1]
-    slopes = np.empty((size * len(channels), width))
-    evaluate = partial(kernel.channel_slopes, channels=channels)
-    evaluated(slots, values, factor_records.group, evaluate, factor_records.record, factor_records.state, slopes)
-    return slopes.reshape(size, len(channels), width)
-
-
-def _residual(kernel: Kernel, slots: Slots, values: Array, factor_records: FactorRecords) -> Array:
-    """Raw (n_r x N); the state is left in equilibrium."""
-    residual = np.empty((kernel.factor.residual.numel(), factor_records.record.shape[1]))
-    evaluated(
-        slots, values, factor_records.group, kernel.residuals, factor_records.record, factor_records.state, residual
-    )
-    return residual
 
 
 def _whitened(factor: Factor, residual: Array) -> Array:

@@ -1,4 +1,4 @@
-"""Readings of instruments and their residuals: which reading has which residual, whatever the order of either.
+"""Readings of instruments and joints, and residuals: which reading changes which residual, and by how much.
 
 A residual need not be the readings less their predictions, one by one: it may have another order, sign or unit, or as
 few numbers as the rotation vector of a quaternion. What a residual means for the readings follows from its slope by
@@ -14,10 +14,10 @@ import numpy as np
 
 from armcal.base.domains import Array
 from armcal.errors import ProblemError
-from armcal.problem.gather import Slots
-from armcal.problem.kernel import Kernel
+from armcal.measure.partners import OTHER
+from armcal.problem.factor import Factor
+from armcal.problem.factor_records import by_covariance, transformed, whitening_of
 from armcal.problem.problem import FactorRecords, Problem
-from armcal.problem.projection import channel_slopes
 
 _STEPS = 8
 _EXACT = 1e-9
@@ -36,8 +36,17 @@ def reading_slopes(problem: Problem, values: Array, records: Sequence[FactorReco
         NotConvergedError: a record has no elastic equilibrium at these values.
     """
     problem.residuals(values, records)  # leaves the states in equilibrium
-    parts = zip(problem.kernels, problem.slots, records, strict=True)
-    return tuple(_slopes(kernel, slots, values, factor_records) for kernel, slots, factor_records in parts)
+    result: list[Array | None] = []
+    for grouped, factor_records in zip(problem.grouped, records, strict=True):
+        factor = grouped.kernel.factor
+        if factor.output_channels:
+            slopes = grouped.channel_slopes(values, factor_records, factor.output_channels)[
+                :, :, : factor_records.count
+            ]
+            result.append(readings_by_residual(slopes.transpose(2, 0, 1), np.array(factor.noise)))
+        else:
+            result.append(None)
+    return tuple(result)
 
 
 def disturbed_records(
@@ -53,17 +62,20 @@ def disturbed_records(
     for _ in range(_STEPS):
         slopes = reading_slopes(problem, values, moved)
         parts = zip(problem.kernels, moved, slopes, missing, strict=True)
-        moved = tuple(_stepped(kernel, factor_records, slope, off) for kernel, factor_records, slope, off in parts)
-        found = zip(before, noise, problem.residuals(values, moved), strict=True)
-        missing = [start + added - now for start, added, now in found]
-        if all(_in_noise(k, off) < _EXACT for k, off in zip(problem.kernels, missing, strict=True)):
+        moved = tuple(_stepped(kernel.factor, record, slope, off) for kernel, record, slope, off in parts)
+        residuals = problem.residuals(values, moved)
+        missing = [start + added - now for start, added, now in zip(before, noise, residuals, strict=True)]
+        if all(
+            np.abs(off / np.array(kernel.factor.noise)[:, None]).max(initial=0.0) < _EXACT
+            for kernel, off in zip(problem.kernels, missing, strict=True)
+            if kernel.factor.output_channels
+        ):
             break
     return moved
 
 
-def _stepped(kernel: Kernel, factor_records: FactorRecords, slope: Array | None, residual: Array) -> FactorRecords:
+def _stepped(factor: Factor, factor_records: FactorRecords, slope: Array | None, residual: Array) -> FactorRecords:
     """The records of a factor with readings nearer to those that have another residual by so much."""
-    factor = kernel.factor
     if not factor.output_channels:
         return factor_records
     if slope is None:
@@ -82,23 +94,6 @@ def _stepped(kernel: Kernel, factor_records: FactorRecords, slope: Array | None,
     return replace(factor_records, record=record)
 
 
-def _in_noise(kernel: Kernel, residual: Array) -> float:
-    """The largest entry of what instruments read, in units of the noise; 0 for a contact."""
-    if not kernel.factor.output_channels:
-        return 0.0
-    return float(np.abs(residual / np.array(kernel.factor.noise)[:, None]).max(initial=0.0))
-
-
-def _slopes(kernel: Kernel, slots: Slots, values: Array, factor_records: FactorRecords) -> Array | None:
-    factor = kernel.factor
-    if not factor.output_channels:
-        return None
-    by_reading = channel_slopes(kernel, slots, values, factor_records, factor.output_channels)[
-        :, :, : factor_records.count
-    ]
-    return readings_by_residual(by_reading.transpose(2, 0, 1), np.array(factor.noise))
-
-
 def readings_by_residual(by_reading: Array, noise: Array) -> Array | None:
     """The least change of readings for a residual (N x outputs x n_r), from the opposite (N x n_r x outputs).
 
@@ -113,3 +108,35 @@ def readings_by_residual(by_reading: Array, noise: Array) -> Array | None:
     if not (singular[:, -1] > _LEAST_SLOPE * singular[:, 0]).all():
         return None
     return np.asarray(np.linalg.pinv(whitened / sizes) / sizes[:, None] / noise)
+
+
+def with_joint_noise(problem: Problem, records: Sequence[FactorRecords], values: Array) -> tuple[FactorRecords, ...]:
+    """The records whitened by the noise of residuals and of joints together; the same where no joint has any.
+
+    The covariance of a residual is its own plus S diag(sd^2) S', with S its derivative by the joints at these values,
+    those of the other record where a measurement lies between two. Records that name the same other one share its
+    noise; that correlation is left out.
+
+    Raises:
+        NotConvergedError: a record has no elastic equilibrium at these values.
+    """
+    arms = problem.blueprint.arms.values()
+    stated = {
+        f"{arm.name}.{joint}{which}": arm.joint_noise
+        for arm in arms
+        for joint, dimension in arm.commanded.items()
+        for which in ("", OTHER)
+        if arm.joint_noise and dimension == "angle"
+    }
+    if not stated:
+        return tuple(records)
+    deviations = np.array(list(stated.values()))
+    slopes = problem.channel_slopes(values, records, list(stated))
+    result = []
+    for kernel, record, slope in zip(problem.kernels, records, slopes, strict=True):
+        own = whitening_of(kernel.factor, record)
+        padded = np.pad(slope, ((0, 0), (0, 0), (0, own.shape[2] - record.count)), mode="edge")
+        scaled = transformed(own, padded * deviations[:, None])
+        covariance = np.einsum("ikn,jkn->ijn", scaled, scaled) + np.eye(len(own))[:, :, None]
+        result.append(replace(record, whitening=transformed(by_covariance(covariance), own)))
+    return tuple(result)

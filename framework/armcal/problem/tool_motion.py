@@ -1,4 +1,4 @@
-"""How tools move with the parameters, and which of it no contact sees."""
+"""How tools move with the parameters, which of it no contact sees, and how one set of points lies to another."""
 
 from __future__ import annotations
 
@@ -24,37 +24,37 @@ def along(problem: Problem, values: Array, poses: Sequence[FactorRecords], direc
 
 def tools(problem: Problem, values: Array, poses: Sequence[FactorRecords]) -> tuple[Array, Array]:
     """All tools, one for each measurement and arm: places (tools x 3 x N, m) and axes (tools x axis x 3 x N)."""
-    found = []
-    for kernel, shown in zip(problem.kernels, problem.predict(values, poses), strict=True):
-        found.append(shown[len(kernel.factor.output_channels) :].reshape(-1, 4, 3, shown.shape[1]))
-    tools = np.concatenate(found)
+    shown = zip(problem.kernels, problem.predict(values, poses), strict=True)
+    rows = [outputs[len(kernel.factor.output_channels) :] for kernel, outputs in shown]
+    tools = np.concatenate([poses_of.reshape(-1, 4, 3, poses_of.shape[1]) for poses_of in rows])
     return tools[:, 3], tools[:, :3]
-
-
-def _shifted(axes: Array) -> list[Array]:
-    """How each tool's place changes with the point of it that is meant."""
-    result = []
-    for tool in range(len(axes)):
-        for axis in range(3):
-            moved = np.zeros((len(axes), *axes.shape[2:]))
-            moved[tool] = axes[tool, axis]
-            result.append(moved)
-    return result
-
-
-def _rigid(at: Array) -> list[Array]:
-    """How tools move with everything else: three shifts and three turns."""
-    shifts = [np.broadcast_to(axis[None, :, None], at.shape) for axis in np.eye(3)]
-    turns = [np.cross(axis[None, :, None], at, axis=1) for axis in np.eye(3)]
-    return [*shifts, *turns]
 
 
 def unseen_motions(at: Array, axes: Array) -> list[Array]:
     """Motions of all tools together, and of the point of each tool that is meant: columns (tools * 3 * N)."""
-    return [motion.ravel() for motion in (*_rigid(at), *_shifted(axes))]
+    motions = [np.broadcast_to(axis[None, :, None], at.shape) for axis in np.eye(3)]
+    motions += [np.cross(axis[None, :, None], at, axis=1) for axis in np.eye(3)]
+    for tool, axis in np.ndindex(len(axes), 3):
+        moved = np.zeros((len(axes), *axes.shape[2:]))
+        moved[tool] = axes[tool, axis]
+        motions.append(moved)
+    return [motion.ravel() for motion in motions]
 
 
 def apart_from(columns: Array, moves: Array) -> Array:
     """What is left of moves (m x k) that columns (m x n) do not make up for."""
     scaled = columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
     return np.asarray(moves - scaled @ np.linalg.lstsq(scaled, moves, rcond=1e-9)[0])
+
+
+def spread_of(points: Array) -> float:
+    """Root mean square distance of points (3 x N) from their middle."""
+    return float(np.sqrt(np.sum(np.var(points, axis=1))))
+
+
+def rigid_fit(points: Array, others: Array) -> tuple[Array, Array]:
+    """The turn R (3 x 3) and the shift t (3) that bring points (3 x N) nearest to others. [Umeyama1991]"""
+    middle, other = points.mean(axis=1), others.mean(axis=1)
+    left, _, right = np.linalg.svd((others - other[:, None]) @ (points - middle[:, None]).T)
+    turn = left @ np.diag([1.0, 1.0, float(np.sign(np.linalg.det(left @ right)))]) @ right
+    return turn, other - turn @ middle

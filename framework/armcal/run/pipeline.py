@@ -20,8 +20,8 @@ from armcal.errors import ConfigError, NotConvergedError, ProblemError
 from armcal.estimate.bootstrap import Bootstrap, bootstrap
 from armcal.estimate.estimator import Progress, gave_up, no_progress, require_solvable, spread
 from armcal.estimate.nuisance import restricted, settled, started, untrained
+from armcal.estimate.polish import hopeless
 from armcal.estimate.profile import Profile, profiled, profiles
-from armcal.estimate.screening import hopeless
 from armcal.estimate.validation import (
     CrossValidation,
     ErrorSummary,
@@ -40,9 +40,9 @@ from armcal.io.parallel import Executor
 from armcal.measure.id_list import read_ids
 from armcal.plugins import PluginRegistry
 from armcal.problem.drift import residuals, with_drift
-from armcal.problem.joint_noise import with_joint_noise
 from armcal.problem.motion import recorded_position
 from armcal.problem.problem import FactorRecords, Problem
+from armcal.problem.readings import with_joint_noise
 from armcal.run.axes_check import check_permuted_axes
 from armcal.run.experiment import Experiment
 from armcal.run.groups import RunGroups, group_errors, labels_of

@@ -15,8 +15,7 @@ from armcal.estimate.estimator import Progress, no_progress
 from armcal.estimate.identifiability import Identifiability, analyse, measures_of
 from armcal.planning.bound import bounded
 from armcal.planning.candidates import Candidates, Indices, deviations, over_draws
-from armcal.planning.criterion import criterion
-from armcal.planning.observability import Observability, observability
+from armcal.planning.criterion import Observability, criterion, observability
 from armcal.planning.planning import Plan, choose, value_of
 from armcal.planning.refinement import Allowed, refine
 from armcal.planning.relaxation import Relaxation, Task

@@ -166,7 +166,7 @@ def _told(factor: Factor, measurement: Measurement, arms: Mapping[str, Arm], blo
     if not factor.nuisance_names or set(factor.nuisance_names) != {block.name for block in own}:
         raise NotRun("a record alone does not say all of its group's parameters")
     values, record = _point(factor, measurement, arms, blocks)
-    said = np.asarray(_function(factor, factor.told)(np.concatenate([values, record]))).ravel()
+    said = np.asarray(_function(factor, factor.nuisance_starts)(np.concatenate([values, record]))).ravel()
     values[len(values) - len(said) :] = said
     found = np.asarray(_function(factor, factor.residual)(np.concatenate([values, record]))).ravel()
     worst = float(np.abs(found).max())
@@ -229,7 +229,7 @@ def _repeated(
         same = tuple(made.parameters()) == tuple(blocks)
         expect(same, "found other parameters another time, expected them from its settings alone")
         own = _factor(made, arms, blocks, tuple(made.channels()))
-        shown = stacked([own.residual, own.outputs, own.told])
+        shown = stacked([own.residual, own.outputs, own.nuisance_starts])
         at = np.concatenate(_point(factor, measurement, arms, blocks))
         return np.concatenate([np.asarray(_function(own, shown)(at)).ravel(), own.noise])
 

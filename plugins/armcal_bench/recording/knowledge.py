@@ -11,8 +11,7 @@ from armcal.base.domains import Array
 from armcal.errors import ArmcalError
 from armcal.estimate.identifiability import numerical_rank
 from armcal.estimate.nuisance import restricted
-from armcal.estimate.scale import GIVE_A_LENGTH, UNSEEN_SCALE, scale_is_unseen
-from armcal.estimate.structure import explain, identify_from
+from armcal.estimate.structure import GIVE_A_LENGTH, UNSEEN_SCALE, explain, identify_from, scale_is_unseen
 from armcal.estimate.validation import hold_out
 from armcal.problem.problem import FactorRecords, Problem
 from armcal.problem.projection import factor_at_zero, projected

@@ -15,11 +15,10 @@ from armcal.base.domains import Array
 from armcal.estimate.nuisance import started
 from armcal.estimate.polish import descended
 from armcal.measure.measurement import Measurement
-from armcal.problem.joint_noise import with_joint_noise
-from armcal.problem.linearised import BLOCK_RECORDS
+from armcal.problem.factor_records import declared
 from armcal.problem.posed import PosedProblem
 from armcal.problem.problem import Problem
-from armcal.problem.whitening import declared
+from armcal.problem.readings import with_joint_noise
 from armcal.run.experiment import Experiment
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
@@ -158,14 +157,12 @@ class QuickFitter:
         expected, and how many numbers that are."""
         to_half = self._weak.parameters.entries_jacobian(fitted.values) @ fitted.half / fitted.scale
         residuals = self._weak.whitened_residuals(fitted.values, self.records)
-        blocks = self._weak.jacobians(fitted.values, self.records)
+        jacobians = self._weak.jacobians(fitted.values, self.records)
         rows: dict[int, list[tuple[Array, Array]]] = {}
-        for record, residual in zip(self.records, residuals, strict=True):
-            for start in range(0, record.record.shape[1], BLOCK_RECORDS):
-                reach = np.einsum("rvb,vc->brc", next(blocks), to_half)
-                for one in range(start, min(start + BLOCK_RECORDS, record.count)):
-                    if fitted.used[one] and record.weight[one] > 0:
-                        rows.setdefault(one, []).append((residual[:, one], reach[one - start]))
+        for record, residual, jacobian in zip(self.records, residuals, jacobians, strict=True):
+            reach = np.einsum("rvb,vc->brc", jacobian, to_half)
+            for one in np.flatnonzero(fitted.used & (record.weight[: record.count] > 0)):
+                rows.setdefault(int(one), []).append((residual[:, one], reach[one]))
         distances = {}
         for one, parts in rows.items():
             whitened, taken_up = (np.concatenate(part) for part in zip(*parts, strict=True))

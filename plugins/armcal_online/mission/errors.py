@@ -14,7 +14,7 @@ from armcal.base.parameters import Parameters
 from armcal.base.se3 import Expression
 from armcal.config.system import System
 from armcal.errors import ConfigError
-from armcal.estimate.mission_truth import Mission
+from armcal.estimate.simulation import Mission
 from armcal.functions.batch_function import EvaluatorChoice
 from armcal.measure.contact import Contact
 from armcal.measure.measurement import Measurement

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from armcal.estimate.mission_truth import DAY_S, Mission
+from armcal.estimate.simulation import DAY_S, Mission
 
 from armcal_online.mission.judge import ErrorCurve, Judgement
 

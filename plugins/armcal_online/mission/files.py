@@ -16,7 +16,7 @@ from armcal.base.domains import Array
 from armcal.base.parameters import Parameters
 from armcal.base.units import to_unit
 from armcal.errors import InputError, Location
-from armcal.estimate.mission_truth import DAY_S, Mission
+from armcal.estimate.simulation import DAY_S, Mission
 from armcal.io.plain_files import check_output
 
 from armcal_online.mission.figure import mission_figure

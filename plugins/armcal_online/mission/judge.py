@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from armcal.base.domains import Array
-from armcal.estimate.mission_truth import DAY_S, Mission, MissionEvent
+from armcal.estimate.simulation import DAY_S, Mission, MissionEvent
 from numpy.typing import NDArray
 
 from armcal_online.mission.mission_log import ALARMS, NAMING, Decision, MissionLog

@@ -12,8 +12,7 @@ from armcal.calibration.calibration import Calibration
 from armcal.calibration.calibration_file import sealed
 from armcal.errors import ConfigError, InputError, NotConvergedError
 from armcal.estimate.estimator import Progress, no_progress
-from armcal.estimate.mission_truth import Mission
-from armcal.estimate.simulation import SimulationRequest
+from armcal.estimate.simulation import Mission, SimulationRequest
 from armcal.io.plain_files import check_output
 from armcal.measure.csv_writer import write_csv
 from armcal.plugins import PluginRegistry

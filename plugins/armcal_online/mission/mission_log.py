@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 from armcal.base.domains import Array
-from armcal.estimate.mission_truth import Mission
+from armcal.estimate.simulation import Mission
 
 NAMING = ("joint_slipped", "joint_replaced", "sensor_moved")
 """Decisions that say what happened."""

@@ -11,7 +11,7 @@ from armcal.base.settings import InputPath, Length, Settings
 from armcal.config.validate import validate
 from armcal.config.yaml_source import load_config
 from armcal.errors import ConfigError
-from armcal.estimate.mission_truth import MissionSimulator
+from armcal.estimate.simulation import MissionSimulator
 from armcal.plugins import PluginRegistry, discover
 from armcal.run.experiment import Experiment
 from pydantic import Field, model_validator

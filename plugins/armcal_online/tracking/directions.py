@@ -118,7 +118,7 @@ def _defaulted(problem: Problem, count: int) -> dict[str, Array]:
 
 
 def _rows(jacobian: Array) -> Array:
-    """(n_r x n_v x B) as rows, record by record."""
+    """Slopes (n_r x n x N) as rows, record by record."""
     return np.ascontiguousarray(np.moveaxis(jacobian, 2, 0)).reshape(-1, jacobian.shape[1])
 
 
@@ -126,9 +126,7 @@ def _whitened(problem: Problem, values: Array, records: Sequence[FactorRecords],
     """d residual / d channels in units of the noise, rows as those of the Jacobians."""
     parts = []
     for kernel, slope in zip(problem.kernels, problem.channel_slopes(values, records, channels), strict=True):
-        scaled = slope / np.array(kernel.factor.noise)[:, None, None]
-        padded = np.concatenate([scaled, np.zeros((*scaled.shape[:2], -scaled.shape[2] % 8))], axis=2)
-        parts.append(np.ascontiguousarray(np.moveaxis(padded, 2, 0)).reshape(-1, len(channels)))
+        parts.append(_rows(slope / np.array(kernel.factor.noise)[:, None, None]))
     return np.concatenate(parts)
 
 

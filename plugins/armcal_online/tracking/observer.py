@@ -13,7 +13,7 @@ from armcal.estimate.online import Linearised
 from armcal.functions.c_source import LANES
 from armcal.measure.groups import NO_GROUP, group_key, group_name, group_numbers, owner_of
 from armcal.measure.measurement import GroupedMeasurement
-from armcal.problem.gather import HELD
+from armcal.problem.grouped_kernel import HELD
 from armcal.problem.kernel import Kernel
 from armcal.problem.one_record import OneRecord
 from armcal.problem.problem import Problem
@@ -71,7 +71,7 @@ class Observer:
         self._noise, self._defaults, self._unfound = noise, defaults, frozenset(unfound)
         self._freedoms = [freedoms[kernel.factor.name] for kernel in problem.kernels]
         self._factors = [OneRecord(kernel) for kernel in problem.kernels]
-        self._plain = [slots.entries[0] if slots.is_plain else None for slots in problem.slots]
+        self._plain = [grouped.entries[0] if grouped.is_plain else None for grouped in problem.grouped]
         rows = [kernel.factor.residual.numel() for kernel in problem.kernels]
         names = [kernel.factor.name for kernel in problem.kernels]
         self._shifts = [gauss_markov.shifts(name, count) for name, count in zip(names, rows, strict=True)]
@@ -113,11 +113,11 @@ class Observer:
         return tuple(self._as_predicted(values, reading) for reading in self.readings({**measured, **channels}, {}))
 
     def _as_predicted(self, values: Array, reading: Reading) -> Reading:
-        kernel, slots = self.problem.kernels[reading.factor], self.problem.slots[reading.factor]
+        kernel, grouped = self.problem.kernels[reading.factor], self.problem.grouped[reading.factor]
         factor, record = kernel.factor, np.repeat(reading.record[:, None], LANES, axis=1)
         shown = np.empty((factor.outputs.numel() + factor.tools.numel(), LANES))
         state = np.zeros((factor.state.numel(), LANES))
-        kernel.predict(slots.values(values, reading.group), record, state, shown)
+        kernel.predict(grouped.values(values, reading.group), record, state, shown)
         read = reading.record.copy()
         for row, channel in enumerate(factor.output_channels):
             if channel in factor.channels:
@@ -161,18 +161,18 @@ class Observer:
         Raises:
             NotConvergedError: no equilibrium there.
         """
-        slots, one, entries = (
-            self.problem.slots[reading.factor],
+        grouped, one, entries = (
+            self.problem.grouped[reading.factor],
             self._factors[reading.factor],
             self._plain[reading.factor],
         )
         if entries is not None:
             residual, jacobian = one.linearise(values[entries], reading.record)
             return residual, -self.space.by_coordinates(values, jacobian)
-        residual, own = one.linearise(slots.values(values, reading.group), reading.record)
-        free = slots.free[reading.group]
+        residual, own = one.linearise(grouped.values(values, reading.group), reading.record)
+        free = grouped.free[reading.group]
         seen: NDArray[np.intp] = np.flatnonzero(free != HELD)
-        jacobian = np.zeros((len(residual), slots.width))
+        jacobian = np.zeros((len(residual), grouped.width))
         jacobian[:, free[seen]] = own[:, seen]
         return residual, -self.space.by_coordinates(values, jacobian)
 
@@ -187,8 +187,8 @@ class Observer:
         return tuple(self._carried(values, reading) for reading in readings)
 
     def _carried(self, values: Array, reading: Reading) -> Array:
-        kernel, slots = self.problem.kernels[reading.factor], self.problem.slots[reading.factor]
-        own, names = slots.values(values, reading.group), tuple(self._noisy_joints)
+        kernel, grouped = self.problem.kernels[reading.factor], self.problem.grouped[reading.factor]
+        own, names = grouped.values(values, reading.group), tuple(self._noisy_joints)
         record = np.repeat(reading.record[:, None], LANES, axis=1)
         state = np.zeros((kernel.factor.state.numel(), LANES))
         rows = kernel.factor.residual.numel()

@@ -54,7 +54,7 @@ class Compensator:
             parameters: its calibrated values.
             options: how commands are chosen.
             allowed: from commands (n x N) to whether the arm may be there (N).
-            choice: of evaluator: compiled C, or CasADi's virtual machine.
+            choice: of evaluator: compiled C, or CasADi's interpreter.
 
         Raises:
             ValueError: limits of a joint that is not there, or in falling order.
