@@ -1,7 +1,7 @@
 """Sequential convex steps: linearise, solve a convex problem with bounds and priors, step, repeat. [Nocedal2006]
 
 Each step solves exactly the Gauss-Newton model within the bounds, damped (Levenberg-Marquardt) when the cost
-does not fall; cvxpy is not told about poses, only about one small triangular matrix.
+does not fall; cvxpy knows nothing of poses, only one small triangular matrix.
 """
 
 from __future__ import annotations
@@ -107,7 +107,12 @@ class _ConvexStep:
             constraints.append(self._step[np.flatnonzero(self._has_low)] >= self._to_low)
         if self._has_high.any():
             constraints.append(self._step[np.flatnonzero(self._has_high)] <= self._to_high)
-        self._cones = [_Cone(base, place) for base, place in _semidefinite(posed)]
+        self._cones, start = list[_Cone](), 0
+        for block in posed.problem.parameters.free:
+            place = slice(start, start + block.domain.dof)
+            start = place.stop
+            if isinstance(block.domain, Semidefinite):
+                self._cones.append(_Cone(np.array(block.nominal) / posed.coordinate_scales[place], place))
         constraints += [cone.constraint(self._step) for cone in self._cones]
         model = cp.sum_squares(self._root @ self._step + self._target)
         self._problem = cp.Problem(cp.Minimize(model), constraints)
@@ -153,14 +158,3 @@ class _Cone:
         unit = float(np.max(units[self._place]))
         self._now.value = symmetric(self._base + at[self._place]) / unit
         self._units.value = units[self._place] / unit
-
-
-def _semidefinite(posed: PosedProblem) -> list[tuple[Array, slice]]:
-    """Nominal entries (in typical scales) and place of each semidefinite block."""
-    found, start = [], 0
-    for block in posed.problem.parameters.free:
-        place = slice(start, start + block.domain.dof)
-        start = place.stop
-        if isinstance(block.domain, Semidefinite):
-            found.append((np.array(block.nominal) / posed.coordinate_scales[place], place))
-    return found

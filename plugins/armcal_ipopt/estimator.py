@@ -23,6 +23,7 @@ from armcal.io.parallel import Executor, Sequential
 from armcal.problem.posed import PosedProblem
 from armcal.problem.problem import FactorRecords, NormalEquations, Problem
 from pydantic import Field
+from typing_extensions import override
 
 T = TypeVar("T")
 
@@ -71,23 +72,18 @@ class IpoptEstimator:
         if not problem.increments:
             return Solution(start, SolverVerdict("ipopt", "nothing is free", True, 0, 0.0))
         posed, random = PosedProblem(problem, records), np.random.default_rng(self._settings.seed)
-        starts = [_start(posed, start, random, number) for number in range(self._settings.starts)]
+        # The given start, then random ones a typical correction away from the nominal values.
+        starts = [posed.x(_definite(problem.parameters, start))]
+        for _ in range(1, self._settings.starts):
+            starts.append(np.clip(random.normal(size=len(posed.scales)), *posed.bounds()))
         tasks = [_Start(self._settings, problem, tuple(records), x) for x in starts]
         runs = self._executor.map(_solve_once, tasks, lambda done: progress("fit", done))
         converged = [run for run in runs if run.converged]
         best = min(converged or runs, key=lambda run: run.cost)
         agreeing = sum(abs(run.cost - best.cost) <= _SAME_COST * max(1.0, best.cost) for run in converged)
-        x = polish(posed, best.x) if best.converged else best.x
-        verdict = SolverVerdict(
-            "ipopt",
-            best.status,
-            best.converged,
-            best.iterations,
-            time.perf_counter() - began,
-            len(runs),
-            agreeing,
-        )
-        return Solution(posed.values(x), verdict)
+        x, seconds = polish(posed, best.x) if best.converged else best.x, time.perf_counter() - began
+        ended = (best.status, best.converged, best.iterations, seconds)
+        return Solution(posed.values(x), SolverVerdict("ipopt", *ended, len(runs), agreeing))
 
 
 @dataclass(frozen=True)
@@ -111,25 +107,21 @@ def _solve_once(task: _Start) -> _Run:
     watch = _Watch(objective)
     solver = _solver(task.settings, callbacks, watch, len(task.x))
     answer = solver(x0=task.x, lbx=lower, ubx=upper)
-    told = solver.stats()
-    stopped = told["return_status"] == "User_Requested_Stop"
+    stats = solver.stats()
+    stopped = stats["return_status"] == "User_Requested_Stop"
     if objective.interrupted or (stopped and not objective.stuck):
         raise KeyboardInterrupt  # CasADi keeps it to itself, and the next start would go on
     # IPOPT stays inside its bounds by a rounding error; the model's domain wants it exactly.
     x = np.clip(np.asarray(answer["x"]).ravel(), lower, upper)
-    converged = bool(told["success"]) and bool(np.isfinite(x).all())
+    converged = bool(stats["success"]) and bool(np.isfinite(x).all())
     cost = float(answer["f"]) * objective.unit
-    return _Run(x, cost, converged, _STUCK if stopped else str(told["return_status"]), int(told["iter_count"]))
+    return _Run(x, cost, converged, _STUCK if stopped else str(stats["return_status"]), int(stats["iter_count"]))
 
 
 def _solver(settings: IpoptSettings, callbacks: list[_Callback], watch: _Watch, size: int) -> Any:
     cost, gradient, hessian = callbacks
-    x, parameters, factor, multipliers = (
-        ca.MX.sym("x", size),
-        ca.MX(0, 1),
-        ca.MX.sym("s"),
-        ca.MX.sym("l", 0),
-    )
+    x, parameters = ca.MX.sym("x", size), ca.MX(0, 1)
+    factor, multipliers = ca.MX.sym("s"), ca.MX.sym("l", 0)
     inputs = [x, parameters]
     value = cost(x)
     options = {
@@ -169,13 +161,6 @@ class _Run:
     converged: bool
     status: str
     iterations: int
-
-
-def _start(posed: PosedProblem, start: Array, random: np.random.Generator, number: int) -> Array:
-    """The given start, then random ones an ordinary correction away from the nominal values."""
-    if number == 0:
-        return posed.x(_definite(posed.problem.parameters, start))
-    return np.clip(random.normal(size=len(posed.scales)), *posed.bounds())
 
 
 def _definite(parameters: Parameters, values: Array) -> Array:
@@ -258,24 +243,16 @@ class _Callback(ca.Callback):  # type: ignore[misc]
         self._size = size
         self.construct(what, {})
 
-    def get_n_in(self) -> int:
-        """One."""
-        return 1
-
-    def get_n_out(self) -> int:
-        """One."""
-        return 1
-
+    @override
     def get_sparsity_in(self, i: int) -> ca.Sparsity:
-        """A vector."""
         return ca.Sparsity.dense(self._size, 1)
 
+    @override
     def get_sparsity_out(self, i: int) -> ca.Sparsity:
-        """A number, a vector or a matrix."""
         return ca.Sparsity.dense(*self._shape)
 
+    @override
     def eval(self, arguments: list[ca.DM]) -> list[ca.DM]:
-        """Evaluate."""
         return [ca.DM(self._function(np.asarray(arguments[0]).ravel()))]
 
 
@@ -287,19 +264,15 @@ class _Watch(ca.Callback):  # type: ignore[misc]
         self._objective = objective
         self.construct("watch", {})
 
+    @override
     def get_n_in(self) -> int:
-        """What a solver gives out."""
         return int(ca.nlpsol_n_out())
 
-    def get_n_out(self) -> int:
-        """One."""
-        return 1
-
+    @override
     def get_sparsity_in(self, i: int) -> ca.Sparsity:
-        """As the solver has it: no constraints, no parameters."""
-        rows = {"f": 1, "x": self._objective.size, "lam_x": self._objective.size}
+        rows = {"f": 1, "x": self._objective.size, "lam_x": self._objective.size}  # no constraints, no parameters
         return ca.Sparsity.dense(rows.get(ca.nlpsol_out(i), 0), 1)
 
+    @override
     def eval(self, arguments: list[ca.DM]) -> list[int]:
-        """Not zero to end."""
-        return [int(self._objective.stuck)]
+        return [int(self._objective.stuck)]  # not zero to end

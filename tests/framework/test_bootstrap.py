@@ -236,7 +236,7 @@ def test_what_was_not_measured_cannot_be_made_up(lrm) -> None:
     node = np.arange(slopes.shape[1])
     shared = Correlation((slopes,), (slopes,), node, np.ones((len(node) - 1, 1)))
     drifting = tuple(replace(each, correlation=shared) for each in records)
-    with pytest.raises(ProblemError, match="make up"):
+    with pytest.raises(ProblemError, match="to simulate"):
         bootstrap(problem, drifting, experiment.estimator, found, BootstrapSettings(bootstrap=2, method="parametric"))
 
 

@@ -74,7 +74,7 @@ def test_gauge_poses_and_values_are_told_apart_in_words() -> None:
     result = armcal("identify", ALL, "--data", DATA, "--set", free(*names))
     assert result.exit_code == 0
     text = result.stdout
-    gauge = text[text.index("no poses would tell (1):") : text.index("only away from them (1):")]
+    gauge = text[text.index("no poses determine it (1):") : text.index("only away from them (1):")]
     assert "arm.mdh.alpha6 trades with arm.mdh.tool_rx (+1 deg with -1 deg)" in gauge
     assert "arm.mdh.after2_z trades with arm.mdh.d3 (+1 mm with -1 mm)" in text[text.index("only away") :]
     assert "Held by nothing, so that armcal run refuses (2)" in text

@@ -11,8 +11,9 @@ import contact_oracle as co
 import numpy as np
 import pytest
 from armcal.errors import DataError, InputError, ProblemError
-from armcal.estimate.estimator import Solution, SolverVerdict, estimate, require_solvable
+from armcal.estimate.estimator import Solution, SolverVerdict, estimate
 from armcal.estimate.nuisance import restricted, started
+from armcal.estimate.structure import require_solvable
 from armcal.functions import compiler
 from armcal_tracker.position import TipPosition, TipPositionSettings
 from contact_oracle import (

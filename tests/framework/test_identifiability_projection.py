@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from armcal.base.dataset import Dataset
 from armcal.base.parameters import Parameters, scalar
-from armcal.estimate.estimator import Solution, SolverVerdict, estimate, require_solvable
+from armcal.estimate.estimator import Solution, SolverVerdict, estimate
 from armcal.estimate.identifiability import analyse
-from armcal.estimate.structure import explain, identify
+from armcal.estimate.structure import explain, identify, require_solvable
 from armcal.measure.measurement import Channel
 from armcal.problem.problem import Problem
 from armcal.problem.projection import projected
@@ -156,7 +156,7 @@ def test_with_projection_the_planted_combination_is_found_whatever_the_errors(na
 def test_what_is_judged_before_solving_and_after_it_agree(name: str) -> None:
     make, planted = PLANTED[name]
     problem, records, start = make(0.01)
-    with pytest.raises(Exception, match=r"does not determine 1 .*a gauge: no poses would tell") as refused:
+    with pytest.raises(Exception, match=r"does not determine 1 .*a gauge: no poses determine it") as refused:
         require_solvable(problem, records, start)
     assert "measure poses" not in str(refused.value)
     found = estimate(problem, records, Solution(start, SolverVerdict("none", "", True, 0, 0.0)))

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from armcal.base import se3
 from armcal.errors import InputError
-from armcal.estimate.estimator import require_solvable
 from armcal.estimate.nuisance import restricted, settled, started, untrained
+from armcal.estimate.structure import require_solvable
 from armcal.problem.readings import with_joint_noise
 from armcal_contact.ball import BallInSocket
 from armcal_contact.clamp import ClampedTool

@@ -9,8 +9,9 @@ import oracle
 import pytest
 from armcal.base.domains import Interval
 from armcal.errors import ProblemError
-from armcal.estimate.estimator import estimate, require_solvable
+from armcal.estimate.estimator import estimate
 from armcal.estimate.identifiability import analyse
+from armcal.estimate.structure import require_solvable
 from armcal.problem.problem import Problem
 from armcal_cvxpy.estimator import CvxpyEstimator
 from armcal_ipopt.estimator import IpoptEstimator

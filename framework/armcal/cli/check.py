@@ -14,9 +14,8 @@ from rich.table import Table
 from armcal.cli.common import Console, overrides, speaking
 from armcal.cli.outlet import say
 from armcal.errors import ProblemError
-from armcal.estimate.estimator import require_solvable
 from armcal.estimate.identifiability import Identifiability
-from armcal.estimate.structure import identify
+from armcal.estimate.structure import identify, require_solvable
 from armcal.plugins import discover
 from armcal.run.experiment import Experiment
 from armcal.run.gravity import gravity_findings

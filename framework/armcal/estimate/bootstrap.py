@@ -22,7 +22,7 @@ from armcal.errors import NotConvergedError, ProblemError
 from armcal.estimate.blocks import automatic_block_length, draw_weights
 from armcal.estimate.estimator import CONFIDENCE, Estimate, Estimator, Progress, no_progress
 from armcal.io.parallel import Executor, Sequential
-from armcal.problem.factor_records import whitening_of
+from armcal.problem.factor_records import noise_roots
 from armcal.problem.problem import FactorRecords, Problem
 from armcal.problem.projection import predicted_records
 from armcal.problem.readings import disturbed_records, reading_slopes
@@ -138,8 +138,7 @@ def _refit(task: _Refit) -> Array | None:
         random, noise = np.random.default_rng(task.seed), []
         for kernel, record in zip(problem.kernels, records, strict=True):
             white = task.noise_scale * random.normal(size=(len(kernel.factor.noise), record.count))
-            inverse = np.linalg.inv(np.moveaxis(whitening_of(kernel.factor, record)[:, :, : record.count], 2, 0))
-            noise.append(np.einsum("wrs,sw->rw", inverse, white))
+            noise.append(np.einsum("wrs,sw->rw", noise_roots(kernel.factor, record), white))
         predicted = predicted_records(problem, task.start, records)
         records = disturbed_records(problem, task.start, predicted, noise)
     records = problem.weighted(records, [task.weights] * len(records))

@@ -12,18 +12,9 @@ from scipy.special import stdtrit
 
 from armcal.base.domains import Array
 from armcal.base.parameters import Parameters
-from armcal.errors import NotConvergedError, ProblemError
-from armcal.estimate.identifiability import POOR_CONDITION, Identifiability, InverseInformation
-from armcal.estimate.structure import (
-    GIVE_A_LENGTH,
-    UNSEEN_SCALE,
-    Undetermined,
-    explain,
-    held_by_nothing,
-    identify,
-    identify_from,
-    scale_is_unseen,
-)
+from armcal.errors import NotConvergedError
+from armcal.estimate.identifiability import Identifiability, InverseInformation
+from armcal.estimate.structure import identify_from
 from armcal.io.parallel import Executor
 from armcal.problem.problem import FactorRecords, Problem, triangular
 from armcal.problem.projection import factor_at_zero
@@ -31,10 +22,6 @@ from armcal.problem.projection import factor_at_zero
 CONFIDENCE = 0.95
 NEAR_A_BOUND_SD = 3.0
 """Within so many standard deviations of a bound an interval is one-sided."""
-MOST_LISTED = 5
-"""So many undetermined combinations are listed in one message."""
-FEW_HELD = 2
-"""Combinations under priors that are listed in full: they do no harm, and more of them bury the rest."""
 SMALLEST_SPREAD = 1e-12
 AT_BOUND = 1e-6
 """In typical scales of the parameter: closer than this, a parameter lies on its bound."""
@@ -122,7 +109,7 @@ class Interval95:
 
 @dataclass(frozen=True)
 class Estimate:
-    """What a calibration found.
+    """Values, and how sure they are.
 
     Attributes:
         parameters: the blocks, with their nominal values.
@@ -299,62 +286,6 @@ def degrees_of_freedom(problem: Problem, values: Array, records: Sequence[Factor
     """
     triangle = np.sqrt(slope) * factor_at_zero(problem, values, records)
     return problem.equations(records) - InverseInformation.of(triangle, problem.parameters).spent
-
-
-def require_solvable(problem: Problem, records: Sequence[FactorRecords], start: Array) -> tuple[str, ...]:
-    """Refuse a problem whose answer would be made up.
-
-    Returns:
-        warnings: what priors alone hold, and a poor condition.
-
-    Raises:
-        ProblemError: fewer equations than parameters, or undetermined combinations, without priors on them.
-    """
-    parameters = problem.parameters
-    count = problem.equations(records)
-    unknown = problem.increments
-    has_prior = parameters.prior_information() > 0
-    warnings = []
-    if count < unknown:
-        poses = max((record.count for record in records), default=0)
-        text = f"{count} equations ({poses} records) for {unknown} free parameters"
-        if not has_prior.all():
-            raise ProblemError(f"{text}.", hint="Measure more poses, fix parameters, or give every one a prior.")
-        warnings.append(f"{text}: what the data does not determine comes from the priors.")
-    known = identify(problem, start, records)
-    if known.undetermined:
-        explained = explain(problem, start, records, known)
-        listed = "; ".join(str(undetermined) for undetermined in explained[:MOST_LISTED])
-        more = len(explained) - MOST_LISTED
-        listed += f"; and {more} more, which armcal identify lists" if more > 0 else ""
-        text = f"the data does not determine {len(explained)} combinations"
-        unseen_scale = scale_is_unseen(problem, start, records, known)
-        if held_by_nothing(parameters, known):
-            first, mend = (f"{UNSEEN_SCALE}; ", f"{GIVE_A_LENGTH}. ") if unseen_scale else ("", "")
-            raise ProblemError(f"{first}{text}: {listed}.", hint=_sentence(f"{mend}{_mend(explained)}"))
-        if unseen_scale:
-            warnings.append(f"{UNSEEN_SCALE}; its priors hold it. To know it, {GIVE_A_LENGTH}.")
-        listed = listed if len(explained) <= FEW_HELD else "armcal identify lists them"
-        warnings.append(
-            f"at the nominal values {text}; their priors hold them: {listed}. The verdict counts at the answer."
-        )
-    if known.condition > POOR_CONDITION and not has_prior.all():
-        warnings.append(f"the scaled condition is {known.condition:.1e}: {known.weakest} is hardly determined.")
-    return tuple(warnings)
-
-
-def _sentence(text: str) -> str:
-    return text[:1].upper() + text[1:]
-
-
-def _mend(undetermined: Sequence[Undetermined]) -> str:
-    causes = {combination.cause for combination in undetermined}
-    advice = ["fix one parameter of each", "give it a prior"]
-    if "values" in causes:
-        advice.append("start from other values")
-    if causes & {"poses", "unknown"}:
-        advice.append("measure poses that separate them")
-    return _sentence(f"{', '.join(advice[:-1])}, or {advice[-1]}.")
 
 
 def _entry_bounds(parameters: Parameters) -> tuple[Array, Array]:

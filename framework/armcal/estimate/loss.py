@@ -13,6 +13,7 @@ from functools import lru_cache
 from typing import Literal
 
 import numpy as np
+from scipy.integrate import trapezoid
 from scipy.special import chdtri, gammaln
 
 from armcal.base.domains import Array
@@ -62,8 +63,7 @@ class Loss:
         grid, m = np.maximum(norm_grid(), 1e-300), self.dimension
         # The density of the chi distribution.
         logarithm = (m - 1) * np.log(grid) - grid**2 / 2 - gammaln(m / 2) - (m / 2 - 1) * np.log(2)
-        weighted = of * np.exp(logarithm)
-        return float((weighted[:-1] + weighted[1:]).sum() / 2 * (_LARGEST_NORM / _STEPS))
+        return float(trapezoid(of * np.exp(logarithm), dx=_LARGEST_NORM / _STEPS))
 
 
 @lru_cache(maxsize=32)

@@ -18,7 +18,7 @@ import numpy as np
 from scipy.special import fdtri, stdtrit
 
 from armcal.base.domains import Array
-from armcal.problem.factor_records import whitening_of
+from armcal.problem.factor_records import noise_roots
 from armcal.problem.kernel import Kernel
 from armcal.problem.problem import FactorRecords, Problem
 
@@ -192,8 +192,8 @@ class Predictor:
         parts = []
         for kernel, record, slope, moved in zip(self.problem.kernels, records, slopes, drift, strict=True):
             values = np.einsum("rvn,vw,swn->nrs", slope, self.covariance, slope, optimize=True)
-            inverse = np.linalg.inv(np.moveaxis(whitening_of(kernel.factor, record)[:, :, : record.count], 2, 0))
-            parts.append((self.noise_scale**2 * (inverse @ inverse.transpose(0, 2, 1)), values, moved))
+            roots = noise_roots(kernel.factor, record)
+            parts.append((self.noise_scale**2 * (roots @ roots.transpose(0, 2, 1)), values, moved))
         return parts
 
     def _slopes(self, records: Sequence[FactorRecords]) -> list[Array]:

@@ -88,7 +88,7 @@ class ProfileTask:
     problem: Problem
     estimator: Estimator
     records: tuple[FactorRecords, ...]
-    found: Estimate
+    estimate: Estimate
     name: str
 
 
@@ -161,18 +161,18 @@ class _Search:
     def __init__(self, task: ProfileTask) -> None:
         self._task, parameters = task, task.problem.parameters
         self._place = parameters.entries_of(task.name).start
-        own = task.found.names.index(task.name)
-        self.value = float(task.found.values[self._place])
-        self.deviation = float(task.found.deviations[own])
-        self.quantile = float(fdtri(1, max(task.found.degrees_of_freedom, 1), CONFIDENCE))
+        own = task.estimate.names.index(task.name)
+        self.value = float(task.estimate.values[self._place])
+        self.deviation = float(task.estimate.deviations[own])
+        self.quantile = float(fdtri(1, max(task.estimate.degrees_of_freedom, 1), CONFIDENCE))
         block = parameters[task.name]
         known = np.isfinite(self.deviation) and self.deviation > 0
         self._step = self.deviation if known else block.scale
         domain = block.domain
         self._bounds = (domain.lower, domain.upper) if isinstance(domain, Interval) else (-np.inf, np.inf)
-        self._cost = _cost(task.problem, task.records, task.found.values)
-        self._unit = _unit(task, own) if known else max(task.found.noise_scale**2, 1e-30)
-        self._fits = {self.value: task.found.values}
+        self._cost = _cost(task.problem, task.records, task.estimate.values)
+        self._unit = _unit(task, own) if known else max(task.estimate.noise_scale**2, 1e-30)
+        self._fits = {self.value: task.estimate.values}
         self.rises = {self.value: 0.0}
         self.failed = 0
 
@@ -258,11 +258,11 @@ def _cost(problem: Problem, records: Sequence[FactorRecords], values: Array) -> 
 def _unit(task: ProfileTask, own: int) -> float:
     """What the rise is divided by: variance of the estimate over that by the curvature of the cost alone."""
     parameters = task.problem.parameters
-    triangle = factor_at_zero(task.problem, task.found.values, task.records)
-    chain = parameters.entries_jacobian(task.found.values)
+    triangle = factor_at_zero(task.problem, task.estimate.values, task.records)
+    chain = parameters.entries_jacobian(task.estimate.values)
     scales = parameters.scales()
     prior = np.sqrt(parameters.prior_information())
     stacked = np.vstack([triangle * scales, np.diag(prior * scales)])
     row = chain[own] * scales
     by_curvature = float(np.sum((np.linalg.pinv(stacked).T @ row) ** 2))
-    return float(task.found.covariance[own, own]) / by_curvature
+    return float(task.estimate.covariance[own, own]) / by_curvature

@@ -15,9 +15,9 @@ import numpy as np
 
 from armcal.base.domains import Array
 from armcal.base.parameters import Parameters
-from armcal.errors import NotConvergedError
+from armcal.errors import NotConvergedError, ProblemError
 from armcal.estimate.combination import Combination, named
-from armcal.estimate.identifiability import RANK_TOLERANCE, Identifiability, analyse, measures_of
+from armcal.estimate.identifiability import POOR_CONDITION, RANK_TOLERANCE, Identifiability, analyse, measures_of
 from armcal.estimate.null_space import null_rows, sparse_basis
 from armcal.problem.problem import FactorRecords, Problem
 from armcal.problem.projection import approach_channels, factor_at_zero, fits, joint_channels, projected
@@ -25,10 +25,10 @@ from armcal.problem.tool_motion import along, apart_from, tools, unseen_motions
 
 Cause = Literal["gauge", "values", "poses", "unknown"]
 CAUSES: dict[Cause, str] = {
-    "gauge": "a gauge: no poses would tell",
+    "gauge": "a gauge: no poses determine it",
     "values": "not seen at these values, only away from them",
-    "poses": "these poses do not tell, others would",
-    "unknown": "whether other poses would tell could not be found out",
+    "poses": "these poses do not determine it, others would",
+    "unknown": "it could not be found out whether other poses would determine it",
 }
 _AWAY = 0.1
 """How far from the values at hand a point lies where the rank is taken, in typical scales."""
@@ -44,6 +44,10 @@ GIVE_A_LENGTH = "give one length: a known distance, a tracker's record, or a dim
 _GROWTH_LEFT = 1e-4
 """Of the size of the workspace: what may be left of a growth of all tool positions in proportion."""
 _POSES = 60
+MOST_LISTED = 5
+"""So many undetermined combinations are listed in one message."""
+FEW_HELD = 2
+"""Combinations under priors that are listed in full: they do no harm, and more of them bury the rest."""
 
 
 @dataclass(frozen=True)
@@ -183,3 +187,59 @@ def scale_is_unseen(problem: Problem, values: Array, records: Sequence[FactorRec
     growth = (at - at.mean(axis=(0, 2), keepdims=True)).ravel()
     left = apart_from(np.array([move.ravel() for move in moves] + unseen_motions(at, axes)).T, growth[:, None])
     return bool(np.linalg.norm(left) < _GROWTH_LEFT * np.linalg.norm(growth))
+
+
+def require_solvable(problem: Problem, records: Sequence[FactorRecords], start: Array) -> tuple[str, ...]:
+    """Refuse a problem whose answer would be invented.
+
+    Returns:
+        warnings: what priors alone hold, and a poor condition.
+
+    Raises:
+        ProblemError: fewer equations than parameters, or undetermined combinations, without priors on them.
+    """
+    parameters = problem.parameters
+    count = problem.equations(records)
+    unknown = problem.increments
+    has_prior = parameters.prior_information() > 0
+    warnings = []
+    if count < unknown:
+        poses = max((record.count for record in records), default=0)
+        text = f"{count} equations ({poses} records) for {unknown} free parameters"
+        if not has_prior.all():
+            raise ProblemError(f"{text}.", hint="Measure more poses, fix parameters, or give every one a prior.")
+        warnings.append(f"{text}: what the data does not determine comes from the priors.")
+    known = identify(problem, start, records)
+    if known.undetermined:
+        explained = explain(problem, start, records, known)
+        listed = "; ".join(str(undetermined) for undetermined in explained[:MOST_LISTED])
+        more = len(explained) - MOST_LISTED
+        listed += f"; and {more} more, which armcal identify lists" if more > 0 else ""
+        text = f"the data does not determine {len(explained)} combinations"
+        unseen_scale = scale_is_unseen(problem, start, records, known)
+        if held_by_nothing(parameters, known):
+            first, mend = (f"{UNSEEN_SCALE}; ", f"{GIVE_A_LENGTH}. ") if unseen_scale else ("", "")
+            raise ProblemError(f"{first}{text}: {listed}.", hint=_sentence(f"{mend}{_mend(explained)}"))
+        if unseen_scale:
+            warnings.append(f"{UNSEEN_SCALE}; its priors hold it. To know it, {GIVE_A_LENGTH}.")
+        listed = listed if len(explained) <= FEW_HELD else "armcal identify lists them"
+        warnings.append(
+            f"at the nominal values {text}; their priors hold them: {listed}. The verdict counts at the answer."
+        )
+    if known.condition > POOR_CONDITION and not has_prior.all():
+        warnings.append(f"the scaled condition is {known.condition:.1e}: {known.weakest} is hardly determined.")
+    return tuple(warnings)
+
+
+def _sentence(text: str) -> str:
+    return text[:1].upper() + text[1:]
+
+
+def _mend(undetermined: Sequence[Undetermined]) -> str:
+    causes = {combination.cause for combination in undetermined}
+    advice = ["fix one parameter of each", "give it a prior"]
+    if "values" in causes:
+        advice.append("start from other values")
+    if causes & {"poses", "unknown"}:
+        advice.append("measure poses that separate them")
+    return _sentence(f"{', '.join(advice[:-1])}, or {advice[-1]}.")

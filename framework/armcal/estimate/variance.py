@@ -20,7 +20,7 @@ from armcal.errors import ProblemError
 from armcal.estimate.estimator import CONFIDENCE, degrees_of_freedom
 from armcal.estimate.identifiability import CORRELATED
 from armcal.estimate.likelihood import Term, maximise
-from armcal.problem.factor_records import by_covariance, transformed, whitening_of
+from armcal.problem.factor_records import by_covariance, noise_roots, transformed, whitening_of
 from armcal.problem.problem import FactorRecords, Problem
 
 Axes = Literal["together", "apart"]
@@ -103,7 +103,9 @@ def estimate_components(
     chosen, sizes = [source for source, moves in zip(sources, seen, strict=True) if moves], sizes[seen]
     terms = _terms(problem, values, records, [source.bases for source in chosen], sizes)
     maximum = maximise(terms, problem.parameters.prior_information(), ~joints[seen])
-    rms = np.sqrt(maximum.theta) * _typical_noise(problem, records)
+    # Times the typical noise that is declared of the first measurement.
+    roots = noise_roots(problem.kernels[0].factor, records[0])
+    rms = np.sqrt(maximum.theta * np.mean(np.sum(roots**2, axis=2)))
     deviations = np.sqrt(np.maximum(np.diag(maximum.covariance), 0.0)) / sizes
     rows = zip(chosen, maximum.theta / sizes, deviations, maximum.theta / maximum.theta.sum(), rms, strict=True)
     return VarianceComponents(
@@ -213,14 +215,6 @@ def _require_freedom(problem: Problem, values: Array, records: Sequence[FactorRe
             f"{components} variance components from.",
             hint="Measure more poses, or set noise.estimate: false.",
         )
-
-
-def _typical_noise(problem: Problem, records: Sequence[FactorRecords]) -> float:
-    """Root mean square of the declared noise of the first measurement."""
-    kernel, factor_records = problem.kernels[0], records[0]
-    whitening = whitening_of(kernel.factor, factor_records)[:, :, : factor_records.count]
-    inverse = np.linalg.inv(np.moveaxis(whitening, 2, 0))
-    return float(np.sqrt(np.mean(np.sum(inverse**2, axis=2))))
 
 
 def _component(source: _Source, variance: float, deviation: float, share: float, rms: float) -> Component:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, Literal
 
 import numpy as np
+from scipy.optimize import brentq
 
 from armcal.base.domains import Array
-from armcal.planning.candidates import Candidates
 from armcal.planning.relaxation import (
     AT_ONCE,
     INTERIOR_POINT,
@@ -38,8 +37,8 @@ def bounded(task: Task, solver: BoundSolver = "auto", relaxation: Relaxation | N
         return None
     small = task.candidates.count <= AT_ONCE and task.candidates.size <= _MOST_COORDINATES
     can = name in ("D", "A", "E") and task.candidates.draws == 1
-    wanted = name == "E" or solver == "cvxpy" or (solver == "auto" and small)
-    if can and wanted and task.count < task.candidates.count * task.limit:
+    chosen = name == "E" or solver == "cvxpy" or (solver == "auto" and small)
+    if can and chosen and task.count < task.candidates.count * task.limit:
         try:
             return relax(task, by_cvxpy, "cvxpy", max(_AT_ONCE_E if name == "E" else AT_ONCE, 4 * task.count))
         except (ArithmeticError, ValueError):
@@ -64,7 +63,11 @@ def by_cvxpy(task: Task) -> tuple[Array, Tangent]:
     values, vectors = np.linalg.eigh(mixed)
     basis = vectors / np.sqrt(np.maximum(values, 1e-300))
     weights = cp.Variable(candidates.count)
-    information = _information(cp, candidates, basis, weights)
+    rows, size = candidates.rows[0] @ basis, candidates.size
+    products = np.einsum("rni,rnj->ijn", rows, rows, optimize=True).reshape(size * size, -1)
+    known = basis.T @ (candidates.known()[0] + candidates.ridge() * np.eye(size)) @ basis
+    information = cp.reshape(products @ weights, (size, size), order="C") + known
+    information = (information + information.T) / 2
     constraints = [weights >= 0, weights <= task.limit, cp.sum(weights) == task.count]
     if task.criterion.name == "E":
         return _smallest(cp, task, (weights, information, constraints), basis)
@@ -72,16 +75,6 @@ def by_cvxpy(task: Task) -> tuple[Array, Tangent]:
     _solve(cp, cp.Problem(cp.Minimize(objective), constraints), ("SCS", "CLARABEL"))
     feasible = _feasible(task, weights.value)
     return feasible, tangent(task, feasible)
-
-
-def _information(cp: Any, candidates: Candidates, basis: Array, weights: Any) -> Any:
-    """The information in the basis, affine in the weights."""
-    size = candidates.size
-    rows = candidates.rows[0] @ basis
-    each = np.einsum("rni,rnj->ijn", rows, rows, optimize=True).reshape(size * size, -1)
-    known = basis.T @ (candidates.known()[0] + candidates.ridge() * np.eye(size)) @ basis
-    whole = cp.reshape(each @ weights, (size, size), order="C") + known
-    return (whole + whole.T) / 2
 
 
 def _smallest(cp: Any, task: Task, posed: tuple[Any, Any, list[Any]], basis: Array) -> tuple[Array, Tangent]:
@@ -127,11 +120,5 @@ def _feasible(task: Task, weights: Array | None) -> Array:
     def excess(shift: float) -> float:
         return float(np.clip(weights + shift, 0.0, upper).sum()) - task.count
 
-    return np.clip(weights + _root(excess, -upper - float(np.abs(weights).max()), upper + 1.0), 0.0, upper)
-
-
-def _root(function: Callable[[float], float], low: float, high: float) -> float:
-    for _ in range(80):
-        middle = (low + high) / 2
-        low, high = (middle, high) if function(middle) < 0 else (low, middle)
-    return (low + high) / 2
+    farthest = upper + float(np.abs(weights).max()) + 1.0
+    return np.clip(weights + brentq(excess, -farthest, farthest, xtol=1e-14), 0.0, upper)

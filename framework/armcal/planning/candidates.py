@@ -17,7 +17,7 @@ from armcal.problem.projection import as_predicted
 Indices = NDArray[np.intp]
 RIDGE = 1e-9
 """Information in typical scales that stands in for what nothing determines yet, relative to the candidates' mean:
-below what any real measurement tells, far above rounding."""
+below what any real measurement gives, far above rounding."""
 _ROWS_AT_ONCE = 8192
 _SEEN = 1e-9
 _TAKES_PART = 1e-6
@@ -73,11 +73,11 @@ class Candidates:
 
     def triangles(self, chosen: Indices) -> list[Array]:
         """R with R'R the information of what is known and the chosen ones, one a draw: keeps small singular values."""
-        found = list(self.base)
+        triangles = list(self.base)
         for start in range(0, len(chosen), _ROWS_AT_ONCE):
             few = self.rows[:, :, chosen[start : start + _ROWS_AT_ONCE], :].reshape(self.draws, -1, self.size)
-            found = [triangular(np.vstack([above, part])) for above, part in zip(found, few, strict=True)]
-        return found
+            triangles = [triangular(np.vstack([above, part])) for above, part in zip(triangles, few, strict=True)]
+        return triangles
 
     def scores(self, gradients: Array) -> Array:
         """<gradient, J'J> of every candidate, averaged over draws (N); ``gradients`` (draws x n x n) symmetric."""

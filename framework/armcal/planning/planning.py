@@ -88,36 +88,22 @@ def choose(task: Task, starts: int | None = None, seed: int = 0, begin: Indices 
     chosen, swaps = _best(smaller, given, kicks, random)
     chosen = few[chosen]
     if len(few) < task.candidates.count:
-        chosen, more = _climbed(task, tally(task.candidates, task.criterion), chosen, longest=0)
+        chosen, more = detmax(task, chosen, longest=0)
         swaps += more
     chosen = in_order(task, chosen)
     return Plan(chosen, value_of(task.candidates, task.criterion, chosen), len(given) + 1 + kicks, swaps, relaxed)
 
 
-def detmax(task: Task, start: Indices, held: Tally | None = None) -> tuple[Indices, int]:
-    """One start of DETMAX, ended by exchanges: the plan, and how many poses came in; ``held`` counts their worth."""
-    return _climbed(task, held or tally(task.candidates, task.criterion), start)
-
-
 def built_up(task: Task) -> Indices:
     """A plan without a relaxation: pose by pose, then led to where no swap helps; in the order of ``in_order``."""
     held = tally(task.candidates, task.criterion)
-    return in_order(task, _climbed(task, held, _built_up(task, held))[0])
+    return in_order(task, detmax(task, _built_up(task, held), held)[0])
 
 
 def in_order(task: Task, chosen: Indices) -> Indices:
     """A plan's poses, each adding most to those before it: to stop early loses least."""
-    part = task.subset(chosen)
-    held = tally(part.candidates, task.criterion)
-    free, order = np.ones(len(chosen), dtype=bool), []
-    for _ in range(len(chosen)):
-        best = int(np.argmax(np.where(free, held.if_added(), -np.inf)))
-        if not free[best]:
-            best = int(np.flatnonzero(free)[0])
-        held.add(best)
-        free[best] = False
-        order.append(best)
-    return chosen[np.array(order, dtype=np.intp)]
+    part = replace(task.subset(chosen), count=len(chosen), limit=1)
+    return chosen[_built_up(part, tally(part.candidates, part.criterion))]
 
 
 def _best(task: Task, starts: list[Indices], kicks: int, random: np.random.Generator) -> tuple[Indices, int]:
@@ -129,8 +115,15 @@ def _best(task: Task, starts: list[Indices], kicks: int, random: np.random.Gener
     starts = [*starts, _built_up(task, held)]
     best, best_value, swaps = starts[0], -np.inf, 0
     for number in range(len(starts) + kicks):
-        start = starts[number] if number < len(starts) else _kicked(task, best, random)
-        chosen, moves = _climbed(task, held, start)
+        if number < len(starts):
+            start = starts[number]
+        else:
+            times = np.bincount(best, minlength=task.candidates.count)
+            others = np.repeat(np.arange(task.candidates.count), task.limit - times)
+            size = min(max(1, round(_KICKED * task.count)), len(others))
+            kept = random.permutation(best)[: task.count - size]
+            start = np.concatenate([kept, random.choice(others, size, replace=False)]).astype(np.intp)
+        chosen, moves = detmax(task, start, held)
         value, swaps = value_of(task.candidates, task.criterion, chosen), swaps + moves
         if value > best_value:
             best, best_value = chosen, value
@@ -142,15 +135,6 @@ def _drawn(task: Task, weights: Array, random: np.random.Generator) -> Indices:
     pool = np.repeat(np.arange(task.candidates.count), task.limit)
     waits = random.exponential(size=len(pool)) / np.maximum(weights[pool], _LEAST_WEIGHT)
     return np.sort(pool[np.argsort(waits)[: task.count]])
-
-
-def _kicked(task: Task, chosen: Indices, random: np.random.Generator) -> Indices:
-    """A plan with a few of its poses exchanged at random."""
-    times = np.bincount(chosen, minlength=task.candidates.count)
-    others = np.repeat(np.arange(task.candidates.count), task.limit - times)
-    size = min(max(1, round(_KICKED * task.count)), len(others))
-    kept = random.permutation(chosen)[: task.count - size]
-    return np.concatenate([kept, random.choice(others, size, replace=False)]).astype(np.intp)
 
 
 def _rounded(task: Task, relaxed: Relaxation) -> Indices:
@@ -240,9 +224,11 @@ class _Climb:
         self.times[candidate] -= 1
 
 
-def _climbed(task: Task, held: Tally, start: Indices, longest: int = _LONGEST_EXCURSION) -> tuple[Indices, int]:
+def detmax(
+    task: Task, start: Indices, held: Tally | None = None, longest: int = _LONGEST_EXCURSION
+) -> tuple[Indices, int]:
     """DETMAX from a start, then exchanges until none helps: the plan, and how many poses came in."""
-    climb = _Climb(task, held, start)
+    climb = _Climb(task, held or tally(task.candidates, task.criterion), start)
     reachable = min(longest, task.count - 1, task.candidates.count * task.limit - task.count)
     length = 1
     for _ in range(_MOST_EXCURSIONS + 10 * task.count):
@@ -250,7 +236,9 @@ def _climbed(task: Task, held: Tally, start: Indices, longest: int = _LONGEST_EX
             break
         length = 1 if _excursion(climb, length) else length + 1
     for _ in range(_MOST_SWEEPS):
-        if not _swept(climb):
+        plan = list(climb.chosen)
+        gains = [climb.swap(climb.chosen.index(candidate)) for candidate in plan if candidate in climb.chosen]
+        if not any(gain > 0 for gain in gains):
             break
     return np.sort(np.array(climb.chosen, dtype=np.intp)), climb.moves
 
@@ -266,12 +254,3 @@ def _excursion(climb: _Climb, length: int) -> bool:
         if not np.array_equal(np.sort(climb.chosen), np.sort(before)):
             climb.begin(before)
     return False
-
-
-def _swept(climb: _Climb) -> bool:
-    """Try every pose once; whether any was exchanged."""
-    swapped = False
-    for candidate in list(climb.chosen):
-        if candidate in climb.chosen:
-            swapped |= climb.swap(climb.chosen.index(candidate)) > 0
-    return swapped

@@ -1,4 +1,4 @@
-"""Moving chosen poses through continuous joint space to where they tell more, one joint at a time."""
+"""Moving chosen poses through continuous joint space to where they determine more, one joint at a time."""
 
 from __future__ import annotations
 
@@ -43,7 +43,11 @@ def refine(
     step = _FIRST_STEP * (limits[:, 1] - limits[:, 0])
     for _ in range(sweeps):
         for index in range(poses.shape[1]):
-            trials = _neighbours(poses[:, index], step, limits)
+            # One joint moved by a step either way, or to one of its limits (joints x trials).
+            pose = poses[:, index, None]
+            moves = [np.diag(step), -np.diag(step), *(np.diag(limits[:, end] - poses[:, index]) for end in (0, 1))]
+            trials = np.clip(pose + np.concatenate(moves, axis=1), limits[:, :1], limits[:, 1:])
+            trials = trials[:, np.any(trials != pose, axis=0)]
             trials = trials[:, allowed(trials)]
             if not trials.shape[1]:
                 continue
@@ -57,14 +61,6 @@ def refine(
                 information = without + _square(tried[:, :, best])
         step = step * _SHRINK
     return np.asarray(poses)
-
-
-def _neighbours(pose: Array, step: Array, limits: Array) -> Array:
-    """One joint moved by a step either way, or to one of its limits (joints x trials)."""
-    to_limits = [pose[:, None] + np.diag(limits[:, end] - pose) for end in (0, 1)]
-    moved = np.concatenate([pose[:, None] + np.diag(step), pose[:, None] - np.diag(step), *to_limits], axis=1)
-    moved = np.clip(moved, limits[:, :1], limits[:, 1:])
-    return np.asarray(moved[:, np.any(moved != pose[:, None], axis=0)])
 
 
 def _square(rows: Array) -> Array:

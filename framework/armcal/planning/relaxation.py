@@ -7,7 +7,7 @@ any M at hand, and any plan v, with X the gradient of f at M,
 
 whose right side is largest for the poses with the largest <X, J'J>: a bound on every plan, whichever way M was
 found. At the optimum of the relaxation it is tight, the equivalence theorem [Kiefer1974] [Boyd2004]. A solver's own
-word is never taken.
+claim is never used.
 """
 
 from __future__ import annotations
@@ -113,12 +113,17 @@ def relax(task: Task, solver: Solver, how: str, at_once: int | None = None) -> R
         at_once = max(AT_ONCE if task.candidates.size <= _MANY_COORDINATES else _FEW, 4 * task.count)
     if task.candidates.count <= at_once:
         return certified(task, *solver(task), how)
-    active = _spread_out(task, at_once // 4)
+    # To begin with: those that add most to an even mixture, and a few of all kinds.
+    candidates, number, count = task.candidates, task.candidates.count, at_once // 4
+    information = candidates.information(np.full(number, task.count / number))
+    information += candidates.ridge() * np.eye(candidates.size)
+    scores = candidates.scores(np.asarray(np.linalg.inv(information), dtype=float))
+    several = np.arange(0, number, max(1, number // count))
+    active = np.union1d(np.argpartition(-scores, count)[:count], several).astype(np.intp)
     best: Relaxation | None = None
     for _ in range(_ROUNDS):
-        found, upper = solver(task.subset(active))
-        weights = np.zeros(task.candidates.count)
-        weights[active] = found
+        weights = np.zeros(number)
+        weights[active], upper = solver(task.subset(active))
         made = certified(task, weights, upper, how)
         reached = upper.constant + task.subset(active).most(made.scores[active])
         best = made if best is None or made.bound < best.bound else best
@@ -127,16 +132,6 @@ def relax(task: Task, solver: Solver, how: str, at_once: int | None = None) -> R
         active = _next_active(task, made, active, at_once)
     assert best is not None
     return best
-
-
-def _spread_out(task: Task, count: int) -> Indices:
-    """To begin with: those that add most to an even mixture, and a few of all kinds."""
-    candidates, number = task.candidates, task.candidates.count
-    even = np.full(number, task.count / number)
-    information = candidates.information(even) + candidates.ridge() * np.eye(candidates.size)
-    scores = candidates.scores(np.asarray(np.linalg.inv(information), dtype=float))
-    step = max(1, number // count)
-    return np.union1d(np.argpartition(-scores, count)[:count], np.arange(0, number, step)).astype(np.intp)
 
 
 def _next_active(task: Task, made: Relaxation, active: Indices, most: int) -> Indices:

@@ -1,4 +1,4 @@
-"""Which few poses would tell most next: D-optimal choice among poses like the recorded ones."""
+"""Which few poses to measure next: D-optimal choice among poses like the recorded ones."""
 
 from __future__ import annotations
 
@@ -45,22 +45,19 @@ def suggest(
     chosen = built_up(Task(candidates, criterion("D"), min(count, len(poses))))
     before = deviations(base)
     known = np.isfinite(before) & (before > 0)
+    units = {channel: display_unit(dimension).name for channel, dimension in joints.items()}
     suggestions = []
     for number in range(1, len(chosen) + 1):
         after = deviations(candidates.triangles(chosen[:number])[0])
         commands = {channel: float(poses.column(channel)[chosen[number - 1]]) for channel in joints}
         shrink = float(np.mean(after[known] / before[known])) if known.any() else 1.0
-        suggestions.append(Suggestion(commands, _text(commands, joints), shrink))
+        parts = [f"{to_unit(value, units[channel]):.0f}" for channel, value in commands.items()]
+        if len(set(units.values())) > 1:
+            text = f"({', '.join(f'{part} {unit}' for part, unit in zip(parts, units.values(), strict=True))})"
+        else:
+            text = f"({', '.join(parts)}) {next(iter(units.values()))}"
+        suggestions.append(Suggestion(commands, text, shrink))
     return tuple(suggestions)
-
-
-def _text(commands: Mapping[str, float], joints: Mapping[str, str]) -> str:
-    units = {channel: display_unit(dimension).name for channel, dimension in joints.items()}
-    parts = [f"{to_unit(value, units[channel]):.0f}" for channel, value in commands.items()]
-    if len(set(units.values())) > 1:
-        parts = [f"{part} {unit}" for part, unit in zip(parts, units.values(), strict=True)]
-        return f"({', '.join(parts)})"
-    return f"({', '.join(parts)}) {next(iter(units.values()))}"
 
 
 def _candidates(dataset: Dataset, joints: tuple[str, ...], seed: int) -> Dataset:

@@ -12,6 +12,7 @@ from __future__ import annotations
 from typing import Protocol
 
 import numpy as np
+from typing_extensions import override
 
 from armcal.base.domains import Array
 from armcal.planning.candidates import Candidates, Indices
@@ -59,41 +60,41 @@ def tally(candidates: Candidates, criterion: Criterion) -> Tally:
     return SpectralTally(candidates, criterion)
 
 
-class MeanTally:
+class MeanTally(Tally):
     """The mean over draws."""
 
     def __init__(self, parts: list[DeterminantTally]) -> None:
         self._parts = parts
 
+    @override
     def restart(self, chosen: Indices) -> None:
-        """All of them."""
         for part in self._parts:
             part.restart(chosen)
 
+    @override
     def add(self, candidate: int) -> None:
-        """To all."""
         for part in self._parts:
             part.add(candidate)
 
+    @override
     def remove(self, candidate: int) -> None:
-        """From all."""
         for part in self._parts:
             part.remove(candidate)
 
+    @override
     def if_added(self) -> Array:
-        """Mean."""
         return self._mean([part.if_added() for part in self._parts])
 
+    @override
     def if_removed(self, chosen: Indices) -> Array:
-        """Mean."""
         return self._mean([part.if_removed(chosen) for part in self._parts])
 
+    @override
     def if_swapped(self, candidate: int) -> Array:
-        """Mean."""
         return self._mean([part.if_swapped(candidate) for part in self._parts])
 
+    @override
     def tolerance(self) -> float:
-        """The largest."""
         return max(part.tolerance() for part in self._parts)
 
     @staticmethod
@@ -101,7 +102,7 @@ class MeanTally:
         return parts[0] if len(parts) == 1 else np.asarray(np.mean(parts, axis=0))
 
 
-class DeterminantTally:
+class DeterminantTally(Tally):
     """Log determinant, at one draw. Symmetric n_r x n_r matrices of all candidates are kept packed (pairs x N)."""
 
     def __init__(self, candidates: Candidates) -> None:
@@ -112,35 +113,35 @@ class DeterminantTally:
         self._known = candidates.known()[0] + candidates.ridge() * np.eye(self._size)
         self.restart(np.zeros(0, dtype=np.intp))
 
+    @override
     def restart(self, chosen: Indices) -> None:
-        """Begin anew with these."""
         rows = self._candidates.rows[0][:, chosen, :].reshape(-1, self._size)
         self._settle(self._known + rows.T @ rows)
 
+    @override
     def add(self, candidate: int) -> None:
-        """Let one in."""
         self._change(candidate, 1.0)
 
+    @override
     def remove(self, candidate: int) -> None:
-        """Take one out."""
         self._change(candidate, -1.0)
 
+    @override
     def if_added(self) -> Array:
-        """log det(I + H C H')."""
-        return _log_det(self._seen, self._n_rows)
+        return _log_det(self._seen, self._n_rows)  # log det(I + H C H')
 
+    @override
     def if_removed(self, chosen: Indices) -> Array:
-        """log det(I - H C H')."""
-        return _log_det(-self._seen[:, chosen], self._n_rows)
+        return _log_det(-self._seen[:, chosen], self._n_rows)  # log det(I - H C H')
 
+    @override
     def if_swapped(self, candidate: int) -> Array:
-        """Without it, then with each other one."""
         loss = self.if_removed(np.array([candidate]))[0]
         half, _ = self._half(candidate, -1.0)
         return _log_det(self._seen + self._outer(half, half), self._n_rows) + float(loss)
 
+    @override
     def tolerance(self) -> float:
-        """Of a logarithm."""
         return _TOLERANCE
 
     def _settle(self, information: Array) -> None:
@@ -194,24 +195,24 @@ class DeterminantTally:
 class TraceTally(DeterminantTally):
     """Minus the trace of the covariance, at one draw; H C^2 H' is kept beside H C H'."""
 
+    @override
     def if_added(self) -> Array:
-        """tr (I + H C H')^-1 H C^2 H'."""
-        return _trace_of_solution(self._seen, self._squared, self._n_rows)
+        return _trace_of_solution(self._seen, self._squared, self._n_rows)  # tr (I + H C H')^-1 H C^2 H'
 
+    @override
     def if_removed(self, chosen: Indices) -> Array:
-        """The same with the signs of a removal."""
         return -_trace_of_solution(-self._seen[:, chosen], self._squared[:, chosen], self._n_rows)
 
+    @override
     def if_swapped(self, candidate: int) -> Array:
-        """Without it, then with each other one."""
         loss = self.if_removed(np.array([candidate]))[0]
         half, factor = self._half(candidate, -1.0)
         seen = self._seen + self._outer(half, half)
         squared = self._squared_after(half, factor, -1.0)
         return _trace_of_solution(seen, squared, self._n_rows) + float(loss)
 
+    @override
     def tolerance(self) -> float:
-        """Relative to the trace."""
         return _TOLERANCE * float(np.trace(self._inverse))
 
     def _settle(self, information: Array) -> None:
@@ -232,7 +233,7 @@ class TraceTally(DeterminantTally):
         return np.asarray(self._squared - sign * cross + self._outer(mixed, half))
 
 
-class SpectralTally:
+class SpectralTally(Tally):
     """Any function of eigenvalues, by decomposition; beyond ``SHORTLIST`` candidates, of those that promise most."""
 
     def __init__(self, candidates: Candidates, criterion: Criterion) -> None:
@@ -240,33 +241,33 @@ class SpectralTally:
         self._known = candidates.known() + candidates.ridge() * np.eye(candidates.size)
         self.restart(np.zeros(0, dtype=np.intp))
 
+    @override
     def restart(self, chosen: Indices) -> None:
-        """Begin anew with these."""
         rows = self._candidates.rows[:, :, chosen, :].reshape(self._candidates.draws, -1, self._candidates.size)
         self._settle(self._known + np.swapaxes(rows, 1, 2) @ rows)
 
+    @override
     def add(self, candidate: int) -> None:
-        """Let one in."""
         self._settle(self._information + self._of(np.array([candidate]))[:, 0])
 
+    @override
     def remove(self, candidate: int) -> None:
-        """Take one out."""
         self._settle(self._information - self._of(np.array([candidate]))[:, 0])
 
+    @override
     def if_added(self) -> Array:
-        """By decomposition."""
         return self._tried(self._information)
 
+    @override
     def if_removed(self, chosen: Indices) -> Array:
-        """By decomposition."""
         return self._values(self._information[:, None] - self._of(chosen)) - self._value
 
+    @override
     def if_swapped(self, candidate: int) -> Array:
-        """By decomposition."""
         return self._tried(self._information - self._of(np.array([candidate]))[:, 0])
 
+    @override
     def tolerance(self) -> float:
-        """Relative to the value."""
         return _TOLERANCE * abs(self._value)
 
     def _settle(self, information: Array) -> None:
@@ -283,30 +284,28 @@ class SpectralTally:
     def _tried(self, information: Array) -> Array:
         count = self._candidates.count
         change = np.full(count, -np.inf)
-        few = np.arange(count) if count <= SHORTLIST else self._promising(information)
+        few = np.arange(count)
+        if count > SHORTLIST:  # those that add most along the directions that are least determined
+            values, vectors = np.linalg.eigh(information)
+            weight = np.maximum(values, 1e-12 * values[:, -1:]) ** -2.0
+            scores = self._candidates.scores((vectors * weight[:, None, :]) @ np.swapaxes(vectors, 1, 2))
+            few = np.argpartition(-scores, SHORTLIST)[:SHORTLIST].astype(np.intp)
         change[few] = self._values(information[:, None] + self._of(few)) - self._value
         return change
-
-    def _promising(self, information: Array) -> Indices:
-        """Those that add most along the directions that are least determined."""
-        values, vectors = np.linalg.eigh(information)
-        weight = np.maximum(values, 1e-12 * values[:, -1:]) ** -2.0
-        scores = self._candidates.scores((vectors * weight[:, None, :]) @ np.swapaxes(vectors, 1, 2))
-        return np.argpartition(-scores, SHORTLIST)[:SHORTLIST].astype(np.intp)
 
 
 def _log_det(packed: Array, n_rows: int) -> Array:
     """log det(I + S) of packed symmetric matrices; very small where it is not positive definite."""
     if n_rows == 1:
-        found = 1 + packed[0]
+        determinant = 1 + packed[0]
     elif n_rows == 3:
         a, b, c, d, e, f = packed
         a, d, f = a + 1, d + 1, f + 1
-        found = a * (d * f - e * e) - b * (b * f - c * e) + c * (b * e - c * d)
+        determinant = a * (d * f - e * e) - b * (b * f - c * e) + c * (b * e - c * d)
     else:
         signs, logarithms = np.linalg.slogdet(_unpacked(packed, n_rows) + np.eye(n_rows))
         return np.asarray(np.where(signs > 0, logarithms, np.log(_SMALLEST)))
-    return np.asarray(np.log(np.maximum(found, _SMALLEST)))
+    return np.asarray(np.log(np.maximum(determinant, _SMALLEST)))
 
 
 def _trace_of_solution(seen: Array, squared: Array, n_rows: int) -> Array:

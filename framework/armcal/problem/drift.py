@@ -3,7 +3,7 @@
 A drifting parameter is its value plus a stationary process whose correlation falls by e over a stated distance in
 recorded order or time (Ornstein-Uhlenbeck [Rasmussen2006]), exactly so at the records' own places. It is no further
 parameter but a covariance of the residuals: the values found stay those of the arm at rest, their uncertainty counts
-the drift, and where records lie near others the drift can be told.
+the drift, and where records lie near others they determine the drift.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from armcal.base.domains import Array
 from armcal.base.parameters import Drift, ParameterBlock
 from armcal.errors import DataError, Location
 from armcal.problem.correlation import Correlation
+from armcal.problem.factor_records import noise_roots
 from armcal.problem.problem import FactorRecords, Problem
 
 
@@ -109,13 +110,9 @@ def with_drift(
     slopes, raw = [], []  # by states, each a standard deviation of a parameter's drift
     for kernel, record, jacobian in zip(problem.kernels, shared, problem.jacobians(values, shared), strict=True):
         slope = np.moveaxis(jacobian[:, chosen], 1, 2) * sds
-        slope = np.pad(slope, ((0, 0), (0, record.record.shape[1] - record.count), (0, 0)))
-        slopes.append(slope)
-        if record.whitening is None:
-            raw.append(np.asarray(slope * np.array(kernel.factor.noise)[:, None, None]))
-        else:
-            inverse = np.linalg.inv(np.moveaxis(record.whitening, 2, 0))
-            raw.append(np.asarray(np.einsum("wrs,swz->rwz", inverse, slope)))
+        padding = ((0, 0), (0, record.record.shape[1] - record.count), (0, 0))
+        slopes.append(np.pad(slope, padding))
+        raw.append(np.pad(np.einsum("wrs,swz->rwz", noise_roots(kernel.factor, record), slope), padding))
     node = along.nodes(dataset)
     node = np.pad(node, (0, len(records[0].weight) - len(node)), mode="edge")
     correlation = Correlation(tuple(slopes), tuple(raw), node, along.apart(drifting))

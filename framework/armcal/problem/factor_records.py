@@ -175,6 +175,11 @@ def whitening_of(factor: Factor, records: FactorRecords) -> Array:
     return np.repeat(declared(factor.noise)[:, :, None], records.record.shape[1], axis=2)
 
 
+def noise_roots(factor: Factor, records: FactorRecords) -> Array:
+    """L with L L' the covariance of each record's residual, as it states it or as declared (N x n_r x n_r; SI)."""
+    return np.asarray(np.linalg.inv(np.moveaxis(whitening_of(factor, records)[:, :, : records.count], 2, 0)))
+
+
 def by_deviation(deviations: Array) -> Array:
     """From each record's own standard deviations (n_r x N), uncorrelated (n_r x n_r x N)."""
     count = len(deviations)

@@ -82,7 +82,7 @@ def recorded_position(dataset: Dataset) -> NDArray[np.intp]:
 
 def _acting(problem: Problem, dataset: Dataset) -> dict[str, Array]:
     """The loads of each record (N each), those of the environment where a record says nothing."""
-    e = problem.environment
+    e = problem.blueprint.environment
     stated = (*e.gravity, e.payload_mass, *e.payload_com, *e.force, *e.torque)
     return {
         channel: dataset.column(channel) if dataset.has(channel) else np.full(len(dataset), default)

@@ -79,23 +79,19 @@ class TieFunction:
     def of(cls, owned: OwnedTie, parameters: Parameters) -> TieFunction:
         """Built for the blocks of a problem."""
         entries: list[int] = []
-        sides: list[dict[str, ca.SX]] = []
-        symbols: list[ca.SX] = []
-        for names in owned.names:
-            side: dict[str, ca.SX] = {}
+        sides: tuple[dict[str, Expression], dict[str, Expression]] = ({}, {})
+        for side, names in zip(sides, owned.names, strict=True):
             for local, full in names.items():
-                place = parameters.entries_of(full)
-                side[local] = ca.SX.sym(local, place.stop - place.start)
-                symbols.append(side[local])
-                entries += range(place.start, place.stop)
-            sides.append(side)
-        stacked_symbols = ca.vertcat(*symbols)
-        residual = owned.tie.residual(sides[0], sides[1])
-        outputs: list[Expression] = [ca.densify(residual), ca.densify(ca.jacobian(residual, stacked_symbols))]
-        function = ca.Function("tie", [stacked_symbols], outputs)
+                own = range(len(parameters.entry_names))[parameters.entries_of(full)]
+                side[local] = ca.SX.sym(local, len(own))
+                entries += own
+        symbols = ca.vertcat(*sides[0].values(), *sides[1].values())
+        residual = owned.tie.residual(*sides)
+        outputs = [ca.densify(residual), ca.densify(ca.jacobian(residual, symbols))]
+        function = ca.Function("tie", [symbols], outputs)
         factors = ca.SX.sym("factors", len(owned.tie.noise))
-        second = ca.densify(ca.hessian(ca.dot(factors, residual), stacked_symbols)[0])
-        bend = ca.Function("tie_bend", [stacked_symbols, factors], [second])
+        second = ca.densify(ca.hessian(ca.dot(factors, residual), symbols)[0])
+        bend = ca.Function("tie_bend", [symbols, factors], [second])
         return cls(owned.tie.groups, np.array(entries, dtype=np.intp), np.array(owned.tie.noise), function, bend)
 
     @property
@@ -126,5 +122,5 @@ class TieFunction:
 
     def _free(self, places: Mapping[int, int]) -> tuple[list[int], list[int]]:
         """Which of its numbers are free, and their places."""
-        found = [(column, places[entry]) for column, entry in enumerate(self.entries.tolist()) if entry in places]
-        return [column for column, _ in found], [place for _, place in found]
+        columns = [column for column, entry in enumerate(self.entries.tolist()) if entry in places]
+        return columns, [places[int(self.entries[column])] for column in columns]

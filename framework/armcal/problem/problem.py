@@ -41,7 +41,6 @@ class Problem:
 
     parameters: Parameters
     kernels: tuple[Kernel, ...]
-    environment: Environment
     blueprint: Blueprint
     known_ties: tuple[TieFunction, ...] = ()
 
@@ -62,7 +61,7 @@ class Problem:
             groups = groups_of(dataset, measurements) if parameters.nuisances else {}
         blueprint = Blueprint(arms, measurements, parameters, environment, frozenset(dataset.channels), groups)
         kernels = blueprint.kernels(len(dataset), dict.fromkeys(measurements, evaluator))
-        return cls(parameters, kernels, environment, blueprint, blueprint.ties())
+        return cls(parameters, kernels, blueprint, blueprint.ties())
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _from_bytes, (self._bytes,)
@@ -102,7 +101,7 @@ class Problem:
     def ties(self) -> tuple[TieFunction, ...]:
         """What is known between groups that are free, or free and known.
 
-        A group held because no record belongs to it is not known: a tie to where it starts would be made up.
+        A group held because no record belongs to it is not known: a tie to where it starts would be invented.
         """
         free, could = set(self.parameters.free_entries), set(self.blueprint.parameters.free_entries)
         sides = [[set(side.tolist()) for side in tie.sides] for tie in self.known_ties]
@@ -119,10 +118,10 @@ class Problem:
         factors = [kernel.factor for kernel in self.kernels]
         numbers = [group_numbers(dataset, name, m, plan.groups) for name, m in plan.measurements.items()]
         masks = [factor_records.applicable(f, dataset, n) for f, n in zip(factors, numbers, strict=True)]
-        # A record that is nobody's stays with all that read it, so that it is found out.
-        nobodys = ~np.any(masks, axis=0)
-        readers = [nobodys if number is None else nobodys & (number != NO_GROUP) for number in numbers]
-        refuse_lost(dataset, plan.measurements, nobodys & ~np.any(readers, axis=0))
+        # A record that no measurement can read stays with all whose group it names, so that an error names it.
+        unread = ~np.any(masks, axis=0)
+        readers = [unread if number is None else unread & (number != NO_GROUP) for number in numbers]
+        refuse_lost(dataset, plan.measurements, unread & ~np.any(readers, axis=0))
         return tuple(
             factor_records.factor_records(factor, dataset, number, mask | reader, weights)
             for factor, number, mask, reader in zip(factors, numbers, masks, readers, strict=True)
@@ -169,7 +168,7 @@ class Problem:
         """Half the weighted squared whitened residuals."""
         raw = self.residuals(values, records)
         whitened = zip(records, self.whitened(raw, records), strict=True)
-        weighted = tuple(residual * np.sqrt(each.weight[: each.count]) for each, residual in whitened)
+        weighted = tuple(residual * np.sqrt(record.weight[: record.count]) for record, residual in whitened)
         shared = correlation_of(records)
         if shared is not None:
             weighted = shared.independent([residual[:, :, None] for residual in weighted])
@@ -310,7 +309,7 @@ class Problem:
 def _from_bytes(written: bytes) -> Problem:
     """A problem that another process sent, compiled once here."""
     blueprint, choices, parameters = pickle.loads(written)
-    return Problem(parameters, blueprint.kernels(0, choices), blueprint.environment, blueprint, blueprint.ties())
+    return Problem(parameters, blueprint.kernels(0, choices), blueprint, blueprint.ties())
 
 
 def triangular(rows: Array) -> Array:

@@ -12,8 +12,9 @@ from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.config.yaml_source import ConfigSource
 from armcal.errors import ConfigError, DataError, Location
-from armcal.estimate.estimator import Progress, no_progress, require_solvable
+from armcal.estimate.estimator import Progress, no_progress
 from armcal.estimate.simulation import SimulationRequest, with_channels
+from armcal.estimate.structure import require_solvable
 from armcal.estimate.validation import (
     FitTask,
     Indices,

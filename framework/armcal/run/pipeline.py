@@ -18,10 +18,11 @@ from armcal.diagnose.evidence import Evidence
 from armcal.diagnose.verdict import Verdict
 from armcal.errors import ConfigError, NotConvergedError, ProblemError
 from armcal.estimate.bootstrap import Bootstrap, bootstrap
-from armcal.estimate.estimator import Progress, gave_up, no_progress, require_solvable, spread
+from armcal.estimate.estimator import Progress, gave_up, no_progress, spread
 from armcal.estimate.nuisance import restricted, settled, started, untrained
 from armcal.estimate.polish import hopeless
 from armcal.estimate.profile import Profile, profiled, profiles
+from armcal.estimate.structure import require_solvable
 from armcal.estimate.validation import (
     CrossValidation,
     ErrorSummary,

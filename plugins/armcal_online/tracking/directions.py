@@ -109,7 +109,7 @@ def probing_poses(arms: Mapping[str, Arm]) -> Dataset:
 
 def _defaulted(problem: Problem, count: int) -> dict[str, Array]:
     """Channels of the kernels that poses do not say: those of a record at rest in the stated surroundings."""
-    environment = problem.environment
+    environment = problem.blueprint.environment
     known = {f"gravity_{a}": g for a, g in zip("xyz", environment.gravity, strict=True)}
     known |= {f"payload_{a}": g for a, g in zip("xyz", environment.payload_com, strict=True)}
     known["payload"] = environment.payload_mass
