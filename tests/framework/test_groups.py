@@ -234,7 +234,7 @@ def test_a_problem_that_went_through_a_pickle_is_the_same(data):
         assert other.parameters == one.parameters
         assert [tie.groups for tie in other.ties] == [tie.groups for tie in one.ties]
         assert_same(summary(one, few, values), summary(other, few, values))
-        assert_same([one.told(values, few)[0]], [other.told(values, few)[0]])
+        assert_same([one.nuisance_starts(values, few)[0]], [other.nuisance_starts(values, few)[0]])
 
 
 # ---------------------------------------------------------------- bad labels
