@@ -161,8 +161,8 @@ class QuickFitter:
         rows: dict[int, list[tuple[Array, Array]]] = {}
         for record, residual, jacobian in zip(self.records, residuals, jacobians, strict=True):
             reach = np.einsum("rvb,vc->brc", jacobian, to_half)
-            for one in np.flatnonzero(fitted.used & (record.weight[: record.count] > 0)):
-                rows.setdefault(int(one), []).append((residual[:, one], reach[one]))
+            for one in np.flatnonzero(fitted.used & (record.weight[: record.count] > 0)).tolist():
+                rows.setdefault(one, []).append((residual[:, one], reach[one]))
         distances = {}
         for one, parts in rows.items():
             whitened, taken_up = (np.concatenate(part) for part in zip(*parts, strict=True))
