@@ -39,6 +39,21 @@ class PriorsAlone:
 
 
 @dataclass(frozen=True)
+class NewRecording:
+    """What the errors of one recording say of another one, where something drifts.
+
+    Attributes:
+        ratio: typical error in a new recording over that of each judged record (n).
+        freedom: degrees of freedom of the errors' mean square, as their records share a drift.
+        independent: the same, if the records were independent.
+    """
+
+    ratio: Array
+    freedom: float
+    independent: float
+
+
+@dataclass(frozen=True)
 class Evidence:
     """All of it; what was not looked at, or is not known, is None. ``unit`` is that of all errors, mm or mrad."""
 
@@ -46,6 +61,7 @@ class Evidence:
     large_errors: LargeErrors | None = None
     priors_alone: PriorsAlone | None = None
     unit: str = "mm"
+    new_recording: NewRecording | None = None
 
     def as_dict(self) -> dict[str, Any]:
         """For metrics.json."""

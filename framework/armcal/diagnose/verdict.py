@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.special import bdtr, chdtri, ndtri
 
 from armcal.base.domains import Array
-from armcal.diagnose.evidence import Evidence
+from armcal.diagnose.evidence import Evidence, NewRecording
 from armcal.diagnose.evidence_findings import (
     MOST_TOLD,
     determined_finding,
@@ -89,15 +89,13 @@ def judge(
     findings += [*_correlated(estimate), *predicted, *large_error_findings(seen.large_errors, seen.unit)]
     findings += [*_outliers(suspicious, own, fitted), *_next(estimate, suggestions)]
     ranked = tuple(sorted(findings, key=lambda finding: _ORDER[finding.grade]))
-    sentences = [_first(judged_mm, judged_on, ranked[0], seen.unit)]
-    sentences += _in_short(estimate, determined, seen, suspicious, suggestions)
+    use = f"{DO_NOT_USE}: {ranked[0].text}"
+    if ranked[0].grade != "bad":
+        use = _good_for(judged_mm, judged_on, seen.unit, seen.new_recording)
+    sentences = [use, *_in_short(estimate, determined, seen, suspicious, suggestions)]
     if not estimate.verdict.converged:
         sentences = ["The solver did not converge: these values are no calibration."]
     return Verdict(_headline(judged_mm, judged_on, ranked[0], seen.unit), ranked, " ".join(sentences))
-
-
-def _first(judged_mm: Array, judged_on: str, worst: Finding, unit: str) -> str:
-    return f"{DO_NOT_USE}: {worst.text}" if worst.grade == "bad" else _good_for(judged_mm, judged_on, unit)
 
 
 def _headline(judged_mm: Array, judged_on: str, worst: Finding, unit: str) -> str:
@@ -117,8 +115,12 @@ def _errors_text(judged_mm: Array, judged_on: str, unit: str) -> str:
     )
 
 
-def _good_for(judged_mm: Array, judged_on: str, unit: str = "mm") -> str:
-    """Below what 95 % of unseen poses lie, with 95 % confidence, by order statistics. [Wilks1941]"""
+def _good_for(judged_mm: Array, judged_on: str, unit: str = "mm", new: NewRecording | None = None) -> str:
+    """Below what 95 % of unseen poses lie, with 95 % confidence, by order statistics. [Wilks1941]
+
+    In a new recording a drift is another one: errors are scaled to it, and the limit is as much wider as an upper
+    limit of the mean square is for so many fewer degrees of freedom.
+    """
     if not len(judged_mm):
         return "How good the model is on unseen poses is not known: hold records out, or cross-validate."
     below = np.arange(len(judged_mm))
@@ -126,7 +128,10 @@ def _good_for(judged_mm: Array, judged_on: str, unit: str = "mm") -> str:
     if not len(enough):
         largest = float(np.max(judged_mm))
         return f"The largest error on {judged_on} is {largest:.2f} {unit}; {len(judged_mm)} are too few to say more."
-    limit = float(np.sort(judged_mm)[enough[0]])
+    limit = float(np.sort(judged_mm if new is None else judged_mm * new.ratio)[enough[0]])
+    if new is not None:
+        correlated, independent = (freedom / chdtri(freedom, 1 - LEVEL) for freedom in (new.freedom, new.independent))
+        limit *= float(np.sqrt(correlated / independent))
     return (
         f"Good for +- {limit:.2f} {unit} on unseen poses like these: 95 % of them, with 95 % confidence ({judged_on})."
     )

@@ -164,6 +164,25 @@ class Predictor:
             for factor_records, (noise, values, drift) in parts
         )
 
+    def new_over_held(self, records: Sequence[FactorRecords]) -> Array | None:
+        """Typical error in a new recording over that of held-out records of this one (N); None without drift.
+
+        A fit takes up part of this recording's drift, which moves its held-out records as well: their errors lack
+        that part, and in a new recording it is an error. For residuals of slopes J and the covariance S, of which D
+        is the drift's, what both have in common is J C J' S^-1 D, with C the covariance of the values.
+        """
+        here, there = records[0].correlation, self.drift
+        if here is None or there is None:
+            return None
+        new, common = 0.0, 0.0
+        for i, (slope, parts) in enumerate(
+            zip(self._slopes(records), self._parts_in_new_recording(records), strict=True)
+        ):
+            drift = np.moveaxis(here.shift(i, there.slopes)[:, : slope.shape[2]], 1, 2)
+            new = new + np.einsum("nrr->n", sum(parts))
+            common = common + np.einsum("rvn,vw,rwn->n", slope, self.covariance, drift, optimize=True)
+        return np.asarray(np.sqrt(new / np.maximum(new - 2 * common, _LEAST_LEFT * new)))
+
     def _parts_in_new_recording(self, records: Sequence[FactorRecords]) -> list[_Parts]:
         """Covariances in a recording whose drift is not known."""
         slopes = self._slopes(records)
