@@ -6,14 +6,14 @@ import math
 from collections.abc import Callable, Mapping
 
 from armcal.devices.device import DeviceIdentity, JointDevice
-from armcal.devices.faults import DeviceError, DeviceRefusedError
+from armcal.devices.faults import DeviceError
 
 from armcal_bench.acquisition.drive import Drive
 from armcal_bench.acquisition.motion_gate import MotionGate, unguarded
 from armcal_bench.acquisition.progress import ENERGISED
 from armcal_bench.acquisition.run_log import RunLog
+from armcal_bench.waiting import AGAIN_EVERY_S, LostDevice
 
-_AGAIN_EVERY_S = 0.25
 _MOST_IN_A_ROW = 10
 _LAST_TRIES_S = 2.0
 """Somebody who wants the arm parked gets it parked, if the device is back within this time."""
@@ -61,33 +61,19 @@ class Recovery:
             DeviceLost: in vain, or the device fails again at once, time after time.
         """
         clock, waits, longest = self._gate.clock, self._gate.waits, self._drive.settings.lost.park
-        began, last = clock.now(), fault
+        began = clock.now()
         self._in_a_row, self._since = (self._in_a_row if began - self._since <= longest else 0) + 1, began
         if self._in_a_row > _MOST_IN_A_ROW:
             raise DeviceLost(f"the device failed {self._in_a_row} times in a row ({fault}); {_AS_IT_IS}")
-        while (left := began + longest - clock.now()) > 0:
-            why = f"the arm holds, the device is looked for: {last.message.rstrip('.')}"
-            waits.goes_on("device", why, left, clock.now())
+
+        def stop() -> None:
             if self._gate.asked_to_end() and clock.now() >= began + _LAST_TRIES_S:
-                raise DeviceLost(f"it was asked to stop while the device was lost ({last}); {_AS_IT_IS}")
-            clock.sleep(_AGAIN_EVERY_S)
-            try:
-                identity = self._device.open(clock)
-                if (identity.digest, identity.name) != (self._identity.digest, self._identity.name):
-                    raise DeviceRefusedError(
-                        f"found {identity.name}, expected {self._identity.name}, with which the run began.",
-                        hint="Connect the board that the run began with.",
-                    )
-                then()
-                waits.over("device", clock.now())
-                return
-            except DeviceRefusedError as refused:
-                # Another program or another board may hold the port for a while.
-                last = DeviceError(str(refused))
-            except DeviceError as again:
-                last = again
-        waits.given_up("device")
-        raise DeviceLost(f"the device did not come back in {longest:.0f} s ({last}); {_AS_IT_IS}")
+                raise DeviceLost(f"it was asked to stop while the device was lost ({fault}); {_AS_IT_IS}")
+
+        try:
+            LostDevice(self._device, clock, self._identity, longest, waits, stop).reopened(fault, then)
+        except DeviceError as last:
+            raise DeviceLost(f"the device did not come back in {longest:.0f} s ({last}); {_AS_IT_IS}") from last
 
     def standing(self) -> dict[str, float]:
         """The angles that its pulses ask for (rad), read back.
@@ -109,4 +95,4 @@ class Recovery:
         """End all pulses, one by one, the tip's first."""
         for joint in reversed(self._device.joint_names):
             self._device.release(joint)
-            self._gate.clock.sleep(_AGAIN_EVERY_S)
+            self._gate.clock.sleep(AGAIN_EVERY_S)

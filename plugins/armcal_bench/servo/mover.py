@@ -15,11 +15,10 @@ from armcal.devices.faults import DeviceError, DeviceRefusedError
 from armcal.errors import InputError
 
 from armcal_bench.servo.known import KnownServo
-from armcal_bench.waiting import Waits
+from armcal_bench.waiting import LostDevice, Waits
 
 _ALIVE_EVERY_S = 0.1
 _BETWEEN_JOINTS_S = 0.5
-_AGAIN_EVERY_S = 0.25
 _LONGEST_LOSS_S = 30.0
 
 
@@ -187,28 +186,13 @@ class Mover:
             StoppedError: it was asked for.
             DeviceError: it does not come back.
         """
-        until, last = self.clock.now() + _LONGEST_LOSS_S, fault
-        while (left := until - self.clock.now()) > 0:
-            self.waits.goes_on("device", f"the board is looked for: {last.message.rstrip('.')}", left, self.clock.now())
-            self._stop_if_asked()
-            self.clock.sleep(_AGAIN_EVERY_S)
-            try:
-                self._taken_up()
-                self.waits.over("device", self.clock.now())
-                return
-            except DeviceRefusedError as refused:
-                # Another program or another board may hold the port for a while.
-                last = DeviceError(str(refused))
-            except DeviceError as again:
-                last = again
-        raise last
+        lost = LostDevice(self.device, self.clock, self.identity, _LONGEST_LOSS_S, self.waits, self._stop_if_asked)
+        lost.reopened(fault, self._restore)
 
-    def _taken_up(self) -> None:
-        before = dict(self.told)
-        self._same(self.device.open(self.clock))
+    def _restore(self) -> None:
         # No way home is known while joints hang free.
         self.device.guard([], self.motion.rate, self.motion.silence)
-        running = self._running()
+        before, running = dict(self.told), self._running()
         self.told |= running
         self.came.clear()
         for joint in before:
@@ -217,14 +201,6 @@ class Mover:
                 self.stand(_BETWEEN_JOINTS_S)
         if self._guarded:
             self.guard(self._guarded)
-
-    def _same(self, found: DeviceIdentity) -> None:
-        begun = self.identity
-        if begun is not None and (found.digest, found.name) != (begun.digest, begun.name):
-            raise DeviceRefusedError(
-                f"found {found.name}, expected {begun.name}, with which the calibration began.",
-                hint="Connect the board that it began with.",
-            )
 
     def _running(self) -> dict[str, int]:
         """The counts of the joints that get pulses."""
