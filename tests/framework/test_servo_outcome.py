@@ -68,7 +68,7 @@ def record_of(arm, seen="rotation", noise_deg=0.01, joints=REACH, step=23):
             for angle in np.arange(-REACH[joint], REACH[joint] + 1, step)[::came]:
                 counts = round(float(table.pulse(math.radians(angle))) / CLOCK.tick)
                 true = float(table.angle(counts * CLOCK.tick)) - came * LAG
-                pose = arm._bent({**stand, joint: true})[0]
+                pose = arm.tools([{**stand, joint: true}])[0]
                 shake = Rotation.from_rotvec(rng.normal(0, math.radians(noise_deg), 3)).as_matrix()
                 at = pose[:3, 3] + rng.normal(0, 1e-4, 3)
                 lines.append(

@@ -97,8 +97,8 @@ def test_what_springs_give_is_their_torque_times_their_compliance(arm):
     step = 1e-5
     energy = [potential(arm, {**pose, "q4": pose["q4"] + d}) for d in (step, -step)]
     torque = -(energy[0] - energy[1]) / (2 * step)
-    assert little.sag("q4", pose) / 1e-4 == pytest.approx(torque, rel=1e-3)
-    assert little.slopes("q4", pose)[arm.compliances.index("arm.spring.k4")] == pytest.approx(torque, rel=1e-3)
+    assert little.sag("q4", [pose])[0] / 1e-4 == pytest.approx(torque, rel=1e-3)
+    assert little.slopes("q4", [pose])[0, arm.compliances.index("arm.spring.k4")] == pytest.approx(torque, rel=1e-3)
 
 
 def potential(arm, pose):

@@ -46,16 +46,6 @@ class Alignment:
     seat: Array | None = None
 
 
-@dataclass(frozen=True, eq=False)
-class _Rows:
-    """Weighted rows of one step: of the compliances, of everything else, of the joints' standing, and what is left."""
-
-    springs: Array
-    others: Array
-    plays: Array
-    sizes: Array
-
-
 def begin(nominal: NominalArm) -> Alignment:
     """The model as it is."""
     return Alignment(np.zeros(len(_sds(nominal))), np.zeros(len(nominal.compliances)))
@@ -67,10 +57,10 @@ def seat_of(alignment: Alignment) -> Array:
 
 
 def shifted(nominal: NominalArm, alignment: Alignment) -> NominalArm:
-    """The arm with what was found."""
+    """The arm at the numbers of an alignment."""
     values, place = {}, 0
     for name in nominal.angles:
-        stated = nominal.values(name)
+        stated = nominal.parameters[name].nominal
         values[name] = tuple(float(v + d) for v, d in zip(stated, alignment.numbers[place:], strict=False))
         place += len(stated)
     zeros = dict(zip(nominal.joints, alignment.numbers[place:].tolist(), strict=False))
@@ -86,7 +76,7 @@ def aligned(
     springs: Mapping[str, Springs],
     compliance_sd: float,
 ) -> tuple[Alignment, SpringRows | None]:
-    """One step better; and what the turns tell of the changes of compliances from ``nominal``, whatever the rest is.
+    """One step better; and what the turns determine of the changes of compliances from ``nominal``.
 
     None where no rotations were seen. Without a ``compliance_sd`` (rad/(N m)) compliances stay.
     """
@@ -94,26 +84,28 @@ def aligned(
     if not tracked:
         return alignment, None
     if alignment.seat is None:
-        alignment = replace(alignment, seat=_seat(alignment.base, tracked, springs))
-    parts = [_rows(alignment, joint, each, springs[joint]) for joint, each in tracked.items()]
-    rows = _Rows(*(np.concatenate([getattr(p, key) for p in parts]) for key in ("springs", "others", "plays", "sizes")))
-    sds = np.concatenate([_sds(nominal), np.full(len(parts) * len(nominal.joints), _PLAY_SD)])
-    plays = block_diag(*[part.plays for part in parts])
-    others = np.vstack([np.hstack([rows.others, plays]), np.diag(1 / sds)])
-    slopes = np.vstack([rows.springs, np.zeros((len(sds), len(alignment.compliances)))])
-    now = np.concatenate([alignment.numbers, np.zeros(plays.shape[1])])
-    sizes = np.concatenate([rows.sizes, -now / sds])
-    changes, step = _step(slopes, others, sizes, alignment, nominal, compliance_sd)
+        alignment = replace(alignment, seat=_mean_seat(alignment.base, tracked, springs))
+    rows = [_rows(alignment, joint, sweep, springs[joint]) for joint, sweep in tracked.items()]
+    by_springs, by_others, by_plays, offs = (list(part) for part in zip(*rows, strict=True))
+    sds = np.concatenate([_sds(nominal), np.full(len(rows) * len(nominal.joints), _PLAY_SD)])
+    others = np.vstack([np.hstack([np.concatenate(by_others), block_diag(*by_plays)]), np.diag(1 / sds)])
+    slopes = np.vstack([np.concatenate(by_springs), np.zeros((len(sds), len(alignment.compliances)))])
     count = len(alignment.numbers)
-    left = sizes - slopes @ changes - others @ step
-    scale = max(1.0, float(np.linalg.norm(left)) / math.sqrt(max(len(rows.sizes) - len(changes), 1)))
+    sizes = np.concatenate([*offs, -alignment.numbers / sds[:count], np.zeros(len(sds) - count)])
+    changes, step = _step(slopes, others, sizes, alignment, nominal, compliance_sd)
+    residuals = sizes - slopes @ changes - others @ step
+    freedom = max(len(sizes) - len(sds) - len(changes), 1)
+    scale = max(1.0, float(np.linalg.norm(residuals)) / math.sqrt(freedom))
     better = Alignment(
         alignment.numbers + step[:count],
         alignment.compliances + changes,
         Rotation.from_rotvec(step[count - 6 : count - 3]).as_matrix() @ alignment.base,
         seat_of(alignment) @ Rotation.from_rotvec(step[count - 3 : count]).as_matrix(),
     )
-    return better, _of_springs(slopes, others, sizes + slopes @ alignment.compliances, scale)
+    # The rows with everything but the compliances taken out, as few as there are compliances.
+    free = np.linalg.qr(others, mode="complete")[0][:, others.shape[1] :].T
+    q, r = np.linalg.qr(free @ slopes)
+    return better, SpringRows(r / scale, q.T @ (free @ (sizes + slopes @ alignment.compliances)) / scale)
 
 
 def _step(
@@ -130,49 +122,38 @@ def _step(
     # Springs much softer than that have no equilibrium, and are what a servo that has let go looks like.
     most = np.maximum(lowest + _MOST_SDS * compliance_sd, low[: len(now)] + 1e-9)
     high = np.concatenate([most, np.full(others.shape[1], np.inf)])
-    found = lsq_linear(whole, np.concatenate([sizes, -now / compliance_sd]), (low, high), tol=1e-12).x
-    return found[: len(now)], found[len(now) :]
+    solution = lsq_linear(whole, np.concatenate([sizes, -now / compliance_sd]), (low, high), tol=1e-12).x
+    return solution[: len(now)], solution[len(now) :]
 
 
-def _of_springs(slopes: Array, others: Array, sizes: Array, scale: float) -> SpringRows:
-    """The rows with everything else taken out, as few as there are compliances."""
-    free = np.linalg.qr(others, mode="complete")[0][:, others.shape[1] :].T
-    q, r = np.linalg.qr(free @ slopes)
-    return SpringRows(r / scale, q.T @ (free @ sizes) / scale)
+def _rows(alignment: Alignment, joint: str, sweeps: Sweeps, springs: Springs) -> tuple[Array, Array, Array, Array]:
+    """One joint's weighted turns across its axis, in the base's axes, two rows a line.
+
+    Slopes by the compliances, by the numbers of an alignment, and by where the joints stand; and what is off.
+    """
+    tool, by_angles, by_joints, by_springs = springs.about.turns(springs.poses(sweeps.lines, joint))
+    seen = sweeps.rotations
+    predicted = alignment.base @ tool @ seat_of(alignment)
+    off = Rotation.from_matrix(seen @ np.swapaxes(predicted, 1, 2)).as_rotvec()
+    axes = by_joints[:, :, springs.about.joints.index(joint)] @ alignment.base.T
+    across = np.linalg.svd(axes[:, None])[2][:, 1:] / sweeps.sds[:, None, None]
+    known = across @ alignment.base
+    by_numbers = np.concatenate([known @ by_angles, known @ by_joints, across, across @ seen], axis=2)
+    by_compliances, by_plays = known @ by_springs, known @ by_joints
+    flat = [rows.reshape(2 * len(seen), -1) for rows in (by_compliances, by_numbers, by_plays)]
+    return *flat, (across @ off[:, :, None]).ravel()
 
 
-def _rows(alignment: Alignment, joint: str, sweeps: Sweeps, springs: Springs) -> _Rows:
-    """One joint's: turns across its axis, in the base's axes."""
-    found: list[tuple[Array, Array, Array, Array]] = []
-    seat = seat_of(alignment)
-    for line, pose, sd in zip(sweeps.lines, springs.poses(sweeps, joint), sweeps.sds, strict=True):
-        tool, by_angles, by_joints, by_springs = springs.about.turns(pose)
-        seen = np.array(line["rotation"])
-        off = Rotation.from_matrix(seen @ (alignment.base @ tool @ seat).T).as_rotvec()
-        own = alignment.base @ by_joints[:, springs.about.joints.index(joint)]
-        across = np.linalg.svd(own[None])[2][1:] / sd
-        known = across @ alignment.base
-        found.append(
-            (
-                known @ by_springs,
-                np.hstack([known @ by_angles, known @ by_joints, across, across @ seen]),
-                known @ by_joints,
-                across @ off,
-            )
-        )
-    return _Rows(*(np.concatenate([each[i] for each in found]) for i in range(4)))
-
-
-def _seat(base: Array, sweeps: Mapping[str, Sweeps], springs: Mapping[str, Springs]) -> Array:
-    """How the tracked body sits on the model's tool, on the average."""
-    between = [
-        (base @ springs[joint].about.turns(pose)[0]).T @ np.array(line["rotation"])
-        for joint, sweep in sweeps.items()
-        for line, pose in zip(sweep.lines, springs[joint].poses(sweep, joint), strict=True)
-    ]
-    return np.asarray(Rotation.from_matrix(np.array(between)).mean().as_matrix())
+def _mean_seat(base: Array, sweeps: Mapping[str, Sweeps], springs: Mapping[str, Springs]) -> Array:
+    """How the tracked body sits on the model's tool, on the average (3x3)."""
+    seats = []
+    for joint, sweep in sweeps.items():
+        tools = springs[joint].about.tools(springs[joint].poses(sweep.lines, joint))
+        seats.append(np.swapaxes(base @ tools[:, :3, :3], 1, 2) @ sweep.rotations)
+    return np.asarray(Rotation.from_matrix(np.concatenate(seats)).mean().as_matrix())
 
 
 def _sds(nominal: NominalArm) -> Array:
-    count = sum(len(nominal.values(name)) for name in nominal.angles)
+    """A priori, of ``Alignment.numbers``."""
+    count = sum(nominal.parameters[name].size for name in nominal.angles)
     return np.concatenate([np.full(count, _ANGLE_SD), np.full(len(nominal.joints), _ZERO_SD), np.full(6, _FRAME_SD)])

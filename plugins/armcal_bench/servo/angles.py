@@ -43,6 +43,11 @@ class Sweeps:
     turning: Turning | None = None
 
     @property
+    def rotations(self) -> Array:
+        """``base_R_body`` as the tracker saw it (N x 3 x 3)."""
+        return np.array([line["rotation"] for line in self.lines])
+
+    @property
     def counts(self) -> list[int]:
         """Of each pulse."""
         return [int(line["counts"]) for line in self.lines]
@@ -71,15 +76,12 @@ class Springs:
 
     def given(self, lines: Sequence[Entry], joint: str) -> Array:
         """What springs give in each line (N x 4 x 4): a rotation in the body's axes, a translation in the base's."""
-        found = np.array([self.about.give(pose) for pose in self._poses(lines, joint)])
-        found[:, :3, :3] = self.seat.T @ found[:, :3, :3] @ self.seat
-        return found
+        given = self.about.give(self.poses(lines, joint))
+        given[:, :3, :3] = self.seat.T @ given[:, :3, :3] @ self.seat
+        return given
 
-    def poses(self, sweeps: Sweeps, joint: str) -> list[dict[str, float]]:
+    def poses(self, lines: Sequence[Entry], joint: str) -> list[dict[str, float]]:
         """All joints' angles (rad), line by line."""
-        return self._poses(sweeps.lines, joint)
-
-    def _poses(self, lines: Sequence[Entry], joint: str) -> list[dict[str, float]]:
         return [{**line["told"], joint: angle} for line, angle in zip(lines, self.angles, strict=True)]
 
 
@@ -90,7 +92,7 @@ def sweeps_of(
     settings: ServoCalibrationSettings,
     springs: Springs | None = None,
 ) -> Sweeps | str:
-    """A joint's angles, or why they cannot be told."""
+    """A joint's angles, or why they are not known."""
     poses = [e for e in entries if e["kind"] == POSE and e["joint"] == joint]
     said = list({(e["target"], e["came"]): e for e in entries if e["kind"] == ANGLE and e["joint"] == joint}.values())
     if not poses and not said:
@@ -98,9 +100,8 @@ def sweeps_of(
     if not poses:
         return Sweeps(tuple(said), np.array([e["angle"] for e in said]), np.array([e["sd"] for e in said]))
     given = np.tile(np.eye(4), (len(poses), 1, 1)) if springs is None else springs.given(poses, joint)
-    find = _by_positions if any(e["rotation"] is None for e in poses) else _by_rotations
     try:
-        return find(poses, joint, nominal, settings, given)
+        return _tracked(poses, joint, nominal, settings, given)
     except NoTurnError as fault:
         return str(fault)
 
@@ -112,50 +113,40 @@ def told_by(sweeps: Sweeps, joint: str, nominal: NominalArm, springs: Springs | 
         return [Observation(joint, *row) for row in rows]
     about = springs.about
     changes = np.array([about.compliance(name) - nominal.compliance(name) for name in about.compliances])
-    observations = []
-    for row, pose in zip(rows, springs.poses(sweeps, joint), strict=True):
-        slopes = about.slopes(joint, pose, sweeps.by)
-        observations.append(
-            Observation(joint, *row, -float(slopes @ changes), dict(zip(about.compliances, slopes, strict=True)))
-        )
-    return observations
+    slopes = about.slopes(joint, springs.poses(sweeps.lines, joint), sweeps.by)
+    return [
+        Observation(joint, *row, -float(slope @ changes), dict(zip(about.compliances, slope, strict=True)))
+        for row, slope in zip(rows, slopes, strict=True)
+    ]
 
 
-def _by_rotations(
+def _tracked(
     poses: Sequence[Entry], joint: str, nominal: NominalArm, settings: ServoCalibrationSettings, given: Array
 ) -> Sweeps:
-    others = _others(poses, joint)
-    rotations = [np.array(e["rotation"]) @ g[:3, :3].T for e, g in zip(poses, given, strict=True)]
-    axis = nominal.axis(joint, {**others, joint: 0.0})[0]
-    turning = turning_of_rotations(rotations, axis)
-    _check_axis(turning, axis, turning.off_axis)
-    absolute = np.array([nominal.angle_of_rotation(joint, others, r) for r in rotations])
-    angles = turning.angles + mean_angle(absolute - turning.angles)
-    seen = [_about(e, r, turning.axis) for e, r in zip(poses, rotations, strict=True)]
-    return Sweeps(tuple(poses), angles, np.hypot(seen, settings.rotation_sd), "rotation", turning)
-
-
-def _by_positions(
-    poses: Sequence[Entry], joint: str, nominal: NominalArm, settings: ServoCalibrationSettings, given: Array
-) -> Sweeps:
-    others = _others(poses, joint)
-    positions = np.array([np.array(e["position"]) - g[:3, 3] for e, g in zip(poses, given, strict=True)])
-    axis = nominal.axis(joint, {**others, joint: 0.0})[0]
-    turning = turning_of_positions(positions, axis, settings.least_radius)
-    radius = turning.radius or math.inf
-    _check_axis(turning, axis, turning.off_axis / radius)
-    absolute = np.array([nominal.angle_of_position(joint, others, p) for p in positions])
-    angles = turning.angles + mean_angle(absolute - turning.angles)
-    seen = [max(_rms([d or 0.0 for d in e["deviations"][:3]]), _LEAST_SEEN_M) / radius for e in poses]
-    return Sweeps(tuple(poses), angles, np.hypot(seen, settings.rotation_sd), "position", turning)
-
-
-def _check_axis(turning: Turning, axis: Array, off_axis: float) -> None:
-    """Whether it is this joint that turned.
+    """By the tool's rotations, or its positions where a rotation is missing; ``given`` by springs (N x 4 x 4).
 
     Raises:
-        NoTurnError: it is not.
+        NoTurnError: the tool did not turn, or not about this joint's axis.
     """
+    # Where the other joints stood: the median, since each was told the same pulse every time.
+    names = sorted({name for e in poses for name in e["told"]} - {joint})
+    others = {name: float(np.median([e["told"][name] for e in poses if name in e["told"]])) for name in names}
+    axis = nominal.axis(joint, {**others, joint: 0.0})[0]
+    deviations = np.array([[d or 0.0 for d in e["deviations"]] for e in poses])
+    by: By = "position" if any(e["rotation"] is None for e in poses) else "rotation"
+    if by == "rotation":
+        rotations = np.array([e["rotation"] for e in poses]) @ np.swapaxes(given[:, :3, :3], 1, 2)
+        turning = turning_of_rotations(rotations, axis)
+        off_axis = turning.off_axis
+        absolute = [nominal.angle_of_rotation(joint, others, rotation) for rotation in rotations]
+        sds = np.linalg.norm((turning.axis @ rotations) * deviations[:, 3:], axis=1)
+    else:
+        positions = np.array([e["position"] for e in poses]) - given[:, :3, 3]
+        turning = turning_of_positions(positions, axis, settings.least_radius)
+        radius = turning.radius or math.inf
+        off_axis = turning.off_axis / radius
+        absolute = [nominal.angle_of_position(joint, others, position) for position in positions]
+        sds = np.maximum(np.sqrt(np.mean(deviations[:, :3] ** 2, axis=1)), _LEAST_SEEN_M) / radius
     apart = math.acos(min(abs(float(turning.axis @ axis)), 1.0))
     if apart > _FARTHEST_AXIS:
         raise NoTurnError(
@@ -163,19 +154,5 @@ def _check_axis(turning: Turning, axis: Array, off_axis: float) -> None:
         )
     if off_axis > _MOST_OFF_AXIS:
         raise NoTurnError(f"the tool did not turn about one axis (it is {math.degrees(off_axis):.0f} deg off it)")
-
-
-def _about(entry: Entry, rotation: Array, axis: Array) -> float:
-    """The deviation of the turn about an axis of the base (rad)."""
-    in_target = rotation.T @ axis
-    return float(np.linalg.norm(in_target * np.array([d or 0.0 for d in entry["deviations"][3:]])))
-
-
-def _others(poses: Sequence[Entry], joint: str) -> dict[str, float]:
-    """Where the other joints stood: the median, since each was told the same pulse every time."""
-    names = {name for e in poses for name in e["told"]} - {joint}
-    return {name: float(np.median([e["told"][name] for e in poses if name in e["told"]])) for name in sorted(names)}
-
-
-def _rms(numbers: Sequence[float]) -> float:
-    return math.sqrt(sum(x * x for x in numbers) / len(numbers))
+    angles = turning.angles + mean_angle(np.array(absolute) - turning.angles)
+    return Sweeps(tuple(poses), angles, np.hypot(sds, settings.rotation_sd), by, turning)

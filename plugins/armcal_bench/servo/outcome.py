@@ -14,8 +14,8 @@ from armcal_bench.servo.angles import Entry, Springs, Sweeps, sweeps_of, told_by
 from armcal_bench.servo.fit import ServoFit, fit_servos
 from armcal_bench.servo.known import KnownBoard, KnownServo, Zero, interpolated
 from armcal_bench.servo.nominal import NominalArm
-from armcal_bench.servo.permuted_servos import mixed_up
 from armcal_bench.servo.settings import ServoCalibrationSettings
+from armcal_bench.servo.trial import permuted
 from armcal_bench.servo.unknowns import FitTask
 
 _ROUNDS = 10
@@ -57,7 +57,7 @@ def outcome_of(
 
     One whose angles scatter as no servo's do is left out: it has let go, and would spoil what is found of the springs.
     """
-    left_out = mixed_up(entries, [servo.joint for servo in servos], nominal)
+    left_out = permuted(entries, [servo.joint for servo in servos], nominal)
     while True:
         fitted = _fitted(entries, [s for s in servos if s.joint not in left_out], boards, nominal, settings)
         worst = max(fitted.fit.servos.values(), key=lambda servo: servo.scatter, default=None)
@@ -89,7 +89,10 @@ def _fitted(
             break
     fit = fitted.fit
     values = {name: (nominal.compliance(name) + n.value, n.sd) for name, n in fit.compliances.items()}
-    spans = {joint: _span(joint, sweep, fitted.springs.get(joint)) for joint, sweep in fitted.sweeps.items()}
+    spans = dict.fromkeys(fitted.sweeps, 0.0)
+    for joint, bent in fitted.springs.items():
+        if by := fitted.sweeps[joint].by:
+            spans[joint] = float(np.ptp(bent.about.sag(joint, bent.poses(fitted.sweeps[joint].lines, joint), by)))
     return Outcome(fit, fitted.task, fitted.sweeps, silent, values, zero, spans)
 
 
@@ -157,11 +160,3 @@ def _springs(sweeps: Sweeps, servo: KnownServo, task: FitTask, fit: ServoFit, ab
     lag = (fitted.lag or 0.0) if fitted else 0.0
     by_table = interpolated(np.array(sweeps.counts) * clock.tick, pulses[order], angles[order])
     return Springs(about, tuple((by_table - lag * np.array(sweeps.approaches)).tolist()))
-
-
-def _span(joint: str, sweeps: Sweeps, springs: Springs | None) -> float:
-    """How much what the springs give varies (rad)."""
-    if springs is None or sweeps.by is None:
-        return 0.0
-    poses = zip(sweeps.lines, springs.angles, strict=True)
-    return float(np.ptp([springs.about.sag(joint, {**line["told"], joint: a}, sweeps.by) for line, a in poses]))

@@ -6,12 +6,14 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations, permutations
+from typing import Any
 
 import numpy as np
 from armcal.base.domains import Array
 from scipy.spatial.transform import Rotation
 
 from armcal_bench.servo.nominal import NominalArm
+from armcal_bench.servo.record import BEGUN, POSE
 from armcal_bench.servo.turning import twist_angles
 
 _LEVER_M = 0.1
@@ -56,7 +58,7 @@ class Move:
     """
 
     joint: str
-    told: float
+    commanded: float
     before: Array
     after: Array
 
@@ -108,11 +110,41 @@ def judged(moves: Sequence[Move], base: Mapping[str, float], nominal: NominalArm
     scored = sorted((_score(wiring, seen, base, nominal), i, wiring) for i, wiring in enumerate(_wirings(tuple(base))))
     best_score, _, best = scored[0]
     near = [wiring for score, _, wiring in scored if score < best_score + _UNSURE]
-    return [_judged(move, best, near, base, nominal) for move in moves]
+    axes = nominal.axes(best.pose(base))
+    verdicts = []
+    for move in moves:
+        joint, moved = move.joint, best.moves[move.joint]
+        turned, off = _explained(move, *axes[moved])
+        others = " or ".join(sorted({wiring.moves[joint] for wiring in near} - {joint}))
+        if move.is_little:
+            kind, turned, others = "still", 0.0, ""
+        elif off > _UNCLEAR_M:
+            kind, others = "unclear", ""
+        elif moved != joint:
+            kind, others = "another", moved
+        elif turned * move.commanded < 0:
+            kind = "reversed"
+        else:
+            kind = "gain" if abs(turned / move.commanded - 1) > _GAIN_OFF else "right"
+        verdicts.append(_verdict(kind, joint, move.commanded, turned, others))
+    return verdicts
 
 
-def exchanged(moves: Sequence[Move], base: Mapping[str, float], nominal: NominalArm) -> dict[str, str]:
-    """Which joints moved instead of which, where that is beyond doubt; see ``judged``."""
+def permuted(entries: Sequence[Mapping[str, Any]], joints: Sequence[str], nominal: NominalArm) -> dict[str, str]:
+    """Why the tables of joints cannot be what a record has under their names, by joint: servos on others' channels."""
+    moves = []
+    for joint in joints:
+        lines = [e for e in entries if e["kind"] == POSE and e["joint"] == joint and joint in e["told"]]
+        pairs = [(a, b) for a, b in combinations(lines, 2) if a["came"] == b["came"]]
+        turned = [(float(b["told"][joint] - a["told"][joint]), a, b) for a, b in pairs]
+        turned = [turn for turn in turned if abs(turn[0]) >= _USUAL_TURN / 2]
+        if turned:  # more than the usual turn shows more of what springs give
+            commanded, before, after = min(turned, key=lambda turn: abs(abs(turn[0]) - _USUAL_TURN))
+            moves.append(Move(joint, commanded, _pose(before), _pose(after)))
+    begun = next((entry for entry in entries if entry["kind"] == BEGUN), None)
+    if begun is None or not moves:
+        return {}
+    base = {joint: float(angle) for joint, angle in begun["base"].items() if joint in nominal.joints}
     seen = [move for move in moves if not move.is_little]
     straight, *others = _wirings(tuple(base))
     as_meant = _score(straight, seen, base, nominal)
@@ -121,7 +153,31 @@ def exchanged(moves: Sequence[Move], base: Mapping[str, float], nominal: Nominal
     best_score, _, best = min((_score(wiring, seen, base, nominal), i, wiring) for i, wiring in enumerate(others))
     if best_score > as_meant - _SURE:
         return {}
-    return {move.joint: best.moves[move.joint] for move in seen if best.moves[move.joint] != move.joint}
+    moved = {move.joint: best.moves[move.joint] for move in seen}
+    return {
+        joint: f"what turned is {other}: exchange their channels in the servo file, or their plugs, and measure anew"
+        for joint, other in moved.items()
+        if other != joint
+    }
+
+
+def _pose(line: Mapping[str, Any]) -> Array:
+    pose = np.eye(4)
+    pose[:3, :3] = np.nan if line["rotation"] is None else np.array(line["rotation"])
+    pose[:3, 3] = line["position"]
+    return pose
+
+
+def _score(wiring: _Wiring, seen: Sequence[Move], base: Mapping[str, float], nominal: NominalArm) -> float:
+    """How badly a wiring explains moves; less is better."""
+    axes = nominal.axes(wiring.pose(base))
+    score = _EACH_FAULT * wiring.faults
+    for move in seen:
+        turned, off = _explained(move, *axes[wiring.moves[move.joint]])
+        usual = _USUAL_M * max(abs(move.commanded) / _USUAL_TURN, 1.0)
+        score += min((off / usual) ** 2, _MOST)
+        score += _MOST if turned * wiring.signs[move.joint] * move.commanded < 0 else 0.0
+    return score
 
 
 def _wirings(joints: tuple[str, ...]) -> Iterator[_Wiring]:
@@ -135,36 +191,6 @@ def _wirings(joints: tuple[str, ...]) -> Iterator[_Wiring]:
                 for reversed_ones in range(3):
                     for turned in combinations(joints, reversed_ones):
                         yield _Wiring(moves, {joint: -1 if joint in turned else 1 for joint in joints})
-
-
-def _score(wiring: _Wiring, seen: Sequence[Move], base: Mapping[str, float], nominal: NominalArm) -> float:
-    axes = nominal.axes(wiring.pose(base))
-    score = _EACH_FAULT * wiring.faults
-    for move in seen:
-        turned, off = _explained(move, *axes[wiring.moves[move.joint]])
-        usual = _USUAL_M * max(abs(move.told) / _USUAL_TURN, 1.0)
-        score += min((off / usual) ** 2, _MOST)
-        score += _MOST if turned * wiring.signs[move.joint] * move.told < 0 else 0.0
-    return score
-
-
-def _judged(
-    move: Move, best: _Wiring, near: Sequence[_Wiring], base: Mapping[str, float], nominal: NominalArm
-) -> Verdict:
-    joint, told = move.joint, move.told
-    if move.is_little:
-        return _verdict("still", joint, told, 0.0)
-    moved = best.moves[joint]
-    turned, off = _explained(move, *nominal.axis(moved, best.pose(base)))
-    if off > _UNCLEAR_M:
-        return _verdict("unclear", joint, told, turned)
-    if moved != joint:
-        return _verdict("another", joint, told, turned, moved)
-    others = sorted({wiring.moves[joint] for wiring in near} - {joint})
-    if turned * told < 0:
-        return _verdict("reversed", joint, told, turned, " or ".join(others))
-    kind = "gain" if abs(turned / told - 1) > _GAIN_OFF else "right"
-    return _verdict(kind, joint, told, turned, " or ".join(others))
 
 
 def wrapped(joint: str, table: tuple[float, ...], limits: tuple[float, float]) -> Verdict | None:

@@ -54,13 +54,16 @@ def turning_of_rotations(rotations: Sequence[Array], model_axis: Array) -> Turni
         NoTurnError: there was next to no motion.
     """
     seen = Rotation.from_matrix(np.array(rotations))
-    vectors = (seen * seen[_middle(seen)].inv()).as_rotvec()
-    rest, axis = seen[_middle(seen)], np.zeros(3)
+    # From the rotation that is nearest to all others, so that none is half a turn away.
+    rest = seen[int(np.argmin([float(np.max((seen * one.inv()).magnitude())) for one in seen]))]
+    vectors, axis = (seen * rest.inv()).as_rotvec(), np.zeros(3)
     for _ in range(_ROUNDS):
         before = axis
-        axis = _along(vectors, model_axis)
+        axis = np.linalg.svd(vectors, full_matrices=False)[2][0]
+        axis = axis * (1.0 if axis @ model_axis >= 0 else -1.0)
         angles = vectors @ axis
-        rest = _chordal_mean(Rotation.from_rotvec(-np.outer(angles, axis)) * seen)
+        turned_back = Rotation.from_rotvec(-np.outer(angles, axis)) * seen
+        rest = Rotation.from_matrix(mean_rotation(turned_back.as_matrix()))
         vectors = (seen * rest.inv()).as_rotvec()
         if np.linalg.norm(axis - before) < 1e-12:
             break
@@ -80,14 +83,19 @@ def turning_of_positions(positions: Array, model_axis: Array, least_radius: floa
     if len(positions) < 4:
         raise NoTurnError(f"found {len(positions)} positions, a circle needs four")
     middle = positions.mean(axis=0)
-    _, spread, rows = np.linalg.svd(positions - middle, full_matrices=False)
+    _, spread, directions = np.linalg.svd(positions - middle, full_matrices=False)
     if spread[1] < 0.05 * least_radius:
         raise NoTurnError("the positions lie on a line or a point, not on a circle")
-    axis = rows[2] * (1.0 if rows[2] @ model_axis >= 0 else -1.0)
-    e1 = rows[0]
+    axis = directions[2] * (1.0 if directions[2] @ model_axis >= 0 else -1.0)
+    e1 = directions[0]
     e2 = np.cross(axis, e1)
     flat = np.stack([(positions - middle) @ e1, (positions - middle) @ e2], axis=1)
-    centre, radius = _circle(flat)
+    # Least squares of the distances, from the algebraic circle.
+    rows = np.column_stack([2 * flat, np.ones(len(flat))])
+    a, b, c = np.linalg.lstsq(rows, np.sum(flat**2, axis=1), rcond=None)[0]
+    start = np.array([a, b, math.sqrt(max(c + a * a + b * b, 0.0))])
+    circle = least_squares(lambda x: np.linalg.norm(flat - x[:2], axis=1) - x[2], start).x
+    centre, radius = circle[:2], float(abs(circle[2]))
     if radius < least_radius:
         raise NoTurnError(f"the target moves on a circle of {1000 * radius:.1f} mm about this joint's axis")
     angles = np.unwrap(np.arctan2(flat[:, 1] - centre[1], flat[:, 0] - centre[0]))
@@ -107,31 +115,3 @@ def twist_angles(rotations: Rotation, axis: Array) -> Array:
 def mean_angle(angles: Array) -> float:
     """Of angles that may differ by whole turns (rad)."""
     return float(np.angle(np.mean(np.exp(1j * angles))))
-
-
-def _middle(seen: Rotation) -> int:
-    """The rotation that is nearest to all others, so that none is half a turn away."""
-    farthest = [float(np.max((seen * one.inv()).magnitude())) for one in seen]
-    return int(np.argmin(farthest))
-
-
-def _along(vectors: Array, model_axis: Array) -> Array:
-    axis = np.linalg.svd(vectors, full_matrices=False)[2][0]
-    return np.asarray(axis * (1.0 if axis @ model_axis >= 0 else -1.0))
-
-
-def _chordal_mean(rotations: Rotation) -> Rotation:
-    return Rotation.from_matrix(mean_rotation(rotations.as_matrix()))
-
-
-def _circle(flat: Array) -> tuple[Array, float]:
-    """Least squares of the distances, from the algebraic circle."""
-    rows = np.column_stack([2 * flat, np.ones(len(flat))])
-    a, b, c = np.linalg.lstsq(rows, np.sum(flat**2, axis=1), rcond=None)[0]
-    start = np.array([a, b, math.sqrt(max(c + a * a + b * b, 0.0))])
-
-    def off(x: Array) -> Array:
-        return np.asarray(np.linalg.norm(flat - x[:2], axis=1) - x[2])
-
-    found = least_squares(off, start).x
-    return np.asarray(found[:2]), float(abs(found[2]))
