@@ -1,13 +1,14 @@
-"""A configured bench: clock, device and tracker, built."""
+"""The section ``bench`` of a configuration, and what it names, built: clock, device, tracker."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 from armcal.arm.assembly import Arm
+from armcal.base.settings import InputPath, Settings
 from armcal.config.system import build_component
 from armcal.config.validate import validate
 from armcal.devices.clock import Clock, RealClock, SimulatedClock
@@ -17,10 +18,38 @@ from armcal.devices.simulated import SimulatedBench
 from armcal.devices.tracker import Tracker
 from armcal.errors import ConfigError
 from armcal.run.experiment import Experiment
+from pydantic import Field
 
-from armcal_bench.settings import BenchSettings, SimulatedClockSettings
+from armcal_bench.acquisition.settings import AcquisitionSettings
+from armcal_bench.bodies import BodySettings
+from armcal_bench.recording.settings import RecordingSettings
 
 SECTION = "bench"
+
+
+class SimulatedClockSettings(Settings):
+    """The clock of a simulated bench: the path of its socket."""
+
+    simulated: InputPath
+
+
+class BenchSettings(Settings):
+    """Components keep their own settings under ``type``.
+
+    ``bodies`` says which of the tracker's bodies is what. ``clock`` is the machine's, unless a simulated bench is at
+    the other end.
+    """
+
+    clock: Literal["real"] | SimulatedClockSettings = "real"
+    link: dict[str, Any] | None = None
+    device: dict[str, Any] | None = None
+    tracker: dict[str, Any] | None = None
+    joints: dict[str, Any] | None = None
+    bodies: BodySettings = Field(default_factory=BodySettings)
+    acquisition: AcquisitionSettings = Field(default_factory=AcquisitionSettings)
+    recording: RecordingSettings = Field(default_factory=RecordingSettings)
+    servo: dict[str, Any] | None = None
+    simulator: dict[str, Any] | None = None
 
 
 @dataclass(frozen=True)

@@ -1,22 +1,61 @@
-"""From what a tracker sees to what the calibration wants: the target in the arm's base frame."""
+"""Which of a tracker's bodies is what; from what the tracker sees to the target in the arm's base frame."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated, Literal
 
 import numpy as np
 from armcal.base.domains import Array
 from armcal.base.pose_settings import PoseSettings
 from armcal.base.quaternions import rotation_matrix
+from armcal.base.settings import Settings
 from armcal.devices.tracker import TrackerFrame
+from pydantic import Field, model_validator
 
-from armcal_bench.body_settings import BodySettings
-from armcal_bench.outliers import far_off
-from armcal_bench.rotations import mean_rotation
+from armcal_bench.stillness import far_off, mean_rotation
 
 _LEAST_OUTLIER_M = 2e-4
 _NAMES_SHOWN = 8
+
+
+NONE = "none"
+"""In the place of the base body's name: the tracker's world itself stands still with the arm's base."""
+
+Name = Annotated[str, Field(min_length=1, max_length=100)]
+
+
+class BodySettings(Settings):
+    """The bodies by the tracker's own names, and what is known about where they sit.
+
+    Attributes:
+        tool: the body on the tool.
+        base: the body that stands still with the arm's base; ``none`` where the tracker's world does.
+        base_motion: ``moving``: each frame is taken in the base body's own pose of that frame. ``still``: the base body's
+            poses of all frames of a capture are averaged first.
+        base_T_reference: where the base body (or the tracker's world, without one) is in the arm's base frame.
+        tool_body_T_target: where the measured target is on the tool body.
+    """  # noqa: E501
+
+    tool: Name = "tool"
+    base: Name = NONE
+    base_motion: Literal["moving", "still"] = "moving"
+    base_T_reference: PoseSettings = Field(default_factory=PoseSettings)
+    tool_body_T_target: PoseSettings = Field(default_factory=PoseSettings)
+
+    @model_validator(mode="after")
+    def _two_bodies(self) -> BodySettings:
+        if self.tool == self.base:
+            raise ValueError(
+                f"found {self.tool!r} for both tool and base, expected two bodies (base: none for no base)"
+            )
+        return self
+
+    @property
+    def has_base(self) -> bool:
+        """Whether a base body is looked for."""
+        return self.base != NONE
 
 
 @dataclass(frozen=True)
@@ -24,9 +63,9 @@ class Capture:
     """Some frames, in the arm's base frame.
 
     Attributes:
-        poses: ``base_T_target`` (N x 4 x 4, m), NaN where a frame does not tell; the rotation alone is NaN where the
-            tracker tells only positions.
-        faults: why a frame does not tell, a sentence; empty where it does (N).
+        poses: ``base_T_target`` (N x 4 x 4, m), NaN where a frame does not show it; the rotation alone is NaN where
+            the tracker gives only positions.
+        faults: why a frame does not show it, a sentence; empty where it does (N).
     """
 
     poses: Array
@@ -44,7 +83,9 @@ def in_base(frames: Sequence[TrackerFrame], settings: BodySettings) -> Capture:
     for i in np.flatnonzero(np.isnan(reference).any(axis=(1, 2))).tolist():
         faults[i] = faults[i] or base_fault(frames[i], settings)
     base_T_reference, body_T_target = matrix_of(settings.base_T_reference), matrix_of(settings.tool_body_T_target)
-    seen_at = tool[:, :3, 3] + _offset(tool[:, :3, :3], body_T_target[:3, 3])
+    seen_at = tool[:, :3, 3]
+    if body_T_target[:3, 3].any():  # a target at the body's origin needs no rotation
+        seen_at = seen_at + tool[:, :3, :3] @ body_T_target[:3, 3]
     back = np.swapaxes(reference[:, :3, :3], 1, 2)
     from_reference = np.einsum("nij,nj->ni", back, seen_at - reference[:, :3, 3])
     poses = np.full((len(frames), 4, 4), np.nan)
@@ -56,7 +97,7 @@ def in_base(frames: Sequence[TrackerFrame], settings: BodySettings) -> Capture:
 
 
 def tool_fault(frame: TrackerFrame, settings: BodySettings) -> str:
-    """Why a frame does not tell where the target is in the tracker's world; empty if it does."""
+    """Why a frame does not show where the target is in the tracker's world; empty if it does."""
     pose = frame.bodies.get(settings.tool)
     if pose is None:
         return _unseen(frame, settings.tool, "tool")
@@ -66,7 +107,7 @@ def tool_fault(frame: TrackerFrame, settings: BodySettings) -> str:
 
 
 def base_fault(frame: TrackerFrame, settings: BodySettings) -> str:
-    """Why a frame does not tell where the base is; empty if it does, or nobody asks."""
+    """Why a frame does not show where the base is; empty if it does, or nobody asks."""
     if not settings.has_base:
         return ""
     pose = frame.bodies.get(settings.base)
@@ -89,9 +130,9 @@ def repeats(frame: TrackerFrame, before: TrackerFrame | None, settings: BodySett
 
 def matrix_of(pose: PoseSettings) -> Array:
     """The homogeneous matrix (4 x 4, m)."""
-    found = np.eye(4)
-    found[:3, :3], found[:3, 3] = rotation_matrix(np.array(pose.unit_quaternion)), pose.position
-    return found
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = rotation_matrix(np.array(pose.unit_quaternion)), pose.position
+    return matrix
 
 
 def _unseen(frame: TrackerFrame, name: str, role: str) -> str:
@@ -103,8 +144,8 @@ def _unseen(frame: TrackerFrame, name: str, role: str) -> str:
 def _stacked(frames: Sequence[TrackerFrame], name: str) -> Array:
     """``world_T_body`` of each frame, NaN where it is not seen (N x 4 x 4)."""
     nothing = np.full((4, 4), np.nan)
-    found = [frame.bodies.get(name) for frame in frames]
-    return np.array([nothing if pose is None else pose for pose in found]).reshape(-1, 4, 4)
+    poses = [frame.bodies.get(name) for frame in frames]
+    return np.array([nothing if pose is None else pose for pose in poses]).reshape(-1, 4, 4)
 
 
 def _reference(frames: Sequence[TrackerFrame], settings: BodySettings) -> Array:
@@ -119,8 +160,3 @@ def _reference(frames: Sequence[TrackerFrame], settings: BodySettings) -> Array:
     mean = np.eye(4)
     mean[:3, :3], mean[:3, 3] = mean_rotation(kept[:, :3, :3]), kept[:, :3, 3].mean(axis=0)
     return np.tile(mean, (len(frames), 1, 1))
-
-
-def _offset(rotations: Array, target: Array) -> Array:
-    """The target off the body's origin, in the world (N x 3); a target at the origin needs no rotation."""
-    return np.asarray(rotations @ target) if target.any() else np.zeros((len(rotations), 3))

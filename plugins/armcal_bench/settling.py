@@ -11,11 +11,10 @@ from armcal.base.domains import Array
 from armcal.devices.tracker import TrackerFrame
 
 from armcal_bench.acquisition.settings import SettleSettings
-from armcal_bench.bodies import in_base, repeats
-from armcal_bench.body_settings import BodySettings
+from armcal_bench.bodies import BodySettings, in_base, repeats
 from armcal_bench.stillness import deviations_of_mean, judged, mean_pose
 
-FROZEN = "the tracker is frozen: it tells the same frame again"
+FROZEN = "the tracker is frozen: it gives the same frame again"
 _MOST_FRAMES = 20_000
 _GAP = 0.25
 """A part of the window that may pass without a usable frame."""
@@ -27,7 +26,7 @@ class Settled:
     """Where the arm stands.
 
     Attributes:
-        base_T_target: the mean (4 x 4, m); the rotation is NaN where the tracker tells only positions.
+        base_T_target: the mean (4 x 4, m); the rotation is NaN where the tracker gives only positions.
         deviations: standard deviations of the mean (6): x, y, z in the base frame (m), and the turn about each axis of
             the target (rad). A coordinate that the tracker rounds more coarsely than its noise may have none.
         frames: how many frames it is the mean of.
@@ -63,7 +62,7 @@ class Settling:
         self._begun = -np.inf
 
     def begin(self, now: float) -> None:
-        """The arm was told to stand just now (s, by the bench's clock): what came before does not count."""
+        """The arm was commanded to stand just now (s, by the bench's clock): what came before does not count."""
         self._begun = now
         self._frames.clear()
 
@@ -85,34 +84,30 @@ class Settling:
         frames = [frame for frame, _ in recent]
         capture = in_base(frames, self._bodies)
         faults = [fault or (FROZEN if again else "") for fault, (_, again) in zip(capture.faults, recent, strict=True)]
-        usable = np.array([not fault for fault in faults], dtype=bool)
-        why = self._too_few(np.array([frame.arrived for frame in frames])[usable], faults, start, now)
-        if why:
+        usable = [frame for frame, fault in zip(frames, faults, strict=True) if not fault]
+        if why := self._too_few([frame.arrived for frame in usable], faults, start, now):
             return Unsettled(why)
-        poses = capture.poses[usable]
+        poses = capture.poses[[not fault for fault in faults]]
         stillness = judged(poses, self._settings.spread)
         if stillness.why_not:
             return Unsettled(stillness.why_not)
-        kept = [frame for frame, use in zip(frames, usable, strict=True) if use]
-        kept = [frame for frame, keep in zip(kept, stillness.kept, strict=True) if keep]
-        return self._settled(poses[stillness.kept], kept, int((~stillness.kept).sum()))
-
-    def _settled(self, poses: Array, kept: list[TrackerFrame], rejected: int) -> Settled:
+        kept = [frame for frame, keep in zip(usable, stillness.kept, strict=True) if keep]
+        poses = poses[stillness.kept]
         mean = mean_pose(poses)
         if self._bodies.has_base and self._bodies.base_motion == "still":
             moving = in_base(kept, self._scattered)
             poses = moving.poses[[not fault for fault in moving.faults]]
-        deviations = deviations_of_mean(poses, mean)
-        return Settled(mean, deviations, len(kept), rejected, kept[0].arrived, kept[-1].arrived)
+        rejected = int((~stillness.kept).sum())
+        return Settled(mean, deviations_of_mean(poses, mean), len(kept), rejected, kept[0].arrived, kept[-1].arrived)
 
-    def _too_few(self, times: Array, faults: list[str], start: float, now: float) -> str:
+    def _too_few(self, times: list[float], faults: list[str], start: float, now: float) -> str:
         """Why the usable frames do not cover the window; empty if they do."""
         s = self._settings
         unusable = Counter(fault for fault in faults if fault).most_common(1)
-        reason = unusable[0][0] if unusable else "the tracker is silent" if not faults else "it tells no more"
+        reason = unusable[0][0] if unusable else "the tracker is silent" if not faults else "nothing more comes"
         if len(times) < s.frames:
             return f"too few frames: {len(times)} usable in {s.window:g} s, expected {s.frames}; {reason}"
-        longest = float(np.diff(np.concatenate([[start], times, [now]])).max())
+        longest = float(np.diff([start, *times, now]).max())
         if longest > _GAP * s.window + _SLACK_S:
             return f"no usable frame for {longest:.2f} s within the last {s.window:g} s; {reason}"
         return ""

@@ -1,15 +1,14 @@
-"""Whether poses that followed each other are those of an arm that stands."""
+"""Whether poses that followed each other are those of an arm that stands; means and outliers of such poses."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import groupby
 
 import numpy as np
 from armcal.base.domains import Array
 from numpy.typing import NDArray
-
-from armcal_bench.outliers import far_off, longest_run, spatial_median
-from armcal_bench.rotations import mean_rotation, turns_from
+from scipy.spatial.transform import Rotation
 
 LEVER_M = 0.1
 """A turn counts as much as it moves points this far from the target."""
@@ -22,9 +21,15 @@ _SURE = 5.5
 _MOST_CORRELATED = 0.95
 
 
+_FAR = 6.0
+"""So many times the median distance is far: 9 standard deviations of noise alike in three directions, 4 of one."""
+_MEDIAN_STEPS = 8
+_TINY_M = 1e-9
+
+
 @dataclass(frozen=True)
 class Stillness:
-    """What is to be said of some poses.
+    """Whether some poses are those of an arm that stands.
 
     Attributes:
         why_not: why they are not those of an arm that stands, a sentence; empty if they are.
@@ -42,54 +47,77 @@ def judged(poses: Array, spread: float) -> Stillness:
     within ``spread`` (m): before and after the middle strictly, at other moments if noise cannot be the reason. A few
     outliers are left out: single or in pairs, and never the last frame, which may be the first of a motion.
     """
-    points = _points(poses)
+    points = poses[:, None, :3, 3]  # N x P x 3: the target alone where a rotation is not known
+    if not np.isnan(poses[:, 0, 0]).any():
+        points = np.concatenate([points, points + LEVER_M * np.swapaxes(poses[:, :3, :3], 1, 2)], axis=1)
     kept = ~far_off(points, spread)
-    if longest_run(~kept) > _LONGEST_OUTLYING or not kept[-1]:
-        off = 1000 * _longest(points[-1] - spatial_median(points))
+    longest_outlying = max((len(list(run)) for is_kept, run in groupby(kept.tolist()) if not is_kept), default=0)
+    if longest_outlying > _LONGEST_OUTLYING or not kept[-1]:
+        off = 1000 * _longest(points[-1] - _spatial_median(points))
         return Stillness(f"still moving: it stands elsewhere than before, now {off:.2f} mm off", kept)
     if (~kept).mean() > MOST_OUTLYING:
         return Stillness(f"positions jump about: {(~kept).sum()} of {len(kept)} frames lie far from the others", kept)
-    good = points[kept]
-    half = len(good) // 2
-    apart = _longest(good[half:].mean(axis=0) - good[:half].mean(axis=0))
-    if apart >= spread:
-        return Stillness(f"still moving by {1000 * apart:.2f} mm (allowed: {1000 * spread:g} mm)", kept)
-    largest = _largest_step(good, spread)
-    if largest > 0:
-        return Stillness(f"still moving by {1000 * largest:.2f} mm (allowed: {1000 * spread:g} mm)", kept)
-    return Stillness("", kept)
+    usable = points[kept]
+    half = len(usable) // 2
+    apart = _longest(usable[half:].mean(axis=0) - usable[:half].mean(axis=0))
+    step = apart if apart >= spread else _largest_step(usable, spread)
+    why = f"still moving by {1000 * step:.2f} mm (allowed: {1000 * spread:g} mm)" if step > 0 else ""
+    return Stillness(why, kept)
+
+
+def far_off(points: Array, least: float) -> NDArray[np.bool_]:
+    """Which frames (points: N x P x 3, m) have a point far from its median: by ``_FAR``, and by ``least`` at any rate.
+
+    Distances do not hang on the directions of the axes, nor does the spatial median. [Huber1981]
+    """
+    away = np.linalg.norm(points - _spatial_median(points), axis=2)
+    limit = np.maximum(_FAR * np.median(away, axis=0), least)
+    return np.asarray((away > limit).any(axis=1))
+
+
+def _spatial_median(points: Array) -> Array:
+    """The place of each point (P x 3) with the least sum of distances to its N places. [Weiszfeld1937]"""
+    median = points.mean(axis=0)
+    for _ in range(_MEDIAN_STEPS):
+        weights = 1 / np.maximum(np.linalg.norm(points - median, axis=2), _TINY_M)
+        median = (weights[..., None] * points).sum(axis=0) / weights.sum(axis=0)[:, None]
+    return np.asarray(median)
+
+
+def mean_rotation(rotations: Array) -> Array:
+    """The rotation (3 x 3) whose matrix is nearest to all (N x 3 x 3, N > 0) in the sum of squares. [Moakher2002]"""
+    left, _, right = np.linalg.svd(rotations.mean(axis=0))
+    handed = np.array([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
+    return np.asarray((left * handed) @ right)
+
+
+def turns_from(mean: Array, rotations: Array) -> Array:
+    """The rotation vectors (N x 3, rad) from one rotation to others, in the axes of the one."""
+    return np.asarray(Rotation.from_matrix(mean.T @ rotations).as_rotvec())
 
 
 def mean_pose(poses: Array) -> Array:
     """The mean (4 x 4) of poses (N x 4 x 4); rotations that are NaN do not count, and all NaN give NaN."""
-    found = np.eye(4)
-    found[:3, 3] = poses[:, :3, 3].mean(axis=0)
-    turned = poses[~np.isnan(poses[:, 0, 0]), :3, :3]
-    found[:3, :3] = mean_rotation(turned) if len(turned) else np.nan
-    return found
+    mean = np.eye(4)
+    mean[:3, 3] = poses[:, :3, 3].mean(axis=0)
+    rotations = poses[~np.isnan(poses[:, 0, 0]), :3, :3]
+    mean[:3, :3] = mean_rotation(rotations) if len(rotations) else np.nan
+    return mean
 
 
 def deviations_of_mean(poses: Array, mean: Array) -> Array:
     """Standard deviations (6) of the mean: x, y, z (m), and the turn about each axis of the target (rad).
 
     Noise of frames that follow each other may be alike: as many count as an autoregression of first order with the
-    correlation found leaves independent. [Box2015] NaN where fewer than two poses tell.
+    correlation found leaves independent. [Box2015] NaN where fewer than two poses have one.
     """
-    found = np.full(6, np.nan)
+    deviations = np.full(6, np.nan)
     if len(poses) >= 2:
-        found[:3] = _of_mean(poses[:, :3, 3] - poses[:, :3, 3].mean(axis=0))
-    turned = poses[~np.isnan(poses[:, 0, 0]), :3, :3]
-    if len(turned) >= 2:
-        found[3:] = _of_mean(turns_from(mean[:3, :3], turned))
-    return found
-
-
-def _points(poses: Array) -> Array:
-    """The target, and three points off it unless a rotation is not known (N x P x 3, m)."""
-    origin = poses[:, None, :3, 3]
-    if np.isnan(poses[:, 0, 0]).any():
-        return np.asarray(origin)
-    return np.concatenate([origin, origin + LEVER_M * np.swapaxes(poses[:, :3, :3], 1, 2)], axis=1)
+        deviations[:3] = _of_mean(poses[:, :3, 3] - poses[:, :3, 3].mean(axis=0))
+    rotations = poses[~np.isnan(poses[:, 0, 0]), :3, :3]
+    if len(rotations) >= 2:
+        deviations[3:] = _of_mean(turns_from(mean[:3, :3], rotations))
+    return deviations
 
 
 def _longest(differences: Array) -> float:

@@ -1,4 +1,4 @@
-"""How long a tracker has told nothing of use, and why."""
+"""How long a tracker has given no usable frame, and why."""
 
 from __future__ import annotations
 
@@ -6,8 +6,7 @@ from collections.abc import Iterable, Mapping
 
 from armcal.devices.tracker import REPEATED, TrackerFrame
 
-from armcal_bench.bodies import base_fault, repeats, tool_fault
-from armcal_bench.body_settings import BodySettings
+from armcal_bench.bodies import BodySettings, base_fault, repeats, tool_fault
 
 WELL_S = 0.1
 """A tracker whose last frame was good and came so lately is well."""
@@ -29,7 +28,13 @@ class TrackerHealth:
         """Take in the frames that came, and what the tracker has refused since it was opened (``Tracker.refused``)."""
         self._refused = dict(refused)
         for frame in frames:
-            self._why = self._fault(frame)
+            unseen, base = tool_fault(frame, self._bodies), base_fault(frame, self._bodies)
+            self._base_seen = self._base_seen or not base
+            if not (self._bodies.base_motion == "still" and self._base_seen):
+                unseen = unseen or base
+            self._why = f"body lost: {unseen}" if unseen else ""
+            if not unseen and repeats(frame, self._last, self._bodies):
+                self._why = "frozen: each frame is like the one before"
             self._last = frame
             if not self._why:
                 self._usable_at = frame.arrived
@@ -42,18 +47,8 @@ class TrackerHealth:
             return 0.0, ""
         return max(since, 0.0), self._why or self._silence()
 
-    def _fault(self, frame: TrackerFrame) -> str:
-        unseen = tool_fault(frame, self._bodies)
-        base = base_fault(frame, self._bodies)
-        self._base_seen = self._base_seen or not base
-        if base and not (self._bodies.base_motion == "still" and self._base_seen):
-            unseen = unseen or base
-        if unseen:
-            return f"body lost: {unseen}"
-        return "frozen: each frame is like the one before" if repeats(frame, self._last, self._bodies) else ""
-
     def _silence(self) -> str:
-        """Why nothing came: what was refused since the last frame of use tells."""
+        """Why nothing came, by what was refused since the last usable frame."""
         before = self._refused_before
         risen = {reason: count - before.get(reason, 0) for reason, count in self._refused.items()}
         worst = max(risen, key=lambda reason: risen[reason], default="")

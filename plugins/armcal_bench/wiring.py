@@ -67,8 +67,19 @@ def check_wiring(bench: Bench, joints: Iterable[str], adapter: str = "") -> None
     """
     if (servos := servo_file_of(bench)) is None:
         return
-    file, known = load_servo_file(servos), _read(servos)
-    why = {joint: reason for joint in joints if (reason := _doubt(file, known.get(joint), joint, adapter))}
+    file, checks = load_servo_file(servos), _read(servos)
+    why = {}
+    for joint in joints:
+        entry = checks.get(joint)
+        checked_on = str((entry or {}).get("adapter", ""))
+        if entry is None or joint not in file.servos:
+            why[joint] = "never checked"
+        elif entry.get("servo") == _WRONG:
+            why[joint] = "the last check did not find it right"
+        elif not _is_of(entry, file, joint):
+            why[joint] = "changed since it was checked"
+        elif adapter and checked_on and adapter != checked_on:
+            why[joint] = f"checked on the adapter {checked_on}"
     if not why:
         return
     alike = {reason: ", ".join(joint for joint in why if why[joint] == reason) for reason in why.values()}
@@ -79,18 +90,6 @@ def check_wiring(bench: Bench, joints: Iterable[str], adapter: str = "") -> None
         hint="With exchanged plugs a joint goes where nobody looked: check them with armcal servo CONFIG --check, or "
         "give --unchecked to drive them all the same.",
     )
-
-
-def _doubt(file: ServoFile, entry: Mapping[str, Any] | None, joint: str, adapter: str) -> str:
-    """Why a joint does not count as checked; empty if it does."""
-    if entry is None or joint not in file.servos:
-        return "never checked"
-    if entry.get("servo") == _WRONG:
-        return "the last check did not find it right"
-    if not _is_of(entry, file, joint):
-        return "changed since it was checked"
-    checked_on = str(entry.get("adapter", ""))
-    return f"checked on the adapter {checked_on}" if adapter and checked_on and adapter != checked_on else ""
 
 
 def _is_of(entry: Mapping[str, Any], file: ServoFile, joint: str) -> bool:

@@ -73,7 +73,14 @@ class Chip:
             self._set_up()
         elif mode1 & (SUB_ADDRESSES | ALL_CALL):
             self._write(MODE1, AUTO_INCREMENT)
-        self._check_set_up()
+        expected = {MODE1: AUTO_INCREMENT, MODE2: OUTDRV, PRE_SCALE: self._prescale}
+        read_back = {register: self._read(register, 1)[0] for register in expected}
+        if read_back != expected:
+            raise DeviceError(
+                f"found {_listed(read_back)}, expected {_listed(expected)}: its set-up does not read back.",
+                where=self.where,
+                hint="Is it a PCA9685, and alone at this address? Look at the bus: wires, pull-ups.",
+            )
 
     def check(self) -> None:
         """Find out whether it is still as ``prepare`` left it.
@@ -91,9 +98,9 @@ class Chip:
             hint="Look at its supply: did the servos pull it down?",
         )
 
-    def channels(self, wanted: Iterable[int]) -> dict[int, Channel]:
+    def channels(self, channels: Iterable[int]) -> dict[int, Channel]:
         """What stands in these channels' registers; read until two readings agree, for links without a checksum."""
-        chosen = sorted(set(wanted))
+        chosen = sorted(set(channels))
         before = self._channels(chosen)
         for _ in range(_TRIES):
             again = self._channels(chosen)
@@ -104,20 +111,20 @@ class Chip:
             "its channels read differently each time.", where=self.where, hint="Look at the bus: wires, pull-ups."
         )
 
-    def set_channel(self, channel: int, wanted: Channel) -> None:
+    def set_channel(self, channel: int, pulse: Channel) -> None:
         """Write a channel's four registers in one transaction, and read them back; once more if they differ.
 
         Raises:
             DeviceError: they differ still.
         """
-        register, data = channel_register(channel), wanted.pack()
+        register, data = channel_register(channel), pulse.pack()
         for _ in range(2):
             self._link.write(self._address, bytes((register,)) + data)
-            found = self._link.read(self._address, register, CHANNEL_BYTES)
-            if found == data:
+            read_back = self._link.read(self._address, register, CHANNEL_BYTES)
+            if read_back == data:
                 return
         raise DeviceError(
-            f"found {found.hex(' ')} in channel {channel}, expected {data.hex(' ')}, which was written twice.",
+            f"found {read_back.hex(' ')} in channel {channel}, expected {data.hex(' ')}, which was written twice.",
             where=self.where,
             hint="Look at the bus: wires, pull-ups, and whether another program uses it.",
         )
@@ -158,16 +165,6 @@ class Chip:
         self._clock.sleep(OSCILLATOR_STARTS_S)
         if self._read(MODE1, 1)[0] & RESTART:
             self._write(MODE1, AUTO_INCREMENT | RESTART)
-
-    def _check_set_up(self) -> None:
-        wanted = {MODE1: AUTO_INCREMENT, MODE2: OUTDRV, PRE_SCALE: self._prescale}
-        found = {register: self._read(register, 1)[0] for register in wanted}
-        if found != wanted:
-            raise DeviceError(
-                f"found {_listed(found)}, expected {_listed(wanted)}: its set-up does not read back.",
-                where=self.where,
-                hint="Is it a PCA9685, and alone at this address? Look at the bus: wires, pull-ups.",
-            )
 
     def _read(self, register: int, count: int) -> bytes:
         return self._link.read(self._address, register, count)

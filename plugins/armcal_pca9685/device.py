@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -13,12 +14,11 @@ from armcal.config.servo_file import ServoFile, digest, load_servo_file
 from armcal.devices.clock import Clock
 from armcal.devices.device import DeviceIdentity, DeviceState, JointDevice, PulseDevice
 from armcal.devices.faults import DeviceLostError, DeviceRefusedError
-from armcal.devices.link import GuardedLink, Link, LinkIdentity
+from armcal.devices.link import GuardedLink, Link
 from armcal.errors import Location
 from typing_extensions import override
 
 from armcal_pca9685.chip import Chip, ForeignPulses
-from armcal_pca9685.guard import Guard
 from armcal_pca9685.registers import no_pulse, pulse_on
 from armcal_pca9685.servo import Servo
 
@@ -28,6 +28,37 @@ class Pca9685Settings(Settings):
 
     servos: InputPath
     foreign_pulses: ForeignPulses = "refuse"
+
+
+@dataclass(frozen=True)
+class _Guard:
+    """What a board does by itself when its host falls silent: where to go, how fast, after which silence.
+
+    Attributes:
+        waypoints: counts by joint.
+        rate: rad/s.
+        after_s: s.
+    """
+
+    waypoints: tuple[Mapping[str, int], ...]
+    rate: float
+    after_s: float
+
+    def hand_over(self, link: GuardedLink, servos: Mapping[str, Servo], standing: Mapping[str, int]) -> None:
+        """To the board, for the joints that have pulses.
+
+        A joint that a waypoint does not name stays where the waypoint before left it, or where it stands.
+        """
+        named = {joint for waypoint in self.waypoints for joint in waypoint}
+        joints = [joint for joint in servos if joint in named and joint in standing]
+        places = {joint: servos[joint].place for joint in joints}
+        at = {joint: standing[joint] for joint in joints}
+        ways = []
+        for waypoint in self.waypoints:
+            at = {joint: waypoint.get(joint, counts) for joint, counts in at.items()}
+            ways.append({places[joint]: counts for joint, counts in at.items()})
+        rates = {places[joint]: servos[joint].counts_per_s(self.rate) for joint in joints}
+        link.guard(ways if joints else [], rates, self.after_s)
 
 
 class Pca9685Device(JointDevice, PulseDevice):
@@ -46,7 +77,7 @@ class Pca9685Device(JointDevice, PulseDevice):
         self._servos = {j: Servo(self._file.calibrated(j), self._file.servos[j].pulse_range) for j in joint_names}
         self._chips: dict[int, Chip] = {}
         self._counts: dict[str, int] = {}  # of joints with pulses, as last read or written
-        self._guard = Guard((), 0.0, 0.0)
+        self._guard = _Guard((), 0.0, 0.0)
 
     @property
     @override
@@ -57,8 +88,16 @@ class Pca9685Device(JointDevice, PulseDevice):
     def open(self, clock: Clock) -> DeviceIdentity:
         identity = self._link.open(clock)
         try:
-            self._check_identity(identity)
-            self._guard = Guard((), 0.0, 0.0)
+            for name in {self._file.servos[joint].board for joint in self._servos}:
+                board_id = self._file.boards[name].id
+                if board_id and identity.adapter and board_id != identity.adapter:
+                    raise DeviceRefusedError(
+                        f"found the adapter {identity.adapter!r}, expected {board_id!r}, with which the board {name!r} "
+                        "was calibrated.",
+                        where=Location(str(self._settings.servos), field=f"boards.{name}.id"),
+                        hint="Connect the calibrated one, or calibrate this one: armcal servo.",
+                    )
+            self._guard = _Guard((), 0.0, 0.0)
             clocks = {servo.place[0]: servo.clock.prescale for servo in self._servos.values()}
             self._chips = {a: Chip(self._link, clock, a, prescale) for a, prescale in clocks.items()}
             for chip in self._chips.values():
@@ -117,8 +156,8 @@ class Pca9685Device(JointDevice, PulseDevice):
         if not isinstance(self._link, GuardedLink):
             return False
         ways = tuple({joint: self._counts_of(joint, a) for joint, a in way.items()} for way in waypoints)
-        self._guard = Guard(ways, rate, after_s)
-        self._guard.tell(self._link, self._servos, self._counts)
+        self._guard = _Guard(ways, rate, after_s)
+        self._guard.hand_over(self._link, self._servos, self._counts)
         return True
 
     @override
@@ -153,17 +192,6 @@ class Pca9685Device(JointDevice, PulseDevice):
     def _where(self) -> Location:
         return Location(str(self._settings.servos))
 
-    def _check_identity(self, identity: LinkIdentity) -> None:
-        for name in {self._file.servos[joint].board for joint in self._servos}:
-            text = self._file.boards[name].id
-            if text and identity.adapter and text != identity.adapter:
-                raise DeviceRefusedError(
-                    f"found the adapter {identity.adapter!r}, expected {text!r}, with which the board {name!r} was "
-                    "calibrated.",
-                    where=Location(str(self._settings.servos), field=f"boards.{name}.id"),
-                    hint="Connect the calibrated one, or calibrate this one: armcal servo.",
-                )
-
     def _counts_of(self, joint: str, angle: float) -> int:
         servo = self._known(joint)
         if not servo.has(angle):
@@ -193,17 +221,17 @@ class Pca9685Device(JointDevice, PulseDevice):
 
     def _read_counts(self) -> None:
         self._check_open()
-        found: dict[str, int] = {}
+        read: dict[str, int] = {}
         for address, chip in self._chips.items():
             own = {joint: servo.place[1] for joint, servo in self._servos.items() if servo.place[0] == address}
             channels = chip.channels(own.values())
             pulses = {joint: channels[channel].counts for joint, channel in own.items()}
-            found |= {joint: counts for joint, counts in pulses.items() if counts is not None}
-        self._counts = {joint: found[joint] for joint in self._servos if joint in found}
+            read |= {joint: counts for joint, counts in pulses.items() if counts is not None}
+        self._counts = {joint: read[joint] for joint in self._servos if joint in read}
 
     def _renew_guard(self) -> None:
         if isinstance(self._link, GuardedLink) and self._guard.waypoints:
-            self._guard.tell(self._link, self._servos, self._counts)
+            self._guard.hand_over(self._link, self._servos, self._counts)
 
     def _chip(self, address: int) -> Chip:
         self._check_open()

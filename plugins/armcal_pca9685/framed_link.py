@@ -23,6 +23,14 @@ _REPLY_S = 0.1
 _RATE_STEPS = 16  # a count per second has so many
 _LARGEST = 0xFFFF
 _TARGETS_AT_ONCE = MAX_PAYLOAD // 6
+_REFUSALS: Mapping[int, tuple[str, str]] = {
+    Code.UNKNOWN_TYPE: ("its firmware does not know this request", "Load newer firmware."),
+    Code.BAD_PAYLOAD: ("its firmware does not understand this request", "Load newer firmware."),
+    Code.NO_ADDRESS: ("no device answers at this I2C address", "Check address, power and wires."),
+    Code.NO_DATA: ("the device refuses byte {byte}", "Check its power and wires."),
+    Code.STUCK: ("its I2C bus is stuck: a line is held low", "Switch the servo board off and on."),
+}
+"""Why a board refuses a request, and what to do."""
 
 
 class FramedSettings(SerialPortSettings):
@@ -59,7 +67,17 @@ class FramedLink(GuardedLink, Link):
         self._decoder.forget()
         self._boots, self._took_over = None, False
         try:
-            hello = self._greet_starting(clock)
+            until, hello = clock.now() + self._settings.start, None
+            while hello is None:  # it may only be starting
+                while self._port.read(0.0):
+                    pass  # what was said to another program
+                hello = self._greet()
+                if hello is None:
+                    if clock.now() >= until:
+                        text = "nobody answers in the framed protocol."
+                        hint = "Check port and baud, and that the board runs the framed firmware."
+                        raise DeviceLostError(text, where=self._where, hint=hint)
+                    clock.sleep(_REPLY_S)
             if hello.version != messages.VERSION:
                 text = f"found version {hello.version} of the protocol, expected {messages.VERSION}."
                 raise DeviceRefusedError(text, where=self._where, hint="Load the board's firmware anew.")
@@ -119,28 +137,11 @@ class FramedLink(GuardedLink, Link):
     def close(self) -> None:
         self._port.close()
 
-    def _greet_starting(self, clock: Clock) -> messages.HelloReply:
-        """Greet a board that may only be starting."""
-        until = clock.now() + self._settings.start
-        while True:
-            while self._port.read(0.0):
-                pass  # what was said to another program
-            hello = self._greet()
-            if hello is not None:
-                return hello
-            if clock.now() >= until:
-                text = "nobody answers in the framed protocol."
-                hint = "Check port and baud, and that the board runs the framed firmware."
-                raise DeviceLostError(text, where=self._where, hint=hint)
-            clock.sleep(_REPLY_S)
-
     def _greet(self) -> messages.HelloReply | None:
+        """None: nobody answers."""
         reply = self._tried(Kind.HELLO, messages.Hello().pack())
-        return None if reply is None else self._read_hello(reply)
-
-    def _read_hello(self, reply: bytes) -> messages.HelloReply:
         try:
-            return messages.HelloReply.read(reply)
+            return None if reply is None else messages.HelloReply.read(reply)
         except ValueError as fault:
             text = f"the board's greeting cannot be read ({fault})."
             raise DeviceRefusedError(text, where=self._where, hint="Load the board's firmware anew.") from fault
@@ -186,26 +187,17 @@ class FramedLink(GuardedLink, Link):
         self._boots = head.boots
         self._flags = head.flags
         self._took_over |= Flag.TOOK_OVER in head.flags
-        if refusal is not None:
-            self._refuse(refusal, kind)
-        return rest
-
-    def _refuse(self, refusal: messages.Refusal, kind: Kind) -> NoReturn:
+        if refusal is None:
+            return rest
         if refusal.code == Code.TOOK_OVER:
             self._lose_to_board()
         if refusal.code == Code.WRONG_BOOTS:
             self._port.close()
             raise DeviceResetError("the board has started anew.", where=self._where, hint="Look at its power.")
-        meanings = {
-            Code.UNKNOWN_TYPE: ("its firmware does not know this request", "Load newer firmware."),
-            Code.BAD_PAYLOAD: ("its firmware does not understand this request", "Load newer firmware."),
-            Code.NO_ADDRESS: ("no device answers at this I2C address", "Check address, power and wires."),
-            Code.NO_DATA: (f"the device refuses byte {refusal.detail}", "Check its power and wires."),
-            Code.STUCK: ("its I2C bus is stuck: a line is held low", "Switch the servo board off and on."),
-        }
-        unknown = f"it gives code {refusal.code}", "Load newer firmware."
-        meaning, hint = meanings.get(refusal.code, unknown) if refusal.code in list(Code) else unknown
-        raise DeviceError(f"the board refuses {kind.name}: {meaning}.", where=self._where, hint=hint)
+        unknown = (f"it gives code {refusal.code}", "Load newer firmware.")
+        meaning, hint = _REFUSALS.get(refusal.code, unknown)
+        text = f"the board refuses {kind.name}: {meaning.format(byte=refusal.detail)}."
+        raise DeviceError(text, where=self._where, hint=hint)
 
     def _lose_to_board(self) -> NoReturn:
         self._port.close()

@@ -7,7 +7,7 @@ import fcntl
 import importlib
 from collections.abc import Callable, Mapping
 from types import ModuleType
-from typing import Annotated, Any, ClassVar, NoReturn, TypeVar
+from typing import Annotated, Any, ClassVar
 
 from armcal.base.settings import Settings
 from armcal.devices.clock import Clock
@@ -16,8 +16,6 @@ from armcal.devices.link import Link, LinkIdentity
 from armcal.errors import Location, PluginError
 from pydantic import Field
 from typing_extensions import override
-
-T = TypeVar("T")
 
 _TRIES = 3
 _GONE = (errno.ENODEV, errno.ENOENT, errno.EBADF, errno.ESHUTDOWN)
@@ -53,7 +51,14 @@ class LinuxI2cLink(Link):
             fcntl.flock(self._bus.fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as fault:
             self.close()
-            self._refuse(fault)
+            message, hint = f"this I2C bus cannot be opened ({fault}).", "Check that it is an I2C bus."
+            if fault.errno == errno.ENOENT:
+                message, hint = "there is no such I2C bus.", "Enable I2C (raspi-config, or modprobe i2c-dev)."
+            elif fault.errno in (errno.EACCES, errno.EPERM):
+                message, hint = "this I2C bus may not be opened.", "Add yourself to its group (i2c) and log in anew."
+            elif fault.errno in (errno.EAGAIN, errno.EWOULDBLOCK, errno.EBUSY):
+                message, hint = "another program has this I2C bus.", "Close it."
+            raise DeviceRefusedError(message, where=Location(self._path), hint=hint) from fault
         return LinkIdentity("", f"Linux I2C, {self._path}")
 
     @override
@@ -62,11 +67,10 @@ class LinuxI2cLink(Link):
 
     @override
     def read(self, address: int, register: int, count: int) -> bytes:
-
-        def messages(library: Any) -> list[Any]:
-            return [library.i2c_msg.write(address, [register]), library.i2c_msg.read(address, count)]
-
-        return bytes(self._transfer(address, messages)[1])
+        made = self._transfer(
+            address, lambda library: [library.i2c_msg.write(address, [register]), library.i2c_msg.read(address, count)]
+        )
+        return bytes(made[1])
 
     @override
     def close(self) -> None:
@@ -96,17 +100,6 @@ class LinuxI2cLink(Link):
             where=Location(self._path),
             hint=f"Check its address, power and wires; i2cdetect -y {self._path.rpartition('-')[2]} lists who answers.",
         ) from fault
-
-    def _refuse(self, fault: OSError) -> NoReturn:
-        if fault.errno == errno.ENOENT:
-            message, hint = "there is no such I2C bus.", "Enable I2C (raspi-config, or modprobe i2c-dev)."
-        elif fault.errno in (errno.EACCES, errno.EPERM):
-            message, hint = "this I2C bus may not be opened.", "Add yourself to its group (i2c) and log in anew."
-        elif fault.errno in (errno.EAGAIN, errno.EWOULDBLOCK, errno.EBUSY):
-            message, hint = "another program has this I2C bus.", "Close it."
-        else:
-            message, hint = f"this I2C bus cannot be opened ({fault}).", "Check that it is an I2C bus."
-        raise DeviceRefusedError(message, where=Location(self._path), hint=hint) from fault
 
 
 def _library() -> ModuleType:

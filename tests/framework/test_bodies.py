@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from armcal.devices.tracker import TrackerFrame
-from armcal_bench.bodies import in_base, matrix_of, repeats
-from armcal_bench.body_settings import BodySettings
-from armcal_bench.rotations import mean_rotation, turns_from
+from armcal_bench.bodies import BodySettings, in_base, matrix_of, repeats
+from armcal_bench.stillness import mean_rotation, turns_from
 from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError

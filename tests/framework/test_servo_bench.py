@@ -99,7 +99,7 @@ def test_it_finds_what_the_servos_truly_are(calibrated, bench):
         spans = [knots[2]["pulse_us"] - knots[1]["pulse_us"], knots[1]["pulse_us"] - knots[0]["pulse_us"]]
         assert spans == pytest.approx([true[2] - true[1], true[1] - true[0]], abs=8.0)
         assert found["servos"][joint]["backlash_deg"] == pytest.approx(0.1, abs=0.05)
-    assert any("cannot be told" in sentence for sentence in found["findings"])
+    assert any("cannot be found" in sentence for sentence in found["findings"])
 
 
 def test_the_servo_file_is_written_and_the_one_before_is_kept(calibrated, bench):

@@ -134,7 +134,7 @@ def test_a_wrong_angle_is_set_aside_and_told() -> None:
 def test_a_knot_that_nothing_tells_keeps_its_stated_pulse() -> None:
     seen = [o for o in observed() if o.angle > 0.2]
     found = fit_servos(task(seen)).servos["q1"]
-    assert found.told == (False, True, True)
+    assert found.determined == (False, True, True)
     assert found.pulses[0] == STATED.pulses[0]
     assert math.isnan(found.pulse_sds[0])
 

@@ -207,7 +207,7 @@ class TestRecovery:
             for joint, angle in setup.base.items():
                 mover.energise(joint, mover.counts_at(joint, angle))
             try:
-                mover.go("q1", mover.told["q1"] + 50)
+                mover.go("q1", mover.counts["q1"] + 50)
             except DeviceError as fault:
                 calls.append(device.calls)
                 mover.recover(fault)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from armcal.devices.tracker import REPEATED, TrackerFrame
 from armcal_bench.acquisition.settings import SettleSettings
-from armcal_bench.body_settings import BodySettings
+from armcal_bench.bodies import BodySettings
 from armcal_bench.settling import Settled, Settling, Unsettled
 from armcal_bench.stillness import deviations_of_mean, mean_pose
 from armcal_bench.tracker_health import TrackerHealth

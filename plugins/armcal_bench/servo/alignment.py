@@ -139,9 +139,9 @@ def _rows(alignment: Alignment, joint: str, sweeps: Sweeps, springs: Springs) ->
     across = np.linalg.svd(axes[:, None])[2][:, 1:] / sweeps.sds[:, None, None]
     known = across @ alignment.base
     by_numbers = np.concatenate([known @ by_angles, known @ by_joints, across, across @ seen], axis=2)
-    by_compliances, by_plays = known @ by_springs, known @ by_joints
-    flat = [rows.reshape(2 * len(seen), -1) for rows in (by_compliances, by_numbers, by_plays)]
-    return *flat, (across @ off[:, :, None]).ravel()
+    count = 2 * len(seen)
+    by_compliances, by_plays = (known @ by_springs).reshape(count, -1), (known @ by_joints).reshape(count, -1)
+    return by_compliances, by_numbers.reshape(count, -1), by_plays, (across @ off[:, :, None]).ravel()
 
 
 def _mean_seat(base: Array, sweeps: Mapping[str, Sweeps], springs: Mapping[str, Springs]) -> Array:

@@ -106,7 +106,7 @@ def sweeps_of(
         return str(fault)
 
 
-def told_by(sweeps: Sweeps, joint: str, nominal: NominalArm, springs: Springs | None) -> list[Observation]:
+def observations_of(sweeps: Sweeps, joint: str, nominal: NominalArm, springs: Springs | None) -> list[Observation]:
     """As a fit takes them. Of what springs give, the change of compliances from ``nominal`` is left to be found."""
     rows = list(zip(sweeps.counts, sweeps.approaches, sweeps.angles.tolist(), sweeps.sds.tolist(), strict=True))
     if springs is None or sweeps.by is None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -22,8 +23,8 @@ _MOST_RESTLESS = 3
 _LOOKED_AT_EVERY_S = 1.0
 _WARM = "a servo had to rest before the tracker was back"
 
-Told = Callable[[str, int, int], None]
-"""Told the joint, and how many of its points are done and planned."""
+ReportProgress = Callable[[str, int, int], None]
+"""Takes the joint, and how many of its points are done and planned."""
 
 
 class TrackerLostError(StoppedError):
@@ -42,7 +43,7 @@ class Automatic:
     mover: Mover
     monitor: TrackerMonitor
     record: Record
-    told: Told
+    report: ReportProgress
     thermal_state: ThermalState
     faults: int = 0
     restless: int = 0
@@ -56,60 +57,29 @@ class Automatic:
                 stand: then it is in its base pose.
             DeviceError: the device is gone and does not come back.
         """
+        setup, mover, self.first = self.setup, self.mover, len(self.record.entries)
+        sweeps = {joint: sweep(setup, mover, joint) for joint in setup.joints}
+        if not any(left(points, self._done) for points in sweeps.values()):
+            return
         try:
-            self._run()
+            self._persist(lambda: to_base(setup, mover))
+            mover.guard(setup.base)
+            for joint, points in sweeps.items():
+                for point in left(points, self._done):
+                    self._persist(partial(self._measure, point))
+                    self.report(joint, len(points) - len(left(points, self._done)), len(points))
+                self._persist(lambda: to_base(setup, mover))
+            mover.guard({})
         except (TrackerLostError, RestlessError):
             # Nobody may be there for hours, and it could hold a heavy pose.
-            self._persist(lambda: to_base(self.setup, self.mover))
+            self._persist(lambda: to_base(setup, mover))
             raise
-
-    def _run(self) -> None:
-        self.first = len(self.record.entries)
-        if not any(left(sweep(self.setup, self.mover, joint), self._done) for joint in self.setup.joints):
-            return
-        self._persist(lambda: to_base(self.setup, self.mover))
-        self.mover.guard(self.setup.base)
-        for joint in self.setup.joints:
-            points = sweep(self.setup, self.mover, joint)
-            for point in left(points, self._done):
-                self._persist(lambda at=point: self._measure(at))  # type: ignore[misc]
-                self.told(joint, len(points) - len(left(points, self._done)), len(points))
-            self._persist(lambda: to_base(self.setup, self.mover))
-        self.mover.guard({})
 
     @property
     def _done(self) -> list[Mapping[str, Any]]:
         """Lines of points that are not to be measured now; what an earlier run left out is tried once more."""
         lines = enumerate(self.record.entries)
         return [line for i, line in lines if i >= self.first or line["kind"] != LEFT_OUT]
-
-    def capture(self) -> Settled | str:
-        """Where the tool stands, once it does; or why that is not known.
-
-        Raises:
-            TrackerLostError: the tracker has told nothing of use for too long.
-        """
-        settings = self.setup.bench.settings.acquisition
-        self.monitor.begin()
-        until = self.mover.clock.now() + settings.settle.longest
-        while self.mover.clock.now() < until:
-            self.mover.tick()
-            settled = self.monitor.settled()
-            if settled is not None:
-                self.mover.waits.over("tracker", self.mover.clock.now())
-                return settled
-            seconds, why = self.monitor.trouble()
-            if seconds >= settings.lost.park:
-                self.mover.waits.given_up("tracker")
-                text = f"the tracker has told nothing for {seconds:.0f} s ({why})"
-                raise TrackerLostError(text, "the arm holds its base pose")
-            if seconds >= settings.lost.hold:
-                left = settings.lost.park - seconds
-                self.mover.waits.goes_on("tracker", f"the arm holds: {why}", left, self.mover.clock.now())
-                if self.thermal_state.must_rest:
-                    return _WARM
-                until = self.mover.clock.now() + settings.settle.longest
-        return self.monitor.why or "the arm did not come to stand"
 
     def look(self) -> None:
         """What is done after every pause: the tracker's frames, and the servos' warmth."""
@@ -127,25 +97,27 @@ class Automatic:
             waits.over("rest", clock.now())
 
     def _measure(self, point: Point) -> None:
-        found: Settled | str = _WARM
-        while found == _WARM:
+        setup, mover = self.setup, self.mover
+        settled: Settled | str = _WARM
+        while settled == _WARM:
             self._rest()
-            come_to(self.setup, self.mover, point)
-            found = self.capture()
-        here: dict[str, Any] = {"joint": point.joint, "counts": point.counts, "came": point.came}
-        here |= {
-            "at": self.mover.clock.wall(),
-            "warmth": self.thermal_state.by_joint,
-            "told": commanded_angles(self.mover),
-        }
-        if isinstance(found, str):
-            self.record.append(LEFT_OUT, {**here, "why": found})
+            come_to(setup, mover, point)
+            settled = capture(setup, mover, self.monitor, lambda: self.thermal_state.must_rest)
+        line: dict[str, Any] = {"joint": point.joint, "counts": point.counts, "came": point.came}
+        line["at"], line["warmth"] = mover.clock.wall(), self.thermal_state.by_joint
+        line["told"] = commanded_angles(mover)
+        if isinstance(settled, str):
+            self.record.append(LEFT_OUT, {**line, "why": settled})
             self.restless += 1
             if self.restless >= _MOST_RESTLESS:
-                text = f"{point.joint} did not come to stand {self.restless} times in a row ({found})"
+                text = f"{point.joint} did not come to stand {self.restless} times in a row ({settled})"
                 raise RestlessError(f"{text}: does a servo stall, or let go?", "the arm is told to hold its base pose")
             return
-        self.record.append(POSE, {**here, **pose_entry(found)})
+        pose = settled.base_T_target
+        line["position"] = pose[:3, 3].tolist()
+        line["rotation"] = None if np.isnan(pose[:3, :3]).any() else pose[:3, :3].tolist()
+        line["deviations"] = [float(d) if np.isfinite(d) else None for d in settled.deviations]
+        self.record.append(POSE, {**line, "frames": settled.frames})
         self.faults = self.restless = 0
 
     def _persist(self, action: Callable[[], None]) -> None:
@@ -161,13 +133,31 @@ class Automatic:
                 self.mover.recover(fault)
 
 
-def pose_entry(settled: Settled) -> dict[str, Any]:
-    """A settled pose as a line of the record tells it."""
-    pose = settled.base_T_target
-    seen = not np.isnan(pose[:3, :3]).any()
-    return {
-        "position": pose[:3, 3].tolist(),
-        "rotation": pose[:3, :3].tolist() if seen else None,
-        "deviations": [float(d) if np.isfinite(d) else None for d in settled.deviations],
-        "frames": settled.frames,
-    }
+def capture(
+    setup: Setup, mover: Mover, monitor: TrackerMonitor, must_rest: Callable[[], bool] = lambda: False
+) -> Settled | str:
+    """Where the tool stands, once it does; or why that is not known.
+
+    Raises:
+        TrackerLostError: the tracker has given nothing of use for too long.
+    """
+    settings, waits, now = setup.bench.settings.acquisition, mover.waits, mover.clock.now
+    monitor.begin()
+    until = now() + settings.settle.longest
+    while now() < until:
+        mover.tick()
+        settled = monitor.settled()
+        if settled is not None:
+            waits.over("tracker", now())
+            return settled
+        seconds, why = monitor.trouble()
+        if seconds >= settings.lost.park:
+            waits.given_up("tracker")
+            text = f"the tracker has told nothing for {seconds:.0f} s ({why})"
+            raise TrackerLostError(text, "the arm holds its base pose")
+        if seconds >= settings.lost.hold:
+            waits.goes_on("tracker", f"the arm holds: {why}", settings.lost.park - seconds, now())
+            if must_rest():
+                return _WARM
+            until = now() + settings.settle.longest
+    return monitor.why or "the arm did not come to stand"

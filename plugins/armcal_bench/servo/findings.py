@@ -1,4 +1,4 @@
-"""What a servo calibration has to say beside its numbers, in sentences."""
+"""What is remarkable about a servo calibration beside its numbers, in sentences."""
 
 from __future__ import annotations
 
@@ -26,15 +26,28 @@ def is_usable(servo: FittedServo) -> bool:
 
 
 def findings(outcome: Outcome) -> list[str]:
-    """All of them."""
+    """A sentence each, of servos, zeros, boards and springs."""
     texts = [f"{joint}: the table is left as it was: {why}." for joint, why in outcome.silent.items()]
     for servo in outcome.fit.servos.values():
         texts += list(_of_servo(servo, outcome))
     if outcome.zero == "kept":
         texts.append("zeros: each servo's pulse at 0 deg was kept; the angles were measured from one another.")
-    texts += _of_boards(outcome)
-    texts += _of_springs(outcome)
-    return texts
+    for board, clock in outcome.fit.clocks.items():
+        if not any(servo.known.board == board for servo in outcome.fit.servos.values()):
+            continue
+        if board not in outcome.fit.oscillator_sds:
+            texts.append(
+                f"{board}: the oscillator cannot be found from tables that are not known, so it is left at "
+                f"{clock.oscillator_hz / 1e6:.3f} MHz and the tables count by it. Angles are right all the same. To "
+                "know the oscillator, measure a pulse (bench.servo.measured_pulses) or trust a table "
+                "(bench.servo.trusted)."
+            )
+        if not _SENSIBLE_HZ[0] <= clock.oscillator_hz <= _SENSIBLE_HZ[1]:
+            texts.append(
+                f"{board}: an oscillator of {clock.oscillator_hz / 1e6:.2f} MHz is outside "
+                f"{_SENSIBLE_HZ[0] / 1e6:.0f} to {_SENSIBLE_HZ[1] / 1e6:.0f} MHz: check what it was measured by."
+            )
+    return texts + _of_springs(outcome)
 
 
 def _of_servo(servo: FittedServo, outcome: Outcome) -> Iterator[str]:
@@ -48,10 +61,10 @@ def _of_servo(servo: FittedServo, outcome: Outcome) -> Iterator[str]:
     before, after = (np.sign(pulses[-1] - pulses[0]) for pulses in (servo.known.table.pulses, servo.pulses))
     if before != after:
         yield f"{joint}: the servo turns the other way than its table said."
-    for angle, told in zip(servo.angles, servo.told, strict=True):
+    for angle, is_determined in zip(servo.angles, servo.determined, strict=True):
         beyond = max(servo.reach[0] - angle, angle - servo.reach[1])
-        if not told:
-            yield f"{joint}: nothing tells the pulse at {math.degrees(angle):g} deg; it is the stated one."
+        if not is_determined:
+            yield f"{joint}: no measurement determines the pulse at {math.degrees(angle):g} deg; it is the stated one."
         elif beyond > math.radians(15):
             yield (
                 f"{joint}: the pulse at {math.degrees(angle):g} deg goes on straight from what was measured, "
@@ -79,28 +92,8 @@ def _of_servo(servo: FittedServo, outcome: Outcome) -> Iterator[str]:
 
 def _gain_change(servo: FittedServo) -> float:
     angles = np.array(servo.angles)
-    stated, found = np.diff(servo.known.pulses_at(angles)), np.diff(servo.pulses)
-    return float(np.max(np.abs(found / stated - 1.0)))
-
-
-def _of_boards(outcome: Outcome) -> list[str]:
-    texts = []
-    for board, clock in outcome.fit.clocks.items():
-        if not any(servo.known.board == board for servo in outcome.fit.servos.values()):
-            continue
-        if board not in outcome.fit.oscillator_sds:
-            texts.append(
-                f"{board}: the oscillator cannot be told from tables that are not known, so it is left at "
-                f"{clock.oscillator_hz / 1e6:.3f} MHz and the tables count by it. Angles are right all the same. To "
-                "know the oscillator, measure a pulse (bench.servo.measured_pulses) or trust a table "
-                "(bench.servo.trusted)."
-            )
-        if not _SENSIBLE_HZ[0] <= clock.oscillator_hz <= _SENSIBLE_HZ[1]:
-            texts.append(
-                f"{board}: an oscillator of {clock.oscillator_hz / 1e6:.2f} MHz is outside "
-                f"{_SENSIBLE_HZ[0] / 1e6:.0f} to {_SENSIBLE_HZ[1] / 1e6:.0f} MHz: check what it was measured by."
-            )
-    return texts
+    stated, fitted = np.diff(servo.known.pulses_at(angles)), np.diff(servo.pulses)
+    return float(np.max(np.abs(fitted / stated - 1.0)))
 
 
 def _of_springs(outcome: Outcome) -> list[str]:
@@ -115,7 +108,7 @@ def _of_springs(outcome: Outcome) -> list[str]:
     worst = max(outcome.sag_span, key=lambda joint: outcome.sag_span[joint])
     if outcome.sag_span[worst] < _SAG_WORTH:
         return []
-    how = "found with the tables" if outcome.compliances or outcome.fit.untold else "the model's"
+    how = "found with the tables" if outcome.compliances or outcome.fit.undetermined else "the model's"
     return [
         f"springs: over a sweep they turn the tool by up to {math.degrees(outcome.sag_span[worst]):.1f} deg ({worst}); "
         f"that is taken out by compliances that are {how}."

@@ -66,41 +66,45 @@ class Guided:
                 done.add(targets[place].key)
 
     def targets(self) -> list[Target]:
-        """Each joint at its knots, as far as its range leaves room to come from aside, once from either side."""
-        found = []
-        for joint in self.setup.joints:
-            low, high = self._inner(joint)
-            for angle in sorted({float(np.clip(knot, low, high)) for knot in self.setup.knots_of(joint)}):
-                found += [Target(joint, angle, 1), Target(joint, angle, -1)]
-        return found
+        """Each joint at its knots, as far as its range leaves room to come from aside, once from either side.
 
-    def _inner(self, joint: str) -> tuple[float, float]:
-        """The range (rad) less what an angle is come to from aside; its middle where there is no such room."""
-        low, high = self.setup.ranges[joint]
-        margin = min(self.setup.settings.approach, (high - low) / 2)
-        return low + margin, high - margin
+        A range without such room is measured in its middle.
+        """
+        targets = []
+        for joint in self.setup.joints:
+            low, high = self.setup.ranges[joint]
+            margin = min(self.setup.settings.approach, (high - low) / 2)
+            knots = np.clip(self.setup.knots_of(joint), low + margin, high - margin)
+            targets += [Target(joint, angle, came) for angle in sorted(set(knots.tolist())) for came in (1, -1)]
+        return targets
 
     def _ask(self, target: Target) -> str:
         """One target: the wish that ended it, ``ok``, ``skip`` or ``back``."""
         joint, mover = target.joint, self.mover
         pulse = mover.pulse(joint, self._within(joint, mover.counts_at(joint, target.angle)))
-        self.say(f"put {joint} at {math.degrees(target.angle):g} deg, coming with {_side(target.came)} pulses")
+        side = "rising" if target.came > 0 else "falling"
+        self.say(f"put {joint} at {math.degrees(target.angle):g} deg, coming with {side} pulses")
         while True:
-            self._come(target, self._within(joint, round(pulse / mover.pulse(joint, 1))))
-            self.say(f"  {joint}: {1e6 * pulse:.0f} us asked, {1e6 * mover.pulse(joint, mover.told[joint]):.1f} us set")
-            wish = self._wish()
+            counts = self._within(joint, round(pulse / mover.pulse(joint, 1)))
+            if mover.came.get(joint) != target.came or target.came * (counts - mover.counts[joint]) < 0:
+                aside = counts - target.came * approach_counts(self.setup, mover, joint)
+                mover.go(joint, self._within(joint, aside))  # from the target's side, with the play taken up
+            mover.go(joint, counts)
+            set_us = 1e6 * mover.pulse(joint, mover.counts[joint])
+            self.say(f"  {joint}: {1e6 * pulse:.0f} us asked, {set_us:.1f} us set")
+            wish = next_wish(self.wishes, mover)
+            line = {"joint": joint, "target": target.angle, "came": target.came, "at": mover.clock.wall()}
             if wish == "ok":
-                said = {"angle": target.angle, "sd": self.setup.settings.guided_sd}
-                self.record.append(ANGLE, {**self._here(target), "counts": mover.told[joint], **said})
+                measured = {"angle": target.angle, "sd": self.setup.settings.guided_sd}
+                self.record.append(ANGLE, {**line, "counts": mover.counts[joint], **measured})
+            elif wish == "skip":
+                self.record.append(LEFT_OUT, {**line, "why": "it was skipped"})
+            if wish in ("ok", "skip", "back"):
                 return wish
-            if wish == "skip":
-                self.record.append(LEFT_OUT, {**self._here(target), "why": "it was skipped"})
-                return wish
-            if wish == "back":
-                return wish
-            pulse = self._changed(joint, pulse, wish)
+            pulse = self._stepped(joint, pulse, wish)
 
-    def _changed(self, joint: str, pulse: float, wish: str) -> float:
+    def _stepped(self, joint: str, pulse: float, wish: str) -> float:
+        """A pulse (s) after a step in microseconds; as it was where the step is none, or leads out of the range."""
         try:
             step = float(wish)
         except ValueError:
@@ -108,21 +112,13 @@ class Guided:
         if not math.isfinite(step):
             self.say(f"  {wish!r} is not known: say a step in us (+10, -1), ok, skip, back or quit")
             return pulse
-        wanted = pulse + 1e-6 * step
+        stepped = pulse + 1e-6 * step
         low, high = self.setup.pulses_of(joint)
-        if not low <= wanted <= high:
+        if not low <= stepped <= high:
             allowed = f"{1e6 * low:.0f} to {1e6 * high:.0f} us, which bench.servo.pulses and the servo's range allow"
-            self.say(f"  {1e6 * wanted:.0f} us is outside {allowed}")
+            self.say(f"  {1e6 * stepped:.0f} us is outside {allowed}")
             return pulse
-        return wanted
-
-    def _come(self, target: Target, counts: int) -> None:
-        """To a pulse from the target's side, with the play taken up."""
-        joint, mover = target.joint, self.mover
-        if mover.came.get(joint) != target.came or target.came * (counts - mover.told[joint]) < 0:
-            aside = counts - target.came * approach_counts(self.setup, mover, joint)
-            mover.go(joint, self._within(joint, aside))
-        mover.go(joint, counts)
+        return stepped
 
     def _within(self, joint: str, counts: int) -> int:
         """The nearest counts that are allowed."""
@@ -130,28 +126,22 @@ class Guided:
         tick = self.mover.pulse(joint, 1)
         return min(max(counts, math.ceil(low / tick)), math.floor(high / tick))
 
-    def _wish(self) -> str:
-        while True:
-            wish = self.wishes.next(_LOOK_S)
-            if wish == QUIT or self.mover.asked_to_stop():
-                raise StoppedError("it was asked to stop")
-            if wish is not None:
-                return wish
-            self.mover.device.keep_alive()
 
-    def _here(self, target: Target) -> dict[str, Any]:
-        return {
-            "joint": target.joint,
-            "target": target.angle,
-            "came": target.came,
-            "at": self.mover.clock.wall(),
-        }
+def next_wish(wishes: Wishes, mover: Mover) -> str:
+    """What somebody wishes next; the arm holds until then.
+
+    Raises:
+        StoppedError: it is the end.
+    """
+    while True:
+        wish = wishes.next(_LOOK_S)
+        if wish == QUIT or mover.asked_to_stop():
+            raise StoppedError("it was asked to stop")
+        if wish is not None:
+            return wish
+        mover.device.keep_alive()
 
 
 def key_of(entry: Mapping[str, Any]) -> tuple[str, int, int]:
     """Which target a line of the record is about."""
     return Target(str(entry["joint"]), float(entry["target"]), int(entry["came"])).key
-
-
-def _side(came: int) -> str:
-    return "rising" if came > 0 else "falling"

@@ -57,13 +57,13 @@ class Motion:
 
 @dataclass
 class Mover:
-    """Moves servos; ``told`` holds each one's counts as they were set, and ``came`` the sign of its last step.
+    """Moves servos; ``counts`` holds each one's as they were set, and ``came`` the sign of its last step.
 
     Args:
         device: opened by ``open``.
         clock: for all waiting.
         servos: by joint, with the clock of their board: what angles are turned into pulses by.
-        read_by: the same as the device has them, by which it tells its angles.
+        read_by: the same as the device has them, by which it reports its angles.
         motion: how fast, and how far.
         asked_to_stop: looked at in every step.
         look: called after every pause, for who watches the arm meanwhile.
@@ -79,7 +79,7 @@ class Mover:
     look: Callable[[], None] = field(default=lambda: None)
     waits: Waits = field(default_factory=Waits)
     identity: DeviceIdentity | None = None
-    told: dict[str, int] = field(default_factory=dict)
+    counts: dict[str, int] = field(default_factory=dict)
     came: dict[str, int] = field(default_factory=dict)
     _alive: float = -math.inf
     _guarded: Mapping[str, float] = field(default_factory=dict)
@@ -95,9 +95,9 @@ class Mover:
                 "this device cannot set pulses by their length.", hint="Calibrate servos with a device like pca9685."
             )
         self.identity = self.device.open(self.clock)
-        # What the board was told by another run must not be done now: ways home of that time are none today.
+        # A way home of another run must not be gone now.
         self.device.guard([], self.motion.rate, self.motion.silence)
-        self.told |= self._running()
+        self.counts |= self._running()
         return self.identity
 
     def counts_at(self, joint: str, angle: float) -> int:
@@ -116,7 +116,7 @@ class Mover:
 
     def energise(self, joint: str, counts: int) -> None:
         """A joint's first pulse; nothing if it gets pulses already."""
-        if joint not in self.told:
+        if joint not in self.counts:
             self._set(joint, counts)
             self.stand(_BETWEEN_JOINTS_S)
 
@@ -128,14 +128,13 @@ class Mover:
             StoppedError: on the way; the joint holds.
         """
         self.check(joint, counts)
-        at = float(self.told[joint])
-        if counts != self.told[joint]:
+        at, step = float(self.counts[joint]), self.motion.rate * self.counts_per_rad(joint) * self.motion.period
+        if counts != self.counts[joint]:
             self.came[joint] = 1 if counts > at else -1
-        while self.told[joint] != counts:
+        while self.counts[joint] != counts:
             self._pause(self.motion.period)
-            step = self._counts_per_s(joint) * self.motion.period
             at += math.copysign(min(step, abs(counts - at)), counts - at)
-            if (near := math.floor(at + 0.5)) != self.told[joint]:
+            if (near := math.floor(at + 0.5)) != self.counts[joint]:
                 self._set(joint, near)
 
     def check(self, joint: str, counts: int) -> None:
@@ -192,8 +191,8 @@ class Mover:
     def _restore(self) -> None:
         # No way home is known while joints hang free.
         self.device.guard([], self.motion.rate, self.motion.silence)
-        before, running = dict(self.told), self._running()
-        self.told |= running
+        before, running = dict(self.counts), self._running()
+        self.counts |= running
         self.came.clear()
         for joint in before:
             if joint not in running:
@@ -210,10 +209,7 @@ class Mover:
     def _set(self, joint: str, counts: int) -> None:
         self.check(joint, counts)
         self.device.set_pulse(joint, self.pulse(joint, counts))
-        self.told[joint] = counts
-
-    def _counts_per_s(self, joint: str) -> float:
-        return self.motion.rate * self.counts_per_rad(joint)
+        self.counts[joint] = counts
 
     def _pause(self, seconds: float) -> None:
         self._stop_if_asked()

@@ -211,7 +211,7 @@ class NominalArm:
             turning = np.einsum("cikn,cjn->nijk", columns[:3], rotations)
             turns = np.stack([turning[:, 2, 1], turning[:, 0, 2], turning[:, 1, 0]], axis=1)
             motions.append(np.concatenate([turns, columns[3].transpose(2, 0, 1)], axis=1))
-        return tools.reshape(4, 3, count).transpose(2, 1, 0), *motions
+        return tools.reshape(4, 3, count).transpose(2, 1, 0), motions[0], motions[1]
 
     @property
     def _values(self) -> Array:

@@ -1,4 +1,4 @@
-"""What a record tells of servos and boards."""
+"""Tables, oscillators and springs from a record, round by round."""
 
 from __future__ import annotations
 
@@ -8,10 +8,11 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
+from armcal.arm.servo import PulseTable
 
 from armcal_bench.servo.alignment import Alignment, aligned, begin, seat_of, shifted
-from armcal_bench.servo.angles import Entry, Springs, Sweeps, sweeps_of, told_by
-from armcal_bench.servo.fit import ServoFit, fit_servos
+from armcal_bench.servo.angles import Entry, Springs, Sweeps, observations_of, sweeps_of
+from armcal_bench.servo.fit import FittedServo, ServoFit, fit_servos
 from armcal_bench.servo.known import KnownBoard, KnownServo, Zero, interpolated
 from armcal_bench.servo.nominal import NominalArm
 from armcal_bench.servo.settings import ServoCalibrationSettings
@@ -31,7 +32,7 @@ class Outcome:
         fit: tables, lags, oscillators.
         task: that was fitted.
         sweeps: by joint.
-        silent: why a joint's table could not be told, by joint.
+        silent: why a joint's table could not be found, by joint.
         compliances: of the arm's springs (rad/(N m)) by parameter, value and deviation, where they were fitted.
         zero: whether stated zeros were kept.
         sag_span: by joint, how much what the springs give varies over its sweep (rad).
@@ -53,7 +54,7 @@ def outcome_of(
     nominal: NominalArm,
     settings: ServoCalibrationSettings,
 ) -> Outcome:
-    """Fit all that a record tells of some servos.
+    """Fit all that a record holds of some servos.
 
     One whose angles scatter as no servo's do is left out: it has let go, and would spoil what is found of the springs.
     """
@@ -79,21 +80,25 @@ def _fitted(
     seen = tuple(servo for servo in servos if servo.joint in sweeps)
     zero: Zero = "kept" if settings.zero == "kept" and all(s.by is not None for s in sweeps.values()) else "measured"
     task = FitTask(seen, dict(boards), settings.knots, (), zero, settings.sag_sd)
-    fitted = _Round(sweeps, task, fit_servos(task), begin(nominal), {})
+    now = _Round(sweeps, task, fit_servos(task), begin(nominal), {})
     has_springs = settings.sag != "none" and bool(nominal.compliances)
     for _ in range(_ROUNDS if has_springs else 1):
-        before = fitted
-        fitted = _better(before, entries, nominal, settings, "bending" if has_springs else "stiff")
-        scatter = max((servo.scatter for servo in fitted.fit.servos.values()), default=0.0)
-        if _nearly_same(before.fit, fitted.fit) or (before.springs and scatter > _MOST_SCATTER):
+        before = now
+        now = _better(before, entries, nominal, settings, "bending" if has_springs else "stiff")
+        scatter = max((servo.scatter for servo in now.fit.servos.values()), default=0.0)
+        former = before.fit.servos
+        is_steady = all(
+            joint in former and np.allclose(former[joint].pulses, servo.pulses, rtol=0, atol=_STEADY_S)
+            for joint, servo in now.fit.servos.items()
+        )
+        if is_steady or (before.springs and scatter > _MOST_SCATTER):
             break
-    fit = fitted.fit
-    values = {name: (nominal.compliance(name) + n.value, n.sd) for name, n in fit.compliances.items()}
-    spans = dict.fromkeys(fitted.sweeps, 0.0)
-    for joint, bent in fitted.springs.items():
-        if by := fitted.sweeps[joint].by:
-            spans[joint] = float(np.ptp(bent.about.sag(joint, bent.poses(fitted.sweeps[joint].lines, joint), by)))
-    return Outcome(fit, fitted.task, fitted.sweeps, silent, values, zero, spans)
+    values = {name: (nominal.compliance(name) + n.value, n.sd) for name, n in now.fit.compliances.items()}
+    spans = dict.fromkeys(now.sweeps, 0.0)
+    for joint, bent in now.springs.items():
+        if by := now.sweeps[joint].by:
+            spans[joint] = float(np.ptp(bent.about.sag(joint, bent.poses(now.sweeps[joint].lines, joint), by)))
+    return Outcome(now.fit, now.task, now.sweeps, silent, values, zero, spans)
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,34 +113,45 @@ class _Round:
 
 
 def _better(
-    found: _Round,
+    now: _Round,
     entries: Sequence[Entry],
     nominal: NominalArm,
     settings: ServoCalibrationSettings,
     arm: Literal["stiff", "bending"],
 ) -> _Round:
     """One round: where the joints stood, what the springs gave there, the angles without it, the fit to those."""
-    servos, task, alignment = found.task.servos, found.task, found.alignment
+    task, alignment = now.task, now.alignment
     springs: dict[str, Springs] = {}
     rows = None
     if arm == "bending":
         about = shifted(nominal, alignment)
-        stood = {s.joint: _springs(found.sweeps[s.joint], s, task, found.fit, about) for s in servos}
+        stood = {s.joint: Springs(about, _stood(now.sweeps[s.joint], s, now)) for s in task.servos}
         sd = settings.sag_sd if settings.sag == "fitted" else 0.0
-        alignment, rows = aligned(alignment, nominal, found.sweeps, stood, sd)
+        alignment, rows = aligned(alignment, nominal, now.sweeps, stood, sd)
         about = shifted(nominal, alignment)
-        springs = {joint: Springs(about, each.angles, seat_of(alignment)) for joint, each in stood.items()}
-    sweeps = {**found.sweeps, **_swept(entries, servos, nominal, settings, springs)[0]}
-    observations = [o for s in servos for o in told_by(sweeps[s.joint], s.joint, nominal, springs.get(s.joint))]
+        springs = {joint: Springs(about, bent.angles, seat_of(alignment)) for joint, bent in stood.items()}
+    sweeps = {**now.sweeps, **_swept(entries, task.servos, nominal, settings, springs)[0]}
+    observations = [
+        observation
+        for servo in task.servos
+        for observation in observations_of(sweeps[servo.joint], servo.joint, nominal, springs.get(servo.joint))
+    ]
     if settings.sag != "fitted":
         observations, rows = [replace(o, sag=0.0, sag_slopes={}) for o in observations], None
     task = replace(task, observations=tuple(observations), springs=rows)
     return _Round(sweeps, task, fit_servos(task), alignment, springs)
 
 
-def _nearly_same(one: ServoFit, other: ServoFit) -> bool:
-    pairs = [(one.servos[joint].pulses, servo.pulses) for joint, servo in other.servos.items() if joint in one.servos]
-    return len(pairs) == len(other.servos) and all(np.allclose(a, b, rtol=0, atol=_STEADY_S) for a, b in pairs)
+def _stood(sweeps: Sweeps, servo: KnownServo, now: _Round) -> tuple[float, ...]:
+    """Where the joint stood in each line (rad), by its fitted table, or the stated one."""
+    fitted = now.fit.servos.get(servo.joint)
+    table: FittedServo | PulseTable = fitted or servo.table
+    clock = now.fit.clocks[servo.board] if fitted else now.task.boards[servo.board].clock
+    lag = (fitted.lag or 0.0) if fitted else 0.0
+    angles, pulses = np.array(table.angles), np.array(table.pulses)
+    order = np.argsort(pulses)
+    by_table = interpolated(np.array(sweeps.counts) * clock.tick, pulses[order], angles[order])
+    return tuple((by_table - lag * np.array(sweeps.approaches)).tolist())
 
 
 def _swept(
@@ -145,18 +161,7 @@ def _swept(
     settings: ServoCalibrationSettings,
     springs: Mapping[str, Springs],
 ) -> tuple[dict[str, Sweeps], dict[str, str]]:
-    found = {s.joint: sweeps_of(entries, s.joint, nominal, settings, springs.get(s.joint)) for s in servos}
-    sweeps = {joint: each for joint, each in found.items() if isinstance(each, Sweeps)}
-    return sweeps, {joint: text for joint, text in found.items() if isinstance(text, str)}
-
-
-def _springs(sweeps: Sweeps, servo: KnownServo, task: FitTask, fit: ServoFit, about: NominalArm) -> Springs:
-    """Where the joint stood, by what was found so far."""
-    fitted = fit.servos.get(servo.joint)
-    angles = np.array(fitted.angles if fitted else servo.table.angles)
-    pulses = np.array(fitted.pulses if fitted else servo.table.pulses)
-    order = np.argsort(pulses)
-    clock = fit.clocks[servo.board] if fitted else task.boards[servo.board].clock
-    lag = (fitted.lag or 0.0) if fitted else 0.0
-    by_table = interpolated(np.array(sweeps.counts) * clock.tick, pulses[order], angles[order])
-    return Springs(about, tuple((by_table - lag * np.array(sweeps.approaches)).tolist()))
+    """Sweeps by joint, and why others have none."""
+    swept = {s.joint: sweeps_of(entries, s.joint, nominal, settings, springs.get(s.joint)) for s in servos}
+    sweeps = {joint: sweep for joint, sweep in swept.items() if isinstance(sweep, Sweeps)}
+    return sweeps, {joint: why for joint, why in swept.items() if isinstance(why, str)}

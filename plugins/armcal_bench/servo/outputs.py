@@ -5,7 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -28,7 +28,7 @@ Part = TypeVar("Part", BoardSettings, ServoSettings)
 
 
 def improved(file: ServoFile, outcome: Outcome, adapter: str = "") -> ServoFile:
-    """The servo file with what was found; servos whose board has another oscillator now keep their counts.
+    """The servo file with the fitted numbers; servos whose board has another oscillator now keep their counts.
 
     Boards whose adapter was not stated get the one that they were measured on (empty: not known). Of each table that
     part is kept whose pulses its servo bears.
@@ -128,7 +128,7 @@ def _text_of(path: Path, before: str, file: ServoFile) -> str:
 
 
 def results(outcome: Outcome, changed: ServoFile) -> dict[str, Any]:
-    """Everything that was found, for programs; units are in the names."""
+    """Tables, boards, springs and findings, for programs; units are in the names."""
     return {
         "servos": {joint: _servo(servo, outcome, changed) for joint, servo in outcome.fit.servos.items()},
         "boards": {
@@ -136,7 +136,7 @@ def results(outcome: Outcome, changed: ServoFile) -> dict[str, Any]:
             for name, clock in outcome.fit.clocks.items()
         },
         "compliances_rad_per_Nm": {name: {"value": v, "sd": sd} for name, (v, sd) in outcome.compliances.items()},
-        "not_told": {"servos": dict(outcome.silent), "compliances": list(outcome.fit.untold)},
+        "not_told": {"servos": dict(outcome.silent), "compliances": list(outcome.fit.undetermined)},
         "findings": [*findings(outcome), *_narrowed(outcome, changed)],
     }
 
@@ -148,25 +148,25 @@ def _is_written(fitted_servo: FittedServo, outcome: Outcome, changed: ServoFile)
 
 def _narrowed(outcome: Outcome, changed: ServoFile) -> list[str]:
     """Of tables that reach less far than they were stated to, or than they were to be given for."""
-    said = []
+    sentences = []
     for joint, fitted_servo in outcome.fit.servos.items():
         servo, stated = changed.servos[joint], fitted_servo.known.table.angles
         meant = min(stated[0], fitted_servo.angles[0]), max(stated[-1], fitted_servo.angles[-1])
         if not _is_written(fitted_servo, outcome, changed):
             if is_usable(fitted_servo):
-                said.append(
+                sentences.append(
                     f"{joint}: the table is left as it was: the servo bears none of the pulses that were found."
                 )
         elif servo.angles[0] > meant[0] + _APART or servo.angles[-1] < meant[1] - _APART:
             low, high = (1e6 * pulse for pulse in servo.pulse_range)
             shortened = (fitted_servo.angles[0], fitted_servo.angles[-1]) != (servo.angles[0], servo.angles[-1])
             why = f"the servo bears {low:g} to {high:g} us" if shortened else "bench.servo.knots ends there"
-            said.append(
+            sentences.append(
                 f"{joint}: its table reaches from {math.degrees(servo.angles[0]):.1f} to "
                 f"{math.degrees(servo.angles[-1]):.1f} deg, not from {math.degrees(meant[0]):.1f} to "
                 f"{math.degrees(meant[1]):.1f} deg: {why}."
             )
-    return said
+    return sentences
 
 
 def write_results(folder: Path, content: Mapping[str, Any]) -> None:
@@ -185,11 +185,26 @@ def write_results(folder: Path, content: Mapping[str, Any]) -> None:
 
 def _servo(servo: FittedServo, outcome: Outcome, changed: ServoFile) -> dict[str, Any]:
     sweeps = outcome.sweeps[servo.known.joint]
+    stated = servo.known.pulses_at(np.array(servo.angles))
+    slopes = np.gradient(np.array(servo.pulses), np.array(servo.angles))  # by a knot's neighbours (s/rad)
+    slopes[np.abs(slopes) <= 1e-9] = math.nan
+    columns = (servo.angles, servo.pulses, servo.pulse_sds, servo.determined, stated.tolist(), slopes.tolist())
     return {
         "board": servo.known.board,
-        "knots": _knots(servo),
+        "knots": [
+            {
+                "angle_deg": math.degrees(angle),
+                "pulse_us": 1e6 * pulse,
+                "sd_us": _finite(1e6 * sd),
+                "told": is_determined,
+                "before_us": 1e6 * before,
+                "change_us": 1e6 * (pulse - before),
+                "change_deg": math.degrees((before - pulse) / slope),
+            }
+            for angle, pulse, sd, is_determined, before, slope in zip(*columns, strict=True)
+        ],
         "backlash_deg": None if servo.lag is None else 2 * math.degrees(servo.lag),
-        "backlash_sd_deg": _number(2 * math.degrees(servo.lag_sd)),
+        "backlash_sd_deg": _finite(2 * math.degrees(servo.lag_sd)),
         "scatter_deg": math.degrees(servo.scatter),
         "observations": servo.used,
         "set_aside": len(servo.outliers),
@@ -199,31 +214,5 @@ def _servo(servo: FittedServo, outcome: Outcome, changed: ServoFile) -> dict[str
     }
 
 
-def _knots(servo: FittedServo) -> list[dict[str, Any]]:
-    stated = servo.known.pulses_at(np.array(servo.angles))
-    slopes = _slopes(servo.angles, servo.pulses)
-    rows: Sequence[Any] = list(
-        zip(servo.angles, servo.pulses, servo.pulse_sds, servo.told, stated, slopes, strict=True)
-    )
-    return [
-        {
-            "angle_deg": math.degrees(angle),
-            "pulse_us": 1e6 * pulse,
-            "sd_us": _number(1e6 * sd),
-            "told": told,
-            "before_us": 1e6 * float(before),
-            "change_us": 1e6 * (pulse - float(before)),
-            "change_deg": math.degrees((float(before) - pulse) / slope),
-        }
-        for angle, pulse, sd, told, before, slope in rows
-    ]
-
-
-def _slopes(angles: Sequence[float], pulses: Sequence[float]) -> list[float]:
-    """At each knot, by its neighbours (s/rad)."""
-    each = np.gradient(np.array(pulses), np.array(angles))
-    return [float(slope) if abs(slope) > 1e-9 else math.nan for slope in each]
-
-
-def _number(value: float) -> float | None:
+def _finite(value: float) -> float | None:
     return value if math.isfinite(value) else None

@@ -49,9 +49,9 @@ class Record:
                 entry = json.loads(line)
             except ValueError:
                 entry = None
-            if fault := _fault_of(entry, number == 1):
+            if damage := _fault_of(entry, number == 1):
                 raise DataError(
-                    f"found {fault}.",
+                    f"found {damage}.",
                     where=Location(str(self.path), line=number),
                     hint="Give another --out." if number == 1 else "Give another --out, or remove this line.",
                 )

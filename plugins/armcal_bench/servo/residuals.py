@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
 from typing import Any
 
@@ -20,18 +19,6 @@ _KEPT_SD = 1e-3 * US
 _LEAST_SLOPE = 50 * US
 
 
-@dataclass(frozen=True)
-class _Seen:
-    """A servo's observations as arrays."""
-
-    servo: KnownServo
-    counts: Array
-    approach: Array
-    angle: Array
-    sd: Array
-    slopes: Array
-
-
 class Residuals:
     """Weighted residuals of a vector of unknowns: the observations', in their order by servo, then the priors'.
 
@@ -44,16 +31,25 @@ class Residuals:
         about: the vector at which deviations of angles are made deviations of pulses, by the slopes of the tables.
     """
 
-    def __init__(self, unknowns: Unknowns, kept: Sequence[bool], scales: dict[str, float], about: Array) -> None:
-        self._u = unknowns
-        task = unknowns.task
-        chosen = [o for o, keep in zip(task.observations, kept, strict=True) if keep]
-        self._seen = [_seen(s, [o for o in chosen if o.joint == s.joint], unknowns.compliances) for s in task.servos]
-        sds = [self._pulse_sds(seen, about) * scales.get(seen.servo.joint, 1.0) for seen in self._seen]
-        x = ca.SX.sym("x", len(unknowns.names))
-        observed = [self._observed(x, seen, sd) for seen, sd in zip(self._seen, sds, strict=True)]
-        rows = ca.densify(ca.vertcat(*observed, *self._priors(x)))
-        self._values = ca.Function("residuals", [x], [rows])
+    def __init__(self, unknowns: Unknowns, kept: Sequence[bool], scales: Mapping[str, float], about: Array) -> None:
+        self._unknowns = unknowns
+        self._counts: dict[str, int] = {}
+        task, x = unknowns.task, ca.SX.sym("x", len(unknowns.names))
+        rows: list[Any] = []
+        for servo in task.servos:
+            used = zip(task.observations, kept, strict=True)
+            observations = [o for o, keep in used if keep and o.joint == servo.joint]
+            self._counts[servo.joint] = len(observations)
+            if not observations:
+                continue
+            knots = task.knots_of(servo)
+            here = np.asarray(ca.DM(self._angles(about, servo, observations))).ravel()
+            steep = np.abs(slopes_at(here, knots, unknowns.pulses(about, servo)))
+            sds = np.array([o.sd for o in observations]) * np.maximum(steep, _LEAST_SLOPE)
+            by_counts = ca.DM([float(o.counts) for o in observations]) * self._tick(x, servo.board)
+            by_table = self._table(x, servo, self._angles(x, servo, observations))
+            rows.append((by_counts - by_table) / ca.DM(sds * scales.get(servo.joint, 1.0)))
+        self._values = ca.Function("residuals", [x], [ca.densify(ca.vertcat(*rows, *self._priors(x)))])
 
     def __call__(self, x: Array) -> Array:
         """All."""
@@ -65,80 +61,47 @@ class Residuals:
 
     def observed(self, x: Array) -> dict[str, Array]:
         """Of the observations, by joint."""
-        ends = np.cumsum([len(seen.counts) for seen in self._seen])
-        parts = np.split(self(x), ends)[:-1]
-        return {seen.servo.joint: part for seen, part in zip(self._seen, parts, strict=True)}
+        parts = np.split(self(x), np.cumsum(list(self._counts.values())))[:-1]
+        return dict(zip(self._counts, parts, strict=True))
 
     @cached_property
     def _slopes(self) -> ca.Function:
         return self._values.jacobian()
 
-    def _pulse_sds(self, seen: _Seen, x: Array) -> Array:
-        angles = np.asarray(ca.DM(self._angles(x, seen))).ravel()
-        steep = slopes_at(angles, self._u.task.knots_of(seen.servo), self._u.pulses(x, seen.servo))
-        return np.asarray(seen.sd * np.maximum(np.abs(steep), _LEAST_SLOPE))
-
-    def _angles(self, x: Any, seen: _Seen) -> Any:
-        """Where the servos stood, by what was measured."""
-        joint = seen.servo.joint
-        angles = ca.DM(seen.angle) - self._one(x, joint, "zero") + self._one(x, joint, "lag") * ca.DM(seen.approach)
-        for column, name in enumerate(self._u.compliances):
-            angles = angles - ca.DM(seen.slopes[:, column]) * self._one(x, name, "compliance")
+    def _angles(self, x: Any, servo: KnownServo, observations: Sequence[Observation]) -> Any:
+        """Where the servo stood, by what was measured (rad)."""
+        one = self._unknowns.one
+        angles = ca.DM([o.angle - o.sag for o in observations]) - one(x, servo.joint, "zero")
+        angles = angles + one(x, servo.joint, "lag") * ca.DM([float(o.approach) for o in observations])
+        for name in self._unknowns.compliances:
+            angles = angles - ca.DM([o.sag_slopes.get(name, 0.0) for o in observations]) * one(x, name, "compliance")
         return angles
 
-    def _observed(self, x: Any, seen: _Seen, sd: Array) -> Any:
-        if not len(seen.counts):
-            return ca.SX.zeros(0, 1)
-        by_table = self._table(x, seen.servo, self._angles(x, seen))
-        return (ca.DM(seen.counts) * self._tick(x, seen.servo.board) - by_table) / ca.DM(sd)
-
     def _table(self, x: Any, servo: KnownServo, angles: Any) -> Any:
-        return piecewise_linear(angles, self._u.task.knots_of(servo).tolist(), self._pulses(x, servo))
-
-    def _pulses(self, x: Any, servo: KnownServo) -> list[Any]:
-        first = self._u.place[servo.joint, "pulse0"]
-        return [x[first + k] * US for k in range(len(self._u.task.knots_of(servo)))]
+        """Pulses (s) at angles (rad)."""
+        pulses = ca.vertsplit(self._unknowns.pulses(x, servo))
+        return piecewise_linear(angles, self._unknowns.task.knots_of(servo).tolist(), pulses)
 
     def _tick(self, x: Any, board: str) -> Any:
-        return self._u.task.boards[board].clock.tick / (1.0 + self._one(x, board, "clock"))
-
-    def _one(self, x: Any, owner: str, name: str) -> Any:
-        place = self._u.place.get((owner, name))
-        return 0.0 if place is None else x[place]
+        """The length of a count (s)."""
+        return self._unknowns.task.boards[board].clock.tick / (1.0 + self._unknowns.one(x, board, "clock"))
 
     def _priors(self, x: Any) -> Iterator[Any]:
-        task = self._u.task
+        task, one = self._unknowns.task, self._unknowns.one
         for servo in task.servos:
             stated = servo.pulses_at(task.knots_of(servo))
-            for pulse, before in zip(self._pulses(x, servo), stated, strict=True):
-                yield (pulse - before) / (servo.trusted_sd or WEAK_PULSE_SD)
+            yield (self._unknowns.pulses(x, servo) - ca.DM(stated)) / (servo.trusted_sd or WEAK_PULSE_SD)
             if task.zero == "kept":
-                yield self._one(x, servo.joint, "zero") / WEAK_ZERO_SD
+                yield one(x, servo.joint, "zero") / WEAK_ZERO_SD
                 if servo.trusted_sd is None:
-                    yield self._kept_zero(x, servo)
+                    # In counts: by another oscillator the same pulse is stated longer or shorter.
+                    longer = self._tick(x, servo.board) / task.boards[servo.board].clock.tick
+                    at_zero = float(servo.pulses_at(np.zeros(1))[0]) * longer
+                    yield (self._table(x, servo, 0.0) - at_zero) / _KEPT_SD
         for name, board in task.boards.items():
             for measured_pulse in board.measured:
                 yield (measured_pulse.counts * self._tick(x, name) - measured_pulse.length) / measured_pulse.sd
-        changes = [self._one(x, name, "compliance") for name in self._u.compliances]
-        yield from (change / task.compliance_sd for change in changes)
+        changes = ca.vertcat(ca.SX(0, 1), *[one(x, name, "compliance") for name in self._unknowns.compliances])
+        yield changes / task.compliance_sd
         if task.springs is not None:
-            for row, size in zip(task.springs.slopes, task.springs.sizes, strict=True):
-                yield sum(slope * change for slope, change in zip(row, changes, strict=True)) - size
-
-    def _kept_zero(self, x: Any, servo: KnownServo) -> Any:
-        """In counts: by another oscillator the same pulse is stated longer or shorter."""
-        longer = self._tick(x, servo.board) / self._u.task.boards[servo.board].clock.tick
-        stated = float(servo.pulses_at(np.zeros(1))[0]) * longer
-        return (self._table(x, servo, 0.0) - stated) / _KEPT_SD
-
-
-def _seen(servo: KnownServo, seen: Sequence[Observation], compliances: Sequence[str]) -> _Seen:
-    slopes = np.array([[o.sag_slopes.get(name, 0.0) for name in compliances] for o in seen])
-    return _Seen(
-        servo,
-        np.array([float(o.counts) for o in seen]),
-        np.array([float(o.approach) for o in seen]),
-        np.array([o.angle - o.sag for o in seen]),
-        np.array([o.sd for o in seen]),
-        slopes.reshape(len(seen), len(compliances)),
-    )
+            yield ca.mtimes(ca.DM(task.springs.slopes), changes) - ca.DM(task.springs.sizes)

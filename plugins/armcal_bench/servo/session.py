@@ -15,10 +15,10 @@ from armcal.errors import InputError, Location
 
 from armcal_bench.acquisition.tracker_monitor import TrackerMonitor
 from armcal_bench.hazards import FirstMotion
-from armcal_bench.servo.automatic import Automatic, Told
+from armcal_bench.servo.automatic import Automatic, ReportProgress, capture
 from armcal_bench.servo.beginning import begin, check_same, stated_by
-from armcal_bench.servo.guided import Guided
-from armcal_bench.servo.keys import QUIT, Wishes
+from armcal_bench.servo.guided import Guided, next_wish
+from armcal_bench.servo.keys import Wishes
 from armcal_bench.servo.mover import Motion, Mover, ServoDevice, StoppedError
 from armcal_bench.servo.outcome import Outcome, outcome_of
 from armcal_bench.servo.record import BEGUN, Record
@@ -40,15 +40,15 @@ class Conversation:
     Attributes:
         asked_to_stop: whether somebody wants it to hold and end.
         may_energise: asked once, with what is about to move and what is dangerous in it, before anything does.
-        told: how far a tracked calibration is.
-        say: a line, of a guided one.
+        report: takes how far a tracked calibration is.
+        say: takes a line, of a guided one.
         wishes: what somebody presses or writes, while it is asked for.
         waits: says what is waited for.
     """
 
     asked_to_stop: Callable[[], bool]
     may_energise: Callable[[FirstMotion], bool]
-    told: Told
+    report: ReportProgress
     say: Callable[[str], None]
     wishes: Callable[[], AbstractContextManager[Wishes]]
     waits: Waits = field(default_factory=Waits)
@@ -70,14 +70,14 @@ def measure(setup: Setup, folder: Path, talk: Conversation, how: str) -> None:
                 Guided(setup, mover, wishes, record, talk.say).run()
             return
         with _monitor(setup, mover) as monitor:
-            look = Automatic(setup, mover, monitor, record, talk.told, _cooling(setup, mover, record))
+            run = Automatic(setup, mover, monitor, record, talk.report, _thermal_state(setup, mover, record))
             begin(setup, record, mover.identity, talk.say)
-            mover.look = look.look
-            look.run()
+            mover.look = run.look
+            run.run()
 
 
 def evaluated(setup: Setup, folder: Path) -> Outcome:
-    """What the record in a folder tells, by the tables that it was begun with.
+    """The tables and oscillators of the record in a folder, from the tables that it was begun with.
 
     Raises:
         InputError: there is no record, or nothing in it.
@@ -103,7 +103,8 @@ def tried(setup: Setup, talk: Conversation, seen: str) -> list[Verdict]:
 
     Raises: as ``measure``.
     """
-    away = [verdict for verdict in (_wrapped(setup, joint) for joint in setup.joints) if verdict is not None]
+    wrap = {joint: wrapped(joint, setup.file.servos[joint].angles, setup.ranges[joint]) for joint in setup.joints}
+    away = [verdict for verdict in wrap.values() if verdict is not None]
     if away:  # by such a table no joint can be moved
         _note(setup, away, {})
         return away
@@ -191,22 +192,17 @@ def _monitor(setup: Setup, mover: Mover) -> Iterator[TrackerMonitor]:
         monitor.await_first_frame(mover.tick, hint)
         yield monitor
     finally:
-        mover.look = _nothing
+        mover.look = lambda: None
         monitor.close()
 
 
-def _thermal_state(setup: Setup, mover: Mover) -> ThermalState:
-    """From cold servos on."""
-    return ThermalState(setup.heat, tuple(setup.bench.arm.commanded), setup.base, mover.clock)
-
-
-def _cooling(setup: Setup, mover: Mover, record: Record) -> ThermalState:
-    """From where the record's last line left it, where the servos may have to rest.
+def _thermal_state(setup: Setup, mover: Mover, record: Record) -> ThermalState:
+    """From where the record's last line left it, where the servos may have to rest; else from cold servos on.
 
     Raises:
         InputError: one would not cool where it is to rest.
     """
-    thermal_state = _thermal_state(setup, mover)
+    thermal_state = ThermalState(setup.heat, tuple(setup.bench.arm.commanded), setup.base, mover.clock)
     if joint := thermal_state.base_is_too_heavy:
         raise InputError(
             f"the servo of {joint} would not cool in the base pose, by bench.acquisition.heat; nothing was moved.",
@@ -218,56 +214,37 @@ def _cooling(setup: Setup, mover: Mover, record: Record) -> ThermalState:
     return thermal_state
 
 
-def _wrapped(setup: Setup, joint: str) -> Verdict | None:
-    return wrapped(joint, setup.file.servos[joint].angles, setup.ranges[joint])
-
-
 def _tracked(setup: Setup, mover: Mover, monitor: TrackerMonitor) -> list[Verdict]:
-    look = Automatic(setup, mover, monitor, cast(Record, None), _silent, _thermal_state(setup, mover))
     base, moves, unseen = commanded_angles(mover), [], []
     for joint in setup.joints:
-        told, at = _small(setup, joint), mover.told[joint]
-        before = look.capture()
-        mover.go(joint, mover.counts_at(joint, setup.base[joint] + told))
-        after = look.capture()
+        turn, at = _small_turn(setup, joint), mover.counts[joint]
+        before = capture(setup, mover, monitor)
+        mover.go(joint, mover.counts_at(joint, setup.base[joint] + turn))
+        after = capture(setup, mover, monitor)
         mover.go(joint, at)
         if isinstance(before, str) or isinstance(after, str):
             why = before if isinstance(before, str) else after
             unseen.append(Verdict(joint, "unclear", f"{joint}: it was not seen to stand ({why})."))
         else:
-            moves.append(Move(joint, told, before.base_T_target, after.base_T_target))
+            moves.append(Move(joint, turn, before.base_T_target, after.base_T_target))
     return [*judged(moves, base, setup.nominal), *unseen]
 
 
 def _by_eye(setup: Setup, mover: Mover, joint: str, talk: Conversation, wishes: Wishes) -> Verdict:
-    told, base = _small(setup, joint), mover.told[joint]
-    mover.go(joint, mover.counts_at(joint, setup.base[joint] + told))
+    turn, at = _small_turn(setup, joint), mover.counts[joint]
+    mover.go(joint, mover.counts_at(joint, setup.base[joint] + turn))
 
     def ask(question: str) -> str:
         talk.say(question)
-        while True:
-            wish = wishes.next(_LOOK_S)
-            if wish == QUIT or talk.asked_to_stop():
-                raise StoppedError("it was asked to stop")
-            if wish is not None:
-                return wish
-            mover.device.keep_alive()
+        return next_wish(wishes, mover)
 
-    verdict = answered(joint, told, ask)
-    mover.go(joint, base)
+    verdict = answered(joint, turn, ask)
+    mover.go(joint, at)
     return verdict
 
 
-def _small(setup: Setup, joint: str) -> float:
-    """A turn that the joint's range has room for."""
+def _small_turn(setup: Setup, joint: str) -> float:
+    """Away from the base pose (rad), to the side where the joint's range has room for it."""
     low, high = setup.ranges[joint]
     at, size = setup.base[joint], setup.settings.check
     return size if high - at >= size or high - at >= at - low else -size
-
-
-def _silent(joint: str, done: int, planned: int) -> None:
-    """Nobody is told."""
-
-
-def _nothing() -> None:
-    """Nothing is looked at."""

@@ -5,17 +5,18 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from itertools import takewhile
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from armcal.arm.clearance import ClearanceCheck
+from armcal.base.domains import Array
 from armcal.config.servo_file import ServoFile, load_servo_file
 from armcal.config.validate import validate
 from armcal.errors import ConfigError
 from armcal.run.experiment import Experiment
 
 from armcal_bench.acquisition.heat import HeatModel, Torques
+from armcal_bench.acquisition.path_planner import PathPlanner
 from armcal_bench.acquisition.preparation import clearance_of, heat_of, run_limits
 from armcal_bench.bench import SECTION, Bench
 from armcal_bench.hazards import HazardJudge
@@ -40,9 +41,9 @@ class Setup:
         joints: those to calibrate.
         base: where every servo's joint stands while others are measured (rad).
         ranges: over which each joint may be moved from there (rad).
-        nominal: what the model says.
+        nominal: the arm by its model.
         heat: of the servos, and the torques that heat them.
-        check: what is too near, if that is stated.
+        planner: of straight ways on which nothing comes too near, if that is stated.
         judge: of what is dangerous in the first motions.
     """
 
@@ -55,7 +56,7 @@ class Setup:
     ranges: Mapping[str, tuple[float, float]]
     nominal: NominalArm
     heat: tuple[HeatModel, Torques]
-    check: ClearanceCheck | None
+    planner: PathPlanner
     judge: HazardJudge
 
     @classmethod
@@ -69,7 +70,13 @@ class Setup:
         settings = ServoCalibrationSettings()
         if bench.settings.servo is not None:
             settings = validate(ServoCalibrationSettings, experiment.source, AT)
-        path = settings.servos or _path_of_device(experiment, bench)
+        path = settings.servos or servo_file_of(bench)
+        if path is None:
+            raise ConfigError(
+                "found no servo file.",
+                where=experiment.source.where((SECTION, "device")),
+                hint="Name it in bench.device.servos, or in bench.servo.servos.",
+            )
         file = load_servo_file(path)
         arm = bench.arm
         moved = tuple(joint for joint in arm.commanded if joint in file.servos)
@@ -80,14 +87,13 @@ class Setup:
         acquisition = bench.settings.acquisition.model_copy(update={"limits": limited})
         limits = dict(zip(arm.commanded, run_limits(experiment, acquisition, arm).tolist(), strict=True))
         nominal = NominalArm.of(arm, experiment.parameters, experiment.system.environment)
-        joints = settings.joints or moved
         heat = heat_of(experiment, bench.settings.acquisition, arm)
-        check = clearance_of(experiment, arm)
+        ends = np.array(list(limits.values()))
+        planner = PathPlanner(clearance_of(experiment, arm), ends, np.zeros((0, len(limits))), _LOOK_STEP)
         rest = np.array([base.get(joint, 0.0) for joint in arm.commanded])
-        judge = HazardJudge(tuple(arm.commanded), moved, np.array(list(limits.values())), heat[1], rest)
-        setup = cls(bench, settings, path, file, joints, base, {}, nominal, heat, check, judge)
-        setup._check_base_pulses(experiment)
-        return replace(setup, ranges=setup.clear_ranges(experiment, limits))
+        judge = HazardJudge(tuple(arm.commanded), moved, ends, heat[1], rest)
+        setup = cls(bench, settings, path, file, settings.joints or moved, base, {}, nominal, heat, planner, judge)
+        return replace(setup, ranges=setup._clear_ranges(experiment, limits))
 
     def known(self, joint: str) -> KnownServo:
         """A servo as the file states it."""
@@ -113,79 +119,59 @@ class Setup:
 
     def boards(self) -> dict[str, KnownBoard]:
         """The boards as the file states them, with the pulses measured at their pins."""
-        return {name: KnownBoard(board.clock, self._measured(name)) for name, board in self.file.boards.items()}
+        measured: dict[str, tuple[MeasuredPulse, ...]] = {}
+        for pulse in self.settings.measured_pulses:
+            known = MeasuredPulse(pulse.counts, 1e-6 * pulse.microseconds, 1e-6 * pulse.sd_microseconds)
+            measured[pulse.board] = (*measured.get(pulse.board, ()), known)
+        return {name: KnownBoard(board.clock, measured.get(name, ())) for name, board in self.file.boards.items()}
 
-    def _check_base_pulses(self, experiment: Experiment) -> None:
-        """Before anything moves: half of the joints in the base pose would be worse than none."""
+    def _clear_ranges(
+        self, experiment: Experiment, limits: Mapping[str, tuple[float, float]]
+    ) -> dict[str, tuple[float, float]]:
+        """How far each joint may go from the base pose, within its limits and table and without coming too near.
+
+        Raises:
+            ConfigError: the base pose is not allowed; half of the joints in it would be worse than none.
+        """
+        where = experiment.source.where((*AT, "base"))
         for joint, angle in self.base.items():
-            (low, high), pulse = self.pulses_of(joint), float(self.file.servos[joint].table.pulse(angle))
-            if not low <= pulse <= high:
+            (shortest, longest), pulse = self.pulses_of(joint), float(self.file.servos[joint].table.pulse(angle))
+            if not shortest <= pulse <= longest:
                 raise ConfigError(
                     f"in the base pose {joint}, at {math.degrees(angle):.1f} deg, needs a pulse of {1e6 * pulse:.0f} "
-                    f"us, expected {1e6 * low:.0f} to {1e6 * high:.0f} us.",
-                    where=experiment.source.where((*AT, "base")),
+                    f"us, expected {1e6 * shortest:.0f} to {1e6 * longest:.0f} us.",
+                    where=where,
                     hint="Choose another base pose, or widen bench.servo.pulses or the servo's pulse_range if the "
                     "servo bears it.",
                 )
-
-    def _measured(self, board: str) -> tuple[MeasuredPulse, ...]:
-        stated = [measured_pulse for measured_pulse in self.settings.measured_pulses if measured_pulse.board == board]
-        return tuple(MeasuredPulse(m.counts, 1e-6 * m.microseconds, 1e-6 * m.sd_microseconds) for m in stated)
-
-    def clear_ranges(self, experiment: Experiment, limits: Mapping[str, Any]) -> dict[str, tuple[float, float]]:
-        """How far each joint may go from the base pose, within its limits and table and without coming too near."""
-        check = self.check
-        where = experiment.source.where((*AT, "base"))
-        found = {}
-        for joint in self.base:
-            low, high = (float(limit) for limit in limits[joint])
-            if not low <= self.base[joint] <= high:
+            low, high = limits[joint]
+            if not low <= angle <= high:
                 raise ConfigError(
-                    f"{joint} stands at {math.degrees(self.base[joint]):.1f} deg in the base pose, expected "
+                    f"{joint} stands at {math.degrees(angle):.1f} deg in the base pose, expected "
                     f"{math.degrees(low):.1f} to {math.degrees(high):.1f} deg.",
                     where=where,
                     hint="Choose another base pose, or another range.",
                 )
-            found[joint] = (self._end(check, joint, low), self._end(check, joint, high))
-        if check is not None and not check(self._pose({}).reshape(-1, 1)).allowed[0]:
-            raise ConfigError(
-                "the base pose is too near to something, by plan.clearance.", where=where, hint="Choose another."
-            )
-        return found
+        if not self.planner.allowed(self._pose({})):
+            text = "the base pose is too near to something, by plan.clearance."
+            raise ConfigError(text, where=where, hint="Choose another.")
+        return {joint: (self._end(joint, limits[joint][0]), self._end(joint, limits[joint][1])) for joint in self.base}
 
-    def _end(self, check: ClearanceCheck | None, joint: str, limit: float) -> float:
+    def _end(self, joint: str, limit: float) -> float:
         """The last angle before something comes too near, on the way from the base pose to a limit."""
-        start = self.base[joint]
-        count = math.ceil(abs(limit - start) / _LOOK_STEP) + 1
-        way = np.linspace(start, limit, max(count, 2))
-        if check is None:
+        if self.planner.clear(self._pose({}), self._pose({joint: limit})):
             return limit
-        allowed = check(np.array([self._pose({joint: angle}) for angle in way]).T).allowed
-        blocked = np.flatnonzero(~allowed)
-        return limit if not len(blocked) else float(way[max(blocked[0] - 1, 0)])
+        start = self.base[joint]
+        way = np.linspace(start, limit, math.ceil(abs(limit - start) / _LOOK_STEP) + 1)
+        allowed = takewhile(lambda angle: self.planner.allowed(self._pose({joint: float(angle)})), way)
+        return float(list(allowed)[-1])
 
     def clear_between(self, start: Mapping[str, float], goal: Mapping[str, float]) -> bool:
         """Whether nothing comes too near on the straight way between two poses (rad by joint)."""
-        if self.check is None:
-            return True
-        ends = np.array([self._pose(start), self._pose(goal)])
-        count = math.ceil(float(np.abs(ends[1] - ends[0]).max()) / _LOOK_STEP) + 2
-        way = ends[0][:, None] + np.linspace(0.0, 1.0, count) * (ends[1] - ends[0])[:, None]
-        return bool(self.check(way).allowed.all())
+        return self.planner.clear(self._pose(start), self._pose(goal))
 
-    def _pose(self, other: Mapping[str, float]) -> Any:
+    def _pose(self, other: Mapping[str, float]) -> Array:
         return np.array([{**self.base, **other}.get(joint, 0.0) for joint in self.bench.arm.commanded])
-
-
-def _path_of_device(experiment: Experiment, bench: Bench) -> Path:
-    servo_file = servo_file_of(bench)
-    if servo_file is None:
-        raise ConfigError(
-            "found no servo file.",
-            where=experiment.source.where((SECTION, "device")),
-            hint="Name it in bench.device.servos, or in bench.servo.servos.",
-        )
-    return servo_file
 
 
 def _check_names(

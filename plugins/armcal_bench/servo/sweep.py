@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from itertools import permutations
+from itertools import pairwise, permutations
 from typing import Any
 
 import numpy as np
@@ -35,11 +35,11 @@ def sweep(setup: Setup, mover: Mover, joint: str) -> list[Point]:
     margin = setup.settings.approach
     shortest, longest = setup.pulses_of(joint)
     steps = max(round((high - low - 2 * margin) / setup.settings.step), 1)
-    wanted = [mover.counts_at(joint, angle) for angle in np.linspace(low + margin, high - margin, steps + 1)]
+    at_angles = {mover.counts_at(joint, angle) for angle in np.linspace(low + margin, high - margin, steps + 1)}
     room = approach_counts(setup, mover, joint)
     fits = [
         counts
-        for counts in sorted(set(wanted))
+        for counts in sorted(at_angles)
         if mover.pulse(joint, counts - room) >= shortest and mover.pulse(joint, counts + room) <= longest
     ]
     return [Point(joint, c, 1) for c in fits] + [Point(joint, c, -1) for c in reversed(fits)]
@@ -59,7 +59,7 @@ def left(points: Iterable[Point], entries: Iterable[Mapping[str, Any]]) -> list[
 def come_to(setup: Setup, mover: Mover, point: Point) -> None:
     """Move to a point from its side, slowly, with the play taken up."""
     aside = point.counts - point.came * approach_counts(setup, mover, point.joint)
-    if point.came * (aside - mover.told[point.joint]) < 0 or mover.came.get(point.joint) != point.came:
+    if point.came * (aside - mover.counts[point.joint]) < 0 or mover.came.get(point.joint) != point.came:
         mover.go(point.joint, aside)
     mover.go(point.joint, point.counts)
 
@@ -70,25 +70,17 @@ def to_base(setup: Setup, mover: Mover) -> None:
     Raises:
         DeviceRefusedError: no order of the joints keeps clear on the way from where the arm stands.
     """
-    for joint, angle in setup.base.items():
-        if joint not in mover.told:
-            mover.energise(joint, mover.counts_at(joint, angle))
-    for joint in _clear_order(setup, mover):
-        mover.go(joint, mover.counts_at(joint, setup.base[joint]))
-
-
-def _clear_order(setup: Setup, mover: Mover) -> tuple[str, ...]:
-    """Joints that are not at the base pose, in an order in which they may go there."""
+    goals = {joint: mover.counts_at(joint, angle) for joint, angle in setup.base.items()}
+    for joint, counts in goals.items():
+        mover.energise(joint, counts)
     start = commanded_angles(mover)
-    away = [j for j, angle in setup.base.items() if mover.told[j] != mover.counts_at(j, angle)]
+    away = [joint for joint, counts in goals.items() if mover.counts[joint] != counts]
     for order in permutations(away):
-        here, clear = dict(start), True
-        for joint in order:
-            there = {**here, joint: setup.base[joint]}
-            clear = clear and setup.clear_between(here, there)
-            here = there
-        if clear:
-            return order
+        arrived = [{**start, **{joint: setup.base[joint] for joint in order[:n]}} for n in range(len(order) + 1)]
+        if all(setup.clear_between(here, there) for here, there in pairwise(arrived)):
+            for joint in order:
+                mover.go(joint, goals[joint])
+            return
     raise DeviceRefusedError(
         "no way to the base pose is clear from where the arm stands.",
         hint="Bring it nearer by armcal servo --guided, or release it and put it there by hand.",
@@ -97,8 +89,8 @@ def _clear_order(setup: Setup, mover: Mover) -> tuple[str, ...]:
 
 def commanded_angles(mover: Mover) -> dict[str, float]:
     """The angles that the pulses ask for by the stated tables (rad, by joint)."""
-    found = {}
-    for joint, counts in mover.told.items():
-        table = mover.servos[joint][0].table
-        found[joint] = float(table.angle(mover.pulse(joint, counts)))
-    return {joint: angle for joint, angle in found.items() if math.isfinite(angle)}
+    angles = {
+        joint: float(mover.servos[joint][0].table.angle(mover.pulse(joint, counts)))
+        for joint, counts in mover.counts.items()
+    }
+    return {joint: angle for joint, angle in angles.items() if math.isfinite(angle)}

@@ -7,7 +7,6 @@ direction along which the rotation vectors of R_k C' lie, and C as the chordal m
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,7 +14,7 @@ from armcal.base.domains import Array
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from armcal_bench.rotations import mean_rotation
+from armcal_bench.stillness import mean_rotation
 
 _ROUNDS = 20
 _LEAST_TURN = math.radians(1.0)
@@ -47,13 +46,13 @@ class Turning:
     centre: Array | None = None
 
 
-def turning_of_rotations(rotations: Sequence[Array], model_axis: Array) -> Turning:
-    """From ``base_R_tool`` (3x3 each) of one joint's motion; the sign is by the model's axis (base frame).
+def turning_of_rotations(rotations: Array, model_axis: Array) -> Turning:
+    """From ``base_R_tool`` (N x 3 x 3) of one joint's motion; the sign is by the model's axis (base frame).
 
     Raises:
         NoTurnError: there was next to no motion.
     """
-    seen = Rotation.from_matrix(np.array(rotations))
+    seen = Rotation.from_matrix(rotations)
     # From the rotation that is nearest to all others, so that none is half a turn away.
     rest = seen[int(np.argmin([float(np.max((seen * one.inv()).magnitude())) for one in seen]))]
     vectors, axis = (seen * rest.inv()).as_rotvec(), np.zeros(3)
@@ -94,7 +93,11 @@ def turning_of_positions(positions: Array, model_axis: Array, least_radius: floa
     rows = np.column_stack([2 * flat, np.ones(len(flat))])
     a, b, c = np.linalg.lstsq(rows, np.sum(flat**2, axis=1), rcond=None)[0]
     start = np.array([a, b, math.sqrt(max(c + a * a + b * b, 0.0))])
-    circle = least_squares(lambda x: np.linalg.norm(flat - x[:2], axis=1) - x[2], start).x
+
+    def off_circle(circle: Array) -> Array:
+        return np.asarray(np.linalg.norm(flat - circle[:2], axis=1) - circle[2])
+
+    circle = least_squares(off_circle, start).x
     centre, radius = circle[:2], float(abs(circle[2]))
     if radius < least_radius:
         raise NoTurnError(f"the target moves on a circle of {1000 * radius:.1f} mm about this joint's axis")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from armcal.arm.servo import PulseClock
@@ -13,7 +14,7 @@ from armcal_bench.servo.known import KnownBoard, KnownServo, Observation, Zero, 
 
 US = 1e-6
 WEAK_PULSE_SD = 300.0 * US
-"""How far a table's pulse may well be from the stated one: what no observation tells stays there."""
+"""How far a table's pulse may well be from the stated one: what no observation determines stays there."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,33 +68,32 @@ class Unknowns:
                 self.names.append((servo.joint, "zero"))
             if {-1, 1} <= {observation.approach for observation in task.of(servo.joint)}:
                 self.names.append((servo.joint, "lag"))
-        self.names += [(board, "clock") for board in task.boards if self._told(board)]
+        for name, board in task.boards.items():
+            trusted = {servo.joint for servo in task.servos if servo.board == name and servo.trusted_sd is not None}
+            if board.measured or any(observation.joint in trusted for observation in task.observations):
+                self.names.append((name, "clock"))
         self.names += [(name, "compliance") for name in self.compliances]
         self.place = {name: i for i, name in enumerate(self.names)}
-
-    def _told(self, board: str) -> bool:
-        trusted = {s.joint for s in self.task.servos if s.board == board and s.trusted_sd is not None}
-        return bool(self.task.boards[board].measured) or any(o.joint in trusted for o in self.task.observations)
 
     @cached_property
     def compliances(self) -> tuple[str, ...]:
         """Parameters of the arm that are found beside the tables."""
         return tuple(dict.fromkeys(name for observation in self.task.observations for name in observation.sag_slopes))
 
-    def pulses(self, x: Array, servo: KnownServo) -> Array:
-        """A servo's pulses at its knots (s)."""
+    def pulses(self, x: Any, servo: KnownServo) -> Any:
+        """A servo's pulses at its knots (s), of a vector of floats or symbols."""
         first = self.place[servo.joint, "pulse0"]
-        return np.asarray(x[first : first + len(self.task.knots_of(servo))] * US)
+        return x[first : first + len(self.task.knots_of(servo))] * US
 
-    def one(self, x: Array, owner: str, name: str) -> float:
-        """A number, or 0 if it is not looked for."""
+    def one(self, x: Any, owner: str, name: str) -> Any:
+        """A number of a vector (floats or symbols), or 0 if it is not looked for."""
         place = self.place.get((owner, name))
-        return 0.0 if place is None else float(x[place])
+        return 0.0 if place is None else x[place]
 
     def clock(self, x: Array, board: str) -> PulseClock:
         """A board's clock."""
         stated = self.task.boards[board].clock
-        return PulseClock(stated.oscillator_hz * (1.0 + self.one(x, board, "clock")), stated.prescale)
+        return PulseClock(stated.oscillator_hz * float(1.0 + self.one(x, board, "clock")), stated.prescale)
 
     def start(self) -> Array:
         """As stated, the tables by a straight line of least squares through what was observed."""
@@ -101,12 +101,13 @@ class Unknowns:
         for servo in self.task.servos:
             knots = self.task.knots_of(servo)
             stated = servo.pulses_at(knots)
-            seen = self.task.of(servo.joint)
+            observations = self.task.of(servo.joint)
             tick = self.task.boards[servo.board].clock.tick
-            hats = [interpolated(np.array([o.angle - o.sag for o in seen]), knots, row) for row in np.eye(len(knots))]
+            angles = np.array([o.angle - o.sag for o in observations])
+            hats = [interpolated(angles, knots, row) for row in np.eye(len(knots))]
             weight = 10.0 if servo.trusted_sd is not None else 1e-3
             rows = np.vstack([np.array(hats).T.reshape(-1, len(knots)), weight * np.eye(len(knots))])
-            right = np.concatenate([[o.counts * tick for o in seen], weight * stated])
+            right = np.concatenate([[o.counts * tick for o in observations], weight * stated])
             first = self.place[servo.joint, "pulse0"]
             x[first : first + len(knots)] = np.linalg.lstsq(rows, right, rcond=None)[0] / US
         return x
