@@ -73,14 +73,7 @@ class Chip:
             self._set_up()
         elif mode1 & (SUB_ADDRESSES | ALL_CALL):
             self._write(MODE1, AUTO_INCREMENT)
-        expected = {MODE1: AUTO_INCREMENT, MODE2: OUTDRV, PRE_SCALE: self._prescale}
-        read_back = {register: self._read(register, 1)[0] for register in expected}
-        if read_back != expected:
-            raise DeviceError(
-                f"found {_listed(read_back)}, expected {_listed(expected)}: its set-up does not read back.",
-                where=self.where,
-                hint="Is it a PCA9685, and alone at this address? Look at the bus: wires, pull-ups.",
-            )
+        self._check_set_up()
 
     def check(self) -> None:
         """Find out whether it is still as ``prepare`` left it.
@@ -165,6 +158,16 @@ class Chip:
         self._clock.sleep(OSCILLATOR_STARTS_S)
         if self._read(MODE1, 1)[0] & RESTART:
             self._write(MODE1, AUTO_INCREMENT | RESTART)
+
+    def _check_set_up(self) -> None:
+        expected = {MODE1: AUTO_INCREMENT, MODE2: OUTDRV, PRE_SCALE: self._prescale}
+        read_back = {register: self._read(register, 1)[0] for register in expected}
+        if read_back != expected:
+            raise DeviceError(
+                f"found {_listed(read_back)}, expected {_listed(expected)}: its set-up does not read back.",
+                where=self.where,
+                hint="Is it a PCA9685, and alone at this address? Look at the bus: wires, pull-ups.",
+            )
 
     def _read(self, register: int, count: int) -> bytes:
         return self._link.read(self._address, register, count)

@@ -7,7 +7,7 @@ between its knots. Weighted least squares; observations far off are set aside an
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -60,14 +60,6 @@ class FittedServo:
 
 
 @dataclass(frozen=True)
-class FittedNumber:
-    """A number and its standard deviation."""
-
-    value: float
-    sd: float
-
-
-@dataclass(frozen=True)
 class ServoFit:
     """Servos, boards and springs.
 
@@ -75,17 +67,16 @@ class ServoFit:
         servos: by joint, those with observations.
         clocks: by board, at the fitted oscillator, or the stated one.
         oscillator_sds: by board (Hz), of those that are determined.
-        compliances: of the arm's springs, by parameter (rad/(N m)), how far from the model's, where determined.
+        compliances: of the arm's springs, by parameter, where determined: how far from the model's, and the standard
+            deviation (rad/(N m)).
         undetermined: compliances that the observations do not determine.
-        changes: the most likely change of every compliance from the model's (rad/(N m)), determined or not.
     """
 
     servos: Mapping[str, FittedServo]
     clocks: Mapping[str, PulseClock]
     oscillator_sds: Mapping[str, float]
-    compliances: Mapping[str, FittedNumber]
+    compliances: Mapping[str, tuple[float, float]]
     undetermined: tuple[str, ...] = ()
-    changes: Mapping[str, float] = field(default_factory=dict)
 
 
 def fit_servos(task: FitTask) -> ServoFit:
@@ -134,15 +125,10 @@ def _servo_fit(unknowns: Unknowns, x: Array, sds: Array, kept: Sequence[bool], s
     clocks = {name: unknowns.clock(x, name) for name in task.boards}
     stated = {name: board.clock.oscillator_hz for name, board in task.boards.items()}
     oscillators = {name: float(sds[at[name, "clock"]]) * hz for name, hz in stated.items() if (name, "clock") in at}
-    changes = {name: float(x[at[name, "compliance"]]) for name in unknowns.compliances}
-    change_sds = {name: float(sds[at[name, "compliance"]]) for name in unknowns.compliances}
-    determined = {
-        name: FittedNumber(change, change_sds[name])
-        for name, change in changes.items()
-        if change_sds[name] < _DETERMINED * task.compliance_sd
-    }
-    undetermined = tuple(name for name in changes if name not in determined)
-    return ServoFit(servos, clocks, oscillators, determined, undetermined, changes)
+    springs = {name: at[name, "compliance"] for name in unknowns.compliances}
+    changes = {name: (float(x[i]), float(sds[i])) for name, i in springs.items()}
+    determined = {name: change for name, change in changes.items() if change[1] < _DETERMINED * task.compliance_sd}
+    return ServoFit(servos, clocks, oscillators, determined, tuple(name for name in changes if name not in determined))
 
 
 def _fitted_servo(

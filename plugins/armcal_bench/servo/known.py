@@ -9,6 +9,7 @@ from typing import Literal
 import numpy as np
 from armcal.arm.servo import PulseClock, PulseTable
 from armcal.base.domains import Array
+from scipy.interpolate import BSpline, make_interp_spline
 
 Zero = Literal["kept", "measured"]
 
@@ -33,7 +34,7 @@ class KnownServo:
 
     def pulses_at(self, angles: Array) -> Array:
         """The stated table's pulses (s) at angles (rad)."""
-        return interpolated(np.asarray(angles, dtype=float), np.array(self.table.angles), np.array(self.table.pulses))
+        return np.asarray(piecewise(np.array(self.table.angles), np.array(self.table.pulses))(angles))
 
 
 @dataclass(frozen=True)
@@ -76,14 +77,6 @@ class Observation:
     sag_slopes: Mapping[str, float] = field(default_factory=dict)
 
 
-def interpolated(x: Array, at: Array, values: Array) -> Array:
+def piecewise(at: Array, values: Array) -> BSpline:
     """Linear between points (``at`` rises), and beyond the ends as before them."""
-    place = np.searchsorted(at[1:-1], x, side="right")
-    part = (x - at[place]) / (at[place + 1] - at[place])
-    return np.asarray(values[place] + part * (values[place + 1] - values[place]))
-
-
-def slopes_at(x: Array, at: Array, values: Array) -> Array:
-    """Of the piece of the line in which x lies."""
-    place = np.searchsorted(at[1:-1], x, side="right")
-    return np.asarray((values[place + 1] - values[place]) / (at[place + 1] - at[place]))
+    return make_interp_spline(at, values, k=1)

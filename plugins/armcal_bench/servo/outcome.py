@@ -13,7 +13,7 @@ from armcal.arm.servo import PulseTable
 from armcal_bench.servo.alignment import Alignment, aligned, begin, seat_of, shifted
 from armcal_bench.servo.angles import Entry, Springs, Sweeps, observations_of, sweeps_of
 from armcal_bench.servo.fit import FittedServo, ServoFit, fit_servos
-from armcal_bench.servo.known import KnownBoard, KnownServo, Zero, interpolated
+from armcal_bench.servo.known import KnownBoard, KnownServo, Zero, piecewise
 from armcal_bench.servo.nominal import NominalArm
 from armcal_bench.servo.settings import ServoCalibrationSettings
 from armcal_bench.servo.trial import permuted
@@ -93,7 +93,7 @@ def _fitted(
         )
         if is_steady or (before.springs and scatter > _MOST_SCATTER):
             break
-    values = {name: (nominal.compliance(name) + n.value, n.sd) for name, n in now.fit.compliances.items()}
+    values = {name: (nominal.compliance(name) + change, sd) for name, (change, sd) in now.fit.compliances.items()}
     spans = dict.fromkeys(now.sweeps, 0.0)
     for joint, bent in now.springs.items():
         if by := now.sweeps[joint].by:
@@ -150,7 +150,7 @@ def _stood(sweeps: Sweeps, servo: KnownServo, now: _Round) -> tuple[float, ...]:
     lag = (fitted.lag or 0.0) if fitted else 0.0
     angles, pulses = np.array(table.angles), np.array(table.pulses)
     order = np.argsort(pulses)
-    by_table = interpolated(np.array(sweeps.counts) * clock.tick, pulses[order], angles[order])
+    by_table = piecewise(pulses[order], angles[order])(np.array(sweeps.counts) * clock.tick)
     return tuple((by_table - lag * np.array(sweeps.approaches)).tolist())
 
 

@@ -6,21 +6,96 @@ Lines are checked when they are read: one that was damaged must not become a tab
 from __future__ import annotations
 
 import json
-import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from armcal.arm.servo import COUNTS, PulseClock, PulseTable
 from armcal.errors import DataError, InputError, Location
 from armcal.io.journal.files import REAL_FILES, opened
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 
 NAME = "observations.jsonl"
 BEGUN, POSE, ANGLE, LEFT_OUT = "begun", "pose", "angle", "left_out"
 """Kinds of lines."""
 
 _ROTATION_OFF = 1e-6
+
+
+Counts = Annotated[int, Field(gt=0, lt=COUNTS)]
+Row = tuple[float, float, float]
+
+
+class _Line(BaseModel):
+    model_config = ConfigDict(strict=True, allow_inf_nan=False)
+
+
+class _StatedServo(_Line):
+    board: str
+    channel: int
+    oscillator_hz: Annotated[float, Field(gt=0)]
+    prescale: int
+    angles: tuple[float, ...]
+    pulses: tuple[float, ...]
+
+    @model_validator(mode="after")
+    def _usable(self) -> Self:
+        PulseTable(self.angles, self.pulses)
+        PulseClock(self.oscillator_hz, self.prescale)
+        return self
+
+
+class _Begun(_Line):
+    kind: Literal["begun"]
+    servos: Annotated[dict[str, _StatedServo], Field(min_length=1)]
+    base: dict[str, float]
+
+
+class _Place(_Line):
+    joint: str
+    came: Literal[-1, 1]
+    at: float
+    warmth: dict[str, tuple[float, float]] = {}
+
+
+class _Pose(_Place):
+    kind: Literal["pose"]
+    counts: Counts
+    told: dict[str, float]
+    position: Row
+    rotation: tuple[Row, Row, Row] | None
+    deviations: Annotated[tuple[Annotated[float, Field(ge=0)] | None, ...], Field(min_length=6, max_length=6)]
+
+    @model_validator(mode="after")
+    def _is_turned(self) -> Self:
+        matrix = np.eye(3) if self.rotation is None else np.array(self.rotation)
+        if np.linalg.det(matrix) < 0 or np.abs(matrix @ matrix.T - np.eye(3)).max() > _ROTATION_OFF:
+            raise ValueError("no rotation")
+        return self
+
+
+class _Angle(_Place):
+    kind: Literal["angle"]
+    counts: Counts
+    target: float
+    angle: float
+    sd: Annotated[float, Field(gt=0)]
+
+
+class _LeftOut(_Place):
+    kind: Literal["left_out"]
+    counts: int | None = None
+    target: float | None = None
+
+    @model_validator(mode="after")
+    def _is_about_a_point(self) -> Self:
+        if self.counts is None and self.target is None:
+            raise ValueError("neither counts nor a target")
+        return self
+
+
+_LINES: TypeAdapter[_Line] = TypeAdapter(Annotated[_Begun | _Pose | _Angle | _LeftOut, Field(discriminator="kind")])
 
 
 class Record:
@@ -45,17 +120,23 @@ class Record:
             raise _unwritable(folder, fault) from fault
         self._entries: list[Mapping[str, Any]] = []
         for number, line in enumerate(kept.splitlines(), start=1):
+            damage = ""
             try:
-                entry = json.loads(line)
-            except ValueError:
-                entry = None
-            if damage := _fault_of(entry, number == 1):
+                is_beginning = isinstance(_LINES.validate_json(line), _Begun)
+            except ValidationError:
+                damage = "a line that is no observation, or a damaged one"
+            else:
+                if number == 1 and not is_beginning:
+                    damage = "a first line that does not say by which tables it was begun"
+                elif number > 1 and is_beginning:
+                    damage = "a second beginning"
+            if damage:
                 raise DataError(
                     f"found {damage}.",
                     where=Location(str(self.path), line=number),
                     hint="Give another --out." if number == 1 else "Give another --out, or remove this line.",
                 )
-            self._entries.append(entry)
+            self._entries.append(json.loads(line))
 
     @property
     def entries(self) -> tuple[Mapping[str, Any], ...]:
@@ -85,13 +166,13 @@ class Record:
         self._entries = []
         return kept
 
-    def append(self, kind: str, content: Mapping[str, Any]) -> None:
+    def append(self, kind: str, values: Mapping[str, Any]) -> None:
         """One more line, durable when this returns.
 
         Raises:
             InputError: it cannot be written.
         """
-        entry = {"kind": kind, **content}
+        entry = {"kind": kind, **values}
         is_first = not self.path.exists()
         try:
             with opened(REAL_FILES, self.path) as descriptor:
@@ -116,81 +197,3 @@ def _unwritable(path: Path, fault: OSError) -> InputError:
     return InputError(
         f"it cannot be written ({fault.strerror}).", where=Location(str(path)), hint="Give --out a writable folder."
     )
-
-
-def _fault_of(entry: Any, is_first: bool) -> str:
-    """Why a line cannot be what was written; empty if it can. Only the first says by what it was begun."""
-    if not isinstance(entry, dict) or not isinstance(entry.get("kind"), str) or entry["kind"] not in _CHECKS:
-        return "a line that is not an observation"
-    if is_first != (entry["kind"] == BEGUN):
-        return "a first line that does not say by which tables it was begun" if is_first else "a second beginning"
-    try:
-        is_sound = _CHECKS[entry["kind"]](entry)
-    except (KeyError, TypeError, ValueError, OverflowError, AttributeError):
-        is_sound = False
-    return "" if is_sound else "a damaged observation"
-
-
-def _is_begun(entry: Mapping[str, Any]) -> bool:
-    for servo in entry["servos"].values():
-        PulseTable(tuple(_numbers(servo["angles"])), tuple(_numbers(servo["pulses"])))
-        PulseClock(_number(servo["oscillator_hz"]), _whole(servo["prescale"]))
-        if not isinstance(servo["board"], str) or not servo["oscillator_hz"] > 0:
-            return False
-        _whole(servo["channel"])
-    _numbers(entry["base"].values())
-    return bool(entry["servos"])
-
-
-def _is_pose(entry: Mapping[str, Any]) -> bool:
-    place = _is_place(entry) and 0 < _whole(entry["counts"]) < COUNTS
-    deviations = [d for d in entry["deviations"] if d is not None]
-    _numbers(entry["told"].values())
-    sizes = len(_numbers(entry["position"])) == 3 and len(entry["deviations"]) == 6
-    rotation = np.eye(3)
-    if entry["rotation"] is not None:
-        rotation = np.array([_numbers(row) for row in entry["rotation"]])
-    if rotation.shape != (3, 3) or np.linalg.det(rotation) < 0:
-        return False
-    off = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
-    return place and sizes and all(d >= 0 for d in _numbers(deviations)) and off < _ROTATION_OFF
-
-
-def _is_angle(entry: Mapping[str, Any]) -> bool:
-    _numbers((entry["angle"], entry["target"]))
-    return _is_place(entry) and 0 < _whole(entry["counts"]) < COUNTS and _number(entry["sd"]) > 0
-
-
-def _is_left_out(entry: Mapping[str, Any]) -> bool:
-    about = _whole(entry["counts"]) if "counts" in entry else _number(entry["target"])
-    return _is_place(entry) and math.isfinite(about)
-
-
-def _is_place(entry: Mapping[str, Any]) -> bool:
-    _number(entry["at"])
-    warm = all(len(_numbers(parts)) == 2 for parts in entry.get("warmth", {}).values())
-    return warm and isinstance(entry["joint"], str) and entry["came"] in (-1, 1)
-
-
-def _numbers(values: Sequence[Any] | Any) -> list[float]:
-    return [_number(value) for value in values]
-
-
-def _number(value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise ValueError("no number")
-    return float(value)
-
-
-def _whole(value: Any) -> int:
-    if isinstance(value, bool) or not isinstance(value, int):
-        raise ValueError("no whole number")
-    return value
-
-
-_CHECKS: Mapping[str, Callable[[Mapping[str, Any]], bool]] = {
-    BEGUN: _is_begun,
-    POSE: _is_pose,
-    ANGLE: _is_angle,
-    LEFT_OUT: _is_left_out,
-}

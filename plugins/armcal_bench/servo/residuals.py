@@ -11,7 +11,7 @@ import numpy as np
 from armcal.arm.servo import piecewise_linear
 from armcal.base.domains import Array
 
-from armcal_bench.servo.known import KnownServo, Observation, slopes_at
+from armcal_bench.servo.known import KnownServo, Observation, piecewise
 from armcal_bench.servo.unknowns import US, WEAK_PULSE_SD, Unknowns
 
 WEAK_ZERO_SD = 1.0
@@ -44,7 +44,7 @@ class Residuals:
                 continue
             knots = task.knots_of(servo)
             here = np.asarray(ca.DM(self._angles(about, servo, observations))).ravel()
-            steep = np.abs(slopes_at(here, knots, unknowns.pulses(about, servo)))
+            steep = np.abs(piecewise(knots, unknowns.pulses(about, servo)).derivative()(here))
             sds = np.array([o.sd for o in observations]) * np.maximum(steep, _LEAST_SLOPE)
             by_counts = ca.DM([float(o.counts) for o in observations]) * self._tick(x, servo.board)
             by_table = self._table(x, servo, self._angles(x, servo, observations))

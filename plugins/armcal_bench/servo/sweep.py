@@ -23,11 +23,6 @@ class Point:
     counts: int
     came: int
 
-    @property
-    def key(self) -> tuple[str, int, int]:
-        """Tells it from all others."""
-        return (self.joint, self.counts, self.came)
-
 
 def sweep(setup: Setup, mover: Mover, joint: str) -> list[Point]:
     """Rising pulses first, then falling ones, as many of the range as leave room to come from either side."""
@@ -52,8 +47,8 @@ def approach_counts(setup: Setup, mover: Mover, joint: str) -> int:
 
 def left(points: Iterable[Point], entries: Iterable[Mapping[str, Any]]) -> list[Point]:
     """Those that no line of the record is about."""
-    done = {(str(e["joint"]), int(e["counts"]), int(e["came"])) for e in entries if "counts" in e}
-    return [point for point in points if point.key not in done]
+    done = {Point(e["joint"], e["counts"], e["came"]) for e in entries if "counts" in e}
+    return [point for point in points if point not in done]
 
 
 def come_to(setup: Setup, mover: Mover, point: Point) -> None:

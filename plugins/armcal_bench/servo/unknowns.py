@@ -10,7 +10,7 @@ import numpy as np
 from armcal.arm.servo import PulseClock
 from armcal.base.domains import Array
 
-from armcal_bench.servo.known import KnownBoard, KnownServo, Observation, Zero, interpolated
+from armcal_bench.servo.known import KnownBoard, KnownServo, Observation, Zero, piecewise
 
 US = 1e-6
 WEAK_PULSE_SD = 300.0 * US
@@ -104,9 +104,9 @@ class Unknowns:
             observations = self.task.of(servo.joint)
             tick = self.task.boards[servo.board].clock.tick
             angles = np.array([o.angle - o.sag for o in observations])
-            hats = [interpolated(angles, knots, row) for row in np.eye(len(knots))]
+            hats = piecewise(knots, np.eye(len(knots)))(angles)
             weight = 10.0 if servo.trusted_sd is not None else 1e-3
-            rows = np.vstack([np.array(hats).T.reshape(-1, len(knots)), weight * np.eye(len(knots))])
+            rows = np.vstack([hats.reshape(-1, len(knots)), weight * np.eye(len(knots))])
             right = np.concatenate([[o.counts * tick for o in observations], weight * stated])
             first = self.place[servo.joint, "pulse0"]
             x[first : first + len(knots)] = np.linalg.lstsq(rows, right, rcond=None)[0] / US
