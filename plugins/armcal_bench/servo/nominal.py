@@ -17,7 +17,7 @@ from armcal.base.parameters import ParameterBlock, Parameters
 from armcal.base.se3 import Expression
 from armcal.measure.measurement import Channel, Measurement
 from armcal.problem.factor import build_factor
-from armcal.problem.kernel import AS_IT_STANDS, Kernel, VirtualMachine
+from armcal.problem.kernel import AS_IT_STANDS, Interpreter, Kernel
 from scipy.spatial.transform import Rotation
 from typing_extensions import override
 
@@ -90,7 +90,7 @@ class NominalArm:
         parameters = parameters.with_free(block.name for block in arm.parameters())
         conditions = frozenset(arm.conditions)
         factor = build_factor("tool", _ToolFrame(arm.name), {arm.name: arm}, parameters, environment, conditions)
-        return cls(arm, parameters, Kernel(factor, VirtualMachine(factor)))
+        return cls(arm, parameters, Kernel(factor, Interpreter(factor)))
 
     def with_values(self, values: Mapping[str, tuple[float, ...]], zeros: Mapping[str, float]) -> NominalArm:
         """The same arm with other values of parameters, and other zeros of its joints (rad)."""
