@@ -401,7 +401,7 @@ class TestNobodyFeelsWhereTheArmIs:
             outcome = run.acquire()
         assert outcome.ending.how == "done"
         assert set(run.progress().measured) == {"p1", "p2", "p3", "p5"}
-        assert "not where it was told to be" in run.progress().left_out["p4"]
+        assert "not where it was commanded to be" in run.progress().left_out["p4"]
 
     @pytest.mark.slow
     def test_an_arm_that_never_arrives_is_parked(self, tmp_path: Path) -> None:

@@ -50,7 +50,7 @@ class Arrival:
             return ""
         angle = "" if np.isnan(turned) else f" and {np.rad2deg(turned):.0f} deg"
         return (
-            f"the arm is not where it was told to be: measured {1000 * far:.0f} mm{angle} off, as seen from other "
+            f"the arm is not where it was commanded to be: measured {1000 * far:.0f} mm{angle} off, as seen from other "
             f"poses (allowed: {1000 * self.settings.astray:.0f} mm, {np.rad2deg(self.settings.astray_turned):.0f} deg)"
         )
 

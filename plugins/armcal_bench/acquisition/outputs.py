@@ -18,8 +18,9 @@ from armcal.run.experiment import Experiment
 from scipy.spatial.transform import Rotation
 
 from armcal_bench.acquisition.progress import Progress
+from armcal_bench.journal_folder import JOURNAL
 
-DATASET, SUMMARY, JOURNAL = "dataset.csv", "summary.json", "journal"
+DATASET, SUMMARY = "dataset.csv", "summary.json"
 BENCH = "bench"
 """Of a rehearsal: where its simulated bench lives."""
 OURS = (DATASET, SUMMARY, JOURNAL, BENCH)

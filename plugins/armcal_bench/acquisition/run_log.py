@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from armcal.devices.device import DeviceIdentity
-from armcal.errors import ArmcalError, InputError, Location
-from armcal.io.folder import check_folder
 from armcal.io.journal.journal import Journal, JournalFailedError, JournalFullError
 
-from armcal_bench.acquisition.outputs import JOURNAL, OURS
+from armcal_bench.acquisition.outputs import OURS
 from armcal_bench.acquisition.progress import HERE, STARTED, Progress, progress_of
-
-Start = Literal["anew", "resume"]
+from armcal_bench.journal_folder import Start, opened_journal
 
 
 class RunLog:
@@ -55,41 +51,7 @@ class RunLog:
 
 @contextmanager
 def opened_log(folder: Path, start: Start, header: Mapping[str, Any]) -> Iterator[RunLog]:
-    """The journal in a run's folder.
-
-    Raises:
-        InputError: there is a run and ``start`` is not to resume it, or there is none to resume; or it was begun with
-            another plan or configuration.
-        JournalDamagedError: it cannot be read.
-    """
-    where = Location(str(folder))
-    try:
-        there = (folder / JOURNAL).is_dir()
-    except OSError as fault:
-        raise InputError(
-            f"it cannot be used ({fault.strerror}).", where=where, hint="Give a folder that can be written."
-        ) from fault
-    if there and start == "anew":
-        with suppress(ArmcalError):  # one that is damaged or in use is kept
-            with Journal.open(folder / JOURNAL, {}) as journal:
-                there = bool(journal.recovered.entries) or journal.recovered.checkpoint is not None
-            if not there:  # its run was refused before anything moved
-                shutil.rmtree(folder / JOURNAL)
-    if there and start == "anew":
-        raise InputError(
-            "it holds a measuring run already.",
-            where=where,
-            hint="Give another --out, or go on with it: armcal acquire --resume.",
-        )
-    if start == "resume" and not there:
-        raise InputError("it holds no run to resume.", where=where, hint="Leave --resume out to begin one.")
-    if not there:
-        check_folder(folder, OURS)
-    with Journal.open(folder / JOURNAL, header) as journal:
-        begun = journal.recovered.header
-        for key, name in (("plan", "plan"), ("config", "configuration")):
-            if begun and begun.get(key) != header[key]:
-                raise InputError(
-                    f"it was begun with another {name}.", where=where, hint=f"Give the same {name}, or another --out."
-                )
+    """The journal in a run's folder; see ``opened_journal`` for what it raises."""
+    same = {"plan": "plan", "config": "configuration"}
+    with opened_journal(folder, start, OURS, header, "run", same) as journal:
         yield RunLog(journal)

@@ -25,9 +25,10 @@ from armcal_bench.acquisition.outputs import in_order, measured_by, write_output
 from armcal_bench.acquisition.preparation import Prepared
 from armcal_bench.acquisition.progress import Progress
 from armcal_bench.acquisition.recovery import Recovery
-from armcal_bench.acquisition.run_log import RunLog, Start, opened_log
+from armcal_bench.acquisition.run_log import RunLog, opened_log
 from armcal_bench.acquisition.tracker_monitor import TrackerMonitor
 from armcal_bench.hazards import FirstMotion
+from armcal_bench.journal_folder import Start
 from armcal_bench.waiting import Waits
 from armcal_bench.wiring import check_wiring
 

@@ -41,11 +41,11 @@ def load(console: Console, config: Path, overrides: tuple[str, ...]) -> Experime
 
 
 def always(motion: FirstMotion) -> bool:
-    """Nobody is asked."""
+    """Without a question."""
     return True
 
 
-def asked(motion: FirstMotion) -> bool:
+def ask(motion: FirstMotion) -> bool:
     """Whether somebody at the terminal says that the arm may be moved.
 
     Raises:
@@ -70,11 +70,11 @@ def asked(motion: FirstMotion) -> bool:
 def warned(console: Console, question: Question) -> Question:
     """The question, after what is dangerous has been named: whoever gave --yes reads it too."""
 
-    def ask(motion: FirstMotion) -> bool:
+    def warn_and_ask(motion: FirstMotion) -> bool:
         show_hazards(console, motion.hazards)
         return question(motion)
 
-    return ask
+    return warn_and_ask
 
 
 def waits(console: Console) -> Waits:
@@ -94,6 +94,6 @@ def energise_option(command: F) -> F:
         "--yes",
         "may_energise",
         is_flag=True,
-        callback=lambda ctx, option, yes: always if yes else asked,
+        callback=lambda ctx, option, yes: always if yes else ask,
         help="Move the arm without asking.",
     )(command)

@@ -23,6 +23,7 @@ from armcal.run.experiment import Experiment
 
 from armcal_bench.bench import SECTION, Bench
 from armcal_bench.commands.common import FILE, load, on_bench
+from armcal_bench.journal_folder import Start
 from armcal_bench.recording.keys import Keys, LineKeys, NoKeys, TerminalKeys
 from armcal_bench.recording.messages import Message
 from armcal_bench.recording.posture import DATASET
@@ -72,7 +73,7 @@ def record_command(
     with Signals() as signals, _keys(bench, capture) as (keys, is_terminal):
         if is_terminal and not console.quiet:
             click.echo(f"{KEYS}.", err=True)
-        start: Literal["anew", "resume"] = "resume" if resume else "anew"
+        start: Start = "resume" if resume else "anew"
         options = RecordingOptions(out, start, capture, keys, lambda: signals.finish or signals.rotate, show)
         ending = record(bench, options)
     show(ending)

@@ -32,7 +32,7 @@ class Recorder:
 
     Args:
         bench: what is recorded, and when a posture is one.
-        stream: of the readings; it is asked only why it is silent.
+        stream: of the readings; it is used only for why it is silent.
         capture: what makes a posture be captured.
         folder: for the dataset.
         log: the journal.

@@ -6,18 +6,14 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Literal
 
-from armcal.errors import InputError, Location
-from armcal.io.folder import check_folder
 from armcal.io.journal.journal import Journal
 
+from armcal_bench.journal_folder import JOURNAL, Start, opened_journal
 from armcal_bench.recording.posture import DATASET, Posture
 
-JOURNAL = "journal"
 OURS = (DATASET, JOURNAL)
 CAPTURED, UNDONE = "captured", "undone"
-Start = Literal["anew", "resume"]
 
 
 class RecordingLog:
@@ -70,28 +66,8 @@ class RecordingLog:
 def opened_recording_log(
     folder: Path, start: Start, channels: Sequence[str], labels: Sequence[str]
 ) -> Iterator[RecordingLog]:
-    """The journal in a recording's folder.
-
-    Raises:
-        InputError: there is a recording and ``start`` is not to resume it, or there is none to resume; or it is of
-            other joints or labels.
-        JournalDamagedError: it cannot be read.
-    """
-    where, there = Location(str(folder)), (folder / JOURNAL).is_dir()
-    if there and start == "anew":
-        raise InputError("it holds a recording already.", where=where, hint="Go on by --resume, or give another --out.")
-    if start == "resume" and not there:
-        raise InputError("it holds no recording to resume.", where=where, hint="Leave --resume out to begin one.")
-    check_folder(folder, OURS)
-    header: dict[str, Any] = {"joints": list(channels), "labels": list(labels)}
-    with Journal.open(folder / JOURNAL, header) as journal:
-        begun = journal.recovered.header
-        for key in header if begun else ():
-            if list(begun.get(key, ())) != header[key]:
-                names = ", ".join(map(str, begun.get(key, ()))) or "none"
-                raise InputError(
-                    f"it was begun with the {key} {names}; the configuration has {', '.join(header[key]) or 'none'}.",
-                    where=where,
-                    hint="Give the configuration that it was begun with, or another --out.",
-                )
+    """The journal in a recording's folder; see ``opened_journal`` for what it raises."""
+    header = {"joints": list(channels), "labels": list(labels)}
+    same = {"joints": "set of joints", "labels": "set of labels"}
+    with opened_journal(folder, start, OURS, header, "recording", same) as journal:
         yield RecordingLog(journal)

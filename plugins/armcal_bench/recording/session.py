@@ -13,12 +13,13 @@ from armcal.devices.rest_stream import RestStream
 from armcal.errors import ConfigError
 
 from armcal_bench.bench import SECTION, Bench
+from armcal_bench.journal_folder import Start
 from armcal_bench.recording.assessor import contacts_of
 from armcal_bench.recording.keys import END, Keys
 from armcal_bench.recording.labels import Labels
 from armcal_bench.recording.messages import Message
 from armcal_bench.recording.recorder import Capture, Recorder
-from armcal_bench.recording.recording_log import Start, opened_recording_log
+from armcal_bench.recording.recording_log import opened_recording_log
 from armcal_bench.recording.window import JointKinds
 
 _PERIOD_S = 0.02

@@ -16,10 +16,10 @@ class RecordingSettings(Settings):
         window: a posture is the mean of the readings of so long.
         samples: it has at least so many.
         spread: no turning joint moves by more within the window; ``sliding_spread``: no sliding one.
-        stale: a stream that is silent for longer tells nothing of where the arm stands now.
+        stale: a stream that is silent for longer does not show where the arm stands now.
         rest: with ``--capture still``, how long the arm must stand before it is captured by itself.
         moved: and how far a joint must have gone since the posture before.
-        alike: postures of one group whose joints all differ by less are told to be nearly the same.
+        alike: postures of one group whose joints all differ by less are reported as nearly the same.
         groups: names that the digits stand for, ``[front/hole_0, front/hole_1]``; an asterisk keeps what was named
             before. Without any, those that the measurements' settings speak of.
     """

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from armcal.arm.assembly import Arm
-from armcal.base.domains import Array
 from armcal.base.units import display_unit, to_unit
 from armcal.devices.joint_stream import JointSample
 
@@ -58,11 +57,6 @@ class JointKinds:
                     "degrees, or turns of the motor?"
                 )
         return ""
-
-    def shown(self, channel: str, amount: float) -> str:
-        """An amount with its unit."""
-        unit = display_unit(self.dimensions[channel]).name
-        return f"{to_unit(amount, unit):.3g} {unit}"
 
 
 @dataclass(frozen=True)
@@ -130,20 +124,19 @@ class SampleWindow:
         spreads = np.ptp(rows, axis=0)
         worst = int(np.argmax(spreads / self._limits))
         if spreads[worst] > self._limits[worst]:
-            return _none(self._not_still(worst, spreads))
+            channel = self._kinds.channels[worst]
+            unit = display_unit(self._kinds.dimensions[channel]).name
+            moved, allowed = (f"{to_unit(amount[worst], unit):.3g} {unit}" for amount in (spreads, self._limits))
+            return _none(
+                f"the arm does not stand still: {channel} moved by {moved} within {self._length:g} s "
+                f"(allowed: {allowed})."
+            )
         return Mean(
             angles=dict(zip(self._kinds.channels, rows.mean(axis=0).tolist(), strict=True)),
             spread=float(spreads[worst]),
             readings=count,
             labels=newest.labels,
             stamp=None if newest.stamp is None else float(np.mean([at for at, _ in self._samples])),
-        )
-
-    def _not_still(self, worst: int, spreads: Array) -> str:
-        channel = self._kinds.channels[worst]
-        moved, allowed = (self._kinds.shown(channel, x) for x in (spreads[worst], self._limits[worst]))
-        return (
-            f"the arm does not stand still: {channel} moved by {moved} within {self._length:g} s (allowed: {allowed})."
         )
 
 
