@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from armcal.base.domains import Array
 
+from armcal_capability.cells import Voxels
 from armcal_capability.quantities import BY_NAME
 from armcal_capability.settings import AreaSettings, CapabilitySettings
 from armcal_capability.survey import Survey
-from armcal_capability.voxels import Voxels
 
 _MM = 1000.0
 _INK, _GRID, _LIMIT, _ARM = "#222222", "#dddddd", "#555555", "#d95f02"

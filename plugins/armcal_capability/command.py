@@ -19,12 +19,18 @@ from rich.table import Table as ScreenTable
 
 from armcal_capability import outputs
 from armcal_capability.capability_figures import DRAWN, designs_figure, quantity_figure, reach_figure
-from armcal_capability.capability_page import Picture, conclusions, render_capability
+from armcal_capability.capability_page import (
+    Picture,
+    area_table,
+    conclusions,
+    design_table,
+    quantity_table,
+    render_capability,
+)
 from armcal_capability.loading import Task, load_task
 from armcal_capability.quantities import BY_NAME
 from armcal_capability.summary import design_summaries, summary_of
 from armcal_capability.survey import Survey, survey
-from armcal_capability.tables import area_table, design_table, quantity_table
 
 _DATA = ("map.csv", "map.npz", "areas.csv", "designs.csv", "capability.json", "capability.html")
 _FIGURES = ("reach.png", "designs.png", *(f"{name}.png" for name in BY_NAME))
@@ -43,7 +49,7 @@ def capability(console: Console, source: Path, out: Path, settings: Path | None,
     """Map what an arm can do: its reach, sag, stiffness, accuracy and dexterity, in all and in areas, for designs."""
     watch = Stopwatch()
     kept = click.get_current_context().with_resource(reserved(out, OURS))
-    import_module("matplotlib")  # if it is not here, that is said now and not after the survey
+    import_module("matplotlib")  # if it is missing, the command ends now and not after the survey
     registry = discover()
     console.plugin_faults(registry)
     task = load_task(source, settings, overrides, registry)
@@ -93,17 +99,17 @@ def _pictures(
 ) -> tuple[Picture, ...]:
     pictures = []
     if designs:
-        said = "Left: how far each design's tool comes, seen from the side. Right: how much of each area it reaches."
-        pictures.append(Picture("designs", "Designs", designs_figure(designs, compared, task.settings), said))
-    said = "Two sections through the workspace; the darker, the more postures of the sample bring the tool there."
-    pictures.append(Picture("reach", "Reach", reach_figure(surveyed, task.settings), said))
+        text = "Left: how far each design's tool comes, seen from the side. Right: how much of each area it reaches."
+        pictures.append(Picture("designs", "Designs", designs_figure(designs, compared, task.settings), text))
+    text = "Two sections through the workspace; the darker, the more postures of the sample bring the tool there."
+    pictures.append(Picture("reach", "Reach", reach_figure(surveyed, task.settings), text))
     for name in DRAWN:
         if name in surveyed.voxels.values:
             quantity = BY_NAME[name]
             dark = "the darker, the more" if quantity.good == "low" else "the darker, the less"
-            said = f"Two sections through the workspace: {quantity.words}; {dark}. Mean over the postures of each cell."
+            text = f"Two sections through the workspace: {quantity.words}; {dark}. Mean over the postures of each cell."
             title = quantity.words[0].upper() + quantity.words[1:]
-            pictures.append(Picture(name, title, quantity_figure(surveyed, task.settings, name), said))
+            pictures.append(Picture(name, title, quantity_figure(surveyed, task.settings, name), text))
     return tuple(pictures)
 
 

@@ -23,7 +23,7 @@ _PROGRESS, _PATIENCE = 0.8, 6
 """A search that comes no nearer than by this factor in so many steps is given up."""
 _DAMPING = 1e-9
 _INSIDE = 1e-3
-"""rad: how far inside the cone that is asked for the tool is brought."""
+"""rad: how far inside the required cone the tool is brought."""
 
 
 @dataclass(frozen=True)
@@ -100,9 +100,9 @@ def _equations(
     about = np.cross(axis, pointing.along)
     size = np.linalg.norm(about, axis=1, keepdims=True)
     about = np.where(size > 1e-9, about / np.maximum(size, 1e-9), np.roll(axis, 1, axis=1))
-    asked = (away > 0).astype(float) * length
-    turn = np.einsum("ni,nij->nj", about, slopes[:, 3:]) * asked[:, None]
-    return np.column_stack([error, away * asked]), np.concatenate([slope, turn[:, None]], axis=1)
+    weight = (away > 0).astype(float) * length
+    turn = np.einsum("ni,nij->nj", about, slopes[:, 3:]) * weight[:, None]
+    return np.column_stack([error, away * weight]), np.concatenate([slope, turn[:, None]], axis=1)
 
 
 def _moved(commands: Array, error: Array, slope: Array, limits: Array) -> Array:

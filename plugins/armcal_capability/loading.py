@@ -129,7 +129,7 @@ def load_designs(path: str | Path, overrides: Sequence[str] = ()) -> dict[str, C
 
 
 def _with_rules(source: ConfigSource, config_source: ConfigSource) -> ConfigSource:
-    """A configuration with the sections of another that say how it is surveyed."""
+    """A configuration with the sections of another that set how it is surveyed."""
     data = {**source.data, **{key: config_source.data[key] for key in _RULES if key in config_source.data}}
     marks = {**source.marks, **{place: at for place, at in config_source.marks.items() if place and place[0] in _RULES}}
     return replace(source, data=data, marks=marks)

@@ -160,7 +160,7 @@ def _part(function: MechanicsFunction, commands: Array, weights: Weights) -> tup
 
 
 def weighted(slopes: Array, slides: Mask, length: float) -> Array:
-    """Jacobians (N x 6 x n; m, then rad, by rad or m) in metres by rad; ``slides`` says which joints slide."""
+    """Jacobians (N x 6 x n; m, then rad, by rad or m) in metres by rad; ``slides`` are the joints that slide."""
     rows = np.array([1.0] * 3 + [length] * 3)
     columns = np.where(slides, length, 1.0)
     return np.asarray(slopes * rows[:, None] * columns)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Annotated, Any, Literal
 
 from armcal.base.settings import Angle, Force3, InputPath, Length, Length3, Mass, Settings, Torque
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, model_validator
 
 
 class ToolDirectionSettings(Settings):
@@ -13,14 +13,12 @@ class ToolDirectionSettings(Settings):
 
     axis: Literal["x", "y", "z"] = "z"
     along: tuple[float, float, float]
-    within: Angle
+    within: Annotated[Angle, Field(gt=0, le=3.15)]
 
     @model_validator(mode="after")
     def _has_direction(self) -> ToolDirectionSettings:
         if not any(self.along):
             raise ValueError("along is zero: give a direction, such as [0, 0, -1] for down")
-        if not 0 < self.within <= 3.15:
-            raise ValueError("within is not between 0 and 180 degrees")
         return self
 
 
@@ -41,16 +39,9 @@ class AreaSettings(Settings):
 class LoadSettings(Settings):
     """What the arm carries, where it differs from the configured ``statics``: payload and force at the tool."""
 
-    payload: Mass | None = None
+    payload: Annotated[Mass, Field(ge=0)] | None = None
     payload_com: Length3 | None = None
     force: Force3 | None = None
-
-    @field_validator("payload")
-    @classmethod
-    def _not_negative(cls, value: float | None) -> float | None:
-        if value is not None and value < 0:
-            raise ValueError(f"a payload of {value * 1000:g} g is below zero")
-        return value
 
 
 class SectionSettings(Settings):
@@ -66,7 +57,7 @@ class CapabilitySettings(Settings):
     ``samples`` postures are spread over joint space between the limits; those with too little clearance count as not
     reached. ``length`` is how many metres a radian counts for, where turns and distances are taken together.
     ``holding`` is what each servo can hold, by joint; ``servos`` the servo file of an arm whose calibration
-    has no tables of them. ``postures`` is how many ways of reaching it are sought for each
+    has no tables of them. ``postures`` is how many postures that reach it are sought for each
     cell of an area. ``values`` is a calibration, or a file of values of the arm that the
     configuration ``values_of`` describes: how they differ from what is stated there corrects the arm and its designs.
     ``designs`` are by name the values that each sets: ``{arms.arm.model.rows.1.d_mm: 10}``.
@@ -77,7 +68,7 @@ class CapabilitySettings(Settings):
     voxel: Annotated[Length, Field(gt=0)] = 0.02
     length: Annotated[Length, Field(gt=0)] = 0.1
     loads: LoadSettings = Field(default_factory=LoadSettings)
-    holding: dict[str, Torque] = Field(default_factory=dict)
+    holding: dict[str, Annotated[Torque, Field(gt=0)]] = Field(default_factory=dict)
     servos: InputPath | None = None
     areas: dict[str, AreaSettings] = Field(default_factory=dict)
     postures: Annotated[int, Field(ge=1, le=1000)] = 8
@@ -85,10 +76,3 @@ class CapabilitySettings(Settings):
     values: InputPath | None = None
     values_of: InputPath | None = None
     designs: dict[str, dict[str, Any] | None] = Field(default_factory=dict)
-
-    @field_validator("holding")
-    @classmethod
-    def _positive(cls, value: dict[str, float]) -> dict[str, float]:
-        if weak := [joint for joint, torque in value.items() if not torque > 0]:
-            raise ValueError(f"what {weak[0]} holds is not above zero")
-        return value

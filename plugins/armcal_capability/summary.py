@@ -9,7 +9,7 @@ import numpy as np
 from armcal.arm.clearance import Mask
 from armcal.base.domains import Array
 
-from armcal_capability.areas import AreaMap
+from armcal_capability.cells import AreaMap
 from armcal_capability.quantities import BY_NAME, CATALOGUE
 from armcal_capability.settings import CapabilitySettings
 from armcal_capability.survey import Survey

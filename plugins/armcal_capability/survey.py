@@ -15,12 +15,11 @@ from armcal.estimate.estimator import Progress, no_progress
 from armcal.functions.batch_function import EvaluatorChoice
 
 from armcal_capability.accuracy import Unexplained, unexplained, with_accuracy
-from armcal_capability.areas import AreaMap, AreaSearch
+from armcal_capability.cells import AreaMap, AreaSearch, Voxels, voxels_of
 from armcal_capability.mechanics import MechanicsFunction
 from armcal_capability.quantities import Postures, Weights, postures_at
 from armcal_capability.settings import CapabilitySettings
 from armcal_capability.subject import Subject
-from armcal_capability.voxels import Voxels, voxels_of
 
 WORTH_COMPILING = 20_000
 """From this many postures on, waiting for the compiler costs less than CasADi's interpreter does."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import casadi as ca
 from armcal.arm.assembly import ArmState
@@ -11,7 +11,7 @@ from armcal.base.parameters import ParameterBlock, scalar
 from armcal.base.settings import Length, Length3, Settings
 from armcal.measure.contact import ContactSettings, OneArmContact
 from armcal.measure.measurement import Channel, Tie
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, model_validator
 
 _MEAN_WEIGHT = 1e6
 """The mean of a socket's postures then lies in the socket to a thousandth of one posture's error."""
@@ -21,13 +21,11 @@ class KnownDistance(Settings):
     """The distance of two sockets of the same tool position, and how sure it is (standard deviation)."""
 
     between: tuple[str, str]
-    distance: Length
-    noise: Length
+    distance: Annotated[Length, Field(gt=0)]
+    noise: Annotated[Length, Field(gt=0)]
 
     @model_validator(mode="after")
     def _possible(self) -> KnownDistance:
-        if self.distance <= 0 or self.noise <= 0:
-            raise ValueError("found a distance or noise of zero or less, expected both above zero")
         if self.between[0] == self.between[1]:
             raise ValueError(f"found {self.between[0]} twice, expected two sockets")
         return self
@@ -42,20 +40,13 @@ class BallInSocketSettings(ContactSettings):
     sockets these are: both arms touch the same ones.
     """
 
-    noise: Length
+    noise: Annotated[Length, Field(gt=0)]
     centre: Length3 = (0.0, 0.0, 0.0)
     group_labels: tuple[str, ...] = ("position", "socket")
     distances: tuple[KnownDistance, ...] = ()
     sockets: dict[str, Length3] = Field(default_factory=dict)
     socket: Literal["fitted", "mean"] = "fitted"
     sockets_of: str | None = None
-
-    @field_validator("noise")
-    @classmethod
-    def _positive(cls, value: float) -> float:
-        if value <= 0:
-            raise ValueError(f"a noise of {value * 1000:g} mm is not above zero: give how well the ball seats")
-        return value
 
 
 class BallInSocket(OneArmContact):
@@ -85,7 +76,7 @@ class BallInSocket(OneArmContact):
         blocks = [scalar(axis, "m", x, 0.01) for axis, x in zip("xyz", known or (0.0, 0.0, 0.0), strict=True)]
         return tuple(ParameterBlock(b.name, b.unit, b.nominal, b.domain, b.scale, free=known is None) for b in blocks)
 
-    def told(self, arms: Mapping[str, ArmState], values: Mapping[str, Any]) -> dict[str, Any]:
+    def group_starts(self, arms: Mapping[str, ArmState], values: Mapping[str, Any]) -> dict[str, Any]:
         """The socket is where the ball is."""
         place = self._ball(arms, values)
         return {axis: place[i] for i, axis in enumerate("xyz")}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import casadi as ca
 from armcal.arm.assembly import ArmState
@@ -14,7 +14,7 @@ from armcal.base.pose_blocks import pose_blocks, pose_transform, quaternion_expr
 from armcal.base.pose_settings import PoseSettings
 from armcal.base.settings import Angle, Length
 from armcal.measure.contact import ContactSettings, OneArmContact
-from pydantic import Field, model_validator
+from pydantic import Field
 
 
 class ClampedToolSettings(ContactSettings):
@@ -26,17 +26,11 @@ class ClampedToolSettings(ContactSettings):
     the points are known only to each other.
     """
 
-    noise: Length
-    orientation_noise: Angle
+    noise: Annotated[Length, Field(gt=0)]
+    orientation_noise: Annotated[Angle, Field(gt=0)]
     group_labels: tuple[str, ...] = ("point",)
     points: dict[str, PoseSettings] = Field(default_factory=dict)
     fixture: PoseSettings = PoseSettings()
-
-    @model_validator(mode="after")
-    def _sane(self) -> ClampedToolSettings:
-        if self.noise <= 0 or self.orientation_noise <= 0:
-            raise ValueError("found a noise of zero or less, expected how far the clamp gives (standard deviation)")
-        return self
 
 
 class ClampedTool(OneArmContact):
@@ -63,7 +57,7 @@ class ClampedTool(OneArmContact):
         """The known points."""
         return tuple(self.settings.points)
 
-    def told(self, arms: Mapping[str, ArmState], values: Mapping[str, Any]) -> dict[str, Any]:
+    def group_starts(self, arms: Mapping[str, ArmState], values: Mapping[str, Any]) -> dict[str, Any]:
         """The point is where the tool is."""
         here = pose_transform("fixture", values).inverse() @ self.base_T_tool(arms)
         place = {f"point_{axis}": here.translation[i] for i, axis in enumerate("xyz")}

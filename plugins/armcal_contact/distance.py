@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import casadi as ca
 from armcal.arm.assembly import ArmState
@@ -12,7 +12,7 @@ from armcal.base.settings import Length, Length3
 from armcal.measure.instrument import Instrument, InstrumentSettings
 from armcal.measure.measurement import Channel
 from armcal.measure.partners import OTHER
-from pydantic import field_validator
+from pydantic import Field
 
 
 class TipDistanceSettings(InstrumentSettings):
@@ -21,16 +21,9 @@ class TipDistanceSettings(InstrumentSettings):
     A record that has a ``distance`` names the other record by its id in the text column ``partner``.
     """
 
-    noise: Length
+    noise: Annotated[Length, Field(gt=0)]
     tip: Length3 = (0.0, 0.0, 0.0)
     partner: str = "partner"
-
-    @field_validator("noise")
-    @classmethod
-    def _positive(cls, value: float) -> float:
-        if value <= 0:
-            raise ValueError(f"a noise of {value * 1000:g} mm is not above zero: give how well distances are known")
-        return value
 
 
 class TipDistance(Instrument):

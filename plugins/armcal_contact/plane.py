@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import casadi as ca
 import numpy as np
@@ -13,7 +13,7 @@ from armcal.base import se3
 from armcal.base.parameters import ParameterBlock, scalar
 from armcal.base.settings import Length, Length3
 from armcal.measure.contact import ContactSettings, OneArmContact
-from pydantic import field_validator
+from pydantic import Field, field_validator
 
 
 class PlaneContactSettings(ContactSettings):
@@ -23,17 +23,10 @@ class PlaneContactSettings(ContactSettings):
     A record's plane is named by its text columns ``group_labels``.
     """
 
-    noise: Length
+    noise: Annotated[Length, Field(gt=0)]
     tip: Length3 = (0.0, 0.0, 0.0)
     normal: tuple[float, float, float] = (0.0, 0.0, 1.0)
     group_labels: tuple[str, ...] = ("plane",)
-
-    @field_validator("noise")
-    @classmethod
-    def _positive(cls, value: float) -> float:
-        if value <= 0:
-            raise ValueError(f"a noise of {value * 1000:g} mm is not above zero: give how well the tip touches")
-        return value
 
     @field_validator("normal")
     @classmethod
@@ -60,7 +53,7 @@ class PlaneContact(OneArmContact):
         tilts = [scalar(f"tilt_{i}", "rad", 0.0, 0.05) for i in (1, 2)]
         return tuple(replace(block, free=True) for block in (*tilts, scalar("offset", "m", 0.0, 0.01)))
 
-    def told(self, arms: Mapping[str, ArmState], values: Mapping[str, Any]) -> dict[str, Any]:
+    def group_starts(self, arms: Mapping[str, ArmState], values: Mapping[str, Any]) -> dict[str, Any]:
         """A plane of the stated normal goes through the tip."""
         offset = ca.dot(ca.SX(list(self.settings.normal)), self._tip(arms, values))
         return {"tilt_1": ca.SX(0), "tilt_2": ca.SX(0), "offset": offset}

@@ -1,6 +1,6 @@
 """Two arms clamped together at their tools: a closed chain, whose clamp is found along with the arms. [Bergstrom2016]
 
-The pose of the right tool in the left one is the clamp's, whatever the joints do. What the joints say instead is the
+The pose of the right tool in the left one is the clamp's, whatever the joints do. What the joints give instead is the
 closing error, and it belongs to both arms at once: it is not split between them.
 """
 
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import casadi as ca
 from armcal.arm.assembly import ArmState
@@ -31,8 +31,8 @@ class ClosedChainSettings(Settings):
 
     left: str = "left"
     right: str = "right"
-    noise: Length
-    orientation_noise: Angle
+    noise: Annotated[Length, Field(gt=0)]
+    orientation_noise: Annotated[Angle, Field(gt=0)]
     group_labels: tuple[str, ...] = ()
     clamps: dict[str, PoseSettings] = Field(default_factory=dict)
 
@@ -40,8 +40,6 @@ class ClosedChainSettings(Settings):
     def _sane(self) -> ClosedChainSettings:
         if self.left == self.right:
             raise ValueError(f"found {self.left} on both sides, expected two arms")
-        if self.noise <= 0 or self.orientation_noise <= 0:
-            raise ValueError("found a noise of zero or less, expected how far the clamp gives (standard deviation)")
         return self
 
 
@@ -81,7 +79,7 @@ class ClosedChain(Contact):
         """The known clamps."""
         return tuple(self._settings.clamps)
 
-    def told(self, arms: Mapping[str, ArmState], values: Mapping[str, Any]) -> dict[str, Any]:
+    def group_starts(self, arms: Mapping[str, ArmState], values: Mapping[str, Any]) -> dict[str, Any]:
         """The clamp is how the tools stand to each other."""
         between = self._between(arms)
         place = {f"clamp_{axis}": between.translation[i] for i, axis in enumerate("xyz")}

@@ -17,7 +17,7 @@ from armcal_dualarm.still import StillSettings
 class ArmColumns(Settings):
     """The columns of one arm's motors, by name or number (from 1), in the robot's own order.
 
-    ``order`` says for each joint from the base its number in the robot's own order; ``gear_ratios`` how far the motor
+    ``order`` gives for each joint from the base its number in the robot's own order; ``gear_ratios`` how far the motor
     of each joint from the base turns while the joint turns once, with its sign.
     """
 

@@ -69,21 +69,17 @@ class TwoArmLogReader:
         values = dict(zip(channels, joint_angles, strict=True))
         names = dict(zip(channels, table.names, strict=False))
         turning = {w.channel for w in request.wanted if w.dimension == "angle" and not w.is_endless}
-        self._refuse_turns(table, {channel: row for channel, row in values.items() if channel in turning}, names)
+        for channel, row in values.items():
+            over = np.flatnonzero((np.abs(row) > _FULL_TURN * (1 + 1e-9)) & np.isfinite(row))
+            if channel in turning and over.size:  # wrong ratios, or other units
+                first = int(over[0])
+                text = f"{channel} would stand at {row[first]:.6g} rad there, more than one turn (2 pi rad)."
+                hint = "Check order and gear_ratios, both from the base, and that the log is in radians."
+                self._refuse(text, hint, table.lines[first], names[channel])
         if times:
             values["time"] = from_unit(table.numbers[len(numbers)], s.time_unit)
         dataset = with_absent(self._dataset(table, joint_angles, values), request.wanted)
         return check_dataset(dataset, layout_of(request.wanted, dataset, names, {}, by_line=True))
-
-    def _refuse_turns(self, table: LogTable, turning: Mapping[str, Array], names: Mapping[str, str]) -> None:
-        """Angles of joints beyond a turn: wrong ratios, or other units."""
-        for channel, values in turning.items():
-            over = np.flatnonzero((np.abs(values) > _FULL_TURN * (1 + 1e-9)) & np.isfinite(values))
-            if over.size:
-                first = int(over[0])
-                text = f"{channel} would stand at {values[first]:.6g} rad there, more than one turn (2 pi rad)."
-                hint = "Check order and gear_ratios, both from the base, and that the log is in radians."
-                self._refuse(text, hint, table.lines[first], names[channel])
 
     def _dataset(self, table: LogTable, joints: Array, values: Mapping[str, Array]) -> Dataset:
         """All rows, or the means of the rests among them."""

@@ -29,7 +29,7 @@ Column = str | int
 
 @dataclass(frozen=True)
 class LogTable:
-    """The columns that were asked for.
+    """The requested columns.
 
     Attributes:
         lines: of each row (from 1).
@@ -98,7 +98,7 @@ def cells_of(text: str, delimiter: str) -> list[str]:
 
 
 def is_header(cells: Sequence[str], numbers: Sequence[Column], texts: Sequence[Column]) -> bool:
-    """Whether the first row holds names: asked for by name, no cell a number; by place, no number where one is due."""
+    """Whether the first row holds names: for columns by name, no number at all; by place, none where one is due."""
     if any(isinstance(column, str) for column in (*numbers, *texts)):
         return not any(is_number(cell) for cell in cells)
     due = [cells[column - 1] for column in numbers if isinstance(column, int) and 1 <= column <= len(cells)]

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Annotated, Any
 
 import casadi as ca
 from armcal.arm.effects import XYZ, EffectSettings, JointCommand, JointEffect, Spring
 from armcal.base.domains import Interval
 from armcal.base.parameters import ParameterBlock, scalar
 from armcal.base.settings import Torque
-from pydantic import field_validator
+from pydantic import Field
 
 PLAY_SCALE_RAD = 0.01
 
@@ -32,16 +32,9 @@ class ApproachBacklash(JointEffect):
 
 
 class TorqueBacklashSettings(EffectSettings):
-    """Which joints, and the torque at which 71 % of the play is taken up."""
+    """Which joints, and the torque at which 71 % of the play is taken up: it keeps the equilibrium smooth."""
 
-    transition: Torque = 0.05
-
-    @field_validator("transition")
-    @classmethod
-    def _positive(cls, value: float) -> float:
-        if value <= 0:
-            raise ValueError(f"a transition of {value:g} N m is not above zero: it keeps the equilibrium smooth")
-        return value
+    transition: Annotated[Torque, Field(gt=0)] = 0.05
 
 
 class TorqueBacklash(JointEffect):

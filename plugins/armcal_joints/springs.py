@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import casadi as ca
 from armcal.arm.effects import XYZ, EffectSettings, JointEffect, Spring
 from armcal.base.domains import Interval, Semidefinite
 from armcal.base.parameters import ParameterBlock, scalar
 from armcal.base.settings import Compliance
-from pydantic import field_validator
+from pydantic import Field, field_validator
 
 COMPLIANCE_SCALE_RAD_PER_NM = 0.05
 CUBIC_SCALE_RAD_PER_NM3 = 0.05
@@ -88,14 +88,7 @@ class ComplianceSettings(EffectSettings):
     """
 
     base: bool = True
-    compliance: Compliance = 0.01
-
-    @field_validator("compliance")
-    @classmethod
-    def _physical(cls, value: float) -> float:
-        if value <= 0:
-            raise ValueError(f"a compliance of {value:g} rad/(N m) is not above zero")
-        return value
+    compliance: Annotated[Compliance, Field(gt=0)] = 0.01
 
 
 class Compliances(JointEffect):

@@ -50,7 +50,7 @@ class RevoluteSettings(_JointSettings):
 
 
 class PrismaticSettings(_JointSettings):
-    """A joint that slides along a direction; the point says where its frame sits, no more."""
+    """A joint that slides along a direction; the point is where its frame sits, no more."""
 
     kind: Literal["prismatic"]
     point: Length3 = (0.0, 0.0, 0.0)

@@ -28,7 +28,7 @@ from armcal_simulation.safety import Bounds, SafetySettings
 from armcal_simulation.servo_model import ServoJointSettings, ServoModel
 
 ALL = "all"
-"""In the place of a joint's name: what holds for all joints that do not say otherwise."""
+"""In the place of a joint's name: settings of all joints, beneath each joint's own."""
 
 
 class BenchTrackerSettings(DTrackSenderSettings):
@@ -51,10 +51,10 @@ class ServoBenchSettings(Settings):
     """The truth of a bench: boards, servos, arm, tracker, and what counts as unsafe.
 
     ``servos`` is a servo file with the true oscillators and pulse tables; ``truth`` has the arm's true parameters by
-    name, and ``without_effects`` what the servos here do themselves. ``joints`` says what kind of servos they are, by
+    name, and ``without_effects`` what the servos here do themselves. ``joints`` has the kind of servo, by
     joint or for ``all``. Before the first pulse the arm hangs as it falls from ``start``. ``measurement`` is the one
     whose body the tracker sees, the only one by default. ``board_id`` and ``states_oscillator_hz`` are what a framed
-    board says of itself (0: nothing).
+    board reports of itself (0: nothing).
     """
 
     firmware: Literal["firmata", "framed"] = "framed"

@@ -15,7 +15,7 @@ from armcal.errors import InputError, Location
 
 Answer = Callable[[dict[str, Any]], dict[str, Any]]
 Port = tuple[int, int]
-"""A descriptor, and a number that tells it from an earlier one of the same name."""
+"""A descriptor, and a number by which it differs from an earlier one of the same name."""
 _AT_ONCE = 65536
 _LONGEST_LINE = 1 << 20
 _LOOK_UP_S = 0.25
@@ -93,7 +93,7 @@ class ClockServer:
             self._path.unlink(missing_ok=True)
 
     def _events(self) -> list[tuple[int, int]]:
-        """What happens next. A client that works with the bench asks again at once: it is not worth falling asleep."""
+        """What happens next. A client at work sends its next request at once: falling asleep would cost more."""
         until = time.perf_counter() + _AWAKE_S
         while self._clients and time.perf_counter() < until:
             if events := self._poll.poll(0):

@@ -98,10 +98,18 @@ class ContactsSimulator:
         measurements = request.measurements
         groups: dict[str, tuple[str, ...]] = {}
         for instance, keys in self._settings.groups.items():
-            _check_groups(request, instance, keys)
-            measurement = measurements[instance]
-            # what one measurement takes up may be another's
-            owner = owner_of(instance, measurement) if isinstance(measurement, GroupedMeasurement) else instance
+            measurement = measurements.get(instance)
+            if not isinstance(measurement, GroupedMeasurement):
+                raise ConfigError(
+                    f"simulation.groups: {instance!r} is no measurement with groups.",
+                    hint=f"The measurements are {', '.join(measurements)}.",
+                )
+            labels = measurement.group_labels
+            for key in keys:
+                if len(key.split("/")) != len(labels) if labels else key != ONLY:
+                    shape = "/".join(label.upper() for label in labels) or ONLY
+                    raise ConfigError(f"simulation.groups.{instance}: found {key!r}, expected {shape}.")
+            owner = owner_of(instance, measurement)  # what one measurement takes up may be another's
             groups[owner] = tuple(dict.fromkeys((*groups.get(owner, ()), *keys)))
         blocks = group_blocks(measurements, groups)
         source = load_config(self._settings.truth)
@@ -158,19 +166,6 @@ class ContactsSimulator:
                     hint=f"The arms are {', '.join(request.arms)}; its joints are {', '.join(known)}.",
                 )
         return {name: around.get(name.partition(".")[0], {}).get(name.partition(".")[2], 0.0) for name in names}
-
-
-def _check_groups(request: SimulationRequest, instance: str, keys: tuple[str, ...]) -> None:
-    if not isinstance(request.measurements.get(instance), GroupedMeasurement):
-        raise ConfigError(
-            f"simulation.groups: {instance!r} is no measurement with groups.",
-            hint=f"The measurements are {', '.join(request.measurements)}.",
-        )
-    labels = _labels(request.measurements[instance])
-    for key in keys:
-        if len(key.split("/")) != len(labels) if labels else key != ONLY:
-            shape = "/".join(label.upper() for label in labels) or ONLY
-            raise ConfigError(f"simulation.groups.{instance}: found {key!r}, expected {shape}.")
 
 
 def _labels(measurement: Measurement) -> tuple[str, ...]:

@@ -34,23 +34,18 @@ class DTrackSenderSettings(Settings):
     rate_hz: Annotated[float, Field(gt=0, le=1000)] = 60.0
     bodies: Annotated[dict[str, Number], Field(min_length=1, default_factory=lambda: {"base": 1, "tool": 2})]
     lines: Literal["6d", "6di"] = "6d"
-    noise: Length = 5e-5
-    orientation_noise: Angle = 3e-4
+    noise: Annotated[Length, Field(ge=0)] = 5e-5
+    orientation_noise: Annotated[Angle, Field(ge=0)] = 3e-4
     occluded: dict[str, Fraction] = Field(default_factory=dict)
-    occlusion: Duration = 0.2
+    occlusion: Annotated[Duration, Field(gt=0)] = 0.2
     lost_frames: Fraction = 0.0
-    latency: Duration = 0.0
+    latency: Annotated[Duration, Field(ge=0)] = 0.0
     clock_offset: Duration = 0.0
     clock_skew_ppm: Annotated[float, Field(ge=-1e5, le=1e5)] = 0.0
     first_frame: Annotated[int, Field(ge=0, lt=2**32)] = 1
 
     @model_validator(mode="after")
     def _sane(self) -> DTrackSenderSettings:
-        for name in ("noise", "orientation_noise", "latency"):
-            if getattr(self, name) < 0:
-                raise ValueError(f"found a {name} below zero, expected 0 or more")
-        if self.occlusion <= 0:
-            raise ValueError("found an occlusion that takes no time, expected a time above zero")
         if len(set(self.bodies.values())) != len(self.bodies):
             raise ValueError("found two bodies of one number, expected each to have its own")
         unknown = set(self.occluded) - set(self.bodies)
@@ -171,7 +166,8 @@ def datagram(counter: int, stamp: float, bodies: Mapping[int, Array | None], lin
     Args:
         counter: its number.
         stamp: seconds of the tracker's clock; what is sent counts from midnight.
-        bodies: ``world_T_body`` (4 x 4, m) by number; None where it is not seen: ``6d`` leaves it out, ``6di`` says so.
+        bodies: ``world_T_body`` (4 x 4, m) by number; None where it is not seen: ``6d`` leaves it out,
+            ``6di`` lists it as lost.
         lines: ``6d`` or ``6di``.
     """
     blocks: list[str] = []

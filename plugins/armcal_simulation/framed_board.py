@@ -75,6 +75,15 @@ class FramedBoard:
     ) -> None:
         self.boots = boots
         self._clock, self._bus, self._send, self._identity = clock, bus, send, identity
+        self._handlers = {
+            Kind.HELLO: self._hello,
+            Kind.TAKE: self._take_over,
+            Kind.WRITE: self._write,
+            Kind.READ: self._read,
+            Kind.SET: self._set,
+            Kind.BEAT: self._beat,
+            Kind.GUARD: self._guard,
+        }
         self._forget()
 
     def boot(self) -> None:
@@ -111,35 +120,23 @@ class FramedBoard:
             if ahead >= LATE:
                 return
         self._last = frame.sequence
+        kind = int(Kind.REFUSED)
         try:
-            kind, content = frame.kind | Kind.REPLY, self._done(frame)
+            if frame.kind not in self._handlers:
+                raise _RefusedError(Code.UNKNOWN_TYPE)
+            content = self._handlers[Kind(frame.kind)](frame.payload)
+            kind = frame.kind | Kind.REPLY
         except _RefusedError as refused:
-            kind, content = int(Kind.REFUSED), Refusal(frame.kind, refused.code, refused.detail).pack()
+            content = Refusal(frame.kind, refused.code, refused.detail).pack()
+        except ValueError:
+            content = Refusal(frame.kind, Code.BAD_PAYLOAD).pack()
         except BusStuckError:
-            kind, content = int(Kind.REFUSED), Refusal(frame.kind, Code.STUCK).pack()
+            content = Refusal(frame.kind, Code.STUCK).pack()
         flags = Flag.TOOK_OVER if self.guard.took_over else Flag(0)
         flags |= Flag.GUARDED if self.guard.is_set else Flag(0)
         flags |= Flag.STUCK if self._bus.stuck else Flag(0)
         self._reply = encoded(Frame(kind, frame.sequence, packed_head(Head(self.boots, flags)) + content))
         self._send(self._reply)
-
-    def _done(self, frame: Frame) -> bytes:
-        """Do what the frame requests; the reply's content."""
-        handlers = {
-            Kind.HELLO: self._hello,
-            Kind.TAKE: self._take_over,
-            Kind.WRITE: self._write,
-            Kind.READ: self._read,
-            Kind.SET: self._set,
-            Kind.BEAT: self._beat,
-            Kind.GUARD: self._guard,
-        }
-        if frame.kind not in handlers:
-            raise _RefusedError(Code.UNKNOWN_TYPE)
-        try:
-            return handlers[Kind(frame.kind)](frame.payload)
-        except ValueError:
-            raise _RefusedError(Code.BAD_PAYLOAD) from None
 
     def _hello(self, payload: bytes) -> bytes:
         Hello.read(payload)

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 from armcal.arm.assembly import Arm
-from armcal.arm.joints import Limits, by_dimension, joint_limits, unknown_joint
+from armcal.arm.joints import by_dimension, joint_limits, unknown_joint
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.errors import ConfigError
@@ -152,8 +152,17 @@ class MissionOfDays:
 
     def _commands(self, arm: Arm, times: Array, truth: MovingTruth, random: np.random.Generator) -> Dataset:
         """Random commands, and when the arm is there; nothing hangs on the tool."""
-        spans = _spans(arm, self._settings.records)
-        angles = np.array([random.uniform(low, high, len(times)) for low, high in spans])
+        records, keys = self._settings.records, ("simulation.records.ranges", "simulation.records.travel")
+        stated = by_dimension(arm.commanded, records.ranges, records.travel, keys)
+        positions: list[Array] = []
+        for joint, span in joint_limits(arm.nominal_chain, stated).items():
+            if span is None:
+                raise ConfigError(
+                    f"simulation.records: found no range of {joint}, and the arm states no limits of it.",
+                    hint=f"Write for example ranges_deg: {{{joint}: [-90, 90]}}.",
+                )
+            positions.append(random.uniform(*span, len(times)))
+        angles = np.array(positions)
         approach = approach_of(angles) if len(times) else angles
         channels = {f"{arm.name}.{joint}": angles[i] for i, joint in enumerate(arm.commanded)}
         channels |= {f"{arm.name}.approach.{joint}": approach[i] for i, joint in enumerate(arm.commanded)}
@@ -194,22 +203,6 @@ def _check(request: SimulationRequest, settings: MissionSettings) -> None:
         joint = getattr(event, "joint", joints[0])
         if fault := unknown_joint([joint], joints):
             raise ConfigError(f"simulation.events: {fault}.")
-
-
-def _spans(arm: Arm, records: RecordSettings) -> list[Limits]:
-    """From where to where each joint is driven (rad, or m)."""
-    keys = ("simulation.records.ranges", "simulation.records.travel")
-    spans: list[Limits] = []
-    for joint, span in joint_limits(
-        arm.nominal_chain, by_dimension(arm.commanded, records.ranges, records.travel, keys)
-    ).items():
-        if span is None:
-            raise ConfigError(
-                f"simulation.records: found no range of {joint}, and the arm states no limits of it.",
-                hint=f"Write for example ranges_deg: {{{joint}: [-90, 90]}}.",
-            )
-        spans.append(span)
-    return spans
 
 
 def _gravity(vectors: Array) -> dict[str, Array]:

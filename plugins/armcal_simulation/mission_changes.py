@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -147,9 +148,12 @@ def _slip(event: SlipSettings) -> float:
 def _paths(parameters: Parameters, settings: MissionSettings, random: np.random.Generator) -> Iterator[Path]:
     end = settings.days * DAY_S
     for glob, text in settings.creep.items():
+        written: str | float
         written, over, walks = parsed_creep(text)
+        with contextlib.suppress(ValueError):  # without a unit: the plain number that dimensionless parameters have
+            written = float(written)
         for name in parameters.select([glob]):
-            amount = _amount(parameters, name, _number(written))
+            amount = _amount(parameters, name, written)
             entry = _entry(parameters, name)
             if not walks:
                 yield Path(entry, np.array([0.0, end]), np.array([0.0, amount * end / over]))
@@ -185,11 +189,3 @@ def _entry(parameters: Parameters, name: str) -> int:
 
 def _amount(parameters: Parameters, name: str, text: str | float) -> float:
     return quantity(parameters[parameters.select([name])[0]], text, None, ())
-
-
-def _number(text: str) -> str | float:
-    """A text without a unit as the plain number that dimensionless parameters want."""
-    try:
-        return float(text)
-    except ValueError:
-        return text

@@ -25,15 +25,13 @@ class RecordSettings(Settings):
     ``ranges`` of turning and ``travel`` of sliding joints; a joint without one is driven between its limits.
     """
 
-    every: Duration = 600.0
+    every: Annotated[Duration, Field(gt=0)] = 600.0
     hours: tuple[Annotated[float, Field(ge=0, le=24)], Annotated[float, Field(ge=0, le=24)]] = (8.0, 18.0)
     ranges: dict[str, tuple[Angle, Angle]] = Field(default_factory=dict)
     travel: dict[str, tuple[Length, Length]] = Field(default_factory=dict)
 
     @model_validator(mode="after")
     def _sane(self) -> RecordSettings:
-        if self.every <= 0:
-            raise ValueError(f"found records every {self.every:g} s, expected a time above zero")
         if self.hours[0] >= self.hours[1]:
             raise ValueError("found hours that end before they begin, expected [from, to], such as [8, 18]")
         for joint, (low, high) in {**self.ranges, **self.travel}.items():
@@ -55,15 +53,9 @@ class TiltSettings(Settings):
     ``error`` is the standard deviation about each axis, made anew at each stand.
     """
 
-    most: Angle = 0.0
+    most: Annotated[Angle, Field(ge=0)] = 0.0
     drives_per_day: Annotated[float, Field(ge=0)] = 3.0
-    error: Angle = 0.0
-
-    @model_validator(mode="after")
-    def _sane(self) -> TiltSettings:
-        if self.most < 0 or self.error < 0:
-            raise ValueError("found a tilt or an error below zero, expected 0 or more")
-        return self
+    error: Annotated[Angle, Field(ge=0)] = 0.0
 
 
 class TemperatureSettings(Settings):
@@ -71,14 +63,8 @@ class TemperatureSettings(Settings):
 
     mean: Temperature = 20.0
     swing: Temperature = 0.0
-    period: Duration = 86400.0
+    period: Annotated[Duration, Field(gt=0)] = 86400.0
     warmest: float = 14.0
-
-    @model_validator(mode="after")
-    def _sane(self) -> TemperatureSettings:
-        if self.period <= 0:
-            raise ValueError(f"found a period of {self.period:g} s, expected one above zero")
-        return self
 
 
 class ThermalSettings(Settings):
@@ -147,7 +133,7 @@ class MissionSettings(Settings):
     creep: dict[str, str] = Field(default_factory=dict)
     events: tuple[Event, ...] = ()
     power_cuts: tuple[Day, ...] = ()
-    noise: Length | None = None
+    noise: Annotated[Length, Field(ge=0)] | None = None
     outliers: OutlierSettings = Field(default_factory=OutlierSettings)
 
     @field_validator("creep")
@@ -159,8 +145,6 @@ class MissionSettings(Settings):
 
     @model_validator(mode="after")
     def _sane(self) -> MissionSettings:
-        if (self.noise or 0) < 0:
-            raise ValueError("found a negative noise, expected 0 or more")
         began_at(self.start)
         return self
 

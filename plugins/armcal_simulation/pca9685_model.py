@@ -234,24 +234,20 @@ class Pca9685Model:
             self._awake_since = self._clock()
             if not self._restart_set():
                 self._restart_at = None  # woken within the cycle: nothing was stopped that could be restarted
-        if byte & RESTART:
-            self._restart()
+        if byte & RESTART and not self._restart_set():
+            self._violated("RESTART was written while it is not set: it does nothing")
+        elif byte & RESTART and self._mode1 & SLEEP:
+            self._violated("RESTART was written while the oscillator sleeps")
+        elif byte & RESTART:
+            if self._starting():
+                self._violated("RESTART was written within 500 us of the oscillator's start")
+            else:
+                self._running = [a or b for a, b in zip(self._running, self._stopped_while_running, strict=True)]
+            self._restart_at = None
         self._update_pins(range(CHANNELS))
 
     def _restart_set(self) -> bool:
         return self._restart_at is not None and self._clock() >= self._restart_at
-
-    def _restart(self) -> None:
-        if not self._restart_set():
-            self._violated("RESTART was written while it is not set: it does nothing")
-        elif self._mode1 & SLEEP:
-            self._violated("RESTART was written while the oscillator sleeps")
-        elif self._starting():
-            self._violated("RESTART was written within 500 us of the oscillator's start")
-            self._restart_at = None
-        else:
-            self._running = [a or b for a, b in zip(self._running, self._stopped_while_running, strict=True)]
-            self._restart_at = None
 
     def _starting(self) -> bool:
         if self._awake_since is None or self._mode1 & EXTCLK:

@@ -91,7 +91,13 @@ class Safety:
             return
         angle = servo.angle_of(commit.after)
         if commit.before is None:
-            self._judge_start(joint, now, angle)
+            last, other = self._first_pulse
+            if other != joint and now - last < settings.together * (1 - 1e-9):
+                self._offend("energised_together", joint, now, now - last, settings.together)
+            self._first_pulse, jump = (now, joint), angle - servo.angle
+            self._dropped.pop(joint, None)
+            self._weigh("first_pulse", joint, abs(jump), value=jump)
+            self._note("first_pulse", joint, now, jump)
         else:
             self._judge_speed(joint, commit, angle, period)
         self._commanded[joint] = angle
@@ -161,16 +167,6 @@ class Safety:
             worst = max(worst, (abs(angle - before) - count) / seconds)
         if worst > SPEED_SLACK * most:
             self._offend("speed", joint, now, worst, SPEED_SLACK * most)
-
-    def _judge_start(self, joint: str, now: float, angle: float) -> None:
-        last, other = self._first_pulse
-        if other != joint and now - last < self._settings.together * (1 - 1e-9):
-            self._offend("energised_together", joint, now, now - last, self._settings.together)
-        self._first_pulse = now, joint
-        jump = angle - self._servos[joint].angle
-        self._dropped.pop(joint, None)
-        self._weigh("first_pulse", joint, abs(jump), value=jump)
-        self._note("first_pulse", joint, now, jump)
 
     def _offend(self, kind: str, joint: str, now: float, value: float, limit: float) -> None:
         self.offences[kind] += 1

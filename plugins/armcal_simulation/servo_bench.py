@@ -56,7 +56,7 @@ class BoardFirmware(Protocol):
 
 
 class BenchWorld:
-    """A bench as a whole: its time, and what happens in it when the port or the clock's socket ask for it.
+    """A bench as a whole: its time, and what happens in it on requests of the port and the clock's socket.
 
     Attributes:
         now: simulated seconds since the bench began.
@@ -233,7 +233,7 @@ class BenchWorld:
 class ServoBench:
     """The simulated bench ``servo_bench``.
 
-    Everything happens in simulated time, which passes only when the clock's socket is asked to let it pass. The same
+    Everything happens in simulated time, which passes only on requests to the clock's socket. The same
     seed and the same requests give the same bytes.
     """
 

@@ -31,25 +31,19 @@ class ServoJointSettings(Settings):
     """
 
     speed_deg_per_s: Positive = 300.0
-    dead_band: Angle = 0.0
-    backlash: Angle = 0.0
+    dead_band: Annotated[Angle, Field(ge=0)] = 0.0
+    backlash: Annotated[Angle, Field(ge=0)] = 0.0
     travel: tuple[Angle, Angle] = (-2.4, 2.4)
-    stall: Torque = 4.0
-    friction: Torque = 0.05
+    stall: Annotated[Torque, Field(gt=0)] = 4.0
+    friction: Annotated[Torque, Field(ge=0)] = 0.05
     fall_deg_per_s: Positive = 60.0
-    continuous: Torque = 1.5
-    winding_time: Duration = 60.0
-    case_time: Duration = 900.0
+    continuous: Annotated[Torque, Field(gt=0)] = 1.5
+    winding_time: Annotated[Duration, Field(gt=0)] = 60.0
+    case_time: Annotated[Duration, Field(gt=0)] = 900.0
     winding_share: Annotated[float, Field(gt=0, lt=1)] = 0.3
 
     @model_validator(mode="after")
     def _physical(self) -> ServoJointSettings:
-        for name in ("stall", "continuous", "winding_time", "case_time"):
-            if getattr(self, name) <= 0:
-                raise ValueError(f"found a {name} that is not above zero")
-        for name in ("dead_band", "backlash", "friction"):
-            if getattr(self, name) < 0:
-                raise ValueError(f"found a {name} below zero, expected 0 or more")
         if not self.travel[0] < self.travel[1]:
             raise ValueError("the ends of travel are not in rising order: give [lowest, highest]")
         return self

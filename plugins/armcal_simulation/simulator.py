@@ -16,7 +16,7 @@ from armcal.base.settings import Angle, InputPath, Length, Settings
 from armcal.errors import ConfigError
 from armcal.estimate.simulation import SimulationRequest, measured_without_noise, with_channels
 from armcal.testing import EXAMPLE_TRUTH
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from armcal_simulation.readings import (
     OutlierSettings,
@@ -76,15 +76,9 @@ class ElasticArmSettings(Settings):
     truth: InputPath
     poses: PoseSettings
     seed: Annotated[int, Field(ge=0)] = 0
-    noise: Length | None = None
-    quantisation: Angle = 0.0
+    noise: Annotated[Length, Field(ge=0)] | None = None
+    quantisation: Annotated[Angle, Field(ge=0)] = 0.0
     outliers: OutlierSettings = Field(default_factory=OutlierSettings)
-
-    @model_validator(mode="after")
-    def _sane(self) -> ElasticArmSettings:
-        if (self.noise or 0) < 0 or self.quantisation < 0:
-            raise ValueError("found a negative noise or quantisation, expected 0 or more")
-        return self
 
 
 class ElasticArmSimulator:

@@ -39,8 +39,8 @@ _SAVE_AS_TEXT = "Save the table as CSV text in UTF-8."
 class CsvSettings(Settings):
     """Which file, and what its columns are called.
 
-    ``columns`` maps a wanted name with its unit to the file's own: ``{q1_deg: joint_1_deg}``, or
-    ``{q1_deg: J1}`` for a column that does not say its unit.
+    ``columns`` maps a name with its unit to the file's own: ``{q1_deg: joint_1_deg}``, or
+    ``{q1_deg: J1}`` for a column without its unit.
     """
 
     path: InputPath

@@ -48,17 +48,17 @@ def json_frame(line: bytes) -> Frame:
     if not isinstance(bodies, dict) or len(bodies) > MOST_BODIES or max(map(len, bodies), default=0) > LONGEST_NAME:
         raise UnreadableError("bodies that are no object of bodies by name")
     stamp = None if content.get("t") is None else _numbers([content["t"]], 1)[0]
-    poses = {name: None if body is None else _pose(body) for name, body in bodies.items()}
+    poses: dict[str, Array | str | None] = {}
+    for name, body in bodies.items():
+        keys = [key for key in _POSITIONS if isinstance(body, dict) and key in body]
+        if body is not None and (len(keys) != 1 or set(body) - {"q", keys[0]}):
+            raise UnreadableError("a body without one of p_mm and p_m, or with more than that and q")
+        poses[name] = None
+        if body is not None:
+            position = [from_unit(x, _POSITIONS[keys[0]]) for x in _numbers(body[keys[0]], 3)]
+            poses[name] = body_pose(position, _numbers(body["q"], 4) if body.get("q") is not None else None)
     wrong = tuple(pose for pose in poses.values() if isinstance(pose, str))
     return Frame(counter, stamp, {n: None if isinstance(pose, str) else pose for n, pose in poses.items()}, wrong)
-
-
-def _pose(body: Any) -> Array | str:
-    given = [name for name in _POSITIONS if isinstance(body, dict) and name in body]
-    if len(given) != 1 or set(body) - {"q", given[0]}:
-        raise UnreadableError("a body without one of p_mm and p_m, or with more than that and q")
-    position = [from_unit(x, _POSITIONS[given[0]]) for x in _numbers(body[given[0]], 3)]
-    return body_pose(position, _numbers(body["q"], 4) if body.get("q") is not None else None)
 
 
 def _numbers(values: Any, count: int) -> list[float]:

@@ -29,7 +29,7 @@ class Orientation(Settings):
 
     @property
     def declared(self) -> str:
-        """What the file is said to hold."""
+        """The declared meaning of the columns."""
         raise NotImplementedError
 
     def mapped(self) -> Mapping[str, str]:
@@ -89,7 +89,7 @@ class QuaternionColumns(Orientation):
 
     @override
     def others(self, values: Array) -> dict[str, Rotation]:
-        """The other order; it is the inverse between two fixed rotations, so no turn tells one from the other."""
+        """The other order; it is the inverse between two fixed rotations, so that no turn of records shows it."""
         other = _OTHER[self.order]
         in_file = values[:, ["wxyz".index(part) for part in self.order]]
         exchanged = Rotation.from_quat(in_file[:, [other.index(part) for part in "xyzw"]])

@@ -36,7 +36,7 @@ TOLERANCE = 1e-3
 MOST_FAULTY = 0.05
 WORSE = 3.0
 WORST_DEG = 5.0
-"""What the columns are said to mean is refused if it fits the arm worse than this, and so much worse than another."""
+"""The declared meaning of the columns is refused if it fits the arm worse than this, and so much worse than another."""
 _ZERO = 1e-6
 FEWEST = 6
 _STRIDES = (1, 2, 3, 5, 7, 11, 17)

@@ -173,12 +173,8 @@ def _hanging(robot: Robot, link: str, on_chain: set[str]) -> Iterator[tuple[str,
     while waiting:
         here, pose = waiting.pop(0)
         yield here, pose
-        beyond = (joint for joint in robot.below[here] if joint.name not in on_chain)
-        waiting += [(joint.child, pose @ _origin(joint)) for joint in beyond]
-
-
-def _origin(joint: UrdfJoint) -> Array:
-    """The pose (4x4) of a joint at zero in its parent's frame."""
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = Rotation.from_euler("xyz", joint.rpy).as_matrix(), joint.xyz
-    return pose
+        for joint in robot.below[here]:
+            if joint.name not in on_chain:
+                origin = np.eye(4)
+                origin[:3, :3], origin[:3, 3] = Rotation.from_euler("xyz", joint.rpy).as_matrix(), joint.xyz
+                waiting.append((joint.child, pose @ origin))

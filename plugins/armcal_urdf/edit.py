@@ -6,8 +6,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from operator import itemgetter
 
-from armcal_urdf.elements import UTF8
-from armcal_urdf.numbers import Three, words_of
+from armcal_urdf.elements import UTF8, Three, words_of
 from armcal_urdf.robot import UrdfJoint
 
 _ROUNDING = 1e-13

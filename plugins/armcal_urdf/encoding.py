@@ -69,7 +69,7 @@ def decode(data: bytes, label: str) -> tuple[str, Encoding]:
 def declared(text: str, label: str) -> Encoding | None:
     """The encoding that the text's first line declares, None if it declares none.
 
-    UTF-16 cannot be told from the declaration alone, and a declaration of it in another encoding is wrong.
+    UTF-16 cannot be recognised by the declaration alone, and a declaration of it in another encoding is wrong.
 
     Raises:
         ConfigError: it is not one of those known.

@@ -18,9 +18,9 @@ from armcal.errors import ConfigError, ProblemError
 from scipy.spatial.transform import Rotation
 
 from armcal_urdf.edit import Placed, with_origins
+from armcal_urdf.elements import Three
 from armcal_urdf.encoding import encode
 from armcal_urdf.model import RPY, XYZ, UrdfModel, UrdfSettings
-from armcal_urdf.numbers import Three
 
 TOLERANCE_M = 1e-9
 TOLERANCE_RAD = 1e-9
@@ -114,7 +114,7 @@ def _frames(arm: Arm, model: UrdfModel, values: Mapping[str, float], commands: A
 
 
 def _placed(request: ExportRequest) -> tuple[str, ...]:
-    """Where the arm stands, of which a URDF says nothing: its base is the arm's own."""
+    """Where the arm stands, which a URDF does not hold: its base is the arm's own."""
     if not request.arm.placement:
         return ()
     scope = f"{request.name}.{PLACEMENT}_"

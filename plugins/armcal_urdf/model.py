@@ -129,7 +129,7 @@ class UrdfModel:
         return tuple(joint.name for joint in self.urdf_chain.moving)
 
     def parameters(self) -> tuple[ParameterBlock, ...]:
-        """The origins of all joints on the chain, as xyz and rpy say."""
+        """The origins of all joints on the chain: xyz (m) and rpy (rad)."""
         blocks: list[ParameterBlock] = []
         for joint in self.urdf_chain.joints:
             xyz, rpy = zip(XYZ, joint.urdf.xyz, strict=True), zip(RPY, joint.urdf.rpy, strict=True)

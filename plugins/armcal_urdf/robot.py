@@ -10,8 +10,7 @@ from functools import cached_property
 
 from armcal.arm.model import Mimic
 
-from armcal_urdf.elements import Element, read_elements
-from armcal_urdf.numbers import Three, number, three, unit_axis
+from armcal_urdf.elements import Element, Three, number, read_elements, three, unit_axis
 
 MOVING = ("revolute", "continuous", "prismatic")
 FREE = ("floating", "planar")
@@ -118,7 +117,7 @@ def read_robot(text: str, label: str) -> Robot:
         label: the file's name, for messages.
 
     Raises:
-        ConfigError: it is no URDF, or what it says cannot be; with file and line.
+        ConfigError: it is no URDF, or describes what cannot be; with file and line.
     """
     top = read_elements(text, label)
     if top.tag != "robot":
@@ -189,7 +188,7 @@ def _named_link(element: Element, which: str, joint: str) -> str:
 
 
 def _limits(element: Element | None, joint: str) -> tuple[float, float] | None:
-    """Where only one end is written the other is 0, as the format says; where neither is, nothing is known."""
+    """Where only one end is written the other is 0, by the format; where neither is, nothing is known."""
     if element is None:
         return None
     for attribute in element.attributes:

@@ -15,7 +15,7 @@ from armcal.errors import ConfigError, ProblemError
 from armcal.measure.contact import ArmsAlone
 from armcal.problem.problem import Problem
 from armcal_capability.accuracy import steps_at, with_accuracy
-from armcal_capability.areas import AreaSearch, cells_of
+from armcal_capability.cells import AreaSearch, cells_of, grouped, voxels_of
 from armcal_capability.inverse import Pointing
 from armcal_capability.loading import Task, load_designs, load_task
 from armcal_capability.mechanics import MechanicsFunction
@@ -24,7 +24,6 @@ from armcal_capability.settings import AreaSettings, CapabilitySettings, LoadSet
 from armcal_capability.subject import Subject
 from armcal_capability.summary import design_summaries
 from armcal_capability.survey import Survey, outline, spread, survey
-from armcal_capability.voxels import grouped, voxels_of
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs" / "lrm_arm"
 LINKS = (0.3, 0.25)

@@ -17,9 +17,8 @@ from armcal.measure.reader import ReadRequest, requested_channels
 from armcal_contact.json_joints import JsonLinesJoints, JsonLinesJointSettings
 from armcal_dualarm.closure import ClosedChain, ClosedChainSettings
 from armcal_dualarm.live import TwoArmLogStream, TwoArmStreamSettings
-from armcal_dualarm.live_still import LiveRests, Rows
 from armcal_dualarm.log_reader import TwoArmLogReader, TwoArmLogSettings
-from armcal_dualarm.still import StillSettings, rests
+from armcal_dualarm.still import LiveRests, Rows, StillSettings, rests
 from armcal_mdh.model import MdhModel, MdhSettings
 
 CHANNELS = ("arm.j1", "arm.j2")

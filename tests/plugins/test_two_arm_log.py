@@ -252,7 +252,7 @@ def test_the_place_of_an_angle_beyond_a_turn_is_told(tmp_path):
         ({"still": {"window_s": 1}}, "needs the column of the time"),
         ({"still": {}}, "either window_s or samples"),
         ({"still": {"samples": 1}}, "greater than or equal to 2"),
-        ({"still": {"samples": 5, "spread_deg": 0}}, "both above zero"),
+        ({"still": {"samples": 5, "spread_deg": 0}}, "greater than 0"),
     ],
     ids=str,
 )

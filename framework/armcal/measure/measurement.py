@@ -90,8 +90,8 @@ class GroupedMeasurement(Protocol):
     def group_parameters(self, group: str) -> Sequence[ParameterBlock]:
         """The numbers of one group, free where they are not known; of every group the same names and domains."""
 
-    def told(self, arms: Mapping[str, ArmState], values: Mapping[str, Expression]) -> Mapping[str, Expression]:
-        """What one record alone says of its group's unknowns, to start from; empty to start from the nominal ones."""
+    def group_starts(self, arms: Mapping[str, ArmState], values: Mapping[str, Expression]) -> Mapping[str, Expression]:
+        """The group's parameters by one record alone, to start from; empty to start from the nominal ones."""
 
     def ties(self, groups: Sequence[str]) -> Sequence[Tie]:
         """What is known between these groups."""

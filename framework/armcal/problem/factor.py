@@ -205,7 +205,7 @@ def build_factor(
     next_state = ca.densify(ca.vertcat(*[states[a].next_deflection for a in measurement.arms]))
     outputs = ca.vertcat(*predicted.values())
     tools = ca.vertcat(*[ca.vec(states[a].base_T_tool.matrix()[:3, :]) for a in measurement.arms])
-    starts = {n: ca.SX(entries) for n, entries in groups.told(states, local).items()} if groups else {}
+    starts = {n: ca.SX(entries) for n, entries in groups.group_starts(states, local).items()} if groups else {}
     nuisance_starts = ca.densify(ca.vertcat(ca.SX(0, 1), *starts.values()))
     used = records.used_by(ca.vertcat(residual, next_state, outputs, tools, nuisance_starts))
     own = [(arm_name, arms[arm_name.removesuffix(OTHER)]) for arm_name in measurement.arms]

@@ -101,7 +101,7 @@ class Walls(Contact):
         """A wall's height."""
         return (replace(scalar("height", "m", 0.0, 0.01), free=True),)
 
-    def told(self, arms: Mapping[str, ArmState], values: Mapping[str, Expression]) -> dict[str, Expression]:
+    def group_starts(self, arms: Mapping[str, ArmState], values: Mapping[str, Expression]) -> dict[str, Expression]:
         """The tool is at the wall's height."""
         return {"height": arms[self.arms[0]].base_T_tool.translation[2]}
 

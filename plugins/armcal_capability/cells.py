@@ -1,9 +1,10 @@
-"""Areas of the workspace: how much of a box the tool reaches, and what the arm is like there."""
+"""Cells of the workspace: the map of all postures, and areas, how much of a box the tool reaches and how well."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from armcal.arm.clearance import Mask
@@ -12,9 +13,62 @@ from numpy.typing import NDArray
 
 from armcal_capability.inverse import Pointing, reach_for
 from armcal_capability.mechanics import MechanicsFunction
-from armcal_capability.quantities import Postures, Weights, postures_at
+from armcal_capability.quantities import BY_NAME, Postures, Weights, postures_at
 from armcal_capability.settings import AreaSettings
-from armcal_capability.voxels import grouped
+
+Statistic = Literal["best", "mean", "worst"]
+
+
+@dataclass(frozen=True)
+class Voxels:
+    """Cells that hold a tool position.
+
+    Attributes:
+        size: of a cell's side (m).
+        places: whole-number places of the cells (cells x 3); a cell's centre is at (place + 1/2) size.
+        counts: postures in each (cells).
+        values: by quantity: best, mean and worst (3 x cells; in the quantity's unit).
+    """
+
+    size: float
+    places: NDArray[np.int64]
+    counts: NDArray[np.int64]
+    values: Mapping[str, Array]
+
+    @property
+    def centres(self) -> Array:
+        """Of the cells (cells x 3; m, base frame)."""
+        return np.asarray((self.places + 0.5) * self.size)
+
+    def of(self, name: str, statistic: Statistic = "mean") -> Array:
+        """One number a cell."""
+        return np.asarray(self.values[name][("best", "mean", "worst").index(statistic)])
+
+
+def voxels_of(postures: Postures, size: float) -> Voxels:
+    """The cells of postures; their order is that of their places, whatever that of the postures."""
+    places = np.floor(postures.positions / size).astype(np.int64)
+    cells, cell, counts = np.unique(places, axis=0, return_inverse=True, return_counts=True)
+    values = grouped(postures.values, cell.ravel(), len(cells))
+    return Voxels(size, cells.reshape(-1, 3), counts, values)
+
+
+def grouped(values: Mapping[str, Array], group: NDArray[np.intp], count: int) -> dict[str, Array]:
+    """Best, mean and worst (3 x count) of quantities by group; not a number where a group has none."""
+    members = np.bincount(group, minlength=count)
+    order = np.argsort(group, kind="stable")
+    filled = np.flatnonzero(members)
+    starts = np.concatenate([[0], np.cumsum(members[filled])[:-1]]).astype(np.intp)
+    statistics = {}
+    for name, value in values.items():
+        rows = np.full((3, count), np.nan)
+        if len(filled):
+            ordered = value[order]
+            low, high = np.minimum.reduceat(ordered, starts), np.maximum.reduceat(ordered, starts)
+            best, worst = (low, high) if BY_NAME[name].good == "low" else (high, low)
+            rows[:, filled] = best, np.add.reduceat(ordered, starts) / members[filled], worst
+        statistics[name] = rows
+    return statistics
 
 
 @dataclass(frozen=True)
@@ -65,8 +119,8 @@ class AreaSearch:
     weights: Weights
     sampled: Postures
 
-    def __call__(self, area: AreaSettings, size: float, ways: int) -> AreaMap:
-        """An area cut into cells of ``size`` (m), with at most so many postures (``ways``) found for each."""
+    def __call__(self, area: AreaSettings, size: float, most: int) -> AreaMap:
+        """An area cut into cells of ``size`` (m), with at ``most`` so many postures sought for each."""
         from scipy.spatial import cKDTree
 
         centres = cells_of(area, size)
@@ -77,7 +131,7 @@ class AreaSearch:
             away = np.maximum(pointing.angles(self.sampled.rotations) - pointing.within, 0.0) * self.weights.length
             where = np.column_stack([where, away])
             targets = np.column_stack([centres, np.zeros(len(centres))])
-        nearest = cKDTree(where).query(targets, k=min(ways, len(where)))[1].reshape(-1)
+        nearest = cKDTree(where).query(targets, k=min(most, len(where)))[1].reshape(-1)
         starts = np.asarray(self.sampled.commands[:, nearest])
         cell = np.repeat(np.arange(len(centres)), starts.shape[1] // len(centres))
         arrivals = reach_for(self.function, centres[cell].T, starts, self.limits, self.weights.length, pointing)
