@@ -16,10 +16,9 @@ from typing_extensions import override
 
 from armcal.base.domains import Array
 from armcal.planning.candidates import Candidates, Indices
-from armcal.planning.criterion import Criterion
+from armcal.planning.criterion import SMALLEST_DETERMINANT, Criterion, packed_log_det, packed_trace
 
 _REFRESH = 64
-_SMALLEST = 1e-13
 _TOLERANCE = 1e-9
 _DOUBTFUL = -12.0
 """A removal that takes so much of the log determinant would carry rounding into the inverse."""
@@ -128,17 +127,17 @@ class DeterminantTally(Tally):
 
     @override
     def if_added(self) -> Array:
-        return _log_det(self._seen, self._n_rows)  # log det(I + H C H')
+        return packed_log_det(self._seen, self._n_rows)  # log det(I + H C H')
 
     @override
     def if_removed(self, chosen: Indices) -> Array:
-        return _log_det(-self._seen[:, chosen], self._n_rows)  # log det(I - H C H')
+        return packed_log_det(-self._seen[:, chosen], self._n_rows)  # log det(I - H C H')
 
     @override
     def if_swapped(self, candidate: int) -> Array:
         loss = self.if_removed(np.array([candidate]))[0]
         half, _ = self._half(candidate, -1.0)
-        return _log_det(self._seen + self._outer(half, half), self._n_rows) + float(loss)
+        return packed_log_det(self._seen + self._outer(half, half), self._n_rows) + float(loss)
 
     @override
     def tolerance(self) -> float:
@@ -156,7 +155,7 @@ class DeterminantTally(Tally):
     def _change(self, candidate: int, sign: float) -> None:
         rows = self._rows_of(candidate)
         information = self._information + sign * (rows.T @ rows)
-        doubtful = sign < 0 and float(_log_det(-self._seen[:, [candidate]], self._n_rows)[0]) < _DOUBTFUL
+        doubtful = sign < 0 and float(packed_log_det(-self._seen[:, [candidate]], self._n_rows)[0]) < _DOUBTFUL
         if doubtful or self._changes >= _REFRESH:
             self._settle(information)
             return
@@ -177,7 +176,7 @@ class DeterminantTally(Tally):
         reached = self._inverse @ rows.T
         middle = np.eye(self._n_rows) + sign * (rows @ reached)
         values, vectors = np.linalg.eigh((middle + middle.T) / 2)
-        factor = reached @ (vectors / np.sqrt(np.maximum(values, _SMALLEST)))
+        factor = reached @ (vectors / np.sqrt(np.maximum(values, SMALLEST_DETERMINANT)))
         return self._across(factor), factor
 
     def _across(self, factor: Array) -> Array:
@@ -197,11 +196,11 @@ class TraceTally(DeterminantTally):
 
     @override
     def if_added(self) -> Array:
-        return _trace_of_solution(self._seen, self._squared, self._n_rows)  # tr (I + H C H')^-1 H C^2 H'
+        return packed_trace(self._seen, self._squared, self._n_rows)  # tr (I + H C H')^-1 H C^2 H'
 
     @override
     def if_removed(self, chosen: Indices) -> Array:
-        return -_trace_of_solution(-self._seen[:, chosen], self._squared[:, chosen], self._n_rows)
+        return -packed_trace(-self._seen[:, chosen], self._squared[:, chosen], self._n_rows)
 
     @override
     def if_swapped(self, candidate: int) -> Array:
@@ -209,7 +208,7 @@ class TraceTally(DeterminantTally):
         half, factor = self._half(candidate, -1.0)
         seen = self._seen + self._outer(half, half)
         squared = self._squared_after(half, factor, -1.0)
-        return _trace_of_solution(seen, squared, self._n_rows) + float(loss)
+        return packed_trace(seen, squared, self._n_rows) + float(loss)
 
     @override
     def tolerance(self) -> float:
@@ -292,41 +291,3 @@ class SpectralTally(Tally):
             few = np.argpartition(-scores, SHORTLIST)[:SHORTLIST].astype(np.intp)
         change[few] = self._values(information[:, None] + self._of(few)) - self._value
         return change
-
-
-def _log_det(packed: Array, n_rows: int) -> Array:
-    """log det(I + S) of packed symmetric matrices; very small where it is not positive definite."""
-    if n_rows == 1:
-        determinant = 1 + packed[0]
-    elif n_rows == 3:
-        a, b, c, d, e, f = packed
-        a, d, f = a + 1, d + 1, f + 1
-        determinant = a * (d * f - e * e) - b * (b * f - c * e) + c * (b * e - c * d)
-    else:
-        signs, logarithms = np.linalg.slogdet(_unpacked(packed, n_rows) + np.eye(n_rows))
-        return np.asarray(np.where(signs > 0, logarithms, np.log(_SMALLEST)))
-    return np.asarray(np.log(np.maximum(determinant, _SMALLEST)))
-
-
-def _trace_of_solution(seen: Array, squared: Array, n_rows: int) -> Array:
-    """tr (I + S)^-1 Q of packed symmetric matrices."""
-    if n_rows == 1:
-        return np.asarray(squared[0] / np.maximum(1 + seen[0], _SMALLEST))
-    if n_rows == 3:
-        a, b, c, d, e, f = seen
-        a, d, f = a + 1, d + 1, f + 1
-        adjugate = (d * f - e * e, c * e - b * f, b * e - c * d, a * f - c * c, b * c - a * e, a * d - b * b)
-        determinant = a * adjugate[0] + b * adjugate[1] + c * adjugate[2]
-        weights = (1.0, 2.0, 2.0, 1.0, 2.0, 1.0)
-        total = sum(w * x * q for w, x, q in zip(weights, adjugate, squared, strict=True))
-        return np.asarray(total / np.maximum(determinant, _SMALLEST))
-    whole = _unpacked(seen, n_rows) + np.eye(n_rows)
-    return np.asarray(np.trace(np.linalg.solve(whole, _unpacked(squared, n_rows)), axis1=1, axis2=2))
-
-
-def _unpacked(packed: Array, n_rows: int) -> Array:
-    left, right = np.triu_indices(n_rows)
-    whole = np.empty((packed.shape[1], n_rows, n_rows))
-    whole[:, left, right] = packed.T
-    whole[:, right, left] = packed.T
-    return whole

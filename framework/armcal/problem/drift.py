@@ -42,9 +42,9 @@ class Chain:
         nodes = np.unique(np.vstack([self.places, own]), axis=0, return_inverse=True)[1].ravel()
         return nodes[len(self.places) :]
 
-    def apart(self, drifting: Sequence[ParameterBlock]) -> Array:
-        """From each node to the next, in distances over which each parameter forgets (n_k - 1 x parameters)."""
-        steps = [np.abs(np.diff(self.places[:, self.channels.index(d.channel)])) / d.over for d in _drifts(drifting)]
+    def apart(self, drifts: Sequence[Drift]) -> Array:
+        """From each node to the next, in distances over which each parameter forgets (n_k - 1 x drifts)."""
+        steps = [np.abs(np.diff(self.places[:, self.channels.index(d.channel)])) / d.over for d in drifts]
         return np.stack(steps, axis=1)
 
 
@@ -57,9 +57,8 @@ def chain(problem: Problem, *datasets: Dataset) -> Chain | None:
     drifting = _drifting(problem)
     if not drifting:
         return None
-    channels = tuple(dict.fromkeys(drift.channel for drift in _drifts(drifting)))
-    stated = zip(drifting, _drifts(drifting), strict=True)
-    for (block, drift), dataset in itertools.product(stated, datasets):
+    channels = tuple(dict.fromkeys(drift.channel for _, drift in drifting))
+    for (block, drift), dataset in itertools.product(drifting, datasets):
         if not dataset.has(drift.channel):
             raise DataError(
                 f"{block.name} drifts over {drift.channel}, and the records do not carry it.",
@@ -78,12 +77,8 @@ def chain(problem: Problem, *datasets: Dataset) -> Chain | None:
     return Chain(channels, places)
 
 
-def _drifting(problem: Problem) -> list[ParameterBlock]:
-    return [block for block in problem.parameters.free if block.drift is not None]
-
-
-def _drifts(drifting: Sequence[ParameterBlock]) -> list[Drift]:
-    return [block.drift for block in drifting if block.drift is not None]
+def _drifting(problem: Problem) -> list[tuple[ParameterBlock, Drift]]:
+    return [(block, block.drift) for block in problem.parameters.free if block.drift is not None]
 
 
 def with_drift(
@@ -106,7 +101,7 @@ def with_drift(
     drifting = _drifting(problem)
     shared = [replace(record, weight=np.ones_like(record.weight), correlation=None) for record in records]
     place = {name: i for i, name in enumerate(problem.free_names)}
-    chosen, sds = [place[block.name] for block in drifting], np.array([drift.sd for drift in _drifts(drifting)])
+    chosen, sds = [place[block.name] for block, _ in drifting], np.array([drift.sd for _, drift in drifting])
     slopes, raw = [], []  # by states, each a standard deviation of a parameter's drift
     for kernel, record, jacobian in zip(problem.kernels, shared, problem.jacobians(values, shared), strict=True):
         slope = np.moveaxis(jacobian[:, chosen], 1, 2) * sds
@@ -115,7 +110,7 @@ def with_drift(
         raw.append(np.pad(np.einsum("wrs,swz->rwz", noise_roots(kernel.factor, record), slope), padding))
     node = along.nodes(dataset)
     node = np.pad(node, (0, len(records[0].weight) - len(node)), mode="edge")
-    correlation = Correlation(tuple(slopes), tuple(raw), node, along.apart(drifting))
+    correlation = Correlation(tuple(slopes), tuple(raw), node, along.apart([drift for _, drift in drifting]))
     correlation = correlation.weighted([record.weight for record in records])
     return tuple(replace(record, correlation=correlation) for record in records)
 

@@ -167,10 +167,6 @@ class _Records:
     def number(self, channel: str) -> Expression:
         return self.symbols.setdefault(channel, ca.SX.sym(channel))
 
-    def has(self, channel: str) -> bool:
-        """Whether the records carry a channel."""
-        return channel in self._available
-
     def optional(self, channel: str, default: float) -> Expression:
         return self.number(channel) if channel in self._available else ca.SX(default)
 
@@ -289,6 +285,6 @@ def _arm_states(
         commands = [records.number(f"{arm.name}.{joint}{which}") for joint in arm.commanded]
         approaches = [records.optional(f"{arm.name}.approach.{joint}{which}", 0.0) for joint in arm.commanded]
         angles, approach = ca.vertcat(*arm.joint_commands(commands)), ca.vertcat(*arm.joint_approaches(approaches))
-        conditions = {channel: records.number(channel) for channel in arm.conditions if records.has(channel)}
+        conditions = {channel: records.number(channel) for channel in arm.conditions if channel in available}
         states[name] = arm.state(values, ArmInputs(angles, approach, load, deflections[-1], conditions))
     return records, states, deflections

@@ -58,10 +58,11 @@ class PosedProblem:
         Raises:
             NotConvergedError: a record has no elastic equilibrium there.
         """
-        data = self._data(x)
+        data = self.problem.normal_equations(self.values(x), self.records)
         gradient, hessian = self._chained(x, data)
         curvature = self.problem.parameters.curvature(self._entry_gradient(x, data.gradient))
-        return NormalEquations(data.cost + self._prior_cost(x), gradient, hessian + curvature * self._products())
+        hessian = hessian + curvature * np.outer(self.scales, self.scales)
+        return NormalEquations(data.cost + self._prior_cost(x), gradient, hessian)
 
     def convex_model(self, x: Array) -> NormalEquations:
         """Cost, gradient and Gauss-Newton Hessian by ``c``.
@@ -70,19 +71,16 @@ class PosedProblem:
             NotConvergedError: a record has no elastic equilibrium there.
         """
         chain = self.problem.parameters.entries_jacobian(self.values(x)) * self.coordinate_scales
-        data = self._data(x).chained(chain)
+        data = self.problem.normal_equations(self.values(x), self.records).chained(chain)
         gradient = data.gradient + self._prior * self.coordinates(x)
         return NormalEquations(data.cost + self._prior_cost(x), gradient, data.hessian + np.diag(self._prior))
 
     def exact_hessian(self, x: Array) -> Array:
         """The Hessian by ``x`` with the curvature of the residuals."""
-        data = self._data(x)
+        data = self.problem.normal_equations(self.values(x), self.records)
         exact = NormalEquations(0.0, data.gradient, self.problem.exact_hessian(self.values(x), self.records))
         curvature = self.problem.parameters.curvature(self._entry_gradient(x, data.gradient))
-        return self._chained(x, exact)[1] + curvature * self._products()
-
-    def _data(self, x: Array) -> NormalEquations:
-        return self.problem.normal_equations(self.values(x), self.records)
+        return self._chained(x, exact)[1] + curvature * np.outer(self.scales, self.scales)
 
     def _chained(self, x: Array, data: NormalEquations) -> tuple[Array, Array]:
         """Gradient and Hessian by ``x`` of data, by canonical entries, and priors, by coordinates."""
@@ -99,6 +97,3 @@ class PosedProblem:
 
     def _prior_cost(self, x: Array) -> float:
         return 0.5 * float(self._prior @ self.coordinates(x) ** 2) if self._prior.any() else 0.0
-
-    def _products(self) -> Array:
-        return np.outer(self.scales, self.scales)

@@ -127,15 +127,8 @@ class Problem:
             for factor, number, mask, reader in zip(factors, numbers, masks, readers, strict=True)
         )
 
-    @staticmethod
-    def subset(records: Sequence[FactorRecords], chosen: NDArray[np.intp]) -> tuple[FactorRecords, ...]:
-        """Some records of all."""
-        return factor_records.subset(records, chosen)
-
-    @staticmethod
-    def weighted(records: Sequence[FactorRecords], weights: Sequence[Array]) -> tuple[FactorRecords, ...]:
-        """The same records with their weights multiplied, factor by factor (N each); equilibria stay shared."""
-        return factor_records.weighted(records, weights)
+    subset = staticmethod(factor_records.subset)
+    weighted = staticmethod(factor_records.weighted)
 
     def equations(self, records: Sequence[FactorRecords]) -> int:
         """How many residual numbers the records give; those of weight zero are no evidence."""
