@@ -21,13 +21,13 @@ class Measure:
     unit: str
     scale: float
 
-    def shown(self, ordinary: float) -> tuple[float, str]:
+    def shown(self, coefficient: float) -> tuple[float, str]:
         """So many typical scales in the unit that people are shown."""
         known = UNITS.get(self.unit)
         if known is None or known.dimension == DIMENSIONLESS:
-            return ordinary * self.scale, "" if known else self.unit
+            return coefficient * self.scale, "" if known else self.unit
         display = display_unit(known.dimension)
-        return ordinary * self.scale * known.factor / display.factor, display.name
+        return coefficient * self.scale * known.factor / display.factor, display.name
 
 
 @dataclass(frozen=True)

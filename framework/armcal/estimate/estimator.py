@@ -271,8 +271,8 @@ def _identified_by_data(chain: Array, scales: Array, known: Identifiability) -> 
     if not len(known.null):
         return (True,) * len(chain)
     moves = np.linalg.norm(chain @ (known.null * scales).T, axis=1)
-    ordinary = np.linalg.norm(chain * scales, axis=1)
-    return tuple(bool(x) for x in moves <= 1e-6 * np.where(ordinary > 0, ordinary, 1.0))
+    typical = np.linalg.norm(chain * scales, axis=1)
+    return tuple(bool(x) for x in moves <= 1e-6 * np.where(typical > 0, typical, 1.0))
 
 
 def degrees_of_freedom(problem: Problem, values: Array, records: Sequence[FactorRecords], slope: float = 1.0) -> float:
