@@ -180,7 +180,6 @@ class FitTask:
 
     def trained(self) -> FitTask:
         """The task without the groups that no training record belongs to."""
-
         train, _ = self.parts()
         return replace(self, problem=restricted(self.problem, train))
 
