@@ -78,24 +78,22 @@ def judge(
         evidence: what residuals still depend on, which records are missed, what priors alone hold.
     """
     seen = evidence or Evidence()
-    typical = float(np.median(judged_mm)) if len(judged_mm) else None
-    determined = determined_finding(estimate, seen.priors_alone, typical)
+    determined = determined_finding(estimate, seen.priors_alone, np.median(judged_mm) if len(judged_mm) else None)
     own, kept = [ids[i] for i in train], train if fitted is None else train[fitted.kept]
     suspicious = _suspicious(errors_mm[train], own, fitted)
     findings = [_convergence(estimate), determined, *_condition(estimate), *_bounds(estimate)]
-    findings += [*shift_findings(estimate), *_noise(estimate, fitted, seen)]
+    findings += shift_findings(estimate) + _noise(estimate, fitted, seen)
     findings += structure_findings(seen.structure, seen.unit)
     findings += neighbour_findings(seen.structure, estimate, seen.unit) or _neighbours(whitened, kept, estimate)
     findings += [*_correlated(estimate), *predicted, *large_error_findings(seen.large_errors, seen.unit)]
-    findings += [*_outliers(suspicious, own, fitted), *_next(estimate, suggestions)]
+    findings += _outliers(suspicious, own, fitted) + _next(estimate, suggestions)
     ranked = tuple(sorted(findings, key=lambda finding: _ORDER[finding.grade]))
-    use = f"{DO_NOT_USE}: {ranked[0].text}"
-    if ranked[0].grade != "bad":
-        use = _good_for(judged_mm, judged_on, seen.unit, seen.new_recording)
-    sentences = [use, *_in_short(estimate, determined, seen, suspicious, suggestions)]
+    good = _good_for(judged_mm, judged_on, seen.unit, seen.new_recording)
+    use = f"{DO_NOT_USE}: {ranked[0].text}" if ranked[0].grade == "bad" else good
+    text = " ".join([use, *_in_short(estimate, determined, seen, suspicious, suggestions)])
     if not estimate.verdict.converged:
-        sentences = ["The solver did not converge: these values are no calibration."]
-    return Verdict(_headline(judged_mm, judged_on, ranked[0], seen.unit), ranked, " ".join(sentences))
+        text = "The solver did not converge: these values are no calibration."
+    return Verdict(_headline(judged_mm, judged_on, ranked[0], seen.unit), ranked, text)
 
 
 def _headline(judged_mm: Array, judged_on: str, worst: Finding, unit: str) -> str:
