@@ -185,23 +185,23 @@ def shares(
 
 
 def _targets(arm: ServedArm, request: CompensateRequest) -> Targets:
-    given = request.targets
-    positions = np.array([target.position for target in given])
-    turned = [i for i, target in enumerate(given) if target.rpy is not None or target.quaternion_wxyz is not None]
-    if turned and len(turned) < len(given):
-        odd = next(i for i in range(len(given)) if i not in set(turned))
+    targets = request.targets
+    positions = np.array([target.position for target in targets])
+    turned = [i for i, target in enumerate(targets) if target.rpy is not None or target.quaternion_wxyz is not None]
+    if turned and len(turned) < len(targets):
+        odd = next(i for i in range(len(targets)) if i not in set(turned))
         raise DataError(
             "found targets with a rotation and targets without, expected all of one kind.",
             where=Location(field=f"targets.{odd}"),
             hint="Ask for them in two requests.",
         )
-    rotations = np.array([_rotation(target, i) for i, target in enumerate(given)]) if turned else None
-    count = len(given)
+    rotations = np.array([_rotation(target, i) for i, target in enumerate(targets)]) if turned else None
+    count = len(targets)
     approach = arm.approach(request, count)
-    for i, target in enumerate(given):
+    for i, target in enumerate(targets):
         if target.approach is not None:
             approach[:, i : i + 1] = arm.approach(target, 1)
-    return Targets(positions, rotations, arm.acting(request, count, given), approach)
+    return Targets(positions, rotations, arm.acting(request, count, targets), approach)
 
 
 def _rotation(target: TargetRequest, index: int) -> Array:

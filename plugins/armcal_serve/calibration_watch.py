@@ -1,4 +1,4 @@
-"""Watches the file of the calibration: which bytes are whole enough to be tried, and why others are not."""
+"""Watches the calibration's file: which bytes are whole enough to be tried, and why others are not."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from armcal.io.plain_files import input_file
 LOOK_S = 0.2
 """How often the file is looked at; a new one must look the same twice."""
 QUIET_S = 5.0
-"""A file that was seen growing or being changed in place is read when nobody has written to it for so long."""
+"""A file that grows or is changed in place is read when it has not changed for so long."""
 AGAIN_S = 10.0
-"""A file that could not be tried for a reason of its own is tried again after so long."""
+"""A file that could not be tried for no fault of its own is tried again after so long."""
 
 _LAST_LINE = re.compile(rb"^# sha256 of the lines above: [0-9a-f]{64}\r?\n\Z", re.MULTILINE)
 """What a calibration ends in."""
@@ -39,14 +39,14 @@ class Snapshot:
 
 
 class CalibrationWatch:
-    """Looks at a file by its stat; reads it when it is another one and at rest.
+    """Polls the status of a file, and reads it when it is another one and at rest.
 
-    What ``armcal recalibrate`` puts there by renaming is taken at the second look. The file that was read last stays
-    open, so that its inode's number cannot come back with another file.
+    A file that ``armcal recalibrate`` puts there by renaming is read at the second look. The file that was read last
+    stays open, so that its inode's number cannot come back with another file.
 
     Attributes:
         path: the file.
-        state: what has become of the newest file there.
+        state: of the newest file there.
         why: the sentence for it, where it is not taken.
     """
 
@@ -95,35 +95,35 @@ class CalibrationWatch:
             status = _key(self.path.stat())
         if status is None:
             self._seen = None
-            self._say("missing", "there is no such file; the calibration before is used on.")
+            self.state, self.why = "missing", "there is no such file; the calibration before is used on."
             return None
         if self._again_at is not None and now >= self._again_at:
             self._tried, self._tried_sha256, self._again_at = None, "", None
         if status == self._tried:
             self._seen = status
             if self.state == "missing":
-                self._say("taken" if self._tried_sha256 == self._taken_sha256 else "refused", self._refusal)
+                self.state = "taken" if self._tried_sha256 == self._taken_sha256 else "refused"
+                self.why = self._refusal
             return None
         if status != self._seen:
             in_place = self._seen is not None and status[:2] == self._seen[:2]
             self._rests_at = now + (QUIET_S if in_place else 0.0)
             self._seen = status
             if in_place:
-                self._say(
-                    "settling", f"the file is being written in place; it is read {QUIET_S:g} s after the last byte."
-                )
+                why = f"the file is being written in place; it is read {QUIET_S:g} s after the last byte."
+                self.state, self.why = "settling", why
             return None
         return self._rested() if now >= self._rests_at else None
 
     def taken(self) -> None:
         """The content that was tried last is used now."""
         self._taken_sha256, self._refusal = self._tried_sha256, ""
-        self._say("taken", "")
+        self.state, self.why = "taken", ""
 
     def refused(self, why: str, again: bool = False) -> None:
         """The content that was tried last is not used; ``again``: for no fault of its own, so it is tried once more."""
         self._refusal = why
-        self._say("refused", why)
+        self.state, self.why = "refused", why
         self._again_at = self._clock() + AGAIN_S if again else None
 
     def close(self) -> None:
@@ -137,24 +137,24 @@ class CalibrationWatch:
         try:
             snapshot = self._read()
         except (OSError, ValueError) as fault:
-            self._say("refused", f"the file cannot be read ({fault}).")
+            self.state, self.why = "refused", f"the file cannot be read ({fault})."
             return None
         except ConfigError as fault:
-            self._say("refused", fault.message)
+            self.state, self.why = "refused", fault.message
             return None
         if snapshot is None:
             return None
         if snapshot.sha256 == self._taken_sha256:
-            self._say("taken", "")
+            self.state, self.why = "taken", ""
             return None
         if snapshot.sha256 == before:
-            self._say("refused", self._refusal)
+            self.state, self.why = "refused", self._refusal
             return None
         fault_of = _not_whole(snapshot)
         if fault_of:
             self.refused(fault_of)
             return None
-        self._say("loading", "")
+        self.state, self.why = "loading", ""
         return snapshot
 
     def _read(self) -> Snapshot | None:
@@ -175,12 +175,9 @@ class CalibrationWatch:
         self._tried_sha256 = hashlib.sha256(data).hexdigest()
         return Snapshot(data, self._tried_sha256)
 
-    def _say(self, state: State, why: str) -> None:
-        self.state, self.why = state, why
-
 
 def _not_whole(snapshot: Snapshot) -> str:
-    """What shows at once that it is no whole calibration; empty if nothing does."""
+    """Why it cannot be a whole calibration; empty if it can."""
     if not snapshot.data:
         return "the file is empty."
     if not snapshot.data.endswith(b"\n"):

@@ -20,7 +20,7 @@ from armcal.functions.batch_function import EvaluatorChoice
 from armcal.io.signals import Signals
 from armcal.io.standard_output import StandardOutput
 
-from armcal_serve.protocol import Tell
+from armcal_serve.protocol import Notify
 from armcal_serve.server import Opening, Server
 from armcal_serve.transports.datagrams import Datagrams
 from armcal_serve.transports.standard import StandardStreams
@@ -84,17 +84,19 @@ def serve(
             text = "standard input or output is closed, expected requests by the one and a reader of the other."
             raise InputError(text, hint="Open both, or give --socket or --udp.")
         openings.append(partial(StandardStreams, sys.__stdin__.fileno(), sys.__stdout__.fileno()))
-    how: dict[str, Any] = {"redundancy": redundancy, "within": str(within or ""), "evaluator": evaluator}
-    how |= {"point": point or "tool", "accept": accept}
+    order_fields: dict[str, Any] = {"redundancy": redundancy, "within": str(within or ""), "evaluator": evaluator}
+    order_fields |= {"point": point or "tool", "accept": accept}
     with Signals() as signals:
-        Server(calibration, workers or min(2, os.cpu_count() or 1), how, openings, _teller(console)).run(signals)
+        Server(calibration, workers or min(2, os.cpu_count() or 1), order_fields, openings, _notifier(console)).run(
+            signals
+        )
 
 
-def _teller(console: Console) -> Tell:
-    """Events to standard error, which nobody need read: a sentence a line, or a JSON object with --json."""
+def _notifier(console: Console) -> Notify:
+    """Writes events to standard error without waiting for a reader: a sentence a line, or JSON objects with --json."""
     out = StandardOutput(getattr(sys.stderr, "buffer", None), patience_s=0.0)
 
-    def tell(event: str, sentence: str, content: Mapping[str, Any]) -> None:
+    def notify(event: str, sentence: str, content: Mapping[str, Any]) -> None:
         if console.quiet and event not in _ALWAYS:
             return
         if console.json:
@@ -102,4 +104,4 @@ def _teller(console: Console) -> Tell:
         else:
             out.write(f"armcal serve: {sentence}")
 
-    return tell
+    return notify

@@ -33,49 +33,49 @@ class Ticket:
         self.answer: bytes | None = None
 
     def answered(self, answer: bytes) -> None:
-        """The answer has come."""
+        """Take the answer, and send what can be sent in order."""
         self.answer = answer
         self.conversation.flush()
 
     def refused(self, fault: ArmcalError) -> None:
-        """It is answered with an error."""
+        """Answer with an error."""
         self.answered(as_bytes(refusal(id_of(self.line), fault)))
 
 
 class Conversation:
-    """What one client asked and has not been told yet.
+    """The requests of one client that are not answered yet.
 
     Attributes:
         waiting: tickets that no worker has yet.
-        ended: whether nobody is there any more to be told.
+        ended: whether the client is gone.
     """
 
     def __init__(self, send: Callable[[bytes], None]) -> None:
         self.waiting: deque[Ticket] = deque()
         self.ended = False
-        self._asked: deque[Ticket] = deque()
+        self._tickets: deque[Ticket] = deque()
         self._send = send
 
     @property
     def open(self) -> int:
-        """How many requests have no answer that was sent."""
-        return len(self._asked)
+        """How many requests have no sent answer."""
+        return len(self._tickets)
 
     def ask(self, number: int, line: bytes, arrived: float) -> Ticket:
         """A new request, after the others."""
         ticket = Ticket(number, line, arrived, self)
-        self._asked.append(ticket)
+        self._tickets.append(ticket)
         return ticket
 
     def flush(self) -> None:
         """Send what can be sent in order."""
-        while self._asked and self._asked[0].answer is not None:
-            answer = self._asked.popleft().answer
+        while self._tickets and self._tickets[0].answer is not None:
+            answer = self._tickets.popleft().answer
             if not self.ended and answer is not None:
                 self._send(answer)
 
     def end(self) -> None:
-        """The client is gone: what it asked is forgotten."""
+        """Drop all requests: the client is gone."""
         self.ended = True
         self.waiting.clear()
-        self._asked.clear()
+        self._tickets.clear()

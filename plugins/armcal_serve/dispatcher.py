@@ -1,4 +1,4 @@
-"""Hands requests to the worker: a client at a time in turn, so that one who asks much does not hold up the others."""
+"""Hands requests to workers, a client at a time in turn, so that one with many requests does not delay the others."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ _LONGEST_STATUS = 4096
 
 
 class Dispatcher:
-    """Takes requests from clients, and gives them to whichever worker answers now.
+    """Queues requests of clients, and gives them to workers.
 
     Args:
         status: gives the answer to a request for the status; no worker is needed for that.
 
     Attributes:
-        asked: requests so far.
+        requests: requests so far.
     """
 
     def __init__(self, status: Callable[[], Mapping[str, Any]]) -> None:
-        self.asked = 0
+        self.requests = 0
         self._status = status
         self._round: deque[Conversation] = deque()
         self._again: deque[Ticket] = deque()
@@ -42,10 +42,10 @@ class Dispatcher:
 
     def ask(self, conversation: Conversation, line: bytes) -> Ticket:
         """A request from a client."""
-        self.asked += 1
-        ticket = conversation.ask(self.asked, line, time.monotonic())
+        self.requests += 1
+        ticket = conversation.ask(self.requests, line, time.monotonic())
         if len(line) <= _LONGEST_STATUS and b'"status"' in line:
-            with contextlib.suppress(InputError):  # whatever else it is, a worker says what is wrong with it
+            with contextlib.suppress(InputError):  # a worker answers what is wrong with it
                 request = request_of(parsed(line))
                 if request.do == "status":
                     ticket.answered(as_bytes({**self._status(), "id": request.id}))
@@ -56,21 +56,21 @@ class Dispatcher:
         return ticket
 
     def refuse(self, conversation: Conversation, fault: ArmcalError) -> None:
-        """Answer with an error, in its order, what could not even be taken."""
-        self.asked += 1
-        conversation.ask(self.asked, b"", time.monotonic()).refused(fault)
+        """Answer a request that cannot be queued with an error, in its order."""
+        self.requests += 1
+        conversation.ask(self.requests, b"", time.monotonic()).refused(fault)
 
     def dispatch(self, workers: Iterable[WorkerProcess]) -> None:
-        """Give each worker that has nothing to do a request."""
+        """Give each idle worker a request."""
         for worker in workers:
-            if worker.given is None and not worker.gone:
+            if worker.ticket is None and not worker.gone:
                 ticket = self._next()
                 if ticket is None:
                     return
                 worker.give(ticket)
 
     def requeue(self, ticket: Ticket, why: ArmcalError) -> None:
-        """The request of a worker that was lost; it may have been the cause, and is given up after another loss."""
+        """Repeat the request of a lost worker; it may be the cause, and is refused after a second loss."""
         ticket.tries += 1
         if ticket.tries < _MOST_TRIES:
             self._again.append(ticket)
@@ -78,7 +78,7 @@ class Dispatcher:
             ticket.refused(why)
 
     def give_up(self, why: ArmcalError) -> None:
-        """Answer all that waits with an error."""
+        """Answer all waiting requests with an error."""
         while (ticket := self._next()) is not None:
             ticket.refused(why)
 

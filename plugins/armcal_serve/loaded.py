@@ -25,7 +25,7 @@ from armcal_serve.served_arm import TEMPERATURE, TEMPERATURE_KEY, ServedArm
 
 _TRIES = 20
 _LONGEST_S = 1.0
-"""Requests of each kind before the first real one: what is made when it is first needed is made then."""
+"""Requests of each kind before the first real one, and how long they may take (s): caches are filled by them."""
 _ORDINARY_C = 20.0
 
 
@@ -42,8 +42,8 @@ class Order:
         within: a configuration whose plan has limits and clearance; empty: none.
         point: what forward and compensate are about: the tool's frame, or the target that was measured.
         evaluator: ``compiled`` where a compiler is found, or ``interpreted``.
-        accept: whether one whose level is lost answers as any other; else the first is refused, and a later
-            one, which says of those before it that they no longer hold either, answers with that error.
+        accept: whether one whose level is lost answers as any other; else the first is refused, and a later one
+            answers every request with that error, since those before it are no longer valid either.
     """
 
     shown: str
@@ -144,7 +144,7 @@ def _arm(calibration: Calibration, name: str, order: Order) -> ServedArm:
 
 
 def _warm_up(answerer: Answerer, arm: ServedArm, acting: Mapping[str, float]) -> None:
-    """Ask everything that can be asked, some times.
+    """Answer requests of every kind, several times.
 
     Raises:
         InputError: the arm cannot even be predicted.
@@ -152,18 +152,18 @@ def _warm_up(answerer: Answerer, arm: ServedArm, acting: Mapping[str, float]) ->
     began = time.monotonic()
     for i in range(_TRIES):
         posture = {"joints": arm.written([0.05 * (k + 1) + 0.01 * i for k in range(len(arm.joints))], "rad")}
-        answer = _asked(answerer, arm, {"do": "forward", **posture, **acting})
+        answer = _answer(answerer, arm, {"do": "forward", **posture, **acting})
         if not answer["ok"]:
             raise InputError(f"the arm {arm.name} cannot be predicted: {answer['error']}", hint=answer["hint"])
         tool = answer["tools"][0]
         for target in (tool, {"position_mm": tool["position_mm"]}):
             for path in (False, True):
-                _asked(answerer, arm, {"do": "compensate", "targets": target, "path": path, **acting})
-        _asked(answerer, arm, {"do": "compensate", "targets": tool, "start_joints": posture["joints"], **acting})
+                _answer(answerer, arm, {"do": "compensate", "targets": target, "path": path, **acting})
+        _answer(answerer, arm, {"do": "compensate", "targets": tool, "start_joints": posture["joints"], **acting})
         if time.monotonic() - began > _LONGEST_S:
             break
 
 
-def _asked(answerer: Answerer, arm: ServedArm, request: Mapping[str, Any]) -> dict[str, Any]:
+def _answer(answerer: Answerer, arm: ServedArm, request: Mapping[str, Any]) -> dict[str, Any]:
     line = json.dumps({**request, "arm": arm.name, "payload_g": 0})
     return dict(json.loads(answerer.answer(line.encode(), 0.0)))

@@ -1,4 +1,4 @@
-"""Waits for many descriptors in one thread, and calls whoever is concerned."""
+"""Waits for many descriptors in one thread, and calls their handlers."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ class Poller:
         self._selector = selectors.PollSelector()
 
     def watch(self, place: Any, read: Call | None = None, write: Call | None = None) -> None:
-        """Call these when a descriptor can be read or written; with neither it is let be.
+        """Call these when a descriptor can be read or written; with neither it is ignored.
 
-        The two are the same whenever a place is watched. One that nobody asks about is not registered at all: a peer
+        The handlers of a place are the same whenever it is watched. An ignored place is not registered at all: a peer
         that hung up would be reported for ever.
         """
         events = (selectors.EVENT_READ if read else 0) | (selectors.EVENT_WRITE if write else 0)
@@ -35,11 +35,11 @@ class Poller:
             self._selector.modify(place, events, (read, write))
 
     def step(self, longest_s: float) -> None:
-        """Wait at most so long, and call those concerned."""
+        """Wait at most so long, and call the handlers of what is ready."""
         for key, events in self._selector.select(longest_s):
             read, write = key.data
             if self._selector.get_map().get(key.fd) is not key:
-                continue  # an earlier call let go of it, or changed it
+                continue  # an earlier handler dropped it, or changed it
             if events & selectors.EVENT_READ:
                 read()
             if events & selectors.EVENT_WRITE and self._selector.get_map().get(key.fd) is key:

@@ -1,4 +1,4 @@
-"""What `armcal serve` is asked and what it answers: version 1. A JSON object each; units stand in the keys."""
+"""Requests to `armcal serve` and its answers, version 1: a JSON object each, with the units in the keys."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def _rows(value: Any) -> Any:
 
 
 class _Quick(Settings):
-    """Settings of which very many are read: what its fields take is found out once."""
+    """Settings that are read very often: the kinds of its fields are worked out once."""
 
     @classmethod
     @cache
@@ -53,7 +53,7 @@ class _Quick(Settings):
 
 
 class Acting(_Quick):
-    """What acts on the arm; what is left out is as the calibration says.
+    """What acts on the arm; the calibration states what is left out.
 
     Attributes:
         payload: at the tool (kg).
@@ -74,12 +74,12 @@ class Acting(_Quick):
 
 
 class Request(_Quick):
-    """What every request may say.
+    """The fields of every request.
 
     Attributes:
         armcal_serve: the version of this protocol that the client speaks.
         id: handed back with the answer.
-        do: what is asked for.
+        do: the kind of request.
     """
 
     armcal_serve: Literal[1] = 1
@@ -125,7 +125,7 @@ class TargetRequest(Acting):
 
 
 class CompensateRequest(Request, Acting):
-    """What to command so that the tool arrives; what acts is said here for all targets, or in a target for itself.
+    """Commands that bring the tool to targets; what acts is stated here for all targets, or in a target for itself.
 
     Attributes:
         arm: which, where the calibration has several.
@@ -156,7 +156,7 @@ class CalibrationTag(TypedDict):
     """Which calibration an answer came from.
 
     Attributes:
-        sequence: 1 for the one that the server began with, one more for each that it took up.
+        sequence: 1 for the one that the server began with, one more for each later one.
         created: when it was made.
         sha256: of its file.
         arm: the identity of the arm's description, the same as long as it is the same arm.
@@ -180,7 +180,7 @@ class Tool(TypedDict):
 
 
 class Answer(TypedDict):
-    """What every answer says.
+    """The fields of every answer.
 
     Attributes:
         id: the request's; null where it could not be read.
@@ -213,17 +213,17 @@ class ForwardAnswer(Answer):
 
 
 class Command(TypedDict):
-    """What to command for one target; of the four, the one that was asked for, in the order of ``joint_names``.
+    """The command for one target, in the units of the request and in the order of ``joint_names``.
 
     Attributes:
         joint_angles_rad, joint_angles_deg: the commands; of an arm with sliding joints ``joints`` in their place, by
             name with the unit.
-        counts, pulse_us: what the servo board is told; null for a joint without a pulse table.
+        counts, pulse_us: for the servo board; null for a joint without a pulse table.
         found: whether the target is reached; ``why_not`` says why not, and the command is the nearest that was found.
         error_mm, error_deg: what remains.
         nearest_mm: no command comes nearer than this, as far as is known.
-        approach: from where each joint is taken to come: -1, 0 (not known), 1.
-        tool: where the tool is then to be expected.
+        approach: the assumed side from which each joint comes: -1, 0 (not known), 1.
+        tool: its predicted pose.
     """
 
     joint_angles_rad: NotRequired[list[float]]
@@ -261,7 +261,7 @@ def refusal(identity: Any, fault: ArmcalError) -> Refusal:
 
 
 def id_of(line: bytes) -> str | int | float | None:
-    """The id in a request that somebody else could not answer; None where it cannot be read."""
+    """The id in a request that no worker answered; None where it cannot be read."""
     try:
         return known_id(json.loads(line.decode("utf-8-sig")))
     except (ValueError, RecursionError):
@@ -281,5 +281,5 @@ def as_bytes(answer: Mapping[str, Any]) -> bytes:
     return as_line(answer).encode()
 
 
-Tell = Callable[[str, str, Mapping[str, Any]], None]
-"""Takes an event's name, a sentence, and what there is to know: for whoever started the server."""
+Notify = Callable[[str, str, Mapping[str, Any]], None]
+"""Takes an event's name, a sentence and its fields, for the program that started the server."""

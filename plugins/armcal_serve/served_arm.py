@@ -62,7 +62,7 @@ class ServedArm:
         conditions: dict[str, str | list[str]] = {} if self.heated is None else {"conditions": [TEMPERATURE_KEY]}
         return {"joints": [*self.joints], "point": self.point, **conditions}
 
-    def angles(self, given: Sequence[Sequence[float] | Mapping[str, float]], field: str) -> Array:
+    def angles(self, postures: Sequence[Sequence[float] | Mapping[str, float]], field: str) -> Array:
         """Postures (N x n; rad) from angles in order or by name.
 
         Raises:
@@ -71,16 +71,16 @@ class ServedArm:
         if not self.turns_only:
             hint = f"Give them by name with the unit, as {field.replace('joint_angles', 'joints')}."
             raise DataError("the arm has sliding joints.", where=Location(field=field), hint=hint)
-        return np.array([self._in_order(row, f"{field}.{i}") for i, row in enumerate(given)])
+        return np.array([self._in_order(row, f"{field}.{i}") for i, row in enumerate(postures)])
 
-    def named(self, given: Sequence[Mapping[str, float]], field: str) -> Array:
+    def named(self, postures: Sequence[Mapping[str, float]], field: str) -> Array:
         """Postures (N x n; rad, or m) from values by name with the unit (``q1_deg``).
 
         Raises:
             DataError: joints are missing or unknown, or have no unit of theirs.
         """
         rows = []
-        for i, row in enumerate(given):
+        for i, row in enumerate(postures):
             values: dict[str, float] = {}
             for key, value in row.items():
                 split = split_suffix(key)
@@ -105,15 +105,15 @@ class ServedArm:
 
     def approach(self, acting: Acting, count: int) -> Array:
         """From where each joint comes (n x count): -1, 0 (not known) or 1."""
-        given = acting.approach
-        if given is None:
+        sides = acting.approach
+        if sides is None:
             return np.zeros((len(self.joints), count))
-        if isinstance(given, Mapping):
-            for name in given:
+        if isinstance(sides, Mapping):
+            for name in sides:
                 self._known(name, "approach")
-            row: Sequence[float] = [given.get(name, 0) for name in self.joints]
+            row: Sequence[float] = [sides.get(name, 0) for name in self.joints]
         else:
-            row = self._in_order(given, "approach")
+            row = self._in_order(sides, "approach")
         return np.repeat(np.array(row, dtype=float)[:, None], count, axis=1)
 
     def acting(self, general: Acting, count: int, single: Sequence[Acting] = ()) -> Array:
@@ -132,7 +132,7 @@ class ServedArm:
         stated = general.payload is not None or (single and all(acting.payload is not None for acting in single))
         if self.needs_payload and not stated:
             _refuse(
-                "the arm gives under load, and neither the request nor the calibration says what hangs on it.",
+                "the arm deflects under load, and neither the request nor the calibration states its payload.",
                 "payload_g",
                 "Give payload_g, 0 where nothing hangs on it.",
             )

@@ -13,7 +13,7 @@ from armcal.io.signals import Signals
 from armcal_serve.calibration_watch import CalibrationWatch
 from armcal_serve.dispatcher import Dispatcher
 from armcal_serve.poller import Poller
-from armcal_serve.protocol import VERSION, Tell
+from armcal_serve.protocol import VERSION, Notify
 from armcal_serve.transports.transport import Transport
 from armcal_serve.worker_pool import WorkerPool
 
@@ -31,23 +31,23 @@ class Server:
     Args:
         path: the file, which may be replaced at any time.
         workers: how many processes answer.
-        how: commands are found; see ``armcal_serve.worker_pool.WorkerPool``.
+        order_fields: those fields of ``armcal_serve.loaded.Order`` that the command line sets.
         openings: make the transports.
-        tell: takes what whoever started it should know.
+        notify: takes events for the program that started it.
 
     Raises:
         InputError: a transport cannot be opened.
     """
 
     def __init__(
-        self, path: Path, workers: int, how: Mapping[str, Any], openings: Sequence[Opening], tell: Tell
+        self, path: Path, workers: int, order_fields: Mapping[str, Any], openings: Sequence[Opening], notify: Notify
     ) -> None:
         self._began = time.monotonic()
-        self._tell = tell
+        self._notify = notify
         self._poller = Poller()
         self._watch = CalibrationWatch(path)
         self._dispatcher = Dispatcher(self.status)
-        self._pool = WorkerPool(workers, self._watch, how, self._poller, self._dispatcher, tell)
+        self._pool = WorkerPool(workers, self._watch, order_fields, self._poller, self._dispatcher, notify)
         self._transports: list[Transport] = []
         try:
             for opening in openings:
@@ -57,7 +57,7 @@ class Server:
             raise
 
     def run(self, signals: Signals) -> None:
-        """Until a signal asks for the end, or nobody can ask anything any more.
+        """Serve until a signal asks for the end, or no transport can bring another request.
 
         Raises:
             ArmcalError: the calibration cannot be used.
@@ -66,21 +66,42 @@ class Server:
             self._pool.begin(self._watch.first())
             while self._pool.tag is None and not signals.finish:
                 self._poller.step(_STEP_S)
-                self._pool.tend(looking=False)
-            if not signals.finish:
-                self._serve(signals)
+                self._pool.poll(looking=False)
+            if signals.finish:
+                return
+            names = [transport.name for transport in self._transports]
+            content = {"calibration": self._pool.tag, "arms": self._pool.arms, "by": names}
+            self._notify("ready", f"ready: {self._watch.path} by {', '.join(names)}", content)
+            gc.collect()
+            gc.freeze()
+            for transport in self._transports:
+                transport.open()
+            while not signals.finish and not all(transport.ended for transport in self._transports):
+                self._step()
+                if signals.status:
+                    signals.status = False
+                    tag = self._pool.tag
+                    number = 0 if tag is None else tag["sequence"]
+                    sentence = f"calibration {number} is answered from, {self._dispatcher.requests} requests so far; "
+                    sentence += f"the file is {self._watch.state}. {self._watch.why}"
+                    self._notify("status", sentence.rstrip(), self.status())
+            for transport in self._transports:
+                transport.stop_reading()
+            ends = time.monotonic() + _GRACE_S
+            while not all(transport.finished for transport in self._transports) and time.monotonic() < ends:
+                self._step(looking=False)
         finally:
             self._close()
 
     def status(self) -> Mapping[str, Any]:
-        """How the server is doing, as an answer."""
+        """The answer to a request for the status."""
         return {
             "armcal_serve": VERSION,
             "ok": True,
             "calibration": self._pool.tag,
             "arms": self._pool.arms,
             "file": {"path": str(self._watch.path), "state": self._watch.state, "why": self._watch.why},
-            "requests": self._dispatcher.asked,
+            "requests": self._dispatcher.requests,
             "waiting": self._dispatcher.waiting,
             "clients": sum(transport.clients for transport in self._transports),
             "worker_pids": self._pool.worker_pids,
@@ -88,34 +109,11 @@ class Server:
             "up_s": round(time.monotonic() - self._began, 1),
         }
 
-    def _serve(self, signals: Signals) -> None:
-        names = [transport.name for transport in self._transports]
-        content = {"calibration": self._pool.tag, "arms": self._pool.arms, "by": names}
-        self._tell("ready", f"ready: {self._watch.path} by {', '.join(names)}", content)
-        gc.collect()
-        gc.freeze()
-        for transport in self._transports:
-            transport.open()
-        while not signals.finish and not all(transport.ended for transport in self._transports):
-            self._step()
-            if signals.status:
-                signals.status = False
-                tag = self._pool.tag
-                number = 0 if tag is None else tag["sequence"]
-                sentence = f"calibration {number} is answered from, {self._dispatcher.asked} requests so far; "
-                sentence += f"the file is {self._watch.state}. {self._watch.why}"
-                self._tell("status", sentence.rstrip(), self.status())
-        for transport in self._transports:
-            transport.listen_no_more()
-        ends = time.monotonic() + _GRACE_S
-        while not all(transport.finished for transport in self._transports) and time.monotonic() < ends:
-            self._step(looking=False)
-
     def _step(self, looking: bool = True) -> None:
         self._poller.step(_STEP_S)
-        self._pool.tend(looking)
+        self._pool.poll(looking)
         for transport in self._transports:
-            transport.tend()
+            transport.poll()
 
     def _close(self) -> None:
         for transport in self._transports:

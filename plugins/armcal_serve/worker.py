@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from armcal_serve.answering import Answerer
 
 ABOUT_ITSELF = 0
-"""The ticket of messages that are no request: orders to a worker, and its state."""
+"""The number of messages that are no request: orders to a worker, and its state."""
 _HEAD = struct.Struct("!IQd")
 _NICENESS = 19
 """Requests come first."""
@@ -32,18 +32,18 @@ class Message:
     """One message: a head of fixed size, and bytes.
 
     Attributes:
-        ticket: of the request that it belongs to.
+        number: of the request that it belongs to, or ``ABOUT_ITSELF``.
         content: the request, or its answer.
         arrived: when the request came (monotonic seconds).
     """
 
-    ticket: int
+    number: int
     content: bytes
     arrived: float = 0.0
 
     def packed(self) -> bytes:
         """As it is sent."""
-        return _HEAD.pack(len(self.content), self.ticket, self.arrived) + self.content
+        return _HEAD.pack(len(self.content), self.number, self.arrived) + self.content
 
 
 class Unpacker:
@@ -57,11 +57,11 @@ class Unpacker:
         self._open += data
         messages, at = [], 0
         while len(self._open) - at >= _HEAD.size:
-            length, ticket, arrived = _HEAD.unpack_from(self._open, at)
+            length, number, arrived = _HEAD.unpack_from(self._open, at)
             end = at + _HEAD.size + length
             if len(self._open) < end:
                 break
-            messages.append(Message(ticket, bytes(self._open[at + _HEAD.size : end]), arrived))
+            messages.append(Message(number, bytes(self._open[at + _HEAD.size : end]), arrived))
             at = end
         del self._open[:at]
         return messages
@@ -82,7 +82,7 @@ def main(descriptor: int) -> None:
             return
         for message in messages:
             answer = answerer.answer(message.content, message.arrived)
-            link.sendall(Message(message.ticket, answer).packed())
+            link.sendall(Message(message.number, answer).packed())
     except (OSError, StopIteration):
         return  # the server is gone
 

@@ -11,7 +11,7 @@ from armcal.errors import EXIT_BAD_INPUT, ArmcalError, InputError, Location
 from armcal_serve.calibration_watch import LOOK_S, CalibrationWatch, Snapshot
 from armcal_serve.dispatcher import Dispatcher
 from armcal_serve.poller import Poller
-from armcal_serve.protocol import CalibrationTag, Tell
+from armcal_serve.protocol import CalibrationTag, Notify
 from armcal_serve.worker_process import WorkerProcess
 
 LONGEST_S = 20.0
@@ -32,14 +32,14 @@ class WorkerPool:
     Args:
         size: how many answer.
         watch: of the file.
-        how: commands are found: those fields of an ``Order`` that a command line sets.
+        order_fields: those fields of ``armcal_serve.loaded.Order`` that the command line sets.
         poller: of the server.
         dispatcher: has the requests.
-        tell: takes news of changes.
+        notify: takes events.
 
     Attributes:
         tag: the calibration that is answered from; None before the first is ready.
-        arms: what there is to ask about.
+        arms: what requests can be about, by name.
         lost: workers that crashed or had to be ended.
     """
 
@@ -47,16 +47,16 @@ class WorkerPool:
         self,
         size: int,
         watch: CalibrationWatch,
-        how: Mapping[str, Any],
+        order_fields: Mapping[str, Any],
         poller: Poller,
         dispatcher: Dispatcher,
-        tell: Tell,
+        notify: Notify,
     ) -> None:
         self.tag: CalibrationTag | None = None
         self.arms: Mapping[str, Any] = {}
         self.lost = 0
-        self._size, self._watch, self._how = size, watch, how
-        self._poller, self._dispatcher, self._tell = poller, dispatcher, tell
+        self._size, self._watch, self._order_fields = size, watch, order_fields
+        self._poller, self._dispatcher, self._notify = poller, dispatcher, notify
         self._served: Snapshot | None = None
         self._active: list[WorkerProcess] = []
         self._next: Snapshot | None = None
@@ -78,15 +78,15 @@ class WorkerPool:
         self._next = snapshot
         self._start(gently=False)
 
-    def tend(self, looking: bool = True) -> None:
-        """Everything that is due: to be called whenever something happened, and now and then when nothing does.
+    def poll(self, looking: bool = True) -> None:
+        """Do what is due; to be called after every event, and often without.
 
         Raises:
             ArmcalError: the first calibration cannot be used.
         """
         now = time.monotonic()
-        self._tend_making(now)
-        self._tend_active(now)
+        self._poll_making(now)
+        self._poll_active(now)
         self._next_ready = [worker for worker in self._next_ready if not self._left(worker)]
         if self._making is None and now >= self._may_start_at:
             self._go_on(now, looking)
@@ -96,11 +96,11 @@ class WorkerPool:
             hint = "Ask again; the status says what is known."
             self._dispatcher.give_up(ArmcalError("no process answers at present.", hint=hint))
         for worker in [*self._leaving]:
-            if worker.gone and worker.given is not None:
+            if worker.gone and worker.ticket is not None:
                 fault = ArmcalError("it ended the process that answers, twice.", hint="Do not send it again.")
-                given, worker.given = worker.given, None
-                self._dispatcher.requeue(given, fault)
-            if not worker.gone and worker.given is None:
+                unanswered, worker.ticket = worker.ticket, None
+                self._dispatcher.requeue(unanswered, fault)
+            if not worker.gone and worker.ticket is None:
                 worker.leave()
             if worker.gone and worker.ended():
                 self._leaving.remove(worker)
@@ -116,7 +116,7 @@ class WorkerPool:
             worker.wait()
 
     def _go_on(self, now: float, looking: bool) -> None:
-        """Start the worker that is wanted most, or look for a new calibration."""
+        """Start the worker that is needed most, or look for a new calibration."""
         if self._next is not None and self._active:
             self._start(gently=True)
         elif len(self._active) < self._size and self._served is not None:
@@ -128,7 +128,7 @@ class WorkerPool:
             before = self._watch.why
             self._next = self._watch.look()
             if self._next is None and self._watch.why not in ("", before):
-                self._tell(self._watch.state, f"{self._watch.path}: {self._watch.why}", {})
+                self._notify(self._watch.state, f"{self._watch.path}: {self._watch.why}", {})
 
     def _start(self, gently: bool, again: bool = False) -> None:
         """Make a worker ready, for the next calibration or ``again`` for the one that is answered from."""
@@ -140,15 +140,15 @@ class WorkerPool:
             "sequence": 1 if known is None else known["sequence"] + (not again),
             "sha256": snapshot.sha256,
             "arm": "" if known is None else known["arm"],
-            **self._how,
+            **self._order_fields,
             "gently": gently,
         }
         try:
-            self._making = WorkerProcess(order, snapshot.data, self._poller, self.tend)
+            self._making = WorkerProcess(order, snapshot.data, self._poller, self.poll)
         except OSError as fault:
             self._not_made(snapshot, ArmcalError(f"no process can be started for it ({fault})."), passing=True)
 
-    def _tend_making(self, now: float) -> None:
+    def _poll_making(self, now: float) -> None:
         making = self._making
         if making is None:
             return
@@ -188,14 +188,14 @@ class WorkerPool:
         self.tag, self.arms = tag, state["arms"]
         self._watch.taken()
         for notice in state["notices"]:
-            self._tell("notice", notice, {})
+            self._notify("notice", notice, {})
         if not first:
             level = f", level {tag['level']}" if tag["level"] else ""
             sentence = f"calibration {tag['sequence']} is answered from, of {tag['created']}{level}"
-            self._tell("calibration", sentence, {"calibration": tag})
+            self._notify("calibration", sentence, {"calibration": tag})
 
     def _not_made(self, snapshot: Snapshot | None, fault: ArmcalError, passing: bool) -> None:
-        """No worker came of it; ``passing`` where that is no fault of the file.
+        """Give the calibration up; ``passing`` where that is no fault of the file.
 
         Raises:
             ArmcalError: it was the first.
@@ -210,14 +210,14 @@ class WorkerPool:
         self._leaving += self._next_ready
         self._next, self._next_ready = None, []
         self._watch.refused(str(fault), again=passing)
-        self._tell("refused", f"the new calibration is not taken: {fault}", {"why": str(fault)})
+        self._notify("refused", f"the new calibration is not taken: {fault}", {"why": str(fault)})
 
-    def _tend_active(self, now: float) -> None:
+    def _poll_active(self, now: float) -> None:
         for worker in self._active:
-            if worker.given is not None and now - worker.since > LONGEST_S:
+            if worker.ticket is not None and now - worker.since > LONGEST_S:
                 hint = "Ask for fewer targets at a time."
-                worker.given.refused(ArmcalError(f"it took longer than {LONGEST_S:g} s.", hint=hint))
-                worker.given = None
+                worker.ticket.refused(ArmcalError(f"it took longer than {LONGEST_S:g} s.", hint=hint))
+                worker.ticket = None
                 worker.kill()
         before = len(self._active)
         self._active = [worker for worker in self._active if not self._left(worker)]
@@ -225,10 +225,10 @@ class WorkerPool:
             self._without_since = now
 
     def _left(self, worker: WorkerProcess) -> bool:
-        """Whether a worker is gone that nobody sent away."""
+        """Whether a worker ended by itself."""
         if not worker.gone:
             return False
         self.lost += 1
         self._leaving.append(worker)
-        self._tell("worker_lost", f"a process that answers ({worker.pid}) is gone; another is started", {})
+        self._notify("worker_lost", f"a process that answers ({worker.pid}) is gone; another is started", {})
         return True

@@ -25,18 +25,18 @@ class WorkerProcess:
     """A process, started at once, with an order and a calibration's bytes.
 
     Attributes:
-        given: the request that it has.
-        since: when it was started, or given that (monotonic seconds).
+        ticket: its request.
+        since: when it was started, or got that request (monotonic seconds).
         state: ``ready``, ``arms`` and ``notices``, or a ``fault``; None before.
         gone: whether it ended.
     """
 
-    def __init__(self, order: Mapping[str, Any], data: bytes, poller: Poller, heard: Callable[[], None]) -> None:
-        self.given: Ticket | None = None
+    def __init__(self, order: Mapping[str, Any], data: bytes, poller: Poller, on_message: Callable[[], None]) -> None:
+        self.ticket: Ticket | None = None
         self.since = time.monotonic()
         self.state: dict[str, Any] | None = None
         self.gone = False
-        self._heard = heard
+        self._on_message = on_message
         self._poller = poller
         self._cutter = Unpacker()
         self._out = bytearray()
@@ -62,7 +62,7 @@ class WorkerProcess:
     def give(self, ticket: Ticket) -> None:
         """Hand a request over."""
         self.since = time.monotonic()
-        self.given = ticket
+        self.ticket = ticket
         self._send(Message(ticket.number, ticket.line, ticket.arrived))
 
     def leave(self) -> None:
@@ -113,14 +113,14 @@ class WorkerProcess:
         except OSError:
             data = b""
         for message in self._cutter.feed(data):
-            if message.ticket == ABOUT_ITSELF:
+            if message.number == ABOUT_ITSELF:
                 self.state = json.loads(message.content)
-            elif self.given is not None and self.given.number == message.ticket:
-                given, self.given = self.given, None
-                given.answered(message.content)
+            elif self.ticket is not None and self.ticket.number == message.number:
+                ticket, self.ticket = self.ticket, None
+                ticket.answered(message.content)
         if not data:
             self._close()
-        self._heard()
+        self._on_message()
 
     def _close(self) -> None:
         if not self.gone:

@@ -248,7 +248,7 @@ def test_counts_pulses_and_sliding_joints() -> None:
 
 def test_an_elastic_arm_whose_payload_nobody_states_asks_for_it(answerer: Answerer) -> None:
     arm = replace(answerer.arms["arm"], needs_payload=True)
-    with pytest.raises(DataError, match="what hangs on it"):
+    with pytest.raises(DataError, match="states its payload"):
         arm.acting(Acting(), 2)
     assert arm.acting(Acting.si(payload=0.1), 2).shape == (13, 2)
     assert arm.acting(Acting(), 1, [Acting.si(payload=0.1)])[3, 0] == 0.1

@@ -29,19 +29,19 @@ class Worker:
     """Answers with the number of the request in its line, when it is told to."""
 
     def __init__(self) -> None:
-        self.given: Ticket | None = None
+        self.ticket: Ticket | None = None
         self.gone = False
         self.lines: list[bytes] = []
 
     def give(self, ticket: Ticket) -> None:
-        self.given = ticket
+        self.ticket = ticket
         self.lines.append(ticket.line)
 
     def answer(self, size: int = 0) -> None:
-        given, self.given = self.given, None
-        if given is not None:
-            content = {"echo": given.line.decode(errors="replace")[:40], "pad": "x" * size}
-            given.answered(json.dumps(content).encode())
+        ticket, self.ticket = self.ticket, None
+        if ticket is not None:
+            content = {"echo": ticket.line.decode(errors="replace")[:40], "pad": "x" * size}
+            ticket.answered(json.dumps(content).encode())
 
 
 class House:
@@ -63,7 +63,7 @@ class House:
                 for worker in self.workers:
                     worker.answer(self.size)
             for transport in self.transports:
-                transport.tend()
+                transport.poll()
 
     def until(self, holds: Callable[[], bool]) -> None:
         ends = time.monotonic() + 20
@@ -316,9 +316,9 @@ def test_a_request_that_costs_two_workers_is_given_up(house: House, tmp_path: Pa
         house.turn(3)
         for _ in range(2):
             house.dispatcher.dispatch(house.workers)  # type: ignore[arg-type]
-            assert worker.given is not None and worker.lines[-1] == b'{"id": 3}'
-            given, worker.given = worker.given, None
-            house.dispatcher.requeue(given, why)
+            assert worker.ticket is not None and worker.lines[-1] == b'{"id": 3}'
+            ticket, worker.ticket = worker.ticket, None
+            house.dispatcher.requeue(ticket, why)
         house.answering = True
         first, second = heard(house, client, 2)
     assert first["id"] == 3 and not first["ok"] and "ended" in first["error"]
@@ -406,7 +406,7 @@ def test_out_of_descriptors_it_neither_spins_nor_stops(house: House, tmp_path: P
             turns, ends = 0, time.monotonic() + 0.5
             while time.monotonic() < ends:
                 house.poller.step(0.1)
-                transport.tend()
+                transport.poll()
                 turns += 1
             send(house, second, b"two\n")
             assert heard(house, second, 1)[0]["echo"] == "two"

@@ -20,14 +20,13 @@ import pytest
 import yaml
 from armcal.calibration.calibration import Calibration
 from armcal.cli.main import cli
-from armcal.io.event_file import EventFile
+from armcal.io.event_file import EventFile, EventTail
 from armcal.io.line_cutter import MAX_LINE_BYTES
 from armcal_online.watch.events import message_of, record_of
 from armcal_online.watch.feed import Feed
 from armcal_online.watch.history import OLDER_ACCEPTED, OLDER_OTHERS, RECENT_RECORDS, History
 from armcal_online.watch.lenient import LONGEST_TEXT, number, parsed, text
 from armcal_online.watch.shape import Shape, drawing_of
-from armcal_online.watch.tail import Tail
 from armcal_online.watch.terminal import line, picture
 from armcal_online.watch.thinned import Thinned
 from click.testing import CliRunner
@@ -47,11 +46,7 @@ def calibration(demo_calibration: Path) -> Path:
 # Files
 
 
-def tail_of(folder: Path) -> Tail:
-    return Tail(folder / "events.jsonl", folder / "events.1.jsonl")
-
-
-def all_lines(tail: Tail) -> list[str]:
+def all_lines(tail: EventTail) -> list[str]:
     found: list[str] = []
     while lines := tail.lines():
         found += [line.decode() for line in lines]
@@ -59,7 +54,7 @@ def all_lines(tail: Tail) -> list[str]:
 
 
 def test_half_a_line_waits_for_its_end(tmp_path: Path) -> None:
-    tail = tail_of(tmp_path)
+    tail = EventTail(tmp_path)
     assert all_lines(tail) == []
     append(tmp_path / "events.jsonl", '{"event": "rec')
     assert all_lines(tail) == []
@@ -72,7 +67,7 @@ def test_half_a_line_waits_for_its_end(tmp_path: Path) -> None:
 @pytest.mark.parametrize("seed", range(5))
 def test_nothing_is_lost_or_doubled_over_many_rotations(tmp_path: Path, seed: int) -> None:
     """By the writer itself, read at moments of chance, at least once in each file's time."""
-    chance, writer, tail = random.Random(seed), EventFile(tmp_path, max_bytes=1000), tail_of(tmp_path)
+    chance, writer, tail = random.Random(seed), EventFile(tmp_path, max_bytes=1000), EventTail(tmp_path)
     found: list[str] = []
     for n in range(2000):
         writer.write(f"line {n} {'x' * chance.randrange(60)}")
@@ -83,18 +78,18 @@ def test_nothing_is_lost_or_doubled_over_many_rotations(tmp_path: Path, seed: in
 
 
 def test_a_watcher_that_was_away_goes_on_with_what_is_left(tmp_path: Path) -> None:
-    writer, tail = EventFile(tmp_path, max_bytes=100), tail_of(tmp_path)
+    writer, tail = EventFile(tmp_path, max_bytes=100), EventTail(tmp_path)
     writer.write("line 0")
     assert all_lines(tail) == ["line 0"]
     for n in range(1, 200):
         writer.write(f"line {n}")
     left = (tmp_path / "events.1.jsonl").read_text() + (tmp_path / "events.jsonl").read_text()
     assert all_lines(tail) == left.splitlines()
-    assert all_lines(tail_of(tmp_path)) == left.splitlines()
+    assert all_lines(EventTail(tmp_path)) == left.splitlines()
 
 
 def test_a_file_that_was_cut_or_written_anew_is_read_from_its_start(tmp_path: Path) -> None:
-    path, tail = tmp_path / "events.jsonl", tail_of(tmp_path)
+    path, tail = tmp_path / "events.jsonl", EventTail(tmp_path)
     path.write_text("one\ntwo\nthr")
     assert all_lines(tail) == ["one", "two"]
     path.write_text("1\n")  # shorter
@@ -111,7 +106,7 @@ def test_a_file_that_was_cut_or_written_anew_is_read_from_its_start(tmp_path: Pa
 def test_a_newest_file_that_is_replaced_does_not_bring_the_rotated_one_back(tmp_path: Path) -> None:
     (tmp_path / "events.1.jsonl").write_text("old\n")
     (tmp_path / "events.jsonl").write_text("new\n")
-    tail = tail_of(tmp_path)
+    tail = EventTail(tmp_path)
     assert all_lines(tail) == ["old", "new"]
     (tmp_path / "other").write_text("newer\n")
     os.replace(tmp_path / "other", tmp_path / "events.jsonl")
@@ -127,7 +122,7 @@ def test_no_file_is_held_so_that_what_is_dropped_makes_room(tmp_path: Path) -> N
 
 
 def test_a_line_without_end_is_passed_over_and_memory_stays_flat(tmp_path: Path) -> None:
-    path, tail = tmp_path / "events.jsonl", tail_of(tmp_path)
+    path, tail = tmp_path / "events.jsonl", EventTail(tmp_path)
     path.write_bytes(b"before\n" + b"x" * (3 * MAX_LINE_BYTES) + b"\nafter\n")
     assert all_lines(tail) == ["before", "after"]
     assert tail.too_long == 1

@@ -22,7 +22,7 @@ _COMMANDS = ("status", "pause", "resume", "finish", "rollback", "what-if")
 @click.option("--timeout", default=60.0, show_default=True, help="How long to wait for the answer, in seconds.")
 @speaking
 def control(console: Console, folder: Path, command: str, values: tuple[str, ...], timeout: float) -> None:
-    """Ask the recalibration that runs in FOLDER, or tell it what to do.
+    """Query or command the recalibration that runs in FOLDER.
 
     `rollback N` takes up the estimate as it was after record N; `what-if q1_deg=10 q2_deg=20 ...` predicts the tip.
     """

@@ -37,7 +37,16 @@ def watch(folder: Path, host: str, port: int, terminal: bool, once: bool, as_jso
         hint = "Programs follow events.jsonl in the folder itself."
         raise InputError("it is only for --once.", where=Location("--json"), hint=hint)
     if once:
-        _print_once(Feed(folder), as_json)
+        feed = Feed(folder)
+        while feed.step():
+            pass
+        if as_json:
+            click.echo(json.dumps(feed.state(), indent=2))
+            return
+        from armcal_online.watch.terminal import picture
+
+        console = Screen()
+        console.print(picture(feed.state(), console.width))
         return
     stop = threading.Event()
     earlier = signal.signal(signal.SIGTERM, lambda *_: stop.set())
@@ -51,19 +60,6 @@ def watch(folder: Path, host: str, port: int, terminal: bool, once: bool, as_jso
     finally:
         stop.set()
         signal.signal(signal.SIGTERM, earlier)
-
-
-def _print_once(feed: Feed, as_json: bool) -> None:
-    while feed.step():
-        pass
-    state = feed.state()
-    if as_json:
-        click.echo(json.dumps(state, indent=2))
-        return
-    from armcal_online.watch.terminal import picture
-
-    console = Screen()
-    console.print(picture(state, console.width))
 
 
 def _terminal(feed: Feed, stop: threading.Event) -> None:

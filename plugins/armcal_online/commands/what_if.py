@@ -77,7 +77,7 @@ def _reductions(remaining: Mapping[str, float]) -> str:
 
 def _table(rows: Sequence[Mapping[str, Any]], unit: str) -> Table:
     """The best poses."""
-    table = Table(title=f"what one more record would tell: the best {min(_SHOWN, len(rows))} of {len(rows)} poses")
+    table = Table(title=f"what one more record would add: the best {min(_SHOWN, len(rows))} of {len(rows)} poses")
     for heading in ("pose", "bits", "prediction known to", "standard deviations that shrink most"):
         table.add_column(heading)
     for row in rows[:_SHOWN]:

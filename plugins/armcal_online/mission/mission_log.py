@@ -11,7 +11,7 @@ from armcal.base.domains import Array
 from armcal.estimate.simulation import Mission
 
 NAMING = ("joint_slipped", "joint_replaced", "sensor_moved")
-"""Decisions that say what happened."""
+"""Decisions that name what happened."""
 ALARMS = (*NAMING, "general_change", "model_no_longer_fits", "unexplained")
 """Decisions that claim that something happened."""
 
@@ -33,7 +33,7 @@ class MissionLog:
     Attributes:
         verdicts: by record id: accepted, rejected or ignored.
         estimates: values by canonical entry, in order, each with its time; the first is where it began.
-        levels: each with the time from which it held.
+        levels: each with the time at which it began.
         decisions: in order.
         resumed: how often it was resumed.
     """
@@ -45,7 +45,7 @@ class MissionLog:
     resumed: int
 
     def estimate_numbers(self, times: Array) -> Array:
-        """Which estimate held at these times (N; the last one not after)."""
+        """The number of the newest estimate at each of these times (N)."""
         known = np.array([time for time, _ in self.estimates])
         return np.asarray(np.maximum(np.searchsorted(known, times, side="right") - 1, 0))
 

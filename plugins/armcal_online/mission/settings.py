@@ -55,7 +55,7 @@ class MissionPlan:
         experiment: the arm, and the simulator.
         simulator: knows the truth.
         settings: of the run.
-        recalibrate: how the calibration is kept true.
+        recalibrate: settings of the recalibration.
     """
 
     experiment: Experiment

@@ -66,6 +66,3 @@ class MissionSource(Source):
             return None
         self._next += 1
         return self._records[self._next - 1]
-
-    @override
-    def close(self) -> None: ...

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import sys
 import time
@@ -20,7 +21,6 @@ from armcal_online.sources.reading import LineReading
 from armcal_online.sources.row_parser import KINDS, Kind, LineParser, RowParser
 from armcal_online.sources.source import AtEnd, Clock, Source, key_of, wait_until
 
-_LINE_END = b"\n"
 _IDENTIFYING: Mapping[Kind, int] = {"csv": 2, "json": 1}
 """So many lines that are not blank identify a file: a header alone does not."""
 
@@ -45,9 +45,10 @@ class CsvFile(Source):
         self._node = (0, 0)
         self._ended = False
         where = Location(str(path))
-        if path.exists() and not S_ISREG(path.stat().st_mode):
-            hint = "Give a file, a directory, or - for a pipe."
-            raise InputError("it is not a regular file.", where=where, hint=hint)
+        with contextlib.suppress(OSError):  # of a path that leads nowhere, input_file says what is wrong
+            if not S_ISREG(path.stat().st_mode):
+                hint = "Give a file, a directory, or - for a pipe."
+                raise InputError("it is not a regular file.", where=where, hint=hint)
         with input_file(path, sys.maxsize, "a file of records", InputError) as file:
             head = file.read(MAX_LINE_BYTES)
         if not head and at_end == "stop":
@@ -80,9 +81,11 @@ class CsvFile(Source):
                 if self._at_end == "stop":
                     self._ended = True
                     return self._reading.last()
-                if self._was_replaced(self._reading):
-                    self._reading.close()
-                    self._reading = None
+                with contextlib.suppress(OSError):
+                    status = self._path.stat()
+                    if (status.st_dev, status.st_ino) != self._node or status.st_size < self._reading.offset:
+                        self._reading.close()
+                        self._reading = None  # another file, or the same from its start
             if not wait_until(deadline):
                 return None
         return None
@@ -98,7 +101,7 @@ class CsvFile(Source):
         """The file, once the first lines that identify it are there."""
         try:
             file = input_file(self._path, sys.maxsize, "a file of records", buffering=0)
-        except InputError:  # it is away, or a pipe or device stands in its place: nobody waits for those
+        except InputError:  # it is away, or a pipe or device stands in its place: those are not waited for
             return None
         head = file.read(2 * MAX_LINE_BYTES) or b""
         count = _IDENTIFYING[self._kind]
@@ -110,14 +113,7 @@ class CsvFile(Source):
         file.seek(0)
         status = os.fstat(file.fileno())
         self._node = (status.st_dev, status.st_ino)
-        key = f"{key_of(self._path.name)}#{crc32(_LINE_END.join(lines)):08x}"
+        checksum = crc32(b"\n".join(lines))
+        key = f"{key_of(self._path.name)}#{checksum:08x}"
         parser = LineParser(self._rows, self._kind, str(self._path))
         return LineReading(file, parser, key, self._positions.get(key, 0), self._clock)
-
-    def _was_replaced(self, reading: LineReading) -> bool:
-        """Whether the path now leads to another file, or to less than was read of it."""
-        try:
-            status = self._path.stat()
-        except OSError:
-            return False
-        return (status.st_dev, status.st_ino) != self._node or status.st_size < reading.offset

@@ -25,7 +25,7 @@ IMPATIENT_S = 10.0
 
 _WHOLE = ".json"
 _GONE = -1
-_WATCHED = 16
+_KEPT_OPEN = 16
 """So many of the files that were read last are read further when they grow."""
 _RESCAN_S = 5.0
 """The directory is listed when it changes, and this often besides: its time may have too few digits."""
@@ -134,8 +134,8 @@ class Folder(Source):
             if not self._is_settled(name, watched):
                 return None
             self._pending.pop(0)
-            incoming = self._begun(name, watched) or self._advance(name, watched)
-            for earlier in [*self._watched][:-_WATCHED]:
+            incoming = self._open_file(name, watched) or self._advance(name, watched)
+            for earlier in [*self._watched][:-_KEPT_OPEN]:
                 self._forget(earlier)
             if incoming is not None:
                 return incoming
@@ -150,7 +150,7 @@ class Folder(Source):
             or now - watched.seen >= IMPATIENT_S
         )
 
-    def _begun(self, name: str, watched: _Watched) -> Incoming | None:
+    def _open_file(self, name: str, watched: _Watched) -> Incoming | None:
         """Open a file; a fault if that cannot be."""
         key, path = key_of(name), self._path / name
         through = self._positions.get(key, 0)
@@ -161,7 +161,7 @@ class Folder(Source):
             file = input_file(path, sys.maxsize, "a file of records", buffering=0)
         except InputError as fault:
             if isinstance(fault.__cause__, FileNotFoundError) or not isinstance(fault.__cause__, OSError):
-                return None  # it is gone, or a pipe or device took its place: nobody waits for those
+                return None  # it is gone, or a pipe or device took its place: those are not waited for
             return faulty(Place(self._clock(), key, 0), f"{key} cannot be read ({fault.__cause__.strerror}).")
         try:
             if path.suffix == _WHOLE:
@@ -183,7 +183,7 @@ class Folder(Source):
         watched.look(self._path / name)
         if isinstance(watched.reading, WholeReading):
             if watched.size not in (_GONE, watched.reading.offset) and self._is_settled(name, watched):
-                return self._begun(name, watched)
+                return self._open_file(name, watched)
         elif _GONE < watched.size < watched.reading.offset and not watched.shorter:
             watched.shorter = True
             mend = "give what is new a name of its own"

@@ -32,7 +32,7 @@ KINDS: Mapping[str, Kind] = {".csv": "csv", ".jsonl": "json", ".ndjson": "json"}
 
 _APPROACH = ".approach."
 _PLANS = 64
-"""So many sets of names are remembered; a sender has one or two."""
+"""So many sets of names are remembered, each with its plan or why there is none; a sender has one or two."""
 
 
 @dataclass(frozen=True)
@@ -92,13 +92,7 @@ class RowParser:
         if not isinstance(fields, dict):
             text = "an array" if isinstance(fields, list) else _short(json.dumps(fields), 40)
             return faulty(place, f"Found {text}, expected a JSON object.")
-        plan = self._plan(tuple(fields))
-        if isinstance(plan, str):
-            return faulty(place, plan)
-        return self._record(plan, list(fields.values()), place)
-
-    def _plan(self, names: tuple[str, ...]) -> Plan | str:
-        """Which name is what, or why that is not known."""
+        names = tuple(fields)
         if names not in self._plans:
             if len(self._plans) >= _PLANS:
                 self._plans.clear()
@@ -108,7 +102,10 @@ class RowParser:
                 self._plans[names] = self._matched(header)
             except DataError as fault:
                 self._plans[names] = str(fault)
-        return self._plans[names]
+        plan = self._plans[names]
+        if isinstance(plan, str):
+            return faulty(place, plan)
+        return self._record(plan, list(fields.values()), place)
 
     def _matched(self, header: Header) -> Plan:
         """Which column is what.

@@ -45,7 +45,8 @@ class Source(Protocol):
         return
 
     def close(self) -> None:
-        """Let go of files and sockets."""
+        """Let go of files and sockets, if there are any."""
+        return
 
 
 def key_of(name: str) -> str:

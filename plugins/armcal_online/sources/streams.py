@@ -96,7 +96,7 @@ class Udp(Source):
         self._row = 0
         self._senders: OrderedDict[int, Any] = OrderedDict()
         self._socket, self._is_ours = listening(host, port, senders)
-        self._strange, self._open = False, True
+        self._stranger_reported, self._open = False, True
 
     @property
     def address(self) -> tuple[str, int]:
@@ -118,9 +118,9 @@ class Udp(Source):
         except OSError:
             return None
         if not self._is_ours(sender[0]):
-            if self._strange:
+            if self._stranger_reported:
                 return None  # one that sends many must not fill the journal
-            self._strange = True
+            self._stranger_reported = True
             self._row += 1
             text = f"A datagram came from {sender[0]}, which is not named as a sender. Further ones are passed over."
             return faulty(Place(self._clock(), "", self._row), text)

@@ -45,11 +45,6 @@ class Estimates:
         self._followed: dict[str, Followed] = {}
         self._rows: Thinned[dict[str, Any]] = Thinned(_RECENT, _OLDER)
 
-    def clear(self) -> None:
-        """Forget everything."""
-        self._followed.clear()
-        self._rows.clear()
-
     def start(self, event: Mapping[str, Any]) -> dict[str, Any] | None:
         """The values at a start; where a parameter started before, its start stays."""
         listed = event.get("parameters")

@@ -21,15 +21,15 @@ def record_of(event: Mapping[str, Any]) -> Message | None:
     verdict = event.get("verdict")
     if verdict not in VERDICTS:
         return None
-    kept: Message = {"event": "record", "verdict": verdict, "sequence": whole(event.get("sequence"))}
-    kept |= {key: number(event.get(key)) for key in ("at", "limit")}
-    kept |= {"nis": rounded(number(event.get("nis")), 7), "dof": whole(event.get("dof"))}
-    kept |= {key: text(event.get(key)) for key in ("id", "why", "measurement", "level")}
+    message: Message = {"event": "record", "verdict": verdict, "sequence": whole(event.get("sequence"))}
+    message |= {key: number(event.get(key)) for key in ("at", "limit")}
+    message |= {"nis": rounded(number(event.get("nis")), 7), "dof": whole(event.get("dof"))}
+    message |= {key: text(event.get(key)) for key in ("id", "why", "measurement", "level")}
     for key in ("residual_mm", "measured_mm", "predicted_mm"):
         values = vector(event.get(key))
-        kept[key] = values and [rounded(value) for value in values]
-    kept["inputs"] = {name: rounded(value, 9) for name, value in numbers(event.get("inputs")).items()}
-    return {key: value for key, value in kept.items() if value not in (None, {})}
+        message[key] = values and [rounded(value) for value in values]
+    message["inputs"] = {name: rounded(value, 9) for name, value in numbers(event.get("inputs")).items()}
+    return {key: value for key, value in message.items() if value not in (None, {})}
 
 
 def shortened(record: Message) -> Message:
@@ -44,13 +44,13 @@ def message_of(event: Mapping[str, Any]) -> Message | None:
     if kind not in LISTED:
         return None
     at = number(event.get("at")) or None  # 0: before the first record
-    kept: Message = {"event": kind, "sequence": whole(event.get("sequence")), "at": at}
-    kept |= {key: text(event.get(key)) for key in _ALONG}
-    kept |= {key: rounded(number(event.get(key))) for key in ("size_deg", "size_mm")}
-    kept["resumed"] = event.get("resumed") is True or None
-    kept = {key: value for key, value in kept.items() if value is not None}
-    kept["sentence"] = text(event.get("sentence")) or _sentence(kept)
-    return kept
+    message: Message = {"event": kind, "sequence": whole(event.get("sequence")), "at": at}
+    message |= {key: text(event.get(key)) for key in _ALONG}
+    message |= {key: rounded(number(event.get(key))) for key in ("size_deg", "size_mm")}
+    message["resumed"] = event.get("resumed") is True or None
+    message = {key: value for key, value in message.items() if value is not None}
+    message["sentence"] = text(event.get("sentence")) or _sentence(message)
+    return message
 
 
 def _sentence(message: Message) -> str:

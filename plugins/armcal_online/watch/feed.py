@@ -13,17 +13,16 @@ from secrets import token_hex
 from typing import Any
 
 from armcal.errors import ArmcalError
-from armcal.io.event_file import EARLIER, EVENTS
+from armcal.io.event_file import EVENTS, EventTail
 
 from armcal_online.watch.events import VERDICTS, Message
 from armcal_online.watch.history import History
 from armcal_online.watch.lenient import numbers, parsed, scalar, text
 from armcal_online.watch.shape import Shape
-from armcal_online.watch.tail import Tail
 
 STATUS, CALIBRATION = "status.json", "calibration.yaml"
 MOST_MESSAGES = 1000
-"""Messages kept for pages that were away; who missed more begins anew."""
+"""Messages kept for pages that were away; a page that missed more begins anew."""
 TIPS = 40
 """Measured tips that are drawn."""
 _LONGEST_STATUS = 1 << 16
@@ -46,7 +45,7 @@ class Feed:
         self.trouble: str | None = None
         self.run = token_hex(4)
         self._shape = shape
-        self._tail = Tail(folder / EVENTS, folder / EARLIER)
+        self._tail = EventTail(folder)
         self._status: dict[str, Any] = {}
         self._status_time = 0
         self._units_after = 0.0
@@ -54,7 +53,7 @@ class Feed:
         self._drawn: int | None = None
         self._messages: deque[tuple[int, str]] = deque(maxlen=MOST_MESSAGES)
         self._number = 0
-        self._heard = time.time()
+        self._event_at = time.time()
         self._changed = threading.Condition()
 
     def step(self) -> list[Message]:
@@ -69,9 +68,9 @@ class Feed:
             for line in lines:
                 messages += self.history.take(parsed(line))
             if lines:
-                self._heard = time.time()
+                self._event_at = time.time()
                 with contextlib.suppress(OSError):
-                    self._heard = (self.folder / EVENTS).stat().st_mtime
+                    self._event_at = (self.folder / EVENTS).stat().st_mtime
             estimates, path = self.history.estimates, self.folder / CALIBRATION
             if estimates.without_unit and time.monotonic() >= self._units_after and path.exists():
                 self._units_after = time.monotonic() + _RETRY
@@ -111,7 +110,7 @@ class Feed:
                 "folder": str(self.folder),
                 "waiting": self.waiting,
                 "too_long": self._tail.too_long,
-                "heard_s": self._since(self._heard),
+                "heard_s": self._since(self._event_at),
                 "status": self._status,
                 "status_s": self._since(self._status_time / 1e9) if self._status else None,
                 "arm": self._arm,

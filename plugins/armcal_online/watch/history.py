@@ -22,18 +22,15 @@ class History:
     """What the events gave so far."""
 
     def __init__(self) -> None:
+        self.unknown = self.unreadable = 0
+        self._begin()
+
+    def _begin(self) -> None:
+        """With nothing, for a recalibration that begins."""
         self._accepted: Thinned[Message] = Thinned(RECENT_RECORDS, OLDER_ACCEPTED, shortened)
         self._others: Thinned[Message] = Thinned(RECENT_RECORDS // 2, OLDER_OTHERS, shortened)
         self.estimates = Estimates()
         self._listed: deque[Message] = deque(maxlen=MOST_EVENTS)
-        self.unknown = self.unreadable = 0
-        self._forget()
-
-    def _forget(self) -> None:
-        self._accepted.clear()
-        self._others.clear()
-        self.estimates.clear()
-        self._listed.clear()
         self.written: Message | None = None
         self._counts = dict.fromkeys(VERDICTS, 0)
         self._first: int | None = None
@@ -64,7 +61,7 @@ class History:
             self.unknown += 1
             return []
         if message["event"] == "level":
-            self._stand(message.get("to"), message["sentence"])
+            self._set_level(message.get("to"), message["sentence"])
         if message["event"] == "calibration":
             self.written = message
         else:
@@ -89,11 +86,6 @@ class History:
             "unreadable": self.unreadable,
         }
 
-    def newest(self, count: int) -> list[Message]:
-        """The newest records, oldest first."""
-        both = [*self._accepted.newest(count), *self._others.newest(count)]
-        return sorted(both, key=lambda r: r.get("sequence") or 0)[-count:]
-
     def _record(self, event: Mapping[str, Any]) -> list[Message]:
         record = record_of(event)
         if record is None:
@@ -108,7 +100,7 @@ class History:
         self.last = record
         record = {key: value for key, value in record.items() if key != "inputs"}
         (self._accepted if record["verdict"] == "accepted" else self._others).add(record)
-        self._stand(record.get("level"), None)
+        self._set_level(record.get("level"), None)
         standing = {"standing": self.level, "standing_sentence": self.level_sentence}
         return [{**record, "counts": dict(self._counts), **standing}]
 
@@ -116,7 +108,7 @@ class History:
         message = message_of(event)
         messages: list[Message] = []
         if event.get("resumed") is not True and (self.last or self._listed):
-            self._forget()
+            self._begin()
             messages.append({"event": "reset"})
         self.calibration = text(event.get("calibration")) or self.calibration
         gate = event.get("gate")
@@ -124,13 +116,13 @@ class History:
         first = whole(event.get("sequence"))
         self._sequence = self._sequence if first is None else first - 1
         row = self.estimates.start(event)
-        self._stand(text(event.get("level")), None)
+        self._set_level(text(event.get("level")), None)
         if message:
             self._listed.append(message)
             messages.append(message)
         return [*messages, *([row] if row else [])]
 
-    def _stand(self, level: Any, sentence: str | None) -> None:
+    def _set_level(self, level: Any, sentence: str | None) -> None:
         if level not in LEVELS:
             return
         if sentence is not None:

@@ -1,6 +1,6 @@
 """The page and its server: three addresses that are read, nothing that is written.
 
-On this machine anyone may look who asks for it by a name of its own, from elsewhere who knows the token.
+On this machine every request is answered that uses one of its own names; from elsewhere it needs the token.
 """
 
 from __future__ import annotations

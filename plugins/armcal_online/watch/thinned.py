@@ -38,16 +38,6 @@ class Thinned(Generic[T]):
             del self._older[1::2]
             self._stride *= 2
 
-    def clear(self) -> None:
-        """Forget everything."""
-        self._recent.clear()
-        self._older.clear()
-        self._stride, self._passed = 1, 0
-
-    def newest(self, count: int) -> list[T]:
-        """The newest few, oldest first."""
-        return list(self._recent)[-count:] if count else []
-
     def __iter__(self) -> Iterator[T]:
         yield from self._older
         yield from self._recent

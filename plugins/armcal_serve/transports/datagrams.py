@@ -25,7 +25,7 @@ _AT_ONCE = 32
 
 
 class Datagrams(Transport):
-    """Serves a port of the loopback address; what is lost on the way, or comes when too much waits, is asked again.
+    """Serves a port of the loopback address; clients repeat requests that were lost or came when too many waited.
 
     Raises:
         InputError: the port cannot be opened.
@@ -40,7 +40,7 @@ class Datagrams(Transport):
 
     @property
     def port(self) -> int:
-        """The one that it has, where any was wanted."""
+        """Its number; the system's choice where 0 was requested."""
         return int(self._socket.getsockname()[1])
 
     @property
@@ -63,14 +63,14 @@ class Datagrams(Transport):
     def open(self) -> None:
         self._poller.watch(self._socket, self._read)
 
-    def tend(self) -> None:
+    def poll(self) -> None:
         """Forget senders that were answered."""
         for sender, conversation in [*self._senders.items()]:
             if not conversation.open:
                 del self._senders[sender]
 
     @override
-    def listen_no_more(self) -> None:
+    def stop_reading(self) -> None:
         self._poller.watch(self._socket)
 
     @override

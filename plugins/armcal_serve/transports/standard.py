@@ -35,7 +35,7 @@ class StandardStreams(Transport):
     @override
     def ended(self) -> bool:
         client = self._client
-        return client is not None and (client.ended or (client.heard_all and client.finished))
+        return client is not None and (client.ended or (client.input_ended and client.finished))
 
     @property
     @override
@@ -49,13 +49,13 @@ class StandardStreams(Transport):
         )
 
     @override
-    def tend(self) -> None:
-        """Whoever reads slowly here holds up nobody else."""
+    def poll(self) -> None:
+        """Nothing: a slow reader delays no other client here."""
 
     @override
-    def listen_no_more(self) -> None:
+    def stop_reading(self) -> None:
         if self._client is not None:
-            self._client.listen_no_more()
+            self._client.stop_reading()
 
     @override
     def close(self) -> None:

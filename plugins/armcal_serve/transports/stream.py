@@ -1,4 +1,4 @@
-"""A client at a stream of bytes: lines in, lines out, no more of either in memory than is bearable."""
+"""A client at a stream of bytes: lines in, lines out, with bounded memory for both."""
 
 from __future__ import annotations
 
@@ -29,63 +29,63 @@ class StreamClient:
 
     Args:
         incoming, outgoing: descriptors, or what has one; the same for a socket.
-        receive, send: raise OSError when nobody is there any more.
+        receive, send: raise OSError when the client is gone.
 
     Attributes:
-        ended: whether nobody is there any more.
-        heard_all: whether all of its requests have come.
-        moved: when it last took something, or had nothing to take (monotonic seconds).
-        asked: whether it ever sent a whole line.
+        ended: whether the client is gone.
+        input_ended: whether all of its requests have come.
+        progress_at: when it last read, or had nothing to read (monotonic seconds).
+        has_sent_line: whether it ever sent a whole line.
     """
 
     def __init__(
         self, incoming: Any, outgoing: Any, receive: Receive, send: Send, poller: Poller, dispatcher: Dispatcher
     ) -> None:
         self.ended = False
-        self.heard_all = False
-        self.asked = False
-        self.moved = self._said = time.monotonic()
+        self.input_ended = False
+        self.has_sent_line = False
+        self.progress_at = self._last_line_at = time.monotonic()
         self._incoming, self._outgoing = incoming, outgoing
         self._receive, self._take = receive, send
         self._poller, self._dispatcher = poller, dispatcher
         self._cutter = LineCutter(MAX_LINE_BYTES)
         self._lines: deque[bytes | None] = deque()
         self._out = bytearray()
-        self.conversation = Conversation(self._tell)
+        self.conversation = Conversation(self._queue)
         self.arrange()
 
     @property
     def finished(self) -> bool:
-        """Whether everything that was asked was answered, and the answers were taken."""
+        """Whether all requests were answered, and the answers taken."""
         return not (self._lines or self.conversation.open or self._out)
 
     @property
     def stuck_s(self) -> float:
-        """How long it has left answers unread (s)."""
-        return time.monotonic() - self.moved if self._out else 0.0
+        """How long answers have been unread (s)."""
+        return time.monotonic() - self.progress_at if self._out else 0.0
 
     @property
     def idle_s(self) -> float:
-        """How long it has asked nothing, a line that it only began left out; 0 while it is owed something (s)."""
-        return time.monotonic() - max(self._said, self.moved) if self.finished else 0.0
+        """How long it has sent no whole request (s); 0 while answers to it are due."""
+        return time.monotonic() - max(self._last_line_at, self.progress_at) if self.finished else 0.0
 
     @property
-    def owes_line(self) -> bool:
+    def line_pending(self) -> bool:
         """Whether it has yet to end its first line, or one that it began."""
-        return not self.heard_all and (not self.asked or self._cutter.begun)
+        return not self.input_ended and (not self.has_sent_line or self._cutter.begun)
 
     def dismiss(self, why: ArmcalError) -> None:
-        """Say why, and listen no more."""
+        """Answer with the reason, and read no further requests."""
         self._dispatcher.refuse(self.conversation, why)
-        self.listen_no_more()
+        self.stop_reading()
 
-    def listen_no_more(self) -> None:
+    def stop_reading(self) -> None:
         """Take no further requests."""
-        self.heard_all = True
+        self.input_ended = True
         self.arrange()
 
     def end(self) -> None:
-        """Forget it."""
+        """Drop its requests and answers."""
         self.ended = True
         self.conversation.end()
         self._out.clear()
@@ -94,7 +94,7 @@ class StreamClient:
             self._poller.watch(place)
 
     def arrange(self) -> None:
-        """Ask what can be asked, and watch what is to be waited for."""
+        """Hand on requests as far as there is room, and watch the descriptors that can go on."""
         while self._lines and self.conversation.open < MOST_WAITING and not self.ended:
             line = self._lines.popleft()
             if line is None:
@@ -105,7 +105,7 @@ class StreamClient:
         if self.ended:
             return
         full = bool(self._lines) or len(self._out) > MOST_UNREAD_BYTES
-        read = None if full or self.heard_all else self._read
+        read = None if full or self.input_ended else self._read
         write = self._write if self._out else None
         if self._incoming is self._outgoing:
             self._poller.watch(self._incoming, read, write)
@@ -124,18 +124,18 @@ class StreamClient:
         began = not self._cutter.begun
         lines = self._cutter.feed(data)
         if began or lines:
-            self._said = time.monotonic()
-        self.asked = self.asked or bool(lines)
+            self._last_line_at = time.monotonic()
+        self.has_sent_line = self.has_sent_line or bool(lines)
         self._lines.extend(lines)
         if not data:
-            self.heard_all = True
+            self.input_ended = True
             if self._cutter.begun:
                 self._lines.append(self._cutter.rest())
         self.arrange()
 
-    def _tell(self, answer: bytes) -> None:
+    def _queue(self, answer: bytes) -> None:
         if not self._out:
-            self.moved = time.monotonic()
+            self.progress_at = time.monotonic()
         self._out += answer
         self._out += b"\n"
         self._write()
@@ -148,7 +148,7 @@ class StreamClient:
                 if not sent:
                     break
                 del self._out[:sent]
-                self.moved = time.monotonic()
+                self.progress_at = time.monotonic()
         except OSError:
             self.end()
             return

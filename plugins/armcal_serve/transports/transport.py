@@ -1,4 +1,4 @@
-"""What every transport can do."""
+"""The interface of transports."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ class Transport(Protocol):
 
     Attributes:
         name: as the server's first line has it.
-        clients: who is there now.
+        clients: the number of clients now.
         ended: whether no request will ever come again by it.
-        finished: whether all that was asked was answered, and taken.
+        finished: whether all requests were answered, and the answers taken.
     """
 
     @property
@@ -34,11 +34,11 @@ class Transport(Protocol):
     def open(self) -> None:
         """Begin to take requests."""
 
-    def tend(self) -> None:
-        """What is due now and then."""
+    def poll(self) -> None:
+        """Do what is due; to be called often."""
 
-    def listen_no_more(self) -> None:
+    def stop_reading(self) -> None:
         """Take no further requests; those that came are answered."""
 
     def close(self) -> None:
-        """Let go of everything."""
+        """Close all connections."""

@@ -21,13 +21,13 @@ from armcal_serve.transports.transport import Transport
 
 MOST_CLIENTS = 64
 PATIENCE_S = 10.0
-"""A client that leaves answers unread for so long is let go of."""
+"""A client that leaves answers unread for so long is disconnected."""
 FIRST_LINE_S = 30.0
 """So long a client may take over its first line, and over any that it began."""
 _LEAST_IDLE_S = 1.0
-"""A client that has asked nothing for so long gives way where there is no place left."""
+"""A client that has sent no request for so long is disconnected where there is no place left."""
 _PAUSE_S = 1.0
-"""Nobody is let in for so long where the system has no descriptor and no client is idle: who waits is reported on."""
+"""No client is accepted for so long where the system has no descriptor and no client is idle."""
 _NO_MORE = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM)
 
 
@@ -75,14 +75,14 @@ class UnixSocket(Transport):
         self._opens_at = None
         self._poller.watch(self._listener, self._accept)
 
-    def tend(self) -> None:
-        """Let go of clients that are done, that do not read, or that do not end a line."""
+    def poll(self) -> None:
+        """Disconnect clients that are done, that do not read, or that do not end a line."""
         if self._opens_at is not None and time.monotonic() >= self._opens_at:
             self.open()
         for connection, client in [*self._clients.items()]:
-            if client.owes_line and client.idle_s > self._first_line_s:
+            if client.line_pending and client.idle_s > self._first_line_s:
                 _dismiss(client, f"no whole request came within {self._first_line_s:g} s")
-            if client.heard_all and client.finished and not client.ended:
+            if client.input_ended and client.finished and not client.ended:
                 client.end()
             if client.stuck_s > self._patience_s:
                 client.end()
@@ -91,11 +91,11 @@ class UnixSocket(Transport):
                 connection.close()
 
     @override
-    def listen_no_more(self) -> None:
+    def stop_reading(self) -> None:
         self._opens_at = None
         self._poller.watch(self._listener)
         for client in self._clients.values():
-            client.listen_no_more()
+            client.stop_reading()
 
     def close(self) -> None:
         """Take the socket away."""
@@ -130,11 +130,11 @@ class UnixSocket(Transport):
 
     @property
     def _staying(self) -> int:
-        return sum(not client.heard_all for client in self._clients.values())
+        return sum(not client.input_ended for client in self._clients.values())
 
     def _make_room(self, why: str) -> bool:
-        """Let go of the client that has asked nothing for longest; False where none is idle."""
-        staying = [client for client in self._clients.values() if not client.heard_all]
+        """Disconnect the client that has been idle for longest; False where none is idle."""
+        staying = [client for client in self._clients.values() if not client.input_ended]
         idlest = max(staying, key=lambda client: client.idle_s, default=None)
         if idlest is None or idlest.idle_s < _LEAST_IDLE_S:
             return False
