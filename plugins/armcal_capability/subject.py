@@ -21,7 +21,7 @@ from armcal.config.yaml_source import ConfigSource, load_config
 from armcal.errors import ConfigError, Location
 from armcal.plugins import PluginRegistry
 from armcal.run.plan_clearance import clearance_check
-from armcal.run.plan_settings import PlanSettings
+from armcal.run.settings import PlanSettings
 
 
 class _PlanPart(Settings):

@@ -125,7 +125,7 @@ def _arm(calibration: Calibration, name: str, order: Order) -> ServedArm:
     allowed = None
     if order.within:
         from armcal.plugins import discover  # late: not needed without limits
-        from armcal.run.workspace import workspace_of
+        from armcal.run.plan_poses import workspace_of
 
         space = workspace_of(Path(order.within), joints, discover())
         limits, allowed = space.limits, space.allowed

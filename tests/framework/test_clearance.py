@@ -23,8 +23,7 @@ from armcal.arm.clearance import (
 )
 from armcal.arm.holding import holding_efforts
 from armcal.errors import PluginError
-from armcal.run.plan_clearance import clearance_check, enclosing_capsule
-from armcal.run.plan_settings import ClearanceSettings
+from armcal.run.plan_clearance import ClearanceSettings, clearance_check, enclosing_capsule
 from scipy.optimize import minimize
 
 RANDOM = np.random.default_rng(0)

@@ -255,9 +255,9 @@ def test_one_arm_of_two(tmp_path: Path) -> None:
         ("x_mm,y_mm,z_mm", ["nan", 2, 3], "found no usable record"),
         ("x_mm,y_mm,z_mm", ["one", 2, 3], "found 'one', expected a number"),
         ("x_mm,y_mm,z_mm", ["1e300", 2, 3], "found 1e+297 m, expected a place that an arm could have"),
-        ("x_mm,y_mm,z_mm,roll_deg,pitch_deg", [1, 2, 3, 0, 0], "it tells roll, pitch and not yaw"),
-        ("x_mm,y_mm,z_mm,qw,qx,qy", [1, 2, 3, 1, 0, 0], "it tells qw, qx, qy and not qz"),
-        ("x_mm,y_mm,z_mm,qw,roll_deg", [1, 2, 3, 1, 0], "it tells the rotation twice, by qw and by roll"),
+        ("x_mm,y_mm,z_mm,roll_deg,pitch_deg", [1, 2, 3, 0, 0], "it gives roll, pitch and not yaw"),
+        ("x_mm,y_mm,z_mm,qw,qx,qy", [1, 2, 3, 1, 0, 0], "it gives qw, qx, qy and not qz"),
+        ("x_mm,y_mm,z_mm,qw,roll_deg", [1, 2, 3, 1, 0], "it gives the rotation twice, by qw and by roll"),
         ("x_mm,y_mm,z_mm,qw,qx,qy,qz", [1, 2, 3, 1, 1, 0, 0], ":2, qw, qx, qy, qz: its quaternion has the norm 1.414"),
         ("x_mm,y_mm,z_mm,qw,qx,qy,qz", [1, 2, 3, 0, 0, 0, 0], "its quaternion has the norm 0"),
         ("x_mm,y_mm,z_mm,gravity_z_m_s2", [1, 2, 3, -1.62], "gravity has no gravity_x, gravity_y"),
@@ -497,7 +497,7 @@ def test_a_table_of_the_nominal_arm_itself_is_all_zeros(tmp_path: Path, arms) ->
     nominal = arms[2]
     settings = read_table_settings(grid(tmp_path, nodes=[2, 2, 2], tried=5))
     table = correction_table(nominal, nominal, settings)
-    assert table.had.all()
+    assert table.reached.all()
     assert np.abs(table.shifts).max() < 1e-8
     assert np.abs(table.turns).max() < 1e-7
     assert table.tried.max() < 1e-7

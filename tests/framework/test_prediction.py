@@ -20,11 +20,11 @@ from armcal.diagnose.coverage import (
     Scores,
     besides,
     coverage,
+    coverage_finding,
     fit_and_predict,
     predictor,
     score,
     stretch,
-    told,
     whitened_like,
 )
 from armcal.errors import DataError
@@ -247,7 +247,7 @@ def test_neighbours_that_err_together_are_worth_less() -> None:
     ("share", "worth", "grade"), [(0.9, 100, "good"), (0.84, 50, "good"), (0.84, 500, "warning"), (0.97, 500, "note")]
 )
 def test_the_verdict_on_intervals_is_a_test_at_five_percent(share: float, worth: float, grade: str) -> None:
-    found = told(Coverage(300, 900, (0.5, share, 0.95), None, None, None, worth), "held-out records")
+    found = coverage_finding(Coverage(300, 900, (0.5, share, 0.95), None, None, None, worth), "held-out records")
     assert found.grade == grade and f"{100 * share:.1f} %" in found.text and f"{worth} independent" in found.test
 
 
@@ -456,7 +456,7 @@ def test_a_run_tells_what_its_intervals_hold(recording: Path) -> None:
     assert same["holdout"]["coordinates"] == 114 and same["cross_validated"]["records"] == 114
     assert same["radius_95_mm"] < 0.8 * message_of["new_recording"]["radius_95_mm"]
     page = (recording / "run" / "report.html").read_text()
-    assert "What a +- is worth" in page and "Predicted and found errors" in page
+    assert "What a +- is worth" in page and "Predicted and measured errors" in page
     assert "90 % prediction intervals" in (recording / "run" / "log.txt").read_text()
 
 

@@ -22,7 +22,8 @@ from armcal.estimate.estimator import Estimate, SolverVerdict
 from armcal.estimate.identifiability import analyse
 from armcal.estimate.validation import Split, hold_out, summarise
 from armcal.report import render
-from armcal.run.result import ErrorTable, RecordErrors, RunResult
+from armcal.run.errors import ErrorTable, RecordErrors
+from armcal.run.result import RunResult
 
 SECTIONS = ("verdict", "accuracy", "distribution", "records", "parameters")
 SECTIONS += ("compliances", "correlations", "determined", "data", "reproduce")

@@ -18,8 +18,9 @@ from armcal.estimate.validation import FitTask, fit_and_judge, folds
 from armcal.io.parallel import Sequential, Workers
 from armcal.report.study_page import conclusions
 from armcal.run.experiment import Experiment
+from armcal.run.model_study import compare
 from armcal.run.pipeline import calibrate
-from armcal.run.study import Study, compare
+from armcal.run.study import Study
 from click.testing import CliRunner, Result
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs" / "lrm_arm"

@@ -6,7 +6,7 @@ from itertools import permutations
 
 import numpy as np
 import pytest
-from armcal.run.visit import cool_order, heat, path_time, peak, quick_order, travel_times
+from armcal.planning.visit import cool_order, heat, path_time, peak, quick_order, travel_times
 
 
 @pytest.mark.parametrize("seed", range(6))

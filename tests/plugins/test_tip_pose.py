@@ -14,7 +14,7 @@ from armcal.run.experiment import Experiment
 from armcal.run.pipeline import calibrate
 from armcal.run.plan_context import plan_context
 from armcal.run.plan_poses import JointSpace
-from armcal.run.plan_settings import PlanSettings
+from armcal.run.settings import PlanSettings
 from armcal_tracker.pose import TipPose, TipPoseSettings
 from pydantic import ValidationError
 from scipy.spatial.transform import Rotation

@@ -17,8 +17,8 @@ from armcal.errors import ProblemError
 from armcal.estimate.identifiability import Identifiability
 from armcal.estimate.structure import identify, require_solvable
 from armcal.plugins import discover
+from armcal.run.data_checks import gravity_findings
 from armcal.run.experiment import Experiment
-from armcal.run.gravity import gravity_findings
 from armcal.run.pipeline import Prepared, Stopwatch, assemble
 
 

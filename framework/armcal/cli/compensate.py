@@ -17,8 +17,7 @@ from armcal.calibration.compensation.request import Redundancy
 from armcal.cli.common import Console, accept, point, spare_inputs, speaking, warn_of_target
 from armcal.errors import InputError, Location
 from armcal.plugins import discover
-from armcal.run.command_file import write_commands
-from armcal.run.compensate import Assessed, Bench, assess, summary
+from armcal.run.compensate import Assessed, Bench, assess, summary, write_commands
 from armcal.run.target_file import TargetFile, check_units
 
 _SHOWN = 5

@@ -49,8 +49,8 @@ def correction_table(
     write_table(out, table)
     with_table, without = (1000 * column[np.isfinite(column)] for column in table.tried.T)
     found = {
-        "nodes": table.had.size,
-        "reached": int(table.had.sum()),
+        "nodes": table.reached.size,
+        "reached": int(table.reached.sum()),
         "tried": len(table.tried),
         "largest_shift_mm": 1000 * float(np.nanmax(np.linalg.norm(table.shifts, axis=-1))),
         "error_mm": float(with_table.mean()) if with_table.size else None,

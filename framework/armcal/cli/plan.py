@@ -19,9 +19,9 @@ from armcal.measure.csv_writer import write_csv
 from armcal.planning.criterion import GOALS
 from armcal.plugins import discover
 from armcal.run.experiment import Experiment
-from armcal.run.plan import PlanRequest, PlanResult, make_plan
-from armcal.run.plan_poses import told
-from armcal.run.plan_settings import PlanSettings
+from armcal.run.plan import PlanResult, make_plan
+from armcal.run.plan_poses import counts_text
+from armcal.run.settings import PlanSettings
 
 _SHOWN = 8
 _FILE = click.Path(path_type=Path)
@@ -47,9 +47,8 @@ def plan(console: Console, config: Path, count: int, out: Path, overrides: tuple
     console.plugin_faults(registry)
     chosen = [f"plan.{key}={given[key]}" for key in ("goal", "order") if given[key]]
     experiment = Experiment.load(config, (*overrides, *chosen), given["data"], registry)
-    request = PlanRequest(count, given["candidates"], given["given"], given["calibration"])
     with console.progress() as progress:
-        result = make_plan(experiment, request, progress)
+        result = make_plan(experiment, count, given["candidates"], given["given"], given["calibration"], progress)
     write_csv(out, result.dataset, experiment.request(measured=False).wanted)
     content = {**_content(experiment, result), "out": str(out), "seconds": time.perf_counter() - began}
     console.result(content)
@@ -115,7 +114,7 @@ def _parameters(experiment: Experiment, result: PlanResult) -> list[dict[str, An
 
 def _show(console: Console, content: dict[str, Any]) -> None:
     out, pool = console.out, content["candidates"]
-    left = f" ({told(pool['left_out'])} left out)" if pool["left_out"] else ""
+    left = f" ({counts_text(pool['left_out'])} left out)" if pool["left_out"] else ""
     given = f" after {content['given_records']} given records" if content["given_records"] else ""
     moved = f"; {pool['refined']} of the plan moved on from there" if pool["refined"] else ""
     kinds = {"continuous": "spread through joint space", "grid": "of a grid", "listed": "listed"}

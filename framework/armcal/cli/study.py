@@ -13,12 +13,12 @@ from armcal.io.folder import reserved
 from armcal.io.parallel import Executor
 from armcal.plugins import discover
 from armcal.report.study_page import conclusions, render_study, render_transfer, transfer_conclusions, transfer_table
-from armcal.run import study_outputs
+from armcal.run import study_result
 from armcal.run.load_transfer import transfer
+from armcal.run.model_study import compare
 from armcal.run.pipeline import Stopwatch
-from armcal.run.study import Study, compare
+from armcal.run.study import LoadTransferSettings, Study
 from armcal.run.study_result import StudyResult, TransferResult
-from armcal.run.study_settings import LoadTransferSettings
 
 
 @click.command()
@@ -34,7 +34,7 @@ def study(
     """Compare the variants that CONFIG lists by cross-validated error, or by load transfer."""
     watch = Stopwatch()
     folder = out or Path("runs") / config.stem
-    kept = click.get_current_context().with_resource(reserved(folder, study_outputs.FILES))
+    kept = click.get_current_context().with_resource(reserved(folder, study_result.FILES))
     registry = discover()
     console.plugin_faults(registry)
     asked = Study.load(config, overrides, data, registry)
@@ -50,7 +50,7 @@ def study(
         console.detail(f"{stage}: {seconds:.3f} s")
     result.seconds["total"] = watch.total()
     page = render_study(result) if isinstance(result, StudyResult) else render_transfer(result)
-    kept.place(study_outputs.files(result, asked, page))
+    kept.place(study_result.files(result, asked, page))
     console.result({**result.as_dict(), "folder": str(folder)})
     if isinstance(result, StudyResult):
         _show_study(console, result)

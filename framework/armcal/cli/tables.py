@@ -14,8 +14,8 @@ from armcal.cli.common import Console
 from armcal.estimate.bootstrap import Bootstrap
 from armcal.estimate.estimator import Estimate
 from armcal.estimate.validation import ErrorSummary
-from armcal.report.group_table import part_of
 from armcal.report.numbers import MINUS, NONE, decimals_for, shown_unit, significant
+from armcal.report.record_tables import part_of
 from armcal.report.tables import parameter_rows
 from armcal.run.result import RunResult
 

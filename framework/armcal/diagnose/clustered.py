@@ -53,8 +53,13 @@ def widened(
         return estimate
     shared = _shared(rows, place, estimate.noise_scale, problem.increments)
     chain = problem.parameters.entries_jacobian(estimate.values) * problem.parameters.scales()
-    weights = np.vstack([np.eye(problem.increments), chain]) @ np.linalg.pinv(rows.slopes)[: problem.increments]
-    factors = _factors(weights, rows, shared, estimate.noise_scale)
+    sums = np.vstack([np.eye(problem.increments), chain]) @ np.linalg.pinv(rows.slopes)[: problem.increments]
+    own, of_priors = sums[:, rows.by_record], np.sum(sums[:, len(rows.record_of) :] ** 2, axis=1)
+    apart, scale = np.sum(own**2, axis=(1, 2)), estimate.noise_scale**2
+    together = np.einsum("jir,ik,jkr->j", own, shared, own, optimize=True)
+    # The part of priors does not grow.
+    whole = np.maximum(scale * apart + of_priors, 1e-300)
+    factors = np.sqrt(1 + scale * np.maximum(together - apart, 0.0) / whole)
     by_coordinate, by_entry = factors[: problem.increments], factors[problem.increments :]
     if by_entry.max() < MATTERS:
         return replace(estimate, widened=())
@@ -89,38 +94,20 @@ def _shared(rows: FitRows, place: NDArray[np.intp], noise_scale: float, paramete
         root = np.linalg.cholesky(_correlation(place[:count], share, distance) + 1e-9 * np.eye(count))
         both = np.concatenate([slopes, residual[:, :, None]], axis=2).reshape(count, -1)
         white = np.asarray(solve_triangular(root, both, lower=True)).reshape(-1, columns + 1)
-        white, drifted = _without_drift(white, parameters, drifts)
+        drifted = 0.0
+        if drifts:  # innovations have unit covariance, so the rows' own is I + A A': its factor takes the drift out
+            drifting = white[:, parameters : parameters + drifts]
+            spread = np.linalg.cholesky(np.eye(len(white)) + drifting @ drifting.T)
+            kept = np.delete(white, np.s_[parameters : parameters + drifts], axis=1)
+            white, drifted = np.asarray(solve_triangular(spread, kept, lower=True)), np.log(np.diag(spread)).sum()
         part = np.vstack([white[:, :parameters], held])
         target = np.concatenate([white[:, -1], below])
         lengths = np.maximum(np.linalg.norm(part, axis=0), 1e-300)
         basis, triangle = np.linalg.qr(part / lengths)
         left = float(target @ target - np.sum((basis.T @ target) ** 2))
-        spread = np.log(np.maximum(np.abs(np.diag(triangle)), 1e-12) * lengths)
-        determinant = size * float(np.sum(np.log(np.diag(root)))) + drifted + float(np.sum(spread))
+        logs = np.log(np.maximum(np.abs(np.diag(triangle)), 1e-12) * lengths)
+        determinant = size * float(np.sum(np.log(np.diag(root)))) + float(drifted) + float(np.sum(logs))
         return 2 * determinant + spare * float(np.log(max(left, 1e-300))), share, distance, left / spare
 
     _, share, distance, variance = min(fitted(s, d) for s in _SHARES for d in _DISTANCES)
     return variance * _correlation(place, share, distance)
-
-
-def _without_drift(white: Array, parameters: int, drifts: int) -> tuple[Array, float]:
-    """Rows by parameters, drifts' innovations and the residual, made independent of these; half their log covariance.
-
-    The innovations have unit covariance: the rows' own is I + A A', whose factor takes them out.
-    """
-    if not drifts:
-        return white, 0.0
-    drifting = white[:, parameters : parameters + drifts]
-    root = np.linalg.cholesky(np.eye(len(white)) + drifting @ drifting.T)
-    kept = np.delete(white, np.s_[parameters : parameters + drifts], axis=1)
-    return np.asarray(solve_triangular(root, kept, lower=True)), float(np.sum(np.log(np.diag(root))))
-
-
-def _factors(weights: Array, rows: FitRows, shared: Array, noise_scale: float) -> Array:
-    """By what standard deviations of sums of rows by weights (sums x rows) grow; the part of priors does not."""
-    own = weights[:, rows.by_record]
-    apart = np.sum(own**2, axis=(1, 2))
-    together = np.einsum("jir,ik,jkr->j", own, shared, own, optimize=True)
-    of_priors = np.sum(weights[:, len(rows.record_of) :] ** 2, axis=1)
-    whole = np.maximum(noise_scale**2 * apart + of_priors, 1e-300)
-    return np.asarray(np.sqrt(1 + noise_scale**2 * np.maximum(together - apart, 0.0) / whole))

@@ -3,8 +3,8 @@
 Residuals of records that took no part in a fit are put in units of what was predicted for them. If the model's own
 error is not Gaussian, or larger in some poses than in others, the shares held differ from the levels claimed. The
 intervals are then stretched by the quantile of these scores, level by level, as conformal prediction does with scores
-in units of the predicted spread [Lei2018]. Its guarantee is not had: scores are those of folds, set against what the
-whole fit predicts, so that they are not exchangeable with those of new records, and all rests on poses alike. A
+in units of the predicted spread [Lei2018]. Its guarantee does not hold here: scores are those of folds, set against
+what the whole fit predicts, so that they are not exchangeable with those of new records, and poses must be alike. A
 stretch is never judged by the records it comes from: each fold of a cross-validation is judged by the stretch that the
 scores of the other folds give (cross-conformal [Vovk2015]).
 """
@@ -40,13 +40,13 @@ from armcal.estimate.weighing import WeighedFit, Weighing, fit
 from armcal.problem.problem import FactorRecords, Problem
 
 Recording = Literal["same", "new"]
-"""Whether what is predicted lies within the recording of the fit, whose drift is told, or in another one."""
+"""Whether what is predicted lies within the recording of the fit, whose drift is known, or in another one."""
 LargeErrors = tuple[Array, ...]
 """Raw residuals, one (n_r x N) a factor."""
 FEWEST = 40
 """Judged records for a stretch to be found."""
 LEVEL = 0.05
-_MEANT = {"same": "", "new": " without what is told of the drift, as in a new recording,"}
+_MEANT = {"same": "", "new": " without the known drift, as in a new recording,"}
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ class Stretch:
 
 @dataclass(frozen=True)
 class PredictedFit(JudgedFit):
-    """A fit that also tells how its predictions missed.
+    """A fit with how its predictions missed.
 
     Attributes:
         large_errors: raw residuals of the records that judge, by recording (``new`` only where something drifts).
@@ -156,33 +156,33 @@ def predictor(problem: Problem, fitted: WeighedFit) -> Predictor:
 
 def missed(by: Predictor, held: Sequence[FactorRecords]) -> dict[Recording, LargeErrors]:
     """Residuals of records that a fit did not see; nan where a measurement was not made."""
-    found: dict[Recording, LargeErrors] = {"same": by.residuals(held)}
+    residuals: dict[Recording, LargeErrors] = {"same": by.residuals(held)}
     if by.drifts:
-        found["new"] = by.problem.residuals(by.values, held)
+        residuals["new"] = by.problem.residuals(by.values, held)
     return {
         name: tuple(
             np.where(factor_records.measured, own, np.nan)
             for factor_records, own in zip(held, large_errors, strict=True)
         )
-        for name, large_errors in found.items()
+        for name, large_errors in residuals.items()
     }
 
 
 def score(by: Predictor, held: Sequence[FactorRecords]) -> dict[Recording, Scores]:
     """Residuals of records that a fit did not see, in units of what it predicts for them."""
-    ways = {"same": by.in_recording, "new": by.in_new_recording}
-    return {name: scored(by.problem, found, ways[name](held)) for name, found in missed(by, held).items()}
+    spreads = {"same": by.in_recording, "new": by.in_new_recording}
+    return {name: scored(by.problem, residuals, spreads[name](held)) for name, residuals in missed(by, held).items()}
 
 
-def scored(problem: Problem, found: LargeErrors, spreads: Sequence[Spread]) -> Scores:
+def scored(problem: Problem, residuals: LargeErrors, spreads: Sequence[Spread]) -> Scores:
     """Residuals in units of what is predicted for them; nan where there are none."""
-    errors = [residual / spread.deviations for residual, spread in zip(found, spreads, strict=True)]
+    errors = [residual / spread.deviations for residual, spread in zip(residuals, spreads, strict=True)]
     reaches = [
         np.linalg.norm(residual, axis=0) / spread.radius()
-        for kernel, residual, spread in zip(problem.kernels, found, spreads, strict=True)
+        for kernel, residual, spread in zip(problem.kernels, residuals, spreads, strict=True)
         if is_position(kernel)
     ]
-    count = found[0].shape[1]
+    count = residuals[0].shape[1]
     freedom = np.full(count, max(spreads[0].freedom, 1))
     return Scores(np.vstack(errors), np.array(reaches).reshape(-1, count), freedom)
 
@@ -197,7 +197,7 @@ def whitened_like(
 
 
 def fit_and_predict(task: FitTask) -> JudgedFit:
-    """Fit, judge and tell how it missed; see ``fit_and_judge``."""
+    """Fit, judge, and how it missed; see ``fit_and_judge``."""
     if task.problem.blueprint.groups:
         return fit_and_judge(task)  # a socket that is found anew from the records that judge it has no interval
     began = time.perf_counter()
@@ -223,11 +223,11 @@ def besides(scores: Scores, places: Indices) -> Scores:
 
 
 def collected(
-    splits: Sequence[Split], found: Sequence[Mapping[Recording, LargeErrors]], count: int
+    splits: Sequence[Split], residuals: Sequence[Mapping[Recording, LargeErrors]], count: int
 ) -> dict[Recording, LargeErrors]:
     """The residuals of all folds in the order of the records; nan where a fold has none."""
     result: dict[Recording, LargeErrors] = {}
-    for split, large_errors in zip(splits, found, strict=True):
+    for split, large_errors in zip(splits, residuals, strict=True):
         for name, own in large_errors.items():
             whole = result.setdefault(name, tuple(np.full((len(each), count), np.nan) for each in own))
             for mine, each in zip(whole, own, strict=True):
@@ -263,22 +263,22 @@ def coverage(scores: Scores, stretches: Sequence[Stretch | None] | None = None) 
     return Coverage(len(judged), int(np.isfinite(held).sum()), raw, raw_radius, shares, radius, _worth(held))
 
 
-def told(found: Coverage, of: str, recording: Recording = "same") -> Finding:
+def coverage_finding(shares: Coverage, of: str, recording: Recording = "same") -> Finding:
     """Do intervals hold their share? Two-sided, at 5 %, against so many independent numbers as they are worth."""
-    share, raw = found.stated[LEVELS.index(STATED)], found.raw[LEVELS.index(STATED)]
-    error = np.sqrt(STATED * (1 - STATED) / found.independent)
+    share, raw = shares.stated[LEVELS.index(STATED)], shares.raw[LEVELS.index(STATED)]
+    error = np.sqrt(STATED * (1 - STATED) / shares.independent)
     off = abs(share - STATED) > ndtri(1 - LEVEL / 2) * error
-    before = f"; {100 * raw:.1f} % before they were stretched" if found.stretched else ""
+    before = f"; {100 * raw:.1f} % before they were stretched" if shares.stretched else ""
     text = (
-        f"90 % prediction intervals{_MEANT[recording]} hold {100 * share:.1f} % of {found.coordinates} coordinates "
+        f"90 % prediction intervals{_MEANT[recording]} hold {100 * share:.1f} % of {shares.coordinates} coordinates "
         f"of {of}{before}"
     )
-    test = f"two-sided, 5 %, as of {found.independent:.0f} independent numbers"
+    test = f"two-sided, 5 %, as of {shares.independent:.0f} independent numbers"
     if not off:
         return Finding("good", f"{text}.", test)
     if share > STATED:
         return Finding("note", f"{text}: wider than need be.", test)
-    return Finding("warning", f"{text}: too narrow.", test, "Take the shares found for what a +- is worth.")
+    return Finding("warning", f"{text}: too narrow.", test, "Take the measured shares for what a +- is worth.")
 
 
 def _ranked(scores: Array, level: float) -> float:

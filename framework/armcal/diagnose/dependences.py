@@ -21,7 +21,7 @@ from armcal.problem.motion import Motion, recorded_order
 from armcal.problem.problem import Problem
 
 MOST_LEVELS = 12
-"""Levels of a joint are told apart one by one up to so many; beyond, by a cubic."""
+"""Levels of a joint are separated one by one up to so many; beyond, by a cubic."""
 _SLOW = 3
 _CUBIC = 3
 _AXES = ("x", "y", "z")
@@ -29,6 +29,11 @@ _SYMMETRIC = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 _BOTH_SIDES = "visit the same poses from both sides of {joint}"
 _SECOND_LOAD = "repeat some poses with a second payload"
 _REPEATS = "repeat one pose at the start, in the middle and at the end"
+
+_SURROUNDINGS = (
+    ("payload", "the payload", "torsional_spring or compliance; the payload's centre"),
+    ("temperature", "the temperature", "thermal_length"),
+)
 
 
 @dataclass(frozen=True)
@@ -42,7 +47,7 @@ class Dependence:
         arm: the arm's name; empty where it is none.
         words: what residuals depend on, as the end of a sentence.
         effect: the effect that would model it, and on what; empty if there is none.
-        measure: which measurement would tell.
+        measure: which measurement would show it.
         columns: raw residual by coefficient, one (n_r x N x k) array a factor.
         labels: what each coefficient is (k), for those that have a unit.
         unit: of the coefficients in SI (``rad``, ``m``, ``rad_per_Nm``; ``1`` for shares); empty if they have none.
@@ -88,9 +93,15 @@ class Records:
 
 
 def dependences(problem: Problem, motion: Motion, dataset: Dataset) -> Iterator[Dependence]:
-    """Everything that could be told of these records; what does not vary is left out."""
+    """Everything that these records could show; what does not vary is left out."""
     arms, here = problem.blueprint.arms, Records(dataset, motion)
-    yield from _of_offset(here)
+    still, measure = np.ones((len(dataset), 1)), "any poses show this: free the parameter"
+    words = "a constant shift of what is measured"
+    yield Dependence("offset", "", "", words, "the base's position, if it is free", measure, here.axes(still))
+    for channel in motion.channels:
+        name, _, joint = channel.partition(".")
+        words, along = f"the zero of {joint}", here.along(channel, still)
+        yield Dependence("offset", joint, name, words, f"{words}, if it is free", measure, along)
     yield from _of_order(here)
     for name, arm in arms.items():
         loads = motion.loads[name]
@@ -103,18 +114,12 @@ def dependences(problem: Problem, motion: Motion, dataset: Dataset) -> Iterator[
             yield from _of_coupling(here, name, arm, joint, shown)
             yield from _of_torque(here, name, f"{name}.{joint}", shown, loads.efforts[index], angle)
         yield from _of_moments(problem, here, arm, loads, len(arms) == 1)
-    yield from _of_surroundings(here)
-
-
-def _of_offset(here: Records) -> Iterator[Dependence]:
-    """What does not change from record to record, and the model still cannot take up."""
-    ones, measure = np.ones((len(here.dataset), 1)), "any poses tell this: free the parameter"
-    words = "a constant shift of what is measured"
-    yield Dependence("offset", "", "", words, "the base's position, if it is free", measure, here.axes(ones))
-    for channel in here.motion.channels:
-        arm, _, joint = channel.partition(".")
-        effect = f"the zero of {joint}, if it is free"
-        yield Dependence("offset", joint, arm, f"the zero of {joint}", effect, measure, here.along(channel, ones))
+    for channel, words, effect in _SURROUNDINGS:
+        if dataset.has(channel) and np.ptp(dataset.column(channel)) > 0:
+            feature = dataset.column(channel)
+            columns = here.axes((feature - feature.mean())[:, None] / feature.std())
+            measure = _SECOND_LOAD if channel == "payload" else "repeat some poses cold and warm"
+            yield Dependence(channel, "", "", words, effect, measure, columns)
 
 
 def _of_order(here: Records) -> Iterator[Dependence]:
@@ -174,7 +179,10 @@ def _of_approach(here: Records, arm: str, joint: str, shown: str, si: str) -> It
     if here.dataset.has(channel):
         came = here.dataset.column(channel)
     else:
-        came = _came_from(command, recorded_order(here.dataset))
+        place = np.argsort(recorded_order(here.dataset), kind="stable")
+        moved = np.sign(np.diff(np.nan_to_num(command[place]), prepend=np.nan_to_num(command[place[:1]])))
+        came = np.empty(len(command))
+        came[place] = moved[np.maximum.accumulate(np.where(moved != 0, np.arange(len(moved)), 0))]
         effect += ", with a column for the approach"
         side += ", if it went from pose to pose in the recorded order"
     if _spread(came) <= 0:
@@ -186,16 +194,6 @@ def _of_approach(here: Records, arm: str, joint: str, shown: str, si: str) -> It
     )
     words = f"{side}, in directions that {shown} does not move"
     yield Dependence("approach", shown, arm, words, "", measure, here.axes(sign))
-
-
-def _came_from(command: Array, order: Array) -> Array:
-    """The sign of each joint's last move before each record (N), 0 before its first."""
-    place = np.argsort(order, kind="stable")
-    moved = np.sign(np.diff(np.nan_to_num(command[place]), prepend=np.nan_to_num(command[place[:1]])))
-    last = np.maximum.accumulate(np.where(moved != 0, np.arange(len(moved)), 0))
-    came = np.empty(len(command))
-    came[place] = moved[last]
-    return came
 
 
 def _of_coupling(here: Records, name: str, arm: Arm, joint: str, shown: str) -> Iterator[Dependence]:
@@ -234,7 +232,11 @@ def _of_torque(
 
 def _of_moments(problem: Problem, here: Records, arm: Arm, loads: SiteLoads, alone: bool) -> Iterator[Dependence]:
     """A symmetric compliance at each site, seen by the factors that measure this arm's tip in its base frame."""
-    seen = [_is_position_of(problem, i, arm.name) for i in range(len(problem.kernels))]
+    seen = [
+        [channel.rpartition(".")[2] for channel in factor.output_channels] == list(_AXES)
+        and tuple(problem.blueprint.measurements[factor.name].arms) == (arm.name,)
+        for factor in (kernel.factor for kernel in problem.kernels)
+    ]
     if not any(seen):
         return
     for site, (moment, lever) in enumerate(zip(loads.moments, loads.levers, strict=True)):
@@ -270,21 +272,3 @@ def _centred(features: Array, command: Array) -> Array:
     centred = np.zeros_like(features)
     centred[known] = features[known] - features[known].mean(axis=0)
     return centred
-
-
-def _is_position_of(problem: Problem, factor: int, arm: str) -> bool:
-    one = problem.kernels[factor].factor
-    axes = [channel.rpartition(".")[2] for channel in one.output_channels]
-    return axes == list(_AXES) and tuple(problem.blueprint.measurements[one.name].arms) == (arm,)
-
-
-def _of_surroundings(here: Records) -> Iterator[Dependence]:
-    asked = (
-        ("payload", "the payload", "torsional_spring or compliance; the payload's centre", _SECOND_LOAD),
-        ("temperature", "the temperature", "thermal_length", "repeat some poses cold and warm"),
-    )
-    for channel, words, effect, measure in asked:
-        if here.dataset.has(channel) and np.ptp(here.dataset.column(channel)) > 0:
-            feature = here.dataset.column(channel)
-            centred = (feature - feature.mean())[:, None] / feature.std()
-            yield Dependence(channel, "", "", words, effect, measure, here.axes(centred))

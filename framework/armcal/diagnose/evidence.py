@@ -19,7 +19,6 @@ from armcal.problem.tool_motion import along, apart_from, tools, unseen_motions
 
 UNSEEN = 400
 UP_TO_FRAMES = "where the base stands and which point of the tool is meant"
-_AXES = ["x", "y", "z"]
 _MM = 1000.0
 
 
@@ -96,28 +95,22 @@ def priors_alone(problem: Problem, estimate: Estimate, poses: Dataset) -> Priors
         None if there are none, or if no prior holds one of them.
     """
     null = estimate.identifiability.null
-    rows = _position_rows(problem)
     scales = estimate.parameters.scales()
     information = null * (scales**2 * estimate.parameters.prior_information()) @ null.T
     if not len(null) or not len(poses) or np.linalg.cond(information) > 1 / np.finfo(float).eps:
         return None
-    if not len(rows):
-        return _of_tools(problem, estimate, poses, np.asarray(np.linalg.inv(information), dtype=float))
-    noise = np.concatenate([kernel.factor.noise for kernel in problem.kernels])
-    seen = whitened_rows(problem, estimate.values, poses)[rows] * noise[rows, None, None] @ null.T
+    values, up_to, rows = estimate.values, "", _position_rows(problem)
+    if rows:
+        noise = np.concatenate([kernel.factor.noise for kernel in problem.kernels])
+        moved = (whitened_rows(problem, values, poses)[rows] * noise[rows, None, None] @ null.T)[None]
+    else:  # nothing reads a position in the base frame: of the tools themselves, up to what no contact could see
+        records, up_to = problem.records(poses), UP_TO_FRAMES
+        at, axes = tools(problem, values, records)
+        moves = np.array([along(problem, values, records, direction).ravel() for direction in null]).T
+        moved = apart_from(np.array(unseen_motions(at, axes)).T, moves).reshape(len(at), 3, -1, moves.shape[1])
     covariance: Array = np.asarray(np.linalg.inv(information), dtype=float)
-    variance = np.einsum("rnk,kl,rnl->n", seen, covariance, seen)
-    return PriorsAlone(float(np.sqrt(np.max(np.maximum(variance, 0.0)))) * _MM, len(poses))
-
-
-def _of_tools(problem: Problem, estimate: Estimate, poses: Dataset, covariance: Array) -> PriorsAlone:
-    """Where nothing reads a position in the base frame: of the tools themselves, up to what no contact could see."""
-    records, values = problem.records(poses), estimate.values
-    at, axes = tools(problem, values, records)
-    moves = np.array([along(problem, values, records, way).ravel() for way in estimate.identifiability.null]).T
-    left = apart_from(np.array(unseen_motions(at, axes)).T, moves).reshape(len(at), 3, -1, moves.shape[1])
-    variance = np.einsum("trnk,kl,trnl->tn", left, covariance, left)
-    return PriorsAlone(float(np.sqrt(np.max(np.maximum(variance, 0.0)))) * _MM, len(poses), UP_TO_FRAMES)
+    variance = np.einsum("trnk,kl,trnl->tn", moved, covariance, moved)
+    return PriorsAlone(float(np.sqrt(np.max(np.maximum(variance, 0.0)))) * _MM, len(poses), up_to)
 
 
 def _position_rows(problem: Problem) -> list[int]:
@@ -125,8 +118,7 @@ def _position_rows(problem: Problem) -> list[int]:
     start = 0
     for kernel in problem.kernels:
         factor = kernel.factor
-        own = [channel.rpartition(".")[2] for channel in factor.output_channels[:3]]
-        if own == _AXES and factor.dimensions[:3] == ("length",) * 3:
+        if factor.position_channels and factor.dimensions[:3] == ("length",) * 3:
             return list(range(start, start + 3))
         start += len(factor.noise)
     return []

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 from scipy.special import stdtrit
 
@@ -14,12 +12,12 @@ from armcal.diagnose.large_errors import MEDIANS, LargeErrors
 from armcal.diagnose.noise_findings import Finding
 from armcal.diagnose.odds import UNLISTED
 from armcal.diagnose.residual_structure import ResidualStructure, Structure
-from armcal.diagnose.smooth import CLEAR, IMITATED, TimeOrPose
+from armcal.diagnose.smooth import CLEAR, IMITATED
 from armcal.estimate.estimator import AT_BOUND, Estimate
 
 MOST_TOLD = 5
 FEW_NAMED = 2
-"""So many combinations that only priors hold are named in the verdict; of more, armcal identify tells."""
+"""So many combinations that only priors hold are named in the verdict; armcal identify names all."""
 _LIKELY = 0.05
 """A cause with less of the odds is not named first."""
 NEGLIGIBLE_SHARE = 0.1
@@ -53,7 +51,9 @@ def determined_finding(estimate: Estimate, alone: PriorsAlone | None, typical_mm
         text = f"{held}; the tip at unseen poses does not depend on them (at most {most} {_MM}, 1 sd)."
         return Finding("note", text, test, "Nothing for the tip; armcal identify names them.")
     text = f"{held}, and the tip at unseen poses depends on them, by up to {alone.worst_mm:.2g} {_MM} (1 sd)."
-    return Finding("warning", text, test, "armcal identify names them, and armcal plan the poses that would tell.")
+    return Finding(
+        "warning", text, test, "armcal identify names them, and armcal plan finds the poses that determine them."
+    )
 
 
 def shift_findings(estimate: Estimate) -> list[Finding]:
@@ -103,8 +103,9 @@ def structure_findings(structure: ResidualStructure | None, unit: str = _MM) -> 
     """What residuals still depend on."""
     if structure is None:
         return []
-    test = _test_of(structure)
-    kept = structure.worthwhile
+    blocks = f", blocks of {structure.block} records" if structure.block > 1 else ""
+    level = f"{100 * structure.level:g} % over all {structure.tested} dependences{blocks}"
+    test, kept = f"score test, {level}, and likelier than chance", structure.worthwhile
     findings = [_structure_finding(s, structure, unit, test) for s in kept] + _unlisted(structure)
     if not findings:
         slight = f" {_plural(len(structure.structures), 'dependence', 'dependences')} found would not lower it by 1 %."
@@ -122,7 +123,7 @@ def _structure_finding(s: Structure, structure: ResidualStructure, unit: str, te
     what = s.words + (f" ({s.size})" if s.size else "")
     test = f"p {_p(s.p_value)}, {test}; odds among all of them and what is none of them"
     if not s.alternatives:
-        model = f"Model it: {s.effect}. " if s.effect else "No effect of armcal says this. "
+        model = f"Model it: {s.effect}. " if s.effect else "No effect of armcal models this. "
         text = f"Residuals still depend on {what}: modelled, {falls}. It has {_share(s.odds)} of the odds."
         return Finding("warning", text, test, f"{model}To be sure: {s.measure}.")
     named = [what, *s.alternatives] if s.odds >= _LIKELY else [s.alternatives[0], what, *s.alternatives[1:]]
@@ -131,7 +132,7 @@ def _structure_finding(s: Structure, structure: ResidualStructure, unit: str, te
     text += f"; or on {more} more (metrics.json). " if more > 0 else ". "
     text += f"These data cannot tell which. Modelled as {s.words}, which has {_share(s.odds)} of the odds, {falls}."
     model = f" Then model it: {s.effect}." if s.effect else ""
-    return Finding("warning", text, test, f"To tell: {s.measure}.{model}")
+    return Finding("warning", text, test, f"To find out: {s.measure}.{model}")
 
 
 def _share(odds: float) -> str:
@@ -165,12 +166,6 @@ def _scatter(structure: ResidualStructure) -> list[Finding]:
     return [Finding("warning", text, test, action)]
 
 
-def _test_of(structure: ResidualStructure) -> str:
-    blocks = f", blocks of {structure.block} records" if structure.block > 1 else ""
-    level = f"{100 * structure.level:g} % over all {structure.tested} dependences{blocks}"
-    return f"score test, {level}, and likelier than chance"
-
-
 def neighbour_findings(structure: ResidualStructure | None, estimate: Estimate, unit: str = _MM) -> list[Finding]:
     """Whether records that follow one another miss alike, why, and whether that made intervals wider."""
     if structure is None:
@@ -182,9 +177,19 @@ def neighbour_findings(structure: ResidualStructure | None, estimate: Estimate, 
     if structure.lag_after_p > structure.level:
         return [Finding("note", f"{text}; what was found above explains it.", test)]
     after = f", by {structure.lag_after:.2f} still beside what was found" if structure.structures else ""
-    why, cause = ("", "open") if structure.alike is None else (f" {_why(structure.alike, unit)}", structure.alike.cause)
-    text += f"{after}: they are no noise. {what_neighbours_cost(estimate)}{why}"
-    return [Finding("warning", text, test, _TELL_APART[cause])]
+    text += f"{after}: they are no noise. {what_neighbours_cost(estimate)}"
+    alike = structure.alike
+    if alike is None:
+        return [Finding("warning", text, test, _TELL_APART["open"])]
+    text += (
+        f" {_WHY[alike.cause]}predicted from the others, a record misses a smooth function of time by "
+        f"{alike.time_mm:.2f} {unit} and one of the pose by {alike.pose_mm:.2f} {unit} (log odds against noise "
+        f"{alike.time:.0f} and {alike.pose:.0f})"
+    )
+    if max(alike.time_imitated, alike.pose_imitated) > IMITATED:
+        shares = f"the pose predicts {_share(alike.time_imitated)} of the one, time {_share(alike.pose_imitated)} of "
+        text += f"; {shares}the other, as the poses were visited in an order"
+    return [Finding("warning", f"{text}.", test, _TELL_APART[alike.cause])]
 
 
 def what_neighbours_cost(estimate: Estimate) -> str:
@@ -211,17 +216,6 @@ _TELL_APART = {
 }
 
 
-def _why(alike: TimeOrPose, unit: str) -> str:
-    """Smooth functions of both, compared."""
-    text = f"{_WHY[alike.cause]}predicted from the others, a record misses a smooth function of time by "
-    text += f"{alike.time_mm:.2f} {unit} and one of the pose by {alike.pose_mm:.2f} {unit} (log odds against "
-    text += f"noise {alike.time:.0f} and {alike.pose:.0f})"
-    if max(alike.time_imitated, alike.pose_imitated) > IMITATED:
-        shares = f"the pose predicts {_share(alike.time_imitated)} of the one, time {_share(alike.pose_imitated)} of "
-        text += f"; {shares}the other, as the poses were visited in an order"
-    return text + "."
-
-
 def large_error_findings(large_errors: LargeErrors | None, unit: str = _MM) -> list[Finding]:
     """Records beyond the limit, each with what is unusual about it."""
     if large_errors is None:
@@ -237,13 +231,8 @@ def large_error_findings(large_errors: LargeErrors | None, unit: str = _MM) -> l
     more = f"; and {large_errors.beyond - MOST_TOLD} more, in the report" if large_errors.beyond > MOST_TOLD else ""
     records = _plural(large_errors.beyond, "record is", "records are")
     text = f"{records} missed by more than {large_errors.limit_mm:.2f} {unit}: "
-    advice = _shared_advice([miss.advice for miss in large_errors.explained[:MOST_TOLD]])
-    return [Finding("warning", f"{text}{listed}{more}.", test, advice)]
-
-
-def _shared_advice(advice: Sequence[str]) -> str:
-    different = list(dict.fromkeys(advice))
-    return "; or ".join(different).capitalize() + "."
+    advice = "; or ".join(dict.fromkeys(miss.advice for miss in large_errors.explained[:MOST_TOLD]))
+    return [Finding("warning", f"{text}{listed}{more}.", test, f"{advice.capitalize()}.")]
 
 
 def _plural(count: int, one: str, many: str) -> str:

@@ -42,7 +42,11 @@ class FitRows:
         shared = records[0].correlation
         drifted = [np.zeros((*r.shape, 0)) for r in weighted] if shared is None else shared.shared()
         drifted = [slope[:, :count] for slope in drifted]
-        drift = np.zeros(0) if shared is None else _innovations(weighted, drifted)
+        drift = np.zeros(0)
+        if shared is not None:  # its most likely innovations
+            by_drift = np.vstack([slope.reshape(-1, slope.shape[2]) for slope in drifted])
+            off = by_drift.T @ np.concatenate([residual.ravel() for residual in weighted])
+            drift = -np.linalg.solve(np.eye(len(off)) + by_drift.T @ by_drift, off)
         data, slopes = [], []
         for residual, part, slope in zip(weighted, parts, drifted, strict=True):
             data.append((residual + slope @ drift).ravel())
@@ -93,13 +97,6 @@ class FitRows:
             squares.append(np.sum(raw**2, axis=0))
             place += size * count
         return np.asarray(np.sqrt(np.mean(squares, axis=0)))
-
-
-def _innovations(residuals: Sequence[Array], slopes: Sequence[Array]) -> Array:
-    """The most likely ones of a drift (n_z), by whitened residuals (n_r x N a factor) and their slopes by them."""
-    residual = np.concatenate([each.ravel() for each in residuals])
-    slope = np.vstack([each.reshape(-1, each.shape[2]) for each in slopes])
-    return -np.linalg.solve(np.eye(slope.shape[1]) + slope.T @ slope, slope.T @ residual)
 
 
 def _whitening(noise: Sequence[float], records: FactorRecords) -> Array:

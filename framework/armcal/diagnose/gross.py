@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armcal.base.domains import Array
-from armcal.base.parameters import ParameterBlock
 from armcal.diagnose.fit_rows import FitRows
 from armcal.errors import NotConvergedError
 from armcal.estimate.combination import Measure
@@ -37,7 +36,7 @@ class Displaced:
         unit: that people are shown.
         times: how many standard deviations of its prior, or typical corrections.
         by_prior: whether it has a prior.
-        placement: whether it only says where the base stands or which point of the tool is meant.
+        placement: whether it only moves where the base stands or which point of the tool is meant.
     """
 
     name: str
@@ -107,16 +106,21 @@ def displaced(problem: Problem, estimate: Estimate, records: Sequence[FactorReco
     parameters = problem.parameters
     moved = parameters.coordinates(parameters.local(estimate.values))
     blocks = [block for block in parameters.free for _ in range(block.domain.dof)]
-    sizes = np.array([_plausible(block) for block in blocks])
-    found = []
+    # By its prior, else by a typical correction of a length or angle; of others nothing is known.
+    typical = [b.scale if b.unit in ("m", "rad") and not b.nuisance else np.inf for b in blocks]
+    sizes = np.array([t if b.prior_sd is None else b.prior_sd for b, t in zip(blocks, typical, strict=True)])
+    far = []
     for i in np.flatnonzero(np.abs(moved) > BEYOND * sizes):
         block, direction = blocks[i], np.zeros(len(moved))
         direction[i] = 1.0
         amount, unit = Measure(block.unit, 1.0).shown(float(moved[i]))
-        placement = _is_placement(problem, estimate.values, records, direction)
+        at, axes = tools(problem, estimate.values, records)
+        moves = along(problem, estimate.values, records, direction).reshape(-1, 1)
+        left = np.linalg.norm(apart_from(np.array(unseen_motions(at, axes)).T, moves))
+        placement = bool(left <= _SAME_MOTION * np.linalg.norm(moves))
         times, name = abs(float(moved[i])) / sizes[i], parameters.coordinate_names[i]
-        found.append(Displaced(name, amount, unit, float(times), block.prior_sd is not None, placement))
-    return tuple(sorted(found, key=lambda each: -each.times))
+        far.append(Displaced(name, amount, unit, float(times), block.prior_sd is not None, placement))
+    return tuple(sorted(far, key=lambda coordinate: -coordinate.times))
 
 
 def scale_deviation(problem: Problem, rows: FitRows, positions: Sequence[Array], noise_scale: float) -> float | None:
@@ -135,19 +139,3 @@ def scale_deviation(problem: Problem, rows: FitRows, positions: Sequence[Array],
         column[: len(position), :, 0] = position
     left = float(np.linalg.norm(apart_from(rows.slopes, rows.columns(raw))))
     return noise_scale / left if left > 0 else float("inf")
-
-
-def _plausible(block: ParameterBlock) -> float:
-    """What its prior says, else a typical correction of a length or angle; of others nothing is known."""
-    if block.prior_sd is not None:
-        return block.prior_sd
-    return block.scale if block.unit in ("m", "rad") and not block.nuisance else float("inf")
-
-
-def _is_placement(problem: Problem, values: Array, records: Sequence[FactorRecords], direction: Array) -> bool:
-    """Whether a direction moves all tools as the base would, or as another point of the tool would."""
-    at, axes = tools(problem, values, records)
-    moves = along(problem, values, records, direction).reshape(-1, 1)
-    size = float(np.linalg.norm(moves))
-    left = apart_from(np.array(unseen_motions(at, axes)).T, moves)
-    return size == 0 or float(np.linalg.norm(left)) <= _SAME_MOTION * size

@@ -44,15 +44,15 @@ def gross_error(
     if share > OF_REACH:
         test = f"mean, limit {100 * OF_REACH:g} % of {whole:.0f} {unit}"
         return [Finding("bad", f"{error}: the values do not describe this arm.", test, CHECK_THE_DATA)]
-    found = 0.0
+    explained = 0.0
     if left is not None:
         causes = [s.falls_mm for s in left.worthwhile if s.kind not in _NO_EXCUSE]
-        found = max(causes, default=0.0) / max(left.mean_mm, 1e-12)
-    limit = UNEXPLAINED_OF_REACH if found < EXPLAINED else EXPLAINED_OF_REACH
+        explained = max(causes, default=0.0) / max(left.mean_mm, 1e-12)
+    limit = UNEXPLAINED_OF_REACH if explained < EXPLAINED else EXPLAINED_OF_REACH
     if share <= limit or scale <= TIMES_NOISE:
         return []
     text = f"{error} and {scale:.0f} times the declared noise; what was found in the residuals does not explain it."
-    test = f"limits {100 * limit:g} % and {TIMES_NOISE:g} times; one cause explains at most {100 * found:.0f} %"
+    test = f"limits {100 * limit:g} % and {TIMES_NOISE:g} times; one cause explains at most {100 * explained:.0f} %"
     return [Finding("bad", text, test, f"The cause is not known. {CHECK_THE_DATA}")]
 
 

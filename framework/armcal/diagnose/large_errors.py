@@ -51,7 +51,7 @@ class LargeErrors:
 
     Attributes:
         limit_mm: the limit.
-        configured: whether it was asked for; else it is ``MEDIANS`` medians.
+        configured: whether it is a setting; else it is ``MEDIANS`` medians.
         judged: how many records were judged.
         beyond: how many lie beyond.
         explained: these, with reasons.
@@ -119,32 +119,22 @@ def _miss(
     leverage: Array,
     efforts: Mapping[str, Array],
 ) -> Miss:
-    around = _neighbours(record, judged)
-    far = bool(leverage[record] > UNUSUAL)
-    reasons = []
-    if far:
-        reasons.append("hardest to predict: what it asks of the parameters is among the top 5 %")
-    heavy = _heaviest(record, problem, motion, efforts)
-    if heavy:
-        reasons.append(heavy)
-    if around == "alike":
-        reasons.append("its neighbours in the recording miss in the same direction")
-    along = _along(record, problem, motion, judged)
-    if along:
-        reasons.append(along)
-    if not reasons:
-        reasons.append("nothing is unusual about the pose")
+    alike, far = _neighbours_alike(record, judged), bool(leverage[record] > UNUSUAL)
+    heavy, along = _heaviest(record, problem, motion, efforts), _along(record, problem, motion, judged)
+    reasons = [
+        "hardest to predict: its variance by the parameters is among the top 5 %" if far else "",
+        heavy,
+        "its neighbours in the recording miss in the same direction" if alike else "",
+        along,
+    ]
+    advice = "measure it again: it may be a single wrong measurement"
+    if alike:
+        advice = "measure this pose again, at another time and coming from elsewhere"
+    elif far or heavy:
+        advice = "measure more poses like it"
+    unusual = tuple(filter(None, reasons)) or ("nothing is unusual about the pose",)
     row = dataset.rows[record] if dataset.rows else 0
-    advice = _advice(far or bool(heavy), around)
-    return Miss(dataset.ids[record], row, float(judged.errors_mm[record]), tuple(reasons), advice)
-
-
-def _advice(unusual: bool, around: str) -> str:
-    if around == "alike":
-        return "measure this pose again, at another time and coming from elsewhere"
-    if unusual:
-        return "measure more poses like it"
-    return "measure it again: it may be a single wrong measurement"
+    return Miss(dataset.ids[record], row, float(judged.errors_mm[record]), unusual, advice)
 
 
 def _leverage(problem: Problem, records: Sequence[FactorRecords], estimate: Estimate) -> Array:
@@ -178,17 +168,12 @@ def _heaviest(record: int, problem: Problem, motion: Motion, efforts: Mapping[st
     return ""
 
 
-def _neighbours(record: int, judged: Judged) -> str:
-    """``alike`` if those before and after it (that there are) miss in its direction, and not by little."""
-    whole = np.vstack(judged.residuals)
-    own, size = whole[:, record], float(np.linalg.norm(whole[:, record]))
-    middle = float(np.median(np.linalg.norm(whole, axis=0)))
-    found = []
-    for step in (-1, 1):
-        for other in np.flatnonzero(judged.position == judged.position[record] + step):
-            length = float(np.linalg.norm(whole[:, other]))
-            found.append(length >= middle and float(own @ whole[:, other]) > _ALIKE * size * length)
-    return "alike" if found and all(found) else "not alike"
+def _neighbours_alike(record: int, judged: Judged) -> bool:
+    """Whether those before and after it (that there are) miss in its direction, and not by little."""
+    whole, step = np.vstack(judged.residuals), judged.position - judged.position[record]
+    lengths, beside = np.linalg.norm(whole, axis=0), np.abs(step) == 1
+    same = whole[:, record] @ whole > _ALIKE * lengths[record] * lengths
+    return bool(beside.any() and np.all((same & (lengths >= np.median(lengths)))[beside]))
 
 
 def _along(record: int, problem: Problem, motion: Motion, judged: Judged) -> str:

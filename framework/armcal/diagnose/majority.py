@@ -55,26 +55,19 @@ def minority(rows: FitRows, noise_scale: float, position: NDArray[np.intp]) -> M
     acting = np.flatnonzero(_lengths(rows, rows.residual) > 0)
     if noise_scale < LEAST_SCALE or len(acting) < 1 / LEAST_SHARE:
         return None
-    residual = _to_majority(rows)
-    lengths = _lengths(rows, residual)
-    limit = max(FAR * float(np.quantile(lengths[acting], _QUARTILE)), FAR_IN_NOISE)
-    far, near = acting[lengths[acting] > limit], acting[lengths[acting] <= limit]
-    if len(far) < LEAST_SHARE * len(acting) or len(far) > len(near):
-        return None
-    sizes = rows.errors(residual) * 1000.0
-    return Minority(far, float(np.median(sizes[near])), float(np.median(sizes[far])), _since(far, near, position))
-
-
-def _to_majority(rows: FitRows) -> Array:
-    """The rows' residual after the fit to the majority."""
-    data, weights, residual = len(rows.record_of), np.ones(len(rows.residual)), rows.residual
+    data, weights = len(rows.record_of), np.ones(len(rows.residual))
     for _ in range(_ROUNDS):
         step = np.linalg.lstsq(rows.slopes * weights[:, None], -rows.residual * weights, rcond=1e-9)[0]
         residual = rows.residual + rows.slopes @ step
         lengths = _lengths(rows, residual)
         floor = max(_SMALLEST, 0.1 * float(np.quantile(lengths, _QUARTILE)))
         weights[:data] = 1 / np.sqrt(np.maximum(lengths, floor))[rows.record_of]
-    return residual
+    limit = max(FAR * float(np.quantile(lengths[acting], _QUARTILE)), FAR_IN_NOISE)
+    far, near = acting[lengths[acting] > limit], acting[lengths[acting] <= limit]
+    if len(far) < LEAST_SHARE * len(acting) or len(far) > len(near):
+        return None
+    sizes = rows.errors(residual) * 1000.0
+    return Minority(far, float(np.median(sizes[near])), float(np.median(sizes[far])), _since(far, near, position))
 
 
 def _lengths(rows: FitRows, residual: Array) -> Array:

@@ -71,7 +71,8 @@ def minimal_set(
         most_uncertain: leave out, the most uncertain first, what stays uncertain by more than so many typical scales.
     """
     columns = triangle * parameters.scales()
-    places = _places(parameters)
+    ends = np.cumsum([block.domain.dof for block in parameters.free]).tolist()
+    places = {b.name: slice(end - b.domain.dof, end) for b, end in zip(parameters.free, ends, strict=True)}
     tolerance = RANK_TOLERANCE * float(np.linalg.norm(columns, 2)) if columns.size else 0.0
     ranked = [[name for name in group if name in places] for group in preferred]
     ranked.append([name for name in places if not any(name in group for group in ranked)])
@@ -87,14 +88,6 @@ def minimal_set(
     return _described(columns, parameters, places, kept, tolerance)
 
 
-def _places(parameters: Parameters) -> dict[str, slice]:
-    places, start = {}, 0
-    for block in parameters.free:
-        places[block.name] = slice(start, start + block.domain.dof)
-        start += block.domain.dof
-    return places
-
-
 def _chosen(columns: Array, places: dict[str, slice], groups: Sequence[Sequence[str]], tolerance: float) -> list[str]:
     """Blocks in the order in which they are taken: within a group, the one with most that is new."""
     basis = np.zeros((len(columns), 0))
@@ -102,10 +95,13 @@ def _chosen(columns: Array, places: dict[str, slice], groups: Sequence[Sequence[
     for group in groups:
         waiting = list(dict.fromkeys(group))
         while waiting:
-            new = {name: _beyond(basis, columns[:, places[name]]) for name in waiting}
+            new = {name: columns[:, places[name]] for name in waiting}
+            for _ in range(2):  # twice, against rounding
+                new = {name: own - basis @ (basis.T @ own) for name, own in new.items()}
             # Rounded, so that equals stay in the order of the parameters whatever their last digits.
             best = max(waiting, key=lambda name: float(f"{np.linalg.norm(new[name]):.9e}"))
-            fresh = _range(new[best], max(tolerance, _NEW * float(np.linalg.norm(columns[:, places[best]]))))
+            left, values, _ = np.linalg.svd(new[best], full_matrices=False)
+            fresh = left[:, values > max(tolerance, _NEW * float(np.linalg.norm(columns[:, places[best]])))]
             if not fresh.shape[1]:
                 break
             basis = np.hstack([basis, fresh])
@@ -159,15 +155,3 @@ def _deviations(columns: Array, places: dict[str, slice], kept: Sequence[str]) -
     blurred = np.linalg.norm(directions[~seen], axis=0) > 1e-6
     deviation[inside] = np.where(blurred, np.inf, known)
     return deviation
-
-
-def _beyond(basis: Array, columns: Array) -> Array:
-    """What columns add to a basis; projected twice against rounding."""
-    once = columns - basis @ (basis.T @ columns)
-    return np.asarray(once - basis @ (basis.T @ once))
-
-
-def _range(columns: Array, tolerance: float) -> Array:
-    """Orthonormal columns that span what is larger than a tolerance."""
-    left, values, _ = np.linalg.svd(columns, full_matrices=False)
-    return np.asarray(left[:, values > tolerance])

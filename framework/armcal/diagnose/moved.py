@@ -26,7 +26,7 @@ class Moved:
     """A group whose first records lie elsewhere than the others.
 
     Attributes:
-        measurement: whose residuals tell.
+        measurement: whose residuals show it.
         key: of the group.
         before, after: how many records there are of each.
         distance: of the two means (m).
@@ -42,8 +42,8 @@ class Moved:
 
 
 def moved_groups(problem: Problem, values: Array, records: Sequence[FactorRecords]) -> tuple[Moved, ...]:
-    """Groups among weighted records that seem to have moved once, by the split that tells most."""
-    found, plan = [], problem.blueprint
+    """Groups among weighted records that seem to have moved once, by the clearest split."""
+    moved, plan = [], problem.blueprint
     residuals = problem.residuals(values, records)
     for kernel, record, residual in zip(problem.kernels, records, residuals, strict=True):
         if record.group is None:
@@ -57,8 +57,8 @@ def moved_groups(problem: Problem, values: Array, records: Sequence[FactorRecord
                 if distance > FAR * scatter:
                     key = group_key(plan.measurements, plan.groups, kernel.factor.name, number)
                     after = own.shape[1] - before
-                    found.append(Moved(kernel.factor.name, key, before, after, distance, scatter))
-    return tuple(found)
+                    moved.append(Moved(kernel.factor.name, key, before, after, distance, scatter))
+    return tuple(moved)
 
 
 def moved_findings(moved: Sequence[Moved]) -> list[Finding]:
@@ -85,7 +85,7 @@ def _split(residual: Array) -> tuple[int, float, float]:
         within = sum(float(np.sum((part - mean) ** 2)) for part, mean in zip(parts, means, strict=True))
         scatter = max(float(np.sqrt(within / (rows * (count - 2)))), 1e-12)
         distance = float(np.linalg.norm(means[0] - means[1]))
-        told = distance / scatter * float(np.sqrt(before * (count - before) / count))
-        if told > best[0]:
-            best = (told, before, distance, scatter)
+        evidence = distance / scatter * float(np.sqrt(before * (count - before) / count))
+        if evidence > best[0]:
+            best = (evidence, before, distance, scatter)
     return best[1], best[2], best[3]

@@ -1,4 +1,4 @@
-"""What a fit says of noise, in sentences of the verdict."""
+"""Noise of a fit, in sentences of the verdict."""
 
 from __future__ import annotations
 
@@ -8,11 +8,12 @@ from typing import Literal
 
 import numpy as np
 
-from armcal.estimate.variance import Component, VarianceComponents
-from armcal.estimate.weighing import Suspect, WeighedFit
+from armcal.estimate.variance import VarianceComponents
+from armcal.estimate.weighing import WeighedFit
 
 Grade = Literal["good", "note", "warning", "bad"]
 MOST_LISTED = 10
+_SHOWN = {"rad": (180 / np.pi, " deg"), "m": (1000.0, " mm")}
 
 
 @dataclass(frozen=True)
@@ -35,52 +36,46 @@ def suspect_findings(fitted: WeighedFit, ids: Sequence[str]) -> list[Finding]:
     if not fitted.suspects:
         return [Finding("good", "No training record lies farther from the fit than noise allows (1 % over all).")]
     left = "Left in the fit" if fitted.loss == "reject" else f"Weighed less by the loss {fitted.loss}"
-    groups = [
-        ("Set aside", fitted.set_aside),
-        (left, tuple(suspect for suspect in fitted.suspects if suspect.weight > 0)),
-    ]
-    return [Finding("warning", _listed(fate, group, ids)) for fate, group in groups if group]
-
-
-def _listed(fate: str, group: Sequence[Suspect], ids: Sequence[str]) -> str:
-    listed = ", ".join(f"{ids[s.record]} ({_distance(s)})" for s in group[:MOST_LISTED])
-    more = f" and {len(group) - MOST_LISTED} more" if len(group) > MOST_LISTED else ""
-    limit = f"{group[0].limit:.1f} sd, 1 % over all records"
-    return (
-        f"{fate}, and farther from the fit than noise allows ({limit}): {len(group)} records: {listed}{more}. "
-        "Their errors are counted all the same; residuals.csv has them."
-    )
-
-
-def _distance(suspect: Suspect) -> str:
-    weight = f", weight {suspect.weight:.2g}" if 0 < suspect.weight < 1 else ""
-    return f"{suspect.distance:.1f} sd{weight}"
+    kept = tuple(suspect for suspect in fitted.suspects if suspect.weight > 0)
+    findings = []
+    for fate, group in (("Set aside", fitted.set_aside), (left, kept)):
+        if not group:
+            continue
+        weights = [f", weight {s.weight:.2g}" if 0 < s.weight < 1 else "" for s in group[:MOST_LISTED]]
+        listed = (f"{ids[s.record]} ({s.distance:.1f} sd{w})" for s, w in zip(group, weights, strict=False))
+        more = f" and {len(group) - MOST_LISTED} more" if len(group) > MOST_LISTED else ""
+        text = (
+            f"{fate}, and farther from the fit than noise allows ({group[0].limit:.1f} sd, 1 % over all records): "
+            f"{len(group)} records: {', '.join(listed)}{more}. Their errors are counted all the same; residuals.csv "
+            "has them."
+        )
+        findings.append(Finding("warning", text))
+    return findings
 
 
 def component_findings(variance_components: VarianceComponents) -> list[Finding]:
     """Is it the tracker or the model?"""
     joints = variance_components.share("joint")
     parts = sorted(variance_components.components, key=lambda c: -c.share)
-    listed = "; ".join(f"{c.name} {100 * c.share:.0f} % ({_size(c)})" for c in parts)
+    texts = []
+    for c in parts:
+        factor, unit = _SHOWN.get(c.unit, (1.0, " times the declared noise"))
+        sd = f"{factor * c.sd:.2g}{unit}, 95 % {factor * c.lower:.2g} to {factor * c.upper:.2g}"
+        texts.append(f"{c.name} {100 * c.share:.0f} % ({sd})")
+    listed = "; ".join(texts)
     whose = "the joints'" if joints > 0.5 else "the instruments'"
     share = joints if joints > 0.5 else 1 - joints
     meaning = (
         " A joint's part is what acts like an angle that is off, repeatable or not: an effect that the model lacks "
-        "looks the same. Poses measured twice would tell the two apart."
+        "looks the same. Poses measured twice would separate the two."
     )
     text = f"The scatter is mostly {whose} ({100 * share:.0f} % of the variance): {listed}."
     findings = [Finding("note", text + (meaning if joints > 0.5 else ""))]
     if variance_components.inseparable:
         pairs = ", ".join(f"{a} and {b} ({r:+.2f})" for a, b, r in variance_components.inseparable)
-        findings.append(Finding("warning", f"These poses hardly tell apart whose the scatter is: {pairs}."))
+        findings.append(Finding("warning", f"In these poses some variances can hardly be told apart: {pairs}."))
     if variance_components.unseen:
         findings.append(
             Finding("note", f"No residual shows what these joints do: {', '.join(variance_components.unseen)}.")
         )
     return findings
-
-
-def _size(c: Component) -> str:
-    """A standard deviation and its interval in a customary unit."""
-    factor, unit = {"rad": (180 / np.pi, " deg"), "m": (1000.0, " mm")}.get(c.unit, (1.0, " times the declared noise"))
-    return f"{factor * c.sd:.2g}{unit}, 95 % {factor * c.lower:.2g} to {factor * c.upper:.2g}"

@@ -52,7 +52,7 @@ def noise_trend(
     spread = float(squares.std())
     if not tried or not spread:
         return None
-    explained = np.array([_correlation(squares, f) ** 2 for _, f in tried])
+    explained = np.array([np.corrcoef(squares, f)[0, 1] ** 2 for _, f in tried])
     best, count = int(np.argmax(explained)), len(squares)
     p = min(1.0, len(tried) * float(chdtrc(1, count * explained[best])))
     if p > LEVEL:
@@ -62,10 +62,6 @@ def noise_trend(
     thirds = np.array_split(np.argsort(tried[best][1], kind="stable"), 3)
     low, high = (float(np.sqrt(np.mean(squares[part]))) for part in (thirds[0], thirds[-1]))
     return NoiseTrend(tried[best][0], p, low, high, tuple(tried[i][0] for i in close))
-
-
-def _correlation(one: Array, other: Array) -> float:
-    return float(np.corrcoef(one, other)[0, 1])
 
 
 def _features(here: Records, place: Array) -> Iterator[tuple[str, Array]]:

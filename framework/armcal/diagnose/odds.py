@@ -7,7 +7,7 @@ likelihood. Several causes at once are judged one by one, each in the presence o
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -66,7 +66,11 @@ class Contest:
     @cached_property
     def names(self) -> tuple[str, ...]:
         """What stands for one cause: a jump is one wherever it is, a drift of the whole any function of time."""
-        return tuple(_name(cause) for cause in self.causes)
+        names = []
+        for cause in self.causes:
+            once = f"{cause.kind} {cause.subject}" if cause.kind in ("step", "slip") else cause.words
+            names.append(CHANGING if cause.kind == "order" and not cause.subject else once)
+        return tuple(names)
 
     def beside(self, others: Sequence[int]) -> tuple[Array, Array]:
         """Residual and basis with some causes in the model."""
@@ -91,8 +95,12 @@ class Contest:
         for words, kernels in ((UNLISTED, self.pose), (CHANGING, self.time)):
             evidence = independence * smooth(residual, basis, self.by_record, kernels).evidence
             shown[words] = max(shown.get(words, -np.inf), evidence)
-        for words in self._possible(cause, others, independence):
-            shown[words] = max(shown[words], shown[mine])
+        # What is none of the causes cannot be excluded where what is left follows the pose, or poses were in order.
+        after, whole = self.beside([*others, cause])
+        left = smooth(after, whole, self.by_record, self.pose).evidence * independence > CLEAR
+        timely = self.causes[cause].kind in _OVER_TIME
+        if left or (timely and self.pose.imitate((residual - after)[self.by_record]) > IMITATED):
+            shown[UNLISTED] = max(shown[UNLISTED], shown[mine])
         shown[CHANCE] = float(np.log(len(self.causes)))  # nothing is as likely beforehand as all causes together
         total = float(np.logaddexp.reduce(list(shown.values())))
         close = [name for name, gain in shown.items() if gain > shown[mine] - CLEAR and name != mine]
@@ -111,17 +119,3 @@ class Contest:
                 gains[i] = -0.5 * independence * freedom * np.log(left)
                 gains[i] -= 0.5 * own.shape[1] * np.log(max(freedom * independence, 2.0))
         return gains
-
-    def _possible(self, cause: int, others: Sequence[int], independence: float) -> Iterator[str]:
-        """What is none of the causes and cannot be excluded: what is left follows the pose, or poses were in order."""
-        (before, _), (after, whole) = self.beside(others), self.beside([*others, cause])
-        left = smooth(after, whole, self.by_record, self.pose).evidence * independence > CLEAR
-        timely = self.causes[cause].kind in _OVER_TIME
-        if left or (timely and self.pose.imitate((before - after)[self.by_record]) > IMITATED):
-            yield UNLISTED
-
-
-def _name(cause: Dependence) -> str:
-    if cause.kind == "order" and not cause.subject:
-        return CHANGING
-    return f"{cause.kind} {cause.subject}" if cause.kind in ("step", "slip") else cause.words

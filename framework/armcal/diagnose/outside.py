@@ -16,37 +16,32 @@ _AXES = ("x", "y", "z")
 _MOST_STEPS, _MOST_SLIPS = 40, 12
 """Places at which something may have jumped are looked at: of all that is measured, and of each joint."""
 _FEWEST_APART = 4
+_LOAD_PARTS = (slice(0, 3), slice(3, 4), slice(4, 8))
+"""Of the loads that motion knows slopes by: turns of gravity, its size, mass and place of a payload."""
 _STEP_MEASURE = "repeat some of the first poses now, and look at what was touched at that time"
 
 
 def outside(problem: Problem, motion: Motion, dataset: Dataset, positions: Sequence[Array]) -> Iterator[Dependence]:
     """Everything of it that these records could show; ``positions`` are what instruments should read."""
     here = Records(dataset, motion)
-    yield from _of_loads(motion)
+    if motion.by_load:
+        by_load = [slope.transpose(0, 2, 1) for slope in motion.by_load]  # n_r x N x (gravity's turn, size, load)
+        level, weigh = "level the base, or measure its tilt with a spirit level", "weigh what hangs on the tool"
+        turns = tuple(f"turned about {axis}" for axis in _AXES)
+        gravity, size, load = (tuple(slope[:, :, part] for slope in by_load) for part in _LOAD_PARTS)
+        words, effect = "the direction of gravity in the base frame", "statics.gravity_r?, freed"
+        yield Dependence("gravity", "", "", words, effect, level, gravity, turns, "rad")
+        words = "the size of gravity, or of all masses together"
+        yield Dependence("gravity", "size", "", words, "statics.gravity_m_s2", weigh, size, ("share",), "1")
+        words = "a load at the tool that is not stated"
+        yield Dependence("load", "", "", words, "statics.payload_g", weigh, load)
     yield from _of_instrument(here, positions)
     yield from _of_steps(here, problem)
 
 
-def _of_loads(motion: Motion) -> Iterator[Dependence]:
-    if not motion.by_load:
-        return
-
-    def columns(*places: int) -> tuple[Array, ...]:
-        return tuple(slope[:, list(places)].transpose(0, 2, 1) for slope in motion.by_load)
-
-    level, weigh = "level the base, or measure its tilt with a spirit level", "weigh what hangs on the tool"
-    turns = tuple(f"turned about {axis}" for axis in _AXES)
-    words, effect = "the direction of gravity in the base frame", "statics.gravity_r?, freed"
-    yield Dependence("gravity", "", "", words, effect, level, columns(0, 1, 2), turns, "rad")
-    words = "the size of gravity, or of all masses together"
-    yield Dependence("gravity", "size", "", words, "statics.gravity_m_s2", weigh, columns(3), ("share",), "1")
-    words = "a load at the tool that is not stated"
-    yield Dependence("load", "", "", words, "statics.payload_g", weigh, columns(4, 5, 6, 7))
-
-
 def _of_instrument(here: Records, read: Sequence[Array]) -> Iterator[Dependence]:
     """Scale and axes of instruments that measure positions; all of them alike."""
-    if not any(np.any(each) for each in read):
+    if not any(np.any(position) for position in read):
         return
     zeros = [np.zeros((size, len(here.dataset), 1)) for size in here.sizes]
 
@@ -79,12 +74,12 @@ def predicted_positions(
 
     Not what it does read: the noise of that would be taken for a scale.
     """
-    found = []
+    positions = []
     for kernel, off in zip(problem.kernels, problem.residuals(values, records), strict=True):
-        channels = kernel.factor.output_channels[:3]
-        read = [c.rpartition(".")[2] for c in channels] == list(_AXES) and all(map(dataset.has, channels))
-        found.append(np.nan_to_num(dataset.stacked(channels) - off[:3]) if read else np.zeros((0, len(dataset))))
-    return tuple(found)
+        channels = kernel.factor.position_channels
+        read = bool(channels) and all(map(dataset.has, channels))
+        positions.append(np.nan_to_num(dataset.stacked(channels) - off[:3]) if read else np.zeros((0, len(dataset))))
+    return tuple(positions)
 
 
 def _of_steps(here: Records, problem: Problem) -> Iterator[Dependence]:

@@ -30,7 +30,7 @@ FITS, MISSES = 0.1, 0.03
 """Of the spread of the positions: what a right reading leaves at most, what is worth a look."""
 _MOST_RECORDS = 300
 _EQUATIONS = 2.0
-"""So many numbers a parameter are needed to tell readings apart."""
+"""So many numbers a parameter are needed to separate readings."""
 _ALIKE = 1.5
 _TURNED = 0.05
 _SMALLEST, _SAME_M = 1e-9, 1e-6
@@ -143,11 +143,10 @@ def find_permuted_axes(problem: Problem, records: Sequence[FactorRecords], datas
 def _seen(problem: Problem, records: Sequence[FactorRecords], dataset: Dataset, number: int) -> _Seen | None:
     """A measurement that gives positions in the base frame, at most so many records of it; None of another."""
     factor = problem.kernels[number].factor
-    channels = factor.output_channels[:3]
-    positions = [channel.rpartition(".")[2] for channel in channels] == list(_AXES)
-    if not positions or factor.dimensions[:3] != ("length",) * 3 or any(OTHER in name for name in factor.channels):
+    channels = factor.position_channels
+    if not channels or factor.dimensions[:3] != ("length",) * 3 or not all(map(dataset.has, channels)):
         return None
-    if not all(dataset.has(channel) for channel in channels):
+    if any(OTHER in name for name in factor.channels):
         return None
     chosen = np.flatnonzero(records[number].measured)
     chosen = chosen[:: max(1, -(-len(chosen) // _MOST_RECORDS))]
@@ -171,23 +170,30 @@ def _of(problem: Problem, seen: _Seen, arm: Arm) -> PermutedAxes | None:
     enough = min(FITS * spread, as_given / MUCH_BETTER)
     readings = list(_single(problem, seen, arm, straight))
     if min(reading.left for reading in readings) > enough:
-        elsewhere, reachable = _elsewhere(straight, seen.measured)
-        if elsewhere.left <= enough and reachable:
+        turn, shift = rigid_fit(straight.predicted, seen.measured)
+        angle = np.rad2deg(np.linalg.norm(Rotation.from_matrix(turn).as_rotvec()))
+        words = f"the arm's base elsewhere by {np.linalg.norm(shift) * _MM:.3g} mm and {angle:.2g} deg"
+        elsewhere = _Reading(straight.left(turn.T @ (seen.measured - shift[:, None])), words, False)
+        if elsewhere.left <= enough and straight.can_move(turn, shift):
             return None
         readings = [elsewhere] if elsewhere.left <= enough else list(_several(problem, seen, arm, enough))
     best = min(readings, key=lambda reading: reading.left, default=None)
     if best is None or best.left > enough:
         return None
     alike = [r for r in readings if r.left <= _ALIKE * best.left and r.of_joints == best.of_joints]
-    words = tuple(reading.words for reading in sorted(alike, key=lambda reading: reading.left)[:_MOST_NAMED])
+    likeliest = tuple(reading.words for reading in sorted(alike, key=lambda reading: reading.left)[:_MOST_NAMED])
     name = problem.kernels[seen.kernel].factor.name
-    return PermutedAxes(name, words, as_given * _MM, best.left * _MM, best.of_joints)
+    return PermutedAxes(name, likeliest, as_given * _MM, best.left * _MM, best.of_joints)
 
 
 def _positions(problem: Problem, seen: _Seen, read_as: Wires) -> _Positions | None:
     """At the nominal values, channels read as others, times a factor; None where a record has no equilibrium."""
     kernel, own, parameters = problem.kernels[seen.kernel], seen.records, problem.parameters
-    records = replace(own, record=_rewired(own.record, kernel.factor.channels, read_as), state=np.zeros_like(own.state))
+    rewired, channels = own.record.copy(), kernel.factor.channels
+    for channel, (other, factor) in read_as.items():
+        if channel in channels and other in channels:
+            rewired[channels.index(channel)] = factor * own.record[channels.index(other)]
+    records = replace(own, record=rewired, state=np.zeros_like(own.state))
     try:
         blocks = list(problem.grouped[seen.kernel].linearised(parameters.nominal(), records))
     except NotConvergedError:
@@ -200,14 +206,6 @@ def _positions(problem: Problem, seen: _Seen, read_as: Wires) -> _Positions | No
     ways, sizes, _ = np.linalg.svd(triangle, full_matrices=False)
     kept = sizes > _SMALLEST * sizes.max(initial=0.0)
     return _Positions(seen.measured - residual * noise, basis @ ways[:, kept], sizes[kept])
-
-
-def _rewired(record: Array, channels: Sequence[str], read_as: Wires) -> Array:
-    rewired = record.copy()
-    for channel, (other, factor) in read_as.items():
-        if channel in channels and other in channels:
-            rewired[channels.index(channel)] = factor * record[channels.index(other)]
-    return rewired
 
 
 def _of_axes(straight: _Positions, measured: Array) -> list[tuple[str, Array]]:
@@ -225,15 +223,6 @@ def _of_axes(straight: _Positions, measured: Array) -> list[tuple[str, Array]]:
         scaled = np.diag([factor if i == axis else 1.0 for i in range(3)]) @ measured
         readings.append((f"{_AXES[axis]} {factor:.3g} times as large", scaled))
     return readings
-
-
-def _elsewhere(straight: _Positions, measured: Array) -> tuple[_Reading, bool]:
-    """The base elsewhere, and whether the free parameters can move it there by themselves."""
-    turn, shift = rigid_fit(straight.predicted, measured)
-    angle = np.rad2deg(np.linalg.norm(Rotation.from_matrix(turn).as_rotvec()))
-    words = f"the arm's base elsewhere by {np.linalg.norm(shift) * _MM:.3g} mm and {angle:.2g} deg"
-    left = straight.left(turn.T @ (measured - shift[:, None]))
-    return _Reading(left, words, False), straight.can_move(turn, shift)
 
 
 def _several(problem: Problem, seen: _Seen, arm: Arm, enough: float) -> Iterator[_Reading]:

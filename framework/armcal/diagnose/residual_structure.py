@@ -1,10 +1,10 @@
-"""What structure is left in the residuals of a calibration, how much of the error it is, and what would tell.
+"""What structure is left in the residuals of a calibration, how much of the error it is, and what would show it.
 
-Dependences are tested all at once (family-wise 5 %). The one that says most for its size [Schwarz1978] is taken into
-the model, to first order, and the others are tested again on what is left: so each is named for what the ones before
-it do not say. Residuals are those of training, less the drift that was found; what the parameters can take up, each
-dependence is freed of first. Of those that were found, each is then set against all the others and against what is
-not among them: it is named alone only where it is clearly the likeliest.
+Dependences are tested all at once (family-wise 5 %). The one that explains most for its size [Schwarz1978] is taken
+into the model, to first order, and the others are tested again on what is left: so each is named for what the ones
+before it do not explain. Residuals are those of training, less the drift that was found; what the parameters can take
+up, each dependence is freed of first. Of those that were found, each is then set against all the others and against
+what is not among them: it is named alone only where it is clearly the likeliest.
 """
 
 from __future__ import annotations
@@ -126,7 +126,7 @@ def structure(
     position: NDArray[np.intp],
     modelled: frozenset[str] = frozenset(),
 ) -> ResidualStructure | None:
-    """Test the residuals of a fit to records, with the weights they had; None where there are too few to tell.
+    """Test the residuals of a fit to records, with the weights they had; None where there are too few to judge.
 
     ``motion`` is how the arm stands in them, ``position`` how many of all records were recorded before each (N),
     ``modelled`` the types of the effects that the model has.
@@ -136,11 +136,10 @@ def structure(
     if len(chosen) < FEWEST_RECORDS:
         return None
     records, dataset, position = problem.subset(records, chosen), dataset.subset(chosen), position[chosen]
-    rows = FitRows.of(problem, records, estimate)
-    block, consecutive = _blocks_of(rows, len(dataset)), np.diff(position) == 1
-    fit, basis = _fit_of(rows, block, consecutive)
+    rows, read = FitRows.of(problem, records, estimate), predicted_positions(problem, estimate.values, records, dataset)
+    fit, basis, block = _fit_of(rows, len(dataset), np.diff(position) == 1)
     motion = motion.subset(chosen)
-    read = predicted_positions(problem, estimate.values, records, dataset)
+    place = next((own for own in read if len(own)), np.zeros((0, len(dataset))))
     causes = [*dependences(problem, motion, dataset), *outside(problem, motion, dataset, read)]
     columns = [rows.columns(one.columns) for one in causes]
     kernels = pose_kernels(problem, dataset), time_kernels(len(dataset))
@@ -156,17 +155,12 @@ def structure(
         search.last.lag_adjusted,
         _alike(residual, whole, rows, contest) if search.last.lag_adjusted <= LEVEL else None,
         smooth(residual, whole, rows.by_record, contest.pose).evidence,
-        noise_trend(residual, whole, rows.by_record, Records(dataset, motion), _first(read, len(dataset))),
+        noise_trend(residual, whole, rows.by_record, Records(dataset, motion), place),
         rows.mean_error(fit.residual) * _MM,
         search.tested,
         len(dataset),
-        int(np.bincount(block).max()),
+        block,
     )
-
-
-def _first(read: Sequence[Array], count: int) -> Array:
-    """The first position that is read (3 x N; m), or nothing (0 x N)."""
-    return next((each for each in read if len(each)), np.zeros((0, count)))
 
 
 def _alike(residual: Array, basis: Array, rows: FitRows, contest: Contest) -> TimeOrPose:
@@ -183,13 +177,6 @@ def _alike(residual: Array, basis: Array, rows: FitRows, contest: Contest) -> Ti
     )
 
 
-def _fit_of(rows: FitRows, block: NDArray[np.intp], consecutive: NDArray[np.bool_]) -> tuple[Fit, Array]:
-    """The rows of priors and drifts are dealt out to the blocks in turn."""
-    extra = np.arange(len(rows.residual) - len(rows.record_of)) % (block.max() + 1)
-    row_block = np.concatenate([block[rows.record_of], extra]).astype(np.intp)
-    return linear_fit(rows.slopes, rows.residual, row_block, rows.by_record, consecutive)
-
-
 def _looked_at(candidates: NDArray[np.intp], position: NDArray[np.intp]) -> NDArray[np.intp]:
     """In recorded order; of very many, runs of neighbours spread over the recording."""
     order = candidates[np.argsort(position[candidates], kind="stable")]
@@ -200,12 +187,19 @@ def _looked_at(candidates: NDArray[np.intp], position: NDArray[np.intp]) -> NDAr
     return np.concatenate([run[:most] for run in runs])
 
 
-def _blocks_of(rows: FitRows, count: int) -> NDArray[np.intp]:
-    """Of each record: as long as errors resemble their neighbours', and neither too many nor too few."""
-    series = rows.residual[rows.by_record].T
-    length = min(automatic_block_length(series), max(1, count // _FEWEST_BLOCKS))
+def _fit_of(rows: FitRows, count: int, consecutive: NDArray[np.bool_]) -> tuple[Fit, Array, int]:
+    """The linear fit, an orthonormal basis of its slopes, and how many records a block has.
+
+    Blocks are as long as errors resemble their neighbours', and neither too many nor too few. The rows of priors and
+    drifts are dealt out to them in turn.
+    """
+    length = min(automatic_block_length(rows.residual[rows.by_record].T), max(1, count // _FEWEST_BLOCKS))
     length = max(length, -(-count // _MOST_BLOCKS))
-    return (np.arange(count) // length).astype(np.intp)
+    block = np.arange(count) // length
+    extra = np.arange(len(rows.residual) - len(rows.record_of)) % (block.max() + 1)
+    row_block = np.concatenate([block[rows.record_of], extra]).astype(np.intp)
+    fit, basis = linear_fit(rows.slopes, rows.residual, row_block, rows.by_record, consecutive)
+    return fit, basis, int(np.bincount(block).max())
 
 
 @dataclass(frozen=True)
@@ -226,9 +220,15 @@ def _search(rows: FitRows, fit: Fit, contest: Contest, modelled: frozenset[str])
     first = test = family_test(fit, [own for _, own in left])
     tested, chosen, p_values, whole = len(left), list[int](), list[float](), float(fit.residual @ fit.residual)
     while len(chosen) < MOST_FOUND:
-        best = _best(test, [own.shape[1] for _, own in left], fit)
-        now = float(fit.residual @ fit.residual)
-        if best is None or test.share[best] * now < _NEGLIGIBLE * (whole - now):
+        now, significant = float(fit.residual @ fit.residual), np.flatnonzero(test.adjusted <= LEVEL)
+        if not len(significant):
+            break
+        # The least Bayesian information criterion, blocks counting as one.
+        sizes = np.array([own.shape[1] for _, own in left])[significant]
+        count = fit.blocks * fit.records.shape[1]
+        unexplained = np.maximum(1 - test.share[significant], 1e-12)
+        best = int(significant[np.argmin(count * np.log(unexplained) + sizes * np.log(count))])
+        if test.share[best] * now < _NEGLIGIBLE * (whole - now):
             break
         chosen.append(left[best][0])
         p_values.append(float(test.adjusted[best]))
@@ -285,17 +285,6 @@ def _structure(
     size = _size(one, -coefficients @ (own.T @ residual))
     named = (one.kind, one.subject, one.words, effect, one.measure)
     return Structure(*named, p_value, share, max(0.0, falls) * _MM, size, odds.share, odds.alternatives)
-
-
-def _best(test: FamilyTest, sizes: Sequence[int], fit: Fit) -> int | None:
-    """Among the significant ones the one with the least Bayesian information criterion, blocks counting as one."""
-    significant = np.flatnonzero(test.adjusted <= LEVEL)
-    if not len(significant):
-        return None
-    count = fit.blocks * fit.records.shape[1]
-    size = np.array(sizes)[significant]
-    left = np.maximum(1 - test.share[significant], 1e-12)
-    return int(significant[np.argmin(count * np.log(left) + size * np.log(count))])
 
 
 def _left_out(residual: Array, own: Array, fold: NDArray[np.intp]) -> Array:

@@ -142,22 +142,22 @@ def _ratios(bases: Sequence[Array], both: Array, fit: Fit) -> Array:
     T = s' (sum of s_b s_b')^-1 s lies between 0 and the number of blocks B, and (B - k)/k T/(B - T) follows F(k, B - k)
     for independent normal blocks.
     """
-    size, rows, found = bases[0].shape[1], _by_block(both, fit), np.empty((len(bases), both.shape[1]))
+    size, rows, statistics = bases[0].shape[1], _by_block(both, fit), np.empty((len(bases), both.shape[1]))
     most = max(1, _COLUMNS_AT_ONCE // size)
     for start in range(0, len(bases), most):
         columns = _by_block(np.hstack(bases[start : start + most]), fit)
         products = (columns.transpose(0, 2, 1) @ rows).reshape(fit.blocks, -1, size, both.shape[1])
-        found[start : start + most] = _statistic(products)
-    return np.asarray((fit.blocks - size) / size * found / np.maximum(fit.blocks - found, 1e-9))
+        statistics[start : start + most] = _statistic(products)
+    return np.asarray((fit.blocks - size) / size * statistics / np.maximum(fit.blocks - statistics, 1e-9))
 
 
 def _by_block(columns: Array, fit: Fit) -> Array:
     """Rows (rows x n) block by block, zeros behind those of short blocks (blocks x most rows x n)."""
     order, sizes = np.argsort(fit.block, kind="stable"), np.bincount(fit.block)
     place = np.arange(len(order)) - np.repeat(np.cumsum(sizes) - sizes, sizes)
-    found = np.zeros((len(sizes), int(sizes.max()), columns.shape[1]))
-    found[fit.block[order], place] = columns[order]
-    return found
+    blocks = np.zeros((len(sizes), int(sizes.max()), columns.shape[1]))
+    blocks[fit.block[order], place] = columns[order]
+    return blocks
 
 
 def _statistic(products: Array) -> Array:

@@ -54,7 +54,12 @@ class Kernels:
     @cached_property
     def features(self) -> tuple[Array, ...]:
         """So that features times their transposes are the kernels, but for their smallest parts."""
-        return tuple(_features(kernel) for kernel in self.each)
+        features = []
+        for kernel in self.each:
+            values, vectors = np.linalg.eigh(kernel)
+            kept = values > _SMALLEST * values[-1]
+            features.append(np.asarray(vectors[:, kept] * np.sqrt(values[kept]))[:, ::-1])
+        return tuple(features)
 
     def imitate(self, function: Array) -> float:
         """Which share of a function (N x n_r) they predict of a record from the others."""
@@ -98,12 +103,6 @@ def smooth(residual: Array, basis: Array, by_record: NDArray[np.intp], kernels: 
     if not own:
         return Smooth(-np.inf, np.zeros_like(residual), np.zeros((len(residual), 0)))
     return max(own, key=lambda one: one.evidence)
-
-
-def _features(kernel: Array) -> Array:
-    values, vectors = np.linalg.eigh(kernel)
-    kept = values > _SMALLEST * values[-1]
-    return np.asarray(vectors[:, kept] * np.sqrt(values[kept]))[:, ::-1]
 
 
 def _of_kernel(residual: Array, basis: Array, by_record: NDArray[np.intp], features: Array) -> Smooth:

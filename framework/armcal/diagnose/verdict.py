@@ -72,7 +72,7 @@ def judge(
         judged_mm: errors of the records that did not train, or of cross-validation; empty if there are none.
         judged_on: what these are, in words.
         ids: of all records (N).
-        suggestions: poses that would tell most next.
+        suggestions: poses that would add most information.
         fitted: how the training records weighed; None for plain least squares.
         predicted: whether prediction intervals hold their share.
         evidence: what residuals still depend on, which records are missed, what priors alone hold.
@@ -81,25 +81,18 @@ def judge(
     determined = determined_finding(estimate, seen.priors_alone, np.median(judged_mm) if len(judged_mm) else None)
     own, kept = [ids[i] for i in train], train if fitted is None else train[fitted.kept]
     suspicious = _suspicious(errors_mm[train], own, fitted)
+    noise = component_findings(fitted.components) if fitted and fitted.components else [_size(estimate, seen)]
     findings = [_convergence(estimate), determined, *_condition(estimate), *_bounds(estimate)]
-    findings += shift_findings(estimate) + _noise(estimate, fitted, seen)
-    findings += structure_findings(seen.structure, seen.unit)
+    findings += [*shift_findings(estimate), *noise, *structure_findings(seen.structure, seen.unit)]
     findings += neighbour_findings(seen.structure, estimate, seen.unit) or _neighbours(whitened, kept, estimate)
     findings += [*_correlated(estimate), *predicted, *large_error_findings(seen.large_errors, seen.unit)]
     findings += _outliers(suspicious, own, fitted) + _next(estimate, suggestions)
     ranked = tuple(sorted(findings, key=lambda finding: _ORDER[finding.grade]))
-    good = _good_for(judged_mm, judged_on, seen.unit, seen.new_recording)
-    use = f"{DO_NOT_USE}: {ranked[0].text}" if ranked[0].grade == "bad" else good
-    text = " ".join([use, *_in_short(estimate, determined, seen, suspicious, suggestions)])
-    if not estimate.verdict.converged:
-        text = "The solver did not converge: these values are no calibration."
-    return Verdict(_headline(judged_mm, judged_on, ranked[0], seen.unit), ranked, text)
-
-
-def _headline(judged_mm: Array, judged_on: str, worst: Finding, unit: str) -> str:
-    if worst.grade == "bad":
-        return f"{DO_NOT_USE}. {_errors_text(judged_mm, judged_on, unit)}"
-    return _errors_text(judged_mm, judged_on, unit)
+    headline = _errors_text(judged_mm, judged_on, seen.unit)
+    first = _good_for(judged_mm, judged_on, seen.unit, seen.new_recording)
+    if ranked[0].grade == "bad":
+        headline, first = f"{DO_NOT_USE}. {headline}", f"{DO_NOT_USE}: {ranked[0].text}"
+    return Verdict(headline, ranked, " ".join(_in_short(first, estimate, determined, seen, suspicious, suggestions)))
 
 
 def _errors_text(judged_mm: Array, judged_on: str, unit: str) -> str:
@@ -136,14 +129,17 @@ def _good_for(judged_mm: Array, judged_on: str, unit: str = "mm", new: NewRecord
 
 
 def _in_short(
+    first: str,
     estimate: Estimate,
     determined: Finding,
     seen: Evidence,
     suspicious: Sequence[str],
     suggestions: Sequence[Suggestion],
 ) -> list[str]:
-    """What is not determined, suspicious, left over, and to be measured next; a sentence each."""
-    sentences = []
+    """What it is good for, what is not determined, suspicious, left over, and to be measured next; a sentence each."""
+    if not estimate.verdict.converged:
+        return ["The solver did not converge: these values are no calibration."]
+    sentences = [first]
     if estimate.identifiability.undetermined:
         sentences.append(f"Not determined: {determined.text[:1].lower()}{determined.text[1:]}")
     missed = seen.large_errors
@@ -204,7 +200,7 @@ def _bounds(estimate: Estimate) -> list[Finding]:
         text = f"The data pushes against a bound: {_few(pushing)}. Something else in the model is missing."
         findings.append(Finding("warning", text, test, "Check loads, masses and signs; look for a missing effect."))
     if agreeing:
-        text = f"At a bound, and the data agrees: {_few(agreeing)}. Its upper limit is what was learned."
+        text = f"At a bound, and the data agrees: {_few(agreeing)}. The data limits it to one side only."
         findings.append(Finding("note", text, test))
     return findings
 
@@ -212,13 +208,6 @@ def _bounds(estimate: Estimate) -> list[Finding]:
 def _few(listed: Sequence[str], separator: str = ", ") -> str:
     more = f" and {len(listed) - MOST_TOLD} more" if len(listed) > MOST_TOLD else ""
     return separator.join(listed[:MOST_TOLD]) + more
-
-
-def _noise(estimate: Estimate, fitted: WeighedFit | None, seen: Evidence) -> list[Finding]:
-    """Whose the scatter is if that was estimated, else whether it is as large as declared."""
-    if fitted is not None and fitted.components is not None:
-        return component_findings(fitted.components)
-    return [_size(estimate, seen)]
 
 
 def _size(estimate: Estimate, seen: Evidence) -> Finding:
@@ -287,7 +276,7 @@ def _outliers(suspicious: Sequence[str], ids: Sequence[str], fitted: WeighedFit 
 
 
 def _next(estimate: Estimate, suggestions: Sequence[Suggestion]) -> list[Finding]:
-    """The parameter whose uncertainty is largest in its own typical scale, and the poses that would tell most."""
+    """The parameter whose uncertainty is largest in its own typical scale, and the poses that would add most."""
     if not estimate.names:
         return []
     scales = [b.scale for b in estimate.parameters.free for _ in range(b.size)]

@@ -145,9 +145,8 @@ def _off(problem: Problem, records: Sequence[FactorRecords], dataset: Dataset, v
     """Median residual by the spread of the measured positions, the worst of all measurements that read positions."""
     worst = 0.0
     for kernel, record, residual in zip(problem.kernels, records, problem.residuals(values, records), strict=True):
-        channels, seen = kernel.factor.output_channels[:3], record.measured[: len(dataset)]
-        positions = [channel.rpartition(".")[2] for channel in channels] == list("xyz")
-        if not positions or any(OTHER in name for name in kernel.factor.channels) or np.count_nonzero(seen) < _FEWEST:
+        channels, seen = kernel.factor.position_channels, record.measured[: len(dataset)]
+        if not channels or any(OTHER in name for name in kernel.factor.channels) or np.count_nonzero(seen) < _FEWEST:
             continue
         off = np.median(np.linalg.norm(residual[:3, seen], axis=0))
         worst = max(worst, float(off) / max(spread_of(dataset.stacked(channels)[:, seen]), 1e-12))

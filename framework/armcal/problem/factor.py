@@ -73,6 +73,12 @@ class Factor:
     joints: tuple[tuple[str, str], ...] = ()
 
     @property
+    def position_channels(self) -> tuple[str, ...]:
+        """Its first three readings where they are a position x, y, z; else none."""
+        first = self.output_channels[:3]
+        return first if [channel.rpartition(".")[2] for channel in first] == ["x", "y", "z"] else ()
+
+    @property
     def _inputs(self) -> list[Expression]:
         return [self.values, self.record, self.state]
 

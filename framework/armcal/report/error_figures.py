@@ -9,7 +9,7 @@ from armcal.base.domains import Array
 from armcal.estimate.validation import FEWEST_FOR_P95
 from armcal.report import svg
 from armcal.report.numbers import count, plural, significant
-from armcal.report.svg import Axis, Box, Figure
+from armcal.report.svg import DIAMOND, Axis, Box, Figure
 from armcal.run.result import RunResult
 
 PLAIN_POINTS = 3000
@@ -17,7 +17,6 @@ PLAIN_POINTS = 3000
 _CURVE_POINTS = 240
 _LOG_FROM = 6.0
 _OUTLIER = 4.0
-_DIAMOND = "m-3.6 0l3.6-3.6l3.6 3.6l-3.6 3.6z"
 _TRIANGLE = "m-4 5l4-7l4 7z"
 
 Mask = NDArray[np.bool_]
@@ -64,13 +63,13 @@ def _curves(result: RunResult) -> list[tuple[str, str, Array]]:
     """Class, name and finite errors of each curve that has any."""
     train, holdout = roles(result)
     errors = result.errors
-    found = [
+    curves = [
         ("before", "nominal", errors.nominal_mm),
         ("train", "calibrated, train", errors.calibrated_mm[train]),
         ("holdout", "calibrated, holdout", errors.calibrated_mm[holdout]),
         ("crossed", "calibrated, cross-validated", errors.cross_validated_mm),
     ]
-    finite = [(css, name, values[np.isfinite(values)]) for css, name, values in found]
+    finite = [(css, name, values[np.isfinite(values)]) for css, name, values in curves]
     return [(css, f"{name} ({count(len(values))})", values) for css, name, values in finite if len(values)]
 
 
@@ -139,7 +138,7 @@ def _order_legend(result: RunResult, thinned: bool) -> list[tuple[str, str]]:
         held = ('<path class="curve holdout" d="M0 0h22"/>', "holdout, median")
     else:
         entries = [('<path class="dot train" d="M11 0h0"/>', "train")]
-        held = (f'<path class="diamond" d="M11 0{_DIAMOND}"/>', "holdout")
+        held = (f'<path class="diamond" d="M11 0{DIAMOND}"/>', "holdout")
     if holdout.any():
         entries.append(held)
     ring = '<circle cx="11" cy="0" r="6" class="ring"/>'
@@ -151,9 +150,10 @@ def _one_by_one(result: RunResult, x: Axis, y: Axis) -> list[str]:
     train, holdout = roles(result)
     place = np.arange(1, len(errors) + 1, dtype=float)
     inside, above = errors <= y.high, np.isfinite(errors) & (errors > y.high)
-    parts = [svg.dots(x.at(place[m]), y.at(errors[m]), css) for m, css in _dotted(train, holdout, inside)]
+    dotted = ((train & inside, "dot train"), (~train & ~holdout & inside, "dot before"))
+    parts = [svg.dots(x.at(place[chosen]), y.at(errors[chosen]), css) for chosen, css in dotted]
     held = holdout & inside
-    parts.append(svg.marks(x.at(place[held]), y.at(errors[held]), _DIAMOND, "diamond"))
+    parts.append(svg.marks(x.at(place[held]), y.at(errors[held]), DIAMOND, "diamond"))
     for chosen, css in ((above & ~holdout, "fill-train"), (above & holdout, "fill-holdout")):
         parts.append(svg.marks(x.at(place[chosen]), y.at(errors[chosen]), _TRIANGLE, css))
     if np.isfinite(errors).all() and len(errors) >= 30:
@@ -162,10 +162,6 @@ def _one_by_one(result: RunResult, x: Axis, y: Axis) -> list[str]:
         centre = place[: len(middle)] + (window - 1) / 2
         parts.append(svg.polyline(x.at(centre), y.at(middle), "running"))
     return parts
-
-
-def _dotted(train: Mask, holdout: Mask, inside: Mask) -> list[tuple[Mask, str]]:
-    return [(train & inside, "dot train"), (~train & ~holdout & inside, "dot before")]
 
 
 def _banded(result: RunResult, x: Axis, y: Axis) -> list[str]:

@@ -1,4 +1,4 @@
-"""Prediction intervals and profiles on the page: what was claimed beside what was found."""
+"""Prediction intervals and profiles on the page: what was claimed beside what was measured."""
 
 from __future__ import annotations
 
@@ -8,17 +8,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from armcal.base.domains import Array
-from armcal.diagnose.coverage import Coverage
 from armcal.estimate.prediction import LEVELS
 from armcal.estimate.profile import Profile
 from armcal.report import svg
 from armcal.report.error_figures import roles
 from armcal.report.numbers import NONE, count, fixed, plural, shown_unit, significant
-from armcal.report.svg import Axis, Box, Figure
+from armcal.report.svg import DIAMOND, Axis, Box, Figure
 from armcal.run.intervals import IntervalResult
 from armcal.run.result import RunResult
 
-_DIAMOND = "m-3.6 0l3.6-3.6l3.6 3.6l-3.6 3.6z"
 _RECORDINGS = {"same": "calibrated recording", "new": "new recording"}
 _ENDS = {"crossed": "", "bound": "at its bound", "open": "does not end as far as was looked"}
 
@@ -51,18 +49,10 @@ def share_rows(interval_result: IntervalResult) -> tuple[ShareRow, ...]:
     for words, shares in sets:
         for name, share in shares.items():
             label = f"{words}, {_RECORDINGS[name]}" if len(shares) > 1 else words
-            rows.append(_row(label, share))
+            radius = share.stretched_radius if share.stretched else share.raw_radius
+            percents = _percent([*share.stated, radius]), _percent([*share.raw, share.raw_radius])
+            rows.append(ShareRow(label, count(share.records), *percents))
     return tuple(rows)
-
-
-def _row(label: str, coverage: Coverage) -> ShareRow:
-    radius = coverage.stretched_radius if coverage.stretched else coverage.raw_radius
-    return ShareRow(
-        label,
-        count(coverage.records),
-        _percent([*coverage.stated, radius]),
-        _percent([*coverage.raw, coverage.raw_radius]),
-    )
 
 
 def _percent(shares: Sequence[float | None]) -> tuple[str, ...]:
@@ -81,15 +71,15 @@ def predicted_against_found(result: RunResult) -> Figure | None:
         return None
     _, holdout = roles(result)
     errors = result.errors
-    found = np.where(holdout, errors.calibrated_mm, errors.cross_validated_mm)
+    judged = np.where(holdout, errors.calibrated_mm, errors.cross_validated_mm)
     reach = scores.reaches[0]
-    known = np.isfinite(reach) & np.isfinite(found) & (reach > 0)
+    known = np.isfinite(reach) & np.isfinite(judged) & (reach > 0)
     if not known.any():
         return None
     stretch = result.intervals.stretches.get("same")
     widened = stretch.radius if stretch and stretch.radius is not None else 1.0
-    radius = np.where(known, widened * found / np.where(known, reach, 1.0), np.nan)
-    inside = float(np.mean(found[known] <= radius[known]))
+    radius = np.where(known, widened * judged / np.where(known, reach, 1.0), np.nan)
+    inside = float(np.mean(judged[known] <= radius[known]))
     said = f"{plural(int(known.sum()), 'record')} judged by a fit that did not see them; {100 * inside:.1f} % inside."
     caption = "Below the line the error is inside its 95 % radius. Spread along the line: the +- follows the pose."
 
@@ -99,16 +89,16 @@ def predicted_against_found(result: RunResult) -> Figure | None:
         low, high = float(np.nanmin(radius[known])), float(np.nanmax(radius[known]))
         margin = max(0.05 * (high - low), 0.02 * high)
         x = Axis(max(low - margin, 0.0), high + margin, box.left, box.right)
-        y = Axis(0, 1.06 * max(float(found[known].max()), high), box.bottom, box.top)
-        labels = ("predicted 95 % radius, mm", "error found, mm")
+        y = Axis(0, 1.06 * max(float(judged[known].max()), high), box.bottom, box.top)
+        labels = ("predicted 95 % radius, mm", "measured error, mm")
         parts += svg.frame(box, x, y, labels, (8 if width > svg.NARROW else 5, 5))
         parts.append(svg.line(x.start, y.of(x.low), x.end, y.of(x.high), "guide"))
         crossed, held = known & ~holdout, known & holdout
-        parts.append(svg.dots(x.at(radius[crossed]), y.at(found[crossed]), "dot train"))
-        parts.append(svg.marks(x.at(radius[held]), y.at(found[held]), _DIAMOND, "diamond"))
+        parts.append(svg.dots(x.at(radius[crossed]), y.at(judged[crossed]), "dot train"))
+        parts.append(svg.marks(x.at(radius[held]), y.at(judged[held]), DIAMOND, "diamond"))
         return box.bottom + 44, parts
 
-    return svg.both("radii", ("Predicted and found errors", said, caption), draw)
+    return svg.both("radii", ("Predicted and measured errors", said, caption), draw)
 
 
 def _legend(crossed: Array, held: Array) -> list[tuple[str, str]]:
@@ -116,7 +106,7 @@ def _legend(crossed: Array, held: Array) -> list[tuple[str, str]]:
     if crossed.any():
         entries.append(('<path class="dot train" d="M11 0h0"/>', "cross-validated"))
     if held.any():
-        entries.append((f'<path class="diamond" d="M11 0{_DIAMOND}"/>', "held out"))
+        entries.append((f'<path class="diamond" d="M11 0{DIAMOND}"/>', "held out"))
     return entries
 
 
@@ -125,9 +115,11 @@ def profile_rows(result: RunResult) -> tuple[ProfileRow, ...]:
     rows = []
     for profile in result.profiles:
         factor, unit = _shown(result, profile)
-        digits = max(2, 1 - int(np.floor(np.log10(max(factor * _width(profile), 1e-12)))))
+        width = max(factor * max(profile.upper - profile.lower, 1e-12), 1e-12)
+        digits = max(2, 1 - int(np.floor(np.log10(width))))
         ends = f"{fixed(factor * profile.lower, digits)} to {fixed(factor * profile.upper, digits)}"
-        remarks = [f"{side} end {_ENDS[end]}" for side, end in _sides(profile) if _ENDS[end]]
+        sides = (("lower", profile.lower_end), ("upper", profile.upper_end))
+        remarks = [f"{side} end {_ENDS[end]}" for side, end in sides if _ENDS[end]]
         if profile.better:
             remarks.append("a better fit was found on the way: try more starts")
         rows.append(ProfileRow(profile.name, fixed(factor * profile.value, digits), ends, unit, "; ".join(remarks)))
@@ -170,14 +162,6 @@ def _curve(result: RunResult, number: int, profile: Profile) -> Figure:
         return box.bottom + 44, parts
 
     return svg.both(f"profile{number}", (f"Profile of {profile.name}", said, caption), draw, svg.HALF)
-
-
-def _sides(profile: Profile) -> tuple[tuple[str, str], tuple[str, str]]:
-    return ("lower", profile.lower_end), ("upper", profile.upper_end)
-
-
-def _width(profile: Profile) -> float:
-    return max(profile.upper - profile.lower, 1e-12)
 
 
 def _shown(result: RunResult, profile: Profile) -> tuple[float, str]:

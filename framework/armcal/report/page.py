@@ -8,17 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from armcal.base.domains import Array
 from armcal.estimate.estimator import Estimate
 from armcal.estimate.identifiability import CORRELATED, POOR_CONDITION, bound_together, correlated_pairs, correlations
 from armcal.report import error_figures, interval_figures, parameter_figures, workspace
-from armcal.report.group_table import group_rows
-from armcal.report.missed_table import missed_records
-from armcal.report.noise_tables import scatter_rows, suspicious_rows
 from armcal.report.numbers import NONE, common_decimals, count, duration, fixed, plural, ratio, significant, unbroken
+from armcal.report.record_tables import group_rows, missed_records, scatter_rows, suspicious_rows
 from armcal.report.tables import (
     Fact,
-    ParameterRow,
     error_rows,
     fixed_rows,
     judged,
@@ -39,19 +35,10 @@ _SYMBOLS = {"bad": "✕", "warning": "!", "note": "i", "good": "✓"}
 
 def render(result: RunResult) -> str:
     """One self-contained HTML file: no scripts, no references to anything outside of it."""
-    from jinja2 import Environment, FileSystemLoader, StrictUndefined
-
-    loader = FileSystemLoader(Path(__file__).parent)
-    environment = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True)
-    environment.lstrip_blocks = True
-    environment.filters.update(count=count, plural=plural, unbroken=unbroken)
-    return environment.get_template("template.html.j2").render(_content(result))
-
-
-def _content(result: RunResult) -> dict[str, Any]:
-    rows = parameter_rows(result.estimate)
     grades = [finding.grade for finding in result.verdict.findings]
-    return {
+    parameters, aside, worst = parameter_rows(result.estimate), result.dataset.set_aside, worst_records(result)
+    springs = [row for row in parameters if row.si_unit == "rad_per_Nm"]
+    content = {
         "result": result,
         "unit": result.errors.unit,
         "version": __version__,
@@ -60,14 +47,43 @@ def _content(result: RunResult) -> dict[str, Any]:
         "worst_grade": next((g for g in _WORDS if g in grades), "note"),
         "grades": [(g, grades.count(g)) for g in _WORDS if g in grades],
         **_accuracy(result),
-        **_poses(result),
-        **_intervals(result),
-        **_parameters(result.estimate, rows),
+        "distribution": error_figures.distribution(result),
+        "workspace": workspace.views(result),
+        "order": error_figures.in_order(result, worst),
+        "worst": worst_rows(result, worst),
+        "missed": missed_records(result.evidence.large_errors),
+        "crossed": bool(np.isfinite(result.errors.cross_validated_mm).any()),
+        "shares": interval_figures.share_rows(result.intervals),
+        "levels": interval_figures.level_names(),
+        "radii": interval_figures.predicted_against_found(result),
+        "profiles": interval_figures.profile_rows(result),
+        "profile_figures": interval_figures.profile_figures(result),
+        "parameters": parameters,
+        "fixed": fixed_rows(result.estimate),
+        "compliance": parameter_figures.compliances(springs),
+        "springs": springs,
         **_correlations(result.estimate),
         **_determined(result.estimate),
-        **_records(result),
+        "suspicious": suspicious_rows(result.noise, MOST_LISTED),
+        "more_suspicious": max(len(result.noise.suspicious) - MOST_LISTED, 0),
+        "scatter": scatter_rows(result.noise),
+        "aside": aside[:MOST_LISTED],
+        "more_aside": max(len(aside) - MOST_LISTED, 0),
+        "warnings": tuple(dict.fromkeys((*result.warnings, *result.dataset.warnings))),
         **_origin(result),
     }
+    return rendered("template.html.j2", content)
+
+
+def rendered(template: str, content: Mapping[str, Any]) -> str:
+    """A page of this folder's templates."""
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+    loader = FileSystemLoader(Path(__file__).parent)
+    environment = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True)
+    environment.lstrip_blocks = True
+    environment.filters.update(count=count, plural=plural, unbroken=unbroken, signed=lambda x: fixed(x, 3, signed=True))
+    return environment.get_template(template).render(content)
 
 
 def _accuracy(result: RunResult) -> dict[str, Any]:
@@ -85,38 +101,6 @@ def _accuracy(result: RunResult) -> dict[str, Any]:
     return {"judged": from_set, "tiles": tiles, "error_rows": error_rows(result), **shown}
 
 
-def _poses(result: RunResult) -> dict[str, Any]:
-    worst = worst_records(result)
-    return {
-        "distribution": error_figures.distribution(result),
-        "workspace": workspace.views(result),
-        "order": error_figures.in_order(result, worst),
-        "worst": worst_rows(result, worst),
-        "missed": missed_records(result.evidence.large_errors),
-        "crossed": bool(np.isfinite(result.errors.cross_validated_mm).any()),
-    }
-
-
-def _intervals(result: RunResult) -> dict[str, Any]:
-    return {
-        "shares": interval_figures.share_rows(result.intervals),
-        "levels": interval_figures.level_names(),
-        "radii": interval_figures.predicted_against_found(result),
-        "profiles": interval_figures.profile_rows(result),
-        "profile_figures": interval_figures.profile_figures(result),
-    }
-
-
-def _parameters(estimate: Estimate, rows: tuple[ParameterRow, ...]) -> dict[str, Any]:
-    springs = [row for row in rows if row.si_unit == "rad_per_Nm"]
-    return {
-        "parameters": rows,
-        "fixed": fixed_rows(estimate),
-        "compliance": parameter_figures.compliances(springs),
-        "springs": springs,
-    }
-
-
 def _correlations(estimate: Estimate) -> dict[str, Any]:
     names = estimate.names
     if len(names) < 2:
@@ -125,7 +109,14 @@ def _correlations(estimate: Estimate) -> dict[str, Any]:
         matrix = correlations(estimate.covariance)
     matrix = np.where(np.outer(estimate.determined, estimate.determined), matrix, 0.0)
     pairs = correlated_pairs(matrix, names, CORRELATED, bound_together(estimate.parameters))
-    strongest = _strongest(matrix, names) if not pairs or len(names) > parameter_figures.MOST_MAPPED else ()
+    strongest: list[tuple[str, str, str]] = []
+    if not pairs or len(names) > parameter_figures.MOST_MAPPED:
+        # The strongest pairs whatever their size, zeros left out.
+        rows, columns = np.triu_indices(len(names), 1)
+        sizes = np.abs(matrix[rows, columns])
+        order = [k for k in np.argsort(-sizes, kind="stable")[:_STRONGEST] if sizes[k] > 0]
+        ends = [(int(rows[k]), int(columns[k])) for k in order]
+        strongest = [(names[i], names[j], fixed(float(matrix[i, j]), 3, signed=True)) for i, j in ends]
     return {
         "map": parameter_figures.correlation_map(matrix, names, estimate.determined),
         "pairs": [(a, b, fixed(r, 3, signed=True)) for a, b, r in pairs[:MOST_LISTED]],
@@ -133,15 +124,6 @@ def _correlations(estimate: Estimate) -> dict[str, Any]:
         "too_many": len(names) > parameter_figures.MOST_MAPPED,
         "strongest": [] if len(pairs) >= _STRONGEST else strongest[len(pairs) :],
     }
-
-
-def _strongest(matrix: Array, names: tuple[str, ...]) -> list[tuple[str, str, str]]:
-    """The strongest pairs whatever their size, zeros left out."""
-    rows, columns = np.triu_indices(len(names), 1)
-    sizes = np.abs(matrix[rows, columns])
-    order = np.argsort(-sizes, kind="stable")[:_STRONGEST]
-    chosen = [(int(rows[k]), int(columns[k])) for k in order if sizes[k] > 0]
-    return [(names[i], names[j], fixed(float(matrix[i, j]), 3, signed=True)) for i, j in chosen]
 
 
 def _determined(estimate: Estimate) -> dict[str, Any]:
@@ -154,18 +136,6 @@ def _determined(estimate: Estimate) -> dict[str, Any]:
         "poor_limit": f"{POOR_CONDITION:.0e}".replace("e+0", "e"),
         "weakest": str(known.weakest) if len(known) and known.rank else "",
         "singular": parameter_figures.singular_values(known),
-    }
-
-
-def _records(result: RunResult) -> dict[str, Any]:
-    aside = result.dataset.set_aside
-    return {
-        "suspicious": suspicious_rows(result.noise, MOST_LISTED),
-        "more_suspicious": max(len(result.noise.suspicious) - MOST_LISTED, 0),
-        "scatter": scatter_rows(result.noise),
-        "aside": aside[:MOST_LISTED],
-        "more_aside": max(len(aside) - MOST_LISTED, 0),
-        "warnings": tuple(dict.fromkeys((*result.warnings, *result.dataset.warnings))),
     }
 
 
@@ -188,16 +158,10 @@ def _origin(result: RunResult) -> dict[str, Any]:
         Fact("noise scale", f"{significant(result.estimate.noise_scale)} times the declared noise"),
         Fact("degrees of freedom", significant(result.estimate.degrees_of_freedom, 4)),
     ]
-    said = {fact.name for fact in facts}
-    facts += [fact for fact in provenance_facts(result.provenance) if fact.name not in said]
+    names, seconds = {fact.name for fact in facts}, result.seconds.items()  # the total last
+    facts += [fact for fact in provenance_facts(result.provenance) if fact.name not in names]
     return {
         "facts": [f for f in facts if not f.long],
         "long_facts": [f for f in facts if f.long],
-        "seconds": _seconds(result.seconds),
+        "seconds": [(name, duration(value)) for name, value in sorted(seconds, key=lambda stage: stage[0] == "total")],
     }
-
-
-def _seconds(seconds: Mapping[str, float]) -> list[tuple[str, str]]:
-    """Each stage, the total last."""
-    stages = [(name, duration(value)) for name, value in seconds.items() if name != "total"]
-    return stages + ([("total", duration(seconds["total"]))] if "total" in seconds else [])

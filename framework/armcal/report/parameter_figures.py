@@ -105,11 +105,15 @@ def correlation_map(correlation: Array, names: tuple[str, ...], known: Sequence[
         parts.append(svg.text(margin - 7, 6 + at + 4, name, "mono", "end"))
         parts.append(svg.text(margin + at + 4, 6 + side + 8, name, "mono", "end", -90))
     width, height = margin + side + 12, 6 + side + margin + 8
-    parts += _correlation_key(margin + side - 176, 14)
+    x, y = margin + side - 176, 14  # of the key
+    parts += [svg.rect(x + i * 16, y, 16, 10, _colour(v)) for i, v in enumerate(np.linspace(-1, 1, 11).tolist())]
+    for at, value in ((8, -1), (88, 0), (168, 1)):
+        parts.append(svg.text(x + at, y + 24, fixed(value, 0, signed=True), "tick", "middle"))
+    parts.append(svg.text(x + 88, y - 4, "correlation", "tick", "middle"))
     said = f"Lower triangle of the correlations of {number} parameters; pairs above 0.95 are listed beside it."
     title = "Correlations of the parameters' estimates"
     drawn = svg.document("correlation-map", (width, height), title, said, parts)
-    caption = "Dark cells: the data tells the two apart badly."
+    caption = "Dark cells: the data hardly separates the two."
     caption += "" if all(known) else " Grey: not determined, so no correlation is known."
     return Figure(title, caption, drawn)
 
@@ -132,14 +136,6 @@ def _colour(value: float) -> str:
     share = min(abs(value), 1.0)
     end = _BLUE if value < 0 else _ORANGE
     return "#" + "".join(f"{round(248 + (channel - 248) * share):02x}" for channel in end)
-
-
-def _correlation_key(x: float, y: float) -> list[str]:
-    steps = np.linspace(-1, 1, 11)
-    parts = [svg.rect(x + i * 16, y, 16, 10, _colour(float(v))) for i, v in enumerate(steps)]
-    for at, value in ((8, -1), (88, 0), (168, 1)):
-        parts.append(svg.text(x + at, y + 24, fixed(value, 0, signed=True), "tick", "middle"))
-    return [*parts, svg.text(x + 88, y - 4, "correlation", "tick", "middle")]
 
 
 def singular_values(known: Identifiability) -> Figure | None:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from armcal.report import study_figures
-from armcal.report.numbers import NONE, common_decimals, count, duration, fixed, plural, unbroken
+from armcal.report.numbers import NONE, common_decimals, count, duration, fixed, plural
+from armcal.report.page import rendered
 from armcal.report.svg import Figure
 from armcal.report.tables import provenance_facts
 from armcal.run.study_result import StudyResult, TransferCell, TransferResult, VariantResult
@@ -48,24 +48,19 @@ def _render(
     figure: Figure,
     changes: list[Any],
 ) -> str:
-    from jinja2 import Environment, FileSystemLoader, StrictUndefined
-
-    loader = FileSystemLoader(Path(__file__).parent)
-    environment = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True)
-    environment.lstrip_blocks = True
-    environment.filters.update(count=count, plural=plural, unbroken=unbroken, signed=lambda x: fixed(x, 3, signed=True))
     facts = provenance_facts(result.provenance)
-    return environment.get_template("study.html.j2").render(
-        result=result,
-        title=title,
-        sentences=sentences,
-        table=table,
-        figure=figure,
-        changes=changes,
-        version=__version__,
-        facts=[f for f in facts if not f.long],
-        seconds=[(name, duration(value)) for name, value in result.seconds.items()],
-    )
+    content = {
+        "result": result,
+        "title": title,
+        "sentences": sentences,
+        "table": table,
+        "figure": figure,
+        "changes": changes,
+        "version": __version__,
+        "facts": [f for f in facts if not f.long],
+        "seconds": [(name, duration(value)) for name, value in result.seconds.items()],
+    }
+    return rendered("study.html.j2", content)
 
 
 def conclusions(result: StudyResult) -> list[str]:

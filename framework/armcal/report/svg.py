@@ -15,6 +15,7 @@ from armcal.report.numbers import MINUS, count, decimals_for, fixed, significant
 WIDE, HALF, NARROW = 1040, 504, 344
 MONO = 6.7
 """Width of a character of the monospaced labels."""
+DIAMOND = "m-3.6 0l3.6-3.6l3.6 3.6l-3.6 3.6z"
 _GROUPED = 10_000
 _LOG_ALL_STEPS = 2.2
 _LOG_SOME_STEPS = 4.0
@@ -64,9 +65,17 @@ class Axis:
 
     def ticks(self, about: int) -> list[tuple[float, str]]:
         """Round values and their labels."""
-        values = _log_ticks(self.low, self.high) if self.log else _linear_ticks(self.low, self.high, about)
         if self.log:
-            return [(v, significant(v, 1)) for v in values]
+            decades = math.log10(self.high / self.low)
+            steps = (1, 2, 5) if decades <= _LOG_ALL_STEPS else (1, 3) if decades <= _LOG_SOME_STEPS else (1,)
+            powers = range(math.floor(math.log10(self.low)), math.ceil(math.log10(self.high)) + 1)
+            skip = max(1, math.ceil(decades / 8))
+            marks = [step * 10.0**p for p in powers if p % skip == 0 for step in steps]
+            inside = [v for v in marks if self.low * (1 - 1e-9) <= v <= self.high * (1 + 1e-9)]
+            return [(v, significant(v, 1)) for v in inside]
+        nice = nice_step((self.high - self.low) / max(about, 1))
+        first, last = math.ceil(self.low / nice - 1e-9), math.floor(self.high / nice + 1e-9)
+        values = [i * nice for i in range(first, last + 1)]
         step = values[1] - values[0] if len(values) > 1 else abs(values[0]) if values else 1.0
         decimals = decimals_for(step, 1)
         if decimals == 0 and max(abs(self.low), abs(self.high)) >= _GROUPED:
@@ -80,21 +89,6 @@ def nice_step(rough: float) -> float:
         return 1.0
     power = 10.0 ** math.floor(math.log10(rough))
     return next(step * power for step in (1, 2, 5, 10, 20) if step * power >= rough * (1 - 1e-9))
-
-
-def _linear_ticks(low: float, high: float, about: int) -> list[float]:
-    step = nice_step((high - low) / max(about, 1))
-    first, last = math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9)
-    return [i * step for i in range(first, last + 1)]
-
-
-def _log_ticks(low: float, high: float) -> list[float]:
-    decades = math.log10(high / low)
-    steps = (1, 2, 5) if decades <= _LOG_ALL_STEPS else (1, 3) if decades <= _LOG_SOME_STEPS else (1,)
-    skip = max(1, math.ceil(decades / 8))
-    powers = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
-    values = [step * 10.0**p for p in powers if p % skip == 0 for step in steps]
-    return [v for v in values if low * (1 - 1e-9) <= v <= high * (1 + 1e-9)]
 
 
 def document(ident: str, size: tuple[float, float], title: str, desc: str, parts: Iterable[str]) -> Markup:

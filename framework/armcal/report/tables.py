@@ -104,7 +104,7 @@ class RawParameter:
 
 @dataclass(frozen=True)
 class ParameterRow:
-    """One free parameter, in words; ``held`` where only a prior says what it is, or nothing."""
+    """One free parameter, in words; ``held`` where only a prior holds it, or nothing."""
 
     name: str
     unit: str
@@ -131,7 +131,11 @@ def parameter_rows(estimate: Estimate) -> tuple[ParameterRow, ...]:
         interval = estimate.intervals[i]
         numbers = (nominal[entry], estimate.values[entry], estimate.deviations[i], interval.lower, interval.upper)
         raw.append(RawParameter(*(float(n) * factor for n in numbers)))
-        decimals.append(_decimals(raw[-1]))
+        own = raw[-1]
+        # Two digits of the standard deviation; five of the value where there is none, three decimals of a zero.
+        known = math.isfinite(own.sd) and own.sd > 0
+        size = own.sd if known else max(abs(own.value), abs(own.nominal)) / 1000
+        decimals.append(decimals_for(size) if size else 3)
     widest = max(decimals, default=0)
     bounds = set(estimate.at_bound)
     rows = (
@@ -139,12 +143,6 @@ def parameter_rows(estimate: Estimate) -> tuple[ParameterRow, ...]:
         for i in range(len(names))
     )
     return tuple(replace(row, held=not seen) for row, seen in zip(rows, estimate.identified_by_data, strict=True))
-
-
-def _decimals(raw: RawParameter) -> int:
-    """Two digits of the standard deviation; five of the value where there is none, three decimals of a zero."""
-    size = raw.sd if math.isfinite(raw.sd) and raw.sd > 0 else max(abs(raw.value), abs(raw.nominal)) / 1000
-    return decimals_for(size) if size else 3
 
 
 def _row(
@@ -156,6 +154,11 @@ def _row(
         return written if written == NONE else written + padding
 
     determined = math.isfinite(raw.sd)
+    lower, upper = fixed(raw.lower, decimals), fixed(raw.upper, decimals)
+    written = f"{lower} to {upper}" if determined else NONE
+    if determined and interval.one_sided:
+        nearer_lower = abs(raw.value - raw.lower) <= abs(raw.upper - raw.value)
+        written = f"≤ {upper}" if nearer_lower else f"≥ {lower}"
     return ParameterRow(
         name=name,
         unit=shown_unit(si_unit)[1],
@@ -164,20 +167,11 @@ def _row(
         value=aligned(raw.value),
         correction=aligned(raw.value - raw.nominal, signed=True),
         sd=aligned(raw.sd),
-        interval=_interval(raw, interval.one_sided, decimals),
+        interval=written,
         at_bound=at_bound,
         determined=determined,
         raw=raw,
     )
-
-
-def _interval(raw: RawParameter, one_sided: bool, decimals: int) -> str:
-    if not math.isfinite(raw.sd):
-        return NONE
-    if one_sided:
-        nearer_lower = abs(raw.value - raw.lower) <= abs(raw.upper - raw.value)
-        return f"≤ {fixed(raw.upper, decimals)}" if nearer_lower else f"≥ {fixed(raw.lower, decimals)}"
-    return f"{fixed(raw.lower, decimals)} to {fixed(raw.upper, decimals)}"
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ MOST_POINTS = 4000
 """More positions than this are thinned out."""
 _MOST_VECTORS = 500
 _COLOURS = ("#9bd93c", "#4ac16d", "#1fa187", "#277f8e", "#365c8d", "#46327e", "#440154")
-"""Light to dark, told apart with any colour vision."""
+"""Light to dark, distinct with any colour vision."""
 _STEPS = (1, 1.5, 2, 2.5, 3, 4, 5, 6, 8, 10, 20)
 _NAMES = "xyz"
 
@@ -28,20 +28,15 @@ def views(result: RunResult) -> list[Figure]:
     known = np.flatnonzero(np.isfinite(errors) & np.isfinite(position[:3]).all(axis=0))
     if not len(known):
         return []
-    chosen = _thinned(known, errors)
+    chosen = known
+    if len(known) > MOST_POINTS:  # evenly through the recorded order, and the worst in any case
+        worst = known[np.argsort(-errors[known], kind="stable")[:50]]
+        even = known[np.linspace(0, len(known) - 1, MOST_POINTS - 50).astype(np.intp)]
+        chosen = np.unique(np.concatenate([even, worst]))
     chosen = chosen[np.argsort(errors[chosen], kind="stable")]
     vectors = _vectors(result, chosen)
     parts = (position, errors, chosen, len(known), vectors)
     return [_view(*parts, axes, result.errors.unit) for axes in ((0, 1), (0, 2))]
-
-
-def _thinned(known: NDArray[np.intp], errors: Array) -> NDArray[np.intp]:
-    """Evenly through the recorded order, and the worst in any case."""
-    if len(known) <= MOST_POINTS:
-        return known
-    worst = known[np.argsort(-errors[known], kind="stable")[:50]]
-    even = known[np.linspace(0, len(known) - 1, MOST_POINTS - 50).astype(np.intp)]
-    return np.unique(np.concatenate([even, worst]))
 
 
 def _vectors(result: RunResult, chosen: NDArray[np.intp]) -> Array | None:

@@ -1,17 +1,21 @@
-"""From a file of targets to commands, with what they lead to, how sure that is, and what nominal commands would do."""
+"""From a file of targets to a file of commands: where they lead, how sure that is, and what nominal ones would do."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 
 from armcal.arm.loading import LOAD_CHANNELS
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
+from armcal.base.pose_settings import quaternion_of
+from armcal.base.units import UNITS
 from armcal.calibration.calibration import Calibration, arm_named
 from armcal.calibration.compensation.compensator import Compensator
 from armcal.calibration.compensation.request import Commands, Options, Redundancy, Targets
@@ -19,12 +23,15 @@ from armcal.calibration.measured_point import MeasuredPoint, Point, measured_poi
 from armcal.calibration.tool_expression import APPROACH, arm_expression
 from armcal.errors import ArmcalError, ConfigError
 from armcal.functions.batch_function import EvaluatorChoice
+from armcal.measure.csv_writer import write_csv
+from armcal.measure.reader import requested_channels
 from armcal.plugins import PluginRegistry
+from armcal.run.plan_poses import Workspace, workspace_of
 from armcal.run.target_file import TargetFile, read_targets
-from armcal.run.workspace import Workspace, workspace_of
 
 _WORTH_COMPILING = 5000
 """From this many targets on, waiting for the compiler costs less than doing without it."""
+_ENGLISH = {False: "no", True: "yes"}
 
 
 @dataclass(frozen=True)
@@ -94,7 +101,7 @@ class Bench:
         """Targets from a CSV.
 
         Raises:
-            DataError: it cannot be read, or the arm is elastic and nothing says what hangs on the tool.
+            DataError: it cannot be read, or the arm is elastic and nothing states what hangs on the tool.
         """
         conditions = self.calibration.system.arms[self.arm].conditions
         file = read_targets(path, self.calibration.expression(self.arm, conditions), registry)
@@ -102,7 +109,7 @@ class Bench:
         return file
 
     def compensator(self, targets: Targets | None = None) -> Compensator:
-        """What finds commands, for targets that tell of such surroundings.
+        """What finds commands, for targets that state such surroundings.
 
         Raises:
             ConfigError: the limits leave a joint no room, or no measurement reads the target that shall arrive.
@@ -171,7 +178,7 @@ def _radii(calibration: Calibration, compensator: Compensator, targets: Targets,
         return radii
     try:
         plus_minus = calibration.plus_minus(commanded(compensator, targets, commands).subset(settled))
-    except ArmcalError:  # what it tells beyond the commands themselves is not kept
+    except ArmcalError:  # such as a record without an equilibrium: commands are worth having without radii
         return None
     if not plus_minus.radii:
         return None
@@ -181,15 +188,82 @@ def _radii(calibration: Calibration, compensator: Compensator, targets: Targets,
 
 def summary(assessed: Assessed) -> Mapping[str, float | int | None]:
     """In mm, over the targets that are reached."""
-    had = assessed.commands.found
-    away = 1000 * assessed.commands.distances[had]
-    nominal = 1000 * assessed.nominal_distances[had & np.isfinite(assessed.nominal_distances)]
-    radii = None if assessed.radii is None else 1000 * assessed.radii[had]
+    reached = assessed.commands.found
+    away = 1000 * assessed.commands.distances[reached]
+    nominal = 1000 * assessed.nominal_distances[reached & np.isfinite(assessed.nominal_distances)]
+    radii = None if assessed.radii is None else 1000 * assessed.radii[reached]
     return {
-        "targets": len(had),
-        "reached": int(had.sum()),
+        "targets": len(reached),
+        "reached": int(reached.sum()),
         "error_mm": float(away.mean()) if away.size else None,
         "largest_error_mm": float(away.max()) if away.size else None,
         "nominal_error_mm": float(nominal.mean()) if nominal.size else None,
         "radius_95_mm": float(np.median(radii)) if radii is not None and radii.size else None,
     }
+
+
+def write_commands(
+    path: Path, compensator: Compensator, targets: Targets, given: Dataset, assessed: Assessed, angle_unit: str
+) -> None:
+    """Write commands beside the targets' own ids; angles in ``deg`` or ``rad``.
+
+    Loads and surroundings are written where the targets state them, approaches where they are known.
+
+    Raises:
+        DataError: the file cannot be written.
+    """
+    arm, name = compensator.expression.arm, compensator.expression.name
+    commands = commanded(compensator, targets, assessed.commands).channels
+    channels = {
+        channel: values
+        for channel, values in commands.items()
+        if channel.removeprefix(f"{name}.") in compensator.joints
+        or (given.has(channel) if channel in LOAD_CHANNELS else "." not in channel)
+        or (APPROACH in channel and values.any())
+    }
+    requested = requested_channels({name: arm}, {}, measured=False)
+    extra = dict(_columns(compensator, assessed))
+    # A target file may be a pose file: its commands, in whatever unit, give way to those that were found.
+    own = {f"{joint}_{unit}" for joint in compensator.joints for unit in UNITS}
+    kept = {column: texts for column, texts in given.extra.items() if column not in extra and column not in own}
+    dataset = replace(given, channels=channels, extra={**extra, **kept})
+    write_csv(path, dataset, [c for c in requested if c.channel in channels], {"angle": angle_unit})
+
+
+def _columns(compensator: Compensator, assessed: Assessed) -> Iterator[tuple[str, tuple[str, ...]]]:
+    commands = assessed.commands
+    if commands.counts is not None:
+        for i, joint in enumerate(compensator.joints):
+            if joint in compensator.expression.servos:
+                tick = compensator.expression.servos[joint][1].tick
+                yield f"{joint}_counts", tuple(str(count) for count in commands.counts[:, i])
+                yield f"{joint}_pulse_us", _texts(1e6 * tick * commands.counts[:, i])
+    yield "reached", tuple(_ENGLISH[bool(reached)] for reached in commands.found)
+    yield from _pose("tool", assessed.tools)
+    yield "error_mm", _texts(1000 * commands.distances)
+    yield "error_deg", _texts(np.asarray(np.degrees(commands.turns)))
+    if assessed.radii is not None:
+        yield "radius95_mm", _texts(1000 * assessed.radii)
+    yield "nominal_error_mm", _texts(1000 * assessed.nominal_distances)
+    if commands.moves is not None:
+        kinds = [compensator.expression.arm.commanded[joint] for joint in compensator.joints]
+        for kind, unit, scale in (("angle", "deg", 180 / np.pi), ("length", "mm", 1000.0)):
+            own = [i for i, text in enumerate(kinds) if text == kind]
+            if own:
+                yield f"longest_move_{unit}", _texts(scale * np.abs(commands.moves[:, own]).max(axis=1))
+    yield "bound_mm", _texts(1000 * commands.bounds)
+    yield "reason", commands.reasons
+    yield from _pose("tell_nominal", assessed.nominal_T_tool)
+
+
+def _pose(name: str, poses: Array) -> Iterator[tuple[str, tuple[str, ...]]]:
+    for i, axis in enumerate("xyz"):
+        yield f"{name}_{axis}_mm", tuple(repr(float(x)) for x in 1000 * poses[:, i, 3])
+    turns = np.array([quaternion_of(pose[:3, :3]) for pose in poses]).reshape(-1, 4)
+    for i, axis in enumerate("wxyz"):
+        yield f"{name}_q{axis}", tuple(repr(float(x)) for x in turns[:, i])
+
+
+def _texts(values: NDArray[Any]) -> tuple[str, ...]:
+    """Short numbers; empty where there is none."""
+    return tuple(f"{value:.6g}" if np.isfinite(value) else "" for value in values.tolist())

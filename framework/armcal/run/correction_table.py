@@ -1,7 +1,7 @@
-"""A table of corrections for a controller that only knows the nominal arm: what to tell it instead of a target.
+"""A table of corrections for a controller that only knows the nominal arm: what to give it instead of a target.
 
 At each node of a grid the exact commands are found, and the pose that the nominal arm takes with them is what the
-controller must be told. Between nodes corrections are interpolated linearly along each axis; how well that does is
+controller must be given. Between nodes corrections are interpolated linearly along each axis; how well that does is
 tried at random points between them, through the controller's own inverse kinematics.
 """
 
@@ -68,14 +68,14 @@ class CorrectionTable:
 
     Attributes:
         axes: the nodes' coordinates along x, y and z (m).
-        had: whether a node's pose can be reached (grid).
+        reached: whether a node's pose can be reached (grid).
         shifts: what to add to a position (grid x 3; m); nan where the pose cannot be reached.
         turns: by what to turn a rotation, a rotation vector in the base frame (grid x 3; rad).
         tried: errors at random points between nodes that can be reached: with the table, and without it (N x 2; m).
     """
 
     axes: tuple[Array, Array, Array]
-    had: Mask
+    reached: Mask
     shifts: Array
     turns: Array
     tried: Array
@@ -108,15 +108,15 @@ def correction_table(compensator: Compensator, nominal: Compensator, settings: T
     commands = over_grid(compensator, _targets(compensator, nodes, settings), settings.nodes)
     if not commands.found.any():
         raise ProblemError("no node of the grid can be reached.", hint="Move the grid, or change the rotation.")
-    told = nominal.forward(commands.joint_angles)
+    commanded = nominal.forward(commands.joint_angles)  # where the nominal arm takes these commands to lead
     shape = settings.nodes
     nothing = np.where(commands.found, 1.0, np.nan)[:, None]
-    asked = np.repeat(_rotation(settings)[None], len(nodes), axis=0)
+    rotations = np.repeat(_rotation(settings)[None], len(nodes), axis=0)
     table = CorrectionTable(
         axes=(axes[0], axes[1], axes[2]),
-        had=commands.found.reshape(shape),
-        shifts=((told[:, :3, 3] - nodes) * nothing).reshape(*shape, 3),
-        turns=(turn_between(asked, told[:, :3, :3]) * nothing).reshape(*shape, 3),
+        reached=commands.found.reshape(shape),
+        shifts=((commanded[:, :3, 3] - nodes) * nothing).reshape(*shape, 3),
+        turns=(turn_between(rotations, commanded[:, :3, :3]) * nothing).reshape(*shape, 3),
         tried=np.zeros((0, 2)),
     )
     starts = commands.joint_angles.reshape(*shape, -1)
@@ -145,23 +145,22 @@ def _tried(
     """The table, tried at random points of cells whose corners can all be reached."""
     random = np.random.default_rng(settings.seed)
     points = random.uniform(settings.low, settings.high, (settings.tried, 3))
-    shift, turn, near = (_between(table.axes, grid)(points) for grid in (table.shifts, table.turns, starts))
+    shift, turn, near = (
+        RegularGridInterpolator(table.axes, grid, method="linear", bounds_error=False)(points)
+        for grid in (table.shifts, table.turns, starts)
+    )
     whole = np.isfinite(shift).all(axis=1)
     points, shift, turn, near = points[whole], shift[whole], turn[whole], near[whole]
     rotation = Rotation.from_matrix(_rotation(settings))
     errors = []
-    for told, turned in ((points + shift, (Rotation.from_rotvec(turn) * rotation).as_matrix()), (points, None)):
-        asked = np.repeat(_rotation(settings)[None], len(points), axis=0) if turned is None else turned
-        thought = nominal.solve(nominal.targets(told, asked), near)
+    for target, turned in ((points + shift, (Rotation.from_rotvec(turn) * rotation).as_matrix()), (points, None)):
+        rotations = np.repeat(_rotation(settings)[None], len(points), axis=0) if turned is None else turned
+        thought = nominal.solve(nominal.targets(target, rotations), near)
         targets = _targets(compensator, points, settings)
         stands = compensator.stand(thought.joint_angles, targets, np.zeros_like(thought.joint_angles))
         away = np.linalg.norm(stands.base_T_tool[:, :3, 3] - points, axis=1)
         errors.append(np.where(thought.found & stands.settled, away, np.nan))
-    return CorrectionTable(table.axes, table.had, table.shifts, table.turns, np.stack(errors, axis=1))
-
-
-def _between(axes: tuple[Array, Array, Array], grid: Array) -> RegularGridInterpolator:
-    return RegularGridInterpolator(axes, grid, method="linear", bounds_error=False)
+    return CorrectionTable(table.axes, table.reached, table.shifts, table.turns, np.stack(errors, axis=1))
 
 
 def _targets(compensator: Compensator, positions: Array, settings: TableSettings) -> Targets:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +16,7 @@ from armcal.base.config_text import ConfigText
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.base.parameters import Parameters
+from armcal.calibration.calibration_file import identity_of
 from armcal.config.selection import select, without_groups
 from armcal.config.system import System, build_component, build_system
 from armcal.config.validate import validate
@@ -93,10 +96,15 @@ class Experiment:
         system = build_system(source, registry)
         known = without_groups(settings.parameters, grouped_instances(system.measurements))
         parameters = select(system.parameters(), known, source)
-        estimator = weighed(_estimator(source, registry), settings.noise)
+        section = source.data.get("estimator") or {}
+        named = source
+        if "type" not in section:
+            named = replace(source, data={**source.data, "estimator": {"type": "ipopt", **section}})
+        estimator: Estimator
+        estimator, _ = build_component(named, registry, "estimator", ("estimator",))
         name = settings.name or source.path.stem
         texts = tuple(_gravity_warnings(settings, np.array(system.environment.gravity)))
-        return cls(str(name), source, settings, system, parameters, estimator, registry, texts)
+        return cls(str(name), source, settings, system, parameters, weighed(estimator, settings.noise), registry, texts)
 
     def read(self) -> Dataset:
         """The measured records.
@@ -115,7 +123,14 @@ class Experiment:
         reader, _ = build_component(self.source, self.registry, "reader", ("data",))
         request = self.request(measured=True)
         dataset = reader.read(request)
-        self._require_payload(dataset)
+        elastic = [block.name for block in self.parameters.free if block.unit == "rad_per_Nm"]
+        if elastic and self.settings.statics.payload is None and not dataset.has("payload"):
+            # A compliance fitted under an unknown load is wrong by that load.
+            raise ConfigError(
+                f"compliances are calibrated ({elastic[0]}, ...) and the payload is not stated.",
+                where=self.source.where(("statics", "payload")),
+                hint="State what hung on the tool beyond the links: payload_g, 0 if nothing, or a column payload_g.",
+            )
         require_conditions(dataset, request.wanted)
         dataset = warn_beyond_limits(noticed(dataset), self.system.arms)
         if not dataset.has("gravity_z"):
@@ -149,6 +164,19 @@ class Experiment:
         wanted = requested_channels(system.arms, system.measurements, measured=measured)
         return ReadRequest(system.arms, system.measurements, wanted)
 
+    def provenance(self, dataset: Dataset) -> dict[str, Any]:
+        """Where the numbers of a run on these records come from: files, hashes, versions."""
+        packages = ("armcal", "numpy", "scipy", "casadi", "cvxpy")
+        return {
+            "config": str(self.source.path),
+            "config_files": [Path(file).name for file in self.source.files],
+            "data": dataset.source,
+            "data_sha256": dataset.sha256,
+            "arm_sha256": identity_of(self.system.description),
+            "versions": {"python": sys.version.split()[0], **{name: version(name) for name in packages}},
+            "plugins": {p.name: f"{p.distribution} {p.version}" for p in self.registry.plugins if not p.fault},
+        }
+
     def simulator(self) -> Simulator:
         """The configured simulator.
 
@@ -164,26 +192,6 @@ class Experiment:
         built: Simulator
         built, _ = build_component(self.source, self.registry, "simulator", ("simulation",))
         return built
-
-    def _require_payload(self, dataset: Dataset) -> None:
-        """A compliance fitted under an unknown load is wrong by that load."""
-        elastic = [block.name for block in self.parameters.free if block.unit == "rad_per_Nm"]
-        if elastic and self.settings.statics.payload is None and not dataset.has("payload"):
-            raise ConfigError(
-                f"compliances are calibrated ({elastic[0]}, ...) and the payload is not stated.",
-                where=self.source.where(("statics", "payload")),
-                hint="Say what hung on the tool beyond the links, payload_g: 0 if nothing, or add a column payload_g.",
-            )
-
-
-def _estimator(source: ConfigSource, registry: PluginRegistry) -> Estimator:
-    """The configured estimator; ipopt where none is named."""
-    section = source.data.get("estimator") or {}
-    if "type" not in section:
-        source = replace(source, data={**source.data, "estimator": {"type": "ipopt", **section}})
-    built: Estimator
-    built, _ = build_component(source, registry, "estimator", ("estimator",))
-    return built
 
 
 def with_data(source: ConfigSource, data: str | Path) -> ConfigSource:

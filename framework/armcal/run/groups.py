@@ -11,10 +11,10 @@ from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.errors import ConfigError
 from armcal.estimate.nuisance import settled, untrained
-from armcal.estimate.validation import Split
 from armcal.measure.groups import Groups
 from armcal.measure.measurement import GroupedMeasurement
-from armcal.problem.problem import FactorRecords, Problem
+from armcal.problem.problem import Problem
+from armcal.run.errors import FittedRecords, RecordErrors
 from armcal.run.experiment import Experiment
 
 _MM = 1000.0
@@ -53,7 +53,7 @@ class RunGroups:
 
 
 def label_of(experiment: Experiment) -> str | None:
-    """The text column that tells groups apart; None if there is none."""
+    """The text column that separates groups; None if there is none."""
     text = experiment.settings.validation.group_by
     if text is not None:
         return text
@@ -69,7 +69,7 @@ def labels_of(experiment: Experiment, dataset: Dataset) -> tuple[str, ...]:
     """Which group each record belongs to.
 
     Raises:
-        ConfigError: no column tells.
+        ConfigError: no column separates groups.
     """
     label = label_of(experiment)
     if label is None or label not in dataset.extra:
@@ -81,41 +81,24 @@ def labels_of(experiment: Experiment, dataset: Dataset) -> tuple[str, ...]:
     return _texts(dataset, label)
 
 
-def group_errors(
-    experiment: Experiment,
-    problem: Problem,
-    records: tuple[FactorRecords, ...],
-    dataset: Dataset,
-    split: Split,
-    values: Array,
-    errors_mm: tuple[Array, Array],
-) -> tuple[GroupError, ...]:
-    """Of each group, sorted by name; none if nothing tells groups apart.
-
-    Args:
-        experiment: what was asked.
-        problem: as it was fitted.
-        records: all of them.
-        dataset: the same with their labels.
-        split: which trained.
-        values: of the fit.
-        errors_mm: of each record, nominal and calibrated (N each).
-    """
+def run_groups(experiment: Experiment, run: FittedRecords, errors: RecordErrors) -> RunGroups:
+    """Errors of each group, sorted by name (none if nothing separates groups), and the keys of the problem's groups."""
+    problem, records, dataset, keys = run.problem, run.records, run.dataset, run.problem.blueprint.groups
     label = label_of(experiment)
     if label is None or label not in dataset.extra:
-        return ()
+        return RunGroups((), keys)
     labels = np.array(_texts(dataset, label))
     before = _distances(problem, settled(untrained(problem), problem.parameters.nominal(), records))
     # Distances are judged by what the records of each socket say, not by what the known distance made of them.
-    after = _distances(problem, settled(untrained(problem), values, records))
+    after = _distances(problem, settled(untrained(problem), run.fitted.estimate.values, records))
     result = []
     for name in sorted(set(labels.tolist()) - {""}):
         inside = labels == name
-        nominal, calibrated = (float(np.nanmean(each[inside])) for each in errors_mm)
-        trained = int(np.sum(inside[split.train]))
+        nominal, calibrated = (float(np.nanmean(e[inside])) for e in (errors.nominal_mm, errors.calibrated_mm))
+        trained = int(np.sum(inside[run.split.train]))
         of_nominal, of_calibrated = _within(name, before), _within(name, after)
         result.append(GroupError(name, int(inside.sum()), trained, nominal, calibrated, of_nominal, of_calibrated))
-    return tuple(result)
+    return RunGroups(tuple(result), keys)
 
 
 def _texts(dataset: Dataset, label: str) -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""What a run says of its predictions: how wide their intervals are, and whether they hold what they claim."""
+"""Prediction intervals of a run: how wide they are, and whether they cover what they claim."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from armcal.diagnose.coverage import (
     besides,
     collected,
     coverage,
+    coverage_finding,
     predictor,
     score,
     scored,
     stretch,
-    told,
     whitened_like,
 )
 from armcal.diagnose.noise_findings import Finding
@@ -64,7 +64,7 @@ class IntervalResult:
         """Whether intervals hold their share."""
         coverages, words = self.judged
         typical = [Finding("note", self._typical())] if self.half_width_mm else []
-        return [*typical, *(told(each, words, name) for name, each in coverages.items())]
+        return [*typical, *(coverage_finding(own, words, name) for name, own in coverages.items())]
 
     def _typical(self) -> str:
         """How wide the intervals are."""
@@ -79,16 +79,16 @@ class IntervalResult:
 
     def as_dict(self) -> dict[str, Any]:
         """For metrics.json."""
-        told = {}
+        content = {}
         for name in self.half_width_mm:
-            told[_NAMED[name]] = {
+            content[_NAMED[name]] = {
                 "half_width_90_mm": self.half_width_mm[name],
                 "radius_95_mm": self.radius_mm[name],
                 "stretch": self.stretches[name].as_dict() if name in self.stretches else None,
                 "cross_validated": self.crossed[name].as_dict() if name in self.crossed else None,
                 "holdout": self.holdout[name].as_dict() if name in self.holdout else None,
             }
-        return told
+        return content
 
 
 def interval_result(
@@ -111,9 +111,9 @@ def interval_result(
     holdout: dict[Recording, Coverage] = {}
     if len(split.holdout):
         for name, own in score(by, problem.subset(alike, split.holdout)).items():
-            found = coverage(own, [stretches.get(name)] * len(split.holdout))
-            if found is not None:
-                holdout[name] = found
+            shares_held = coverage(own, [stretches.get(name)] * len(split.holdout))
+            if shares_held is not None:
+                holdout[name] = shares_held
             scores = {**scores, name: _filled(scores.get(name), own, split.holdout, records[0].count)}
     spreads: dict[Recording, Sequence[Spread]] = {"same": by.in_recording(alike)}
     if by.drifts:

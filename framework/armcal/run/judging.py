@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.config.system import System
 from armcal.diagnose.coverage import predictor
@@ -26,34 +24,22 @@ from armcal.diagnose.gross_findings import (
 )
 from armcal.diagnose.large_errors import Judged, large_errors
 from armcal.diagnose.majority import minority
-from armcal.diagnose.moved import Moved, moved_findings, moved_groups
+from armcal.diagnose.moved import moved_findings, moved_groups
 from armcal.diagnose.noise_findings import Finding
 from armcal.diagnose.outside import predicted_positions
 from armcal.diagnose.residual_structure import structure
 from armcal.diagnose.verdict import Verdict, judge
-from armcal.estimate.validation import Split, error_unit
-from armcal.estimate.weighing import WeighedFit
-from armcal.planning.suggestion import suggest
+from armcal.estimate.validation import error_unit
+from armcal.planning.suggestion import Suggestion, suggest
 from armcal.problem.drift import residuals
 from armcal.problem.motion import Motion, recorded_position
-from armcal.problem.problem import FactorRecords, Problem
-from armcal.run.gravity import gravity_findings
+from armcal.problem.problem import FactorRecords
+from armcal.run.data_checks import gravity_findings
+from armcal.run.errors import FittedRecords, RecordErrors
 from armcal.run.intervals import IntervalResult
-from armcal.run.result import RecordErrors
 
 _MM = 1000.0
 _AT_REST = ", as in a new recording (its drift not known)"
-
-
-@dataclass(frozen=True)
-class FittedRecords:
-    """All records of a run, which of them trained, and the fit to those."""
-
-    problem: Problem
-    records: tuple[FactorRecords, ...]
-    dataset: Dataset
-    split: Split
-    fitted: WeighedFit
 
 
 def verdict_of(
@@ -68,30 +54,31 @@ def verdict_of(
         system: the arms.
         limit: above which the error of a judged record is explained (m); None for the default.
     """
-    estimate, held = run.fitted.estimate, len(run.split.holdout)
+    problem, fitted, train, held = run.problem, run.fitted, run.split.train, len(run.split.holdout)
+    estimate, acting = fitted.estimate, run.problem.weighted(fitted.records, fitted.weights)
     judged = _judged(run, errors)
     evidence = gather(run, judged, system, limit)
-    joints = {
-        f"{name}.{joint}": dimension for name, arm in system.arms.items() for joint, dimension in arm.commanded.items()
-    }
-    training, gravity = run.dataset.subset(run.split.train), gravity_findings(system, run.dataset)
+    drifts = any(block.drift is not None for block in problem.parameters.free)
+    gross, moved, suggestions = list[Finding](), list[Finding](), tuple[Suggestion, ...]()
+    if estimate.verdict.converged:
+        gross = _gross(run, acting, judged, evidence)
+        moved = moved_findings(moved_groups(problem, estimate.values, acting))
+        # In a contact no pose can be chosen that does not touch.
+        if estimate.names and all(kernel.factor.output_channels for kernel in problem.kernels):
+            joints = {f"{name}.{j}": kind for name, arm in system.arms.items() for j, kind in arm.commanded.items()}
+            suggestions = suggest(problem, run.dataset.subset(train), estimate, joints)
+    worse = worse_than_nominal(judged, errors.nominal_mm, errors.unit)
     verdict = judge(
         estimate,
         _whitened(run),
         errors.calibrated_mm,
-        run.split.train,
+        train,
         judged[np.isfinite(judged)],
-        (f"{held} held-out records" if held else "cross-validation") + (_AT_REST if _drifts(run) else ""),
+        (f"{held} held-out records" if held else "cross-validation") + (_AT_REST if drifts else ""),
         run.dataset.ids,
-        suggest(run.problem, training, estimate, joints) if estimate.names and _can_be_helped(run) else (),
-        run.fitted,
-        [
-            *_gross(run, judged, evidence),
-            *worse_than_nominal(judged, errors.nominal_mm, errors.unit),
-            *intervals.findings(),
-            *moved_findings(_moved(run)),
-            *gravity,
-        ],
+        suggestions,
+        fitted,
+        [*gross, *worse, *intervals.findings(), *moved, *gravity_findings(system, run.dataset)],
         evidence,
     )
     return verdict, evidence
@@ -129,15 +116,13 @@ def _new_recording(run: FittedRecords, judged: NDArray[np.bool_]) -> NewRecordin
     return NewRecording(ratio[at], *correlation.subset(at).degrees_of_freedom(len(at)))
 
 
-def _gross(run: FittedRecords, judged_mm: Array, evidence: Evidence) -> list[Finding]:
-    """What is grossly wrong with a fit that converged, and what its data cannot show."""
+def _gross(run: FittedRecords, acting: Sequence[FactorRecords], judged_mm: Array, evidence: Evidence) -> list[Finding]:
+    """What is grossly wrong with a fit that converged to weighted records, and what its data cannot show."""
     problem, estimate, train = run.problem, run.fitted.estimate, run.split.train
-    if not estimate.verdict.converged:
-        return []
     looked_at = thinned(train, MOST_RECORDS)
     figure = figure_of(problem, estimate, problem.subset(run.records, looked_at))
     own = thinned(np.arange(len(train)), MOST_RECORDS)
-    acting = problem.subset(problem.weighted(run.fitted.records, run.fitted.weights), own)
+    acting = problem.subset(acting, own)
     rows = FitRows.of(problem, acting, estimate)
     dataset = run.dataset.subset(looked_at)
     position = recorded_position(run.dataset)[looked_at]
@@ -149,24 +134,6 @@ def _gross(run: FittedRecords, judged_mm: Array, evidence: Evidence) -> list[Fin
         *displacement_findings(figure),
         *limit_findings(figure, scale_deviation(problem, rows, read, estimate.noise_scale)),
     ]
-
-
-def _moved(run: FittedRecords) -> tuple[Moved, ...]:
-    """Of the training groups, by a fit that converged."""
-    if not run.fitted.estimate.verdict.converged:
-        return ()
-    acting = run.problem.weighted(run.fitted.records, run.fitted.weights)
-    return moved_groups(run.problem, run.fitted.estimate.values, acting)
-
-
-def _can_be_helped(run: FittedRecords) -> bool:
-    """Whether poses can be told that would help the fit.
-
-    It must have converged, and all measurements must read something: in a contact no pose can be chosen that does not
-    touch.
-    """
-    converged = run.fitted.estimate.verdict.converged
-    return converged and all(kernel.factor.output_channels for kernel in run.problem.kernels)
 
 
 def effect_types(system: System) -> frozenset[str]:
@@ -191,15 +158,11 @@ def _judged(run: FittedRecords, errors: RecordErrors) -> Array:
     return judged
 
 
-def _drifts(run: FittedRecords) -> bool:
-    return any(block.drift is not None for block in run.problem.parameters.free)
-
-
 def _whitened(run: FittedRecords) -> Array:
     """Residuals in units of their noise times the record's weight (n_r x N); not a number outside of training."""
     problem, fitted = run.problem, run.fitted
-    found = residuals(problem, fitted.solution.values, fitted.records, fitted.records)
-    parts = problem.whitened(found, fitted.records)
+    raw = residuals(problem, fitted.solution.values, fitted.records, fitted.records)
+    parts = problem.whitened(raw, fitted.records)
     own = np.vstack([part * weight for part, weight in zip(parts, fitted.weights, strict=True)])
     whole = np.full((len(own), len(run.dataset)), np.nan)
     whole[:, run.split.train] = own

@@ -10,15 +10,12 @@ import numpy as np
 
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
-from armcal.config.yaml_source import ConfigSource
 from armcal.errors import ConfigError, DataError, Location
 from armcal.estimate.estimator import Progress, no_progress
 from armcal.estimate.simulation import SimulationRequest, with_channels
 from armcal.estimate.structure import require_solvable
 from armcal.estimate.validation import (
-    FitTask,
     Indices,
-    JudgedFit,
     Split,
     error_unit,
     fit_and_judge,
@@ -30,11 +27,9 @@ from armcal.io.parallel import Executor
 from armcal.problem.drift import with_drift
 from armcal.problem.problem import Problem
 from armcal.run.experiment import Experiment
-from armcal.run.pipeline import Stopwatch
-from armcal.run.provenance import provenance
-from armcal.run.study import Study, Trainable, compiled, interpreted_first, naming
+from armcal.run.pipeline import Prepared, Stopwatch
+from armcal.run.study import LoadTransferSettings, Study, compiled, fit_task, interpreted_first, naming
 from armcal.run.study_result import TransferCell, TransferResult
-from armcal.run.study_settings import LoadTransferSettings
 
 _MM = 1000.0
 _GRAMS = 1000.0
@@ -49,6 +44,11 @@ class _Fit:
     trained: tuple[int, ...]
     split: Split
 
+    @property
+    def key(self) -> tuple[str, tuple[int, ...]]:
+        """All fits of a variant that trained at the same payloads."""
+        return self.variant, self.trained
+
 
 def transfer(
     study: Study,
@@ -59,8 +59,7 @@ def transfer(
 ) -> TransferResult:
     """Train every variant at each payload and at all, and judge it at each.
 
-    At a payload that it trained at, a record is judged by a fit whose training left its fold out, so that no figure
-    is of a record that trained.
+    At a payload that it trained at, a record is judged by a fit whose training left its fold out.
 
     Raises:
         InputError: the records are not at two payloads, or a variant cannot be solved with those of one.
@@ -69,17 +68,19 @@ def transfer(
     first = next(iter(study.experiments.values()))
     with watch.stage("prepare"):
         simulated = first.settings.data is None
-        dataset = _simulated(first, settings) if simulated else _measured(first)
+        dataset = _simulated(first, settings) if simulated else first.read()
         groups, payloads = _groups(dataset, settings)
         ready = {name: naming(name, partial(_prepared, e, dataset, groups)) for name, e in study.experiments.items()}
     plan = [fit for name in ready for fit in _plan(name, groups, settings)]
     with watch.stage("compile"):
         ready = compiled(study.experiments, ready, len(dataset) * len(plan) // len(ready), executor, progress)
-    tasks = [_task(ready[fit.variant], fit) for fit in plan]
+    tasks = [fit_task(study.experiments[fit.variant], ready[fit.variant], fit.split) for fit in plan]
     with watch.stage("fits"):
         fits = executor.map(fit_and_judge, tasks, lambda done: progress("fits", done))
-    errors = _collected(plan, fits, len(dataset))
-    unsolved = [(p.variant, p.trained) for p, fit in zip(plan, fits, strict=True) if not fit.converged]
+    errors = {fit.key: np.full(len(dataset), np.nan) for fit in plan}
+    for fit, judged in zip(plan, fits, strict=True):
+        errors[fit.key][fit.split.holdout] = judged.errors * _MM
+    unsolved = [fit.key for fit, judged in zip(plan, fits, strict=True) if not judged.converged]
     return TransferResult(
         name=study.name,
         command=command,
@@ -87,11 +88,11 @@ def transfer(
         simulated=simulated,
         payloads_g=payloads,
         counts=tuple(len(group) for group in groups),
-        cells=_all_cells(ready, errors, groups, payloads, unsolved),
+        cells=_cells(ready, errors, groups, payloads, unsolved),
         errors_mm={(name, tuple(payloads[i] for i in trained)): error for (name, trained), error in errors.items()},
         warnings=dataset.warnings,
         seconds=watch.seconds,
-        provenance=provenance(first, dataset),
+        provenance=first.provenance(dataset),
         unit=error_unit(next(iter(ready.values())).problem),
     )
 
@@ -109,56 +110,50 @@ def _simulated(experiment: Experiment, settings: LoadTransferSettings) -> Datase
         system = experiment.system
         environment = replace(system.environment, payload_mass=payload)
         request = SimulationRequest(system.arms, system.measurements, experiment.parameters, environment)
-        seeded = replace(experiment, source=_with_seed(experiment.source, number))
-        made = seeded.simulator().simulate(request)
-        parts.append(with_channels(made, {PAYLOAD: np.full(len(made), payload)}))
+        section = dict(experiment.source.data.get("simulation") or {})
+        if isinstance(section.get("seed", 0), int):
+            section["seed"] = section.get("seed", 0) + number
+        source = replace(experiment.source, data={**experiment.source.data, "simulation": section})
+        simulated = replace(experiment, source=source).simulator().simulate(request)
+        parts.append(with_channels(simulated, {PAYLOAD: np.full(len(simulated), payload)}))
     ids = tuple(f"{p * _GRAMS:g}g-{i}" for p, part in zip(settings.payloads, parts, strict=True) for i in part.ids)
     channels = {name: np.concatenate([part.channels[name] for part in parts]) for name in parts[0].channels}
     return Dataset(ids, channels, source="simulation")
 
 
-def _with_seed(source: ConfigSource, number: int) -> ConfigSource:
-    section = dict(source.data.get("simulation") or {})
-    if isinstance(section.get("seed", 0), int):
-        section["seed"] = section.get("seed", 0) + number
-    return replace(source, data={**source.data, "simulation": section})
-
-
-def _measured(experiment: Experiment) -> Dataset:
-    dataset = experiment.read()
-    if not dataset.has(PAYLOAD):
-        raise DataError(
-            "no column says what hung on the tool.",
-            where=Location(dataset.source),
-            hint="Add a column payload_g; a load transfer needs records at two payloads at least.",
-        )
-    return dataset
-
-
 def _groups(dataset: Dataset, settings: LoadTransferSettings) -> tuple[list[Indices], tuple[float, ...]]:
     """Record indices of each payload, and the payloads (g), to the nearest tenth of a gram."""
-    tenths = np.round(dataset.column(PAYLOAD) * _GRAMS * 10).astype(int)
-    wanted = [round(p * _GRAMS * 10) for p in settings.payloads] or sorted(set(tenths.tolist()))
-    groups = [np.flatnonzero(tenths == each).astype(np.intp) for each in wanted]
-    missing = [f"{each / 10:g} g" for each, group in zip(wanted, groups, strict=True) if len(group) < settings.folds]
-    if missing or len(groups) < 2:
-        there = ", ".join(f"{each / 10:g} g ({int(np.sum(tenths == each))})" for each in sorted(set(tenths.tolist())))
+    where = Location(dataset.source)
+    if not dataset.has(PAYLOAD):
         raise DataError(
-            f"too few records at {', '.join(missing) or 'a second payload'}; there are records at {there}.",
-            where=Location(dataset.source),
+            "no column states what hung on the tool.",
+            where=where,
+            hint="Add a column payload_g; a load transfer needs records at two payloads at least.",
+        )
+    tenths = np.round(dataset.column(PAYLOAD) * _GRAMS * 10).astype(int)
+    present = sorted(set(tenths.tolist()))
+    payloads = [round(p * _GRAMS * 10) for p in settings.payloads] or present
+    groups = [np.flatnonzero(tenths == payload).astype(np.intp) for payload in payloads]
+    few = [f"{p / 10:g} g" for p, group in zip(payloads, groups, strict=True) if len(group) < settings.folds]
+    if few or len(groups) < 2:
+        counts = ", ".join(f"{payload / 10:g} g ({int(np.sum(tenths == payload))})" for payload in present)
+        raise DataError(
+            f"too few records at {', '.join(few) or 'a second payload'}; there are records at {counts}.",
+            where=where,
             hint=f"A payload needs at least as many records as there are folds ({settings.folds}).",
         )
-    return groups, tuple(each / 10 for each in wanted)
+    return groups, tuple(payload / 10 for payload in payloads)
 
 
-def _prepared(experiment: Experiment, dataset: Dataset, groups: Sequence[Indices]) -> Trainable:
+def _prepared(experiment: Experiment, dataset: Dataset, groups: Sequence[Indices]) -> Prepared:
     system, parameters = experiment.system, experiment.parameters
     choice = interpreted_first(experiment).evaluator
     problem = Problem.build(system.arms, system.measurements, parameters, system.environment, dataset, choice)
     records = with_drift(problem, problem.records(dataset), dataset, parameters.nominal())
     for group in groups:
         require_solvable(problem, problem.subset(records, group), parameters.nominal())
-    return Trainable(experiment, problem, records)
+    every = np.arange(len(dataset), dtype=np.intp)
+    return Prepared(dataset, problem, records, Split(every, every), ())
 
 
 def _plan(name: str, groups: Sequence[Indices], settings: LoadTransferSettings) -> list[_Fit]:
@@ -175,24 +170,8 @@ def _plan(name: str, groups: Sequence[Indices], settings: LoadTransferSettings) 
     return plan
 
 
-def _task(ready: Trainable, fit: _Fit) -> FitTask:
-    e = ready.experiment
-    return FitTask(ready.problem, e.estimator, ready.problem.parameters.nominal(), ready.records, fit.split)
-
-
-def _collected(
-    plan: Sequence[_Fit], fits: Sequence[JudgedFit], count: int
-) -> Mapping[tuple[str, tuple[int, ...]], Array]:
-    """Errors (mm) of each record by variant and payloads trained at."""
-    errors: dict[tuple[str, tuple[int, ...]], Array] = {}
-    for fit, judged in zip(plan, fits, strict=True):
-        row = errors.setdefault((fit.variant, fit.trained), np.full(count, np.nan))
-        row[fit.split.holdout] = judged.errors * _MM
-    return errors
-
-
-def _all_cells(
-    ready: Mapping[str, Trainable],
+def _cells(
+    ready: Mapping[str, Prepared],
     errors: Mapping[tuple[str, tuple[int, ...]], Array],
     groups: Sequence[Indices],
     payloads: Sequence[float],
@@ -200,33 +179,12 @@ def _all_cells(
 ) -> tuple[TransferCell, ...]:
     """Variant by variant: without calibration, then by what it was trained at."""
     cells: list[TransferCell] = []
-    for name in ready:
-        cells += _nominal_cells(name, ready[name], groups, payloads)
-        for key in [key for key in errors if key[0] == name]:
-            cells += _cells(key, errors[key], groups, payloads, unsolved.count(key))
+    for name, own in ready.items():
+        nominal = record_errors(own.problem, own.problem.parameters.nominal(), own.records) * _MM
+        for trained, row in (((), nominal), *((key[1], row) for key, row in errors.items() if key[0] == name)):
+            at, failed = tuple(payloads[i] for i in trained), unsolved.count((name, trained))
+            cells += [
+                TransferCell(name, at, payloads[i], summarise(row[group]), i in trained, failed)
+                for i, group in enumerate(groups)
+            ]
     return tuple(cells)
-
-
-def _cells(
-    key: tuple[str, tuple[int, ...]],
-    errors: Array,
-    groups: Sequence[Indices],
-    payloads: Sequence[float],
-    failed: int,
-) -> list[TransferCell]:
-    name, trained = key
-    at = tuple(payloads[i] for i in trained)
-    return [
-        TransferCell(name, at, payloads[i], summarise(errors[group]), i in trained, failed)
-        for i, group in enumerate(groups)
-    ]
-
-
-def _nominal_cells(
-    name: str, ready: Trainable, groups: Sequence[Indices], payloads: Sequence[float]
-) -> list[TransferCell]:
-    errors = record_errors(ready.problem, ready.problem.parameters.nominal(), ready.records) * _MM
-    return [
-        TransferCell(name, (), payload, summarise(errors[group]), False, 0)
-        for group, payload in zip(groups, payloads, strict=True)
-    ]

@@ -1,4 +1,4 @@
-"""What a run says of noise: how records weighed, which are suspicious, whose the scatter is."""
+"""Noise of a run: how records weighed, which are suspicious, and estimated variances."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from armcal.base.config_text import finite
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.estimate.residual_spread import ResidualSpread, residual_spread
@@ -75,20 +76,18 @@ class NoiseResult:
             content["rounds"] = self.rounds
             content["suspicious_records"] = [asdict(record) for record in self.suspicious]
         if self.components is not None:
-            content["components"] = [
-                {key: _finite(value) for key, value in asdict(c).items()} for c in self.components.components
-            ]
+            content["components"] = [finite(asdict(component)) for component in self.components.components]
             content["inseparable"] = [list(pair) for pair in self.components.inseparable]
             content["unseen_joints"] = list(self.components.unseen)
         content["scatter"] = {
             name: {
-                "covariance": each.covariance.tolist(),
-                "share": each.share,
-                "over": each.over,
-                "channel": each.channel,
-                "freedom": each.freedom,
+                "covariance": spread.covariance.tolist(),
+                "share": spread.share,
+                "over": spread.over,
+                "channel": spread.channel,
+                "freedom": spread.freedom,
             }
-            for name, each in self.scatter.items()
+            for name, spread in self.scatter.items()
         }
         return content
 
@@ -105,7 +104,3 @@ def noise_result(problem: Problem, fit: WeighedFit, dataset: Dataset, split: Spl
         suspicious.append(SuspiciousRecord(row, dataset.ids[i], suspect.measurement, *numbers))
     scatter = residual_spread(problem, fit.estimate, fit.records, dataset.subset(split.train))
     return NoiseResult(fit.loss, weights, tuple(suspicious), fit.components, len(fit.rounds), scatter)
-
-
-def _finite(value: Any) -> Any:
-    return None if isinstance(value, float) and not np.isfinite(value) else value

@@ -6,7 +6,7 @@ import csv
 import io
 import tempfile
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import asdict
 from datetime import UTC, datetime
@@ -27,16 +27,13 @@ from armcal.calibration.calibration_file import (
     sealed,
 )
 from armcal.calibration.physics import check_poses
-from armcal.config.yaml_source import ConfigSource
 from armcal.errors import ArmcalError, CalibrationWarning, NotConvergedError
 from armcal.estimate.bootstrap import Bootstrap
-from armcal.estimate.profile import Profile
 from armcal.estimate.validation import in_unit
 from armcal.io import folder as folders
 from armcal.measure.reader import surroundings
 from armcal.plugins import PluginRegistry
 from armcal.run.experiment import Experiment
-from armcal.run.groups import GroupError
 from armcal.run.result import RunResult
 
 FILES = ("experiment.yaml", "residuals.csv", "metrics.json", "report.html", "log.txt", "calibration.yaml")
@@ -102,40 +99,30 @@ def place(
         InputError: the folder cannot be written.
         ArmcalError: the calibration cannot be read back: it is left as ``calibration.yaml.unreadable``.
     """
-    texts, fault = files(result, experiment, render, accepted), None
-    if "calibration.yaml" in texts:
-        try:
-            read_back(texts["calibration.yaml"], experiment.registry)
-        except ArmcalError as found:
-            fault = found
-            texts[f"calibration.yaml{UNREADABLE_SUFFIX}"] = texts.pop("calibration.yaml")
-    held.place(texts)
-    if fault is not None:
-        hint = f"It was left as calibration.yaml{UNREADABLE_SUFFIX}, which nothing loads. {fault.hint}"
-        raise ArmcalError(f"the calibration cannot be read back: {fault.message}", hint=hint) from fault
-
-
-def files(
-    result: RunResult, experiment: Experiment, render: Callable[[RunResult], str], accepted: bool = False
-) -> dict[str, str]:
-    """The texts of all files by their names.
-
-    The calibration of a run that did not converge, or whose verdict is bad and was not ``accepted``, gets a name that
-    nothing loads.
-    """
-    texts = {
-        "experiment.yaml": experiment_text(experiment.source),
+    texts: dict[str, str] = {}
+    fault: ArmcalError | None = None
+    if result.profiles:  # each by its parameter (SI), with its curve
+        texts[PROFILE_FILE] = as_json({profile.name: profile.as_dict() for profile in result.profiles}) + "\n"
+    if result.bootstrap:
+        texts[BOOTSTRAP_FILE] = bootstrap_text(result.bootstrap, result)
+    texts |= {
+        "experiment.yaml": dump(experiment.source.data),
         "residuals.csv": residuals_text(result),
         "metrics.json": as_json(metrics(result)) + "\n",
         "report.html": render(result),
         "log.txt": log_text(result),
         calibration_name(result, accepted): sealed(calibration_content(result, experiment, accepted)),
     }
-    if result.bootstrap:
-        texts = {BOOTSTRAP_FILE: bootstrap_text(result.bootstrap, result), **texts}
-    if result.profiles:
-        texts = {PROFILE_FILE: profile_text(result.profiles), **texts}
-    return texts
+    if "calibration.yaml" in texts:
+        try:
+            read_back(texts["calibration.yaml"], experiment.registry)
+        except ArmcalError as refusal:
+            fault = refusal
+            texts[f"calibration.yaml{UNREADABLE_SUFFIX}"] = texts.pop("calibration.yaml")
+    held.place(texts)
+    if fault is not None:
+        hint = f"It was left as calibration.yaml{UNREADABLE_SUFFIX}, which nothing loads. {fault.hint}"
+        raise ArmcalError(f"the calibration cannot be read back: {fault.message}", hint=hint) from fault
 
 
 def metrics(result: RunResult) -> dict[str, Any]:
@@ -176,7 +163,7 @@ def metrics(result: RunResult) -> dict[str, Any]:
         "structure": result.evidence.as_dict(),
         "prediction_intervals": result.intervals.as_dict(),
         "bootstrap": _bootstrap_metrics(result),
-        "profile": _profile_metrics(result),
+        "profile": {p.name: {k: v for k, v in p.as_dict().items() if k != "curve"} for p in result.profiles} or None,
         "warnings": list(result.warnings),
         "evaluator": result.backend,
         "seconds": dict(result.seconds),
@@ -188,17 +175,13 @@ def metrics(result: RunResult) -> dict[str, Any]:
 def _errors(result: RunResult) -> dict[str, Any]:
     """The table, and of training and judging groups the mean of their means: a group of few records counts as much."""
     table, groups = result.table.as_dict(), result.groups.errors
-    for key, own in (("train", [g for g in groups if g.trained]), ("holdout", _judging(groups))):
+    for key, own in (("train", [g for g in groups if g.trained]), ("holdout", [g for g in groups if not g.trained])):
         if own:
             table["nominal"][key]["mean_of_groups"] = float(np.mean([g.nominal_error_mm for g in own]))
             table["calibrated"][key]["mean_of_groups"] = float(np.mean([g.error_mm for g in own]))
             known = [g.distance_error_mm for g in own if g.distance_error_mm is not None]
             table["calibrated"][key]["distance_mean_of_groups"] = float(np.mean(known)) if known else None
     return table
-
-
-def _judging(groups: Sequence[GroupError]) -> list[GroupError]:
-    return [group for group in groups if not group.trained]
 
 
 def calibration_content(result: RunResult, experiment: Experiment, accepted: bool = False) -> dict[str, Any]:
@@ -237,18 +220,14 @@ def calibration_content(result: RunResult, experiment: Experiment, accepted: boo
         prediction=result.prediction,
         information=information,
     )
-    return dict(finite(_checked(record, result, experiment).to_config()))
-
-
-def _checked(record: CalibrationFile, result: RunResult, experiment: Experiment) -> CalibrationFile:
-    """With predictions at check poses, if the arm settles there."""
     system, registry = experiment.system, experiment.registry
-    parameters = system.parameters(record.groups).with_nominal(result.estimate.values)
-    made = Calibration(system, parameters, record)
+    parameters = system.parameters(record.groups).with_nominal(estimate.values)
+    calibration = Calibration(system, parameters, record)
     try:
-        return made.checked(check_poses(system, result.dataset, result.split.train), registry).record
-    except NotConvergedError:
-        return made.checked(None, registry).record
+        calibration = calibration.checked(check_poses(system, result.dataset, result.split.train), registry)
+    except NotConvergedError:  # the arm does not settle at the check poses
+        calibration = calibration.checked(None, registry)
+    return dict(finite(calibration.record.to_config()))
 
 
 def read_back(text: str, registry: PluginRegistry) -> Calibration:
@@ -267,13 +246,8 @@ def read_back(text: str, registry: PluginRegistry) -> Calibration:
 
 def _noise(result: RunResult) -> dict[str, Any]:
     estimate = result.estimate
-    told = {"scale": estimate.noise_scale, "degrees_of_freedom": estimate.degrees_of_freedom}
-    return {**told, **result.noise.as_dict()}
-
-
-def experiment_text(source: ConfigSource) -> str:
-    """The merged configuration that was run."""
-    return dump(source.data)
+    fit = {"scale": estimate.noise_scale, "degrees_of_freedom": estimate.degrees_of_freedom}
+    return {**fit, **result.noise.as_dict()}
 
 
 def residuals_text(result: RunResult) -> str:
@@ -312,11 +286,6 @@ def bootstrap_text(resampled: Bootstrap, result: RunResult) -> str:
     return text.getvalue()
 
 
-def profile_text(profiles: tuple[Profile, ...]) -> str:
-    """Each profile by its parameter (SI), with its curve."""
-    return as_json({profile.name: profile.as_dict() for profile in profiles}) + "\n"
-
-
 def log_text(result: RunResult) -> str:
     """What happened, in sentences."""
     lines = [
@@ -349,12 +318,6 @@ def _bootstrap_metrics(result: RunResult) -> dict[str, Any] | None:
             name: {"sd": _finite(sd), "lower": _finite(low), "upper": _finite(high)} for name, sd, (low, high) in rows
         },
     }
-
-
-def _profile_metrics(result: RunResult) -> dict[str, Any] | None:
-    """Intervals without their curves."""
-    told = {profile.name: profile.as_dict() for profile in result.profiles}
-    return {name: {k: v for k, v in content.items() if k != "curve"} for name, content in told.items()} or None
 
 
 def _finite(number: float) -> float | None:

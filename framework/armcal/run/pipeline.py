@@ -7,55 +7,43 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 
-import numpy as np
-
-from armcal.base.dataset import Dataset
-from armcal.base.domains import Array
+from armcal.base.dataset import Dataset, SetAside
 from armcal.calibration.intervals import PredictionRecord, covariance_rows, recording_record, stretch_records
 from armcal.diagnose.clustered import widened
 from armcal.diagnose.coverage import fit_and_predict
-from armcal.diagnose.evidence import Evidence
-from armcal.diagnose.verdict import Verdict
-from armcal.errors import ConfigError, NotConvergedError, ProblemError
+from armcal.errors import ConfigError, ProblemError
 from armcal.estimate.bootstrap import Bootstrap, bootstrap
-from armcal.estimate.estimator import Progress, gave_up, no_progress, spread
-from armcal.estimate.nuisance import restricted, settled, started, untrained
+from armcal.estimate.estimator import Progress, no_progress, spread
+from armcal.estimate.nuisance import restricted, started
 from armcal.estimate.polish import hopeless
 from armcal.estimate.profile import Profile, profiled, profiles
 from armcal.estimate.structure import require_solvable
 from armcal.estimate.validation import (
     CrossValidation,
-    ErrorSummary,
     Split,
     cross_validate,
     error_unit,
     folds,
     hold_out,
-    record_errors,
     split_by_id,
     split_by_label,
-    summarise,
 )
 from armcal.estimate.weighing import WeighedFit, fit, plain_fit
 from armcal.io.parallel import Executor
 from armcal.measure.id_list import read_ids
 from armcal.plugins import PluginRegistry
-from armcal.problem.drift import residuals, with_drift
+from armcal.problem.drift import with_drift
 from armcal.problem.motion import recorded_position
 from armcal.problem.problem import FactorRecords, Problem
 from armcal.problem.readings import with_joint_noise
-from armcal.run.axes_check import check_permuted_axes
+from armcal.run.data_checks import check_permuted_axes, check_reach
+from armcal.run.errors import ErrorTable, FittedRecords, RecordErrors, errors_of
 from armcal.run.experiment import Experiment
-from armcal.run.groups import RunGroups, group_errors, labels_of
+from armcal.run.groups import labels_of, run_groups
 from armcal.run.intervals import IntervalResult, interval_result
-from armcal.run.judging import FittedRecords, verdict_of
-from armcal.run.noise import noise_result
-from armcal.run.provenance import provenance
-from armcal.run.reach import check_reach
-from armcal.run.result import ErrorTable, RecordErrors, RunResult
-
-_MM = 1000.0
-"""Thousandths of m; of rad where errors are angles."""
+from armcal.run.judging import verdict_of
+from armcal.run.noise import SuspiciousRecord, noise_result
+from armcal.run.result import RunResult
 
 
 @dataclass(frozen=True)
@@ -132,7 +120,10 @@ def assemble(experiment: Experiment, watch: Stopwatch) -> Prepared:
         check_reach(problem, records, dataset)
         check_permuted_axes(problem, records, dataset)
         split = _split(experiment, dataset)
-        _check_folds(experiment, dataset, split)
+        if not len(split.train):
+            raise ProblemError("no record is left to train on.", hint="Hold fewer out, or measure more poses.")
+        if experiment.settings.validation.folds:
+            _folds(experiment, dataset, split)  # refused before the fit rather than after it
         if experiment.settings.validation.limit is not None and error_unit(problem) != "mm":
             where = experiment.source.where(("validation", "limit"))
             hint = "Leave it out: records are explained that miss by far more than the median."
@@ -152,46 +143,41 @@ def calibrate(
     """Calibrate (see ``outputs.write``), starts and folds by ``executor``; InputError where refused before solving."""
     watch, registry = watch or Stopwatch(), experiment.registry
     ready = prepare(experiment, watch)
-    faults = _announce(experiment, ready)
-    with watch.stage("fit"):
-        fitted = _fitted(experiment, ready, progress, executor)
+    dataset, split, validation = ready.dataset, ready.split, experiment.settings.validation
+    faults = registry.notify("armcal_run_started", name=experiment.name, records=len(dataset))
+    faults += _notify_rejected(registry, dataset.set_aside)
+    fitted = _fitted(experiment, ready, progress, executor, watch)
     faults += registry.notify("armcal_estimate_changed", estimate=fitted.estimate)
+    run = FittedRecords(ready.problem, ready.records, dataset, split, fitted)
     resampled, profiled_result = _uncertainty(experiment, ready, fitted, progress, executor, watch)
-    with watch.stage("validate"):
-        crossed = _crossed(experiment, ready, fitted, progress, executor)
-        errors, intervals = _errors(ready, fitted, crossed), _intervals(experiment, ready, fitted, crossed)
+    errors, intervals = _validated(experiment, run, ready.training, progress, executor, watch)
     progress("judging", 0.0)
-    verdict, evidence = _judge(experiment, ready, fitted, errors, intervals, watch)
+    with watch.stage("judge"):
+        verdict, evidence = verdict_of(run, errors, intervals, experiment.system, validation.limit)
     progress("judging", 1.0)
-    noise = noise_result(ready.problem, fitted, ready.dataset, ready.split, errors.calibrated_mm)
-    faults += _tell_rejected(registry, [(s.row, s.record_id, s.reason) for s in noise.set_aside])
+    noise = noise_result(ready.problem, fitted, dataset, split, errors.calibrated_mm)
+    faults += _notify_rejected(registry, noise.set_aside)
     return RunResult(
         name=experiment.name,
         command=command,
-        dataset=ready.dataset,
-        split=ready.split,
+        dataset=dataset,
+        split=split,
         estimate=fitted.estimate,
         errors=errors,
-        table=_table(errors, ready.split),
+        table=ErrorTable.of(errors, split),
         verdict=verdict,
         evidence=evidence,
-        warnings=(*ready.warnings, *fitted.warnings, *_fold_warnings(errors, experiment), *dict.fromkeys(faults)),
+        warnings=(*ready.warnings, *fitted.warnings, *errors.fold_warnings(validation.folds), *dict.fromkeys(faults)),
         backend=ready.problem.backend,
         seconds=watch.seconds,
-        provenance=provenance(experiment, ready.dataset),
+        provenance=experiment.provenance(dataset),
         noise=noise,
         bootstrap=resampled,
         intervals=intervals,
         profiles=profiled_result,
-        prediction=_prediction(experiment, ready, fitted, intervals),
-        groups=_groups(experiment, ready, fitted, errors),
+        prediction=_prediction(experiment, run, intervals),
+        groups=run_groups(experiment, run, errors),
     )
-
-
-def _groups(experiment: Experiment, ready: Prepared, fitted: WeighedFit, errors: RecordErrors) -> RunGroups:
-    values, found = fitted.estimate.values, (errors.nominal_mm, errors.calibrated_mm)
-    told = group_errors(experiment, ready.problem, ready.records, ready.dataset, ready.split, values, found)
-    return RunGroups(told, ready.problem.blueprint.groups)
 
 
 def _uncertainty(
@@ -203,58 +189,46 @@ def _uncertainty(
     watch: Stopwatch,
 ) -> tuple[Bootstrap | None, tuple[Profile, ...]]:
     """What was asked for beyond the covariance, of a fit that converged."""
-    uncertainty_settings, estimate = experiment.settings.uncertainty, fitted.estimate
+    settings, estimate = experiment.settings.uncertainty, fitted.estimate
     resampled: Bootstrap | None = None
-    found: tuple[Profile, ...] = ()
-    if uncertainty_settings.bootstrap and estimate.verdict.converged and estimate.names:
+    profiled_result: tuple[Profile, ...] = ()
+    if settings.bootstrap and estimate.verdict.converged and estimate.names:
         with watch.stage("bootstrap"):
             poses = experiment.poses(ready.dataset.subset(ready.split.train))
-            parts = (ready.training, experiment.estimator, estimate, uncertainty_settings, executor, progress, poses)
+            parts = (ready.training, experiment.estimator, estimate, settings, executor, progress, poses)
             resampled = bootstrap(ready.problem, *parts)
-    if uncertainty_settings.profile and estimate.verdict.converged:
+    if settings.profile and estimate.verdict.converged:
         with watch.stage("profile"):
-            found = profiles(
-                ready.problem, fitted, experiment.estimator, uncertainty_settings.profile, executor, progress
+            profiled_result = profiles(
+                ready.problem, fitted, experiment.estimator, settings.profile, executor, progress
             )
-    return resampled, found
+    return resampled, profiled_result
 
 
-def _announce(experiment: Experiment, ready: Prepared) -> list[str]:
-    """Observers hear that a run has started, and which records it sets aside; their faults."""
-    started = experiment.registry.notify("armcal_run_started", name=experiment.name, records=len(ready.dataset))
-    aside = [(a.row, a.record_id, a.reason) for a in ready.dataset.set_aside]
-    return [*started, *_tell_rejected(experiment.registry, aside)]
-
-
-def _fitted(experiment: Experiment, ready: Prepared, progress: Progress, executor: Executor | None) -> WeighedFit:
+def _fitted(
+    experiment: Experiment, ready: Prepared, progress: Progress, executor: Executor | None, watch: Stopwatch
+) -> WeighedFit:
     """The fit to the training records, as sure as records that may err alike allow."""
     problem, train = ready.problem, ready.split.train
     estimator, nominal = spread(experiment.estimator, executor), problem.parameters.nominal()
-    given_up = hopeless(problem, ready.training, ready.dataset.subset(train), nominal)
-    if given_up is not None:
-        return plain_fit(problem, ready.training, given_up)
-    fitted = fit(problem, ready.training, estimator, nominal, progress)
-    acting, position = problem.weighted(fitted.records, fitted.weights), recorded_position(ready.dataset)[train]
-    return replace(fitted, estimate=widened(problem, acting, fitted.estimate, position))
+    with watch.stage("fit"):
+        given_up = hopeless(problem, ready.training, ready.dataset.subset(train), nominal)
+        if given_up is not None:
+            return plain_fit(problem, ready.training, given_up)
+        fitted = fit(problem, ready.training, estimator, nominal, progress)
+        acting, position = problem.weighted(fitted.records, fitted.weights), recorded_position(ready.dataset)[train]
+        return replace(fitted, estimate=widened(problem, acting, fitted.estimate, position))
 
 
-def _judge(
-    experiment: Experiment,
-    ready: Prepared,
-    fitted: WeighedFit,
-    errors: RecordErrors,
-    intervals: IntervalResult,
-    watch: Stopwatch,
-) -> tuple[Verdict, Evidence]:
-    run = FittedRecords(ready.problem, ready.records, ready.dataset, ready.split, fitted)
-    with watch.stage("judge"):
-        return verdict_of(run, errors, intervals, experiment.system, experiment.settings.validation.limit)
-
-
-def _tell_rejected(registry: PluginRegistry, records: Sequence[tuple[int, str, str]]) -> list[str]:
-    """Observers hear of each record (row, id, reason) that takes no part; their faults."""
-    told = [dict(zip(("row", "record_id", "reason"), record, strict=True)) for record in records]
-    return [fault for one in told for fault in registry.notify("armcal_record_rejected", **one)]
+def _notify_rejected(registry: PluginRegistry, records: Sequence[SetAside | SuspiciousRecord]) -> list[str]:
+    """Observers hear of each record that takes no part; their faults."""
+    return [
+        fault
+        for record in records
+        for fault in registry.notify(
+            "armcal_record_rejected", row=record.row, record_id=record.record_id, reason=record.reason
+        )
+    ]
 
 
 def _split(experiment: Experiment, dataset: Dataset) -> Split:
@@ -266,53 +240,41 @@ def _split(experiment: Experiment, dataset: Dataset) -> Split:
     return hold_out(len(dataset), validation.holdout, validation.seed, experiment.poses(dataset))
 
 
-def _check_folds(experiment: Experiment, dataset: Dataset, split: Split) -> None:
-    """Refused before the fit rather than after it."""
-    validation = experiment.settings.validation
-    if not len(split.train):
-        raise ProblemError("no record is left to train on.", hint="Hold fewer out, or measure more poses.")
-    if validation.folds:
-        _folds(experiment, dataset, split)
-
-
 def _folds(experiment: Experiment, dataset: Dataset, split: Split) -> tuple[Split, ...]:
     """Of the training records."""
     validation_settings, training = experiment.settings.validation, dataset.subset(split.train)
     return folds(len(training), validation_settings.folds, validation_settings.seed, experiment.poses(training))
 
 
-def _crossed(
-    experiment: Experiment, ready: Prepared, fitted: WeighedFit, progress: Progress, executor: Executor | None
-) -> tuple[CrossValidation, tuple[Split, ...]] | None:
-    """Cross-validation over the training records, with what each fold predicted; None where none is asked for.
-
-    Nor of a fit that did not converge: its folds would not either, and each would take as long.
-    """
-    validation_settings, problem = experiment.settings.validation, ready.problem
-    if not (validation_settings.folds and fitted.estimate.verdict.converged):
-        return None
-    splits = _folds(experiment, ready.dataset, ready.split)
-    start = problem.parameters.nominal()
-    parts = (ready.training, splits, experiment.estimator, start, progress, executor, fit_and_predict)
-    return cross_validate(problem, *parts), splits
-
-
-def _intervals(
+def _validated(
     experiment: Experiment,
-    ready: Prepared,
-    fitted: WeighedFit,
-    crossed: tuple[CrossValidation, tuple[Split, ...]] | None,
-) -> IntervalResult:
-    """Of predictions by the fit; none by one that did not converge."""
-    if not fitted.estimate.verdict.converged:
-        return IntervalResult()
-    return interval_result(ready.problem, fitted, ready.records, ready.split, experiment.estimator, crossed)
+    run: FittedRecords,
+    training: tuple[FactorRecords, ...],
+    progress: Progress,
+    executor: Executor | None,
+    watch: Stopwatch,
+) -> tuple[RecordErrors, IntervalResult]:
+    """Errors of all records and prediction intervals, by cross-validation over the training records if configured.
+
+    Nothing is predicted, nor cross-validated, by a fit that did not converge: its folds would not either, and each
+    would take as long.
+    """
+    problem, estimator = run.problem, experiment.estimator
+    crossed: tuple[CrossValidation, tuple[Split, ...]] | None = None
+    with watch.stage("validate"):
+        if not run.fitted.estimate.verdict.converged:
+            return errors_of(run, None), IntervalResult()
+        if experiment.settings.validation.folds:
+            splits, start = _folds(experiment, run.dataset, run.split), problem.parameters.nominal()
+            parts = (training, splits, estimator, start, progress, executor, fit_and_predict)
+            crossed = cross_validate(problem, *parts), splits
+        intervals = interval_result(problem, run.fitted, run.records, run.split, estimator, crossed)
+        return errors_of(run, crossed and crossed[0]), intervals
 
 
-def _prediction(
-    experiment: Experiment, ready: Prepared, fitted: WeighedFit, intervals: IntervalResult
-) -> PredictionRecord | None:
-    """What predictions need of this run."""
+def _prediction(experiment: Experiment, run: FittedRecords, intervals: IntervalResult) -> PredictionRecord | None:
+    """What predictions need of a run; None where it did not converge."""
+    fitted = run.fitted
     if not fitted.estimate.verdict.converged:
         return None
     columns = (experiment.source.data.get("data") or {}).get("columns") or {}
@@ -321,77 +283,5 @@ def _prediction(
         covariance=covariance_rows(fitted.estimate.covariance),
         stretches=stretch_records(intervals.stretches),
         columns={str(name): str(own) for name, own in columns.items()},
-        recording=recording_record(ready.problem, ready.dataset.subset(ready.split.train), fitted.records),
+        recording=recording_record(run.problem, run.dataset.subset(run.split.train), fitted.records),
     )
-
-
-def _errors(
-    ready: Prepared, fitted: WeighedFit, judged: tuple[CrossValidation, tuple[Split, ...]] | None
-) -> RecordErrors:
-    try:
-        return _errors_of(ready, fitted, judged)
-    except NotConvergedError as fault:
-        verdict = fitted.estimate.verdict
-        raise fault if verdict.converged else gave_up(verdict) from fault
-
-
-def _errors_of(
-    ready: Prepared, fitted: WeighedFit, judged: tuple[CrossValidation, tuple[Split, ...]] | None
-) -> RecordErrors:
-    problem, records, values = ready.problem, ready.records, fitted.estimate.values
-    unfitted, nominal = untrained(problem), problem.parameters.nominal()
-    before, after = settled(unfitted, nominal, records), settled(problem, values, records)
-    (crossed, at_rest), failed = np.full((2, len(ready.dataset)), np.nan), 0
-    if judged is not None:
-        train, cross_validation = ready.split.train, judged[0]
-        crossed[train], at_rest[train] = cross_validation.errors * _MM, cross_validation.at_rest * _MM
-        failed = cross_validation.failed_folds
-    drifts = any(block.drift for block in problem.parameters.free)
-    shown = problem.predict(values, records)[0]
-    first = len(problem.kernels[0].factor.output_channels)
-    return RecordErrors(
-        nominal_mm=record_errors(unfitted, nominal, records) * _MM,
-        calibrated_mm=record_errors(problem, values, records, fitted.records) * _MM,
-        cross_validated_mm=crossed,
-        nominal_residual_mm=np.vstack(problem.residuals(before, records)) * _MM,
-        calibrated_residual_mm=np.vstack(residuals(problem, after, records, fitted.records)) * _MM,
-        position_mm=shown[first + 9 : first + 12] * _MM,
-        failed_folds=failed,
-        at_rest_mm=record_errors(problem, values, records) * _MM if drifts else None,
-        cross_validated_at_rest_mm=at_rest if drifts else None,
-        residual_columns=_residual_columns(problem),
-        unit=error_unit(problem),
-    )
-
-
-def _residual_columns(problem: Problem) -> tuple[str, ...]:
-    """What the rows of all residuals are called: by axis where there is one position, else by number."""
-    dimensions = [dimension for kernel in problem.kernels for dimension in kernel.factor.dimensions]
-    if dimensions == ["length"] * 3:
-        return ("dx_mm", "dy_mm", "dz_mm")
-    units = {"length": "mm", "angle": "mrad"}
-    return tuple(f"residual{i}_{units[dimension]}" for i, dimension in enumerate(dimensions, start=1))
-
-
-def _fold_warnings(errors: RecordErrors, experiment: Experiment) -> list[str]:
-    if not errors.failed_folds:
-        return []
-    folds_asked = experiment.settings.validation.folds
-    return [f"{errors.failed_folds} of {folds_asked} folds did not converge; their records are not cross-validated."]
-
-
-def _table(errors: RecordErrors, split: Split) -> ErrorTable:
-    judged = np.isfinite(errors.cross_validated_mm)
-
-    def summaries(of: Array, crossed: Array) -> dict[str, ErrorSummary]:
-        return {
-            "train": summarise(of[split.train]),
-            "holdout": summarise(of[split.holdout]),
-            "cross_validated": summarise(crossed[judged]),
-        }
-
-    at_rest = {}
-    if errors.at_rest_mm is not None and errors.cross_validated_at_rest_mm is not None:
-        at_rest = summaries(errors.at_rest_mm, errors.cross_validated_at_rest_mm)
-    nominal = summaries(errors.nominal_mm, errors.nominal_mm)
-    return ErrorTable(nominal, summaries(errors.calibrated_mm, errors.cross_validated_mm), at_rest)

@@ -18,25 +18,21 @@ from armcal.planning.candidates import Candidates, Indices, deviations, over_dra
 from armcal.planning.criterion import Observability, criterion, observability
 from armcal.planning.planning import Plan, choose, value_of
 from armcal.planning.refinement import Allowed, refine
-from armcal.planning.relaxation import Relaxation, Task
+from armcal.planning.relaxation import Task
 from armcal.run.experiment import Experiment
 from armcal.run.plan_clearance import clearance_check
-from armcal.run.plan_context import PlanContext, as_if_measured, draws_of, parameters_of, plan_context, problem_of
-from armcal.run.plan_poses import JointSpace, Pool, dataset_of, given_records, pool_of, same_poses, told
-from armcal.run.plan_settings import PlanSettings
-from armcal.run.plan_visit import visit
+from armcal.run.plan_context import (
+    PlanContext,
+    as_if_measured,
+    in_order_of_visit,
+    parameters_of,
+    plan_context,
+    problem_of,
+)
+from armcal.run.plan_poses import JointSpace, Pool, counts_text, dataset_of, given_records, pool_of, same_poses
+from armcal.run.settings import PlanSettings
 
 _MORE = "Plan more poses, give the records that are there already (--given), or give priors."
-
-
-@dataclass(frozen=True)
-class PlanRequest:
-    """What is asked for: how many poses, of which candidates (None: as configured), after which records."""
-
-    count: int
-    listed: Path | None = None
-    given: Path | None = None
-    calibration: Path | None = None
 
 
 @dataclass(frozen=True)
@@ -87,58 +83,59 @@ class PlanResult:
     refined: int
 
 
-def make_plan(experiment: Experiment, request: PlanRequest, progress: Progress = no_progress) -> PlanResult:
-    """Plan poses.
+def make_plan(
+    experiment: Experiment,
+    count: int,
+    listed: Path | None = None,
+    records: Path | None = None,
+    calibration: Path | None = None,
+    progress: Progress = no_progress,
+) -> PlanResult:
+    """Plan so many poses: of ``listed`` candidates or the configured ones, after ``records``, about a calibration.
 
     Raises:
         InputError: settings, candidates or records are refused, or so many poses cannot determine the parameters.
     """
     settings = experiment.settings.plan or PlanSettings()
     space = JointSpace.of(experiment)
-    parameters = parameters_of(experiment, request.calibration)
+    parameters = parameters_of(experiment, calibration)
     check = None
     if settings.clearance is not None:
         check = clearance_check(settings.clearance, experiment.system.arms, experiment.source)
     progress("candidates", 0.0)
-    pool = pool_of(experiment, settings, space, request.listed, check)
-    given = None if request.given is None else given_records(experiment, request.given)
+    pool = pool_of(experiment, settings, space, listed, check)
+    given = None if records is None else given_records(experiment, records)
     if given is not None and settings.repeats == 1 and pool.kind != "continuous":
         again = same_poses(pool.dataset.stacked(space.channels), given.stacked(space.channels))
         pool = pool.without(again, "measured already")
-    if len(pool.dataset) * settings.repeats < request.count:
+    if len(pool.dataset) * settings.repeats < count:
         raise ProblemError(
-            f"{request.count} poses of {len(pool.dataset)} candidates ({told(pool.left_out)}).",
+            f"{count} poses of {len(pool.dataset)} candidates ({counts_text(pool.left_out)}).",
             hint="Ask for fewer poses, give more candidates, or allow plan.repeats.",
         )
     context = plan_context(experiment, settings, space, parameters, given)
-    if settings.robust is not None:
-        context = context.about(draws_of(experiment, settings.robust, parameters))
     progress("planning", 0.2)
-    rows = context.rows(pool.dataset)
-    task = Task(Candidates(context.base, rows), criterion(settings.goal), request.count, settings.repeats)
-    _require_enough(task, parameters)
-    plan = choose(task, settings.starts, settings.seed)
-    _require_determined(task, plan.chosen, parameters)
-    refined = 0
+    candidates = Candidates(context.base, context.rows(pool.dataset))
+    task = Task(candidates, criterion(settings.goal), count, settings.repeats)
+    plan, refined = _chosen(task, settings, parameters), 0
     if pool.kind == "continuous" and settings.sweeps:
         progress("refinement", 0.5)
         allowed = (lambda q: np.ones(q.shape[1], dtype=bool)) if check is None else (lambda q: check(q).allowed)
         task, plan, pool, refined = _refined(context, task, plan, pool, allowed)
     progress("bound", 0.8)
-    relaxed = bounded(task, settings.bound, plan.relaxation)
-    return _result(context, task, plan, pool, relaxed, refined)
+    return _result(context, task, plan, pool, refined)
 
 
-def _analysed(task: Task, chosen: Indices, parameters: Parameters) -> Identifiability:
+def _identifiability(task: Task, chosen: Indices, parameters: Parameters) -> Identifiability:
     """What a plan determines, with what is known before."""
     names = parameters.coordinate_names
     return analyse(task.candidates.triangles(chosen)[0], np.ones(len(names)), names, measures_of(parameters))
 
 
-def _require_enough(task: Task, parameters: Parameters) -> None:
-    """Refuse what no choice could determine: candidates that leave something open, or too few poses."""
+def _chosen(task: Task, settings: PlanSettings, parameters: Parameters) -> Plan:
+    """The plan; refused where candidates, or so few of them, leave something open."""
     candidates = task.candidates
-    most = _analysed(task, np.arange(candidates.count), parameters)
+    most = _identifiability(task, np.arange(candidates.count), parameters)
     if most.undetermined:
         raise ProblemError(
             f"even all {candidates.count} candidates leave {len(most.undetermined)} combinations undetermined: "
@@ -153,17 +150,15 @@ def _require_enough(task: Task, parameters: Parameters) -> None:
             "parameters are open.",
             hint=_MORE,
         )
-
-
-def _require_determined(task: Task, chosen: Indices, parameters: Parameters) -> None:
-    """Refuse a plan that leaves combinations open."""
-    known = _analysed(task, chosen, parameters)
+    plan = choose(task, settings.starts, settings.seed)
+    known = _identifiability(task, plan.chosen, parameters)
     if known.undetermined:
         raise ProblemError(
             f"{task.count} poses leave {len(known.undetermined)} combinations undetermined: "
             f"{'; '.join(str(combination) for combination in known.undetermined)}.",
             hint=_MORE,
         )
+    return plan
 
 
 def _refined(
@@ -193,12 +188,10 @@ def _refined(
     return task, plan, pool, int(np.sum(plan.chosen >= number))
 
 
-def _result(
-    context: PlanContext, task: Task, plan: Plan, pool: Pool, relaxed: Relaxation | None, refined: int
-) -> PlanResult:
-    """What is told of a plan; all but the criterion and its bound at the nominal values."""
+def _result(context: PlanContext, task: Task, plan: Plan, pool: Pool, refined: int) -> PlanResult:
+    """A plan's figures; all but the criterion and its bound at the nominal values."""
     parameters, chosen = context.parameters, pool.dataset.subset(plan.chosen)
-    certificate = None
+    relaxed, certificate = bounded(task, context.settings.bound, plan.relaxation), None
     if relaxed is not None:
         efficiency = task.criterion.efficiency(plan.value, relaxed.bound, task.candidates.size)
         certificate = Certificate(relaxed.bound, efficiency, relaxed.how)
@@ -208,7 +201,7 @@ def _result(
     triangle = measured.candidates.triangles(everything)[0]
     given = 0 if context.given is None else len(context.given)
     equations = (task.count + given) * measured.candidates.rows.shape[1] + len(context.priors)
-    dataset, seconds, hottest = visit(context, chosen)
+    dataset, seconds, hottest = in_order_of_visit(context, chosen)
     return PlanResult(
         dataset=dataset,
         pool=pool,
@@ -220,7 +213,7 @@ def _result(
         observability=observability(np.linalg.svd(triangle, compute_uv=False).astype(float), equations),
         names=parameters.coordinate_names,
         deviations=np.array([deviations(part) for part in (nominal.base[0], triangle)]) * parameters.scales(),
-        identifiability=_analysed(measured, everything, parameters),
+        identifiability=_identifiability(measured, everything, parameters),
         travel_s=seconds,
         peak=hottest,
         starts=plan.starts,

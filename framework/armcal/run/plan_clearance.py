@@ -1,4 +1,4 @@
-"""A configured clearance made into shapes of an arm."""
+"""The clearance that a plan keeps: settings of an arm's parts and its surroundings, made into shapes."""
 
 from __future__ import annotations
 
@@ -6,9 +6,10 @@ from collections.abc import Mapping
 from fnmatch import filter as matching
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Literal, TypeAlias
 
 import numpy as np
+from pydantic import Field, model_validator
 
 from armcal.arm.assembly import Arm
 from armcal.arm.clearance import (
@@ -23,21 +24,97 @@ from armcal.arm.clearance import (
     Shape,
     joints_of_frames,
 )
-from armcal.arm.model import Vector3
 from armcal.base.domains import Array
+from armcal.base.settings import InputPath, Length, Length3, Settings
 from armcal.config.yaml_source import ConfigSource
 from armcal.errors import ConfigError, DataError, Location, PluginError
-from armcal.run.plan_settings import (
-    BallSettings,
-    BoxSettings,
-    CapsuleSettings,
-    ClearanceSettings,
-    HalfSpaceSettings,
-    MeshSettings,
-    PointSettings,
-)
 
 _AT = ("plan", "clearance")
+
+
+class PointSettings(Settings):
+    """A point ``at`` coordinates of a frame: ``base``, ``mount``, ``tool`` or a named frame of the arm."""
+
+    frame: str = "base"
+    at: Length3 = (0.0, 0.0, 0.0)
+
+
+class CapsuleSettings(Settings):
+    """All that lies within ``radius`` of the segment from ``start`` to ``end``."""
+
+    type: Literal["capsule"]
+    start: PointSettings
+    end: PointSettings
+    radius: Length
+
+
+class BallSettings(Settings):
+    """A ball."""
+
+    type: Literal["ball"]
+    centre: PointSettings
+    radius: Length
+
+
+class BoxSettings(Settings):
+    """A box along the axes of the base frame, between two corners."""
+
+    type: Literal["box"]
+    low: Length3
+    high: Length3
+
+    @model_validator(mode="after")
+    def _ordered(self) -> BoxSettings:
+        if any(low > high for low, high in zip(self.low, self.high, strict=True)):
+            raise ValueError("low lies beyond high on an axis: give the smaller coordinates as low")
+        return self
+
+
+class HalfSpaceSettings(Settings):
+    """Everything behind a plane of the base frame, such as a table; ``normal`` points out of it."""
+
+    type: Literal["half_space"]
+    point: Length3
+    normal: tuple[float, float, float]
+
+    @model_validator(mode="after")
+    def _has_direction(self) -> HalfSpaceSettings:
+        if not any(self.normal):
+            raise ValueError("normal is zero: give the direction out of the plane, such as [0, 0, 1]")
+        return self
+
+
+class MeshSettings(Settings):
+    """A mesh file, taken as the capsule that encloses it; ``unit`` is the length that its numbers count."""
+
+    type: Literal["mesh"]
+    path: InputPath
+    frame: str
+    unit: Length = 0.001
+
+
+ShapeSettings: TypeAlias = Annotated[
+    CapsuleSettings | BallSettings | BoxSettings | HalfSpaceSettings | MeshSettings, Field(discriminator="type")
+]
+
+
+class RuleSettings(Settings):
+    """Parts that match the two globs (or ``everything``) keep ``at_least`` apart; ``besides`` names exceptions."""
+
+    between: tuple[str, str]
+    at_least: Length
+    besides: tuple[str, ...] = ()
+
+
+class ClearanceSettings(Settings):
+    """The arm's parts and its surroundings by name, and how far they keep from each other.
+
+    ``forbidden`` are boxes and balls that the tool point stays out of.
+    """
+
+    parts: dict[str, tuple[ShapeSettings, ...]] = Field(default_factory=dict)
+    rules: tuple[RuleSettings, ...] = ()
+    forbidden: tuple[Annotated[BoxSettings | BallSettings, Field(discriminator="type")], ...] = ()
 
 
 def clearance_check(settings: ClearanceSettings, arms: Mapping[str, Arm], source: ConfigSource) -> ClearanceCheck:
@@ -56,16 +133,22 @@ def clearance_check(settings: ClearanceSettings, arms: Mapping[str, Arm], source
         )
     arm = next(iter(arms.values()))
     frames = joints_of_frames(arm)
-    parts: dict[str, tuple[Shape, ...]] = {}
-    for name, shapes in settings.parts.items():
-        made = tuple(_shape(shape) for shape in shapes)
-        for index, shape in enumerate(made):
-            _known_frames(shape, frames, source, (*_AT, "parts", name, index))
-        parts[name] = made
+    parts = {
+        name: tuple(_shape(shape, frames, source, ("parts", name, index)) for index, shape in enumerate(shapes))
+        for name, shapes in settings.parts.items()
+    }
+    forbidden = []
+    for index, region in enumerate(settings.forbidden):
+        if isinstance(region, BallSettings) and region.centre.frame != "base":
+            raise ConfigError(
+                f"found the frame {region.centre.frame!r}, expected base: forbidden regions stand still.",
+                where=source.where((*_AT, "forbidden", index, "centre")),
+                hint="Give the centre in the base frame.",
+            )
+        forbidden.append(_region(region))
     rules = tuple(Rule(rule.between, rule.at_least, rule.besides) for rule in settings.rules)
-    forbidden = tuple(_region(region, source, index) for index, region in enumerate(settings.forbidden))
-    _known_parts(rules, parts, source)
-    check = ClearanceCheck(arm, Clearance(parts, rules, forbidden))
+    _check_part_names(rules, parts, source)
+    check = ClearanceCheck(arm, Clearance(parts, rules, tuple(forbidden)))
     for index, pairs in enumerate(check.pairs):
         if not pairs:
             raise ConfigError(
@@ -89,38 +172,40 @@ def enclosing_capsule(points: Array, frame: str) -> Capsule:
     if low > high:
         low = high = (low + high) / 2
         radius = float(np.max(np.linalg.norm(points - middle - low * axis, axis=1)))
-    start, end = (Point(frame, _three(middle + x * axis)) for x in (low, high))
-    return Capsule(start, end, radius)
+    ends = [(float(x), float(y), float(z)) for x, y, z in (middle + low * axis, middle + high * axis)]
+    return Capsule(Point(frame, ends[0]), Point(frame, ends[1]), radius)
 
 
-def _shape(settings: Any) -> Shape:
-    if isinstance(settings, CapsuleSettings):
-        return Capsule(_point(settings.start), _point(settings.end), settings.radius)
-    if isinstance(settings, BallSettings):
-        return Capsule(_point(settings.centre), _point(settings.centre), settings.radius)
+def _shape(
+    settings: ShapeSettings, frames: Mapping[str, int], source: ConfigSource, at: tuple[str | int, ...]
+) -> Shape:
+    """A part's shape, whose frames are known and whose radius is no less than zero."""
+    shape: Shape
+    if isinstance(settings, HalfSpaceSettings):
+        shape = HalfSpace(settings.point, settings.normal)
+    elif isinstance(settings, MeshSettings):
+        shape = enclosing_capsule(_vertices(Path(settings.path)) * settings.unit, settings.frame)
+    elif isinstance(settings, CapsuleSettings):
+        start, end = (Point(point.frame, point.at) for point in (settings.start, settings.end))
+        shape = Capsule(start, end, settings.radius)
+    else:
+        shape = _region(settings)
+    where = source.where((*_AT, *at))
+    for frame in shape.frames:
+        if frame not in frames:
+            raise ConfigError(
+                f"no frame is called {frame!r}.", where=where, hint=f"The frames are {', '.join(frames)}."
+            )
+    if isinstance(shape, Capsule) and not shape.radius >= 0:
+        raise ConfigError("found a radius below zero.", where=where, hint="Give the radius.")
+    return shape
+
+
+def _region(settings: BoxSettings | BallSettings) -> Box | Capsule:
     if isinstance(settings, BoxSettings):
         return Box(settings.low, settings.high)
-    if isinstance(settings, HalfSpaceSettings):
-        return HalfSpace(settings.point, settings.normal)
-    mesh: MeshSettings = settings
-    return enclosing_capsule(_vertices(Path(mesh.path)) * mesh.unit, mesh.frame)
-
-
-def _point(settings: PointSettings) -> Point:
-    return Point(settings.frame, settings.at)
-
-
-def _region(settings: BoxSettings | BallSettings, source: ConfigSource, index: int) -> Box | Capsule:
-    shape = _shape(settings)
-    if isinstance(shape, Capsule) and shape.start.frame != "base":
-        raise ConfigError(
-            f"found the frame {shape.start.frame!r}, expected base: forbidden regions stand still.",
-            where=source.where((*_AT, "forbidden", index, "centre")),
-            hint="Give the centre in the base frame.",
-        )
-    if not isinstance(shape, Box | Capsule):
-        raise TypeError(type(shape).__name__)
-    return shape
+    centre = Point(settings.centre.frame, settings.centre.at)
+    return Capsule(centre, centre, settings.radius)
 
 
 def _vertices(path: Path) -> Array:
@@ -134,26 +219,14 @@ def _vertices(path: Path) -> Array:
         ) from fault
     try:
         vertices = np.asarray(trimesh.load(path, force="mesh").vertices, dtype=float)
-    except Exception as fault:  # whatever a mesh reader raises, the user is told which file
+    except Exception as fault:  # whatever a mesh reader raises, the message names the file
         raise DataError(f"it cannot be read as a mesh ({fault}).", where=Location(str(path))) from fault
     if not len(vertices) or not np.isfinite(vertices).all():
         raise DataError("it has no vertices.", where=Location(str(path)), hint="Give a mesh with faces.")
     return vertices
 
 
-def _known_frames(shape: Shape, frames: Mapping[str, int], source: ConfigSource, at: tuple[str | int, ...]) -> None:
-    for frame in shape.frames:
-        if frame not in frames:
-            raise ConfigError(
-                f"no frame is called {frame!r}.",
-                where=source.where(at),
-                hint=f"The frames are {', '.join(frames)}.",
-            )
-    if isinstance(shape, Capsule) and not shape.radius >= 0:
-        raise ConfigError("found a radius below zero.", where=source.where(at), hint="Give the radius.")
-
-
-def _known_parts(rules: tuple[Rule, ...], parts: Mapping[str, object], source: ConfigSource) -> None:
+def _check_part_names(rules: tuple[Rule, ...], parts: Mapping[str, object], source: ConfigSource) -> None:
     for index, rule in enumerate(rules):
         for glob in (*rule.between, *rule.besides):
             if glob != EVERYTHING and not matching(parts, glob):
@@ -162,7 +235,3 @@ def _known_parts(rules: tuple[Rule, ...], parts: Mapping[str, object], source: C
                     where=source.where((*_AT, "rules", index)),
                     hint=f"The parts are {', '.join(parts) or 'none'}.",
                 )
-
-
-def _three(vector: Array) -> Vector3:
-    return float(vector[0]), float(vector[1]), float(vector[2])

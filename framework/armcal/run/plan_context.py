@@ -1,12 +1,14 @@
-"""What a pose plan stands on: parameter values or draws of them, and the information that is there before."""
+"""What a pose plan stands on: parameter values or draws of them, and the information there is before; its order."""
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
+from armcal.arm.holding import holding_efforts
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.base.parameters import Parameters
@@ -15,10 +17,13 @@ from armcal.errors import ConfigError, ProblemError
 from armcal.estimate.simulation import with_channels
 from armcal.measure.groups import grouped_instances
 from armcal.planning.candidates import over_draws, parameter_draws
+from armcal.planning.visit import cool_order, heat, path_time, peak, quick_order, travel_times
 from armcal.problem.problem import Problem, triangular
 from armcal.run.experiment import Experiment
 from armcal.run.plan_poses import JointSpace
-from armcal.run.plan_settings import PlanSettings, RobustSettings
+from armcal.run.settings import PlanSettings
+
+_SPEEDS = {"angle": np.deg2rad(60.0), "length": 0.05}
 
 
 @dataclass(frozen=True)
@@ -67,21 +72,21 @@ def parameters_of(experiment: Experiment, calibration: Path | None) -> Parameter
     if touching := grouped_instances(experiment.system.measurements):
         raise ProblemError(
             f"{touching[0]} is a contact: poses that touch cannot be chosen from free space.",
-            hint="Take postures up by hand, varied as docs/ball_and_sockets.md says; armcal identify tells what they "
+            hint="Take postures up by hand, varied as docs/ball_and_sockets.md says; armcal identify names what they "
             "determine, and what is missing.",
         )
     if not parameters.free:
         raise ProblemError("no parameter is free: there is nothing to plan for.", hint="Set parameters.free.")
     if calibration is None:
         return parameters
-    found = Calibration.load(calibration, experiment.registry).parameters
-    if found.entry_names != parameters.entry_names:
-        differing = sorted(set(found.entry_names) ^ set(parameters.entry_names))
+    calibrated = Calibration.load(calibration, experiment.registry).parameters
+    if calibrated.entry_names != parameters.entry_names:
+        differing = sorted(set(calibrated.entry_names) ^ set(parameters.entry_names))
         raise ConfigError(
             f"the calibration has other parameters: {', '.join(differing[:3]) or 'their order differs'}.",
             hint="Give a calibration of the same arm.",
         )
-    return parameters.with_nominal(found.nominal())
+    return parameters.with_nominal(calibrated.nominal())
 
 
 def problem_of(experiment: Experiment, parameters: Parameters, dataset: Dataset) -> Problem:
@@ -100,18 +105,66 @@ def as_if_measured(experiment: Experiment, dataset: Dataset) -> Dataset:
 def plan_context(
     experiment: Experiment, settings: PlanSettings, space: JointSpace, parameters: Parameters, given: Dataset | None
 ) -> PlanContext:
-    """Priors and given records as information, at the nominal values."""
-    scales, prior = parameters.scales(), parameters.prior_information()
-    held = np.diag(scales * np.sqrt(prior))[prior > 0]
-    return PlanContext(experiment, settings, space, parameters, given, held).about((parameters.nominal(),))
+    """Priors and given records as information, at the nominal values, or at draws from the priors if so configured.
 
-
-def draws_of(experiment: Experiment, robust: RobustSettings, parameters: Parameters) -> tuple[Array, ...]:
-    """Value vectors from the priors."""
-    if not parameters.prior_information().any():
+    Raises:
+        ConfigError: draws are configured, and no prior to draw from.
+    """
+    scales, prior, robust = parameters.scales(), parameters.prior_information(), settings.robust
+    priors = np.diag(scales * np.sqrt(prior))[prior > 0]
+    context = PlanContext(experiment, settings, space, parameters, given, priors)
+    if robust is None:
+        return context.about((parameters.nominal(),))
+    if not prior.any():
         raise ConfigError(
             "found plan.robust and no prior on a free parameter: there is nothing to be robust against.",
             where=experiment.source.where(("plan", "robust")),
             hint="Give parameters.priors, or leave plan.robust out.",
         )
-    return tuple(parameter_draws(parameters, robust.draws, robust.seed))
+    return context.about(tuple(parameter_draws(parameters, robust.draws, robust.seed)))
+
+
+def in_order_of_visit(context: PlanContext, chosen: Dataset) -> tuple[Dataset, float, float | None]:
+    """The poses in the order of visit, the time that takes (s), and the peak of the torque's moving average.
+
+    Ids are unique where a pose is repeated; approaches are what this order makes them.
+    """
+    settings, space, environment = context.settings, context.space, context.experiment.system.environment
+    angles = chosen.stacked(space.channels)
+    given = space.by_joint(
+        {n: [np.deg2rad(v)] for n, v in settings.speeds_deg_per_s.items()},
+        {n: [v / 1000] for n, v in settings.speeds_mm_per_s.items()},
+        ("speeds_deg_per_s", "speeds_mm_per_s"),
+    )
+    speeds = [given.get(n, np.array([_SPEEDS[d]])) for n, d in zip(space.names, space.dimensions, strict=True)]
+    load = environment.gravity, environment.payload_mass, environment.payload_com
+    efforts = [
+        holding_efforts(arm, chosen.stacked([f"{name}.{joint}" for joint in arm.commanded]), *load)
+        for name, arm in context.experiment.system.arms.items()
+    ]
+    times, heats = travel_times(angles, np.concatenate(speeds)), heat(np.concatenate(efforts))
+    if settings.order == "travel":
+        order = quick_order(times)
+    else:
+        order = cool_order(heats, times) if settings.order == "torque" else np.arange(len(chosen))
+    visited = chosen.subset(order)
+    copies: Counter[str] = Counter()
+    ids: list[str] = []
+    for record in visited.ids:
+        copies[record] += 1
+        ids.append(record if copies[record] == 1 else f"{record}_{copies[record]}")
+    numbers = tuple(str(i) for i in range(1, len(ids) + 1))
+    channels = dict(visited.channels) | _approaches(visited, space)
+    visited = replace(visited, ids=tuple(ids), channels=channels, extra={"order": numbers})
+    return visited, path_time(times, order), peak(heats, order) if heats.any() else None
+
+
+def _approaches(visited: Dataset, space: JointSpace) -> dict[str, Array]:
+    """The sign of each joint's last motion before each pose (N), 0 before its first."""
+    approaches = {}
+    for channel in space.channels:
+        command, (arm, _, joint) = visited.column(channel), channel.partition(".")
+        signs = np.sign(np.diff(command, prepend=command[:1]))
+        moved = np.maximum.accumulate(np.where(signs != 0, np.arange(len(signs)), 0))
+        approaches[f"{arm}.approach.{joint}"] = signs[moved]
+    return approaches

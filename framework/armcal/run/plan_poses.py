@@ -1,10 +1,11 @@
-"""Where a plan's candidates come from: recorded poses, a grid of levels, or joint space between limits."""
+"""Where an arm may go, and where a plan's candidates come from: recorded poses, a grid, or all of joint space."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -13,13 +14,16 @@ from armcal.arm.clearance import ClearanceCheck, Mask
 from armcal.arm.joints import by_dimension
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
+from armcal.calibration.compensation.finder import Allowed
 from armcal.config.system import build_component
 from armcal.errors import ConfigError, DataError, Location, ProblemError
 from armcal.io.plain_files import input_file
 from armcal.measure.id_list import MAX_BYTES, read_ids
 from armcal.measure.reader import Reader
+from armcal.plugins import PluginRegistry
 from armcal.run.experiment import Experiment, with_data
-from armcal.run.plan_settings import PlanSettings
+from armcal.run.plan_clearance import clearance_check
+from armcal.run.settings import PlanSettings
 
 _OF_THE_MOMENT = ("time", "temperature")
 _MOST_GRID = 2_000_000
@@ -86,8 +90,8 @@ class Pool:
         """Those that are not faulty (N, bool)."""
         if not faulty.any():
             return self
-        told = {**self.left_out, reason: self.left_out.get(reason, 0) + int(faulty.sum())}
-        return replace(self, dataset=self.dataset.subset(np.flatnonzero(~faulty)), left_out=told)
+        left_out = {**self.left_out, reason: self.left_out.get(reason, 0) + int(faulty.sum())}
+        return replace(self, dataset=self.dataset.subset(np.flatnonzero(~faulty)), left_out=left_out)
 
 
 def pool_of(
@@ -101,21 +105,19 @@ def pool_of(
         ProblemError: nothing is left.
     """
     limits = space.limits(settings)
-    kind = "listed" if listed is not None else settings.candidates or _usual(experiment, limits)
+    usual = "continuous" if experiment.settings.data is None and np.isfinite(limits).all() else "recorded"
+    kind = "listed" if listed is not None else settings.candidates or usual
     if kind == "continuous":
         return spread(settings, space, limits, check)
-    if kind == "grid":
-        pool = Pool(kind, _grid(settings, space), {})
-    else:
-        pool = Pool(kind, commands_of(read_poses(experiment, listed), space), {})
-    angles = pool.dataset.stacked(space.channels)
+    poses = _grid(settings, space) if kind == "grid" else commands_of(read_poses(experiment, listed), space)
+    pool, angles = Pool(kind, poses, {}), poses.stacked(space.channels)
     outside = np.any((angles < limits[:, :1] - _SAME_POSE) | (angles > limits[:, 1:] + _SAME_POSE), axis=0)
     pool = pool.without(outside, "beyond joint limits")
     if check is not None:
         pool = pool.without(~check(pool.dataset.stacked(space.channels)).allowed, "too little clearance")
     if not len(pool.dataset):
         raise ProblemError(
-            f"none of the candidates is left ({told(pool.left_out)}).",
+            f"none of the candidates is left ({counts_text(pool.left_out)}).",
             hint="Check limits and clearance, or give other candidates.",
         )
     return pool
@@ -148,9 +150,14 @@ def given_records(experiment: Experiment, path: Path) -> Dataset:
     Raises:
         DataError: refused, or an id is not in the data.
     """
-    if not _is_id_list(path):
+    try:
+        with input_file(path, MAX_BYTES, "a list of ids") as stream:
+            line = stream.readline(1000).decode("utf-8-sig", "replace")
+    except DataError:
+        return read_poses(experiment, path)  # the reader reports what is wrong
+    if any(mark in line for mark in ",;\t|"):
         return read_poses(experiment, path)
-    ids = read_ids(path)
+    ids = read_ids(path)  # a file of one column
     if experiment.settings.data is None:
         raise DataError(
             "it lists ids, and no data is configured that they could belong to.",
@@ -195,29 +202,27 @@ def spread(settings: PlanSettings, space: JointSpace, limits: Array, check: Clea
             hint="Give plan.limits (plan.travel_limits for sliding joints): {q1: [-100 deg, 100 deg], ...}.",
         )
     sequence = qmc.Sobol(len(limits), rng=settings.seed)
-    found: list[Array] = []
+    kept_poses: list[Array] = []
     kept = tried = 0
-    drawn = _corners(limits, settings.count // 2)
+    drawn = _corners(len(limits), settings.count // 2)
     while kept < settings.count and tried <= _MOST_TRIED * settings.count:
         poses = (limits[:, 0] + drawn * (limits[:, 1] - limits[:, 0])).T
         allowed = np.ones(poses.shape[1], dtype=bool) if check is None else check(poses).allowed
-        found.append(poses[:, allowed])
+        kept_poses.append(poses[:, allowed])
         kept, tried = kept + int(allowed.sum()), tried + poses.shape[1]
         drawn = sequence.random_base2(_POWER)
-    poses = np.concatenate(found, axis=1)
     left_out = {"too little clearance": tried - kept} if tried > kept else {}
     if not kept:
         raise ProblemError(f"none of {tried} poses keeps its clearance.", hint="Check plan.clearance.")
-    return Pool("continuous", dataset_of(poses[:, : settings.count], space), left_out)
+    return Pool("continuous", dataset_of(np.hstack(kept_poses)[:, : settings.count], space), left_out)
 
 
-def _corners(limits: Array, most: int) -> Array:
+def _corners(joints: int, most: int) -> Array:
     """The ends and middles of all joints, or their ends alone, as far as that is not too many (N x joints, 0 to 1)."""
     for levels in ((0.0, 0.5, 1.0), (0.0, 1.0)):
-        if len(levels) ** len(limits) <= most:
-            axes = np.meshgrid(*[levels] * len(limits), indexing="ij")
-            return np.array([axis.ravel() for axis in axes]).T
-    return np.zeros((0, len(limits)))
+        if len(levels) ** joints <= most:
+            return np.array(list(product(levels, repeat=joints)))
+    return np.zeros((0, joints))
 
 
 def dataset_of(poses: Array, space: JointSpace) -> Dataset:
@@ -226,23 +231,9 @@ def dataset_of(poses: Array, space: JointSpace) -> Dataset:
     return Dataset(ids, dict(zip(space.channels, np.ascontiguousarray(poses), strict=True)), source="plan")
 
 
-def told(left_out: Mapping[str, int]) -> str:
-    """What was left out, in words."""
+def counts_text(left_out: Mapping[str, int]) -> str:
+    """How many poses were left out by each reason, in words."""
     return ", ".join(f"{count} {reason}" for reason, count in left_out.items()) or "none was given"
-
-
-def _usual(experiment: Experiment, limits: Array) -> str:
-    return "continuous" if experiment.settings.data is None and np.isfinite(limits).all() else "recorded"
-
-
-def _is_id_list(path: Path) -> bool:
-    """A file of one column."""
-    try:
-        with input_file(path, MAX_BYTES, "a list of ids") as stream:
-            line = stream.readline(1000).decode("utf-8-sig", "replace")
-    except DataError:
-        return False  # the reader says what is wrong
-    return not any(mark in line for mark in ",;\t|")
 
 
 def _grid(settings: PlanSettings, space: JointSpace) -> Dataset:
@@ -260,3 +251,40 @@ def _grid(settings: PlanSettings, space: JointSpace) -> Dataset:
         )
     axes = np.meshgrid(*[given[name] for name in space.names], indexing="ij")
     return dataset_of(np.array([axis.ravel() for axis in axes]), space)
+
+
+@dataclass(frozen=True)
+class Workspace:
+    """Limits by joint (rad or m), and from commands (n x N) to whether nothing is too near (N); None: all may be."""
+
+    limits: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    allowed: Allowed | None = None
+
+
+def workspace_of(path: Path, joints: Sequence[str], registry: PluginRegistry) -> Workspace:
+    """Limits and clearance of a configuration's ``plan``, for an arm with these joints.
+
+    Raises:
+        ConfigError: it has no plan, or plans for another arm.
+    """
+    experiment = Experiment.load(path, registry=registry)
+    plan = experiment.settings.plan
+    if plan is None:
+        raise ConfigError(
+            "found no plan, expected its limits and clearance.",
+            where=Location(str(path)),
+            hint="Add plan: {limits: {q1: [-100 deg, 100 deg], ...}}.",
+        )
+    space = JointSpace.of(experiment)
+    if space.names != tuple(joints):
+        raise ConfigError(
+            f"its joints are {', '.join(space.names)}, those of the calibration {', '.join(joints)}.",
+            where=Location(str(path)),
+            hint="Give the configuration of the same arm.",
+        )
+    stated = zip(space.names, space.limits(plan), strict=True)
+    limits = {name: (float(low), float(high)) for name, (low, high) in stated if np.isfinite([low, high]).any()}
+    if plan.clearance is None:
+        return Workspace(limits)
+    check = clearance_check(plan.clearance, experiment.system.arms, experiment.source)
+    return Workspace(limits, lambda commands: check(commands).allowed)

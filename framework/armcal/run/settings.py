@@ -1,17 +1,23 @@
-"""The settings of a run, beyond what the arm is: data, parameters, estimator, validation, simulation."""
+"""The settings of a run, beyond what the arm is: data, parameters, estimator, validation, simulation, pose plan."""
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeAlias
 
 from pydantic import Field, model_validator
 
-from armcal.base.settings import InputPath, Length, Settings
+from armcal.base.settings import Angle, InputPath, Length, Settings
 from armcal.config.selection import ParameterSettings
 from armcal.config.system import StaticsSettings
 from armcal.estimate.bootstrap import BootstrapSettings
 from armcal.estimate.weighing import NoiseSettings
-from armcal.run.plan_settings import PlanSettings
+from armcal.planning.bound import BoundSolver
+from armcal.planning.criterion import Goal
+from armcal.run.plan_clearance import ClearanceSettings
+
+Levels: TypeAlias = dict[str, Annotated[tuple[Angle, ...], Field(min_length=1)]]
+Travel: TypeAlias = dict[str, Annotated[tuple[Length, ...], Field(min_length=1)]]
+Speed: TypeAlias = Annotated[float, Field(gt=0)]
 
 
 class ValidationSettings(Settings):
@@ -48,6 +54,48 @@ class UncertaintySettings(BootstrapSettings):
     """How intervals are made beside the curvature at the estimate; ``profile`` are globs over free numbers."""
 
     profile: tuple[str, ...] = ()
+
+
+class RobustSettings(Settings):
+    """The criterion is averaged over so many draws of the parameters from their priors."""
+
+    draws: Annotated[int, Field(ge=1, le=100)] = 8
+    seed: Annotated[int, Field(ge=0)] = 0
+
+
+class PlanSettings(Settings):
+    """How poses are planned.
+
+    ``candidates``: ``recorded`` (the data's), ``grid`` (all combinations of ``levels``), or ``continuous``
+    (``count`` poses spread over ``limits``, and the chosen ones moved from there to where they determine most). Sliding
+    joints have their levels under ``travel`` and their limits under ``travel_limits``. Any candidate outside the
+    limits is left out. ``speeds_deg_per_s`` and ``speeds_mm_per_s`` are by joint; 60 deg/s and 50 mm/s by default.
+    """
+
+    goal: Goal = "D"
+    candidates: Literal["recorded", "grid", "continuous"] | None = None
+    count: Annotated[int, Field(ge=1, le=1_000_000)] = 4096
+    limits: dict[str, tuple[Angle, Angle]] = Field(default_factory=dict)
+    travel_limits: dict[str, tuple[Length, Length]] = Field(default_factory=dict)
+    levels: Levels = Field(default_factory=dict)
+    travel: Travel = Field(default_factory=dict)
+    repeats: Annotated[int, Field(ge=1)] = 1
+    starts: Annotated[int, Field(ge=0)] | None = None
+    seed: Annotated[int, Field(ge=0)] = 0
+    sweeps: Annotated[int, Field(ge=0, le=100)] = 8
+    bound: BoundSolver = "auto"
+    robust: RobustSettings | None = None
+    clearance: ClearanceSettings | None = None
+    order: Literal["travel", "torque", "none"] = "travel"
+    speeds_deg_per_s: dict[str, Speed] = Field(default_factory=dict)
+    speeds_mm_per_s: dict[str, Speed] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _ordered(self) -> PlanSettings:
+        for joint, (low, high) in {**self.limits, **self.travel_limits}.items():
+            if not low < high:
+                raise ValueError(f"the limits of {joint} are not in rising order: give [lowest, highest]")
+        return self
 
 
 class ExperimentSettings(Settings):

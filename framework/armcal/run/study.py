@@ -1,57 +1,75 @@
-"""A study: variants of one configuration, each judged on the same folds of the same records."""
+"""A study: variants of one configuration, how they are judged, and what both kinds of study share."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
-import numpy as np
+from pydantic import Field
 
+from armcal.base.settings import Mass, Settings
+from armcal.config.validate import validate
 from armcal.config.variants import load_variants
 from armcal.config.yaml_source import ConfigSource
-from armcal.diagnose.comparison import change, simplest_good
-from armcal.errors import InputError, NotConvergedError, ProblemError
-from armcal.estimate.estimator import Progress, no_progress
-from armcal.estimate.validation import (
-    ErrorSummary,
-    FitTask,
-    Indices,
-    JudgedFit,
-    Split,
-    error_unit,
-    fit_and_judge,
-    folds,
-    record_errors,
-    summarise,
-)
+from armcal.errors import ConfigError, InputError
+from armcal.estimate.estimator import Progress
+from armcal.estimate.validation import FitTask, Split
 from armcal.io.parallel import Executor
 from armcal.plugins import PluginRegistry, discover
-from armcal.problem.problem import FactorRecords, Problem
+from armcal.problem.problem import Problem
 from armcal.run.experiment import Experiment
-from armcal.run.pipeline import Prepared, Stopwatch, prepare
-from armcal.run.provenance import provenance
+from armcal.run.pipeline import Prepared
 from armcal.run.settings import ExperimentSettings, ValidationSettings
-from armcal.run.study_result import NestedResult, StudyResult, VariantResult
-from armcal.run.study_settings import PREVIOUS, LoadTransferSettings, ModelStudySettings, study_settings
 
 R = TypeVar("R")
-K = TypeVar("K", ModelStudySettings, LoadTransferSettings)
-S = TypeVar("S", Prepared, "Trainable")
-_MM = 1000.0
+K = TypeVar("K", "ModelStudySettings", "LoadTransferSettings")
+PREVIOUS = "previous"
+"""As a reference: each variant is compared with the one before it."""
 WORTH_COMPILING = 1000
 """Records to fit: less than for a run, since the models of a study may be large and their fits long."""
 
 
-@dataclass(frozen=True)
-class Trainable:
-    """An experiment whose problem can be solved with the records at hand."""
+class ModelStudySettings(Settings):
+    """Variants compared by cross-validation, all on the same folds of the same records.
 
-    experiment: Experiment
-    problem: Problem
-    records: tuple[FactorRecords, ...]
+    ``reference`` is what each is compared with: a variant, or ``previous`` for a ladder. ``repeats`` draws the folds
+    anew. ``nested`` chooses a variant inside each fold's training records and judges the choice on the fold.
+    ``blocks`` is the number of neighbouring records that are resampled together for standard errors.
+    """
+
+    kind: Literal["models"] = "models"
+    variants: Annotated[dict[str, Any], Field(min_length=1)]
+    reference: str = PREVIOUS
+    folds: Annotated[int, Field(ge=2)] = 5
+    repeats: Annotated[int, Field(ge=1, le=1000)] = 1
+    seed: Annotated[int, Field(ge=0)] = 0
+    nested: bool = False
+    blocks: Annotated[int, Field(ge=1)] | Literal["auto"] = "auto"
+
+
+class LoadTransferSettings(Settings):
+    """Variants trained at some payloads and judged at others.
+
+    ``payloads`` are simulated, or looked for in the records' payload column, to the nearest tenth of a gram (by
+    default all that are in it). Where a fit is judged at a payload it trained on, ``folds`` keep the two apart.
+    """
+
+    kind: Literal["load_transfer"]
+    variants: Annotated[dict[str, Any], Field(min_length=1)]
+    payloads: tuple[Mass, ...] = ()
+    folds: Annotated[int, Field(ge=2)] = 5
+    seed: Annotated[int, Field(ge=0)] = 0
+
+
+class _ModelStudyFile(Settings):
+    study: ModelStudySettings
+
+
+class _LoadTransferFile(Settings):
+    study: LoadTransferSettings
 
 
 @dataclass(frozen=True)
@@ -82,8 +100,10 @@ class Study:
         settings = study_settings(read.base)
         experiments = {}
         for name, source in read.variants.items():
-            made = naming(name, partial(Experiment.of, source, data, registry))
-            experiments[name] = with_every_record(made)
+            experiment = naming(name, partial(Experiment.of, source, data, registry))
+            # Without the split that a run would make: a study draws its own folds.
+            whole = experiment.settings.model_copy(update={"validation": ValidationSettings()})
+            experiments[name] = replace(experiment, settings=whole)
         return cls(str(read.base.data.get("name") or Path(path).stem), read.base, settings, experiments)
 
     def settings_as(self, kind: type[K]) -> K:
@@ -97,61 +117,42 @@ class Study:
         return self.settings
 
 
-def with_every_record(experiment: Experiment) -> Experiment:
-    """Without the split that a run would make: a study draws its own folds."""
-    settings = experiment.settings.model_copy(update={"validation": ValidationSettings()})
-    return replace(experiment, settings=settings)
-
-
-def compare(
-    study: Study,
-    executor: Executor,
-    command: str = "",
-    progress: Progress = no_progress,
-    watch: Stopwatch | None = None,
-) -> StudyResult:
-    """Judge every variant by cross-validation.
+def study_settings(source: ConfigSource) -> ModelStudySettings | LoadTransferSettings:
+    """The checked section ``study`` of a configuration.
 
     Raises:
-        InputError: a variant cannot be solved, or variants do not use the same records.
-        NotConvergedError: of every variant some fit failed.
+        ConfigError: there is none, or it is refused.
     """
-    watch, settings = watch or Stopwatch(), study.settings_as(ModelStudySettings)
-    with watch.stage("prepare"):
-        ready = {name: naming(name, partial(_prepared, e)) for name, e in study.experiments.items()}
-        _require_same_records(ready)
-    dataset = next(iter(ready.values())).dataset
-    poses = next(iter(study.experiments.values())).poses(dataset)
-    drawn = [folds(len(dataset), settings.folds, settings.seed + r, poses) for r in range(settings.repeats)]
-    inner = [_inside(outer, settings, poses) for outer in drawn[0]] if settings.nested else []
-    splits = [_everything(len(dataset)), *(s for each in drawn for s in each), *(s for each in inner for s in each)]
-    with watch.stage("compile"):
-        ready = compiled(study.experiments, ready, len(dataset) * len(splits), executor, progress)
-    tasks = [_task(study.experiments[name], ready[name], split) for name in ready for split in splits]
-    with watch.stage("fits"):
-        fits = executor.map(fit_and_judge, tasks, lambda done: progress("fits", done))
-    by_name = {name: fits[i * len(splits) : (i + 1) * len(splits)] for i, name in enumerate(ready)}
-    variants = _compared([_judged(n, ready[n], by_name[n], drawn) for n in ready], settings, dataset.ids)
-    best, simplest = _choices(variants, settings, dataset.ids)
-    return StudyResult(
-        name=study.name,
-        command=command,
-        dataset=dataset,
-        folds=settings.folds,
-        repeats=settings.repeats,
-        variants=variants,
-        best=best,
-        simplest=simplest,
-        nested=_nested(by_name, drawn[0], inner, 1 + settings.repeats * settings.folds) if inner else None,
-        warnings=_warnings(ready, variants),
-        seconds=watch.seconds,
-        provenance=provenance(next(iter(study.experiments.values())), dataset),
-        unit=error_unit(next(iter(ready.values())).problem),
-    )
-
-
-def _prepared(experiment: Experiment) -> Prepared:
-    return prepare(replace(experiment, settings=interpreted_first(experiment)), Stopwatch())
+    section = source.data.get("study")
+    if not isinstance(section, dict):
+        raise ConfigError(
+            "found no study.",
+            where=source.where(("study",)),
+            hint="Give study: {variants: {NAME: {extends: FILE}, ...}}; see docs/study.md.",
+        )
+    kind, own = section.get("kind", "models"), replace(source, data={"study": section})
+    if kind == "load_transfer":
+        transfer = validate(_LoadTransferFile, own).study
+        grams = [round(payload * 1e4) for payload in transfer.payloads]
+        if len(set(grams)) < len(grams) or len(grams) == 1 or min(grams, default=0) < 0:
+            raise ConfigError(
+                "expected at least two different payloads, none below zero.",
+                where=source.where(("study", "payloads")),
+                hint="Write for example payloads_g: [0, 66.3].",
+            )
+        return transfer
+    if kind != "models":
+        raise ConfigError(
+            f"found kind {kind!r}, expected models or load_transfer.", where=source.where(("study", "kind"))
+        )
+    models = validate(_ModelStudyFile, own).study
+    if models.reference not in (PREVIOUS, *models.variants):
+        names = ", ".join(models.variants)
+        raise ConfigError(
+            f"found the reference {models.reference!r}, expected {PREVIOUS} or one of {names}.",
+            where=source.where(("study", "reference")),
+        )
+    return models
 
 
 def interpreted_first(experiment: Experiment) -> ExperimentSettings:
@@ -161,14 +162,23 @@ def interpreted_first(experiment: Experiment) -> ExperimentSettings:
 
 
 def compiled(
-    experiments: Mapping[str, Experiment], ready: Mapping[str, S], work: int, executor: Executor, progress: Progress
-) -> dict[str, S]:
+    experiments: Mapping[str, Experiment],
+    ready: Mapping[str, Prepared],
+    work: int,
+    executor: Executor,
+    progress: Progress,
+) -> dict[str, Prepared]:
     """The same by compiled functions, where the choice was left open and so much work (records to fit) is worth it."""
     worth_it = work >= WORTH_COMPILING
     chosen = [name for name in ready if worth_it and experiments[name].settings.evaluator == "auto"]
     executor.map(_compile, [ready[name].problem for name in chosen], lambda done: progress("compile", done))
     faster = {name: replace(ready[name], problem=ready[name].problem.evaluated_by("compiled")) for name in chosen}
-    return {name: faster.get(name, each) for name, each in ready.items()}
+    return {**ready, **faster}
+
+
+def fit_task(experiment: Experiment, ready: Prepared, split: Split) -> FitTask:
+    """A fit to the records that train, judged on those held out."""
+    return FitTask(ready.problem, experiment.estimator, ready.problem.parameters.nominal(), ready.records, split)
 
 
 def _compile(problem: Problem) -> None:
@@ -176,134 +186,8 @@ def _compile(problem: Problem) -> None:
     problem.evaluated_by("compiled")
 
 
-def _task(experiment: Experiment, ready: Prepared, split: Split) -> FitTask:
-    start = ready.problem.parameters.nominal()
-    return FitTask(ready.problem, experiment.estimator, start, ready.records, split)
-
-
-def _everything(count: int) -> Split:
-    every = np.arange(count, dtype=np.intp)
-    return Split(every, every)
-
-
-def _inside(outer: Split, settings: ModelStudySettings, poses: Indices) -> tuple[Split, ...]:
-    """Folds of the training records of a fold."""
-    train = outer.train
-    inner = folds(len(train), settings.folds, settings.seed, poses[train])
-    return tuple(Split(train[split.train], train[split.holdout]) for split in inner)
-
-
-def _judged(name: str, ready: Prepared, fits: Sequence[JudgedFit], drawn: Sequence[Sequence[Split]]) -> VariantResult:
-    whole, rest = fits[0], iter(fits[1:])
-    repeats, at_rest = np.full((2, len(drawn), len(ready.dataset)), np.nan)
-    failed = 0
-    for number, splits in enumerate(drawn):
-        for split in splits:
-            fit = next(rest)
-            repeats[number, split.holdout] = fit.errors * _MM
-            at_rest[number, split.holdout] = fit.at_rest * _MM
-            failed += not fit.converged
-    nominal = record_errors(ready.problem, ready.problem.parameters.nominal(), ready.records)
-    return VariantResult(
-        name=name,
-        free=ready.problem.increments,
-        nominal=summarise(nominal * _MM),
-        train=summarise(whole.errors * _MM),
-        crossed=_averaged([summarise(row) for row in repeats]),
-        at_rest=_averaged([summarise(row) for row in at_rest]),
-        errors_mm=repeats.mean(axis=0),
-        change=None,
-        converged=whole.converged,
-        failed_folds=failed,
-        fit_seconds=whole.seconds,
-        seconds=sum(fit.seconds for fit in fits),
-    )
-
-
-def _averaged(summaries: Sequence[ErrorSummary]) -> ErrorSummary:
-    """The mean of each figure over the repeats that have it."""
-    found = {}
-    for field in fields(ErrorSummary):
-        known = [value for s in summaries if (value := getattr(s, field.name)) is not None]
-        found[field.name] = float(np.mean(known)) if known else None
-    return ErrorSummary(found["mean"], found["rms"], found["p95"], found["max"], min(s.count for s in summaries))
-
-
-def _compared(
-    plain: Sequence[VariantResult], settings: ModelStudySettings, ids: Sequence[str]
-) -> tuple[VariantResult, ...]:
-    """Each with its change against the one before or the reference, unless it is that itself."""
-    by_name = {result.name: result for result in plain}
-    compared = []
-    for place, result in enumerate(plain):
-        other = plain[max(place - 1, 0)] if settings.reference == PREVIOUS else by_name[settings.reference]
-        if other is not result:
-            against = change(result.errors_mm, other.errors_mm, other.name, ids, settings.blocks)
-            compared.append(replace(result, change=against))
-        else:
-            compared.append(result)
-    return tuple(compared)
-
-
-def _choices(variants: Sequence[VariantResult], settings: ModelStudySettings, ids: Sequence[str]) -> tuple[str, str]:
-    """The variant with the lowest mean error, and the simplest that is as good; of those whose fits all converged."""
-    whole = [v for v in variants if v.converged and not v.failed_folds]
-    if not whole:
-        raise NotConvergedError(
-            "of every variant some fit did not converge.", hint="Check the data and the start values."
-        )
-    means = np.array([v.crossed.mean for v in whole], dtype=float)
-    best = whole[int(np.argmin(means))]
-    changes = [change(v.errors_mm, best.errors_mm, best.name, ids, settings.blocks) for v in whole]
-    return best.name, whole[simplest_good(means, [v.free for v in whole], changes)].name
-
-
-def _nested(
-    fits: Mapping[str, Sequence[JudgedFit]], outer: Sequence[Split], inner: Sequence[Sequence[Split]], offset: int
-) -> NestedResult:
-    """Each fold's choice, made by the mean error over the folds inside of it, judged by the fold. [Varma2006]"""
-    chosen, errors = [], np.full(sum(len(split.holdout) for split in outer), np.nan)
-    at = offset
-    for number, (split, inside) in enumerate(zip(outer, inner, strict=True)):
-        seen = {name: np.concatenate([f.errors for f in fit[at : at + len(inside)]]) for name, fit in fits.items()}
-        means = {name: float(np.mean(e)) if np.isfinite(e).all() else np.inf for name, e in seen.items()}
-        best = min(means, key=lambda name: means[name])
-        chosen.append(best)
-        errors[split.holdout] = fits[best][1 + number].errors * _MM
-        at += len(inside)
-    return NestedResult(summarise(errors), tuple(chosen), errors)
-
-
-def _require_same_records(ready: Mapping[str, Prepared]) -> None:
-    (first_name, first), *others = ready.items()
-    outputs = [c for k in first.problem.kernels for c in k.factor.output_channels]
-    for name, prepared in others:
-        same = prepared.dataset.ids == first.dataset.ids and prepared.dataset.sha256 == first.dataset.sha256
-        measured = [c for k in prepared.problem.kernels for c in k.factor.output_channels]
-        if not same or measured != outputs:
-            raise ProblemError(
-                f"the variants {first_name} and {name} are not judged on the same records: "
-                f"{len(first.dataset)} and {len(prepared.dataset)} are used, measured are {', '.join(outputs)} and "
-                f"{', '.join(measured)}.",
-                hint="Give every variant the same data and measurements.",
-            )
-
-
-def _warnings(ready: Mapping[str, Prepared], variants: Sequence[VariantResult]) -> tuple[str, ...]:
-    """Each once, with the variants it holds for unless these are all."""
-    told: dict[str, list[str]] = {}
-    for name, prepared in ready.items():
-        for text in dict.fromkeys(prepared.warnings):
-            told.setdefault(text, []).append(name)
-    listed = [text if len(names) == len(ready) else f"{', '.join(names)}: {text}" for text, names in told.items()]
-    for v in variants:
-        if v.failed_folds or not v.converged:
-            listed.append(f"{v.name}: {v.failed_folds + (not v.converged)} fits did not converge; it is not chosen.")
-    return tuple(listed)
-
-
 def naming(name: str, work: Callable[[], R]) -> R:
-    """Do some work; what it refuses says in which variant."""
+    """Do some work; its refusals name the variant."""
     try:
         return work()
     except InputError as fault:

@@ -45,28 +45,37 @@ def read_targets(path: Path, expression: ToolExpression, registry: PluginRegistr
 
     Columns ``x_mm, y_mm, z_mm``, or ``target_x_mm`` and so on, which alone counts where a joint is called ``x``; for a
     rotation too ``qw, qx, qy, qz`` or ``roll_deg, pitch_deg, yaw_deg`` (about the base frame's x, then y, then z).
-    Load, gravity, surroundings and approach are told as in measured data.
+    Load, gravity, surroundings and approach stand as in measured data.
 
     Raises:
-        DataError: the file cannot be read, or a rotation is told in part, or twice, or is none.
+        DataError: the file cannot be read, or a rotation is given in part, or twice, or is none.
     """
     dataset = _read(path, expression, registry)
     if not len(dataset):
         raise DataError("it has no targets.", where=Location(str(path)), hint="Give a row for each target.")
-    count = len(dataset)
-    acting = np.repeat(expression.defaults[:, None], count, axis=1)
+    acting = np.repeat(expression.defaults[:, None], len(dataset), axis=1)
     for i, channel in enumerate(expression.channels):
         name = f"{expression.name}.{channel}" if channel.startswith(APPROACH) else channel
         if channel not in expression.joints and dataset.has(name):
             acting[i] = dataset.column(name)
-    _check_payload(path, dataset)
+    if dataset.has("payload") and (below := np.flatnonzero(dataset.column("payload") < 0)).size:
+        raise DataError(
+            f"found a payload of {1000 * dataset.column('payload')[below[0]]:g} g, which is below zero.",
+            where=Location(str(path), line=_line(dataset, int(below[0])), field="payload"),
+            hint="Give the mass that hangs on the tool.",
+        )
+    positions = np.stack([dataset.column(axis) for axis in "xyz"], axis=1)
+    row, axis = np.unravel_index(np.abs(positions).argmax(), positions.shape)
+    if abs(positions[row, axis]) > FARTHEST_M:
+        raise DataError(
+            f"found {positions[row, axis]:g} m, expected a place that an arm could have.",
+            where=Location(str(path), line=_line(dataset, int(row)), field="xyz"[axis]),
+            hint="Check the number and the unit in the column's name.",
+        )
     joints = len(expression.joints)
-    positions = _positions(path, dataset)
-    loads = slice(2 * joints, 2 * joints + len(LOAD_CHANNELS))
-    surroundings = {name: dataset.column(name) for name in expression.arm.conditions if dataset.has(name)}
-    return TargetFile(
-        Targets(positions, _rotations(path, dataset), acting[loads], acting[joints : 2 * joints], surroundings), dataset
-    )
+    loads, approaches = acting[2 * joints : 2 * joints + len(LOAD_CHANNELS)], acting[joints : 2 * joints]
+    conditions = {name: dataset.column(name) for name in expression.arm.conditions if dataset.has(name)}
+    return TargetFile(Targets(positions, _rotations(path, dataset), loads, approaches, conditions), dataset)
 
 
 def rpy_matrices(rpy: Array) -> Array:
@@ -97,11 +106,10 @@ def check_units(path: Path, targets: Targets, reach: Reach) -> None:
 
 def _read(path: Path, expression: ToolExpression, registry: PluginRegistry) -> Dataset:
     """The columns that mean something to this arm; a warning names those with a unit that do not."""
-    requested_channels = _wanted(expression)
     reader_class = registry.find("reader", "csv").load()
     reader = reader_class(reader_class.Settings(path=ConfigText(str(path))))
     try:
-        dataset = noticed(reader.read(ReadRequest({}, {}, requested_channels)))
+        dataset = noticed(reader.read(ReadRequest({}, {}, _requested(expression))))
     except DataError as fault:
         # Measured data have a section in a configuration that describes them; targets have none.
         hint = _AS_DOCUMENTED if "data section" in fault.hint else fault.hint
@@ -115,71 +123,43 @@ def _read(path: Path, expression: ToolExpression, registry: PluginRegistry) -> D
     return replace(dataset, warnings=(*dataset.warnings, text))
 
 
-def _wanted(expression: ToolExpression) -> tuple[RequestedChannel, ...]:
-    told: list[tuple[str, str, bool]] = [(axis, "length", True) for axis in "xyz"]
-    told += [(name, DIMENSIONLESS, False) for name in QUATERNION] + [(name, "angle", False) for name in RPY]
-    acting = surroundings({expression.name: expression.arm})
-    requested_channels = [
-        RequestedChannel(name, _names(name, expression), dimension, needed) for name, dimension, needed in told
-    ]
-    requested_channels += [
-        RequestedChannel(n, (n,), d, False) for n, d in acting.items() if n not in ("time", "sequence")
-    ]
+def _requested(expression: ToolExpression) -> tuple[RequestedChannel, ...]:
+    """What a column may be called; the short name is the joint's where one has it."""
+    pose = [(axis, "length", True) for axis in "xyz"]
+    pose += [(name, DIMENSIONLESS, False) for name in QUATERNION] + [(name, "angle", False) for name in RPY]
+    channels = []
+    for name, dimension, needed in pose:
+        names = (f"target_{name}", name) if name not in expression.joints else (f"target_{name}",)
+        channels.append(RequestedChannel(name, names, dimension, needed))
+    for name, dimension in surroundings({expression.name: expression.arm}).items():
+        if name not in ("time", "sequence"):
+            channels.append(RequestedChannel(name, (name,), dimension, False))
     for index, joint in enumerate(expression.joints, start=1):
         names = (f"approach{index}", f"approach_{joint}")
-        requested_channels.append(RequestedChannel(f"{expression.name}.{APPROACH}{joint}", names, DIMENSIONLESS, False))
-    return tuple(requested_channels)
-
-
-def _positions(path: Path, dataset: Dataset) -> Array:
-    positions = np.stack([dataset.column(axis) for axis in "xyz"], axis=1)
-    row, axis = np.unravel_index(np.abs(positions).argmax(), positions.shape)
-    if abs(positions[row, axis]) > FARTHEST_M:
-        raise DataError(
-            f"found {positions[row, axis]:g} m, expected a place that an arm could have.",
-            where=Location(str(path), line=_line(dataset, int(row)), field="xyz"[axis]),
-            hint="Check the number and the unit in the column's name.",
-        )
-    return positions
-
-
-def _check_payload(path: Path, dataset: Dataset) -> None:
-    if not dataset.has("payload"):
-        return
-    below = np.flatnonzero(dataset.column("payload") < 0)
-    if below.size:
-        raise DataError(
-            f"found a payload of {1000 * dataset.column('payload')[below[0]]:g} g, which is below zero.",
-            where=Location(str(path), line=_line(dataset, int(below[0])), field="payload"),
-            hint="Give the mass that hangs on the tool.",
-        )
+        channels.append(RequestedChannel(f"{expression.name}.{APPROACH}{joint}", names, DIMENSIONLESS, False))
+    return tuple(channels)
 
 
 def _line(dataset: Dataset, row: int) -> int:
     return dataset.rows[row] if dataset.rows else row + 1
 
 
-def _names(name: str, expression: ToolExpression) -> tuple[str, ...]:
-    """What a column may be called; the short name is the joint's where one has it."""
-    return (f"target_{name}", *((name,) if name not in expression.joints else ()))
-
-
 def _rotations(path: Path, dataset: Dataset) -> Array | None:
-    told = {kind: [name for name in names if dataset.has(name)] for kind, names in _KINDS.items()}
-    given = [kind for kind, texts in told.items() if texts]
+    present = {kind: [name for name in names if dataset.has(name)] for kind, names in _KINDS.items()}
+    given = [kind for kind, columns in present.items() if columns]
     if not given:
         return None
     if len(given) == 2:
         raise DataError(
-            f"it tells the rotation twice, by {', '.join(told[given[0]])} and by {', '.join(told[given[1]])}.",
+            f"it gives the rotation twice, by {', '.join(present[given[0]])} and by {', '.join(present[given[1]])}.",
             where=Location(str(path)),
             hint="Leave one of them out.",
         )
     kind = given[0]
-    missing = [name for name in _KINDS[kind] if name not in told[kind]]
+    missing = [name for name in _KINDS[kind] if name not in present[kind]]
     if missing:
         raise DataError(
-            f"it tells {', '.join(told[kind])} and not {', '.join(missing)}: that is no rotation.",
+            f"it gives {', '.join(present[kind])} and not {', '.join(missing)}: that is no rotation.",
             where=Location(str(path)),
             hint="Give all columns, or none where only positions count.",
         )

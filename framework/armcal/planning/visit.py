@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
 from armcal.base.domains import Array
+from armcal.planning.candidates import Indices
 
-Indices = NDArray[np.intp]
 WINDOW = 5
 """Poses over which squared torque is averaged: a servo warms and cools over about so many."""
 _MOST_SWAPPED = 300
@@ -35,9 +34,28 @@ def quick_order(times: Array) -> Indices:
     number = len(times)
     if number < 3:
         return np.arange(number)
-    starts = np.unique(np.linspace(0, number - 1, min(number, 50)).astype(int))
-    paths = [_nearest(times, int(start)) for start in starts]
-    return _two_opt(times, min(paths, key=lambda path: path_time(times, path)))
+    paths = []
+    for start in np.unique(np.linspace(0, number - 1, min(number, 50)).astype(int)):
+        path, left = [int(start)], np.arange(number) != start
+        while left.any():
+            path.append(int(np.argmin(np.where(left, times[path[-1]], np.inf))))
+            left[path[-1]] = False
+        paths.append(np.array(path, dtype=np.intp))
+    order = min(paths, key=lambda path: path_time(times, path))
+    for _ in range(_MOST_PASSES):
+        improved = False
+        for i in range(number - 1):
+            ends = np.arange(i + 1, number)
+            into = times[order[i - 1], order[ends]] - times[order[i - 1], order[i]] if i else np.zeros(len(ends))
+            after = times[order[i], order[ends[:-1] + 1]] - times[order[ends[:-1]], order[ends[:-1] + 1]]
+            change = into + np.append(after, 0.0)
+            best = int(np.argmin(change))
+            if change[best] < -1e-9:
+                order[i : ends[best] + 1] = order[i : ends[best] + 1][::-1].copy()
+                improved = True
+        if not improved:
+            break
+    return order
 
 
 def heat(efforts: Array) -> Array:
@@ -55,52 +73,14 @@ def peak(heats: Array, order: Indices, window: int = WINDOW) -> float:
 
 def cool_order(heats: Array, times: Array) -> Indices:
     """Hot poses among cool ones: the smallest peak that swaps can reach, then the shortest way with no higher peak."""
-    order = _interleaved(heats)
+    by_heat = np.argsort(-heats.max(axis=0), kind="stable")
+    hot, order = (len(by_heat) + 1) // 2, np.empty(len(by_heat), dtype=np.intp)
+    order[0::2], order[1::2] = by_heat[:hot], by_heat[hot:][::-1]  # hottest and coolest by turns
     if len(order) < 3 or len(order) > _MOST_SWAPPED:
         return order
     order = _swapped(order, lambda path: peak(heats, path))
     limit = peak(heats, order) * (1 + 1e-9)
     return _swapped(order, lambda path: path_time(times, path) if peak(heats, path) <= limit else np.inf)
-
-
-def _nearest(times: Array, start: int) -> Indices:
-    left = np.ones(len(times), dtype=bool)
-    path = [start]
-    left[start] = False
-    for _ in range(len(times) - 1):
-        path.append(int(np.argmin(np.where(left, times[path[-1]], np.inf))))
-        left[path[-1]] = False
-    return np.array(path, dtype=np.intp)
-
-
-def _two_opt(times: Array, order: Indices) -> Indices:
-    number = len(order)
-    for _ in range(_MOST_PASSES):
-        improved = False
-        for i in range(number - 1):
-            ends = np.arange(i + 1, number)
-            into = times[order[i - 1], order[ends]] - times[order[i - 1], order[i]] if i else np.zeros(len(ends))
-            after = np.append(
-                times[order[i], order[ends[:-1] + 1]] - times[order[ends[:-1]], order[ends[:-1] + 1]], 0.0
-            )
-            change = into + after
-            best = int(np.argmin(change))
-            if change[best] < -1e-9:
-                order[i : ends[best] + 1] = order[i : ends[best] + 1][::-1].copy()
-                improved = True
-        if not improved:
-            break
-    return order
-
-
-def _interleaved(heats: Array) -> Indices:
-    """Hottest and coolest by turns."""
-    by_heat = np.argsort(-heats.max(axis=0), kind="stable")
-    number = len(by_heat)
-    order = np.empty(number, dtype=np.intp)
-    order[0::2] = by_heat[: (number + 1) // 2]
-    order[1::2] = by_heat[(number + 1) // 2 :][::-1]
-    return order
 
 
 def _swapped(order: Indices, cost: Callable[[Indices], float]) -> Indices:

@@ -1,0 +1,151 @@
+"""Errors of a run's records, nominal and calibrated, and their summaries."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from armcal.base.dataset import Dataset
+from armcal.base.domains import Array
+from armcal.errors import NotConvergedError
+from armcal.estimate.estimator import gave_up
+from armcal.estimate.nuisance import settled, untrained
+from armcal.estimate.validation import (
+    CrossValidation,
+    ErrorSummary,
+    Split,
+    error_unit,
+    record_errors,
+    summarise,
+)
+from armcal.estimate.weighing import WeighedFit
+from armcal.problem.drift import residuals
+from armcal.problem.problem import FactorRecords, Problem
+
+_MM = 1000.0
+"""Thousandths of m; of rad where errors are angles."""
+_UNITS = {"length": "mm", "angle": "mrad"}
+
+
+@dataclass(frozen=True)
+class FittedRecords:
+    """All records of a run, which of them trained, and the fit to those."""
+
+    problem: Problem
+    records: tuple[FactorRecords, ...]
+    dataset: Dataset
+    split: Split
+    fitted: WeighedFit
+
+
+@dataclass(frozen=True)
+class RecordErrors:
+    """Error of each record of the dataset, in dataset order: in mm, or in ``unit`` where nothing measured is a length.
+
+    Attributes:
+        nominal_mm: with nominal parameters (N).
+        calibrated_mm: with the calibrated ones (N).
+        cross_validated_mm: by the fold that did not train on it (N; nan outside of cross-validation).
+        nominal_residual_mm: measured minus predicted, all factors stacked (n_r x N).
+        calibrated_residual_mm: the same after calibration.
+        position_mm: predicted tool position of the first arm in its base frame (3 x N).
+        failed_folds: how many folds of the cross-validation did not converge.
+        at_rest_mm: with the calibrated parameters where nothing is known of a drift (N); None if nothing drifts.
+        cross_validated_at_rest_mm: the same by the fold that did not train on it.
+        residual_columns: names of the rows of the residuals, with their units (mm; mrad for angles).
+        unit: of all errors, ``mm`` or ``mrad``.
+    """
+
+    nominal_mm: Array
+    calibrated_mm: Array
+    cross_validated_mm: Array
+    nominal_residual_mm: Array
+    calibrated_residual_mm: Array
+    position_mm: Array
+    failed_folds: int = 0
+    at_rest_mm: Array | None = None
+    cross_validated_at_rest_mm: Array | None = None
+    residual_columns: tuple[str, ...] = ()
+    unit: str = "mm"
+
+    def fold_warnings(self, folds: int) -> tuple[str, ...]:
+        """That some of the folds did not converge."""
+        if not self.failed_folds:
+            return ()
+        return (f"{self.failed_folds} of {folds} folds did not converge; their records are not cross-validated.",)
+
+
+def errors_of(run: FittedRecords, crossed: CrossValidation | None) -> RecordErrors:
+    """Errors of every record, with those of the folds of the training records.
+
+    Raises:
+        NotConvergedError: a record has no elastic equilibrium.
+    """
+    problem, records, fitted, train = run.problem, run.records, run.fitted, run.split.train
+    unfitted, nominal, values = untrained(problem), problem.parameters.nominal(), fitted.estimate.values
+    drifts = any(block.drift for block in problem.parameters.free)
+    judged, judged_at_rest = np.full((2, len(run.dataset)), np.nan)
+    if crossed is not None:
+        judged[train], judged_at_rest[train] = crossed.errors * _MM, crossed.at_rest * _MM
+    dimensions = [dimension for kernel in problem.kernels for dimension in kernel.factor.dimensions]
+    columns = tuple(f"residual{i}_{_UNITS[dimension]}" for i, dimension in enumerate(dimensions, start=1))
+    first = len(problem.kernels[0].factor.output_channels)
+    try:
+        before, after = settled(unfitted, nominal, records), settled(problem, values, records)
+        return RecordErrors(
+            nominal_mm=record_errors(unfitted, nominal, records) * _MM,
+            calibrated_mm=record_errors(problem, values, records, fitted.records) * _MM,
+            cross_validated_mm=judged,
+            nominal_residual_mm=np.vstack(problem.residuals(before, records)) * _MM,
+            calibrated_residual_mm=np.vstack(residuals(problem, after, records, fitted.records)) * _MM,
+            position_mm=problem.predict(values, records)[0][first + 9 : first + 12] * _MM,
+            failed_folds=0 if crossed is None else crossed.failed_folds,
+            at_rest_mm=record_errors(problem, values, records) * _MM if drifts else None,
+            cross_validated_at_rest_mm=judged_at_rest if drifts else None,
+            residual_columns=("dx_mm", "dy_mm", "dz_mm") if dimensions == ["length"] * 3 else columns,
+            unit=error_unit(problem),
+        )
+    except NotConvergedError as fault:
+        verdict = fitted.estimate.verdict
+        raise fault if verdict.converged else gave_up(verdict) from fault
+
+
+@dataclass(frozen=True)
+class ErrorTable:
+    """Error summaries (mm) by model and by records (train, holdout, cross_validated).
+
+    ``calibrated`` counts the drift that neighbouring records show; ``at_rest`` is without it, and empty if nothing
+    drifts.
+    """
+
+    nominal: dict[str, ErrorSummary]
+    calibrated: dict[str, ErrorSummary]
+    at_rest: dict[str, ErrorSummary] = field(default_factory=dict)
+
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {
+            model: {name: summary.as_dict() for name, summary in table.items()}
+            for model, table in (("nominal", self.nominal), ("calibrated", self.calibrated), ("at_rest", self.at_rest))
+            if table
+        }
+
+    @classmethod
+    def of(cls, errors: RecordErrors, split: Split) -> ErrorTable:
+        """The summaries of every record's errors."""
+        judged = np.isfinite(errors.cross_validated_mm)
+
+        def summaries(of: Array, crossed: Array) -> dict[str, ErrorSummary]:
+            return {
+                "train": summarise(of[split.train]),
+                "holdout": summarise(of[split.holdout]),
+                "cross_validated": summarise(crossed[judged]),
+            }
+
+        at_rest = {}
+        if errors.at_rest_mm is not None and errors.cross_validated_at_rest_mm is not None:
+            at_rest = summaries(errors.at_rest_mm, errors.cross_validated_at_rest_mm)
+        nominal = summaries(errors.nominal_mm, errors.nominal_mm)
+        return cls(nominal, summaries(errors.calibrated_mm, errors.cross_validated_mm), at_rest)

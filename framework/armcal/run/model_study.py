@@ -1,0 +1,197 @@
+"""A study of models: each variant judged on the same folds of the same records."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import fields, replace
+from functools import partial
+from itertools import chain
+
+import numpy as np
+
+from armcal.diagnose.comparison import change, simplest_good
+from armcal.errors import NotConvergedError, ProblemError
+from armcal.estimate.estimator import Progress, no_progress
+from armcal.estimate.validation import (
+    ErrorSummary,
+    Indices,
+    JudgedFit,
+    Split,
+    error_unit,
+    fit_and_judge,
+    folds,
+    record_errors,
+    summarise,
+)
+from armcal.io.parallel import Executor
+from armcal.run.experiment import Experiment
+from armcal.run.pipeline import Prepared, Stopwatch, prepare
+from armcal.run.study import PREVIOUS, ModelStudySettings, Study, compiled, fit_task, interpreted_first, naming
+from armcal.run.study_result import NestedResult, StudyResult, VariantResult
+
+_MM = 1000.0
+
+
+def compare(
+    study: Study,
+    executor: Executor,
+    command: str = "",
+    progress: Progress = no_progress,
+    watch: Stopwatch | None = None,
+) -> StudyResult:
+    """Judge every variant by cross-validation.
+
+    Raises:
+        InputError: a variant cannot be solved, or variants do not use the same records.
+        NotConvergedError: of every variant some fit failed.
+    """
+    watch, settings = watch or Stopwatch(), study.settings_as(ModelStudySettings)
+    with watch.stage("prepare"):
+        ready = {name: naming(name, partial(_prepared, e)) for name, e in study.experiments.items()}
+        _require_same_records(ready)
+    dataset, first = next(iter(ready.values())).dataset, next(iter(study.experiments.values()))
+    every, poses = np.arange(len(dataset), dtype=np.intp), first.poses(dataset)
+    drawn = [folds(len(dataset), settings.folds, settings.seed + r, poses) for r in range(settings.repeats)]
+    inner = [_inside(outer, settings, poses) for outer in drawn[0]] if settings.nested else []
+    splits = [Split(every, every), *chain.from_iterable(drawn), *chain.from_iterable(inner)]
+    with watch.stage("compile"):
+        ready = compiled(study.experiments, ready, len(dataset) * len(splits), executor, progress)
+    tasks = [fit_task(study.experiments[name], ready[name], split) for name in ready for split in splits]
+    with watch.stage("fits"):
+        fits = executor.map(fit_and_judge, tasks, lambda done: progress("fits", done))
+    by_name = {name: fits[i * len(splits) : (i + 1) * len(splits)] for i, name in enumerate(ready)}
+    variants = _compared([_judged(n, ready[n], by_name[n], drawn) for n in ready], settings, dataset.ids)
+    best, simplest = _choices(variants, settings, dataset.ids)
+    return StudyResult(
+        name=study.name,
+        command=command,
+        dataset=dataset,
+        folds=settings.folds,
+        repeats=settings.repeats,
+        variants=variants,
+        best=best,
+        simplest=simplest,
+        nested=_nested(by_name, drawn[0], inner, 1 + settings.repeats * settings.folds) if inner else None,
+        warnings=_warnings(ready, variants),
+        seconds=watch.seconds,
+        provenance=first.provenance(dataset),
+        unit=error_unit(next(iter(ready.values())).problem),
+    )
+
+
+def _prepared(experiment: Experiment) -> Prepared:
+    return prepare(replace(experiment, settings=interpreted_first(experiment)), Stopwatch())
+
+
+def _inside(outer: Split, settings: ModelStudySettings, poses: Indices) -> tuple[Split, ...]:
+    """Folds of the training records of a fold."""
+    train = outer.train
+    inner = folds(len(train), settings.folds, settings.seed, poses[train])
+    return tuple(Split(train[split.train], train[split.holdout]) for split in inner)
+
+
+def _judged(name: str, ready: Prepared, fits: Sequence[JudgedFit], drawn: Sequence[Sequence[Split]]) -> VariantResult:
+    whole, rest = fits[0], iter(fits[1:])
+    repeats, at_rest = np.full((2, len(drawn), len(ready.dataset)), np.nan)
+    failed = 0
+    for number, splits in enumerate(drawn):
+        for split in splits:
+            fit = next(rest)
+            repeats[number, split.holdout] = fit.errors * _MM
+            at_rest[number, split.holdout] = fit.at_rest * _MM
+            failed += not fit.converged
+    nominal = record_errors(ready.problem, ready.problem.parameters.nominal(), ready.records)
+    return VariantResult(
+        name=name,
+        free=ready.problem.increments,
+        nominal=summarise(nominal * _MM),
+        train=summarise(whole.errors * _MM),
+        crossed=_averaged([summarise(row) for row in repeats]),
+        at_rest=_averaged([summarise(row) for row in at_rest]),
+        errors_mm=repeats.mean(axis=0),
+        change=None,
+        converged=whole.converged,
+        failed_folds=failed,
+        fit_seconds=whole.seconds,
+        seconds=sum(fit.seconds for fit in fits),
+    )
+
+
+def _averaged(summaries: Sequence[ErrorSummary]) -> ErrorSummary:
+    """The mean of each figure over the repeats that have it."""
+    means = {}
+    for field in fields(ErrorSummary):
+        known = [value for s in summaries if (value := getattr(s, field.name)) is not None]
+        means[field.name] = float(np.mean(known)) if known else None
+    return ErrorSummary(means["mean"], means["rms"], means["p95"], means["max"], min(s.count for s in summaries))
+
+
+def _compared(
+    plain: Sequence[VariantResult], settings: ModelStudySettings, ids: Sequence[str]
+) -> tuple[VariantResult, ...]:
+    """Each with its change against the one before or the reference, unless it is that itself."""
+    by_name = {result.name: result for result in plain}
+    others = [plain[0], *plain] if settings.reference == PREVIOUS else [by_name[settings.reference]] * len(plain)
+    return tuple(
+        result
+        if other is result
+        else replace(result, change=change(result.errors_mm, other.errors_mm, other.name, ids, settings.blocks))
+        for result, other in zip(plain, others, strict=False)
+    )
+
+
+def _choices(variants: Sequence[VariantResult], settings: ModelStudySettings, ids: Sequence[str]) -> tuple[str, str]:
+    """The variant with the lowest mean error, and the simplest that is as good; of those whose fits all converged."""
+    whole = [v for v in variants if v.converged and not v.failed_folds]
+    if not whole:
+        raise NotConvergedError(
+            "of every variant some fit did not converge.", hint="Check the data and the start values."
+        )
+    means = np.array([v.crossed.mean for v in whole], dtype=float)
+    best = whole[int(np.argmin(means))]
+    changes = [change(v.errors_mm, best.errors_mm, best.name, ids, settings.blocks) for v in whole]
+    return best.name, whole[simplest_good(means, [v.free for v in whole], changes)].name
+
+
+def _nested(
+    fits: Mapping[str, Sequence[JudgedFit]], outer: Sequence[Split], inner: Sequence[Sequence[Split]], offset: int
+) -> NestedResult:
+    """Each fold's choice, made by the mean error over the folds inside of it, judged by the fold. [Varma2006]"""
+    chosen, errors = [], np.full(sum(len(split.holdout) for split in outer), np.nan)
+    at = offset
+    for number, (split, inside) in enumerate(zip(outer, inner, strict=True)):
+        seen = {name: np.concatenate([f.errors for f in fit[at : at + len(inside)]]) for name, fit in fits.items()}
+        means = {name: float(np.mean(e)) if np.isfinite(e).all() else np.inf for name, e in seen.items()}
+        best = min(means, key=lambda name: means[name])
+        chosen.append(best)
+        errors[split.holdout] = fits[best][1 + number].errors * _MM
+        at += len(inside)
+    return NestedResult(summarise(errors), tuple(chosen), errors)
+
+
+def _require_same_records(ready: Mapping[str, Prepared]) -> None:
+    (first_name, first), *others = ready.items()
+    outputs = [c for k in first.problem.kernels for c in k.factor.output_channels]
+    for name, prepared in others:
+        same = prepared.dataset.ids == first.dataset.ids and prepared.dataset.sha256 == first.dataset.sha256
+        measured = [c for k in prepared.problem.kernels for c in k.factor.output_channels]
+        if not same or measured != outputs:
+            raise ProblemError(
+                f"the variants {first_name} and {name} are not judged on the same records: "
+                f"{len(first.dataset)} and {len(prepared.dataset)} are used, measured are {', '.join(outputs)} and "
+                f"{', '.join(measured)}.",
+                hint="Give every variant the same data and measurements.",
+            )
+
+
+def _warnings(ready: Mapping[str, Prepared], variants: Sequence[VariantResult]) -> tuple[str, ...]:
+    """Each once, with the variants it holds for unless these are all."""
+    holders: dict[str, list[str]] = {}
+    for name, prepared in ready.items():
+        for text in dict.fromkeys(prepared.warnings):
+            holders.setdefault(text, []).append(name)
+    listed = [text if len(names) == len(ready) else f"{', '.join(names)}: {text}" for text, names in holders.items()]
+    for v in variants:
+        if v.failed_folds or not v.converged:
+            listed.append(f"{v.name}: {v.failed_folds + (not v.converged)} fits did not converge; it is not chosen.")
+    return tuple(listed)
