@@ -7,7 +7,7 @@ sliding joint for ``1/length`` rad, and a turn of the tool for ``length`` metres
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -98,8 +98,7 @@ class Postures:
 
     def with_values(self, more: Mapping[str, Array]) -> Postures:
         """With more quantities."""
-        parts = (self.commands, self.positions, self.rotations, self.efforts, {**self.values, **more}, self.levers)
-        return Postures(*parts)
+        return replace(self, values={**self.values, **more})
 
 
 @dataclass(frozen=True)

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Annotated, Any, ClassVar, Literal
 
 import casadi as ca
 from armcal.arm.assembly import ArmState
 from armcal.base.parameters import ParameterBlock, scalar
+from armcal.base.pose_blocks import point_blocks, point_expression
 from armcal.base.settings import Length, Length3, Settings
 from armcal.measure.contact import ContactSettings, OneArmContact
 from armcal.measure.measurement import Channel, Tie
@@ -66,15 +68,13 @@ class BallInSocket(OneArmContact):
 
     def parameters(self) -> tuple[ParameterBlock, ...]:
         """The ball's centre on the tool (m)."""
-        return tuple(
-            scalar(f"centre_{axis}", "m", x, 0.01) for axis, x in zip("xyz", self.settings.centre, strict=True)
-        )
+        return point_blocks("centre", self.settings.centre)
 
     def group_parameters(self, group: str) -> tuple[ParameterBlock, ...]:
         """A socket's place in the base frame (m); fixed if it is known."""
         known = self.settings.sockets.get(group)
         blocks = [scalar(axis, "m", x, 0.01) for axis, x in zip("xyz", known or (0.0, 0.0, 0.0), strict=True)]
-        return tuple(ParameterBlock(b.name, b.unit, b.nominal, b.domain, b.scale, free=known is None) for b in blocks)
+        return tuple(replace(block, free=known is None) for block in blocks)
 
     def group_starts(self, arms: Mapping[str, ArmState], values: Mapping[str, Any]) -> dict[str, Any]:
         """The socket is where the ball is."""
@@ -113,8 +113,7 @@ class BallInSocket(OneArmContact):
         return ((Channel("noise", "length"),),) * 3
 
     def _ball(self, arms: Mapping[str, ArmState], values: Mapping[str, Any]) -> Any:
-        centre = ca.sparsify(ca.vertcat(*[values[f"centre_{axis}"] for axis in "xyz"]))
-        return self.base_T_tool(arms).apply(centre)
+        return self.base_T_tool(arms).apply(point_expression("centre", values))
 
 
 def _distance(known: float) -> Any:

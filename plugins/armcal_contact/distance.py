@@ -7,7 +7,8 @@ from typing import Annotated, Any, ClassVar
 
 import casadi as ca
 from armcal.arm.assembly import ArmState
-from armcal.base.parameters import ParameterBlock, scalar
+from armcal.base.parameters import ParameterBlock
+from armcal.base.pose_blocks import point_blocks, point_expression
 from armcal.base.settings import Length, Length3
 from armcal.measure.instrument import Instrument, InstrumentSettings
 from armcal.measure.measurement import Channel
@@ -43,7 +44,7 @@ class TipDistance(Instrument):
 
     def parameters(self) -> tuple[ParameterBlock, ...]:
         """The tip on the tool (m)."""
-        return tuple(scalar(f"tip_{axis}", "m", x, 0.01) for axis, x in zip("xyz", self.settings.tip, strict=True))
+        return point_blocks("tip", self.settings.tip)
 
     def channels(self) -> tuple[Channel, ...]:
         """The distance of the two tips."""
@@ -51,7 +52,7 @@ class TipDistance(Instrument):
 
     def outputs(self, arms: Mapping[str, ArmState], values: Mapping[str, Any]) -> dict[str, Any]:
         """The distance of the two tips (m)."""
-        tip = ca.sparsify(ca.vertcat(*[values[f"tip_{axis}"] for axis in "xyz"]))
+        tip = point_expression("tip", values)
         here, there = (arms[name].base_T_tool.apply(tip) for name in self.arms)
         return {"distance": ca.sqrt(ca.dot(here - there, here - there))}
 

@@ -11,6 +11,7 @@ import numpy as np
 from armcal.arm.assembly import ArmState
 from armcal.base import se3
 from armcal.base.parameters import ParameterBlock, scalar
+from armcal.base.pose_blocks import point_blocks, point_expression
 from armcal.base.settings import Length, Length3
 from armcal.measure.contact import ContactSettings, OneArmContact
 from pydantic import Field, field_validator
@@ -46,7 +47,7 @@ class PlaneContact(OneArmContact):
 
     def parameters(self) -> tuple[ParameterBlock, ...]:
         """The tip on the tool (m)."""
-        return tuple(scalar(f"tip_{axis}", "m", x, 0.01) for axis, x in zip("xyz", self.settings.tip, strict=True))
+        return point_blocks("tip", self.settings.tip)
 
     def group_parameters(self, group: str) -> tuple[ParameterBlock, ...]:
         """How a plane is tilted from the stated normal (rad), and how far it lies from the origin (m)."""
@@ -73,5 +74,4 @@ class PlaneContact(OneArmContact):
         return (self.settings.noise,)
 
     def _tip(self, arms: Mapping[str, ArmState], values: Mapping[str, Any]) -> Any:
-        tip = ca.sparsify(ca.vertcat(*[values[f"tip_{axis}"] for axis in "xyz"]))
-        return self.base_T_tool(arms).apply(tip)
+        return self.base_T_tool(arms).apply(point_expression("tip", values))

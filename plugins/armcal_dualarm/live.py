@@ -140,7 +140,19 @@ class TwoArmLogStream(JointStream, RestStream):
         self.close()
         s = self._settings
         names = tuple(dict.fromkeys(channel.partition(".")[0] for channel in channels))
-        _check(s, names, channels)
+        hint = "Give bench: {joints: {arms: {NAME: {columns: [...]}}}} a column for each joint of each arm."
+        if unknown := [name for name in s.arms if name not in names]:
+            raise ConfigError(
+                f"bench.joints.arms: no arm is called {unknown[0]!r}; the arms are {', '.join(names)}.", hint=hint
+            )
+        for name in names:
+            count = sum(channel.partition(".")[0] == name for channel in channels)
+            columns = len(s.arms[name].columns) if name in s.arms else 0
+            if columns != count:
+                raise ConfigError(
+                    f"bench.joints.arms: found {columns} columns for the arm {name}, which has {count} joints.",
+                    hint=hint,
+                )
         self._channels = channels
         self._ratios = np.concatenate([s.arms[name].ratios for name in names])
         columns = [column for name in names for column in s.arms[name].from_base]
@@ -205,20 +217,3 @@ class TwoArmLogStream(JointStream, RestStream):
     def _refuse(self, reason: str) -> None:
         known = reason in self._refused or len(self._refused) < _MOST_REASONS
         self._refused[reason if known else "other reasons"] += 1
-
-
-def _check(settings: TwoArmStreamSettings, names: Sequence[str], channels: Sequence[str]) -> None:
-    """Refuse other arms, or other numbers of joints."""
-    hint = "Give bench: {joints: {arms: {NAME: {columns: [...]}}}} a column for each joint of each arm."
-    unknown = [name for name in settings.arms if name not in names]
-    if unknown:
-        raise ConfigError(
-            f"bench.joints.arms: no arm is called {unknown[0]!r}; the arms are {', '.join(names)}.", hint=hint
-        )
-    for name in names:
-        count = sum(channel.partition(".")[0] == name for channel in channels)
-        columns = len(settings.arms[name].columns) if name in settings.arms else 0
-        if columns != count:
-            raise ConfigError(
-                f"bench.joints.arms: found {columns} columns for the arm {name}, which has {count} joints.", hint=hint
-            )

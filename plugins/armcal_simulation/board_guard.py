@@ -98,27 +98,24 @@ class BoardGuard:
             if not self._left or self._guard is None:
                 self._next_tick = math.inf
                 return
-            self._leg = self._begin(now, self._guard, self._left[0])
+            # channels without pulses stay without: nobody knows where their servos stand
+            start: dict[GuardedChannel, int] = {}
+            end: dict[GuardedChannel, int] = {}
+            for channel, target in zip(self._guard.channels, self._left[0], strict=True):
+                registers = self._bus.read(channel.address, LED0 + 4 * channel.channel, 4)
+                if registers is None or registers[3] & FULL or registers[1] & FULL:
+                    continue
+                self._on[channel] = registers[0] | (registers[1] & 0x0F) << 8
+                start[channel] = ((registers[2] | (registers[3] & 0x0F) << 8) - self._on[channel]) % COUNTS
+                end[channel] = target
+            seconds = max((abs(end[c] - start[c]) * _RATE_UNIT / c.rate for c in end), default=0.0)
+            self._leg = _Leg(now, seconds, start, end)
             self._left.pop(0)  # not before: on a stuck bus nothing begins
         leg = self._leg
         share = 1.0 if leg.seconds <= 0 else min(1.0, (now - leg.begin) / leg.seconds)
-        for channel, end in leg.end.items():
-            start, on = leg.start[channel], self._on[channel]
-            off = (on + start + round(share * (end - start))) % COUNTS
+        for channel, target in leg.end.items():
+            begun, on = leg.start[channel], self._on[channel]
+            off = (on + begun + round(share * (target - begun))) % COUNTS
             self._bus.write(channel.address, struct.pack("<BHH", LED0 + 4 * channel.channel, on, off))
         if now >= leg.begin + leg.seconds:
             self._leg = None
-
-    def _begin(self, now: float, guard: Guard, waypoint: tuple[int, ...]) -> _Leg:
-        """Channels without pulses stay without: nobody knows where their servos stand."""
-        start: dict[GuardedChannel, int] = {}
-        end: dict[GuardedChannel, int] = {}
-        for channel, target in zip(guard.channels, waypoint, strict=True):
-            registers = self._bus.read(channel.address, LED0 + 4 * channel.channel, 4)
-            if registers is None or registers[3] & FULL or registers[1] & FULL:
-                continue
-            self._on[channel] = registers[0] | (registers[1] & 0x0F) << 8
-            start[channel] = ((registers[2] | (registers[3] & 0x0F) << 8) - self._on[channel]) % COUNTS
-            end[channel] = target
-        seconds = max((abs(end[c] - start[c]) * _RATE_UNIT / c.rate for c in end), default=0.0)
-        return _Leg(now, seconds, start, end)

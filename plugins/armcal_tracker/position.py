@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
-import casadi as ca
 from armcal.arm.assembly import ArmState
-from armcal.base.parameters import ParameterBlock, scalar
+from armcal.base.parameters import ParameterBlock
+from armcal.base.pose_blocks import point_blocks, point_expression
 from armcal.base.settings import Length, Length3
 from armcal.measure.instrument import Instrument, InstrumentSettings
 from armcal.measure.measurement import Channel
@@ -40,9 +40,7 @@ class TipPosition(Instrument):
 
     def parameters(self) -> tuple[ParameterBlock, ...]:
         """The target on the tool (m)."""
-        return tuple(
-            scalar(f"target_{axis}", "m", value, 0.01) for axis, value in zip("xyz", self.settings.target, strict=True)
-        )
+        return point_blocks("target", self.settings.target)
 
     def channels(self) -> tuple[Channel, ...]:
         """Three coordinates."""
@@ -50,8 +48,7 @@ class TipPosition(Instrument):
 
     def outputs(self, arms: Mapping[str, ArmState], values: Mapping[str, Any]) -> dict[str, Any]:
         """The target's position in the base frame (m)."""
-        target = ca.sparsify(ca.vertcat(*[values[f"target_{axis}"] for axis in "xyz"]))
-        position = self.base_T_tool(arms).apply(target)
+        position = self.base_T_tool(arms).apply(point_expression("target", values))
         return {axis: position[i] for i, axis in enumerate("xyz")}
 
     def noise(self) -> tuple[float, ...]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from operator import itemgetter
@@ -12,6 +13,8 @@ from armcal_urdf.robot import UrdfJoint
 _ROUNDING = 1e-13
 """m or rad: what a solver leaves of a number that nothing moved."""
 _WHITE = b" \t\r\n"
+_ATTRIBUTE = re.compile(rb"""\s+(?P<name>[^\s=/>]+)\s*=\s*(?P<value>"[^"]*"|'[^']*')""")
+_START_TAG = re.compile(rb"""(?P<name><[^\s/>]+)(?:\s+[^\s=/>]+\s*=\s*(?:"[^"]*"|'[^']*'))*\s*/?>""")
 
 
 @dataclass(frozen=True)
@@ -33,15 +36,6 @@ Edit = tuple[int, int, bytes]
 """Bytes from an offset to before another become new ones."""
 
 
-@dataclass(frozen=True)
-class _StartTag:
-    """Where a start tag's name ends, where each attribute's value stands, and where the tag ends."""
-
-    name_end: int
-    values: Mapping[str, tuple[int, int]]
-    end: int
-
-
 def with_origins(text: str, placed: Iterable[Placed]) -> str:
     """The text with other origins of joints; ``placed`` has joints that were read from this very text."""
     data = text.encode(UTF8)
@@ -60,18 +54,18 @@ def _edits(data: bytes, placed: Placed) -> list[Edit]:
         return []
     if origin is None:
         # as the joint's first element, on a line of its own if the next thing in it stands on one
-        end = _start_tag(data, element.start).end
+        _, _, end = _start_tag(data, element.start)
         inside = data[end:]
         lead = inside[: len(inside) - len(inside.lstrip(_WHITE))].decode(UTF8)
         attributes = " ".join(f'{name}="{_written(numbers, [])}"' for name, numbers in changed.items())
         return [(end, end, f"{lead}<origin {attributes}/>".encode())]
-    tag = _start_tag(data, origin.start)
+    name_end, values, _ = _start_tag(data, origin.start)
     edits = []
     for name, numbers in changed.items():
-        if name in tag.values:
-            edits.append((*tag.values[name], _written(numbers, words_of(origin.attributes[name])).encode()))
+        if name in values:
+            edits.append((*values[name], _written(numbers, words_of(origin.attributes[name])).encode()))
         else:
-            edits.append((tag.name_end, tag.name_end, f' {name}="{_written(numbers, [])}"'.encode()))
+            edits.append((name_end, name_end, f' {name}="{_written(numbers, [])}"'.encode()))
     return edits
 
 
@@ -82,23 +76,10 @@ def _written(numbers: Three, before: list[str]) -> str:
     return " ".join(word if abs(float(word) - now) <= _ROUNDING else repr(now) for now, word in pairs)
 
 
-def _start_tag(data: bytes, start: int) -> _StartTag:
-    """Walk through the start tag at an offset of a text that is known to be well-formed."""
-    here = start + 1
-    while data[here] not in b" \t\r\n/>":
-        here += 1
-    name_end = here
-    values: dict[str, tuple[int, int]] = {}
-    while True:
-        while data[here] in _WHITE:
-            here += 1
-        if data[here] in b"/>":
-            return _StartTag(name_end, values, data.index(b">", here) + 1)
-        equals = data.index(b"=", here)
-        name = data[here:equals].strip(_WHITE).decode(UTF8)
-        here = equals + 1
-        while data[here] in _WHITE:
-            here += 1
-        close = data.index(data[here : here + 1], here + 1)
-        values[name] = (here + 1, close)
-        here = close + 1
+def _start_tag(data: bytes, start: int) -> tuple[int, dict[str, tuple[int, int]], int]:
+    """Of the start tag at an offset: where its name ends, where each attribute's value stands, and where it ends."""
+    match = _START_TAG.match(data, start)
+    assert match is not None, "the text is well-formed"
+    attributes = _ATTRIBUTE.finditer(data, match.end("name"), match.end())
+    values = {m["name"].decode(UTF8): (m.start("value") + 1, m.end("value") - 1) for m in attributes}
+    return match.end("name"), values, match.end()

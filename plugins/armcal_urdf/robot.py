@@ -165,7 +165,13 @@ def _joint(element: Element) -> UrdfJoint:
     _refuse_misspelt(element, _IN_JOINT)
     if kind not in _KINDS:
         element.refuse(f"joint {name!r} has the type {kind!r}.", f"The types are {', '.join(_KINDS)}.")
-    origin = _only(element.one("origin"), _ORIGIN)
+    origin, mimic = _only(element.one("origin"), _ORIGIN), None
+    follows = _only(element.one("mimic"), _MIMIC) if kind in MOVING else None
+    if follows is not None:
+        if follows.text("joint") == name:
+            follows.refuse(f"joint {name!r} follows itself.", "Name another joint, or remove <mimic>.")
+        multiplier, offset = number(follows, "multiplier", 1.0), number(follows, "offset", 0.0)
+        mimic = Mimic(follows.text("joint"), multiplier, offset)
     return UrdfJoint(
         name=name,
         kind=kind,
@@ -175,7 +181,7 @@ def _joint(element: Element) -> UrdfJoint:
         rpy=three(origin, "rpy"),
         axis=unit_axis(_only(element.one("axis"), ("xyz",))) if kind in MOVING else (1.0, 0.0, 0.0),
         limits=_limits(element.one("limit"), name) if kind in ("revolute", "prismatic") else None,
-        mimic=_mimic(_only(element.one("mimic"), _MIMIC), name) if kind in MOVING else None,
+        mimic=mimic,
         element=element,
     )
 
@@ -201,15 +207,6 @@ def _limits(element: Element | None, joint: str) -> tuple[float, float] | None:
             f"joint {joint!r} has the limits {lower:g} and {upper:g}, expected the lower one first.", "Swap them."
         )
     return lower, upper
-
-
-def _mimic(element: Element | None, joint: str) -> Mimic | None:
-    if element is None:
-        return None
-    master = element.text("joint")
-    if master == joint:
-        element.refuse(f"joint {joint!r} follows itself.", "Name another joint, or remove <mimic>.")
-    return Mimic(master, number(element, "multiplier", 1.0), number(element, "offset", 0.0))
 
 
 def _only(element: Element | None, known: tuple[str, ...]) -> Element | None:

@@ -15,6 +15,16 @@ ANGLE_SCALE_RAD = 0.05
 NO_TURN = (1.0, 0.0, 0.0, 0.0)
 
 
+def point_blocks(name: str, position: Sequence[float]) -> tuple[ParameterBlock, ...]:
+    """``name_x``, ``name_y``, ``name_z`` (m)."""
+    return tuple(scalar(f"{name}_{axis}", "m", x, LENGTH_SCALE_M) for axis, x in zip("xyz", position, strict=True))
+
+
+def point_expression(name: str, values: Mapping[str, Expression]) -> Expression:
+    """The point (3x1, m) that the blocks of ``point_blocks`` stand for."""
+    return ca.sparsify(ca.vertcat(*[values[f"{name}_{axis}"] for axis in "xyz"]))
+
+
 def pose_blocks(
     name: str, position: Sequence[float] = (0.0, 0.0, 0.0), quaternion: Sequence[float] = NO_TURN
 ) -> tuple[ParameterBlock, ...]:
@@ -23,14 +33,12 @@ def pose_blocks(
     Position and rotation are blocks of their own, so that each has its unit, its typical scale and its prior.
     """
     turned = ParameterBlock(f"{name}_rotation", "rad", tuple(map(float, quaternion)), Rotation(), ANGLE_SCALE_RAD)
-    placed = [scalar(f"{name}_{axis}", "m", x, LENGTH_SCALE_M) for axis, x in zip("xyz", position, strict=True)]
-    return (*placed, turned)
+    return (*point_blocks(name, position), turned)
 
 
 def pose_transform(name: str, values: Mapping[str, Expression]) -> Transform:
     """The motion that the blocks of ``pose_blocks`` stand for."""
-    position = ca.sparsify(ca.vertcat(*[values[f"{name}_{axis}"] for axis in "xyz"]))
-    return Transform(rotation_of(values[f"{name}_rotation"]), position)
+    return Transform(rotation_of(values[f"{name}_rotation"]), point_expression(name, values))
 
 
 def rotation_of(quaternion: Expression) -> Expression:
