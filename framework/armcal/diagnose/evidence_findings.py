@@ -106,7 +106,15 @@ def structure_findings(structure: ResidualStructure | None, unit: str = _MM) -> 
     blocks = f", blocks of {structure.block} records" if structure.block > 1 else ""
     level = f"{100 * structure.level:g} % over all {structure.tested} dependences{blocks}"
     test, kept = f"score test, {level}, and likelier than chance", structure.worthwhile
-    findings = [_structure_finding(s, structure, unit, test) for s in kept] + _unlisted(structure)
+    findings = [_structure_finding(s, structure, unit, test) for s in kept]
+    if structure.unlisted > CLEAR and not any(UNLISTED in s.alternatives for s in kept):
+        text = (
+            f"Residuals follow the pose smoothly in a way that none of the {structure.tested} causes tried explains: "
+            "the model lacks something that is not among them."
+        )
+        likelihood = f"marginal likelihood of a Gaussian process over the poses, odds of {np.exp(CLEAR):.0f} to 1"
+        advice = "Free more of the geometry; repeat some poses with a second payload."
+        findings.append(Finding("warning", text, likelihood, advice))
     if not findings:
         slight = f" {_plural(len(structure.structures), 'dependence', 'dependences')} found would not lower it by 1 %."
         text = f"Of {structure.tested} things that residuals might depend on none explains the error left."
@@ -137,18 +145,6 @@ def _structure_finding(s: Structure, structure: ResidualStructure, unit: str, te
 
 def _share(odds: float) -> str:
     return "over 99 %" if odds > 0.99 else "less than 1 %" if odds < 0.01 else f"{100 * odds:.0f} %"
-
-
-def _unlisted(structure: ResidualStructure) -> list[Finding]:
-    """What follows the pose, and is none of the causes; those that may stand for it say so themselves."""
-    if structure.unlisted <= CLEAR or any(UNLISTED in s.alternatives for s in structure.worthwhile):
-        return []
-    text = (
-        f"Residuals follow the pose smoothly in a way that none of the {structure.tested} causes tried explains: the "
-    )
-    text += "model lacks something that is not among them."
-    test = f"marginal likelihood of a Gaussian process over the poses, odds of {np.exp(CLEAR):.0f} to 1"
-    return [Finding("warning", text, test, "Free more of the geometry; repeat some poses with a second payload.")]
 
 
 def _scatter(structure: ResidualStructure) -> list[Finding]:

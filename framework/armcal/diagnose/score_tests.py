@@ -147,7 +147,17 @@ def _ratios(bases: Sequence[Array], both: Array, fit: Fit) -> Array:
     for start in range(0, len(bases), most):
         columns = _by_block(np.hstack(bases[start : start + most]), fit)
         products = (columns.transpose(0, 2, 1) @ rows).reshape(fit.blocks, -1, size, both.shape[1])
-        statistics[start : start + most] = _statistic(products)
+        total = products.sum(axis=0)  # bases x k x draws
+        spread = np.empty((*total[:, 0].shape, size, size))
+        for i, j in zip(*np.tril_indices(size), strict=True):
+            spread[..., i, j] = spread[..., j, i] = np.einsum("bmd,bmd->md", products[:, :, i], products[:, :, j])
+        floor = 1e-12 * np.trace(spread, axis1=2, axis2=3) + _SMALLEST_P
+        if size == 1:
+            statistics[start : start + most] = total[:, 0] ** 2 / (spread[..., 0, 0] + floor)
+            continue
+        sums = total.transpose(0, 2, 1)
+        solved = np.linalg.solve(spread + floor[..., None, None] * np.eye(size), sums[..., None])[..., 0]
+        statistics[start : start + most] = np.sum(sums * solved, axis=2)
     return np.asarray((fit.blocks - size) / size * statistics / np.maximum(fit.blocks - statistics, 1e-9))
 
 
@@ -158,20 +168,6 @@ def _by_block(columns: Array, fit: Fit) -> Array:
     blocks = np.zeros((len(sizes), int(sizes.max()), columns.shape[1]))
     blocks[fit.block[order], place] = columns[order]
     return blocks
-
-
-def _statistic(products: Array) -> Array:
-    """T of block products (blocks x bases x k x draws), (bases x draws)."""
-    size, total = products.shape[2], products.sum(axis=0)
-    spread = np.empty((*total[:, 0].shape, size, size))
-    for i, j in zip(*np.tril_indices(size), strict=True):
-        spread[..., i, j] = spread[..., j, i] = np.einsum("bmd,bmd->md", products[:, :, i], products[:, :, j])
-    floor = 1e-12 * np.trace(spread, axis1=2, axis2=3) + _SMALLEST_P
-    if size == 1:
-        return np.asarray(total[:, 0] ** 2 / (spread[..., 0, 0] + floor))
-    sums = total.transpose(0, 2, 1)
-    solved = np.linalg.solve(spread + floor[..., None, None] * np.eye(size), sums[..., None])[..., 0]
-    return np.asarray(np.sum(sums * solved, axis=2))
 
 
 def _p_value(size: int, spare: int, ratio: Array) -> Array:

@@ -99,31 +99,28 @@ def pose_kernels(problem: Problem, dataset: Dataset) -> Kernels:
 
 def smooth(residual: Array, basis: Array, by_record: NDArray[np.intp], kernels: Kernels) -> Smooth:
     """The best process in a residual (rows) that is freed of an orthonormal basis (rows x n)."""
-    own = [_of_kernel(residual, basis, by_record, features) for features in kernels.features]
-    if not own:
-        return Smooth(-np.inf, np.zeros_like(residual), np.zeros((len(residual), 0)))
-    return max(own, key=lambda one: one.evidence)
-
-
-def _of_kernel(residual: Array, basis: Array, by_record: NDArray[np.intp], features: Array) -> Smooth:
-    rows, count = len(residual), by_record.shape[1]
-    features = features[:, : max(1, _MOST_FEATURES // count)]
-    size = features.shape[1]
-    spread = np.zeros((rows, size * count))
-    for entry, own in enumerate(by_record.T):
-        seen = residual[own] != 0
-        spread[own, entry * size : (entry + 1) * size] = features * seen[:, None]
-    spread -= basis @ (basis.T @ spread)
-    values, vectors = np.linalg.eigh(spread.T @ spread)
-    kept = values > 1e-9 * max(float(values[-1]), 1e-300)
-    values, axes = values[kept], spread @ (vectors[:, kept] / np.sqrt(values[kept]))
-    along, total, freedom = axes.T @ residual, float(residual @ residual), rows - basis.shape[1]
-    taken = _RATIOS[:, None] * values / (1 + _RATIOS[:, None] * values)
-    left = np.maximum(total - taken @ along**2, 1e-12 * total)
-    gained = -0.5 * (freedom * np.log(left / total) + np.sum(np.log1p(_RATIOS[:, None] * values), axis=1))
-    best = int(np.argmax(gained))
-    function = axes @ (taken[best] * along)
-    return Smooth(float(gained[best]) - np.log(freedom), function, axes * np.sqrt(taken[best]))
+    rows, entries = len(residual), by_record.shape[1]
+    best = Smooth(-np.inf, np.zeros_like(residual), np.zeros((rows, 0)))
+    total, freedom = float(residual @ residual), rows - basis.shape[1]
+    for features in kernels.features:
+        features = features[:, : max(1, _MOST_FEATURES // entries)]
+        size = features.shape[1]
+        spread = np.zeros((rows, size * entries))
+        for entry, own in enumerate(by_record.T):
+            spread[own, entry * size : (entry + 1) * size] = features * (residual[own] != 0)[:, None]
+        spread -= basis @ (basis.T @ spread)
+        values, vectors = np.linalg.eigh(spread.T @ spread)
+        kept = values > 1e-9 * max(float(values[-1]), 1e-300)
+        values, axes = values[kept], spread @ (vectors[:, kept] / np.sqrt(values[kept]))
+        along = axes.T @ residual
+        taken = _RATIOS[:, None] * values / (1 + _RATIOS[:, None] * values)
+        left = np.maximum(total - taken @ along**2, 1e-12 * total)
+        gained = -0.5 * (freedom * np.log(left / total) + np.sum(np.log1p(_RATIOS[:, None] * values), axis=1))
+        i = int(np.argmax(gained))
+        evidence = float(gained[i]) - float(np.log(freedom))
+        if evidence > best.evidence:
+            best = Smooth(evidence, axes @ (taken[i] * along), axes * np.sqrt(taken[i]))
+    return best
 
 
 def left_out(of: Smooth, residual: Array, basis: Array, by_record: NDArray[np.intp]) -> Array:

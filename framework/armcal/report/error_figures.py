@@ -37,6 +37,7 @@ def distribution(result: RunResult) -> Figure | None:
         return None
     values = np.concatenate([errors for _, _, errors in curves])
     medians = [float(np.median(errors)) for _, _, errors in curves]
+    high = max(float(values.max()), 1e-9)
     log = min(medians) > 0 and max(medians) / min(medians) > _LOG_FROM and float(values.min()) > 0
     named = zip(curves, medians, strict=True)
     said = "; ".join(f"{name}: median {significant(middle)} {result.errors.unit}" for (_, name, _), middle in named)
@@ -47,7 +48,8 @@ def distribution(result: RunResult) -> Figure | None:
     def draw(width: float) -> tuple[float, list[str]]:
         top, parts = svg.legend(52, 12, width - 60, entries)
         box = Box(52, top + 2, width - 16, top + (270 if width > svg.NARROW else 220))
-        x = _error_axis(values, box, log)
+        low = max(float(np.percentile(values, 0.5)), high * 1e-6) * 0.8 if log else 0.0
+        x = Axis(low, high * (1.15 if log else 1.03), box.left, box.right, log=log)
         y = Axis(0, 100, box.bottom, box.top)
         parts += svg.frame(
             box, x, y, (f"error, {result.errors.unit}", "records below, %"), (8 if width > svg.NARROW else 5, 5)
@@ -71,14 +73,6 @@ def _curves(result: RunResult) -> list[tuple[str, str, Array]]:
     ]
     finite = [(css, name, values[np.isfinite(values)]) for css, name, values in curves]
     return [(css, f"{name} ({count(len(values))})", values) for css, name, values in finite if len(values)]
-
-
-def _error_axis(values: Array, box: Box, log: bool) -> Axis:
-    high = max(float(values.max()), 1e-9)
-    if log:
-        low = max(float(np.percentile(values, 0.5)), high * 1e-6)
-        return Axis(low * 0.8, high * 1.15, box.left, box.right, log=True)
-    return Axis(0, high * 1.03, box.left, box.right)
 
 
 def _ecdf(errors: Array, x: Axis, y: Axis, css: str) -> str:

@@ -204,7 +204,10 @@ def spread(settings: PlanSettings, space: JointSpace, limits: Array, check: Clea
     sequence = qmc.Sobol(len(limits), rng=settings.seed)
     kept_poses: list[Array] = []
     kept = tried = 0
-    drawn = _corners(len(limits), settings.count // 2)
+    drawn = np.zeros((0, len(limits)))
+    for levels in ((0.0, 1.0), (0.0, 0.5, 1.0)):  # ends, or ends and middles, as far as those are not too many
+        if len(levels) ** len(limits) <= settings.count // 2:
+            drawn = np.array(list(product(levels, repeat=len(limits))))
     while kept < settings.count and tried <= _MOST_TRIED * settings.count:
         poses = (limits[:, 0] + drawn * (limits[:, 1] - limits[:, 0])).T
         allowed = np.ones(poses.shape[1], dtype=bool) if check is None else check(poses).allowed
@@ -215,14 +218,6 @@ def spread(settings: PlanSettings, space: JointSpace, limits: Array, check: Clea
     if not kept:
         raise ProblemError(f"none of {tried} poses keeps its clearance.", hint="Check plan.clearance.")
     return Pool("continuous", dataset_of(np.hstack(kept_poses)[:, : settings.count], space), left_out)
-
-
-def _corners(joints: int, most: int) -> Array:
-    """The ends and middles of all joints, or their ends alone, as far as that is not too many (N x joints, 0 to 1)."""
-    for levels in ((0.0, 0.5, 1.0), (0.0, 1.0)):
-        if len(levels) ** joints <= most:
-            return np.array(list(product(levels, repeat=joints)))
-    return np.zeros((0, joints))
 
 
 def dataset_of(poses: Array, space: JointSpace) -> Dataset:

@@ -106,25 +106,7 @@ def check_units(path: Path, targets: Targets, reach: Reach) -> None:
 
 def _read(path: Path, expression: ToolExpression, registry: PluginRegistry) -> Dataset:
     """The columns that mean something to this arm; a warning names those with a unit that do not."""
-    reader_class = registry.find("reader", "csv").load()
-    reader = reader_class(reader_class.Settings(path=ConfigText(str(path))))
-    try:
-        dataset = noticed(reader.read(ReadRequest({}, {}, _requested(expression))))
-    except DataError as fault:
-        # Measured data have a section in a configuration that describes them; targets have none.
-        hint = _AS_DOCUMENTED if "data section" in fault.hint else fault.hint
-        raise DataError(fault.message, where=fault.where, hint=hint) from fault
-    units = {name: split_suffix(name) for name in dataset.extra if not any(name in w for w in dataset.warnings)}
-    # Commands that stand in the file already give way to those that are found.
-    idle = [name for name, split in units.items() if split is not None and split[0] not in expression.joints]
-    if not idle:
-        return dataset
-    text = f"columns that mean nothing to this arm are not used: {', '.join(idle)}."
-    return replace(dataset, warnings=(*dataset.warnings, text))
-
-
-def _requested(expression: ToolExpression) -> tuple[RequestedChannel, ...]:
-    """What a column may be called; the short name is the joint's where one has it."""
+    # The short name of a column is the joint's where one has it.
     pose = [(axis, "length", True) for axis in "xyz"]
     pose += [(name, DIMENSIONLESS, False) for name in QUATERNION] + [(name, "angle", False) for name in RPY]
     channels = []
@@ -137,7 +119,21 @@ def _requested(expression: ToolExpression) -> tuple[RequestedChannel, ...]:
     for index, joint in enumerate(expression.joints, start=1):
         names = (f"approach{index}", f"approach_{joint}")
         channels.append(RequestedChannel(f"{expression.name}.{APPROACH}{joint}", names, DIMENSIONLESS, False))
-    return tuple(channels)
+    reader_class = registry.find("reader", "csv").load()
+    reader = reader_class(reader_class.Settings(path=ConfigText(str(path))))
+    try:
+        dataset = noticed(reader.read(ReadRequest({}, {}, tuple(channels))))
+    except DataError as fault:
+        # Measured data have a section in a configuration that describes them; targets have none.
+        hint = _AS_DOCUMENTED if "data section" in fault.hint else fault.hint
+        raise DataError(fault.message, where=fault.where, hint=hint) from fault
+    units = {name: split_suffix(name) for name in dataset.extra if not any(name in w for w in dataset.warnings)}
+    # Commands that stand in the file already give way to those that are found.
+    idle = [name for name, split in units.items() if split is not None and split[0] not in expression.joints]
+    if not idle:
+        return dataset
+    text = f"columns that mean nothing to this arm are not used: {', '.join(idle)}."
+    return replace(dataset, warnings=(*dataset.warnings, text))
 
 
 def _line(dataset: Dataset, row: int) -> int:
