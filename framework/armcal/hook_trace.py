@@ -81,7 +81,7 @@ class HookTrace:
             seconds = time.perf_counter() - began.pop()
             if answering:
                 fault = _raised(outcome.exception)
-                in_order = [each.plugin_name for each in reversed(answering)]  # pluggy calls the last one first
+                in_order = [plugin.plugin_name for plugin in reversed(answering)]  # pluggy calls the last one first
                 self.write(hook, arguments, [Answer(" then ".join(in_order), seconds, fault)], seconds)
 
         manager.add_hookcall_monitoring(before, after)

@@ -126,15 +126,15 @@ def _listed(variable: str) -> tuple[str, ...]:
 
 def _files_of(place: Path) -> Iterator[Path]:
     """A file itself, or those of a folder that are no tests and do not begin with an underscore."""
-    where, asked = Location(str(place)), "as --plugin asks"
+    where, hint = Location(str(place)), "as --plugin asks"
     if place.is_dir():
         paths = sorted(file for file in place.glob("*.py") if not file.name.startswith(_NO_PLUGINS))
         if not paths:
-            raise PluginError(f"found no plugin in this folder, {asked}.", where=where, hint="Put NAME.py there.")
+            raise PluginError(f"found no plugin in this folder, {hint}.", where=where, hint="Put NAME.py there.")
     elif place.is_file():
         paths = [place]
     else:
-        raise PluginError(f"found no such file or folder, {asked}.", where=where, hint="Correct the path.")
+        raise PluginError(f"found no such file or folder, {hint}.", where=where, hint="Correct the path.")
     for file in paths:
         if file.suffix != ".py" or not _NAME.fullmatch(file.stem):
             text = "expected the name of a plugin's file, letters, digits, - and _ with .py after them."

@@ -142,7 +142,7 @@ def _spoken(kind: str) -> str:
     return f"{'an' if name[0] in 'aeiou' else 'a'} {name}"
 
 
-def discover(found: Iterable[EntryPoint] | None = None) -> PluginRegistry:
+def discover(points: Iterable[EntryPoint] | None = None) -> PluginRegistry:
     """Load every registration module.
 
     A plugin that fails to import, or has a hook that armcal does not know, is listed with its fault and breaks nothing
@@ -156,7 +156,7 @@ def discover(found: Iterable[EntryPoint] | None = None) -> PluginRegistry:
     """
     trace, manager = HookTrace.from_environment(), new_manager()
     plugins, components = [], []
-    for point in _chosen(entry_points(group=plugin_files.GROUP) if found is None else found):
+    for point in _chosen(entry_points(group=plugin_files.GROUP) if points is None else points):
         outcome = registered(manager, point, trace)
         if isinstance(point, plugin_files.FilePoint) and (outcome.fault or not outcome.works):
             text = outcome.fault or "it registers nothing: write a function armcal_register_... after @hookimpl."

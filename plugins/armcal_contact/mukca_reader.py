@@ -87,7 +87,7 @@ class MukcaReader:
             hint = "Set arm: NAME in the data section."
             raise DataError(f"{fault}.", where=Location(str(folder), field="arm"), hint=hint) from fault
         requested_channels = [
-            w for w in request.wanted if w.channel in {f"{arm.name}.{joint}" for joint in arm.commanded}
+            w for w in request.channels if w.channel in {f"{arm.name}.{joint}" for joint in arm.commanded}
         ]
         tables = [_rows(file, requested_channels) for file in files]
         names = [(file, line) for file, (lines, _) in zip(files, tables, strict=True) for line in lines]
@@ -101,8 +101,8 @@ class MukcaReader:
             hash_of(files),
             warnings=warnings,
         )
-        dataset = with_absent(dataset, request.wanted)
-        layout = layout_of(request.wanted, dataset, {}, {}, by_line=True)
+        dataset = with_absent(dataset, request.channels)
+        layout = layout_of(request.channels, dataset, {}, {}, by_line=True)
         checked = check_dataset(dataset, replace(layout, by_id=True))
         return _weighed(checked, request) if self._settings.weights == "positions" else checked
 
@@ -220,7 +220,7 @@ def _refuse(path: Path, message: str, hint: str, line: int | None = None, column
 
 def _weighed(dataset: Dataset, request: ReadRequest) -> Dataset:
     """The dataset with a standard deviation for each ball, by which every position weighs the same."""
-    known = {channel.channel for channel in request.wanted}
+    known = {channel.channel for channel in request.channels}
     postures = Counter(dataset.extra[POSITION])
     roots = np.sqrt([postures[position] for position in dataset.extra[POSITION]])
     noises: dict[str, Array] = {}

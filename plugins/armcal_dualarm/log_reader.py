@@ -68,7 +68,7 @@ class TwoArmLogReader:
         joint_angles = table.numbers[: len(numbers)] / ratios[:, None]
         values = dict(zip(channels, joint_angles, strict=True))
         names = dict(zip(channels, table.names, strict=False))
-        turning = {w.channel for w in request.wanted if w.dimension == "angle" and not w.is_endless}
+        turning = {w.channel for w in request.channels if w.dimension == "angle" and not w.is_endless}
         for channel, row in values.items():
             over = np.flatnonzero((np.abs(row) > _FULL_TURN * (1 + 1e-9)) & np.isfinite(row))
             if channel in turning and over.size:  # wrong ratios, or other units
@@ -78,8 +78,8 @@ class TwoArmLogReader:
                 self._refuse(text, hint, table.lines[first], names[channel])
         if times:
             values["time"] = from_unit(table.numbers[len(numbers)], s.time_unit)
-        dataset = with_absent(self._dataset(table, joint_angles, values), request.wanted)
-        return check_dataset(dataset, layout_of(request.wanted, dataset, names, {}, by_line=True))
+        dataset = with_absent(self._dataset(table, joint_angles, values), request.channels)
+        return check_dataset(dataset, layout_of(request.channels, dataset, names, {}, by_line=True))
 
     def _dataset(self, table: LogTable, joints: Array, values: Mapping[str, Array]) -> Dataset:
         """All rows, or the means of the rests among them."""

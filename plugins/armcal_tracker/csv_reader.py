@@ -73,14 +73,14 @@ class CsvReader:
                 if len(cells) == 1:
                     _refuse_delimiter(header_of(cells, source, line), s.delimiter, rows)
                 header = renamed(header_of(cells, source, line), s.columns)
-                plan = match_columns(header, request.wanted)
+                plan = match_columns(header, request.channels)
                 dataset = _load(rows, header, plan)
         except OSError as fault:
             _refuse_file(path, f"it cannot be read ({fault.strerror or fault}).", "Check the path and its permissions.")
         dataset = replace(dataset, sha256=digest.hexdigest())
         names = {channel: column.name for channel, (column, _) in plan.channels.items()}
         units = {channel: unit for channel, (_, unit) in plan.channels.items()}
-        return check_dataset(dataset, layout_of(request.wanted, dataset, names, units, by_line=True))
+        return check_dataset(dataset, layout_of(request.channels, dataset, names, units, by_line=True))
 
 
 def _refuse_file(path: Path, message: str, hint: str, line: int | None = None) -> NoReturn:
@@ -188,5 +188,5 @@ def _number(cell: str, line: int, column: Column, header: Header) -> float:
     number = read_cell(cell)
     if isinstance(number, CellFault):
         where = Location(header.source, line=line, field=column.name)
-        raise DataError(number.found, where=where, hint=number.hint)
+        raise DataError(number.text, where=where, hint=number.hint)
     return number

@@ -99,9 +99,9 @@ class PoseCsvReader:
         reader = CsvReader(CsvSettings(path=s.path, columns={**s.columns, **mapped}, delimiter=s.delimiter))
         # the file's numbers in place of the quaternion; they cannot be absent
         quaternion = {f"{instance}.{name}" for name in QUATERNION}
-        rest = [channel for channel in request.wanted if channel.channel not in quaternion]
+        rest = [channel for channel in request.channels if channel.channel not in quaternion]
         own = [RequestedChannel(name, (name,), DIMENSIONLESS, True, parts=(instance,)) for name in mapped]
-        dataset = reader.read(replace(request, wanted=(*rest, *own)))
+        dataset = reader.read(replace(request, channels=(*rest, *own)))
         dataset = self._without_faulty(dataset, tuple(mapped))
         values = dataset.stacked(tuple(mapped)).T
         made = np.flatnonzero(~np.isnan(values).any(axis=1))

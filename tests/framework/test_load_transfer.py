@@ -124,7 +124,7 @@ def test_records_that_were_measured_give_what_their_simulation_gave(place: Path,
 
     experiment = Study.load(place / "study.yaml").experiments["elastic"]
     data = tmp_path / "measured.csv"
-    write_csv(data, simulated.dataset, experiment.request(measured=True).wanted)
+    write_csv(data, simulated.dataset, experiment.request(measured=True).channels)
     if "payload_g" not in data.read_text().splitlines()[0]:
         lines = data.read_text().splitlines()
         grams = simulated.dataset.column("payload") * 1000

@@ -443,7 +443,7 @@ def test_a_dataset_without_places_is_refused_in_the_same_recording(recording: Pa
     loaded = Experiment.load(DEMO, [FREE])
     arms = loaded.system.arms
     commands = loaded.read().subset(np.arange(3))
-    assert ReadRequest(arms, {}, requested_channels(arms, {}, measured=False)).wanted
+    assert ReadRequest(arms, {}, requested_channels(arms, {}, measured=False)).channels
     with pytest.raises(DataError, match="drifts over sequence"):
         calibration.plus_minus(commands, "same")
     assert np.isfinite(calibration.plus_minus(commands).radii["tracker"]).all()

@@ -151,8 +151,8 @@ def read_bare(name: str, value: Any, kind: Kind, is_si: bool) -> Any:
     if is_si and hasattr(value, "tolist"):
         value = value.tolist()  # arrays are welcome from Python
     if not is_si and has_number(value, kind):
-        found = plain(value)
-        return Fault(f"found {found} with its unit missing: write {example(name, dimension, found)}.")
+        number = plain(value)
+        return Fault(f"found {number} with its unit missing: write {example(name, dimension, number)}.")
     return convert(name, value, kind, si_unit(dimension).name)
 
 

@@ -17,7 +17,8 @@ def shown(text: str, keep: str = "\n\t") -> str:
     if text.isascii() and text.isprintable():
         return text
     return "".join(
-        each if each in keep or unicodedata.category(each) not in _STEERING else _written(ord(each)) for each in text
+        character if character in keep or unicodedata.category(character) not in _STEERING else _written(ord(character))
+        for character in text
     )
 
 

@@ -125,8 +125,8 @@ def split_suffix(name: str, dimension: str | None = None) -> tuple[str, Unit] | 
     for unit_name in _LONGEST_FIRST:
         stem = name.removesuffix(f"_{unit_name}")
         if stem and stem != name:
-            found = UNITS[unit_name]
-            return (stem, found) if dimension in (None, found.dimension) else None
+            unit = UNITS[unit_name]
+            return (stem, unit) if dimension in (None, unit.dimension) else None
     return None
 
 
@@ -153,12 +153,12 @@ def parse_quantity(text: str, dimension: str) -> float:
     if written is None and dimension != DIMENSIONLESS:
         raise ValueError(_expected(f"{text!r} has no unit", dimension))
     name = (written or "1").replace("N m", "Nm").replace("N*m", "Nm").replace("N·m", "Nm")
-    found = UNITS.get(_SPELLINGS.get(name, name))
-    if found is None:
+    unit = UNITS.get(_SPELLINGS.get(name, name))
+    if unit is None:
         raise ValueError(_expected(f"{text!r} has an unknown unit {written!r}", dimension))
-    if found.dimension != dimension:
-        raise ValueError(_expected(f"{text!r} has a unit of {found.dimension}", dimension))
-    value = from_unit(float(number), found.name)
+    if unit.dimension != dimension:
+        raise ValueError(_expected(f"{text!r} has a unit of {unit.dimension}", dimension))
+    value = from_unit(float(number), unit.name)
     if not math.isfinite(value):
         raise ValueError(_expected(f"{text!r} is too large to be a number", dimension))
     return value

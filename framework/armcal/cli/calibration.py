@@ -29,13 +29,13 @@ def accept(console: Console, path: Path) -> None:
     """
     registry = discover()
     console.plugin_faults(registry)
-    found = accepted(path, datetime.now(UTC).date().isoformat(), registry)
-    if found.was_needed:
-        write_over({path.resolve(): sealed(found.calibration.record.to_config()).encode()})
-    moved = None if found.moved_m is None else found.moved_m * 1000
-    console.result({"file": str(path), "edited": found.was_edited, "moved_mm": moved})
+    record = accepted(path, datetime.now(UTC).date().isoformat(), registry)
+    if record.was_needed:
+        write_over({path.resolve(): sealed(record.calibration.record.to_config()).encode()})
+    moved = None if record.moved_m is None else record.moved_m * 1000
+    console.result({"file": str(path), "edited": record.was_edited, "moved_mm": moved})
     moved_text = (
         "it keeps no check poses" if moved is None else f"tools at its check poses moved by up to {moved:.3f} mm"
     )
-    done = "accepted" if found.was_needed else "nothing to accept, it is as armcal wrote it"
+    done = "accepted" if record.was_needed else "nothing to accept, it is as armcal wrote it"
     console.out.print(f"{done}: {path} ({moved_text})", markup=False, soft_wrap=True)

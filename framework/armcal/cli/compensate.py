@@ -43,23 +43,25 @@ _ARRIVES = {"tool": "by the tool frame's origin", "target": "by the measured tar
 @click.option("--angles", type=click.Choice(["deg", "rad"]), default="deg", show_default=True, help="Unit of commands.")
 @accept
 @speaking
-def compensate(console: Console, calibration: Path, targets: Path, out: Path, angles: str, **asked: Any) -> None:
+def compensate(console: Console, calibration: Path, targets: Path, out: Path, angles: str, **options: Any) -> None:
     """Find what to command so that the arm in CALIBRATION, as it really is, arrives at targets."""
-    spare_inputs(out, calibration, targets, asked["within"])
+    spare_inputs(out, calibration, targets, options["within"])
     registry = discover()
     console.plugin_faults(registry)
-    loaded = Calibration.load(calibration, registry, asked["accept"])
-    bench = Bench.of(loaded, asked["arm"], asked["within"], asked["redundancy"], registry, asked["point"] or "tool")
+    loaded = Calibration.load(calibration, registry, options["accept"])
+    bench = Bench.of(
+        loaded, options["arm"], options["within"], options["redundancy"], registry, options["point"] or "tool"
+    )
     file = bench.read(targets, registry)
     for text in file.dataset.warnings:
         console.warn(text)
     compensator = bench.compensator(file.targets)
     check_units(targets, file.targets, compensator.reach)
     _warn_of_free_joints(console, compensator)
-    if asked["point"] is None:
+    if options["point"] is None:
         warn_of_target(console, "these commands bring", bench.target)
-    start = _start(asked["start"], compensator)
-    if asked["kind"] == "path":
+    start = _start(options["start"], compensator)
+    if options["kind"] == "path":
         commands = compensator.follow(file.targets, start)
     else:
         commands = compensator.solve(file.targets, start)
@@ -82,9 +84,9 @@ def _start(stated: Sequence[str], compensator: Compensator) -> Array | None:
     kinds = compensator.expression.arm.commanded
     at = dict.fromkeys(compensator.joints, 0.0)
     for text in stated:
-        joint, found, quantity = (part.strip() for part in text.partition("="))
+        joint, equals, quantity = (part.strip() for part in text.partition("="))
         hint = "For example --start 'q1=10 deg'."
-        if not found or joint not in at:
+        if not equals or joint not in at:
             known = ", ".join(compensator.joints)
             raise InputError(
                 f"found {text!r}, expected JOINT=ANGLE with a joint of {known}.", where=Location("--start"), hint=hint
@@ -97,39 +99,46 @@ def _start(stated: Sequence[str], compensator: Compensator) -> Array | None:
 
 
 def _tell(console: Console, file: TargetFile, assessed: Assessed, bench: Bench, out: Path) -> None:
-    found, commands = summary(assessed), assessed.commands
+    figures, commands = summary(assessed), assessed.commands
     missed = [
         {"id": name, "reason": reason, "nearest_mm": 1000 * float(distance) if np.isfinite(distance) else None}
         for name, reason, distance in zip(file.dataset.ids, commands.reasons, commands.distances, strict=True)
         if reason
     ]
-    set_aside = [{"row": each.row, "reason": each.reason} for each in file.dataset.set_aside]
+    set_aside = [{"row": target.row, "reason": target.reason} for target in file.dataset.set_aside]
     offset = None if bench.target is None else [1000 * float(x) for x in bench.target.tool_T_target[:3, 3]]
     console.result(
-        {**found, "point": bench.point, "target_mm": offset, "missed": missed, "set_aside": set_aside, "out": str(out)}
+        {
+            **figures,
+            "point": bench.point,
+            "target_mm": offset,
+            "missed": missed,
+            "set_aside": set_aside,
+            "out": str(out),
+        }
     )
-    for each in missed[:_SHOWN]:
-        away = each["nearest_mm"]
+    for target in missed[:_SHOWN]:
+        away = target["nearest_mm"]
         console.warn(
-            f"{each['id']}: {each['reason']}" + ("" if away is None else f"; the nearest is {away:.3f} mm away")
+            f"{target['id']}: {target['reason']}" + ("" if away is None else f"; the nearest is {away:.3f} mm away")
         )
     if len(missed) > _SHOWN:
         console.warn(f"{len(missed) - _SHOWN} more targets cannot be reached; the file says why")
     for cell in set_aside[:_SHOWN]:
         console.warn(f"row {cell['row']} is set aside: {cell['reason']}")
     console.out.print(
-        f"{found['reached']} of {found['targets']} targets are reached, {_ARRIVES[bench.point]}: {out}",
+        f"{figures['reached']} of {figures['targets']} targets are reached, {_ARRIVES[bench.point]}: {out}",
         markup=False,
         soft_wrap=True,
     )
-    if found["reached"]:
-        console.out.print(f"error {_accuracy(found)}", markup=False, soft_wrap=True)
+    if figures["reached"]:
+        console.out.print(f"error {_accuracy(figures)}", markup=False, soft_wrap=True)
 
 
-def _accuracy(found: Any) -> str:
-    text = f"{found['error_mm']:.3g} mm by the calibration's model (at most {found['largest_error_mm']:.3g} mm)"
-    if found["nominal_error_mm"] is not None:
-        text += f"; nominal commands: {found['nominal_error_mm']:.3g} mm"
-    if found["radius_95_mm"] is not None:
-        text += f"; measured places lie within {found['radius_95_mm']:.3g} mm (95 %, median)"
+def _accuracy(accuracy: Any) -> str:
+    text = f"{accuracy['error_mm']:.3g} mm by the calibration's model (at most {accuracy['largest_error_mm']:.3g} mm)"
+    if accuracy["nominal_error_mm"] is not None:
+        text += f"; nominal commands: {accuracy['nominal_error_mm']:.3g} mm"
+    if accuracy["radius_95_mm"] is not None:
+        text += f"; measured places lie within {accuracy['radius_95_mm']:.3g} mm (95 %, median)"
     return text

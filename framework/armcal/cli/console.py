@@ -30,7 +30,7 @@ class Screen(Console):
 
     def print(self, *objects: Any, **more: Any) -> None:
         """As rich does; a table whose words and numbers would be cut is shown row by row."""
-        super().print(*(self._fitting(each) for each in objects), **more)
+        super().print(*(self._fitting(part) for part in objects), **more)
 
     def _fitting(self, shown_object: Any) -> Any:
         if not isinstance(shown_object, Table):

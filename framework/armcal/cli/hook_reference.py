@@ -121,11 +121,11 @@ def reference(specifications: Any = hooks) -> Reference:
     return Reference(register, kinds, observers)
 
 
-def missing(found: Reference) -> list[str]:
+def missing(reference: Reference) -> list[str]:
     """What a reader would not find explained: hooks and methods without a docstring, arguments without a word."""
     gaps = []
-    entries = [("", hook) for hook in (found.register, *(k.hook for k in found.kinds), *found.observers)]
-    for protocol in _protocols(found):
+    entries = [("", hook) for hook in (reference.register, *(k.hook for k in reference.kinds), *reference.observers)]
+    for protocol in _protocols(reference):
         gaps += [f"{protocol.name}: a docstring"] if not protocol.text else []
         entries += [(f"{protocol.name}.", method) for method in protocol.methods]
     for before, entry in entries:
@@ -134,11 +134,11 @@ def missing(found: Reference) -> list[str]:
     return gaps
 
 
-def idle_words(found: Reference) -> list[str]:
+def idle_words(reference: Reference) -> list[str]:
     """Words of the table above that explain no argument."""
     used = {
         argument.name
-        for protocol in _protocols(found)
+        for protocol in _protocols(reference)
         for method in protocol.methods
         for argument in method.arguments
         if argument.explained == WORDS.get(argument.name)
@@ -146,8 +146,8 @@ def idle_words(found: Reference) -> list[str]:
     return [word for word in WORDS if word not in used]
 
 
-def _protocols(found: Reference) -> list[ProtocolEntry]:
-    return [protocol for kind in found.kinds for protocol in (kind.protocol, *kind.beside)]
+def _protocols(reference: Reference) -> list[ProtocolEntry]:
+    return [protocol for kind in reference.kinds for protocol in (kind.protocol, *kind.beside)]
 
 
 def _protocol(target: str) -> ProtocolEntry:
@@ -185,10 +185,12 @@ def _shown(parameter: inspect.Parameter) -> str:
     return f"{parameter.name}: {parameter.annotation} = {default}"
 
 
-def _explained(parameter: inspect.Parameter, function: Callable[..., Any], told: Mapping[str, str], text: str) -> str:
+def _explained(
+    parameter: inspect.Parameter, function: Callable[..., Any], summaries: Mapping[str, str], text: str
+) -> str:
     """From its own docstring, the class's, the words above, or the docstring of its type."""
-    if parameter.name in told:
-        return told[parameter.name]
+    if parameter.name in summaries:
+        return summaries[parameter.name]
     if f"``{parameter.name}``" in text:
         return "see above."
     if parameter.name in WORDS:
@@ -228,7 +230,7 @@ def _sections(text: str) -> tuple[str, dict[str, dict[str, str]]]:
     return "\n".join(kept).strip(), sections
 
 
-def as_markdown(found: Reference) -> str:
+def as_markdown(reference: Reference) -> str:
     """The page ``docs/hooks.md``."""
     lines = [
         "# Hooks and kinds of component",
@@ -241,7 +243,7 @@ def as_markdown(found: Reference) -> str:
         "| Kind | Hook | Built as | Derives from, or must have |",
         "| --- | --- | --- | --- |",
     ]
-    for kind in found.kinds:
+    for kind in reference.kinds:
         row = (f"[{kind.kind}](#{kind.kind})", f"`{kind.hook.name}`")
         lines.append(f"| {' | '.join((*row, f'`{kind.built_as}`', f'`{kind.protocol.name}`'))} |")
     lines += [
@@ -249,11 +251,11 @@ def as_markdown(found: Reference) -> str:
         "`settings` are the component's own checked `Settings`, `joint_names` the commanded joints of its arm from",
     ]
     lines += ["the base, `arm_names` all arms' instance names, `link` the link of the bench.", ""]
-    lines += ["## Announcing a component", "", *_markdown(found.register)]
+    lines += ["## Announcing a component", "", *_markdown(reference.register)]
     lines += ["## Observers", "", "They are told what happens; what they return is ignored.", ""]
-    for hook in found.observers:
+    for hook in reference.observers:
         lines += [f"### `{hook.name}`", "", *_markdown(hook)]
-    for kind in found.kinds:
+    for kind in reference.kinds:
         lines += [f"## {kind.kind}", "", _marked(kind.hook.text), ""]
         lines += [f"Announced in `{kind.hook.call}`, built as `{kind.built_as}`.", ""]
         for protocol in (kind.protocol, *kind.beside):
@@ -294,16 +296,16 @@ def _marked(text: str) -> str:
     return text.replace("``", "`")
 
 
-def as_text(found: Reference) -> str:
+def as_text(reference: Reference) -> str:
     """For a terminal."""
     lines: list[str] = []
-    for kind in found.kinds:
+    for kind in reference.kinds:
         lines += [f"{kind.kind}: {kind.hook.name}", *_indented(kind.hook.text, 2)]
         lines += [f"  built as {kind.built_as}; {kind.protocol.name}:"]
         lines += [f"    {method.call}" for method in kind.protocol.methods]
         lines += [f"  may have {protocol.name}" for protocol in kind.beside] + [""]
     lines += ["observers:"]
-    for hook in found.observers:
+    for hook in reference.observers:
         lines += [f"  {hook.call}", *_indented(hook.text, 4)]
     return "\n".join(lines) + "\n"
 

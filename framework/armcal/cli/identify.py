@@ -59,8 +59,8 @@ def identify(
     known = identify_from(triangle, parameters)
     content = _content(experiment, ready, triangle, known)
     if minimal or prefer or most is not None or max_sd is not None:
-        found = minimal_set(triangle, parameters, preferred, most, np.inf if max_sd is None else max_sd)
-        content["minimal"] = _minimal_content(found)
+        minimal_parameters = minimal_set(triangle, parameters, preferred, most, np.inf if max_sd is None else max_sd)
+        content["minimal"] = _minimal_content(minimal_parameters)
     for text in ready.warnings:
         console.warn(text)
     console.result(content)
@@ -128,12 +128,12 @@ def _finite(number: float) -> float | None:
     return number if np.isfinite(number) else None
 
 
-def _minimal_content(found: MinimalSet) -> dict[str, Any]:
+def _minimal_content(minimal: MinimalSet) -> dict[str, Any]:
     return {
-        "kept": list(found.kept),
-        "redundant": [_dropped(dropped) for dropped in found.redundant],
-        "left_out": [_dropped(dropped) for dropped in found.left_out],
-        "sd_ordinary_sizes": {name: _finite(sd) for name, sd in found.deviations.items()},
+        "kept": list(minimal.kept),
+        "redundant": [_dropped(dropped) for dropped in minimal.redundant],
+        "left_out": [_dropped(dropped) for dropped in minimal.left_out],
+        "sd_ordinary_sizes": {name: _finite(sd) for name, sd in minimal.deviations.items()},
     }
 
 
@@ -159,11 +159,11 @@ def _show(console: Console, content: dict[str, Any]) -> None:
         )
     _show_undetermined(console, content)
     hardly = [
-        f"{each['text']}: sd {each['sd_ordinary_sizes'] or np.inf:.3g} typical scales"
-        for each in content["hardly_determined"]
+        f"{pair['text']}: sd {pair['sd_ordinary_sizes'] or np.inf:.3g} typical scales"
+        for pair in content["hardly_determined"]
     ]
     _section(console, "Hardly determined (worse than a typical scale of correction, by the declared noise):", hardly)
-    pairs = [f"{each['one']} and {each['other']} ({each['correlation']:+.3f})" for each in content["correlated"]]
+    pairs = [f"{pair['one']} and {pair['other']} ({pair['correlation']:+.3f})" for pair in content["correlated"]]
     _section(console, f"Correlated above {CORRELATED:g}:", pairs)
     if console.verbose:
         deviations = content["expected_sd"].items()
@@ -173,12 +173,13 @@ def _show(console: Console, content: dict[str, Any]) -> None:
 
 def _show_undetermined(console: Console, content: dict[str, Any]) -> None:
     for cause, words in CAUSES.items():
-        found = [
-            each["text"] + (f", held by the prior of {' and '.join(each['priors'])}" if each["priors"] else "")
-            for each in content["undetermined"]
-            if each["cause"] == cause
+        determined = [
+            combination["text"]
+            + (f", held by the prior of {' and '.join(combination['priors'])}" if combination["priors"] else "")
+            for combination in content["undetermined"]
+            if combination["cause"] == cause
         ]
-        _section(console, f"Undetermined, {words} ({len(found)}):", found)
+        _section(console, f"Undetermined, {words} ({len(determined)}):", determined)
     free = content["held_by_nothing"]
     if not content["undetermined"]:
         _line(console, "No combination is undetermined.", "green")
@@ -186,15 +187,18 @@ def _show_undetermined(console: Console, content: dict[str, Any]) -> None:
         _line(console, "Priors hold every undetermined combination: what they say of it is all that will be known.")
     else:
         _section(
-            console, f"Held by nothing, so that armcal run refuses ({len(free)}):", [each["text"] for each in free]
+            console,
+            f"Held by nothing, so that armcal run refuses ({len(free)}):",
+            [combination["text"] for combination in free],
         )
 
 
 def _show_minimal(console: Console, content: dict[str, Any]) -> None:
-    redundant = [each["text"] for each in content["redundant"]]
+    redundant = [combination["text"] for combination in content["redundant"]]
     _section(console, f"Not needed, the kept ones do the same ({len(redundant)}):", redundant)
     left_out = [
-        f"{each['name']} ({100 * each['effect_left']:.0f} % of its effect is its own)" for each in content["left_out"]
+        f"{combination['name']} ({100 * combination['effect_left']:.0f} % of its effect is its own)"
+        for combination in content["left_out"]
     ]
     _section(console, f"Left out as asked, though determined ({len(left_out)}):", left_out)
     within = sorted({name for name, sd in content["sd_ordinary_sizes"].items() if sd is None})

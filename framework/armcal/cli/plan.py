@@ -49,7 +49,7 @@ def plan(console: Console, config: Path, count: int, out: Path, overrides: tuple
     experiment = Experiment.load(config, (*overrides, *chosen), given["data"], registry)
     with console.progress() as progress:
         result = make_plan(experiment, count, given["candidates"], given["given"], given["calibration"], progress)
-    write_csv(out, result.dataset, experiment.request(measured=False).wanted)
+    write_csv(out, result.dataset, experiment.request(measured=False).channels)
     content = {**_content(experiment, result), "out": str(out), "seconds": time.perf_counter() - began}
     console.result(content)
     for text in experiment.warnings:

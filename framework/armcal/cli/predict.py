@@ -67,10 +67,10 @@ def predict(
             console.warn(f"how far {', '.join(unknown)} may be off is not known: no residual determines it.")
     if out.resolve() == poses.resolve():
         raise DataError("it is the file of poses itself.", where=Location(str(out)), hint="Give another --out.")
-    wanted = requested_channels(system.arms, loaded.readable, measured=False)
+    requested = requested_channels(system.arms, loaded.readable, measured=False)
     if not loaded.readable:
-        wanted = (*wanted, *_tool_channels(tuple(system.arms)))
-    shown = [channel for channel in wanted if channel.channel in channels]
+        requested = (*requested, *_tool_channels(tuple(system.arms)))
+    shown = [channel for channel in requested if channel.channel in channels]
     extra, medians = (_columns(plus_minus, shown), _medians(plus_minus, shown)) if plus_minus else ({}, {})
     write_csv(out, replace(commands, channels=channels, extra=extra), shown)
     _report(console, commands, out, recording, plus_minus, medians)
@@ -132,17 +132,17 @@ def _tool_channels(arms: Sequence[str]) -> Iterator[RequestedChannel]:
 def read_commands(registry: PluginRegistry, loaded: Calibration, poses: Path, columns: Sequence[str]) -> Dataset:
     """The commands. Measured columns, if there are any, are not read: every row gets its prediction."""
     arms = loaded.system.arms
-    wanted = requested_channels(arms, {}, measured=False)
+    requested = requested_channels(arms, {}, measured=False)
     reader_class = registry.find("reader", "csv").load()
-    named = {**_kept(loaded, poses, wanted), **_given(columns)}
+    named = {**_kept(loaded, poses, requested), **_given(columns)}
     reader = reader_class(reader_class.Settings(path=ConfigText(str(poses)), columns=named))
-    return noticed(reader.read(ReadRequest(arms, {}, wanted)))
+    return noticed(reader.read(ReadRequest(arms, {}, requested)))
 
 
-def _kept(loaded: Calibration, poses: Path, wanted: Sequence[RequestedChannel]) -> dict[str, str]:
+def _kept(loaded: Calibration, poses: Path, requested: Sequence[RequestedChannel]) -> dict[str, str]:
     """What the calibration's data called the columns that a prediction uses, as far as the file has them."""
     kept = loaded.record.prediction
-    used = {name for channel in wanted for name in channel.columns}
+    used = {name for channel in requested for name in channel.columns}
     try:
         with input_file(poses, _MOST_BYTES, "a CSV file") as file:
             line = file.readline(_LONGEST_HEADER).decode("utf-8-sig")
@@ -159,8 +159,8 @@ def _kept(loaded: Calibration, poses: Path, wanted: Sequence[RequestedChannel]) 
 
 def _given(columns: Sequence[str]) -> dict[str, str]:
     for text in columns:
-        name, found, own = text.partition("=")
-        if not (name.strip() and found and own.strip()):
+        name, equals, own = text.partition("=")
+        if not (name.strip() and equals and own.strip()):
             raise InputError(
                 f"found {text!r}, expected NAME=COLUMN.",
                 where=Location("--columns"),
@@ -207,7 +207,7 @@ def _medians(plus_minus: PlusMinus, shown: Sequence[RequestedChannel]) -> dict[s
     half = {
         column: to_unit(plus_minus.half_widths[c], unit) for c, (column, unit) in columns if c in plus_minus.half_widths
     }
-    return {column: float(np.nanmedian(each)) for column, each in half.items() if np.isfinite(each).any()}
+    return {column: float(np.nanmedian(widths)) for column, widths in half.items() if np.isfinite(widths).any()}
 
 
 def _texts(values: Array) -> tuple[str, ...]:

@@ -26,6 +26,6 @@ def simulate(console: Console, config: Path, out: Path, overrides: tuple[str, ..
     system = experiment.system
     request = SimulationRequest(system.arms, system.measurements, experiment.parameters, system.environment)
     dataset = experiment.simulator().simulate(request)
-    write_csv(out, dataset, experiment.request(measured=True).wanted)
+    write_csv(out, dataset, experiment.request(measured=True).channels)
     console.result({"records": len(dataset), "out": str(out)})
     console.out.print(f"{len(dataset)} records written: {out}", markup=False)

@@ -273,8 +273,8 @@ def _in_unit(
 ) -> tuple[str, str]:
     """The numbers in a customary unit if every one can be read back from it to the last bit, in SI otherwise."""
     written = [_exact(value, unit, convert(value)) for value in values]
-    found = [number for number in written if number is not None]
-    key, numbers = (f"{name}_{unit}", found) if len(found) == len(values) else (f"{name}_{si}", list(values))
+    stated = [number for number in written if number is not None]
+    key, numbers = (f"{name}_{unit}", stated) if len(stated) == len(values) else (f"{name}_{si}", list(values))
     return key, f"[{', '.join(map(_number, numbers))}]"
 
 

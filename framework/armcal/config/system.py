@@ -164,13 +164,13 @@ def build_component(
         )
     name = str(section["type"])
     try:
-        found = registry.find(kind, name)
+        registered = registry.find(kind, name)
     except PluginError as fault:
         raise PluginError(fault.message, where=source.where((*at, "type")), hint=fault.hint) from fault
-    component = found.load()
+    component = registered.load()
     settings_class = getattr(component, "Settings", None)
     if not (isinstance(settings_class, type) and issubclass(settings_class, Settings)):
-        raise _broken(found, "it has no class attribute Settings derived from armcal.Settings")
+        raise _broken(registered, "it has no class attribute Settings derived from armcal.Settings")
     stripped = {key: value for key, value in section.items() if key != "type"}
     settings = validate(settings_class, _with(source, at, stripped), at)
     try:
@@ -178,10 +178,10 @@ def build_component(
     except ArmcalError:
         raise
     except Exception as fault:  # a plugin may fail in any way; the user is told which and how
-        raise _broken(found, f"building it raised {type(fault).__name__}: {fault}") from fault
+        raise _broken(registered, f"building it raised {type(fault).__name__}: {fault}") from fault
     base = _BASES.get(kind, object)
     if not isinstance(built, base):
-        raise _broken(found, f"it does not derive from armcal.{base.__name__}")
+        raise _broken(registered, f"it does not derive from armcal.{base.__name__}")
     return built, {"type": name, **settings.to_config()}
 
 

@@ -50,7 +50,7 @@ class _Finding:
     path: tuple[Step, ...]
     branches: tuple[tuple[tuple[Step, ...], str], ...]
     kind: str
-    found: str
+    value: str
     expected: str
     mend: str
     message: str = ""
@@ -60,7 +60,7 @@ class _Finding:
         if self.message:
             return self.message
         end = "" if self.mend.endswith("?") else "."
-        return f"found {self.found}, expected {self.expected}: {self.mend}{end}"
+        return f"found {self.value}, expected {self.expected}: {self.mend}{end}"
 
 
 def validate(settings_class: type[S], source: ConfigSource, at: tuple[Step, ...] = ()) -> S:
@@ -148,7 +148,7 @@ def _explained(made: _Finding, error: Mapping[str, Any]) -> _Finding:
         tags = str(context.get("expected_tags"))
         text = f"the {context.get('discriminator')} {context.get('tag')!r}"
         mend = _nearest(context.get("tag"), tags)
-        return replace(made, found=text, expected=f"one of {tags}", mend=mend)
+        return replace(made, value=text, expected=f"one of {tags}", mend=mend)
     if made.kind == "union_tag_not_found":
         key = str(context.get("discriminator")).strip("'")
         return replace(made, message=f"found nothing, expected the key {key!r}: write '{key}: ...'.")
@@ -156,8 +156,8 @@ def _explained(made: _Finding, error: Mapping[str, Any]) -> _Finding:
     return replace(made, expected=expected[:1].lower() + expected[1:], mend="correct it")
 
 
-def _nearest(found: Any, choices: str) -> str:
-    near = difflib.get_close_matches(str(found), [word.strip(" '") for word in choices.split(",")], n=1)
+def _nearest(value: Any, choices: str) -> str:
+    near = difflib.get_close_matches(str(value), [word.strip(" '") for word in choices.split(",")], n=1)
     return f"did you mean {near[0]}?" if near else "write one of these"
 
 

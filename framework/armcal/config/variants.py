@@ -90,7 +90,7 @@ def _by_path(node: Node | None, at: tuple[str, ...]) -> list[tuple[tuple[str, ..
     """The values of a mapping whose keys are dotted names."""
     if node is None or node.value is None:
         return []
-    found = []
+    variants = []
     for name, value in entries_of(node).items():
         steps = steps_of(str(name))
         if steps is None or steps[0] in ("extends", SECTION):
@@ -99,11 +99,11 @@ def _by_path(node: Node | None, at: tuple[str, ...]) -> list[tuple[tuple[str, ..
                 where=value.origin.at(value.line, at),
                 hint="Write for example parameters.bounds: none.",
             )
-        found.append((steps, value))
+        variants.append((steps, value))
     if not isinstance(node.value, dict):
         where = node.origin.at(node.line, at)
         raise ConfigError("expected dotted names with values.", where=where, hint="Write NAME: value lines below it.")
-    return found
+    return variants
 
 
 def _added(tree: Node, steps: tuple[str, ...], value: Node) -> Node:

@@ -145,14 +145,14 @@ class SerialPort:
             numbers = [port.serial_number for port in list_ports.comports() if os.path.realpath(port.device) == actual]
             return path, (numbers[0] or "") if numbers else ""
         ports = list_ports.comports()
-        found = [port.device for port in ports if port.serial_number == text]
-        if len(found) == 1:
-            return str(found[0]), str(text)
-        if not found and self._was_open:
+        devices = [port.device for port in ports if port.serial_number == text]
+        if len(devices) == 1:
+            return str(devices[0]), str(text)
+        if not devices and self._was_open:
             self._lose("no adapter with this serial number is plugged in")
         seen = ", ".join(f"{port.device} ({port.serial_number})" for port in ports if port.serial_number)
         raise DeviceRefusedError(
-            f"found {len(found)} adapters with this serial number, expected one.",
+            f"found {len(devices)} adapters with this serial number, expected one.",
             where=Location(self._settings.meant),
             hint=f"Plugged in are: {seen or 'none that tell a serial number'}.",
         )

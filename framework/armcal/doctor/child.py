@@ -47,10 +47,10 @@ def ask(probe: str, *arguments: str, longest_s: float = LONGEST_S) -> Mapping[st
 def answer(probe: str, arguments: list[str]) -> None:
     """The child's side: do it, and write what it gave as the last line."""
     try:
-        told = getattr(import_module("armcal.doctor.probes"), probe)(*arguments)
+        answer_content = getattr(import_module("armcal.doctor.probes"), probe)(*arguments)
     except BaseException as fault:  # a broken library may raise anything, or try to leave
-        told = {"fault": one_line(fault)}
-    sys.stdout.write(f"\n{_MARK}{json.dumps(told)}\n")
+        answer_content = {"fault": one_line(fault)}
+    sys.stdout.write(f"\n{_MARK}{json.dumps(answer_content)}\n")
     sys.stdout.flush()
 
 

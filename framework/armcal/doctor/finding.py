@@ -34,5 +34,5 @@ class Finding:
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON."""
-        told = {"section": self.section, "subject": self.subject, "state": self.state, "text": self.text}
-        return {**told, "hint": self.hint or None, **self.detail}
+        content = {"section": self.section, "subject": self.subject, "state": self.state, "text": self.text}
+        return {**content, "hint": self.hint or None, **self.detail}

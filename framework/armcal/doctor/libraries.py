@@ -26,16 +26,16 @@ def itself() -> Iterator[Finding]:
     version = platform.python_version()
     facts = {"version": version, "executable": sys.executable, "platform": platform.platform()}
     yield Finding("armcal", "Python", "ok", f"{version} ({sys.executable}), {platform.platform()}", detail=facts)
-    told = installed(DISTRIBUTION)
-    facts = {"version": __version__, "metadata": told or "", "path": where}
-    if told is None:
+    version_text = installed(DISTRIBUTION)
+    facts = {"version": __version__, "metadata": version_text or "", "path": where}
+    if version_text is None:
         text, hint = "it can be imported, but is not installed: no plugin is found", "Install it: pip install -e ."
         yield Finding("armcal", "armcal", "fault", f"{__version__} in {where}: {text}", hint, facts)
-    elif told != __version__:
-        text = f"{__version__} in {where}, but it was installed as {told}: plugins may be missing"
+    elif version_text != __version__:
+        text = f"{__version__} in {where}, but it was installed as {version_text}: plugins may be missing"
         yield Finding("armcal", "armcal", "warning", text, "Install it anew: pip install -e .", facts)
     else:
-        yield Finding("armcal", "armcal", "ok", f"{told}, in {where}", detail=facts)
+        yield Finding("armcal", "armcal", "ok", f"{version_text}, in {where}", detail=facts)
 
 
 def library(requirement: Requirement, ask: Ask) -> Finding:
@@ -45,19 +45,19 @@ def library(requirement: Requirement, ask: Ask) -> Finding:
     facts = {"version": version, "range": requirement.range, "needed": purpose.needed, **content}
     pip = f"pip install '{requirement.name}{requirement.range}'."
 
-    def found(state: State, text: str, hint: str = "") -> Finding:
+    def finding(state: State, text: str, hint: str = "") -> Finding:
         return Finding("libraries", requirement.name, state, text, hint, facts)
 
     broken: State = "fault" if purpose.needed else "warning"
     if "fault" in content:
         if version is None:
-            return found(broken, f"not installed: {purpose.lost}", f"Install it: {pip}")
+            return finding(broken, f"not installed: {purpose.lost}", f"Install it: {pip}")
         text = f"{version} does not load{_origin(purpose.module)} ({content['fault']}): {purpose.lost}"
-        return found(broken, text, f"{_ANEW} '{requirement.name}{requirement.range}'.")
+        return finding(broken, text, f"{_ANEW} '{requirement.name}{requirement.range}'.")
     shown = f"{version or 'of no known version'}, loads in {content['import_s']:.2f} s"
     if version and not requirement.admits(version):
-        return found("warning", f"{shown}, but armcal asks for {requirement.range}", f"Change it: {pip}")
-    return found("ok", shown)
+        return finding("warning", f"{shown}, but armcal asks for {requirement.range}", f"Change it: {pip}")
+    return finding("ok", shown)
 
 
 def _origin(module: str) -> str:

@@ -49,11 +49,11 @@ def serial_ports() -> Iterator[Finding]:
         ports = {port.device: port for port in list_ports.comports()}
     except Exception:  # pyserial may be broken in any way; what the files tell is told all the same
         ports = {}
-    found = sorted({*ports, *_files(_SERIAL_NAMES)})
-    if not found:
+    serial = sorted({*ports, *_files(_SERIAL_NAMES)})
+    if not serial:
         text = "none; servo boards are the only thing that needs one"
         yield Finding("bench", "serial ports", "note", text)
-    for path in found:
+    for path in serial:
         number = getattr(ports.get(path), "serial_number", None)
         yield _device(path, "serial port", f"serial number {number}" if number else "")
 

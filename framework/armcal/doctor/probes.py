@@ -51,14 +51,14 @@ def components() -> dict[str, Any]:
     from armcal.plugins import discover
 
     registry = discover()
-    told = []
+    lines = []
     for plugin in registry.plugins:
         own = registry.announced_by(plugin)
         broken = [{"kind": c.kind, "name": c.name, "fault": fault} for c in own if (fault := _fault_of(c))]
         origin = f"{plugin.distribution} {plugin.version}".strip()
         facts = {"name": plugin.name, "module": plugin.module, "distribution": origin, "fault": plugin.fault or None}
-        told.append({**facts, "components": len(own), "broken": broken})
-    return {"plugins": told}
+        lines.append({**facts, "components": len(own), "broken": broken})
+    return {"plugins": lines}
 
 
 def _fault_of(component: Component) -> str:
@@ -80,9 +80,9 @@ def ipopt() -> dict[str, Any]:
     x, y = ca.SX.sym("x"), ca.SX.sym("y")
     options: Any = {"print_time": False, "ipopt": {"print_level": 0, "sb": "yes"}}
     solver = ca.nlpsol("doctor", "ipopt", {"x": ca.vertcat(x, y), "f": (x - 1) ** 2 + (y - x**2) ** 2}, options)
-    found = [float(v) for v in solver(x0=[0.0, 0.0], lbx=[-2, -2], ubx=[2, 2])["x"].full().ravel()]
-    if not solver.stats()["success"] or max(abs(v - 1.0) for v in found) > 1e-6:
-        raise ArithmeticError(f"IPOPT found {found} ({solver.stats()['return_status']}), expected [1, 1]")
+    solution = [float(v) for v in solver(x0=[0.0, 0.0], lbx=[-2, -2], ubx=[2, 2])["x"].full().ravel()]
+    if not solver.stats()["success"] or max(abs(v - 1.0) for v in solution) > 1e-6:
+        raise ArithmeticError(f"IPOPT found {solution} ({solver.stats()['return_status']}), expected [1, 1]")
     return {"version": str(ca.CasadiMeta.version())}
 
 
@@ -100,13 +100,13 @@ def convex() -> dict[str, Any]:
         right = problem.value is not None and abs(float(problem.value) - 3.0) < 1e-3
         return "" if right else f"it found {problem.value}, expected 3"
 
-    told: dict[str, str] = {}
+    states: dict[str, str] = {}
     for name in dict.fromkeys(["CLARABEL", *sorted(cp.installed_solvers())]):
         try:
-            told[name] = _nearest_semidefinite() if name == "CLARABEL" else least_sum(name)
+            states[name] = _nearest_semidefinite() if name == "CLARABEL" else least_sum(name)
         except Exception as fault:  # each solver has its own way of failing
-            told[name] = " ".join(f"{type(fault).__name__}: {fault}".split())[:160]
-    return {"solvers": told}
+            states[name] = " ".join(f"{type(fault).__name__}: {fault}".split())[:160]
+    return {"solvers": states}
 
 
 def _nearest_semidefinite() -> str:
@@ -127,9 +127,9 @@ def kalman() -> dict[str, Any]:
 
     filtered = ExtendedKalmanFilter(dim_x=1, dim_z=1)
     filtered.update(np.ones((1, 1)), lambda x: np.ones((1, 1)), lambda x: x)
-    found = float(filtered.x[0, 0])
-    if not abs(found - 0.5) < 1e-12:
-        raise ArithmeticError(f"filterpy found {found}, expected 0.5")
+    mean = float(filtered.x[0, 0])
+    if not abs(mean - 0.5) < 1e-12:
+        raise ArithmeticError(f"filterpy found {mean}, expected 0.5")
     return {}
 
 
@@ -153,8 +153,8 @@ def calibration() -> dict[str, Any]:
         result = calibrate(experiment, "armcal doctor")
         outputs.write(result, experiment, place / "run", render)
         record = Calibration.load(place / "run" / "calibration.yaml").record
-        found = [p.value for p in record.parameters if p.free]
-    off = max(abs(a - b) for a, b in zip(found, TRUE_LENGTHS_M, strict=True))
+        values = [p.value for p in record.parameters if p.free]
+    off = max(abs(a - b) for a, b in zip(values, TRUE_LENGTHS_M, strict=True))
     if not result.estimate.verdict.converged or not off < _NEAR_M:
         raise ArithmeticError(f"the lengths found are off by {off * 1000:.3g} mm")
     return {"off_mm": round(off * 1000, 4)}

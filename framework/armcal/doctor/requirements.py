@@ -63,9 +63,9 @@ def _admits(clause: str, version: str) -> bool:
     match = _CLAUSE.match(clause)
     if match is None:
         return True
-    found, wanted = _release(version), _release(match[2])
-    order = _compared(found, wanted)
-    same_series = found[: len(wanted) - 1] == wanted[:-1]
+    installed, required = _release(version), _release(match[2])
+    order = _compared(installed, required)
+    same_series = installed[: len(required) - 1] == required[:-1]
     return {
         ">=": order >= 0,
         "<=": order <= 0,

@@ -25,7 +25,7 @@ _NUMBER_AND_UNIT = re.compile(r"\s*[+-]?[0-9]*[.,]?[0-9]+\s*[^\W\d][\w/^]*\s*")
 class CellFault:
     """A cell that holds no number: what was found, and how to mend it; sentences."""
 
-    found: str
+    text: str
     hint: str
 
 

@@ -20,8 +20,8 @@ from armcal.errors import ArmcalError, InputError, Location
 
 T = TypeVar("T")
 R = TypeVar("R")
-Told = Callable[[float], None]
-"""Told which fraction of the work is done."""
+Report = Callable[[float], None]
+"""Takes which fraction of the work is done."""
 
 WORTH_WORKERS_S = 6.0
 """Starting worker processes takes a second or two: not worth it for less work than this."""
@@ -31,14 +31,14 @@ _OPTION = Location("--parallel")
 _FORMS = "a number of processes, loky:N, threading:N, dask:ADDRESS, ray or ray:ADDRESS"
 
 
-def untold(fraction: float) -> None:
+def unreported(fraction: float) -> None:
     """Tells nobody."""
 
 
 class Executor(Protocol):
     """Does independent pieces of work."""
 
-    def map(self, work: Callable[[T], R], tasks: Sequence[T], told: Told = untold) -> list[R]:
+    def map(self, work: Callable[[T], R], tasks: Sequence[T], report: Report = unreported) -> list[R]:
         """``work`` of each task, in order; the first exception of any ends it and is raised as it was."""
 
 
@@ -46,13 +46,13 @@ class Executor(Protocol):
 class Sequential:
     """One after another in this process."""
 
-    def map(self, work: Callable[[T], R], tasks: Sequence[T], told: Told = untold) -> list[R]:
+    def map(self, work: Callable[[T], R], tasks: Sequence[T], report: Report = unreported) -> list[R]:
         """As the protocol says."""
         results = []
         for number, task in enumerate(tasks):
-            told(number / len(tasks))
+            report(number / len(tasks))
             results.append(work(task))
-        told(1.0)
+        report(1.0)
         return results
 
 
@@ -62,20 +62,20 @@ class Automatic:
 
     worth_s: float = WORTH_WORKERS_S
 
-    def map(self, work: Callable[[T], R], tasks: Sequence[T], told: Told = untold) -> list[R]:
+    def map(self, work: Callable[[T], R], tasks: Sequence[T], report: Report = unreported) -> list[R]:
         """As the protocol says."""
         results: list[R] = []
         began = time.perf_counter()
         for number, task in enumerate(tasks):
-            told(number / len(tasks))
+            report(number / len(tasks))
             spent = time.perf_counter() - began
             left = len(tasks) - number
             worth_it = number and left > 1 and spent / number * left > self.worth_s
             if worth_it and _picklable((work, task)):
-                rest = partial(_told_of_rest, told, number / len(tasks))
+                rest = partial(_report_rest, report, number / len(tasks))
                 return results + Workers().map(work, tasks[number:], rest)
             results.append(work(task))
-        told(1.0)
+        report(1.0)
         return results
 
 
@@ -93,7 +93,7 @@ class Workers:
     count: int | None = None
     address: str = ""
 
-    def map(self, work: Callable[[T], R], tasks: Sequence[T], told: Told = untold) -> list[R]:
+    def map(self, work: Callable[[T], R], tasks: Sequence[T], report: Report = unreported) -> list[R]:
         """As the protocol says.
 
         Raises:
@@ -113,12 +113,12 @@ class Workers:
         results: list[R] = []
         try:
             with self._configured():
-                told(0.0)
+                report(0.0)
                 # One at a time: a batch might hold all the long ones.
                 at_work = joblib.Parallel(return_as="generator", batch_size=1)
                 for result in at_work(joblib.delayed(work)(task) for task in tasks):
                     results.append(result)
-                    told(len(results) / len(tasks))
+                    report(len(results) / len(tasks))
         except BrokenProcessPool as fault:
             text = f"a worker process ended without an answer ({str(fault).splitlines()[0]})"
             raise ArmcalError(text, where=_OPTION, hint="If memory was short, take fewer processes.") from fault
@@ -159,8 +159,8 @@ def _safe_path() -> Iterator[None]:
             os.environ[_SAFE_PATH] = before
 
 
-def _told_of_rest(told: Told, before: float, done: float) -> None:
-    told(before + (1 - before) * done)
+def _report_rest(report: Report, before: float, done: float) -> None:
+    report(before + (1 - before) * done)
 
 
 def parse_executor(text: str) -> Executor:

@@ -39,13 +39,13 @@ def input_file(
     except (OSError, ValueError) as fault:
         message, hint = f"it cannot be read ({getattr(fault, 'strerror', None) or fault}).", "Check its permissions."
         raise refusal(message, where=where, hint=hint) from fault
-    found = os.fstat(descriptor)
+    status = os.fstat(descriptor)
     message = hint = ""
-    if S_ISDIR(found.st_mode):
+    if S_ISDIR(status.st_mode):
         message, hint = f"it is a directory, expected {expected}.", "Give the path of the file itself."
-    elif not S_ISREG(found.st_mode):
+    elif not S_ISREG(status.st_mode):
         message, hint = f"it is a device or pipe, expected {expected}.", "Save what it gives to a file, and give that."
-    elif found.st_size > most:
+    elif status.st_size > most:
         message, hint = f"it is larger than {size_text(most)}, expected {expected}.", "Check the path, or split it."
     if message:
         os.close(descriptor)

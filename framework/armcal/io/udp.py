@@ -51,8 +51,8 @@ def listening(host: str, port: int, senders: Sequence[str]) -> tuple[socket.sock
 
 def _plain(address: str) -> IPv4Address | IPv6Address:
     """An address, without a zone; one of IPv4 as that even where it came by IPv6."""
-    found = ip_address(address.partition("%")[0])
-    return getattr(found, "ipv4_mapped", None) or found
+    ip = ip_address(address.partition("%")[0])
+    return getattr(ip, "ipv4_mapped", None) or ip
 
 
 def _addresses(senders: Sequence[str]) -> frozenset[IPv4Address | IPv6Address]:
@@ -61,15 +61,15 @@ def _addresses(senders: Sequence[str]) -> frozenset[IPv4Address | IPv6Address]:
     Raises:
         InputError: one has none.
     """
-    found = set()
+    addresses = set()
     for name in senders:
         try:
             known = socket.getaddrinfo(name.strip("[] "), None, type=socket.SOCK_DGRAM)
         except (OSError, UnicodeError) as fault:
             message = f"the sender {name!r} has no address ({fault})."
             raise InputError(message, where=Location("?from="), hint="Give its IP address.") from fault
-        found |= {_plain(str(each[4][0])) for each in known}
-    return frozenset(found)
+        addresses |= {_plain(str(entry[4][0])) for entry in known}
+    return frozenset(addresses)
 
 
 def bound(host: str, port: int) -> socket.socket:
@@ -81,14 +81,14 @@ def bound(host: str, port: int) -> socket.socket:
     where = Location(f"udp:{host}:{port}")
     try:
         kind, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM, flags=socket.AI_PASSIVE)[0]
-        found = socket.socket(kind, socket.SOCK_DGRAM)
+        bound_socket = socket.socket(kind, socket.SOCK_DGRAM)
         try:
-            found.bind(address)
+            bound_socket.bind(address)
         except OSError:
-            found.close()
+            bound_socket.close()
             raise
     except (OSError, UnicodeError) as fault:
         hint = "Give a free port, and an address of this machine."
         raise InputError(f"the socket cannot be opened ({fault}).", where=where, hint=hint) from fault
-    found.setblocking(False)
-    return found
+    bound_socket.setblocking(False)
+    return bound_socket

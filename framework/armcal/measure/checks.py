@@ -83,19 +83,19 @@ def refuse_joint_count(names: Sequence[str], requested_channels: Sequence[Reques
     for arm, joints in joints_by_arm(requested_channels).items():
         own = {name for joint in joints for name in joint.columns}
         prefixes = {name.rstrip(_DIGITS) for name in own if name[-1:].isdigit()} - {""}
-        found: dict[str, str] = {}
+        owners: dict[str, str] = {}
         for name in names:
             stem, unit = split_suffix(name) or (name, None)
             is_numbered = stem[-1:].isdigit() and stem.rstrip(_DIGITS) in prefixes
             is_motion = unit is not None and unit.dimension in ("angle", "length")
             if stem in own or (is_numbered and is_motion):
-                found[stem] = name
-        if found and len(found) != len(joints):
-            missing = [joint.columns[-1] for joint in joints if found.keys().isdisjoint(joint.columns)]
-            beyond = [name for stem, name in found.items() if stem not in own]
+                owners[stem] = name
+        if owners and len(owners) != len(joints):
+            missing = [joint.columns[-1] for joint in joints if owners.keys().isdisjoint(joint.columns)]
+            beyond = [name for stem, name in owners.items() if stem not in own]
             raise DataError(
-                f"the file has {len(found)} joint columns, the arm has {len(joints)} (arm {arm}; "
-                f"{'missing' if missing else 'not its own'}: {', '.join(missing or beyond or found.values())}).",
+                f"the file has {len(owners)} joint columns, the arm has {len(joints)} (arm {arm}; "
+                f"{'missing' if missing else 'not its own'}: {', '.join(missing or beyond or owners.values())}).",
                 where=replace(where, field=next(iter(missing or beyond), None)),
                 hint="Use this arm's file, or add or remove columns; one that is no joint needs another name.",
             )
@@ -313,5 +313,5 @@ def _first_alike(dataset: Dataset, channels: Sequence[str]) -> NDArray[np.intp]:
     table[np.isnan(table)] = np.nan  # and so are all that are missing
     data, step = table.tobytes(), table.itemsize * table.shape[1]
     first: dict[bytes, int] = {}
-    found = (first.setdefault(data[i * step : (i + 1) * step], i) for i in range(len(dataset)))
-    return np.fromiter(found, dtype=np.intp, count=len(dataset))
+    firsts = (first.setdefault(data[i * step : (i + 1) * step], i) for i in range(len(dataset)))
+    return np.fromiter(firsts, dtype=np.intp, count=len(dataset))

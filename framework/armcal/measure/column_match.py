@@ -80,7 +80,7 @@ def renamed(header: Header, columns: Mapping[str, str]) -> Header:
         DataError: a column that the mapping names is not there, or two columns go by one name.
     """
     names = [column.name for column in header.columns]
-    wanted = {own: name for name, own in columns.items()}
+    by_column = {own: name for name, own in columns.items()}
     for name, own in columns.items():
         if own not in names:
             header.refuse(
@@ -88,9 +88,9 @@ def renamed(header: Header, columns: Mapping[str, str]) -> Header:
                 "Correct it under columns in the data section.",
                 own,
             )
-        if wanted[own] != name:
-            header.refuse(f"{own} is mapped to both {name} and {wanted[own]}.", "Give each its own column.", own)
-    known = tuple(replace(c, known_as=wanted.get(c.name, c.name)) for c in header.columns)
+        if by_column[own] != name:
+            header.refuse(f"{own} is mapped to both {name} and {by_column[own]}.", "Give each its own column.", own)
+    known = tuple(replace(c, known_as=by_column.get(c.name, c.name)) for c in header.columns)
     seen: dict[str, Column] = {}
     for column in known:
         other = seen.setdefault(column.known_as, column)
@@ -113,11 +113,11 @@ def match_columns(header: Header, requested_channels: Sequence[RequestedChannel]
     channels: dict[str, tuple[Column, str]] = {}
     claimed: dict[str, str] = {}
     for w in requested_channels:
-        found = [(by_name[name], unit) for name, unit in spellings(w).items() if name in by_name]
-        if len(found) > 1:
-            both = " and ".join(column.name for column, _ in found)
-            header.refuse(f"found both {both}, expected one column for {w.channel}.", "Remove one.", found[1][0].name)
-        for column, unit in found:
+        matches = [(by_name[name], unit) for name, unit in spellings(w).items() if name in by_name]
+        if len(matches) > 1:
+            both = " and ".join(column.name for column, _ in matches)
+            header.refuse(f"found both {both}, expected one column for {w.channel}.", "Remove one.", matches[1][0].name)
+        for column, unit in matches:
             other = claimed.setdefault(column.known_as, w.channel)
             if other != w.channel:
                 hint = f"Name two columns, beginning with {w.columns[0]} and {other}."

@@ -86,13 +86,13 @@ def column_names(
         ValueError: a unit is not one of its dimension.
     """
     taken = [name for w in requested_channels for name in set(w.columns)]
-    found = {}
+    columns = {}
     for w in requested_channels:
         own = [name for name in w.columns if taken.count(name) == 1] or [w.columns[0]]
         unit = _unit(w.dimension, units)
         name = min(own, key=len)
-        found[w.channel] = (name if unit == "1" else f"{name}_{unit}", unit)
-    return found
+        columns[w.channel] = (name if unit == "1" else f"{name}_{unit}", unit)
+    return columns
 
 
 def _unit(dimension: str, units: Mapping[str, str]) -> str:

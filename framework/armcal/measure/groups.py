@@ -47,13 +47,13 @@ def groups_of(dataset: Dataset, measurements: Mapping[str, Measurement]) -> dict
         DataError: a label is missing, or unfit for a name.
         ConfigError: a measurement uses the groups of one that has no such groups.
     """
-    found: dict[str, set[str]] = {}
+    groups: dict[str, set[str]] = {}
     for instance, measurement in measurements.items():
         if isinstance(measurement, GroupedMeasurement):
             _check_owner(instance, measurement, measurements)
             keys = {key for key in record_keys(dataset, measurement) if key}
-            found.setdefault(owner_of(instance, measurement), set()).update(keys)
-    return {owner: tuple(sorted(keys)) for owner, keys in found.items()}
+            groups.setdefault(owner_of(instance, measurement), set()).update(keys)
+    return {owner: tuple(sorted(keys)) for owner, keys in groups.items()}
 
 
 def unmatched(measurements: Mapping[str, Measurement], groups: Groups) -> list[str]:
@@ -182,7 +182,7 @@ def _check_owner(instance: str, measurement: GroupedMeasurement, measurements: M
             f"{instance} uses the groups of {name!r}, which is no measurement with groups of its own.",
             hint=f"Those are {', '.join(others) or 'none'}.",
         )
-    mine, theirs = ([b.name for b in each.group_parameters("")] for each in (measurement, owner))
+    mine, theirs = ([b.name for b in part.group_parameters("")] for part in (measurement, owner))
     if mine != theirs or len(measurement.group_labels) != len(owner.group_labels):
         raise ConfigError(
             f"{instance} uses the groups of {name}, which are of another kind.",

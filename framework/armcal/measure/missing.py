@@ -38,12 +38,12 @@ def set_aside_not_finite(dataset: Dataset, layout: Layout) -> Dataset:
 
 def _complete(dataset: Dataset, layout: Layout) -> dict[str, Mask]:
     """Of each measurement whether a record has all it needs (N)."""
-    found: dict[str, Mask] = {}
+    masks: dict[str, Mask] = {}
     for channel, parts in layout.parts.items():
         known = np.isfinite(dataset.column(channel))
         for part in parts:
-            found[part] = found[part] & known if part in found else known
-    return found
+            masks[part] = masks[part] & known if part in masks else known
+    return masks
 
 
 def _reason(dataset: Dataset, layout: Layout, index: int) -> str:
@@ -90,12 +90,12 @@ def _with_deviations(dataset: Dataset, layout: Layout, channel: str) -> Dataset:
         return replace(dataset, channels=others)
     largest = float(values[~missing].max())
     filled: Array = np.where(missing, largest, values)
-    found = replace(dataset, channels={name: others.get(name, filled) for name in dataset.channels})
+    completed = replace(dataset, channels={name: others.get(name, filled) for name in dataset.channels})
     part = channel.rpartition(".")[0]
     if any(name.rpartition(".")[0] == part for name in layout.measured):
-        return found
+        return completed
     text = f"{layout.column(channel)} is empty in {int(missing.sum())} of {len(dataset)} records: if {part} was made "
-    return warned(found, f"{text}there, the largest one stated counts ({layout.shown(channel, largest)}).")
+    return warned(completed, f"{text}there, the largest one stated counts ({layout.shown(channel, largest)}).")
 
 
 def with_absent(dataset: Dataset, requested_channels: Sequence[RequestedChannel]) -> Dataset:

@@ -35,22 +35,22 @@ def with_partners(dataset: Dataset, measurements: Mapping[str, Measurement]) -> 
     Raises:
         DataError: a record names one that is not there, or itself.
     """
-    found: dict[str, Array] = {}
+    channels: dict[str, Array] = {}
     for measurement in measurements.values():
         if isinstance(measurement, PairedMeasurement):
             partners = _partners(dataset, measurement.partner_label)
             arms = [name.removesuffix(OTHER) for name in measurement.arms if name.endswith(OTHER)]
             for channel, values in dataset.channels.items():
                 if channel.partition(".")[0] in arms and not channel.endswith(OTHER):
-                    found[channel + OTHER] = np.where(partners >= 0, values[np.maximum(partners, 0)], np.nan)
-    return replace(dataset, channels={**dataset.channels, **found}) if found else dataset
+                    channels[channel + OTHER] = np.where(partners >= 0, values[np.maximum(partners, 0)], np.nan)
+    return replace(dataset, channels={**dataset.channels, **channels}) if channels else dataset
 
 
 def _partners(dataset: Dataset, label: str) -> Array:
     """Of each record the place of the one it names (N); -1 where it names none."""
     named = dataset.extra.get(label, ("",) * len(dataset))
     place = {name: i for i, name in enumerate(dataset.ids)}
-    found = np.full(len(dataset), -1)
+    partners = np.full(len(dataset), -1)
     for i, name in enumerate(cell.strip() for cell in named):
         if not name:
             continue
@@ -60,5 +60,5 @@ def _partners(dataset: Dataset, label: str) -> Array:
                 where=Location(dataset.source or None, row=dataset.rows[i] if dataset.rows else i + 1, field=label),
                 hint="Correct it, or leave it empty; the other record may have been set aside.",
             )
-        found[i] = place[name]
-    return found
+        partners[i] = place[name]
+    return partners

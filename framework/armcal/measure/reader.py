@@ -49,7 +49,7 @@ class ReadRequest:
 
     arms: Mapping[str, Arm]
     measurements: Mapping[str, Measurement]
-    wanted: tuple[RequestedChannel, ...]
+    channels: tuple[RequestedChannel, ...]
 
 
 class Reader(Protocol):
@@ -112,15 +112,15 @@ def requested_channels(
 
     ``measured`` says whether measured values are required (a calibration) or may be absent (a prediction).
     """
-    wanted: list[RequestedChannel] = []
+    requested: list[RequestedChannel] = []
     for arm in arms.values():
         parts = tuple(name for name, measurement in measurements.items() if arm.name in measurement.arms)
-        wanted += _arm_channels(arm, len(arms) == 1, parts)
+        requested += _arm_channels(arm, len(arms) == 1, parts)
     read: dict[str, list[str]] = {}
     for arm in arms.values():
         for effect, condition in arm.declared:
             read.setdefault(condition.name, []).append(f"{arm.name}.{effect}")
-    wanted += [
+    requested += [
         RequestedChannel(name, (name,), dimension, measured and name in read, effects=tuple(read.get(name, ())))
         for name, dimension in surroundings(arms).items()
     ]
@@ -129,8 +129,8 @@ def requested_channels(
         for channel in measurement.channels():
             own = f"{instance}.{channel.name}"
             names = (own, channel.name) if local.count(channel.name) == 1 else (own,)
-            wanted.append(RequestedChannel(own, names, channel.dimension, measured, parts=(instance,)))
-    return (*wanted, *_deviations(measurements)) if measured else tuple(wanted)
+            requested.append(RequestedChannel(own, names, channel.dimension, measured, parts=(instance,)))
+    return (*requested, *_deviations(measurements)) if measured else tuple(requested)
 
 
 def _deviations(measurements: Mapping[str, Measurement]) -> Iterator[RequestedChannel]:

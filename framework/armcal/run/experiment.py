@@ -131,7 +131,7 @@ class Experiment:
                 where=self.source.where(("statics", "payload")),
                 hint="State what hung on the tool beyond the links: payload_g, 0 if nothing, or a column payload_g.",
             )
-        require_conditions(dataset, request.wanted)
+        require_conditions(dataset, request.channels)
         dataset = warn_beyond_limits(noticed(dataset), self.system.arms)
         if not dataset.has("gravity_z"):
             return dataset

@@ -62,7 +62,7 @@ class _Line:
             return None
         cell = read_cell(text)
         if isinstance(cell, CellFault):
-            self.refuse(key, cell.found, "Correct it.")
+            self.refuse(key, cell.text, "Correct it.")
         if not math.isfinite(cell):
             self.refuse(key, f"found {text!r}, expected a number.", "Correct it.")
         value = from_unit(cell, unit.name)
@@ -72,10 +72,10 @@ class _Line:
 
     def required(self, stem: str, dimension: str) -> float:
         """A number that has to be there."""
-        found = self.number(stem, dimension)
-        if found is None:
+        number = self.number(stem, dimension)
+        if number is None:
             self.refuse((stem, dimension), "found nothing, expected a number.", "Write 0 for none.")
-        return found
+        return number
 
     def text(self, stems: tuple[str, ...]) -> str:
         """A text, from the first column of several that is there; empty if none is."""
@@ -106,8 +106,8 @@ def _text(path: Path) -> str:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError as fault:
         line = content.count(b"\n", 0, fault.start) + 1
-        found = f"found the byte 0x{content[fault.start]:02x}, which is not UTF-8 text."
-        raise DataError(found, where=Location(str(path), line=line), hint=_AS_TEXT) from fault
+        reason = f"found the byte 0x{content[fault.start]:02x}, which is not UTF-8 text."
+        raise DataError(reason, where=Location(str(path), line=line), hint=_AS_TEXT) from fault
     if "\0" in text:
         line = text.count("\n", 0, text.index("\0")) + 1
         raise DataError("found a NUL byte, expected text.", where=Location(str(path), line=line), hint=_AS_TEXT)

@@ -33,9 +33,9 @@ def choose_free(experiment: Experiment, robot: Robot) -> FreeChoice:
     preferred = [
         [name for name in free if any(fnmatch.fnmatchcase(name, glob) for glob in globs)] for globs in robot.preferred
     ]
-    found = minimal_set(triangle, parameters, preferred, most_uncertain=MOST_UNCERTAIN)
+    minimal = minimal_set(triangle, parameters, preferred, most_uncertain=MOST_UNCERTAIN)
     return FreeChoice(
-        found.kept,
-        tuple(dropped.name for dropped in found.redundant),
-        tuple(dropped.name for dropped in found.left_out),
+        minimal.kept,
+        tuple(dropped.name for dropped in minimal.redundant),
+        tuple(dropped.name for dropped in minimal.left_out),
     )

@@ -126,13 +126,13 @@ def _reach(experiment: Experiment, robot: Robot) -> float:
     system = experiment.system
     request = SimulationRequest(system.arms, system.measurements, experiment.parameters, system.environment)
     exact = measured_without_noise(request, poses)
-    found = truth.reach(np.array([exact[f"tracker.{axis}"] for axis in "xyz"]))
-    if not found > _SMALLEST_REACH_M:
+    reach = truth.reach(np.array([exact[f"tracker.{axis}"] for axis in "xyz"]))
+    if not reach > _SMALLEST_REACH_M:
         raise InputError(
-            f"in all poses the tip stays within {1000 * found:.3g} mm.",
+            f"in all poses the tip stays within {1000 * reach:.3g} mm.",
             hint="Check the lengths a and d and their units.",
         )
-    return found
+    return reach
 
 
 def _simulate(place: Path, registry: PluginRegistry) -> None:
@@ -140,4 +140,4 @@ def _simulate(place: Path, registry: PluginRegistry) -> None:
     system = experiment.system
     request = SimulationRequest(system.arms, system.measurements, experiment.parameters, system.environment)
     dataset = experiment.simulator().simulate(request)
-    write_csv(place / RECORDS, dataset, experiment.request(measured=True).wanted)
+    write_csv(place / RECORDS, dataset, experiment.request(measured=True).channels)

@@ -48,11 +48,11 @@ def made_up(parameters: Parameters, load_Nm: float) -> dict[str, float]:
 
 def as_text(parameters: Parameters, values: Mapping[str, float]) -> dict[str, str]:
     """Values with their units, as people write them."""
-    found = {}
+    lines = {}
     for name, value in values.items():
         unit = _SHOWN[parameters[name].unit]
-        found[name] = f"{number(float(f'{to_unit(value, unit):.6g}'))} {_WRITTEN.get(unit, unit)}"
-    return found
+        lines[name] = f"{number(float(f'{to_unit(value, unit):.6g}'))} {_WRITTEN.get(unit, unit)}"
+    return lines
 
 
 def _true(block: ParameterBlock, load_Nm: float, random: np.random.Generator) -> float:

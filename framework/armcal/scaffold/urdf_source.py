@@ -84,8 +84,8 @@ def _preferred(joints: tuple[RobotJoint, ...]) -> tuple[tuple[str, ...], ...]:
 
 def _priors(joints: tuple[RobotJoint, ...]) -> dict[str, str]:
     """How far each joint's origin may be off the URDF; where the arm stands before the tracker has none."""
-    found = {}
+    priors = {}
     for joint in joints:
-        found[f"arm.urdf.{joint.name}_[xyz]"] = "10 mm"
-        found[f"arm.urdf.{joint.name}_[rpy][oia]*"] = "2 deg"
-    return found
+        priors[f"arm.urdf.{joint.name}_[xyz]"] = "10 mm"
+        priors[f"arm.urdf.{joint.name}_[rpy][oia]*"] = "2 deg"
+    return priors

@@ -52,11 +52,11 @@ def assert_contract(component: type | str, kind: str, *, at_least: int | None = 
     results = check_made(kind, name, lambda: _loaded(component))
     faults = [f"  {result.check}: {result.fault}" for result in results if result.fault]
     left = [f"  {result.check}" for result in results if result.not_run]
-    ran, wanted = len(results) - len(left), KNOWN_CHECKS[kind] if at_least is None else at_least
+    ran, expected = len(results) - len(left), KNOWN_CHECKS[kind] if at_least is None else at_least
     if faults:
         raise AssertionError("\n".join([f"{kind} {name} breaks the plugin contract:", *faults]))
-    if ran < wanted:
-        raise AssertionError("\n".join([f"{kind} {name}: {ran} checks ran, expected at least {wanted}.", *left]))
+    if ran < expected:
+        raise AssertionError("\n".join([f"{kind} {name}: {ran} checks ran, expected at least {expected}.", *left]))
     return results
 
 

@@ -101,20 +101,22 @@ def _sets(device: Any) -> None:
     for joint, angle in zip(JOINTS, (0.2, -0.3), strict=True):
         device.energise(joint, angle)
     _at(device, dict(zip(JOINTS, (0.2, -0.3), strict=True)), "energise()")
-    asked = dict(zip(JOINTS, (-0.4, 0.5), strict=True))
-    device.command(asked)
-    _at(device, asked, "command()")
+    commands = dict(zip(JOINTS, (-0.4, 0.5), strict=True))
+    device.command(commands)
+    _at(device, commands, "command()")
 
 
-def _at(device: Any, asked: Mapping[str, float], after: str) -> None:
-    found, told = device.state().angles, device.standing(asked)
-    for joint, angle in asked.items():
-        expect(joint in found, f"found no angle of {joint} after {after}, expected {angle:g} rad")
-        for what, value in (("state()", found[joint]), ("standing()", told[joint])):
+def _at(device: Any, commands: Mapping[str, float], after: str) -> None:
+    angles, standing = device.state().angles, device.standing(commands)
+    for joint, angle in commands.items():
+        expect(joint in angles, f"found no angle of {joint} after {after}, expected {angle:g} rad")
+        for what, value in (("state()", angles[joint]), ("standing()", standing[joint])):
             off = abs(value - angle)
             expect(off <= _NEAR_RAD, f"found {value:.4f} rad of {joint} in {what} after {after}, expected {angle:g}")
-        off = abs(found[joint] - told[joint])
-        expect(off <= _SAME_RAD, f"found {joint} at {found[joint]:.6f} rad after {after}, expected {told[joint]:.6f}")
+        off = abs(angles[joint] - standing[joint])
+        expect(
+            off <= _SAME_RAD, f"found {joint} at {angles[joint]:.6f} rad after {after}, expected {standing[joint]:.6f}"
+        )
 
 
 def _reads(device: Any, link: MemoryLink) -> None:
@@ -122,24 +124,26 @@ def _reads(device: Any, link: MemoryLink) -> None:
     device.command(dict.fromkeys(JOINTS, 0.15))
     expect(link.snapshot() != before, "found nothing written to the board by command()")
     link.restore(before)
-    found = device.state().angles
-    same = all(abs(found[joint] - there[joint]) <= _SAME_RAD for joint in JOINTS)
-    expect(same, f"found {found} after the board was put back, expected {there}: read its pulses, do not remember them")
+    angles = device.state().angles
+    same = all(abs(angles[joint] - there[joint]) <= _SAME_RAD for joint in JOINTS)
+    expect(
+        same, f"found {angles} after the board was put back, expected {there}: read its pulses, do not remember them"
+    )
 
 
 def _lets_go(device: Any) -> None:
     device.release(JOINTS[0])
-    found = device.state().angles
-    expect(JOINTS[0] not in found, f"found {JOINTS[0]} with an angle after release(), expected it to hang free")
-    expect(JOINTS[1] in found, f"found {JOINTS[1]} without an angle after release() of {JOINTS[0]}")
+    angles = device.state().angles
+    expect(JOINTS[0] not in angles, f"found {JOINTS[0]} with an angle after release(), expected it to hang free")
+    expect(JOINTS[1] in angles, f"found {JOINTS[1]} without an angle after release() of {JOINTS[0]}")
 
 
 def _refused(device: Any, angle: float) -> None:
     try:
-        found = device.standing({JOINTS[0]: angle})
+        standing = device.standing({JOINTS[0]: angle})
     except InputError:
         return
-    raise ContractError(f"found {found}, expected armcal.devices.faults.DeviceRefusedError")
+    raise ContractError(f"found {standing}, expected armcal.devices.faults.DeviceRefusedError")
 
 
 def _callable(made: Any, name: str) -> None:

@@ -106,10 +106,10 @@ def _finite_displacement(
     random = np.random.default_rng(1)
     for approach in (-1.0, 0.0, 1.0):
         for command in (0.0, 0.3, -1.2):
-            found = np.asarray(function(near_nominal(blocks, random), [command, approach] * len(JOINTS)))
+            displacement = np.asarray(function(near_nominal(blocks, random), [command, approach] * len(JOINTS)))
             expect(
-                bool(np.isfinite(found).all()),
-                f"found {found.ravel()} for the command {command} from approach {approach:+.0f}",
+                bool(np.isfinite(displacement).all()),
+                f"found {displacement.ravel()} for the command {command} from approach {approach:+.0f}",
             )
 
 
@@ -120,9 +120,9 @@ def _displacement_gains(
     slope = ca.Function("slope", [given, recorded], [ca.densify(ca.jacobian(moved, given))])
     entries = near_nominal(blocks, np.random.default_rng(3))
     points = [[command, side] * len(JOINTS) for command in (0.4, -1.2, 2.0) for side in (-1.0, 1.0)]
-    found = np.abs([np.asarray(slope(entries, at)) for at in points]).max(axis=(0, 1), initial=0.0)
+    gains = np.abs([np.asarray(slope(entries, at)) for at in points]).max(axis=(0, 1), initial=0.0)
     for place, block in scalars(blocks, "m", "rad"):
-        expect_gain(float(found[place]), "a joint's displacement", block.name, block.unit)
+        expect_gain(float(gains[place]), "a joint's displacement", block.name, block.unit)
 
 
 def _all_of(effect: JointEffect, values: Mapping[str, Expression]) -> Expression:
@@ -181,11 +181,11 @@ def _law_gains(blocks: Sequence[ParameterBlock], given: Expression, loads: Expre
     """What a parameter in rad adds to a deflection; one in rad/(N m), for each N m."""
     slope = ca.Function("slope", [given, loads], [ca.densify(ca.jacobian(laws, given))])
     random = np.random.default_rng(3)
-    entries, found = near_nominal(blocks, random), []
+    entries, gains = near_nominal(blocks, random), []
     for _ in range(3):
         load = random.uniform(0.5, 2, loads.numel()) * random.choice([-1, 1], loads.numel())
-        found.append(np.abs(np.asarray(slope(entries, load))) / np.array([[1.0], [np.abs(load).max()]])[:, :, None])
-    per = np.array(found).max(axis=(0, 2), initial=0.0)
+        gains.append(np.abs(np.asarray(slope(entries, load))) / np.array([[1.0], [np.abs(load).max()]])[:, :, None])
+    per = np.array(gains).max(axis=(0, 2), initial=0.0)
     for row, unit in enumerate(("rad", "rad_per_Nm")):
         for place, block in scalars(blocks, unit):
             expect_gain(float(per[row, place]), "a deflection", block.name, "rad")
@@ -235,6 +235,6 @@ def _smooth(blocks: Sequence[ParameterBlock], given: Expression, loads: Expressi
     names = (*(f"load {i}" for i in range(1, loads.numel() + 1)), *entry_names(blocks))
     for load in (np.zeros(loads.numel()), random.uniform(-2, 2, loads.numel())):
         at = np.concatenate([load, entries])
-        found = np.asarray(function(at)).ravel()
-        expect(bool(np.isfinite(found).all()), f"found the deflections {found} under the loads {load}")
+        values = np.asarray(function(at)).ravel()
+        expect(bool(np.isfinite(values).all()), f"found the deflections {values} under the loads {load}")
         expect_derivatives(function, at, "the deflections", names)

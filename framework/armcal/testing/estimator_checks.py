@@ -26,12 +26,12 @@ _SIDE = f"{ARM}.planar.side"
 
 @dataclass(frozen=True)
 class _Case:
-    """A problem, its records, and the values that solve it; ``told`` are those known beforehand, None for all."""
+    """A problem, its records, and the values that solve it; ``known`` are those known beforehand, None for all."""
 
     problem: Problem
     records: tuple[FactorRecords, ...]
     answer: Array
-    told: tuple[str, ...] | None = None
+    known: tuple[str, ...] | None = None
 
     @property
     def parameters(self) -> Parameters:
@@ -56,7 +56,7 @@ def check_estimator(record: Recorder, subject: Subject) -> None:
     case = _case(Interval(), PRIOR_SD_M, _with_prior())
     record.check("it weighs priors", lambda: _near(case, _solve(estimator, case)))
     scattered = _scattered()
-    record.check("it weighs records", lambda: _near(scattered, _solve(estimator, scattered), scattered.told))
+    record.check("it weighs records", lambda: _near(scattered, _solve(estimator, scattered), scattered.known))
     record.check("the order of records changes nothing", lambda: _any_order(estimator, scattered))
     record.check("a second one of equal settings does the same", lambda: _repeats(_fresh(subject), bounded, solution))
     record.check("cut short, it reports that it did not converge", lambda: _cut_short(subject, bounded))
@@ -90,7 +90,7 @@ def _scattered() -> _Case:
     y = noisy[kernel.factor.channels.index(f"{TRACKER}.y"), :POSES]
     answer = case.answer.copy()
     answer[case.parameters.entries_of(_SIDE)] = weights @ y / weights.sum()
-    return replace(case, records=weighted, answer=answer, told=(_SIDE,))
+    return replace(case, records=weighted, answer=answer, known=(_SIDE,))
 
 
 def _any_order(estimator: Estimator, case: _Case) -> None:

@@ -32,18 +32,21 @@ def _request() -> ExportRequest:
 def _written(exporter: Any, request: ExportRequest) -> Exported | str:
     """What it writes, or why it refuses."""
     try:
-        found = exporter.export(request)
+        exported = exporter.export(request)
     except InputError as refusal:
         return str(refusal)
     except Exception as fault:
         raise ContractError(f"found {type(fault).__name__} ({fault}), expected armcal.errors.InputError") from fault
-    expect(isinstance(found, Exported), f"found {type(found).__name__}, expected armcal.calibration.exporter.Exported")
-    for name, content in {"content": found.content, **found.companions}.items():
+    expect(
+        isinstance(exported, Exported),
+        f"found {type(exported).__name__}, expected armcal.calibration.exporter.Exported",
+    )
+    for name, content in {"content": exported.content, **exported.companions}.items():
         expect(isinstance(content, bytes), f"found {name} of type {type(content).__name__}, expected bytes")
-    for name in found.companions:
+    for name in exported.companions:
         plain = name == PurePath(name).name and name not in ("", ".", "..") and "\\" not in name
         expect(plain, f"found the companion {name!r}, expected the plain name of a file")
-    result: Exported = found
+    result: Exported = exported
     return result
 
 

@@ -60,13 +60,13 @@ def _named(blocks: tuple[ParameterBlock, ...]) -> tuple[ParameterBlock, ...]:
 
 def _valued(blocks: tuple[ParameterBlock, ...]) -> bool:
     for block in blocks:
-        found = np.array(block.nominal, dtype=float)
+        values = np.array(block.nominal, dtype=float)
         expect(
-            found.shape == (block.size,),
-            f"{block.name}: found {found.size} nominal numbers, expected {block.size}",
+            values.shape == (block.size,),
+            f"{block.name}: found {values.size} nominal numbers, expected {block.size}",
         )
-        expect(bool(np.isfinite(found).all()), f"{block.name}: found the nominal value {block.nominal}")
-        fault = block.domain.check(found)
+        expect(bool(np.isfinite(values).all()), f"{block.name}: found the nominal value {block.nominal}")
+        fault = block.domain.check(values)
         expect(not fault, f"{block.name}: {fault}")
     return True
 
@@ -131,7 +131,7 @@ def stacked(parts: Sequence[Expression]) -> Expression:
 
 def expect_only(expression: Expression, given: Sequence[Expression]) -> None:
     """Raise ContractError if an expression has symbols that it was not given."""
-    known = {symbol.element_hash() for each in given for symbol in ca.symvar(each)}
+    known = {symbol.element_hash() for input_ in given for symbol in ca.symvar(input_)}
     foreign = sorted({str(s) for s in ca.symvar(ca.SX(expression)) if s.element_hash() not in known})
     expect(not foreign, f"found the symbols {', '.join(foreign)}, expected only those that were given")
 
@@ -148,8 +148,8 @@ def expect_no_choice(expression: Expression, recorded: Expression, estimated: Ex
             depends = inputs[0] == 1
         else:
             depends = any(i in tainted for i in inputs)
-            asked = inputs[:1] if operation == ca.OP_IF_ELSE_ZERO else inputs
-            if operation in _CHOICES and any(i in tainted for i in asked):
+            conditions = inputs[:1] if operation == ca.OP_IF_ELSE_ZERO else inputs
+            if operation in _CHOICES and any(i in tainted for i in conditions):
                 raise ContractError(
                     f"found {_CHOICES[operation]} of a parameter or a result, expected a smooth expression "
                     "(it may branch on commands and approaches only)"

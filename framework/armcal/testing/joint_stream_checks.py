@@ -43,10 +43,10 @@ def _ended(stream: Any) -> None:
 
 
 def _samples(stream: Any) -> None:
-    found = within(stream.samples)
-    expect(isinstance(found, list), f"found {type(found).__name__}, expected a list")
-    for each in found:
-        expect(isinstance(each, JointSample), f"found {type(each).__name__}, expected a JointSample")
+    samples = within(stream.samples)
+    expect(isinstance(samples, list), f"found {type(samples).__name__}, expected a list")
+    for sample in samples:
+        expect(isinstance(sample, JointSample), f"found {type(sample).__name__}, expected a JointSample")
 
 
 def _closes(stream: Any) -> None:

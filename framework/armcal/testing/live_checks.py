@@ -40,12 +40,12 @@ def within(call: Callable[[], T]) -> T:
     Raises:
         ContractError: it does.
     """
-    found: list[T] = []
+    items: list[T] = []
     raised: list[BaseException] = []
 
     def run() -> None:
         try:
-            found.append(call())
+            items.append(call())
         except BaseException as fault:
             raised.append(fault)
 
@@ -56,7 +56,7 @@ def within(call: Callable[[], T]) -> T:
         raise ContractError(f"found it still waiting after {_PATIENCE_S:g} s, expected what has come by now, at once")
     if raised:
         raise raised[0]
-    return found[0]
+    return items[0]
 
 
 def opens(opened: Callable[[], Any]) -> None:
@@ -137,11 +137,11 @@ def _send(address: tuple[Any, ...], data: bytes) -> None:
 
 def _taken(take: Callable[[], Any], data: bytes) -> None:
     try:
-        found = within(take)
+        taken = within(take)
     except ContractError:
         raise
     except Exception as fault:
         raise ContractError(
             f"found {type(fault).__name__} ({fault}) for the bytes {data[:20]!r}, expected them counted in refused"
         ) from fault
-    expect(isinstance(found, list), f"found {type(found).__name__}, expected a list")
+    expect(isinstance(taken, list), f"found {type(taken).__name__}, expected a list")

@@ -75,12 +75,12 @@ def _of_modules(made: Any) -> dict[str, _Place]:
     own = str(getattr(made, "__module__", ""))
     package = own.partition(".")[0]
     if own.startswith(f"{plugin_files.__name__}."):
-        found = [sys.modules[own]]
+        modules = [sys.modules[own]]
     elif package in ("", "builtins", "armcal"):
         return {}
     else:
-        found = [module for name, module in sorted(sys.modules.items()) if name.partition(".")[0] == package]
-    return {f"{where}.{place.name}": place for module in found for where, place in _places(module)}
+        modules = [module for name, module in sorted(sys.modules.items()) if name.partition(".")[0] == package]
+    return {f"{where}.{place.name}": place for module in modules for where, place in _places(module)}
 
 
 def _places(module: ModuleType) -> Iterator[tuple[str, _Place]]:
@@ -112,5 +112,5 @@ def _picture(value: Any, depth: int) -> Any:
     if depth < _DEEPEST and isinstance(value, Mapping):
         return tuple((_picture(k, depth + 1), _picture(v, depth + 1)) for k, v in list(value.items()))
     if depth < _DEEPEST and isinstance(value, _CONTAINERS):
-        return type(value).__name__, tuple(_picture(each, depth + 1) for each in value)
+        return type(value).__name__, tuple(_picture(item, depth + 1) for item in value)
     return repr(value) if isinstance(value, bytearray) else id(value)

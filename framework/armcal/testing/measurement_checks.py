@@ -168,8 +168,8 @@ def _told(factor: Factor, measurement: Measurement, arms: Mapping[str, Arm], blo
     values, record = _point(factor, measurement, arms, blocks)
     said = np.asarray(_function(factor, factor.nuisance_starts)(np.concatenate([values, record]))).ravel()
     values[len(values) - len(said) :] = said
-    found = np.asarray(_function(factor, factor.residual)(np.concatenate([values, record]))).ravel()
-    worst = float(np.abs(found).max())
+    residual = np.asarray(_function(factor, factor.residual)(np.concatenate([values, record]))).ravel()
+    worst = float(np.abs(residual).max())
     expect(worst <= 1e-9, f"found a residual of {worst:.1e} with what the record itself says, expected zero")
 
 
@@ -200,10 +200,10 @@ def _zero(
         raise NotRun("it reads nothing")
     if set(factor.output_channels) != set(measured):
         raise NotRun("it has channels without an output")
-    found = np.asarray(
+    residual = np.asarray(
         _function(factor, factor.residual)(np.concatenate(_point(factor, measurement, arms, blocks)))
     ).ravel()
-    worst = float(np.abs(found).max())
+    worst = float(np.abs(residual).max())
     expect(worst <= 1e-9, f"found a residual of {worst:.1e}, expected zero")
 
 
@@ -293,10 +293,10 @@ def _readings(
 
 
 def _position(names: Sequence[str], slopes: Array) -> None:
-    found = slopes[:3, [names.index(axis) for axis in "xyz"]]
+    slope = slopes[:3, [names.index(axis) for axis in "xyz"]]
     expect(
-        bool(np.allclose(found, np.eye(3), atol=1e-6)),
-        f"found residuals that change by {np.round(found, 3).tolist()} with x, y and z, expected measured minus "
+        bool(np.allclose(slope, np.eye(3), atol=1e-6)),
+        f"found residuals that change by {np.round(slope, 3).tolist()} with x, y and z, expected measured minus "
         "predicted of x, y and z in this order: a run tells by them how the arm and the instrument are mistaken",
     )
 

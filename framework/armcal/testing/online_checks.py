@@ -77,8 +77,8 @@ def _taken(estimator: OnlineEstimator, window: int, prior: Gaussian, lines: Sequ
         update = estimator.update(belief if window == 1 else known, held if window > 1 else [line])
         belief = update.posterior
         shapes = belief.mean.shape, belief.covariance.shape, update.innovation.shape, update.covariance.shape
-        wanted = (STATES,), (STATES, STATES), (ROWS,), (ROWS, ROWS)
-        expect(shapes == wanted, f"found arrays of the shapes {shapes}, expected {wanted}")
+        expected = (STATES,), (STATES, STATES), (ROWS,), (ROWS, ROWS)
+        expect(shapes == expected, f"found arrays of the shapes {shapes}, expected {expected}")
         updates.append(update)
         if len(held) == window > 1:
             known = _known(known, held[:1])
@@ -89,12 +89,12 @@ def _taken(estimator: OnlineEstimator, window: int, prior: Gaussian, lines: Sequ
 def _known(prior: Gaussian, lines: Sequence[_Line]) -> Gaussian:
     """By information: what prior and records say."""
     information = np.linalg.inv(prior.covariance)
-    told = information @ prior.mean
+    projected = information @ prior.mean
     for line in lines:
         weighted = line.slope.T @ np.linalg.inv(line.noise)
-        information, told = information + weighted @ line.slope, told + weighted @ line.measured
+        information, projected = information + weighted @ line.slope, projected + weighted @ line.measured
     covariance = np.linalg.inv(information)
-    return Gaussian(covariance @ told, covariance)
+    return Gaussian(covariance @ projected, covariance)
 
 
 def _sound(updates: Sequence[Update]) -> None:

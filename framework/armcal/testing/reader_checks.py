@@ -47,8 +47,8 @@ def check_reader(record: Recorder, subject: Subject) -> None:
 
 
 def _has_read(reader: Any) -> None:
-    found = getattr(reader, "read", None)
-    expect(callable(found), f"found read = {found!r}, expected a method")
+    method = getattr(reader, "read", None)
+    expect(callable(method), f"found read = {method!r}, expected a method")
 
 
 def _read(subject: Subject, path: str, read_request: ReadRequest | None = None) -> Dataset:

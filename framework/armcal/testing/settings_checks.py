@@ -38,16 +38,16 @@ class Subject:
 
 def check_settings(record: Recorder, kind: str, made: Any) -> Subject | None:
     """The component with settings to build it from, if it has any that hold."""
-    found = record.check("it has checked settings", lambda: _settings_class(made))
-    if found is None:
+    settings_class = record.check("it has checked settings", lambda: _settings_class(made))
+    if settings_class is None:
         return None
-    record.check("every setting is typed or documented", lambda: _described(found))
-    record.check("every quantity has its unit", lambda: _with_units(found))
-    example = record.check("its EXAMPLE is a mapping", lambda: _example(kind, made, found))
+    record.check("every setting is typed or documented", lambda: _described(settings_class))
+    record.check("every quantity has its unit", lambda: _with_units(settings_class))
+    example = record.check("its EXAMPLE is a mapping", lambda: _example(kind, made, settings_class))
     if example is None:
         return None
-    settings = record.check("its example settings are accepted", lambda: _accepted(kind, made, found, example))
-    record.check("an unknown key is refused", lambda: _refuses_unknown(found, example))
+    settings = record.check("its example settings are accepted", lambda: _accepted(kind, made, settings_class, example))
+    record.check("an unknown key is refused", lambda: _refuses_unknown(settings_class, example))
     if settings is None:
         return None
     record.check("its settings survive to_config()", lambda: _survives(settings))
@@ -55,28 +55,28 @@ def check_settings(record: Recorder, kind: str, made: Any) -> Subject | None:
 
 
 def _settings_class(made: Any) -> type[Settings]:
-    found = getattr(made, "Settings", None)
+    settings_class = getattr(made, "Settings", None)
     expect(
-        isinstance(found, type) and issubclass(found, Settings),
-        f"found Settings = {found!r}, expected a class attribute that is a subclass of armcal.base.settings.Settings",
+        isinstance(settings_class, type) and issubclass(settings_class, Settings),
+        f"found Settings = {settings_class!r}, expected a class attribute: a subclass of armcal.base.settings.Settings",
     )
     result: type[Settings] = made.Settings
     return result
 
 
-def _described(found: type[Settings]) -> None:
+def _described(settings_class: type[Settings]) -> None:
     bare = [
         name
-        for name, info in found.model_fields.items()
+        for name, info in settings_class.model_fields.items()
         if info.annotation in (None, Any, object) and not info.description
     ]
     expect(not bare, f"found {', '.join(bare)} without a type, expected a type or Field(description=...)")
 
 
-def _with_units(found: type[Settings]) -> None:
+def _with_units(settings_class: type[Settings]) -> None:
     """No plain number has a quantity's name; one that is none says so in ``Field(description=...)``."""
-    quantities = found.quantities()
-    for name, info in found.model_fields.items():
+    quantities = settings_class.quantities()
+    for name, info in settings_class.model_fields.items():
         if name in quantities or info.description or not _holds_floats(info.annotation, info.metadata):
             continue
         suffix = split_suffix(name)
@@ -91,23 +91,25 @@ def _with_units(found: type[Settings]) -> None:
 
 def _holds_floats(*parts: Any) -> bool:
     """Whether a type is a float, or holds some; a name that maps to floats counts too."""
-    inner = [each for part in parts for each in (part if isinstance(part, list) else (part,))]
-    return any(each is float or (get_args(each) and _holds_floats(*get_args(each))) for each in inner)
+    inner = [part_type for part in parts for part_type in (part if isinstance(part, list) else (part,))]
+    return any(
+        part_type is float or (get_args(part_type) and _holds_floats(*get_args(part_type))) for part_type in inner
+    )
 
 
-def _example(kind: str, made: Any, found: type[Settings]) -> Mapping[str, Any]:
+def _example(kind: str, made: Any, settings_class: type[Settings]) -> Mapping[str, Any]:
     given = getattr(made, "EXAMPLE", {})
     expect(isinstance(given, Mapping), f"found EXAMPLE of type {type(given).__name__}, expected a mapping of settings")
     example = dict(given)
-    path = found.model_fields.get("path")
+    path = settings_class.model_fields.get("path")
     if kind == "reader" and path is not None and path.is_required():
         example.setdefault("path", MISSING_FILE)
     return example
 
 
-def _accepted(kind: str, made: Any, found: type[Settings], example: Mapping[str, Any]) -> Settings:
+def _accepted(kind: str, made: Any, settings_class: type[Settings], example: Mapping[str, Any]) -> Settings:
     try:
-        return found.model_validate(example)
+        return settings_class.model_validate(example)
     except ValidationError as fault:
         if hasattr(made, "EXAMPLE"):
             raise
@@ -118,9 +120,9 @@ def _accepted(kind: str, made: Any, found: type[Settings], example: Mapping[str,
         raise
 
 
-def _refuses_unknown(found: type[Settings], example: Mapping[str, Any]) -> None:
+def _refuses_unknown(settings_class: type[Settings], example: Mapping[str, Any]) -> None:
     try:
-        found.model_validate({**example, _UNKNOWN_KEY: 1})
+        settings_class.model_validate({**example, _UNKNOWN_KEY: 1})
     except ValidationError as fault:
         named = any(_UNKNOWN_KEY in map(str, error["loc"]) for error in fault.errors())
         expect(named, "found an unknown key refused without being named, expected its name in the error")

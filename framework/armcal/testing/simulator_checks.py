@@ -19,8 +19,8 @@ from armcal.testing.settings_checks import Subject
 
 
 def _has(component: Any, method: str) -> None:
-    found = getattr(component, method, None)
-    expect(callable(found), f"found {method} = {found!r}, expected a method")
+    attribute = getattr(component, method, None)
+    expect(callable(attribute), f"found {method} = {attribute!r}, expected a method")
 
 
 def check_simulator(record: Recorder, subject: Subject) -> None:

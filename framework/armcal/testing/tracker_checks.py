@@ -36,9 +36,9 @@ def _opens(tracker: Any) -> None:
 
 
 def _frames(tracker: Any) -> None:
-    found = within(tracker.frames)
-    expect(isinstance(found, list), f"found {type(found).__name__}, expected a list")
-    for frame in found:
+    frames = within(tracker.frames)
+    expect(isinstance(frames, list), f"found {type(frames).__name__}, expected a list")
+    for frame in frames:
         expect(
             isinstance(frame, TrackerFrame),
             f"found {type(frame).__name__}, expected armcal.devices.tracker.TrackerFrame",

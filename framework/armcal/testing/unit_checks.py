@@ -51,12 +51,12 @@ def expect_small_noise(noise: Sequence[float], dimensions: Sequence[str]) -> Non
 
 def scalars(blocks: Sequence[ParameterBlock], *units: str) -> list[tuple[int, ParameterBlock]]:
     """Blocks of one number in one of these units, each with the place of its entry among all entries."""
-    found, place = [], 0
+    scalars, place = [], 0
     for block in blocks:
         if isinstance(block.domain, Interval) and block.unit in units:
-            found.append((place, block))
+            scalars.append((place, block))
         place += block.size
-    return found
+    return scalars
 
 
 def dimension_of(block: ParameterBlock) -> str:

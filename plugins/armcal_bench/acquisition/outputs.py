@@ -92,5 +92,5 @@ def write_outputs(folder: Path, experiment: Experiment, progress: Progress, summ
     """
     if progress.measured:
         dataset = dataset_of(experiment, progress, summary["digests"])
-        write_csv(folder / DATASET, dataset, experiment.request(measured=True).wanted)
+        write_csv(folder / DATASET, dataset, experiment.request(measured=True).channels)
     write_whole(REAL_FILES, folder / SUMMARY, (json.dumps(summary, indent=2) + "\n").encode())

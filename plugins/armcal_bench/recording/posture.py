@@ -67,4 +67,4 @@ def write_dataset(folder: Path, experiment: Experiment, postures: Sequence[Postu
     if not postures:
         (folder / DATASET).unlink(missing_ok=True)
         return
-    write_csv(folder / DATASET, dataset_of(postures, doubts), experiment.request(measured=True).wanted)
+    write_csv(folder / DATASET, dataset_of(postures, doubts), experiment.request(measured=True).channels)

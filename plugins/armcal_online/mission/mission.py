@@ -87,7 +87,7 @@ def before_launch(plan: MissionPlan, folder: Path, progress: Progress = no_progr
     made = bench.simulator().simulate(
         SimulationRequest(system.arms, system.measurements, bench.parameters, system.environment)
     )
-    write_csv(folder / BENCH, made, bench.request(measured=True).wanted)
+    write_csv(folder / BENCH, made, bench.request(measured=True).channels)
     again = Experiment.load(settings.experiment or "", data=folder / BENCH, registry=bench.registry)
     result = calibrate(again, progress=progress)
     if not result.estimate.verdict.converged:
@@ -130,7 +130,7 @@ def run_mission(
     watch = watch or Stopwatch()
     with watch.stage("simulate"):
         mission = simulated(plan)
-        write_csv(folder / RECORDS, mission.records, plan.experiment.request(measured=True).wanted)
+        write_csv(folder / RECORDS, mission.records, plan.experiment.request(measured=True).channels)
     with watch.stage("calibrate"):
         path = before_launch(plan, folder, progress)
         calibration = Calibration.load(path, registry)

@@ -59,8 +59,8 @@ def joint_values(joints: Any, request: ReadRequest) -> dict[str, float]:
     """
     if not isinstance(joints, dict) or not joints:
         raise InputError("found no joints.", where=Location("joints"), hint='For example {"q1_deg": 10}.')
-    names = {name: (w.channel, unit) for w in request.wanted for name, unit in spellings(w).items()}
-    names |= {w.channel: (w.channel, "1") for w in request.wanted}
+    names = {name: (w.channel, unit) for w in request.channels for name, unit in spellings(w).items()}
+    names |= {w.channel: (w.channel, "1") for w in request.channels}
     found: dict[str, float] = {}
     for name, value in joints.items():
         if name not in names:

@@ -48,8 +48,8 @@ class RowParser:
     """Records for a request, with a source's own names of columns (requested name to own name)."""
 
     def __init__(self, request: ReadRequest, columns: Mapping[str, str]) -> None:
-        self._wanted = request.wanted
-        self._optional = tuple(replace(channel, required=False) for channel in request.wanted)
+        self._wanted = request.channels
+        self._optional = tuple(replace(channel, required=False) for channel in request.channels)
         self._columns = dict(columns)
         self._plans: dict[tuple[str, ...], Plan | str] = {}
 
@@ -149,7 +149,7 @@ class RowParser:
             if _APPROACH in channel and isinstance(number, float) and not (math.isnan(number) or number in (-1, 0, 1)):
                 number = CellFault(f"found the approach {number:g}, expected -1, 0 or 1.", "")
             if isinstance(number, CellFault):
-                sentence = f"{_short(column.name, MAX_ID)}: {number.found} {number.hint}".rstrip()
+                sentence = f"{_short(column.name, MAX_ID)}: {number.text} {number.hint}".rstrip()
                 return replace(faulty(place, sentence), record_id=record_id)
             channels[channel] = from_unit(number, unit)
         return Incoming(record_id, channels, labels, place.arrived, place.source_key, place.row)

@@ -57,10 +57,10 @@ class Table:
 
     def places(self, header: Any, request: Any) -> Any:
         names = {(split[0] if (split := split_suffix(name)) else name): i for i, name in enumerate(header)}
-        lacking = [w.columns[0] for w in request.wanted if w.required and not set(w.columns) & set(names)]
+        lacking = [w.columns[0] for w in request.channels if w.required and not set(w.columns) & set(names)]
         if lacking:
             raise DataError(f"no column {', '.join(lacking)}.", where=Location(str(self.path)))
-        wanted = {w.channel: next((names[c] for c in w.columns if c in names), None) for w in request.wanted}
+        wanted = {w.channel: next((names[c] for c in w.columns if c in names), None) for w in request.channels}
         return {channel: place for channel, place in wanted.items() if place is not None}
 
     def numbers(self, cells: Any, places: Any, header: Any, line: int) -> Any:

@@ -228,12 +228,12 @@ class Journal:
         old.close()
         return self._writer.tail.sequence
 
-    def _recover(self, found: Newest) -> None:
-        segment, files = found.segment, self._files
-        torn = segment.cut if segment and segment.cut else found.stub.cut if found.stub else None
+    def _recover(self, newest: Newest) -> None:
+        segment, files = newest.segment, self._files
+        torn = segment.cut if segment and segment.cut else newest.stub.cut if newest.stub else None
         cut = keep_cut(files, self._folder, torn) if torn else None
-        if found.stub:
-            remove_durably(files, found.stub.path)
+        if newest.stub:
+            remove_durably(files, newest.stub.path)
         if segment is None:
             path = segment_path(self._folder, 1)
             self._segment = SegmentWriter.begin(files, path, 1, Link(), self._header, None)
@@ -242,7 +242,7 @@ class Journal:
             self._segment = SegmentWriter.go_on(files, segment)
             state = segment.checkpoint
             self.recovered = Recovered(segment.header, state.content, state.sequence, segment.entries, cut)
-        self._room = JournalRoom(files, self._folder, found.older)
+        self._room = JournalRoom(files, self._folder, newest.older)
         self._room.make_ballast()
 
 

@@ -71,14 +71,14 @@ def read_newest(folder: Path, files: FileLayer = REAL_FILES) -> Newest:
     numbers = segment_numbers(folder, files)
     if not numbers:
         return Newest(None, None, ())
-    found = _read(folder, numbers[-1], None, files)
-    if isinstance(found, Segment):
-        return Newest(found, None, numbers[:-1])
+    newest = _read(folder, numbers[-1], None, files)
+    if isinstance(newest, Segment):
+        return Newest(newest, None, numbers[:-1])
     if numbers == (1,):
-        return Newest(None, found, ())
+        return Newest(None, newest, ())
     if numbers[-2:-1] != (numbers[-1] - 1,):
         raise _missing(folder, numbers[-1] - 1, Link())
-    return Newest(_whole(_begun(_read(folder, numbers[-2], None, files), None)), found, numbers[:-2])
+    return Newest(_whole(_begun(_read(folder, numbers[-2], None, files), None)), newest, numbers[:-2])
 
 
 def read_segments(folder: Path, files: FileLayer = REAL_FILES) -> Iterator[Segment]:
@@ -134,21 +134,21 @@ def read_until(folder: Path, sequence: int, files: FileLayer = REAL_FILES) -> tu
         InputError: the journal no longer reaches back to it, or does not yet reach to it.
         DataError: see ``read_segments``.
     """
-    found: Segment | None = None
+    last: Segment | None = None
     for segment in read_segments(folder, files):
         if segment.checkpoint.sequence > sequence:
             break
-        found = segment
+        last = segment
     else:
-        found = found if found and sequence <= found.link.sequence else None
-    if found is None:
+        last = last if last and sequence <= last.link.sequence else None
+    if last is None:
         kept = verify(folder, files)
         raise InputError(
             f"found no entry {sequence}; the journal goes from {kept.first_sequence + 1} to {kept.last_sequence}.",
             where=Location(str(folder)),
             hint="Give the sequence number of an entry that is kept.",
         )
-    return found.checkpoint, tuple(entry for entry in found.entries if entry.sequence <= sequence)
+    return last.checkpoint, tuple(entry for entry in last.entries if entry.sequence <= sequence)
 
 
 def verify(folder: Path, files: FileLayer = REAL_FILES) -> Verified:
@@ -186,10 +186,10 @@ def _whole(segment: Segment) -> Segment:
     return segment
 
 
-def _begun(found: Segment | Stub, before: Segment | None) -> Segment:
-    if isinstance(found, Stub):
-        raise _damaged(found.cut, before.link if before else Link())
-    return found
+def _begun(segment: Segment | Stub, before: Segment | None) -> Segment:
+    if isinstance(segment, Stub):
+        raise _damaged(segment.cut, before.link if before else Link())
+    return segment
 
 
 def _damaged(cut: Cut, before: Link) -> JournalDamagedError:
