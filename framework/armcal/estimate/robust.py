@@ -222,7 +222,7 @@ def _selection(beyond: Weights, most: float) -> tuple[Weights, str]:
     kept[aside] = 0.0
     text = (
         f"{count} of {len(every)} records lie beyond the limit and only {allowed} ({most:.0%}) may be set aside: these "
-        "are no few outliers. Look at the model, the noise and the data before raising noise.most_rejected."
+        "are more than a few outliers. Look at the model, the noise and the data before raising noise.most_rejected."
     )
     return tuple(np.split(kept, np.cumsum([len(limits) for limits in beyond])[:-1])), text
 
