@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar
 
@@ -22,7 +23,7 @@ from armcal_export.describe import chain_of, describe
 from armcal_export.description import ArmDescription
 from armcal_export.mjcf import Drive, Hinge, mjcf
 from armcal_export.mujoco_rest import LoadedModel
-from armcal_export.reference import Equilibrium
+from armcal_export.reference import in_equilibrium
 from armcal_export.springs import SpringNumbers, spring_numbers
 
 TOLERANCE = 1e-9
@@ -169,14 +170,11 @@ def _compare(loaded: LoadedModel, expected: Array, commands: Array) -> None:
 
 def _reach(request: ExportRequest, loaded: LoadedModel, commands: Array) -> float:
     """How far MuJoCo's tool at rest is from the calibrated arm's, at most over poses that settle in both (m)."""
-    expression = request.expression()
-    equilibrium, largest = Equilibrium(expression), 0.0
-    for command in commands.T:
-        record = expression.defaults.copy()
-        record[: len(command)] = command
-        try:
-            pose, _ = equilibrium.at(record)
-            largest = max(largest, float(np.linalg.norm(loaded.tool_at_rest(command)[:3, 3] - pose[:, 3])))
-        except NotConvergedError:
-            continue
+    expression, largest = request.expression(), 0.0
+    records = np.tile(expression.defaults, (commands.shape[1], 1))
+    records[:, : len(commands)] = commands.T
+    tools, _, settled = in_equilibrium(expression, records)
+    for command, tool in zip(commands.T[settled], tools[settled], strict=True):
+        with suppress(NotConvergedError):
+            largest = max(largest, float(np.linalg.norm(loaded.tool_at_rest(command)[:3, 3] - tool[:, 3])))
     return largest

@@ -7,20 +7,17 @@ from dataclasses import dataclass, replace
 
 import casadi as ca
 import numpy as np
-from armcal.arm.assembly import Arm, ArmInputs, ArmState
-from armcal.arm.environment import STATICS, Environment
-from armcal.arm.equilibrium import MOST_PASSES
-from armcal.arm.statics import Load
+from armcal.arm.assembly import Arm, ArmInputs, ArmState, scoped
+from armcal.arm.environment import STATICS, Environment, tilted
+from armcal.arm.evaluator import ElasticPass, Evaluator
 from armcal.base import se3
 from armcal.base.domains import Array
 from armcal.base.parameters import Parameters
 from armcal.base.pose_blocks import rotation_of
 from armcal.errors import ConfigError, NotConvergedError
-from armcal.functions.interpreted import BoundFunction
 from armcal.measure.measurement import Measurement
 
-REST_RAD = 1e-8
-"""A spring that moves less in a pass is at rest: far below what a tracker sees."""
+_NO_VALUES = np.zeros(0)
 _POSITION, _QUATERNION = ("x", "y", "z"), ("qw", "qx", "qy", "qz")
 
 
@@ -49,7 +46,8 @@ class ElasticPose:
                 f"effects of {arm.name} ask for {', '.join(arm.conditions)}, which a bench does not simulate.",
                 hint="Name them under bench.simulator.without_effects.",
             )
-        self._function = BoundFunction(_function(tracked))
+        self._evaluator, size = _evaluator(tracked)
+        self._state = np.zeros((size, 1))
 
     def __call__(self, joint_angles: Array, approaches: Array) -> Array:
         """The pose (4x4, m) at joint angles (joints, rad) that were reached from these sides (-1, 0, 1).
@@ -57,20 +55,15 @@ class ElasticPose:
         Raises:
             NotConvergedError: the springs do not hold the arm there.
         """
-        commands, approach, state = (array[0] for array in self._function.inputs)
-        following, shown = (array[0] for array in self._function.outputs)
-        commands[:], approach[:] = joint_angles, approaches
-        for _ in range(MOST_PASSES):
-            self._function.evaluate()
-            moved = (following - state).tolist()
-            state[:] = following
-            if all(-REST_RAD <= step <= REST_RAD for step in moved):
-                return _pose(shown)
-        state[:] = 0.0
-        raise NotConvergedError(
-            "the simulated arm's springs did not settle.",
-            hint="Check compliances and masses of the truth: springs this soft do not hold the arm.",
-        )
+        record = np.concatenate([joint_angles, approaches])[:, None]
+        try:
+            shown = self._evaluator(_NO_VALUES, record, self._state)
+        except NotConvergedError:
+            self._state[:] = 0.0
+            raise
+        pose = np.eye(4)
+        pose[:3] = shown.reshape(4, 3).T
+        return pose
 
 
 def without_effects(arm: Arm, names: tuple[str, ...]) -> Arm:
@@ -87,40 +80,31 @@ def without_effects(arm: Arm, names: tuple[str, ...]) -> Arm:
     return replace(arm, effects={name: effect for name, effect in arm.effects.items() if name not in names})
 
 
-def _pose(shown: Array) -> Array:
-    pose = np.eye(4)
-    pose[:3, 3] = shown[:3]
-    pose[:3, :3] = shown[3:].reshape(3, 3).T
-    return pose
-
-
-def _function(tracked: TrackedArm) -> ca.Function:
-    """(commands, approaches, deflection) -> (next deflection, position and rotation column by column)."""
+def _evaluator(tracked: TrackedArm) -> tuple[Evaluator, int]:
+    """From commands and approaches to the body's pose (3x4, column by column); and how many deflections there are."""
     arm = tracked.arm
     values = {block.name: ca.SX(list(block.nominal)) for block in tracked.parameters.blocks}
     count = len(arm.commanded)
-    commands, approaches = ca.SX.sym("commands", count), ca.SX.sym("approaches", count)
-    deflection = ca.SX.sym("deflection", arm.deflection_size)
+    record, deflection = ca.SX.sym("record", 2 * count), ca.SX.sym("deflection", arm.deflection_size)
     inputs = ArmInputs(
-        ca.vertcat(*arm.joint_commands(ca.vertsplit(commands))),
-        ca.vertcat(*arm.joint_approaches(ca.vertsplit(approaches))),
-        _load(tracked.environment, values),
+        ca.vertcat(*arm.joint_commands(ca.vertsplit(record[:count]))),
+        ca.vertcat(*arm.joint_approaches(ca.vertsplit(record[count:]))),
+        tilted(tracked.environment.load, scoped(values, f"{STATICS}.")),
         deflection,
     )
     state = arm.state(values, inputs)
     position, rotation = _body(tracked, state, values)
-    shown = ca.densify(ca.vertcat(position, ca.vec(ca.densify(rotation))))
-    outputs = [ca.densify(state.next_deflection), shown]
-    return ca.Function("bench_pose", [commands, approaches, deflection], outputs, {"cse": True})
+    elastic = ElasticPass(
+        record=record, state=deflection, next_state=ca.densify(state.next_deflection), springs=arm.spring_names
+    )
+    return Evaluator(elastic, ca.horzcat(rotation, position)), arm.deflection_size
 
 
 def _body(
     tracked: TrackedArm, state: ArmState, values: Mapping[str, se3.Expression]
 ) -> tuple[se3.Expression, se3.Expression]:
     """Position and rotation of the body; that of the tool where the measurement knows of no rotation."""
-    scope = f"{tracked.name}."
-    local = {name.removeprefix(scope): value for name, value in values.items() if name.startswith(scope)}
-    read = tracked.measurement.outputs({tracked.arm.name: state}, local)
+    read = tracked.measurement.outputs({tracked.arm.name: state}, scoped(values, f"{tracked.name}."))
     if not set(_POSITION) <= set(read):
         raise ConfigError(
             f"the measurement {tracked.name} is no position, which a tracker would see.",
@@ -130,14 +114,3 @@ def _body(
     if set(_QUATERNION) <= set(read):
         return position, rotation_of(ca.vertcat(*[read[name] for name in _QUATERNION]))
     return position, state.base_T_tool.rotation
-
-
-def _load(environment: Environment, values: Mapping[str, se3.Expression]) -> Load:
-    tilts = [se3.rotation_about(axis, values[f"{STATICS}.gravity_r{axis}"]).rotation for axis in "yx"]
-    return Load(
-        ca.mtimes([*tilts, ca.SX(list(environment.gravity))]),
-        ca.SX(environment.payload_mass),
-        ca.SX(list(environment.payload_com)),
-        ca.SX(list(environment.force)),
-        ca.SX(list(environment.torque)),
-    )

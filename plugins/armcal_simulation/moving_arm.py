@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import casadi as ca
 import numpy as np
-from armcal.arm.equilibrium import MOST_PASSES, REST_RAD
+from armcal.arm.evaluator import Evaluator
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
-from armcal.errors import NotConvergedError
 from armcal.estimate.simulation import SimulationRequest
-from armcal.problem.factor import Factor
 from armcal.problem.problem import Problem
-
-_BLOCK = 256
 
 
 def measured_while_moving(request: SimulationRequest, commands: Dataset, values: Array) -> dict[str, Array]:
@@ -39,36 +37,13 @@ def measured_while_moving(request: SimulationRequest, commands: Dataset, values:
     own = values[:, list(parameters.free_entries)].T
     shown: dict[str, Array] = {}
     for kernel, records in zip(problem.kernels, problem.records(commands), strict=True):
-        factor = kernel.factor
-        read = _outputs(factor, own, records.record[:, : records.count])
-        shown |= dict(zip(factor.output_channels, read, strict=False))
+        factor, record = kernel.factor, records.record[:, : records.count]
+        row_by_row = replace(factor, record=ca.vertcat(factor.record, factor.values), values=ca.SX(0, 1))
+        start = np.zeros((factor.state.numel(), records.count))
+        read = Evaluator(row_by_row, factor.outputs)(np.zeros(0), np.concatenate([record, own]), start)
+        shown |= dict(zip(factor.output_channels, read, strict=True))
     return shown
 
 
 def _places(place: slice) -> range:
     return range(place.start, place.stop)
-
-
-def _outputs(factor: Factor, values: Array, record: Array) -> Array:
-    """In equilibrium, with a column of values a record (outputs x N)."""
-    function, count = factor.output_function(), record.shape[1]
-    shown = np.zeros((function.numel_out(1), count))
-    for start in range(0, count, _BLOCK):
-        columns = slice(start, min(start + _BLOCK, count))
-        shown[:, columns] = _settled(function, values[:, columns], record[:, columns])
-    return shown
-
-
-def _settled(function: ca.Function, values: Array, record: Array) -> Array:
-    """Outputs of a block of records at rest."""
-    block, state = function.map(record.shape[1]), np.zeros((function.numel_in(2), record.shape[1]))
-    for _ in range(MOST_PASSES):
-        following, shown = (np.asarray(dm) for dm in block(values, record, state))
-        moved = np.abs(following - state).max(initial=0.0)
-        state = following.reshape(state.shape)
-        if moved <= REST_RAD:
-            return shown
-    raise NotConvergedError(
-        "the elastic equilibrium of a simulated record did not settle.",
-        hint="Check compliances and masses of the truth: springs this soft do not hold the arm.",
-    )

@@ -121,7 +121,7 @@ def test_where_the_arm_stands_is_its_own_nearest_command() -> None:
 def test_c_and_the_interpreter_find_the_same() -> None:
     interpreted = compensator("rigid")
     compiled = calibration("rigid").compensator(choice="compiled")
-    assert compiled._equilibrium._function.compiled
+    assert compiled._equilibrium._evaluator._pass.compiled
     targets = of(interpreted, drawn(interpreted, 30))
     assert np.abs(interpreted.solve(targets).joint_angles - compiled.solve(targets).joint_angles).max() < 1e-7
 

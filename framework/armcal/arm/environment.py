@@ -28,6 +28,14 @@ class Environment:
     force: Vector3 = _ZERO
     torque: Vector3 = _ZERO
 
+    @property
+    def load(self) -> Load:
+        """As constant expressions."""
+        gravity, com, force, torque = (
+            ca.SX(list(vector)) for vector in (self.gravity, self.payload_com, self.force, self.torque)
+        )
+        return Load(gravity, ca.SX(self.payload_mass), com, force, torque)
+
 
 def gravity_tilt() -> tuple[ParameterBlock, ...]:
     """How the real gravity is turned from the stated one, about the base frame's x and y axes (rad)."""

@@ -51,16 +51,33 @@ class Settled:
         return self.at_rest & self.held
 
 
+def by_passes(following: Callable[[], Array], state: Array, rest: float = REST_RAD) -> NDArray[np.bool_]:
+    """Replace states (n_d x N), in place, by what ``following`` gives of them until none moves more than ``rest``.
+
+    Returns:
+        which still move (N).
+    """
+    for _ in range(MOST_PASSES):
+        after = following()
+        moved = np.abs(after - state)
+        state[:] = after
+        if moved.max(initial=0.0) <= rest:
+            break
+    return np.asarray(~(moved.max(axis=0, initial=0.0) <= rest))
+
+
 def lowest(slopes: Array) -> Array:
     """The smallest real part of the eigenvalues of I - S (N), one without springs; S is (N x n_d x n_d).
 
     A bound by the sums of rows serves where it says enough: most arms need no eigenvalue.
     """
-    found = 1.0 - np.abs(slopes).sum(axis=2).max(axis=1, initial=0.0)
-    unsure = np.flatnonzero(found <= 0)
-    if len(unsure):
-        found[unsure] = 1.0 - np.linalg.eigvals(slopes[unsure]).real.max(axis=1)
-    return np.asarray(np.nan_to_num(found, nan=-np.inf))
+    low = np.asarray(1.0 - np.abs(slopes).sum(axis=2).max(axis=1, initial=0.0))
+    unsure = ~(low > 0)
+    if unsure.any():
+        finite = unsure & np.isfinite(slopes).all(axis=(1, 2))
+        low[unsure] = -np.inf
+        low[finite] = 1.0 - np.linalg.eigvals(slopes[finite]).real.max(axis=1)
+    return low
 
 
 def refusal(which: str, springs: Sequence[str], state: Array, slope: Array, far: bool) -> NotConvergedError:

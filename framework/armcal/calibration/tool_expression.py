@@ -8,13 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
 
 import casadi as ca
 import numpy as np
+from typing_extensions import override
 
 from armcal.arm.assembly import Arm, ArmInputs, scoped
 from armcal.arm.environment import STATICS, Environment, tilted
+from armcal.arm.evaluator import ElasticPass
 from armcal.arm.loading import LOAD_CHANNELS
 from armcal.arm.servo import PulseClock, PulseTable, SteppedEffect
 from armcal.arm.statics import Load
@@ -28,7 +29,7 @@ _VECTORS = ("gravity", "payload", "force", "torque")
 
 
 @dataclass(frozen=True)
-class ToolExpression:
+class ToolExpression(ElasticPass):
     """One arm whose parameters are numbers.
 
     Attributes:
@@ -38,8 +39,6 @@ class ToolExpression:
         channels: of ``record``, in this order: the joints, ``approach.JOINT`` of each, LOAD_CHANNELS, conditions.
         defaults: of each channel where nothing is said; commands and approaches are zero.
         record: symbols, one a channel (commands in rad or m, approaches -1 to 1, loads in SI, in the base frame).
-        state: symbols, the deflection (n_d; rad or m).
-        next_state: what the springs answer with; equal to ``state`` in equilibrium.
         base_T_tool: at ``state``.
         origins: of the mount and of each joint's frame in the base frame, at ``state`` (3x1 each; m).
         efforts: about or along the axes of all joints of the chain, at ``state`` (N m, N on sliding joints).
@@ -52,9 +51,6 @@ class ToolExpression:
     joints: tuple[str, ...]
     channels: tuple[str, ...]
     defaults: Array
-    record: Expression
-    state: Expression
-    next_state: Expression
     base_T_tool: Transform
     origins: tuple[Expression, ...]
     efforts: Expression
@@ -81,18 +77,9 @@ class ToolExpression:
         chosen = ca.vertcat(*[self.record[self.channels.index(channel)] for channel in channels])
         return bool(ca.depends_on(ca.vertcat(ca.vec(self.base_T_tool.matrix()), self.next_state), chosen))
 
-    def slope(self) -> Expression:
-        """d next_state / d state (n_d x n_d)."""
-        return ca.densify(ca.jacobian(self.next_state, self.state))
-
-    def to_equilibrium(self, *right: Expression) -> list[Expression]:
-        """(I - slope)^-1 of each right hand side (n_d rows)."""
-        if not self.state.numel():
-            return list(right)
-        matrix = ca.SX.eye(self.state.numel()) - self.slope()
-        solved = se3.solve_near_identity(matrix, ca.densify(ca.horzcat(*right)))
-        widths = np.cumsum([0, *(each.size2() for each in right)])
-        return [solved[:, int(a) : int(b)] for a, b in pairwise(widths)]
+    @override
+    def described(self, index: int, record: Array) -> str:
+        return f"command {index + 1}"
 
 
 def arm_expression(
@@ -134,6 +121,7 @@ def arm_expression(
         record=record,
         state=deflection,
         next_state=ca.densify(arm_state.next_deflection),
+        springs=smooth.spring_names,
         base_T_tool=arm_state.base_T_tool,
         origins=arm_state.origins,
         efforts=ca.densify(arm_state.efforts),

@@ -17,11 +17,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import casadi as ca
+from typing_extensions import override
 
 from armcal.arm.assembly import Arm, ArmInputs, ArmState, scoped
 from armcal.arm.environment import STATICS, Environment, Vector3, tilted
+from armcal.arm.evaluator import ElasticPass
 from armcal.arm.statics import Load
-from armcal.base import se3
+from armcal.base.domains import Array
 from armcal.base.parameters import ParameterBlock, Parameters
 from armcal.base.se3 import Expression
 from armcal.errors import ProblemError
@@ -30,7 +32,7 @@ from armcal.measure.partners import OTHER
 
 
 @dataclass(frozen=True)
-class Factor:
+class Factor(ElasticPass):
     """The expressions of one measurement.
 
     Attributes:
@@ -39,7 +41,6 @@ class Factor:
         values: free canonical entries (symbols, n_v); fixed ones are numbers in the expressions.
         record: symbols, one a channel.
         state: deflections of all arms that take part (symbols, n_d).
-        next_state: one elastic pass from ``state``.
         residual: m or rad (n_r).
         outputs: what the instrument would read (n_o), named by ``output_channels``.
         tools: each arm's base_T_tool without its last row, column by column (12 an arm; m).
@@ -49,17 +50,12 @@ class Factor:
         nuisance_starts: entries of the group's parameters by the record alone, to start from; empty for none.
         nuisance_names: local names of the parameters of these entries, one an entry.
         mean_weight: how many times more the mean of a group's residuals weighs.
-        springs: of each number of the state, what gives, in words.
         joints: channels of commanded joints, each with ``angle`` or ``length``.
     """
 
     name: str
     channels: tuple[str, ...]
     output_channels: tuple[str, ...]
-    values: Expression
-    record: Expression
-    state: Expression
-    next_state: Expression
     residual: Expression
     outputs: Expression
     tools: Expression
@@ -69,7 +65,6 @@ class Factor:
     nuisance_starts: Expression = None
     nuisance_names: tuple[str, ...] = ()
     mean_weight: float = 1.0
-    springs: tuple[str, ...] = ()
     joints: tuple[tuple[str, str], ...] = ()
 
     @property
@@ -86,31 +81,21 @@ class Factor:
         """(values, record, state) -> (next state, residual)."""
         return ca.Function("single_pass", self._inputs, [self.next_state, ca.densify(self.residual)], {"cse": True})
 
-    def output_function(self) -> ca.Function:
-        """(values, record, state) -> (next state, outputs and tools)."""
-        shown = ca.densify(ca.vertcat(self.outputs, self.tools))
-        return ca.Function("outputs", self._inputs, [self.next_state, shown], {"cse": True})
-
-    def nuisance_function(self) -> ca.Function:
-        """(values, record, state) -> (next state, where the record has its group's parameters start)."""
-        return ca.Function("starts", self._inputs, [self.next_state, ca.densify(self.nuisance_starts)], {"cse": True})
-
     def linearise_function(self) -> ca.Function:
         """(values, record, state) -> (next state, residual, Jacobian transposed), in equilibrium to second order."""
         residual, jacobian = self.residual, ca.jacobian(self.residual, self.values)
         if self.state.numel():
             adjoint = ca.SX.sym("adjoint", self.residual.numel(), self.state.numel())
-            solved = self._solve_left(ca.jacobian(self.residual, self.state))
+            solved = self.adjoint(ca.jacobian(self.residual, self.state))
             held = ca.jacobian(self.residual + ca.mtimes(adjoint, self.next_state), self.values)
             jacobian = ca.substitute(held, adjoint, solved)
             residual = self.residual + ca.mtimes(solved, self.next_state - self.state)
         outputs = [self.next_state, ca.densify(residual), ca.densify(jacobian.T)]
         return ca.Function("linearise", self._inputs, outputs, {"cse": True})
 
-    def slope_function(self) -> ca.Function:
-        """(values, record, state) -> (next state, its slope by the state)."""
-        slope = ca.densify(ca.jacobian(self.next_state, self.state))
-        return ca.Function("slope", self._inputs, [self.next_state, slope], {"cse": True})
+    @override
+    def described(self, index: int, record: Array) -> str:
+        return f"a record ({self.pose_of(record)})"
 
     def pose_of(self, record: Any) -> str:
         """The commanded joints of one record (n_c numbers), as people read them."""
@@ -137,8 +122,8 @@ class Factor:
         both = ca.vertcat(self.values, self.state)
         adjoint = ca.SX.sym("adjoint", 1, self.state.numel())
         lagrangian = ca.hessian(cost + ca.mtimes(adjoint, self.next_state), both)[0]
-        lagrangian = ca.substitute(lagrangian, adjoint, self._solve_left(ca.jacobian(cost, self.state)))
-        slope = se3.solve_near_identity(self._one_minus_slope(), ca.densify(ca.jacobian(self.next_state, self.values)))
+        lagrangian = ca.substitute(lagrangian, adjoint, self.adjoint(ca.jacobian(cost, self.state)))
+        (slope,) = self.to_equilibrium(ca.jacobian(self.next_state, self.values))
         tangent = ca.vertcat(ca.SX.eye(self.values.numel()), slope)
         hessian = ca.mtimes(tangent.T, ca.mtimes(lagrangian, tangent))
         return ca.Function("hessian", inputs, [ca.densify(hessian)], {"cse": True})
@@ -149,18 +134,11 @@ class Factor:
         slope = ca.jacobian(self.residual, self.record)
         chosen_ones = [self.record[place] for place in places if place is not None]
         if self.state.numel() and ca.depends_on(self.next_state, ca.vertcat(ca.SX(0, 1), *chosen_ones)):
-            solved = self._solve_left(ca.jacobian(self.residual, self.state))
+            solved = self.adjoint(ca.jacobian(self.residual, self.state))
             slope = slope + ca.mtimes(solved, ca.jacobian(self.next_state, self.record))
         none = ca.SX.zeros(self.residual.numel(), 1)
         chosen = ca.horzcat(*[none if place is None else slope[:, place] for place in places])
         return ca.Function("channel_slope", self._inputs, [ca.densify(chosen).T], {"cse": True})
-
-    def _one_minus_slope(self) -> Expression:
-        return ca.SX.eye(self.state.numel()) - ca.densify(ca.jacobian(self.next_state, self.state))
-
-    def _solve_left(self, rows: Expression) -> Expression:
-        """rows (I - dF/dd)^-1."""
-        return se3.solve_near_identity(self._one_minus_slope().T, ca.densify(rows).T).T
 
 
 class _Records:

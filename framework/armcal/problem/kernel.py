@@ -11,23 +11,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from importlib import resources
-from typing import Any, NoReturn, Protocol
+from typing import Any, Protocol
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 from typing_extensions import override
 
-from armcal.arm.equilibrium import (
-    MOST_DEFLECTION,
-    MOST_PASSES,
-    NEAR_REST_RAD,
-    REST_RAD,
-    Evaluate,
-    lowest,
-    refusal,
-    settle,
-)
+from armcal.arm.equilibrium import MOST_DEFLECTION, MOST_PASSES, NEAR_REST_RAD, REST_RAD, by_passes
+from armcal.arm.evaluator import Evaluator
 from armcal.base.domains import Array
 from armcal.functions import c_source, compiler
 from armcal.functions.batch_function import EvaluatorChoice, quietly
@@ -86,15 +77,12 @@ class Interpreter(Backend):
         state[:], residual[:], jacobian[:] = self._linearise(values, record, state)
         return unsettled
 
-    def _settle(self, values: Array, record: Array, state: Array, residual: Array, tolerance: float) -> int:
-        moving = np.ones(record.shape[1], dtype=bool)
-        for _ in range(MOST_PASSES):
-            following, residual[:] = self._pass(values, record, state)
-            moving = ~(np.abs(following - state).max(axis=0, initial=0.0) <= tolerance)
-            state[:] = following
-            if not moving.any():
-                return 0
-        return int(moving.sum())
+    def _settle(self, values: Array, record: Array, state: Array, residual: Array, rest: float) -> int:
+        def following() -> Array:
+            following_state, residual[:] = self._pass(values, record, state)
+            return following_state
+
+        return int(by_passes(following, state, rest).sum())
 
 
 class Compiled(Backend):
@@ -135,19 +123,14 @@ class Kernel:
     identity: str = f"casadi {ca.CasadiMeta.version()}"
 
     @cached_property
-    def _slope(self) -> InterpretedFunction:
-        """How the next state follows the state."""
-        return InterpretedFunction(self.factor.slope_function(), 1)
-
-    @cached_property
     def _by_channels(self) -> dict[tuple[str, ...], InterpretedFunction]:
         """Slopes by channels, once they were asked for."""
         return {}
 
     @cached_property
-    def outputs(self) -> ca.Function:
-        """What the instrument would read, and where the tools are."""
-        return self.factor.output_function()
+    def evaluator(self) -> Evaluator:
+        """What the instrument would read, and where the tools are, in equilibrium."""
+        return Evaluator(self.factor, ca.vertcat(self.factor.outputs, self.factor.tools))
 
     @cached_property
     def hessian(self) -> ca.Function:
@@ -172,7 +155,7 @@ class Kernel:
         """
         before = state.copy()
         if self.backend.residuals(values, record, state, residual, REST_RAD) or _out_of_hand(state):
-            self._settle_by_newton(values, record, state, before)
+            self.evaluator.recover(values, record, state, before)
             self.backend.residuals(values, record, state, residual, AS_IT_STANDS)
 
     def linearise(self, values: Array, record: Array, state: Array, residual: Array, jacobian: Array) -> None:
@@ -183,54 +166,8 @@ class Kernel:
         """
         before = state.copy()
         if self.backend.linearise(values, record, state, residual, jacobian, NEAR_REST_RAD) or _out_of_hand(state):
-            self._settle_by_newton(values, record, state, before)
+            self.evaluator.recover(values, record, state, before)
             self.backend.linearise(values, record, state, residual, jacobian, AS_IT_STANDS)
-
-    def _settle_by_newton(self, values: Array, record: Array, state: Array, before: Array) -> None:
-        """Bring every record to an equilibrium that the springs hold in place, where passes lead away from it.
-
-        ``state`` is where the passes ended. Records that they brought to rest stay there; the others start anew from
-        ``before``, or from no deflection if that is too much. If one has none, all are left at ``before``.
-        """
-        at_rest = np.abs(state).max(axis=0, initial=0.0) <= MOST_DEFLECTION
-        state[:, ~at_rest] = 0.0
-        following, slopes = self._slopes(values, record, state)(np.arange(state.shape[1]))
-        at_rest &= (np.abs(following - state).max(axis=0, initial=0.0) < NEAR_REST_RAD) & (lowest(slopes) > 0)
-        within = np.abs(before).max(axis=0, initial=0.0) <= MOST_DEFLECTION
-        moving = np.flatnonzero(~at_rest)
-        moved = np.where(within, before, 0.0)[:, moving]
-        settled = settle(self._slopes(values, record[:, moving], moved), moved)
-        state[:, moving] = moved
-        if not settled.sound.all():
-            bad = int(np.argmin(settled.sound))
-            self._refuse(values, record[:, moving[bad]], moved[:, bad], not settled.at_rest[bad], state, before)
-
-    def require_held(self, values: Array, record: Array, state: Array) -> None:
-        """Refuse states in equilibrium that springs do not hold, such as a load balanced upright on a soft joint.
-
-        Raises:
-            NotConvergedError: of a record.
-        """
-        if len(state):
-            low = lowest(self._slopes(values, record, state)(np.arange(state.shape[1]))[1])
-            bad = int(np.argmin(low))
-            if not low[bad] > 0:
-                self._refuse(values, record[:, bad], state[:, bad], False, state, np.zeros_like(state))
-
-    def _refuse(self, values: Array, record: Array, at: Array, far: bool, state: Array, before: Array) -> NoReturn:
-        """Of one record at a state; all states are left at ``before``."""
-        _, slopes = self._slopes(values, record[:, None], at[:, None].copy())(np.arange(1))
-        state[:] = before
-        raise refusal(f"a record ({self.factor.pose_of(record)})", self.factor.springs, at, slopes[0], far)
-
-    def _slopes(self, values: Array, record: Array, state: Array) -> Evaluate:
-        """What ``settle`` asks for, of these records at their states."""
-
-        def evaluate(places: NDArray[np.intp]) -> tuple[Array, Array]:
-            following, slopes = self._slope(values, record[:, places], state[:, places])
-            return following, slopes.reshape(len(state), len(state), -1).transpose(2, 1, 0)
-
-        return evaluate
 
     def predict(self, values: Array, record: Array, state: Array, shown: Array) -> None:
         """Outputs and tool poses in equilibrium (n_o + 12 an arm x records).
@@ -238,23 +175,11 @@ class Kernel:
         Raises:
             NotConvergedError: a record has no equilibrium.
         """
-        self._in_equilibrium(self.outputs, values, record, state, shown)
+        shown[:] = self.evaluator(values, record, state)
 
     def nuisance_starts(self, values: Array, record: Array, state: Array, starts: Array) -> None:
         """Where each record alone has its group's parameters start, in equilibrium (entries x records)."""
-        self._in_equilibrium(self.factor.nuisance_function(), values, record, state, starts)
-
-    def _in_equilibrium(self, function: ca.Function, values: Array, record: Array, state: Array, shown: Array) -> None:
-        mapped, before = InterpretedFunction(function, 1), state.copy()
-        for _ in range(MOST_PASSES):
-            following, shown[:] = mapped(values, record, state)
-            moved = np.abs(following - state).max(initial=0.0)
-            state[:] = following
-            if moved <= REST_RAD and not _out_of_hand(state):
-                self.require_held(values, record, state)
-                return
-        self._settle_by_newton(values, record, state, before)
-        _, shown[:] = mapped(values, record, state)
+        starts[:] = Evaluator(self.factor, self.factor.nuisance_starts)(values, record, state)
 
 
 def _out_of_hand(state: Array) -> bool:

@@ -1,0 +1,207 @@
+"""Where springs come to rest: the one evaluator of expressions in elastic equilibrium.
+
+An elastic pass F leads from a deflection d to the one that springs answer with; in equilibrium d = F(d). Its value is
+iterated, from wherever the caller has it already: passes while these lead to rest, Newton's method where they do not.
+Its derivatives follow from one pass, by the implicit function theorem [Griewank2008].
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from itertools import pairwise
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from armcal.arm.equilibrium import (
+    MOST_DEFLECTION,
+    NEAR_REST_RAD,
+    REST_RAD,
+    Evaluate,
+    by_passes,
+    lowest,
+    refusal,
+    settle,
+)
+from armcal.base import se3
+from armcal.base.domains import Array
+from armcal.base.se3 import Expression
+from armcal.functions.interpreted import InterpretedFunction
+
+Mask = NDArray[np.bool_]
+ManyRecords = Callable[..., list[Array]]
+"""A CasADi function over columns: ``InterpretedFunction`` or ``BatchFunction``."""
+_TOGETHER = 4096
+"""Records whose slopes are in memory at once."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ElasticPass:
+    """One elastic pass of a record, as an expression.
+
+    Attributes:
+        record: symbols of what differs from record to record (n_c).
+        state: symbols of the deflections of all springs (n_d; rad or m).
+        next_state: what the springs answer with; equal to ``state`` in equilibrium.
+        values: symbols of what all records share (n_v).
+        springs: of each number of the state, what gives, in words.
+    """
+
+    record: Expression
+    state: Expression
+    next_state: Expression
+    values: Expression = field(default_factory=lambda: ca.SX(0, 1))
+    springs: tuple[str, ...] = ()
+
+    def described(self, index: int, record: Array) -> str:
+        """What messages call a record (n_c) at a place among others."""
+        return f"record {index + 1}"
+
+    def slope(self) -> Expression:
+        """S = d next_state / d state (n_d x n_d)."""
+        return ca.densify(ca.jacobian(self.next_state, self.state))
+
+    def to_equilibrium(self, *right: Expression) -> list[Expression]:
+        """(I - S)^-1 of each right hand side (n_d rows): how the equilibrium follows what moves ``next_state``."""
+        if not self.state.numel():
+            return list(right)
+        solved = se3.solve_near_identity(self._one_minus_slope, ca.densify(ca.horzcat(*right)))
+        widths = np.cumsum([0, *(side.size2() for side in right)])
+        return [solved[:, int(a) : int(b)] for a, b in pairwise(widths)]
+
+    def adjoint(self, rows: Expression) -> Expression:
+        """Rows (n_d columns) times (I - S)^-1, for derivatives by many numbers at once."""
+        return se3.solve_near_identity(self._one_minus_slope.T, ca.densify(rows).T).T
+
+    @property
+    def _one_minus_slope(self) -> Expression:
+        return ca.SX.eye(self.state.numel()) - self.slope()
+
+
+class Evaluator:
+    """Outputs of records whose springs are in equilibrium.
+
+    Everywhere ``values`` (n_v) are shared by all records (n_c x N); ``state`` (n_d x N) is where the search for the
+    equilibrium starts, and is left there.
+    """
+
+    def __init__(
+        self,
+        elastic: ElasticPass,
+        outputs: Expression,
+        many: Callable[[ca.Function], ManyRecords] | None = None,
+    ) -> None:
+        """``many`` makes functions of many records (compiled, where there are no shared values)."""
+        self._elastic = elastic
+        self._shared = [elastic.values] if elastic.values.numel() else []
+        self._many = many or (lambda function: InterpretedFunction(function, len(self._shared)))
+        self._outputs = outputs
+
+    def __call__(self, values: Array, record: Array, state: Array) -> Array:
+        """Outputs (n_o x N) in equilibrium.
+
+        Raises:
+            NotConvergedError: a record has none that its springs hold; all states are where they were.
+        """
+        before = state.copy()
+        outputs, sound = self.settle(values, record, state)
+        self._require(sound, values, record, state, before)
+        return outputs
+
+    def settle(self, values: Array, record: Array, state: Array, rest: float = REST_RAD) -> tuple[Array, Mask]:
+        """The same, and which records have an equilibrium that their springs hold (N), instead of an error.
+
+        Passes end where no deflection moves more than ``rest``.
+        """
+        before, outputs = state.copy(), np.empty((self._outputs.numel(), record.shape[1]))
+
+        def following() -> Array:
+            following_state, outputs[:] = self._pass(*self._inputs(values, record, state))
+            return following_state
+
+        by_passes(following, state, rest)
+        passed = state.copy()
+        sound = self._hold(values, record, state, before)
+        if (state != passed).any():
+            following()
+        return outputs, sound
+
+    def recover(self, values: Array, record: Array, state: Array, before: Array) -> None:
+        """Bring records, to which passes from ``before`` led, to equilibria that the springs hold.
+
+        Raises:
+            NotConvergedError: a record has none; all states are left at ``before``.
+        """
+        self._require(self._hold(values, record, state, before), values, record, state, before)
+
+    def require_held(self, values: Array, record: Array, state: Array) -> None:
+        """Refuse states in equilibrium that springs do not hold, such as a load balanced upright on a soft joint.
+
+        Raises:
+            NotConvergedError: of a record; all states are left at zero.
+        """
+        if len(state):
+            held = lowest(self._slopes(values, record, state)(np.arange(state.shape[1]))[1]) > 0
+            self._require(held, values, record, state, np.zeros_like(state))
+
+    def _hold(self, values: Array, record: Array, state: Array, before: Array) -> Mask:
+        """Which records (N) have come to rest where springs hold them, by Newton's method where passes did not.
+
+        Records that are at rest stay there; others start anew from ``before``, or from no deflection if that is much.
+        """
+        sound = np.ones(state.shape[1], dtype=bool)
+        for start in range(0, state.shape[1] if len(state) else 0, _TOGETHER):
+            part = slice(start, start + _TOGETHER)
+            here, own = state[:, part], record[:, part]
+            far = ~(np.abs(here).max(axis=0) <= MOST_DEFLECTION)
+            here[:, far] = 0.0
+            following, slopes = self._slopes(values, own, here)(np.arange(here.shape[1]))
+            at_rest = (np.abs(following - here).max(axis=0) < NEAR_REST_RAD) & (lowest(slopes) > 0) & ~far
+            if not at_rest.all():
+                moving = np.flatnonzero(~at_rest)
+                begun = before[:, part][:, moving]
+                begun[:, ~(np.abs(begun).max(axis=0) <= MOST_DEFLECTION)] = 0.0
+                at_rest[moving] = settle(self._slopes(values, own[:, moving], begun), begun).sound
+                here[:, moving] = begun
+            sound[part] = at_rest
+        return sound
+
+    def _require(self, sound: Mask, values: Array, record: Array, state: Array, before: Array) -> None:
+        if sound.all():
+            return
+        bad = int(np.argmin(sound))
+        own, at = record[:, [bad]], state[:, [bad]]
+        following, slopes = self._slopes(values, own, at)(np.arange(1))
+        far = not (np.abs(following - at).max() < NEAR_REST_RAD and np.abs(at).max() <= MOST_DEFLECTION)
+        state[:] = before
+        raise refusal(self._elastic.described(bad, own[:, 0]), self._elastic.springs, at[:, 0], slopes[0], far)
+
+    def _slopes(self, values: Array, record: Array, state: Array) -> Evaluate:
+        """What Newton's method asks for, of these records at their states."""
+        size = len(state)
+
+        def evaluate(places: NDArray[np.intp]) -> tuple[Array, Array]:
+            following, slopes = self._slope(*self._inputs(values, record[:, places], state[:, places]))
+            return following, slopes.reshape(size, size, -1).transpose(2, 1, 0)
+
+        return evaluate
+
+    def _inputs(self, values: Array, record: Array, state: Array) -> Sequence[Array]:
+        return (values, record, state) if self._shared else (record, state)
+
+    @cached_property
+    def _pass(self) -> ManyRecords:
+        return self._function("elastic_pass", self._outputs)
+
+    @cached_property
+    def _slope(self) -> ManyRecords:
+        return self._function("elastic_slope", self._elastic.slope())
+
+    def _function(self, name: str, outputs: Expression) -> ManyRecords:
+        """(shared values, record, state) -> (next state, outputs column by column)."""
+        inputs = [*self._shared, self._elastic.record, self._elastic.state]
+        shown = [ca.densify(self._elastic.next_state), ca.densify(ca.vec(outputs))]
+        return self._many(ca.Function(name, inputs, shown, {"cse": True}))
