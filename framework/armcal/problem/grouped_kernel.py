@@ -74,7 +74,7 @@ class GroupedKernel:
 
     def require_held(self, values: Array, records: FactorRecords) -> None:
         """Refuse states in equilibrium that springs do not hold (NotConvergedError)."""
-        self._evaluate(self.kernel.require_held, values, records)
+        self._evaluate(self.kernel.evaluator.require_held, values, records)
 
     def channel_slopes(self, values: Array, records: FactorRecords, channels: Sequence[str]) -> Array:
         """d raw residual / d channels at states that are in equilibrium already (n_r x channels x width)."""
@@ -85,7 +85,8 @@ class GroupedKernel:
 
     def predict(self, values: Array, records: FactorRecords) -> Array:
         """Outputs, then tool poses (n_o + 12 an arm x width)."""
-        shown = np.empty((self.kernel.outputs.numel_out(1), records.record.shape[1]))
+        factor = self.kernel.factor
+        shown = np.empty((factor.outputs.numel() + factor.tools.numel(), records.record.shape[1]))
         self._evaluate(self.kernel.predict, values, records, shown)
         return shown
 
