@@ -429,7 +429,7 @@ class Ledge(Contact):
     def group_parameters(self, group: str) -> Any:
         return (replace(scalar("height", "m", 0.0, 0.01), free=True),)
 
-    def told(self, arms: Any, values: Any) -> Any:
+    def group_starts(self, arms: Any, values: Any) -> Any:
         return {"height": arms[self.arms[0]].base_T_tool.translation[2]}
 
     def residual(self, arms: Any, measured: Any, values: Any) -> Any:
@@ -445,8 +445,8 @@ class LedgeInMillimetres(Ledge):
 
 
 class TellsTheOppositeHeight(Ledge):
-    def told(self, arms: Any, values: Any) -> Any:
-        return {"height": -super().told(arms, values)["height"]}
+    def group_starts(self, arms: Any, values: Any) -> Any:
+        return {"height": -super().group_starts(arms, values)["height"]}
 
 
 class GroupsThatDiffer(Ledge):
