@@ -50,7 +50,7 @@ class Unsettled:
 
 
 class Settling:
-    """Fed with frames, it says whether the arm stands. See ``stillness.judged`` for what that means."""
+    """Judges by frames whether the arm stands. See ``stillness.judged`` for what that means."""
 
     def __init__(self, settings: SettleSettings, bodies: BodySettings) -> None:
         self._settings = settings

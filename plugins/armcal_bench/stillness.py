@@ -109,7 +109,7 @@ def deviations_of_mean(poses: Array, mean: Array) -> Array:
     """Standard deviations (6) of the mean: x, y, z (m), and the turn about each axis of the target (rad).
 
     Noise of frames that follow each other may be alike: as many count as an autoregression of first order with the
-    correlation found leaves independent. [Box2015] NaN where fewer than two poses have one.
+    estimated correlation leaves independent. [Box2015] NaN where fewer than two poses have one.
     """
     deviations = np.full(6, np.nan)
     if len(poses) >= 2:

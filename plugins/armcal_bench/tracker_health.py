@@ -9,7 +9,7 @@ from armcal.devices.tracker import REPEATED, TrackerFrame
 from armcal_bench.bodies import BodySettings, base_fault, repeats, tool_fault
 
 WELL_S = 0.1
-"""A tracker whose last frame was good and came so lately is well."""
+"""A tracker whose last frame was usable and came so lately is well."""
 
 
 class TrackerHealth:

@@ -36,7 +36,7 @@ class Waits:
         self._since[kind] = since, now
 
     def given_up(self, kind: str) -> None:
-        """It is waited for no longer, in vain: whoever gives up says so."""
+        """It is waited for no longer, in vain: whoever gives up reports it."""
         self._since.pop(kind, None)
 
     def over(self, kind: str, now: float) -> None:

@@ -149,7 +149,7 @@ class Chip:
         """Prescale and modes, while no channel has pulses."""
         self._link.write(self._address, bytes((ALL_LED,)) + Channel(0, FULL).pack())
         if any(set_to.counts is not None for set_to in self.channels(range(CHANNELS)).values()):
-            raise DeviceError("its pulses did not end when they were told to.", where=self.where, hint="Try again.")
+            raise DeviceError("its pulses did not end as they should have.", where=self.where, hint="Try again.")
         self._write(MODE1, AUTO_INCREMENT | SLEEP)
         self._write(PRE_SCALE, self._prescale)
         self._write(MODE2, OUTDRV)

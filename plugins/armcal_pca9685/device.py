@@ -143,7 +143,7 @@ class Pca9685Device(JointDevice, PulseDevice):
 
     @override
     def keep_alive(self) -> None:
-        """A guarded link says, too, whether its other end drives by itself meanwhile."""
+        """A guarded link reports, too, whether its other end drives by itself meanwhile."""
         self._check_open()
         if isinstance(self._link, GuardedLink):
             self._link.beat()

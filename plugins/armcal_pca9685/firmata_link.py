@@ -25,7 +25,7 @@ _TRIES = 4
 _REPLY_S = 0.1
 _PROTOCOL = 2
 _LENGTHS = 4
-"""Answers have no number of their own: their lengths tell so many reads in a row apart."""
+"""Answers have no number of their own: their lengths distinguish so many reads in a row."""
 
 
 class FirmataSettings(SerialPortSettings):
@@ -62,7 +62,7 @@ class FirmataLink(Link):
 
     @override
     def write(self, address: int, data: bytes) -> None:
-        """Nobody says whether it arrived: read it back."""
+        """It is not acknowledged: read it back."""
         self._heard(0.0)
         self._port.write(firmata.i2c_write(address, data))
 
@@ -107,7 +107,7 @@ class FirmataLink(Link):
         return None, complaint
 
     def _heard(self, longest_s: float) -> list[Message]:
-        """What the board said; that it started anew, if it tells its versions unasked."""
+        """What the board sent; that it started anew, if it sends its versions unasked."""
         messages = self._decoder.feed(self._port.read(longest_s))
         if any(message.kind in (firmata.VERSION, firmata.FIRMWARE) for message in messages):
             self._port.close()
@@ -115,25 +115,25 @@ class FirmataLink(Link):
         return messages
 
     def _greet(self, clock: Clock) -> str:
-        """Who it is; afterwards the line is quiet, so that versions told again mean a reset."""
-        version, firmware, asked = b"", "", 0
+        """Who it is; afterwards the line is quiet, so that versions sent again mean a reset."""
+        version, firmware, queries = b"", "", 0
         until = clock.now() + self._settings.start
         while not (version and firmware):
             self._port.write(firmata.QUERY_VERSIONS)
-            asked += 1
+            queries += 1
             quiet = time.monotonic() + _REPLY_S
             while (left := quiet - time.monotonic()) > 0:
                 data = self._port.read(left)  # readings of pins may come all the time: they make no line unquiet
                 for message in self._decoder.feed(data):
                     if message.kind in (firmata.VERSION, firmata.FIRMWARE):
-                        quiet = time.monotonic() + _REPLY_S * asked  # a slow line brings an answer for each
+                        quiet = time.monotonic() + _REPLY_S * queries  # a slow line brings an answer for each
                     if message.kind == firmata.VERSION:
                         version = message.data
                     elif message.kind == firmata.FIRMWARE:
                         firmware = f"{firmata.text_of(message.data[2:])} {'.'.join(map(str, message.data[:2]))}"
             if not (version and firmware):
                 if clock.now() >= until:
-                    text = "it tells no version of Firmata, expected a board with the sketch StandardFirmata."
+                    text = "it sends no version of Firmata, expected a board with the sketch StandardFirmata."
                     raise DeviceLostError(text, where=self._where, hint="Load the sketch, and check port and baud.")
                 clock.sleep(_REPLY_S)
         if version[0] != _PROTOCOL:

@@ -17,7 +17,7 @@ _UNFINISHED = re.compile(rb"(?:\xf0[\x00-\x7f]{0,1024}|[\x80-\xef\xf9][\x00-\x7f
 
 
 class Message(NamedTuple):
-    """What a board said: ``VERSION``, or the first byte of a sysex message, and its data as it came (7 bits each)."""
+    """What a board sent: ``VERSION``, or the first byte of a sysex message, and its data as it came (7 bits each)."""
 
     kind: int
     data: bytes
@@ -95,8 +95,8 @@ def i2c_read(address: int, register: int, count: int) -> bytes:
 
 def i2c_reply(data: bytes) -> I2cReply | None:
     """What an ``I2C_REPLY`` holds; None if it is garbled."""
-    found = unpaired(data)
-    return None if found is None or len(found) < 2 else I2cReply(found[0], found[1], found[2:])
+    reply = unpaired(data)
+    return None if reply is None or len(reply) < 2 else I2cReply(reply[0], reply[1], reply[2:])
 
 
 def text_of(data: bytes) -> str:

@@ -70,7 +70,7 @@ class FramedLink(GuardedLink, Link):
             until, hello = clock.now() + self._settings.start, None
             while hello is None:  # it may only be starting
                 while self._port.read(0.0):
-                    pass  # what was said to another program
+                    pass  # what was sent to another program
                 hello = self._greet()
                 if hello is None:
                     if clock.now() >= until:

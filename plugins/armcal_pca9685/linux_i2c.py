@@ -28,7 +28,7 @@ class LinuxI2cSettings(Settings):
 
 
 class LinuxI2cLink(Link):
-    """The link ``linux_i2c``. Nothing tells one such bus from another, and nothing counts its starts."""
+    """The link ``linux_i2c``. Such buses have no identity, and nothing counts their starts."""
 
     Settings: ClassVar[type[LinuxI2cSettings]] = LinuxI2cSettings
     EXAMPLE: ClassVar[Mapping[str, Any]] = {"bus": 1}

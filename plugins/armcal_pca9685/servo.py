@@ -16,7 +16,7 @@ _COUNT_SLACK = 1e-6
 
 @dataclass(frozen=True)
 class Servo:
-    """A servo as the servo file has it; tables and clocks are looked up once, for they are asked at every step."""
+    """A servo as the servo file has it; tables and clocks are looked up once, for every step needs them."""
 
     calibrated: CalibratedServo
     pulse_range: tuple[float, float]

@@ -10,7 +10,7 @@ import pytest
 from armcal.arm.servo import PulseClock, PulseTable
 from armcal_bench.servo.fit import fit_servos
 from armcal_bench.servo.known import KnownBoard, KnownServo, MeasuredPulse, Observation
-from armcal_bench.servo.unknowns import FitTask
+from armcal_bench.servo.problem import FitTask
 
 US = 1e-6
 KNOTS = tuple(math.radians(a) for a in (-100, 0, 100))

@@ -269,7 +269,7 @@ class TestTracker:
 
 
 def _of_mover(setup: Setup) -> tuple[Any, ...]:
-    read_by = {joint: (setup.known(joint), setup.file.boards["front"].clock) for joint in setup.base}
+    read_by = {joint: setup.table_of(joint) for joint in setup.base}
     clock, pulses = FakeClock(), {joint: setup.pulses_of(joint) for joint in setup.base}
     return clock, read_by, read_by, Motion(0.3, 0.02, pulses), lambda: False
 

@@ -1,8 +1,8 @@
-"""The model's axes put where the tool's turns show them, and what those turns tell of the springs.
+"""The model's axes put where the tool's turns show them, and the springs as far as those turns determine them.
 
 What springs give is reckoned by the model, and a model whose axes point a few degrees elsewhere reckons it wrong. Turns
-of the tool across the axis of the joint that moves have nothing to do with its servo; they tell the axes, and the
-compliances. They are fitted by Gauss-Newton steps [Nocedal2006], every number near its nominal value.
+of the tool across the axis of the joint that moves have nothing to do with its servo; they determine the
+axes, and the compliances. They are fitted by Gauss-Newton steps [Nocedal2006], every number near its nominal value.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from armcal_bench.servo.angles import Springs, Sweeps
 from armcal_bench.servo.nominal import NominalArm
-from armcal_bench.servo.unknowns import SpringRows
+from armcal_bench.servo.problem import SpringRows
 
 _ANGLE_SD = math.radians(4.0)
 _ZERO_SD = math.radians(2.0)
@@ -35,7 +35,7 @@ class Alignment:
 
     Attributes:
         numbers: of the model's angles, then the joints' zeros, less their nominal values; then the tilt of ``base`` and
-            what ``seat`` was turned by since it was first found (3 each, rad).
+            what ``seat`` was turned by since it was first estimated (3 each, rad).
         compliances: of the springs, less their nominal values (rad/(N m)).
         base, seat: rotations (3x3).
     """

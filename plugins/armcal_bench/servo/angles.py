@@ -26,13 +26,13 @@ Entry = Mapping[str, Any]
 
 @dataclass(frozen=True, eq=False)
 class Sweeps:
-    """A joint's lines that tell angles, and what they tell.
+    """A joint's lines that show angles, and these angles.
 
     Attributes:
         lines: of the record.
-        angles: found (rad), what springs give taken out as far as it is known.
+        angles: of the joint (rad), what springs give taken out as far as it is known.
         sds: of these (rad).
-        by: what they were found by; None: somebody said so.
+        by: what showed them; None: somebody's eyes.
         turning: how the tool turned, where a tracker saw it.
     """
 
@@ -94,11 +94,11 @@ def sweeps_of(
 ) -> Sweeps | str:
     """A joint's angles, or why they are not known."""
     poses = [e for e in entries if e["kind"] == POSE and e["joint"] == joint]
-    said = list({(e["target"], e["came"]): e for e in entries if e["kind"] == ANGLE and e["joint"] == joint}.values())
-    if not poses and not said:
+    by_eye = list({(e["target"], e["came"]): e for e in entries if e["kind"] == ANGLE and e["joint"] == joint}.values())
+    if not poses and not by_eye:
         return "nothing was measured"
     if not poses:
-        return Sweeps(tuple(said), np.array([e["angle"] for e in said]), np.array([e["sd"] for e in said]))
+        return Sweeps(tuple(by_eye), np.array([e["angle"] for e in by_eye]), np.array([e["sd"] for e in by_eye]))
     given = np.tile(np.eye(4), (len(poses), 1, 1)) if springs is None else springs.given(poses, joint)
     try:
         return _tracked(poses, joint, nominal, settings, given)
@@ -107,7 +107,7 @@ def sweeps_of(
 
 
 def observations_of(sweeps: Sweeps, joint: str, nominal: NominalArm, springs: Springs | None) -> list[Observation]:
-    """As a fit takes them. Of what springs give, the change of compliances from ``nominal`` is left to be found."""
+    """As a fit takes them. Of what springs give, the change of compliances from ``nominal`` is left to the fit."""
     rows = list(zip(sweeps.counts, sweeps.approaches, sweeps.angles.tolist(), sweeps.sds.tolist(), strict=True))
     if springs is None or sweeps.by is None:
         return [Observation(joint, *row) for row in rows]
@@ -128,7 +128,7 @@ def _tracked(
     Raises:
         NoTurnError: the tool did not turn, or not about this joint's axis.
     """
-    # Where the other joints stood: the median, since each was told the same pulse every time.
+    # Where the other joints stood: the median, since each had the same pulse every time.
     names = sorted({name for e in poses for name in e["told"]} - {joint})
     others = {name: float(np.median([e["told"][name] for e in poses if name in e["told"]])) for name in names}
     axis = nominal.axis(joint, {**others, joint: 0.0})[0]

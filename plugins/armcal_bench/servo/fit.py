@@ -16,8 +16,7 @@ from armcal.base.domains import Array
 from scipy.optimize import OptimizeResult, least_squares
 
 from armcal_bench.servo.known import KnownServo, Observation
-from armcal_bench.servo.residuals import Residuals
-from armcal_bench.servo.unknowns import WEAK_PULSE_SD, FitTask, Unknowns
+from armcal_bench.servo.problem import WEAK_PULSE_SD, FitTask, Residuals, Unknowns
 
 _FAR_OFF = 5.0
 _LOSSES: tuple[Literal["linear", "soft_l1"], ...] = ("soft_l1", "linear", "linear")

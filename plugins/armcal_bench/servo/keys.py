@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import os
+import re
 import select
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Protocol
+
+from typing_extensions import override
 
 from armcal_bench.terminal import keep_single_keys, single_keys
 
@@ -32,7 +35,7 @@ _KEYS = {
     b"o": "o",
     b"n": "n",
 }
-_LONGEST_KEY = max(map(len, _KEYS))
+_KEY = re.compile(b"|".join(map(re.escape, sorted(_KEYS, key=len, reverse=True))))
 
 
 class Wishes(Protocol):
@@ -45,16 +48,23 @@ class Wishes(Protocol):
         """
 
 
-class Keys:
+class Keys(Wishes):
     """Single keys of a terminal; see ``terminal.single_keys`` for the mode that it must be in."""
 
     def __init__(self, descriptor: int) -> None:
         self._descriptor, self._read = descriptor, b""
 
+    @override
     def next(self, seconds: float) -> str | None:
-        """See ``Wishes``."""
         keep_single_keys(self._descriptor)
-        while (wish := self._taken()) is None:
+        while True:
+            while self._read:
+                if key := _KEY.match(self._read):
+                    self._read = self._read[key.end() :]
+                    return _KEYS[key[0]]
+                if any(key.startswith(self._read) for key in _KEYS):
+                    break
+                self._read = self._read[1:]  # what is no key is passed over
             if not select.select([self._descriptor], [], [], seconds)[0]:
                 # An escape with nothing after it is no key.
                 self._read = b""
@@ -66,29 +76,16 @@ class Keys:
             if not more:
                 return QUIT
             self._read += more
-        return wish
-
-    def _taken(self) -> str | None:
-        """The first key of what was read; what is no key is passed over."""
-        while self._read:
-            for length in range(min(_LONGEST_KEY, len(self._read)), 0, -1):
-                if (wish := _KEYS.get(self._read[:length])) is not None:
-                    self._read = self._read[length:]
-                    return wish
-            if any(key.startswith(self._read) for key in _KEYS):
-                return None
-            self._read = self._read[1:]
-        return None
 
 
-class Lines:
+class Lines(Wishes):
     """A wish a line, for scripts."""
 
     def __init__(self, descriptor: int) -> None:
         self._descriptor, self._read, self._ended = descriptor, b"", False
 
+    @override
     def next(self, seconds: float) -> str | None:
-        """See ``Wishes``."""
         while b"\n" not in self._read:
             if self._ended:
                 last, self._read = self._read, b""

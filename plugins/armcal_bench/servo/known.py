@@ -22,7 +22,7 @@ class KnownServo:
         joint: that it turns.
         board: that drives it.
         table: as stated; pulses by the board's stated oscillator.
-        trusted_sd: of the table's pulses (s), where the table is believed; None: it is to be found.
+        trusted_sd: of the table's pulses (s), where the table is believed; None: it is to be fitted.
         knots: angles (rad) that the table is to be given at; empty: those of the stated one.
     """
 
@@ -56,7 +56,7 @@ class KnownBoard:
 
 @dataclass(frozen=True)
 class Observation:
-    """An angle found at a pulse.
+    """An angle measured at a pulse.
 
     Attributes:
         joint: whose.

@@ -8,13 +8,12 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
-from armcal.arm.servo import PulseClock
+from armcal.arm.servo import PulseClock, PulseTable
 from armcal.devices.clock import Clock
 from armcal.devices.device import DeviceIdentity, JointDevice, PulseDevice
 from armcal.devices.faults import DeviceError, DeviceRefusedError
 from armcal.errors import InputError
 
-from armcal_bench.servo.known import KnownServo
 from armcal_bench.waiting import LostDevice, Waits
 
 _ALIVE_EVERY_S = 0.1
@@ -62,7 +61,7 @@ class Mover:
     Args:
         device: opened by ``open``.
         clock: for all waiting.
-        servos: by joint, with the clock of their board: what angles are turned into pulses by.
+        servos: tables and their boards' clocks by joint: what angles are turned into pulses by.
         read_by: the same as the device has them, by which it reports its angles.
         motion: how fast, and how far.
         asked_to_stop: looked at in every step.
@@ -72,8 +71,8 @@ class Mover:
 
     device: ServoDevice
     clock: Clock
-    servos: Mapping[str, tuple[KnownServo, PulseClock]]
-    read_by: Mapping[str, tuple[KnownServo, PulseClock]]
+    servos: Mapping[str, tuple[PulseTable, PulseClock]]
+    read_by: Mapping[str, tuple[PulseTable, PulseClock]]
     motion: Motion
     asked_to_stop: Callable[[], bool]
     look: Callable[[], None] = field(default=lambda: None)
@@ -110,8 +109,8 @@ class Mover:
 
     def counts_per_rad(self, joint: str) -> float:
         """By the stated table, where it is least."""
-        servo, clock = self.servos[joint]
-        slopes = np.abs(np.diff(servo.table.pulses) / np.diff(servo.table.angles))
+        table, clock = self.servos[joint]
+        slopes = np.abs(np.diff(table.pulses) / np.diff(table.angles))
         return float(slopes.min() / clock.tick)
 
     def energise(self, joint: str, counts: int) -> None:
@@ -171,7 +170,7 @@ class Mover:
         return self.device.guard([base] if base else [], self.motion.rate, self.motion.silence)
 
     def hold(self) -> bool:
-        """The board is to stay where it is when the host falls silent. False: it could not be told, for it is lost."""
+        """The board is to stay where it is when the host falls silent. False: the board is lost."""
         try:
             self.guard({})
         except DeviceError:
@@ -225,5 +224,5 @@ class Mover:
             raise StoppedError("it was asked to stop")
 
 
-def _counts(servo: KnownServo, clock: PulseClock, angle: float) -> int:
-    return math.floor(float(servo.pulses_at(np.array([angle]))[0]) / clock.tick + 0.5)
+def _counts(table: PulseTable, clock: PulseClock, angle: float) -> int:
+    return int(clock.counts(table.pulse(angle)))

@@ -1,4 +1,4 @@
-"""What the model says of one joint's motion: its axis, the tool, and what the springs add to it."""
+"""One joint's motion by the model: its axis, the tool, and what the springs add to it."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ class NominalArm:
 
     @classmethod
     def of(cls, arm: Arm, parameters: Parameters, environment: Environment) -> NominalArm:
-        """An arm without those of its effects that have no springs: its joints stand where they are said to."""
+        """An arm without those of its effects that have no springs: its joints stand where they are commanded."""
         nominal = {block.name: ca.SX(list(block.nominal)) for block in arm.parameters()}
         springy = {n: e for n, e in arm.effects.items() if e.springs(scoped(nominal, f"{arm.name}.{n}."))}
         arm = replace(arm, effects=springy)

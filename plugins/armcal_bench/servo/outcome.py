@@ -15,9 +15,9 @@ from armcal_bench.servo.angles import Entry, Springs, Sweeps, observations_of, s
 from armcal_bench.servo.fit import FittedServo, ServoFit, fit_servos
 from armcal_bench.servo.known import KnownBoard, KnownServo, Zero, piecewise
 from armcal_bench.servo.nominal import NominalArm
+from armcal_bench.servo.problem import FitTask
 from armcal_bench.servo.settings import ServoCalibrationSettings
 from armcal_bench.servo.trial import permuted
-from armcal_bench.servo.unknowns import FitTask
 
 _ROUNDS = 10
 _STEADY_S = 2e-8
@@ -56,7 +56,7 @@ def outcome_of(
 ) -> Outcome:
     """Fit all that a record holds of some servos.
 
-    One whose angles scatter as no servo's do is left out: it has let go, and would spoil what is found of the springs.
+    One whose angles scatter as no servo's do is left out: it has let go, and would spoil the estimate of the springs.
     """
     left_out = permuted(entries, [servo.joint for servo in servos], nominal)
     while True:

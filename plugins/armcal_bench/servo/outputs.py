@@ -23,7 +23,7 @@ from armcal_bench.servo.record import next_name
 
 RESULTS = "servo.json"
 _APART = math.radians(0.5)
-"""Knots that are nearer to the end of a shortened table say nothing more."""
+"""Knots that are nearer to the end of a shortened table add nothing."""
 Part = TypeVar("Part", BoardSettings, ServoSettings)
 
 
@@ -169,14 +169,14 @@ def _narrowed(outcome: Outcome, changed: ServoFile) -> list[str]:
     return sentences
 
 
-def write_results(folder: Path, content: Mapping[str, Any]) -> None:
+def write_results(folder: Path, summary: Mapping[str, Any]) -> None:
     """The results beside the record.
 
     Raises:
         InputError: the folder cannot be written.
     """
     try:
-        write_whole(REAL_FILES, folder / RESULTS, (json.dumps(content, indent=2, allow_nan=False) + "\n").encode())
+        write_whole(REAL_FILES, folder / RESULTS, (json.dumps(summary, indent=2, allow_nan=False) + "\n").encode())
     except OSError as fault:
         raise InputError(
             f"it cannot be written ({fault.strerror}).", where=Location(str(folder)), hint="Give another --out."

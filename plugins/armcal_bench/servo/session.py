@@ -9,7 +9,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, cast
 
-from armcal.arm.servo import PulseClock
 from armcal.devices.clock import Clock
 from armcal.errors import InputError, Location
 
@@ -39,7 +38,8 @@ class Conversation:
 
     Attributes:
         asked_to_stop: whether somebody wants it to hold and end.
-        may_energise: asked once, with what is about to move and what is dangerous in it, before anything does.
+        may_energise: whether the arm may be moved; called once before anything moves, with what is
+            about to move and what is dangerous in it.
         report: takes how far a tracked calibration is.
         say: takes a line, of a guided one.
         wishes: what somebody presses or writes, while it is asked for.
@@ -97,7 +97,7 @@ def adapter_of(folder: Path) -> str:
 
 
 def tried(setup: Setup, talk: Conversation, seen: str) -> list[Verdict]:
-    """Move each joint a little, and say what it did; ``seen`` by the ``tracker`` or by ``somebody``.
+    """Move each joint a little, and judge what it did; ``seen`` by the ``tracker`` or by ``somebody``.
 
     Joints that turned as commanded, and as no other joint did, are written down as checked beside the servo file.
 
@@ -155,11 +155,10 @@ def _opened(
     settings = setup.settings
     pulses = {joint: setup.pulses_of(joint) for joint in setup.base}
     motion = Motion(math.radians(settings.rate_deg_per_s), settings.period, pulses, settings.silence)
-    read_by = {joint: (setup.known(joint), _clock(setup, joint)) for joint in setup.base}
-    servos = read_by
+    servos = read_by = {joint: setup.table_of(joint) for joint in setup.base}
     if record is not None and record.is_measured:
-        stated = stated_by(setup, record.of_kind(BEGUN)[0], tuple(setup.base))[0]
-        servos = {known_servo.joint: (known_servo, _clock(setup, known_servo.joint)) for known_servo in stated}
+        stated, _ = stated_by(setup, record.of_kind(BEGUN)[0], tuple(setup.base))
+        servos = {servo.joint: (servo.table, read_by[servo.joint][1]) for servo in stated}
     mover = Mover(device, clock, servos, read_by, motion, talk.asked_to_stop, waits=talk.waits)
     try:
         identity = mover.open()
@@ -175,10 +174,6 @@ def _opened(
         raise
     finally:
         device.close()
-
-
-def _clock(setup: Setup, joint: str) -> PulseClock:
-    return setup.file.boards[setup.file.servos[joint].board].clock
 
 
 @contextmanager

@@ -44,8 +44,8 @@ class ServoCalibrationSettings(Settings):
         rotation_sd: of a settled rotation about an axis.
         least_radius: of a circle that shows an angle, where a tracker sees positions only.
         guided_sd: how well a joint is put at an angle by eye.
-        measured_pulses: pulses measured at boards' pins: they tell the oscillators.
-        trusted: joints whose stated tables are believed, by how well: they tell the oscillators too.
+        measured_pulses: pulses measured at boards' pins: they determine the oscillators.
+        trusted: joints whose stated tables are believed, by how well: they determine the oscillators too.
         check: how far ``--check`` moves a joint.
         silence: after this silence of the host a board that can brings the arm back to the base pose.
     """
@@ -74,7 +74,7 @@ class ServoCalibrationSettings(Settings):
     @model_validator(mode="after")
     def _usable(self) -> ServoCalibrationSettings:
         if len(self.knots) == 1 or not all(a < b for a, b in pairwise(self.knots)):
-            raise ValueError("the knots do not rise from each to the next, or are fewer than two")
+            raise ValueError("the knots do not rise, or are fewer than two")
         if not 0 < self.pulses[0] < self.pulses[1]:
             raise ValueError("the range of pulses does not rise from above zero: give [shortest, longest]")
         for joint, (low, high) in self.ranges.items():

@@ -9,6 +9,7 @@ from itertools import takewhile
 from pathlib import Path
 
 import numpy as np
+from armcal.arm.servo import PulseClock, PulseTable
 from armcal.base.domains import Array
 from armcal.config.servo_file import ServoFile, load_servo_file
 from armcal.config.validate import validate
@@ -99,6 +100,11 @@ class Setup:
         """A servo as the file states it."""
         servo = self.file.servos[joint]
         return KnownServo(joint, servo.board, servo.table, self.settings.trusted.get(joint), self.knots_of(joint))
+
+    def table_of(self, joint: str) -> tuple[PulseTable, PulseClock]:
+        """A servo's table, and the clock of its board, as the file states them."""
+        servo = self.file.servos[joint]
+        return servo.table, self.file.boards[servo.board].clock
 
     def knots_of(self, joint: str) -> tuple[float, ...]:
         """Angles (rad) that a table is to be given at: as configured, else its own; its ends reach over the range.

@@ -85,7 +85,6 @@ def to_base(setup: Setup, mover: Mover) -> None:
 def commanded_angles(mover: Mover) -> dict[str, float]:
     """The angles that the pulses ask for by the stated tables (rad, by joint)."""
     angles = {
-        joint: float(mover.servos[joint][0].table.angle(mover.pulse(joint, counts)))
-        for joint, counts in mover.counts.items()
+        joint: float(mover.servos[joint][0].angle(mover.pulse(joint, counts))) for joint, counts in mover.counts.items()
     }
     return {joint: angle for joint, angle in angles.items() if math.isfinite(angle)}

@@ -1,4 +1,4 @@
-"""Whether each joint of a new arm turns as the model says: the right one, the right way, as far as it is told."""
+"""Whether each joint of a new arm turns as commanded: the right one, the right way, as far as the model has it."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ class Verdict:
     """What a joint did.
 
     Attributes:
-        joint: that was told to move.
+        joint: that was commanded.
         kind: ``right``, ``reversed``, ``gain``, ``another``, ``still``, ``wrapped`` or ``unclear``.
         sentence: what was seen.
         mend: what to do; empty if nothing.
-        turned: the angle found (rad); NaN where none is known.
-        other: the joint that moved instead, or that cannot be told apart.
+        turned: the measured angle (rad); NaN where none is known.
+        other: the joint that moved instead, or that cannot be distinguished.
     """
 
     joint: str
@@ -52,7 +52,7 @@ class Verdict:
 
 @dataclass(frozen=True, eq=False)
 class Move:
-    """What was seen when a joint was told to turn (rad): the tool's pose before and after (4 x 4, base frame).
+    """What was seen when a joint was commanded to turn (rad): the tool's pose before and after (4 x 4, base frame).
 
     Rotations may be NaN.
     """
@@ -103,7 +103,7 @@ def judged(moves: Sequence[Move], base: Mapping[str, float], nominal: NominalArm
 
     Args:
         moves: one of each joint that was tried.
-        base: the angles of all joints that the pulses asked for (rad).
+        base: the angles of all joints that the pulses command (rad).
         nominal: the model.
     """
     seen = [move for move in moves if not move.is_little]
@@ -208,15 +208,15 @@ def wrapped(joint: str, table: tuple[float, ...], limits: tuple[float, float]) -
     )
 
 
-def answered(joint: str, told: float, ask: Callable[[str], str]) -> Verdict:
-    """The same by somebody's eyes."""
-    size = f"{math.degrees(told):+.0f} deg"
+def answered(joint: str, commanded: float, ask: Callable[[str], str]) -> Verdict:
+    """The verdict of somebody who watches the arm."""
+    size = f"{math.degrees(commanded):+.0f} deg"
     wish = ask(
-        f"{joint} was told to turn by {size}. y: it did, r: the other way, o: another joint did, n: nothing moved"
+        f"{joint} was commanded to turn by {size}. y: it did, r: the other way, o: another joint did, n: nothing moved"
     )
-    kinds = {"y": ("right", told), "r": ("reversed", -told), "o": ("another", math.nan), "n": ("still", 0.0)}
+    kinds = {"y": ("right", commanded), "r": ("reversed", -commanded), "o": ("another", math.nan), "n": ("still", 0.0)}
     kind, turned = kinds.get(wish, ("unclear", math.nan))
-    return _verdict(kind, joint, told, turned, "another joint" if kind == "another" else "")
+    return _verdict(kind, joint, commanded, turned, "another joint" if kind == "another" else "")
 
 
 def swapped(verdicts: list[Verdict]) -> list[str]:
@@ -243,30 +243,30 @@ def _explained(move: Move, axis: Array, origin: Array) -> tuple[float, float]:
     return turned, float(np.linalg.norm(by_joint.apply(p) - q)) + _LEVER_M * left
 
 
-def _verdict(kind: str, joint: str, told: float, turned: float, other: str = "") -> Verdict:
-    size, seen = f"{math.degrees(told):+.1f} deg", f"{math.degrees(turned):+.1f} deg"
+def _verdict(kind: str, joint: str, commanded: float, turned: float, other: str = "") -> Verdict:
+    size, seen = f"{math.degrees(commanded):+.1f} deg", f"{math.degrees(turned):+.1f} deg"
     alike = (
-        f" It cannot be told from {other} in this base pose: choose one that bends the arm between them."
+        f" It cannot be distinguished from {other} in this base pose: choose one that bends the arm between them."
         if other
         else ""
     )
     sentences = {
-        "right": (f"{joint} turned by {seen}, told {size}.{alike}", ""),
+        "right": (f"{joint} turned by {seen}, commanded {size}.{alike}", ""),
         "reversed": (
-            f"{joint} turned by {seen}, told {size}: the other way.{alike}",
+            f"{joint} turned by {seen}, commanded {size}: the other way.{alike}",
             "Give its pulses in the servo file in the opposite order, or turn the joint's sign in the model.",
         ),
         "gain": (
-            f"{joint} turned by {seen}, told {size}: the wrong size.{alike}",
+            f"{joint} turned by {seen}, commanded {size}: the wrong size.{alike}",
             "Check its servo's type and its table's angles; then calibrate it.",
         ),
         "another": (
-            f"{joint} was told {size}, and {other} turned{'' if math.isnan(turned) else f' by {seen}'}.",
+            f"{joint} was commanded {size}, and {other} turned{'' if math.isnan(turned) else f' by {seen}'}.",
             f"Give {joint} the channel of {other} in the servo file, or change the plugs.",
         ),
-        "still": (f"{joint} was told {size} and did not move.", "Check its plug, its channel and its supply."),
+        "still": (f"{joint} was commanded {size} and did not move.", "Check its plug, its channel and its supply."),
         "unclear": (
-            f"{joint} was told {size}, and what moved is no joint of the model.",
+            f"{joint} was commanded {size}, and what moved is no joint of the model.",
             "Check that the tracker follows the tool, and the pose of its base (bench.bodies).",
         ),
     }
