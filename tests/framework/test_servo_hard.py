@@ -16,11 +16,10 @@ from armcal.devices.device import DeviceIdentity
 from armcal.devices.faults import DeviceError
 from armcal.errors import ArmcalError, DataError, InputError
 from armcal_bench.acquisition.heat import HeatModel
-from armcal_bench.servo.mover import Motion, Mover, StoppedError
+from armcal_bench.servo.mover import Mover, StoppedError
 from armcal_bench.servo.outputs import improved, write_servo_file
 from armcal_bench.servo.record import NAME, Record
 from armcal_bench.servo.session import Conversation, evaluated, measure
-from armcal_bench.servo.setup import Setup
 from armcal_bench.servo.thermal_state import ThermalState
 
 from tests.bench_fakes import FakeClock
@@ -200,7 +199,8 @@ class TestRecovery:
             return DeviceIdentity("fake" if device.opened == 1 else "another", "d1")
 
         monkeypatch.setattr(device, "open", other)
-        mover = Mover(device, *_of_mover(setup))
+        servos = {joint: setup.table_of(joint) for joint in setup.base}
+        mover = Mover(setup, device, FakeClock(), servos, lambda: False)
         mover.open()
         calls = []
         with pytest.raises(DeviceError, match="found another, expected fake"):
@@ -266,12 +266,6 @@ class TestTracker:
         assert not warm.must_rest  # it hung free
         warm.go_on({"q1": [0.9, 0.5]}, {"q1": 0.0}, -1e9)
         assert warm.must_rest  # by a wall clock that was set back
-
-
-def _of_mover(setup: Setup) -> tuple[Any, ...]:
-    read_by = {joint: setup.table_of(joint) for joint in setup.base}
-    clock, pulses = FakeClock(), {joint: setup.pulses_of(joint) for joint in setup.base}
-    return clock, read_by, read_by, Motion(0.3, 0.02, pulses), lambda: False
 
 
 @pytest.mark.slow

@@ -13,7 +13,6 @@ from armcal.devices.faults import DeviceError
 from armcal_bench.acquisition.tracker_monitor import TrackerMonitor
 from armcal_bench.servo.mover import Mover, StoppedError
 from armcal_bench.servo.record import LEFT_OUT, POSE, Record
-from armcal_bench.servo.setup import Setup
 from armcal_bench.servo.sweep import Point, come_to, commanded_angles, left, sweep, to_base
 from armcal_bench.servo.thermal_state import ThermalState
 from armcal_bench.settling import Settled
@@ -39,7 +38,6 @@ class RestlessError(StoppedError):
 class Automatic:
     """A tracked calibration. What is in the record is not measured again."""
 
-    setup: Setup
     mover: Mover
     monitor: TrackerMonitor
     record: Record
@@ -57,22 +55,22 @@ class Automatic:
                 stand: then it is in its base pose.
             DeviceError: the device is gone and does not come back.
         """
-        setup, mover, self.first = self.setup, self.mover, len(self.record.entries)
-        sweeps = {joint: sweep(setup, mover, joint) for joint in setup.joints}
+        mover, self.first = self.mover, len(self.record.entries)
+        sweeps = {joint: sweep(mover, joint) for joint in mover.setup.joints}
         if not any(left(points, self._done) for points in sweeps.values()):
             return
         try:
-            self._persist(lambda: to_base(setup, mover))
-            mover.guard(setup.base)
+            self._persist(lambda: to_base(mover))
+            mover.guard(mover.setup.base)
             for joint, points in sweeps.items():
                 for point in left(points, self._done):
                     self._persist(partial(self._measure, point))
                     self.report(joint, len(points) - len(left(points, self._done)), len(points))
-                self._persist(lambda: to_base(setup, mover))
+                self._persist(lambda: to_base(mover))
             mover.guard({})
         except (TrackerLostError, RestlessError):
             # Nobody may be there for hours, and it could hold a heavy pose.
-            self._persist(lambda: to_base(setup, mover))
+            self._persist(lambda: to_base(mover))
             raise
 
     @property
@@ -89,7 +87,7 @@ class Automatic:
     def _rest(self) -> None:
         """In the base pose, once a servo is near its budget."""
         if self.thermal_state.must_rest:
-            to_base(self.setup, self.mover)
+            to_base(self.mover)
             waits, clock = self.mover.waits, self.mover.clock
             while (left_s := self.thermal_state.rest_s) > 0:
                 waits.goes_on("rest", "the servos cool in the base pose", left_s, clock.now())
@@ -97,12 +95,12 @@ class Automatic:
             waits.over("rest", clock.now())
 
     def _measure(self, point: Point) -> None:
-        setup, mover = self.setup, self.mover
+        mover = self.mover
         settled: Settled | str = _WARM
         while settled == _WARM:
             self._rest()
-            come_to(setup, mover, point)
-            settled = capture(setup, mover, self.monitor, lambda: self.thermal_state.must_rest)
+            come_to(mover, point)
+            settled = capture(mover, self.monitor, lambda: self.thermal_state.must_rest)
         line: dict[str, Any] = {"joint": point.joint, "counts": point.counts, "came": point.came}
         line["at"], line["warmth"] = mover.clock.wall(), self.thermal_state.by_joint
         line["told"] = commanded_angles(mover)
@@ -133,15 +131,13 @@ class Automatic:
                 self.mover.recover(fault)
 
 
-def capture(
-    setup: Setup, mover: Mover, monitor: TrackerMonitor, must_rest: Callable[[], bool] = lambda: False
-) -> Settled | str:
+def capture(mover: Mover, monitor: TrackerMonitor, must_rest: Callable[[], bool] = lambda: False) -> Settled | str:
     """Where the tool stands, once it does; or why that is not known.
 
     Raises:
         TrackerLostError: the tracker has given nothing of use for too long.
     """
-    settings, waits, now = setup.bench.settings.acquisition, mover.waits, mover.clock.now
+    settings, waits, now = mover.setup.bench.settings.acquisition, mover.waits, mover.clock.now
     monitor.begin()
     until = now() + settings.settle.longest
     while now() < until:

@@ -12,7 +12,6 @@ import numpy as np
 from armcal_bench.servo.keys import QUIT, Wishes
 from armcal_bench.servo.mover import Mover, StoppedError
 from armcal_bench.servo.record import ANGLE, LEFT_OUT, Record
-from armcal_bench.servo.setup import Setup
 from armcal_bench.servo.sweep import approach_counts, to_base
 
 _LOOK_S = 0.1
@@ -36,7 +35,6 @@ class Target:
 class Guided:
     """A calibration by eye. What is in the record is not asked for again."""
 
-    setup: Setup
     mover: Mover
     wishes: Wishes
     record: Record
@@ -54,7 +52,7 @@ class Guided:
         place = next((i for i, target in enumerate(targets) if target.key not in done), len(targets))
         if place == len(targets):
             return
-        to_base(self.setup, self.mover)
+        to_base(self.mover)
         while place < len(targets):
             if targets[place].key in done:
                 place += 1
@@ -71,10 +69,10 @@ class Guided:
         A range without such room is measured in its middle.
         """
         targets = []
-        for joint in self.setup.joints:
-            low, high = self.setup.ranges[joint]
-            margin = min(self.setup.settings.approach, (high - low) / 2)
-            knots = np.clip(self.setup.knots_of(joint), low + margin, high - margin)
+        for joint in self.mover.setup.joints:
+            low, high = self.mover.setup.ranges[joint]
+            margin = min(self.mover.setup.settings.approach, (high - low) / 2)
+            knots = np.clip(self.mover.setup.knots_of(joint), low + margin, high - margin)
             targets += [Target(joint, angle, came) for angle in sorted(set(knots.tolist())) for came in (1, -1)]
         return targets
 
@@ -87,7 +85,7 @@ class Guided:
         while True:
             counts = self._within(joint, round(pulse / mover.pulse(joint, 1)))
             if mover.came.get(joint) != target.came or target.came * (counts - mover.counts[joint]) < 0:
-                aside = counts - target.came * approach_counts(self.setup, mover, joint)
+                aside = counts - target.came * approach_counts(mover, joint)
                 mover.go(joint, self._within(joint, aside))  # from the target's side, with the play taken up
             mover.go(joint, counts)
             set_us = 1e6 * mover.pulse(joint, mover.counts[joint])
@@ -95,7 +93,7 @@ class Guided:
             wish = next_wish(self.wishes, mover)
             line = {"joint": joint, "target": target.angle, "came": target.came, "at": mover.clock.wall()}
             if wish == "ok":
-                measured = {"angle": target.angle, "sd": self.setup.settings.guided_sd}
+                measured = {"angle": target.angle, "sd": self.mover.setup.settings.guided_sd}
                 self.record.append(ANGLE, {**line, "counts": mover.counts[joint], **measured})
             elif wish == "skip":
                 self.record.append(LEFT_OUT, {**line, "why": "it was skipped"})
@@ -113,7 +111,7 @@ class Guided:
             self.say(f"  {wish!r} is not known: say a step in us (+10, -1), ok, skip, back or quit")
             return pulse
         stepped = pulse + 1e-6 * step
-        low, high = self.setup.pulses_of(joint)
+        low, high = self.mover.setup.pulses_of(joint)
         if not low <= stepped <= high:
             allowed = f"{1e6 * low:.0f} to {1e6 * high:.0f} us, which bench.servo.pulses and the servo's range allow"
             self.say(f"  {1e6 * stepped:.0f} us is outside {allowed}")
@@ -122,7 +120,7 @@ class Guided:
 
     def _within(self, joint: str, counts: int) -> int:
         """The nearest counts that are allowed."""
-        low, high = self.setup.pulses_of(joint)
+        low, high = self.mover.setup.pulses_of(joint)
         tick = self.mover.pulse(joint, 1)
         return min(max(counts, math.ceil(low / tick)), math.floor(high / tick))
 

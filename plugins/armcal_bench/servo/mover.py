@@ -14,6 +14,7 @@ from armcal.devices.device import DeviceIdentity, JointDevice, PulseDevice
 from armcal.devices.faults import DeviceError, DeviceRefusedError
 from armcal.errors import InputError
 
+from armcal_bench.servo.setup import Setup
 from armcal_bench.waiting import LostDevice, Waits
 
 _ALIVE_EVERY_S = 0.1
@@ -37,46 +38,27 @@ class StoppedError(Exception):
         self.arm = arm
 
 
-@dataclass(frozen=True)
-class Motion:
-    """How servos may be moved.
-
-    Attributes:
-        rate: the fastest (rad/s, by the stated tables).
-        period: between steps (s).
-        pulses: the shortest and the longest pulse (s), by joint.
-        silence: of the host, after which a board that can goes back to the base pose (s).
-    """
-
-    rate: float
-    period: float
-    pulses: Mapping[str, tuple[float, float]]
-    silence: float = 1.0
-
-
 @dataclass
 class Mover:
     """Moves servos; ``counts`` holds each one's as they were set, and ``came`` the sign of its last step.
 
     Args:
+        setup: how fast and how far servos may be moved, and the tables by which the device reports its angles.
         device: opened by ``open``.
         clock: for all waiting.
         servos: tables and their boards' clocks by joint: what angles are turned into pulses by.
-        read_by: the same as the device has them, by which it reports its angles.
-        motion: how fast, and how far.
         asked_to_stop: looked at in every step.
-        look: called after every pause, for who watches the arm meanwhile.
         waits: says what is waited for.
+        look: called after every pause, for who watches the arm meanwhile.
     """
 
+    setup: Setup
     device: ServoDevice
     clock: Clock
     servos: Mapping[str, tuple[PulseTable, PulseClock]]
-    read_by: Mapping[str, tuple[PulseTable, PulseClock]]
-    motion: Motion
     asked_to_stop: Callable[[], bool]
-    look: Callable[[], None] = field(default=lambda: None)
     waits: Waits = field(default_factory=Waits)
+    look: Callable[[], None] = field(default=lambda: None)
     identity: DeviceIdentity | None = None
     counts: dict[str, int] = field(default_factory=dict)
     came: dict[str, int] = field(default_factory=dict)
@@ -95,7 +77,7 @@ class Mover:
             )
         self.identity = self.device.open(self.clock)
         # A way home of another run must not be gone now.
-        self.device.guard([], self.motion.rate, self.motion.silence)
+        self.device.guard([], self._rate, self.setup.settings.silence)
         self.counts |= self._running()
         return self.identity
 
@@ -127,11 +109,12 @@ class Mover:
             StoppedError: on the way; the joint holds.
         """
         self.check(joint, counts)
-        at, step = float(self.counts[joint]), self.motion.rate * self.counts_per_rad(joint) * self.motion.period
+        at, period = float(self.counts[joint]), self.setup.settings.period
+        step = self._rate * self.counts_per_rad(joint) * period
         if counts != self.counts[joint]:
             self.came[joint] = 1 if counts > at else -1
         while self.counts[joint] != counts:
-            self._pause(self.motion.period)
+            self._pause(period)
             at += math.copysign(min(step, abs(counts - at)), counts - at)
             if (near := math.floor(at + 0.5)) != self.counts[joint]:
                 self._set(joint, near)
@@ -142,7 +125,7 @@ class Mover:
         Raises:
             InputError: it is not.
         """
-        low, high = self.motion.pulses[joint]
+        low, high = self.setup.pulses_of(joint)
         if not low <= self.pulse(joint, counts) <= high:
             raise InputError(
                 f"{joint}: found a pulse of {1e6 * self.pulse(joint, counts):.0f} us, expected {1e6 * low:.0f} to "
@@ -162,12 +145,12 @@ class Mover:
 
     def tick(self) -> None:
         """One period of standing still. See ``stand``."""
-        self._pause(self.motion.period)
+        self._pause(self.setup.settings.period)
 
     def guard(self, base: Mapping[str, float]) -> bool:
         """What the board is to do when the host falls silent: back to a pose (rad by joint), slowly."""
         self._guarded = dict(base)
-        return self.device.guard([base] if base else [], self.motion.rate, self.motion.silence)
+        return self.device.guard([base] if base else [], self._rate, self.setup.settings.silence)
 
     def hold(self) -> bool:
         """The board is to stay where it is when the host falls silent. False: the board is lost."""
@@ -189,7 +172,7 @@ class Mover:
 
     def _restore(self) -> None:
         # No way home is known while joints hang free.
-        self.device.guard([], self.motion.rate, self.motion.silence)
+        self.device.guard([], self._rate, self.setup.settings.silence)
         before, running = dict(self.counts), self._running()
         self.counts |= running
         self.came.clear()
@@ -203,7 +186,13 @@ class Mover:
     def _running(self) -> dict[str, int]:
         """The counts of the joints that get pulses."""
         angles = self.device.state().angles
-        return {joint: _counts(*self.read_by[joint], angle) for joint, angle in angles.items() if joint in self.read_by}
+        moved = {joint: angle for joint, angle in angles.items() if joint in self.setup.base}
+        return {joint: _counts(*self.setup.table_of(joint), angle) for joint, angle in moved.items()}
+
+    @property
+    def _rate(self) -> float:
+        """The fastest (rad/s, by the stated tables)."""
+        return math.radians(self.setup.settings.rate_deg_per_s)
 
     def _set(self, joint: str, counts: int) -> None:
         self.check(joint, counts)

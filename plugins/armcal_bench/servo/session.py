@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
@@ -18,7 +17,7 @@ from armcal_bench.servo.automatic import Automatic, ReportProgress, capture
 from armcal_bench.servo.beginning import begin, check_same, stated_by
 from armcal_bench.servo.guided import Guided, next_wish
 from armcal_bench.servo.keys import Wishes
-from armcal_bench.servo.mover import Motion, Mover, ServoDevice, StoppedError
+from armcal_bench.servo.mover import Mover, ServoDevice, StoppedError
 from armcal_bench.servo.outcome import Outcome, outcome_of
 from armcal_bench.servo.record import BEGUN, Record
 from armcal_bench.servo.setup import Setup
@@ -67,10 +66,10 @@ def measure(setup: Setup, folder: Path, talk: Conversation, how: str) -> None:
         if how == "guided":
             begin(setup, record, mover.identity, talk.say)
             with talk.wishes() as wishes:
-                Guided(setup, mover, wishes, record, talk.say).run()
+                Guided(mover, wishes, record, talk.say).run()
             return
-        with _monitor(setup, mover) as monitor:
-            run = Automatic(setup, mover, monitor, record, talk.report, _thermal_state(setup, mover, record))
+        with _monitor(mover) as monitor:
+            run = Automatic(mover, monitor, record, talk.report, _thermal_state(mover, record))
             begin(setup, record, mover.identity, talk.say)
             mover.look = run.look
             run.run()
@@ -110,13 +109,13 @@ def tried(setup: Setup, talk: Conversation, seen: str) -> list[Verdict]:
         return away
     with setup.bench.clock() as clock, _opened(setup, clock, talk, None) as mover:
         if seen == "tracker":
-            with _monitor(setup, mover) as monitor:
-                to_base(setup, mover)
-                verdicts = _tracked(setup, mover, monitor)
+            with _monitor(mover) as monitor:
+                to_base(mover)
+                verdicts = _tracked(mover, monitor)
         else:
-            to_base(setup, mover)
+            to_base(mover)
             with talk.wishes() as wishes:
-                verdicts = [_by_eye(setup, mover, joint, talk, wishes) for joint in setup.joints]
+                verdicts = [_by_eye(mover, joint, talk, wishes) for joint in setup.joints]
         adapter = mover.identity.adapter if mover.identity else ""
         _note(setup, verdicts, {"adapter": adapter, "by": seen, "at": clock.wall()})
         return verdicts
@@ -140,7 +139,7 @@ def park(setup: Setup, talk: Conversation, how: str) -> None:
     Raises: as ``measure``.
     """
     with setup.bench.clock() as clock, _opened(setup, clock, talk, None, releases=how == "release") as mover:
-        to_base(setup, mover)
+        to_base(mover)
         mover.guard({})
         for joint in reversed(tuple(setup.base)) if how == "release" else ():
             mover.device.release(joint)
@@ -152,14 +151,11 @@ def _opened(
     setup: Setup, clock: Clock, talk: Conversation, record: Record | None, *, releases: bool = False
 ) -> Iterator[Mover]:
     device = cast(ServoDevice, setup.bench.device())
-    settings = setup.settings
-    pulses = {joint: setup.pulses_of(joint) for joint in setup.base}
-    motion = Motion(math.radians(settings.rate_deg_per_s), settings.period, pulses, settings.silence)
-    servos = read_by = {joint: setup.table_of(joint) for joint in setup.base}
+    servos = {joint: setup.table_of(joint) for joint in setup.base}
     if record is not None and record.is_measured:
         stated, _ = stated_by(setup, record.of_kind(BEGUN)[0], tuple(setup.base))
-        servos = {servo.joint: (servo.table, read_by[servo.joint][1]) for servo in stated}
-    mover = Mover(device, clock, servos, read_by, motion, talk.asked_to_stop, waits=talk.waits)
+        servos = {servo.joint: (servo.table, servos[servo.joint][1]) for servo in stated}
+    mover = Mover(setup, device, clock, servos, talk.asked_to_stop, talk.waits)
     try:
         identity = mover.open()
         if record is not None and record.is_measured:
@@ -177,9 +173,9 @@ def _opened(
 
 
 @contextmanager
-def _monitor(setup: Setup, mover: Mover) -> Iterator[TrackerMonitor]:
+def _monitor(mover: Mover) -> Iterator[TrackerMonitor]:
     """The tracker, once it gives frames that can be used."""
-    monitor = TrackerMonitor(setup.bench, mover.clock)
+    monitor = TrackerMonitor(mover.setup.bench, mover.clock)
     try:
         monitor.open()
         mover.look = monitor.look
@@ -191,12 +187,13 @@ def _monitor(setup: Setup, mover: Mover) -> Iterator[TrackerMonitor]:
         monitor.close()
 
 
-def _thermal_state(setup: Setup, mover: Mover, record: Record) -> ThermalState:
+def _thermal_state(mover: Mover, record: Record) -> ThermalState:
     """From where the record's last line left it, where the servos may have to rest; else from cold servos on.
 
     Raises:
         InputError: one would not cool where it is to rest.
     """
+    setup = mover.setup
     thermal_state = ThermalState(setup.heat, tuple(setup.bench.arm.commanded), setup.base, mover.clock)
     if joint := thermal_state.base_is_too_heavy:
         raise InputError(
@@ -209,13 +206,13 @@ def _thermal_state(setup: Setup, mover: Mover, record: Record) -> ThermalState:
     return thermal_state
 
 
-def _tracked(setup: Setup, mover: Mover, monitor: TrackerMonitor) -> list[Verdict]:
-    base, moves, unseen = commanded_angles(mover), [], []
+def _tracked(mover: Mover, monitor: TrackerMonitor) -> list[Verdict]:
+    setup, base, moves, unseen = mover.setup, commanded_angles(mover), [], []
     for joint in setup.joints:
         turn, at = _small_turn(setup, joint), mover.counts[joint]
-        before = capture(setup, mover, monitor)
+        before = capture(mover, monitor)
         mover.go(joint, mover.counts_at(joint, setup.base[joint] + turn))
-        after = capture(setup, mover, monitor)
+        after = capture(mover, monitor)
         mover.go(joint, at)
         if isinstance(before, str) or isinstance(after, str):
             why = before if isinstance(before, str) else after
@@ -225,9 +222,9 @@ def _tracked(setup: Setup, mover: Mover, monitor: TrackerMonitor) -> list[Verdic
     return [*judged(moves, base, setup.nominal), *unseen]
 
 
-def _by_eye(setup: Setup, mover: Mover, joint: str, talk: Conversation, wishes: Wishes) -> Verdict:
-    turn, at = _small_turn(setup, joint), mover.counts[joint]
-    mover.go(joint, mover.counts_at(joint, setup.base[joint] + turn))
+def _by_eye(mover: Mover, joint: str, talk: Conversation, wishes: Wishes) -> Verdict:
+    turn, at = _small_turn(mover.setup, joint), mover.counts[joint]
+    mover.go(joint, mover.counts_at(joint, mover.setup.base[joint] + turn))
 
     def ask(question: str) -> str:
         talk.say(question)

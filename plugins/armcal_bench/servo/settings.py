@@ -10,6 +10,8 @@ from armcal.base.quantities import UnitOf
 from armcal.base.settings import Angle, Compliance, Duration, InputPath, Length, Settings
 from pydantic import Field, model_validator
 
+PositiveAngle = Annotated[Angle, Field(gt=0)]
+PositiveDuration = Annotated[Duration, Field(gt=0)]
 Angles = Annotated[tuple[float, ...], UnitOf("angle")]
 PulseRange = Annotated[tuple[float, float], UnitOf("time")]
 
@@ -55,21 +57,21 @@ class ServoCalibrationSettings(Settings):
     knots: Angles = ()
     base: dict[str, Angle] = Field(default_factory=dict)
     ranges: dict[str, tuple[Angle, Angle]] = Field(default_factory=dict)
-    step: Angle = math.radians(10)
-    approach: Angle = math.radians(4)
+    step: PositiveAngle = math.radians(10)
+    approach: PositiveAngle = math.radians(4)
     pulses: PulseRange = (500e-6, 2600e-6)
     rate_deg_per_s: Annotated[float, Field(gt=0, le=60)] = 20.0
-    period: Duration = 0.02
+    period: PositiveDuration = 0.02
     zero: Literal["kept", "model"] = "kept"
     sag: Literal["none", "model", "fitted"] = "fitted"
-    sag_sd: Compliance = 0.2
-    rotation_sd: Angle = math.radians(0.03)
+    sag_sd: Annotated[Compliance, Field(gt=0)] = 0.2
+    rotation_sd: PositiveAngle = math.radians(0.03)
     least_radius: Length = 0.03
-    guided_sd: Angle = math.radians(0.5)
+    guided_sd: PositiveAngle = math.radians(0.5)
     measured_pulses: tuple[MeasuredPulseSettings, ...] = ()
-    trusted: dict[str, Duration] = Field(default_factory=dict)
-    check: Angle = math.radians(10)
-    silence: Duration = 1.0
+    trusted: dict[str, PositiveDuration] = Field(default_factory=dict)
+    check: PositiveAngle = math.radians(10)
+    silence: PositiveDuration = 1.0
 
     @model_validator(mode="after")
     def _usable(self) -> ServoCalibrationSettings:
@@ -80,10 +82,4 @@ class ServoCalibrationSettings(Settings):
         for joint, (low, high) in self.ranges.items():
             if not low < high:
                 raise ValueError(f"the range of {joint} does not rise: give [lowest, highest]")
-        positive = ("step", "approach", "period", "rotation_sd", "guided_sd", "check", "sag_sd", "silence")
-        for name in positive:
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name} is not above zero")
-        if any(not sd > 0 for sd in self.trusted.values()):
-            raise ValueError("a trusted table has a standard deviation that is not above zero")
         return self

@@ -9,6 +9,7 @@ from itertools import takewhile
 from pathlib import Path
 
 import numpy as np
+from armcal.arm.joints import unknown_joint
 from armcal.arm.servo import PulseClock, PulseTable
 from armcal.base.domains import Array
 from armcal.config.servo_file import ServoFile, load_servo_file
@@ -184,12 +185,9 @@ def _check_names(
     experiment: Experiment, settings: ServoCalibrationSettings, file: ServoFile, moved: tuple[str, ...]
 ) -> None:
     for key in ("joints", "base", "ranges", "trusted"):
-        if unknown := [joint for joint in getattr(settings, key) if joint not in moved]:
-            raise ConfigError(
-                f"no servo of the arm is called {unknown[0]!r}.",
-                where=experiment.source.where((*AT, key)),
-                hint=f"Servos of this arm are {', '.join(moved) or 'none'}; see the servo file.",
-            )
+        if fault := unknown_joint(getattr(settings, key), moved):
+            where = experiment.source.where((*AT, key))
+            raise ConfigError(f"{fault}.", where=where, hint="Name joints that have a servo in the servo file.")
     if not moved:
         raise ConfigError(
             "the servo file has no servo of a joint of this arm.",

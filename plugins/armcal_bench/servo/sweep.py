@@ -12,7 +12,6 @@ import numpy as np
 from armcal.devices.faults import DeviceRefusedError
 
 from armcal_bench.servo.mover import Mover
-from armcal_bench.servo.setup import Setup
 
 
 @dataclass(frozen=True)
@@ -24,14 +23,15 @@ class Point:
     came: int
 
 
-def sweep(setup: Setup, mover: Mover, joint: str) -> list[Point]:
+def sweep(mover: Mover, joint: str) -> list[Point]:
     """Rising pulses first, then falling ones, as many of the range as leave room to come from either side."""
+    setup = mover.setup
     low, high = setup.ranges[joint]
     margin = setup.settings.approach
     shortest, longest = setup.pulses_of(joint)
     steps = max(round((high - low - 2 * margin) / setup.settings.step), 1)
     at_angles = {mover.counts_at(joint, angle) for angle in np.linspace(low + margin, high - margin, steps + 1)}
-    room = approach_counts(setup, mover, joint)
+    room = approach_counts(mover, joint)
     fits = [
         counts
         for counts in sorted(at_angles)
@@ -40,9 +40,9 @@ def sweep(setup: Setup, mover: Mover, joint: str) -> list[Point]:
     return [Point(joint, c, 1) for c in fits] + [Point(joint, c, -1) for c in reversed(fits)]
 
 
-def approach_counts(setup: Setup, mover: Mover, joint: str) -> int:
+def approach_counts(mover: Mover, joint: str) -> int:
     """How many counts a joint comes from aside before it is measured; at most what the sweep leaves room for."""
-    return max(int(setup.settings.approach * mover.counts_per_rad(joint)) - 1, 1)
+    return max(int(mover.setup.settings.approach * mover.counts_per_rad(joint)) - 1, 1)
 
 
 def left(points: Iterable[Point], entries: Iterable[Mapping[str, Any]]) -> list[Point]:
@@ -51,20 +51,21 @@ def left(points: Iterable[Point], entries: Iterable[Mapping[str, Any]]) -> list[
     return [point for point in points if point not in done]
 
 
-def come_to(setup: Setup, mover: Mover, point: Point) -> None:
+def come_to(mover: Mover, point: Point) -> None:
     """Move to a point from its side, slowly, with the play taken up."""
-    aside = point.counts - point.came * approach_counts(setup, mover, point.joint)
+    aside = point.counts - point.came * approach_counts(mover, point.joint)
     if point.came * (aside - mover.counts[point.joint]) < 0 or mover.came.get(point.joint) != point.came:
         mover.go(point.joint, aside)
     mover.go(point.joint, point.counts)
 
 
-def to_base(setup: Setup, mover: Mover) -> None:
+def to_base(mover: Mover) -> None:
     """Every servo to the base pose, one by one; those without pulses get their first.
 
     Raises:
         DeviceRefusedError: no order of the joints keeps clear on the way from where the arm stands.
     """
+    setup = mover.setup
     goals = {joint: mover.counts_at(joint, angle) for joint, angle in setup.base.items()}
     for joint, counts in goals.items():
         mover.energise(joint, counts)
