@@ -77,7 +77,7 @@ def test_gauge_poses_and_values_are_told_apart_in_words() -> None:
     gauge = text[text.index("no poses determine it (1):") : text.index("only away from them (1):")]
     assert "arm.mdh.alpha6 trades with arm.mdh.tool_rx (+1 deg with -1 deg)" in gauge
     assert "arm.mdh.after2_z trades with arm.mdh.d3 (+1 mm with -1 mm)" in text[text.index("only away") :]
-    assert "Held by nothing, so that armcal run refuses (2)" in text
+    assert "Undetermined without a prior: armcal run refuses these (2)" in text
 
 
 def test_poses_that_do_not_tell_are_told_from_poses_that_cannot(tmp_path: Path) -> None:

@@ -188,7 +188,7 @@ def _show_undetermined(console: Console, content: dict[str, Any]) -> None:
     else:
         _section(
             console,
-            f"Held by nothing, so that armcal run refuses ({len(free)}):",
+            f"Undetermined without a prior: armcal run refuses these ({len(free)}):",
             [combination["text"] for combination in free],
         )
 

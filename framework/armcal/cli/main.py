@@ -33,7 +33,7 @@ COMMANDS = {
     "calibration": ("armcal.cli.calibration:calibration", "Accept a calibration that was edited by hand."),
     "plan": ("armcal.cli.plan:plan", "Which poses to measure: the best few, and how good any could be."),
     "convert": ("armcal.cli.convert:convert", "The geometry of an arm in another form: mdh, poe, urdf."),
-    "simulate": ("armcal.cli.simulate:simulate", "Make measurements up from a stated truth."),
+    "simulate": ("armcal.cli.simulate:simulate", "Simulate measurements of an arm with known parameters."),
     "plugins": ("armcal.cli.plugins:plugins", "List plugins, or check one."),
     "doctor": ("armcal.cli.doctor:doctor", "What is installed, what works, and what is missing."),
 }

@@ -19,7 +19,7 @@ from armcal.run.experiment import Experiment
 @overrides
 @speaking
 def simulate(console: Console, config: Path, out: Path, overrides: tuple[str, ...]) -> None:
-    """Make measurements up as the simulation section of CONFIG says."""
+    """Simulate measurements as the simulation section of CONFIG says."""
     registry = discover()
     console.plugin_faults(registry)
     experiment = Experiment.load(config, overrides, registry=registry)

@@ -122,7 +122,7 @@ def _miss(
     alike, far = _neighbours_alike(record, judged), bool(leverage[record] > UNUSUAL)
     heavy, along = _heaviest(record, problem, motion, efforts), _along(record, problem, motion, judged)
     reasons = [
-        "hardest to predict: its variance by the parameters is among the top 5 %" if far else "",
+        "its prediction is among the 5 % that depend most on the parameters' uncertainty" if far else "",
         heavy,
         "its neighbours in the recording miss in the same direction" if alike else "",
         along,

@@ -45,7 +45,7 @@ from armcal_online.tracking.what_if import of_errors, worth
 _TOO_MANY = 1e-3
 """More outliers than chance makes with this probability are a reason to watch."""
 _FARTHEST_TURN = 100.0
-"""rad; no joint stands there."""
+"""rad; a larger angle is an error of the data."""
 
 
 class Recalibrator:
@@ -148,7 +148,7 @@ class Recalibrator:
             for joint in arm.commanded:
                 angle = incoming.channels.get(f"{arm.name}.{joint}", 0.0)
                 if not abs(angle) < _FARTHEST_TURN:
-                    return f"{arm.name}.{joint} is {angle:g}: no joint stands there"
+                    return f"{arm.name}.{joint} is {angle:g} rad: no joint reaches that"
         bad = [name for name, value in incoming.channels.items() if math.isinf(value)]
         return f"{bad[0]} is not finite" if bad else ""
 
