@@ -22,8 +22,8 @@ from armcal.io.journal.journal import Journal
 from armcal.run.experiment import Experiment
 from armcal_bench.acquisition.outputs import dataset_of
 from armcal_bench.acquisition.preparation import Prepared, prepare
-from armcal_bench.acquisition.progress import Progress, progress_of
 from armcal_bench.acquisition.rehearsal import overrides_for
+from armcal_bench.acquisition.run_log import Progress, progress_of
 from armcal_bench.acquisition.session import Outcome, RunOptions, acquire
 from armcal_bench.bench import Bench
 

@@ -13,8 +13,8 @@ from armcal_bench.acquisition.drive import Drive
 from armcal_bench.acquisition.heat import HeatModel
 from armcal_bench.acquisition.motion_gate import MotionGate
 from armcal_bench.acquisition.path_planner import PathPlanner
-from armcal_bench.acquisition.progress import Progress
 from armcal_bench.acquisition.recovery import Recovery
+from armcal_bench.acquisition.run_log import Progress
 from armcal_bench.acquisition.schedule import Scheduler
 from armcal_bench.acquisition.settings import AcquisitionSettings, ServoHeatSettings
 

@@ -11,13 +11,12 @@ import numpy as np
 from armcal.base.domains import Array
 from armcal.devices.faults import DeviceError
 
-from armcal_bench.acquisition import progress as entry
+from armcal_bench.acquisition import run_log as entry
 from armcal_bench.acquisition.arrival import Arrival
 from armcal_bench.acquisition.drive import Drive, ThermalLimit
 from armcal_bench.acquisition.motion_gate import MotionGate, ParkRequested, TrackerLost, unguarded
-from armcal_bench.acquisition.progress import Progress
 from armcal_bench.acquisition.recovery import DeviceLost, Recovery
-from armcal_bench.acquisition.run_log import RunLog
+from armcal_bench.acquisition.run_log import Progress, RunLog
 from armcal_bench.acquisition.schedule import LeaveOut, Measure, Rest, Scheduler
 from armcal_bench.settling import Settled
 

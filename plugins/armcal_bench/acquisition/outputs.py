@@ -17,7 +17,7 @@ from armcal.measure.csv_writer import write_csv
 from armcal.run.experiment import Experiment
 from scipy.spatial.transform import Rotation
 
-from armcal_bench.acquisition.progress import Progress
+from armcal_bench.acquisition.run_log import Progress
 from armcal_bench.journal_folder import JOURNAL
 
 DATASET, SUMMARY = "dataset.csv", "summary.json"

@@ -10,8 +10,7 @@ from armcal.devices.faults import DeviceError
 
 from armcal_bench.acquisition.drive import Drive
 from armcal_bench.acquisition.motion_gate import MotionGate, unguarded
-from armcal_bench.acquisition.progress import ENERGISED
-from armcal_bench.acquisition.run_log import RunLog
+from armcal_bench.acquisition.run_log import ENERGISED, RunLog
 from armcal_bench.waiting import AGAIN_EVERY_S, LostDevice
 
 _MOST_IN_A_ROW = 10

@@ -1,18 +1,72 @@
-"""The journal of a measuring run: begun, or gone on with."""
+"""The journal of a measuring run, and what the run has done by its entries."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from pathlib import Path
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from armcal.devices.device import DeviceIdentity
 from armcal.io.journal.journal import Journal, JournalFailedError, JournalFullError
+from armcal.io.journal.segment import Entry
 
-from armcal_bench.acquisition.outputs import OURS
-from armcal_bench.acquisition.progress import HERE, STARTED, Progress, progress_of
-from armcal_bench.journal_folder import Start, opened_journal
+STARTED, ENERGISED, GOING, HERE, MEASURED, LEFT_OUT, NOTICE, ENDED = (
+    "started",
+    "energised",
+    "going",
+    "here",
+    "measured",
+    "left_out",
+    "told",
+    "ended",
+)
+"""Kinds of entries."""
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Where a run stands.
+
+    Attributes:
+        measured: what was written of each pose, by its id, in the order of measuring.
+        left_out: why, by pose id.
+        angles: the angles that were commanded last (rad, by joint); empty before the first.
+        thermal_state: of winding and case, by joint, when ``angles`` were written.
+        at: unix s of that.
+        ended: how it ended, if it did: ``done``, ``held`` or ``parked``.
+    """
+
+    measured: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    left_out: Mapping[str, str] = field(default_factory=dict)
+    angles: Mapping[str, float] = field(default_factory=dict)
+    thermal_state: Mapping[str, Sequence[float]] = field(default_factory=dict)
+    at: float = 0.0
+    ended: str = ""
+
+    def after(self, kind: str, content: Mapping[str, Any]) -> Progress:
+        """One entry later."""
+        if kind == STARTED:
+            return replace(self, ended="")
+        if kind == MEASURED:
+            return replace(self, measured={**self.measured, str(content["pose"]): content})
+        if kind == LEFT_OUT:
+            return replace(self, left_out={**self.left_out, str(content["pose"]): str(content["why"])})
+        if kind == ENERGISED:
+            return replace(self, angles={**self.angles, content["joint"]: content["angle"]})
+        if kind in (HERE, GOING):
+            return replace(self, angles=content["angles"], thermal_state=content["warmth"], at=content["at"])
+        if kind == ENDED:
+            return replace(self, ended=content["how"])
+        return self
+
+
+def progress_of(entries: tuple[Entry, ...]) -> Progress:
+    """After all entries."""
+    progress = Progress()
+    for entry in entries:
+        progress = progress.after(entry.kind, entry.content)
+    return progress
 
 
 class RunLog:
@@ -47,11 +101,3 @@ class RunLog:
             if not self._failed:
                 self._failed = True
                 raise
-
-
-@contextmanager
-def opened_log(folder: Path, start: Start, header: Mapping[str, Any]) -> Iterator[RunLog]:
-    """The journal in a run's folder; see ``opened_journal`` for what it raises."""
-    same = {"plan": "plan", "config": "configuration"}
-    with opened_journal(folder, start, OURS, header, "run", same) as journal:
-        yield RunLog(journal)

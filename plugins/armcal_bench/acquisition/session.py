@@ -17,20 +17,22 @@ from armcal.devices.clock import Clock
 from armcal.devices.device import DeviceIdentity, JointDevice
 from armcal.errors import InputError, Location
 
-from armcal_bench.acquisition import progress as entry
+from armcal_bench.acquisition import run_log as entry
 from armcal_bench.acquisition.acquisition_run import AcquisitionRun, Ending
 from armcal_bench.acquisition.drive import Drive
 from armcal_bench.acquisition.motion_gate import MotionGate
-from armcal_bench.acquisition.outputs import in_order, measured_by, write_outputs
+from armcal_bench.acquisition.outputs import OURS, in_order, measured_by, write_outputs
 from armcal_bench.acquisition.preparation import Prepared
-from armcal_bench.acquisition.progress import Progress
 from armcal_bench.acquisition.recovery import Recovery
-from armcal_bench.acquisition.run_log import RunLog, opened_log
+from armcal_bench.acquisition.run_log import Progress, RunLog
 from armcal_bench.acquisition.tracker_monitor import TrackerMonitor
 from armcal_bench.hazards import FirstMotion
-from armcal_bench.journal_folder import Start
+from armcal_bench.journal_folder import Start, opened_journal
 from armcal_bench.waiting import Waits
 from armcal_bench.wiring import check_wiring
+
+_SAME = {"plan": "plan", "config": "configuration"}
+"""What a run that is resumed must have been begun with: entries of the journal's header, and their names."""
 
 
 @dataclass(frozen=True)
@@ -75,7 +77,9 @@ def acquire(prepared: Prepared, plan: Path, options: RunOptions) -> Outcome:
     experiment = prepared.bench.experiment
     measured_by(experiment)
     header = _header(prepared, plan)
-    with prepared.bench.clock() as clock, opened_log(options.folder, options.start, header) as log:
+    opened = opened_journal(options.folder, options.start, OURS, header, "run", _SAME)
+    with prepared.bench.clock() as clock, opened as journal:
+        log = RunLog(journal)
         progress, identity = log.progress, log.identity
         is_done = {*progress.measured, *progress.left_out} >= set(prepared.scheduler.ids)
         if identity is not None and is_done and progress.ended in ("done", "parked"):  # nothing needs to be there

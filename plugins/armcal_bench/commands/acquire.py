@@ -13,7 +13,7 @@ from armcal.io.signals import Signals
 
 from armcal_bench.acquisition.outputs import DATASET
 from armcal_bench.acquisition.preparation import Prepared, prepare
-from armcal_bench.acquisition.progress import Progress
+from armcal_bench.acquisition.run_log import Progress
 from armcal_bench.acquisition.schedule import LeaveOut, Rest, ScheduleForecast, forecast_schedule
 from armcal_bench.acquisition.session import Outcome, RunOptions, acquire
 from armcal_bench.commands.common import (

@@ -26,8 +26,8 @@ from armcal_bench.commands.common import FILE, load, on_bench
 from armcal_bench.journal_folder import Start
 from armcal_bench.recording.keys import Keys, LineKeys, NoKeys, TerminalKeys
 from armcal_bench.recording.messages import Message
-from armcal_bench.recording.posture import DATASET
 from armcal_bench.recording.recorder import KEYS
+from armcal_bench.recording.recording_log import DATASET
 from armcal_bench.recording.session import RecordingOptions, record
 from armcal_bench.terminal import single_keys
 

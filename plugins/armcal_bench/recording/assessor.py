@@ -12,8 +12,8 @@ from armcal.run.experiment import Experiment
 
 from armcal_bench.recording.agreement import Agreement, AgreementJudge, Offset
 from armcal_bench.recording.knowledge import Knowledge, explained, knowledge
-from armcal_bench.recording.posture import Posture, dataset_of
 from armcal_bench.recording.quick_fit import QuickFitter
+from armcal_bench.recording.recording_log import Posture, dataset_of
 
 _UNFIT = (ArmcalError, ArithmeticError, ValueError)
 """Faults of postures that no fit can take."""

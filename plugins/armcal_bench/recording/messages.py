@@ -8,7 +8,7 @@ from typing import Any
 
 from armcal_bench.recording.assessor import Assessment
 from armcal_bench.recording.knowledge import Knowledge
-from armcal_bench.recording.posture import Posture
+from armcal_bench.recording.recording_log import Posture
 
 _MOST_MISSING = 1
 

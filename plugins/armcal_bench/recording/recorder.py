@@ -18,8 +18,7 @@ from armcal_bench.recording import messages as messages_of
 from armcal_bench.recording.assessor import Assessment, Assessor
 from armcal_bench.recording.labels import Labels
 from armcal_bench.recording.messages import Message
-from armcal_bench.recording.posture import Posture, dataset_of, write_dataset
-from armcal_bench.recording.recording_log import RecordingLog
+from armcal_bench.recording.recording_log import Posture, RecordingLog, dataset_of, write_dataset
 from armcal_bench.recording.window import JointKinds, Mean, SampleWindow
 
 Capture = Literal["keys", "still", "rests"]

@@ -13,16 +13,18 @@ from armcal.devices.rest_stream import RestStream
 from armcal.errors import ConfigError
 
 from armcal_bench.bench import SECTION, Bench
-from armcal_bench.journal_folder import Start
+from armcal_bench.journal_folder import Start, opened_journal
 from armcal_bench.recording.assessor import contacts_of
 from armcal_bench.recording.keys import END, Keys
 from armcal_bench.recording.labels import Labels
 from armcal_bench.recording.messages import Message
 from armcal_bench.recording.recorder import Capture, Recorder
-from armcal_bench.recording.recording_log import opened_recording_log
+from armcal_bench.recording.recording_log import OURS, RecordingLog
 from armcal_bench.recording.window import JointKinds
 
 _PERIOD_S = 0.02
+_SAME = {"joints": "set of joints", "labels": "set of labels"}
+"""What a recording that is resumed must have been begun with: entries of the journal's header, and their names."""
 
 
 @dataclass(frozen=True)
@@ -56,6 +58,7 @@ def record(bench: Bench, options: RecordingOptions) -> Message:
     contacts_of(bench.experiment)
     channels = JointKinds.of(bench.experiment.system.arms).channels
     columns = Labels(bench.experiment.system.measurements, ()).columns
+    header = {"joints": list(channels), "labels": list(columns)}
     stream, capture = bench.joints(), options.capture
     if isinstance(stream, RestStream) and stream.gives_rests:
         if capture == "keys":
@@ -68,8 +71,8 @@ def record(bench: Bench, options: RecordingOptions) -> Message:
     with bench.clock() as clock:
         try:
             stream.open(clock, channels)
-            with opened_recording_log(options.folder, options.start, channels, columns) as log:
-                recorder = Recorder(bench, stream, capture, options.folder, log, clock)
+            with opened_journal(options.folder, options.start, OURS, header, "recording", _SAME) as journal:
+                recorder = Recorder(bench, stream, capture, options.folder, RecordingLog(journal), clock)
                 return _recorded(recorder, stream, options, clock)
         finally:
             stream.close()
