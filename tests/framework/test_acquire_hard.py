@@ -584,7 +584,9 @@ class TestPlans:
         """Neither play nor a way round may lead where there are no pulses."""
         wide = tuple(f"plan.limits.{joint}=[-120 deg, 120 deg]" for joint in ("q1", "q4"))
         park = "bench.acquisition.park={q1: -100 deg, q2: -50 deg, q4: -10 deg}"
-        run = self.sub(tmp_path, ((-100, 0, 0, 0, 0, 0), (100, 0, 0, 0, 0, 10)), *wide, park)
+        run = self.sub(
+            tmp_path, ((-100, 0, 0, 0, 0, 0), (100, 0, 0, 0, 0, 10)), *wide, park, "bench.acquisition.heat={}"
+        )
         prepared = run.prepared()
         device = prepared.device
         for pose in prepared.scheduler.planner._roadmap:
