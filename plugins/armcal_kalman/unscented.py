@@ -8,9 +8,10 @@ from typing import Annotated, Any, ClassVar
 import numpy as np
 from armcal.base.domains import Array
 from armcal.base.settings import Settings
-from armcal.estimate.online import Gaussian, Observation, Update, checked
+from armcal.estimate.online import Gaussian, Observation, OnlineEstimator, Update, checked
 from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
 from pydantic import Field
+from typing_extensions import override
 
 
 class UnscentedSettings(Settings):
@@ -21,8 +22,8 @@ class UnscentedSettings(Settings):
     kappa: Annotated[float, Field(ge=0)] = 0.0
 
 
-class UnscentedFilter:
-    """The online estimator ``unscented``: no Jacobian, two looks a state at each record."""
+class UnscentedFilter(OnlineEstimator):
+    """The online estimator ``unscented``: no Jacobian, two predictions a state for each record."""
 
     Settings: ClassVar[type[UnscentedSettings]] = UnscentedSettings
     EXAMPLE: ClassVar[Mapping[str, Any]] = {}
@@ -31,12 +32,12 @@ class UnscentedFilter:
         self._settings = settings
 
     @property
+    @override
     def window(self) -> int:
-        """One: a filter never looks back."""
         return 1
 
+    @override
     def update(self, prior: Gaussian, observations: Sequence[Observation], start: Array | None = None) -> Update:
-        """As the protocol says."""
         observation = observations[-1]
         first, size = observation.at(prior.mean), len(prior.mean)
         points = MerweScaledSigmaPoints(

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from armcal.base.domains import Array
 from armcal.errors import NotConvergedError
+from armcal.estimate.online import inverse_times
 from armcal.estimate.online import normalised_innovation_squared as nis
-from armcal.estimate.online import weighed
 from armcal.functions.batch_function import EvaluatorChoice
 from armcal.functions.compiler import find_compiler
 from armcal.problem.one_record import OneRecord
@@ -95,10 +95,10 @@ def test_small_systems_are_solved_as_numpy_does_and_indefinite_ones_too() -> Non
     for rows in (1, 3, 6):
         root, right = random.normal(size=(rows, rows + 2)), random.normal(size=rows)
         covariance = root @ root.T
-        assert np.allclose(weighed(covariance, right), np.linalg.solve(covariance, right), rtol=1e-10)
+        assert np.allclose(inverse_times(covariance, right), np.linalg.solve(covariance, right), rtol=1e-10)
         assert nis(right, covariance) == pytest.approx(right @ np.linalg.inv(covariance) @ right, rel=1e-10)
     indefinite = np.diag([1.0, -2.0, 3.0])
-    assert np.allclose(weighed(indefinite, np.ones(3)), [1.0, -0.5, 1 / 3])
+    assert np.allclose(inverse_times(indefinite, np.ones(3)), [1.0, -0.5, 1 / 3])
     before = covariance.copy()
-    weighed(covariance, right)
+    inverse_times(covariance, right)
     assert np.array_equal(before, covariance)

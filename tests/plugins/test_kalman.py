@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 from armcal.errors import ProblemError
-from armcal.estimate.online import Gaussian, Linearised, OnlineEstimator, Update, absorbed, checked
+from armcal.estimate.online import Gaussian, Linearised, OnlineEstimator, Update, checked, kalman_update
 from armcal.plugins import Component, discover
 from armcal.testing.contract import check_component, check_plugin
 from armcal_kalman.extended import ExtendedFilter, ExtendedSettings
@@ -58,7 +58,7 @@ def taken(estimator: OnlineEstimator, prior: Gaussian, records: list[Curved]) ->
         update = estimator.update(anchor, held)
         if len(held) >= estimator.window:
             place = update.posterior.mean
-            anchor = update.posterior if estimator.window == 1 else absorbed(anchor, held[0].at(place), place)
+            anchor = update.posterior if estimator.window == 1 else kalman_update(anchor, held[0].at(place), place)
             held = held[1:]
     return update
 

@@ -1,8 +1,8 @@
-"""Online estimators: what is believed of a problem, and how one more record changes it.
+"""Online estimators: a Gaussian belief about a problem's parameters, and its update by one more record.
 
 Beliefs are Gaussian in scaled coordinates about an origin: each number of a block's increment in its typical scale,
-then the companions (drifts, a correlated model error) in their standard deviations. Scaled, a covariance keeps its
-small eigenvalues when angles stand beside compliances. [BarShalom2001]
+then the Gauss-Markov states (drifts, a correlated model error) in their standard deviations. Scaled, a covariance
+keeps its small eigenvalues when angles stand beside compliances. [BarShalom2001]
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class Gaussian:
 
 @dataclass(frozen=True)
 class Linearised:
-    """A record seen from one place.
+    """A record, linearised at one point.
 
     Attributes:
         innovation: measured minus predicted there (m; m or rad).
@@ -43,10 +43,10 @@ class Linearised:
 
 
 class Observation(Protocol):
-    """One record, ready to be looked at from anywhere."""
+    """One record, which can be linearised anywhere."""
 
-    def at(self, place: Array) -> Linearised:
-        """The record at scaled coordinates (N) about the origin.
+    def at(self, point: Array) -> Linearised:
+        """The record, linearised at scaled coordinates (N) about the origin.
 
         Raises:
             NotConvergedError: the arm has no elastic equilibrium there.
@@ -55,11 +55,11 @@ class Observation(Protocol):
 
 @dataclass(frozen=True)
 class Update:
-    """What a record did to a belief.
+    """A belief after a record.
 
     Attributes:
-        posterior: the belief with it.
-        innovation: how far it lay from the prediction of the belief before it, seen from where the update ended (m).
+        posterior: the belief.
+        innovation: measured minus predicted by the prior, linearised where the update ended (m).
         covariance: of that innovation, as expected (m x m).
     """
 
@@ -73,12 +73,12 @@ class OnlineEstimator(Protocol):
 
     @property
     def window(self) -> int:
-        """How many of the last records it wants to see again with each new one; 1 for a filter."""
+        """How many of the last records each update needs; 1 for a filter."""
 
     def update(self, prior: Gaussian, observations: Sequence[Observation], start: Array | None = None) -> Update:
         """The belief after the last observation; ``prior`` is the one before the first of them.
 
-        ``start`` (N) is where all observations but the last have led; one that looks again may begin there.
+        ``start`` (N) is the mean after all observations but the last; an iteration may begin there.
         A covariance that is not positive is an error, never made positive by abs().
 
         Raises:
@@ -89,40 +89,40 @@ class OnlineEstimator(Protocol):
 
 def normalised_innovation_squared(innovation: Array, covariance: Array) -> float:
     """The squared Mahalanobis distance, NIS: chi-square with as many degrees of freedom as numbers."""
-    return float(innovation @ weighed(covariance, innovation))
+    return float(innovation @ inverse_times(covariance, innovation))
 
 
-def weighed(covariance: Array, right: Array) -> Array:
-    """``covariance^-1 right`` for a small positive definite matrix (m x m) and a vector (m), with little around it."""
-    _, found, fault = dposv(covariance, right)
-    return np.asarray(np.linalg.solve(covariance, right) if fault else found, dtype=np.float64)
+def inverse_times(covariance: Array, vector: Array) -> Array:
+    """``covariance^-1 vector`` for a small positive definite matrix (m x m), without the overhead of numpy's solver."""
+    _, solution, fault = dposv(covariance, vector)
+    return np.asarray(np.linalg.solve(covariance, vector) if fault else solution, dtype=np.float64)
 
 
 def log_likelihood(innovation: Array, covariance: Array, freedom: float = math.inf) -> float:
-    """Of an innovation under its expected covariance, which is known with so many degrees of freedom."""
-    logarithm = float(np.linalg.slogdet(covariance)[1])
-    return log_density(normalised_innovation_squared(innovation, covariance), logarithm, len(innovation), freedom)
+    """Of an innovation (m) under its expected covariance (m x m), which is known with so many degrees of freedom."""
+    log_determinant = float(np.linalg.slogdet(covariance)[1])
+    return log_density(normalised_innovation_squared(innovation, covariance), log_determinant, len(innovation), freedom)
 
 
-def log_density(nis: float, logarithm: float, count: int, freedom: float = math.inf) -> float:
+def log_density(nis: float, log_determinant: float, count: int, freedom: float = math.inf) -> float:
     """Of numbers by their squared Mahalanobis distance and their covariance's log determinant.
 
     Normal, or Student's t where the covariance is known with so many degrees of freedom up to a common factor.
     """
     if math.isinf(freedom):
-        return -0.5 * (nis + logarithm + count * math.log(2 * math.pi))
+        return -0.5 * (nis + log_determinant + count * math.log(2 * math.pi))
     whole = 0.5 * (freedom + count)
     normal = math.lgamma(whole) - math.lgamma(0.5 * freedom) - 0.5 * count * math.log(freedom * math.pi)
-    return normal - 0.5 * logarithm - whole * math.log1p(nis / freedom)
+    return normal - 0.5 * log_determinant - whole * math.log1p(nis / freedom)
 
 
-def absorbed(prior: Gaussian, seen: Linearised, place: Array) -> Gaussian:
-    """The belief with a record as it looks from one place: a Kalman update in Joseph's form [Bucy1968]."""
-    innovation = seen.innovation + seen.slope @ (place - prior.mean)
-    across = prior.covariance @ seen.slope.T
-    gain = np.linalg.solve(seen.slope @ across + seen.noise, across.T).T
-    kept = np.eye(len(prior.mean)) - gain @ seen.slope
-    covariance = kept @ prior.covariance @ kept.T + gain @ seen.noise @ gain.T
+def kalman_update(prior: Gaussian, record: Linearised, point: Array) -> Gaussian:
+    """The belief after a record that was linearised at a point (N), in Joseph's form [Bucy1968]."""
+    innovation = record.innovation + record.slope @ (point - prior.mean)
+    across = prior.covariance @ record.slope.T
+    gain = np.linalg.solve(record.slope @ across + record.noise, across.T).T
+    kept = np.eye(len(prior.mean)) - gain @ record.slope
+    covariance = kept @ prior.covariance @ kept.T + gain @ record.noise @ gain.T
     return checked(Gaussian(prior.mean + gain @ innovation, covariance))
 
 

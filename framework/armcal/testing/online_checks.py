@@ -7,10 +7,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from typing_extensions import override
 
 from armcal.base.domains import Array
 from armcal.errors import ProblemError
-from armcal.estimate.online import Gaussian, Linearised, OnlineEstimator, Update
+from armcal.estimate.online import Gaussian, Linearised, Observation, OnlineEstimator, Update
 from armcal.testing.results import ContractError, Recorder, expect
 from armcal.testing.settings_checks import Subject
 
@@ -20,16 +21,16 @@ TOLERANCE = 1e-7
 
 
 @dataclass(frozen=True)
-class _Line:
+class _Line(Observation):
     """A record whose prediction is linear in the state, so that it looks alike from anywhere."""
 
     measured: Array
     slope: Array
     noise: Array
 
-    def at(self, place: Array) -> Linearised:
-        """As the protocol of observations says."""
-        return Linearised(self.measured - self.slope @ place, self.slope, self.noise)
+    @override
+    def at(self, point: Array) -> Linearised:
+        return Linearised(self.measured - self.slope @ point, self.slope, self.noise)
 
 
 def check_online(record: Recorder, subject: Subject) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from armcal.base.domains import Array
-from armcal.estimate.online import OnlineEstimator, absorbed
+from armcal.estimate.online import OnlineEstimator, kalman_update
 
 from armcal_online.tracking.belief import Belief
 from armcal_online.tracking.hypotheses import Recent
@@ -61,7 +61,7 @@ class Advance:
         belief, anchor = believed.updated(space, update.posterior), Belief(believed.origin, prior)
         if len(held) >= self._estimator.window:
             place = update.posterior.mean
-            anchor, held = Belief(believed.origin, absorbed(prior, observations[0].at(place), place)), held[1:]
+            anchor, held = Belief(believed.origin, kalman_update(prior, observations[0].at(place), place)), held[1:]
         return replace(state, belief=belief, anchor=anchor, held=held)
 
     def _refreshed(self, state: State) -> State:

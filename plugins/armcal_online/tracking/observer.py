@@ -223,12 +223,12 @@ class Seen:
     joint_noise: tuple[Array | None, ...] = ()
     _last: dict[bytes, Linearised] = field(default_factory=dict, compare=False, repr=False)
 
-    def at(self, place: Array) -> Linearised:
+    def at(self, point: Array) -> Linearised:
         """As the protocol says."""
-        key = place.tobytes()
+        key = point.tobytes()
         if key not in self._last:
             self._last.clear()
-            self._last[key] = self._linearised(place)
+            self._last[key] = self._linearised(point)
         return self._last[key]
 
     def _linearised(self, place: Array) -> Linearised:

@@ -15,7 +15,7 @@ from armcal.base.units import from_unit, split_suffix
 from armcal.calibration.exporter import Exported
 from armcal.errors import ConfigError, DataError, Location
 from armcal.estimate.estimator import Solution, SolverVerdict, no_progress
-from armcal.estimate.online import Gaussian, Update, absorbed, checked
+from armcal.estimate.online import Gaussian, Update, checked, kalman_update
 from armcal.problem.posed import PosedProblem
 
 COUNTER = itertools.count()
@@ -233,7 +233,7 @@ class Filter:
         return seen
 
     def posterior(self, prior: Any, seen: Any) -> Any:
-        return absorbed(prior, seen, prior.mean)
+        return kalman_update(prior, seen, prior.mean)
 
 
 class ForgetsTheGainTwice(Filter):
@@ -247,7 +247,7 @@ class ForgetsTheGainTwice(Filter):
 class MakesVariancesPositive(Filter):
     def posterior(self, prior: Any, seen: Any) -> Any:
         repaired = Gaussian(prior.mean, prior.covariance + np.diag(np.where(np.diag(prior.covariance) < 0, 1.0, 0.0)))
-        return checked(absorbed(repaired, seen, prior.mean))
+        return checked(kalman_update(repaired, seen, prior.mean))
 
 
 class RemembersTheLastBelief(Filter):
