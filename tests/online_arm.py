@@ -23,7 +23,7 @@ from armcal.plugins import discover
 from armcal.problem.problem import Problem
 from armcal_online.sources.incoming import Incoming
 from armcal_online.tracking.belief import Belief
-from armcal_online.tracking.observer import Seen
+from armcal_online.tracking.observer import RecordObservation
 from armcal_online.tracking.recalibrator import Recalibrator
 from armcal_online.tracking.settings import RecalibrateSettings
 from armcal_online.tracking.start import FilterSetup, filter_setup
@@ -206,7 +206,7 @@ class World:
 def predicted(setup: FilterSetup, values: np.ndarray, q: np.ndarray) -> np.ndarray:
     """Where the target is at joint angles (6; rad), by a value vector (3; m)."""
     (reading,) = setup.observer.readings(dict(zip(JOINTS, q.tolist(), strict=True)) | dict.fromkeys(AXES, 0.0), {})
-    return -setup.observer.look(values, reading)[0]
+    return -setup.observer.linearise(values, reading)[0]
 
 
 PROBES = random_poses(np.random.default_rng(99), 25)
@@ -238,10 +238,10 @@ class Filtered:
         """At the calibration."""
         return cls(setup, estimator, setup.belief)
 
-    def seen(self, belief: Belief, channels: Mapping[str, float]) -> Seen:
+    def seen(self, belief: Belief, channels: Mapping[str, float]) -> RecordObservation:
         """A record as a belief looks at it."""
         readings = self.setup.observer.readings(channels, {})
-        return Seen(self.setup.observer, belief.origin, belief.gaussian.mean, readings)
+        return self.setup.observer.observation(belief, readings)
 
     def take(self, channels: Mapping[str, float], seconds: float = EVERY_S) -> Update:
         """One record."""

@@ -232,7 +232,9 @@ def test_both_evaluators_agree() -> None:
         values = one.space.inside(one.space.moved(one.belief.origin, 3 * spread))
         angles = dict(zip(JOINTS, random_poses(random, 1)[0].tolist(), strict=True))
         (reading,) = one.observer.readings(angles | dict.fromkeys(AXES, 0.0), {})
-        for a, b in zip(one.observer.look(values, reading), other.observer.look(values, reading), strict=True):
+        for a, b in zip(
+            one.observer.linearise(values, reading), other.observer.linearise(values, reading), strict=True
+        ):
             worst = max(worst, float(np.abs(a - b).max() / np.abs(a).max()))
     filters = extended(one), extended(other)
     arm = World.drawn(2)
@@ -336,11 +338,13 @@ def batch(setup: FilterSetup, records: Sequence[dict[str, float]]) -> np.ndarray
 
     def residual(place: np.ndarray) -> np.ndarray:
         values = space.moved(origin, place)
-        return np.concatenate([prior @ (place - mean), *(weight @ setup.observer.look(values, r)[0] for r in readings)])
+        return np.concatenate(
+            [prior @ (place - mean), *(weight @ setup.observer.linearise(values, r)[0] for r in readings)]
+        )
 
     def jacobian(place: np.ndarray) -> np.ndarray:
         values = space.moved(origin, place)
-        return np.vstack([prior, *(-weight @ setup.observer.look(values, r)[1] for r in readings)])
+        return np.vstack([prior, *(-weight @ setup.observer.linearise(values, r)[1] for r in readings)])
 
     lower, upper = np.full(STATES, -np.inf), np.full(STATES, np.inf)
     at, coordinates, low, high = space.bounds
@@ -381,7 +385,7 @@ def test_the_filter_ends_where_a_batch_of_all_records_does(bounded: bool) -> Non
     assert bool(held) == bounded
     assert np.abs(off).max() < 0.1
     # The covariance is that of the belief without bounds: the information of prior and records.
-    slopes = [one.setup.observer.look(one.values, one.setup.observer.readings(each, {})[0])[1] for each in records]
+    slopes = [one.setup.observer.linearise(one.values, one.setup.observer.readings(each, {})[0])[1] for each in records]
     whole = np.linalg.inv(one.setup.belief.gaussian.covariance) + sum(s.T @ s for s in slopes) / 0.0003**2
     expected = np.sqrt(np.diag(np.linalg.inv(whole)))
     assert np.sqrt(np.diag(covariance)) == pytest.approx(expected, rel=0.05)

@@ -227,5 +227,5 @@ def mean_error(session: Recalibrator, dataset: Dataset, values: np.ndarray) -> f
     observer, found = session.setup.observer, []
     for i in range(len(dataset)):
         readings = observer.readings({name: float(column[i]) for name, column in dataset.channels.items()}, {})
-        found.append(np.linalg.norm(observer.look(session.setup.space.inside(values), readings[0])[0]))
+        found.append(np.linalg.norm(observer.linearise(session.setup.space.inside(values), readings[0])[0]))
     return 1000 * float(np.mean(found))

@@ -17,9 +17,9 @@ from armcal.io.plain_files import check_output
 from armcal.plugins import discover
 from rich.table import Table
 
-from armcal_online.tracking.pose_worth import ranked
 from armcal_online.tracking.settings import RecalibrateSettings
 from armcal_online.tracking.start import filter_setup
+from armcal_online.tracking.what_if import ranked
 
 _SHOWN = 10
 

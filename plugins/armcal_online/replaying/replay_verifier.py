@@ -67,7 +67,7 @@ class Comparer:
             if noted["digest"] == session.digest():
                 self.equal += 1
                 return
-            written = State.of(noted["state"])
+            written = State.from_dict(noted["state"])
         apart = distance(session.setup.space, written, session.state)
         self.measured += 1
         self.widest = self.widest.widest(apart)

@@ -1,71 +1,53 @@
-"""What a good record makes of a state."""
+"""The state after an accepted record."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
-from armcal.base.domains import Array
 from armcal.estimate.online import OnlineEstimator, kalman_update
 
-from armcal_online.tracking.belief import Belief
+from armcal_online.tracking.belief import Belief, most_likely
 from armcal_online.tracking.hypotheses import Recent
-from armcal_online.tracking.observer import Reading, Seen
-from armcal_online.tracking.projection import most_likely
 from armcal_online.tracking.start import FilterSetup
 from armcal_online.tracking.state import State
 
 _REFRESHED = 25
-"""After so many good records the origin is put where it is most likely within the bounds."""
+"""After so many accepted records the origin is put where it is most likely within the bounds."""
 
 
-class Advance:
-    """Takes good records in, by an estimator.
+def advanced(state: State, recent: Recent, setup: FilterSetup, estimator: OnlineEstimator, nis_window: int) -> State:
+    """The state with a record taken in by an estimator.
 
     Args:
-        setup: what it stands on.
-        estimator: that is asked.
-        nis_window: how many are kept.
+        state: before it, with belief and anchor at its time.
+        recent: the record.
+        setup: of the recalibration.
+        estimator: a filter, or one that holds the last records back.
+        nis_window: how many NIS the state keeps.
+
+    Raises:
+        NotConvergedError: the arm has no elastic equilibrium near the belief.
+        ProblemError: the numbers of the belief are no longer sound.
     """
-
-    def __init__(self, setup: FilterSetup, estimator: OnlineEstimator, nis_window: int) -> None:
-        self._setup, self._estimator, self._nis_window = setup, estimator, nis_window
-
-    def seen(self, belief: Belief, readings: tuple[Reading, ...], noise: tuple[Array | None, ...]) -> Seen:
-        """A record as a belief looks at it."""
-        return Seen(self._setup.observer, belief.origin, belief.gaussian.mean, readings, noise)
-
-    def after(self, state: State, recent: Recent) -> State:
-        """The state with a record in it.
-
-        Raises:
-            NotConvergedError: the arm has no elastic equilibrium near what is believed.
-            ProblemError: the numbers of the belief are no longer sound.
-        """
-        nis_window = (*state.nis_window, (recent.nis, recent.dof))[-self._nis_window :]
-        state = replace(state, nis_window=nis_window)
-        after = self._filtered(state, recent) if self._estimator.window == 1 else self._held(state, recent)
-        return self._refreshed(after) if state.counts["accepted"] % _REFRESHED == _REFRESHED - 1 else after
-
-    def _filtered(self, state: State, recent: Recent) -> State:
-        prior = recent.before
-        update = self._estimator.update(prior.gaussian, [self.seen(prior, recent.readings, recent.joint_noise)])
-        belief = prior.updated(self._setup.space, update.posterior)
-        return replace(state, belief=belief, anchor=belief)
-
-    def _held(self, state: State, recent: Recent) -> State:
-        """With the last records held back; one that leaves them is taken for good, as it looks from where they led."""
-        space, believed, held = self._setup.space, state.belief, (*state.held, recent)
-        prior = state.anchor.about(space, believed.origin).gaussian
-        observations = [self.seen(believed, each.readings, each.joint_noise) for each in held]
-        update = self._estimator.update(prior, observations, believed.gaussian.mean)
-        belief, anchor = believed.updated(space, update.posterior), Belief(believed.origin, prior)
-        if len(held) >= self._estimator.window:
-            place = update.posterior.mean
-            anchor, held = Belief(believed.origin, kalman_update(prior, observations[0].at(place), place)), held[1:]
-        return replace(state, belief=belief, anchor=anchor, held=held)
-
-    def _refreshed(self, state: State) -> State:
-        """The same beliefs about the most likely origin: where bounds hold, steps of the mean lead it astray slowly."""
-        space = self._setup.space
-        belief = state.belief.about(space, most_likely(space, state.belief))
-        return replace(state, belief=belief, anchor=state.anchor if state.held else belief)
+    space, observer, before = setup.space, setup.observer, state.belief
+    if estimator.window == 1:
+        observation = observer.observation(before, recent.readings, recent.joint_noise)
+        belief = before.updated(space, estimator.update(before.gaussian, [observation]).posterior)
+        anchor, held = belief, state.held
+    else:
+        # A record that leaves the window is taken for good, linearised where the records after it lead.
+        held = (*state.held, recent)
+        prior = state.anchor.about(space, before.origin).gaussian
+        observations = [observer.observation(before, record.readings, record.joint_noise) for record in held]
+        update = estimator.update(prior, observations, before.gaussian.mean)
+        belief = before.updated(space, update.posterior)
+        if len(held) >= estimator.window:
+            point = update.posterior.mean
+            prior, held = kalman_update(prior, observations[0].at(point), point), held[1:]
+        anchor = Belief(before.origin, prior)
+    if state.counts["accepted"] % _REFRESHED == _REFRESHED - 1:
+        # Where bounds hold, steps of the mean lead the origin astray slowly.
+        belief = belief.about(space, most_likely(space, belief))
+        anchor = anchor if held else belief
+    nis = (*state.nis_window, (recent.nis, recent.dof))[-nis_window:]
+    return replace(state, belief=belief, anchor=anchor, held=held, nis_window=nis)

@@ -1,4 +1,4 @@
-"""Time as records state it: believed in small steps, never trusted."""
+"""Time as records state it: taken in small steps; clocks jump and are set back."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Clock:
 
 @dataclass(frozen=True)
 class Tick:
-    """What a record's time means: the clock after it, the seconds that parameters had to wander, why it is stale."""
+    """The clock after a record, the time that parameters had to wander (s), why the record is stale, what was odd."""
 
     clock: Clock
     passed: float
@@ -45,20 +45,15 @@ def ticked(clock: Clock, time: float | None, arrived: float, settings: ClockSett
         return Tick(Clock(time), 0.0)
     step = time - clock.now
     if step < -settings.tolerance:
-        return _behind(clock, time, settings)
+        late = clock.late + 1 if clock.late and time >= clock.behind else 1
+        if late >= settings.reset_after:
+            note = f"{late} records in a row are older than one before them: the clock is taken to have been set back"
+            return Tick(Clock(time), 0.0, note=note)
+        return Tick(replace(clock, late=late, behind=time), 0.0, f"it is {_span(-step)} older than the last record")
     if step > settings.longest_step:
         note = f"the clock went ahead by {_span(step)}; parameters are let wander for {_span(settings.longest_step)}"
         return Tick(Clock(time), settings.longest_step, note=note)
     return Tick(Clock(max(time, clock.now)), max(step, 0.0))
-
-
-def _behind(clock: Clock, time: float, settings: ClockSettings) -> Tick:
-    late = clock.late + 1 if clock.late and time >= clock.behind else 1
-    if late >= settings.reset_after:
-        note = f"{late} records in a row are older than one before them: the clock is taken to have been set back"
-        return Tick(Clock(time), 0.0, note=note)
-    text = f"it is {_span((clock.now or 0.0) - time)} older than the last record"
-    return Tick(replace(clock, late=late, behind=time), 0.0, text)
 
 
 def _span(seconds: float) -> str:

@@ -1,12 +1,12 @@
-"""What a step of a joint, or of an instrument's frame, looks like among the parameters.
+"""What a step of a joint, or of an instrument's frame, is in terms of the parameters.
 
-Found by trying, so that it holds for any arm model and effect: in some poses, which combination of parameters moves
-the prediction as the step does? Where one parameter alone does (a joint's offset), it is that one.
+Found by trying, so that it holds for any arm model and effect: the combination of parameters that moves the
+prediction in some poses as the step does. Where one parameter alone does (a joint's offset), it is that one.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +14,8 @@ from armcal.arm.assembly import Arm
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.base.quaternions import quaternion_matrix
+from armcal.calibration.calibration import Calibration
+from armcal.errors import ArmcalError
 from armcal.problem.problem import FactorRecords, Problem
 
 from armcal_online.tracking.observer import Observer
@@ -24,6 +26,7 @@ _ALONE = 0.999
 _LOCAL = 0.98
 _EXPLAINED = 0.97
 _CUT = 1e-6
+_AXES = ("x", "y", "z", "rx", "ry", "rz")
 
 
 @dataclass(frozen=True)
@@ -47,10 +50,10 @@ class JointStep:
 
 @dataclass(frozen=True)
 class Steps:
-    """What can be followed.
+    """Steps that the filter can follow.
 
     Attributes:
-        joints: steps of joints, those that parameters can make.
+        joints: those that parameters can make.
         unfollowed: joints whose steps no combination of parameters makes.
         sensors: by measurement, scaled coordinates of shifts (m) and turns (rad) of its frame (n x up to 6), and
             which of ``x y z rx ry rz`` they are.
@@ -61,43 +64,53 @@ class Steps:
     sensors: Mapping[str, tuple[Array, tuple[str, ...]]]
 
 
-def find_steps(observer: Observer, values: Array, predicted: Mapping[str, Array], poses: Dataset) -> Steps:
-    """The steps that the free parameters can follow.
+def find_steps(calibration: Calibration, observer: Observer, values: Array) -> Steps:
+    """The steps that the free parameters can follow; none where no instrument reads a single pose.
 
     Args:
+        calibration: predicts readings.
         observer: of the problem.
         values: of its parameters.
-        predicted: what instruments read in the poses, by channel.
-        poses: joint angles (see ``probing_poses``).
     """
-    problem, space = observer.problem, observer.space
-    complete = Dataset(poses.ids, {**_defaulted(problem, len(poses)), **poses.channels, **predicted})
-    records = problem.records(complete)
-    slopes = -np.concatenate([_rows(jacobian) for jacobian in problem.jacobians(values, records)])
-    slopes = space.by_coordinates(values, slopes)
-    arms = problem.blueprint.arms.values()
-    commanded = {f"{arm.name}.{joint}": dimension for arm in arms for joint, dimension in arm.commanded.items()}
-    motions = -_whitened(problem, values, records, list(commanded))
-    joints, unfollowed = [], []
-    for (channel, dimension), moved in zip(commanded.items(), motions.T, strict=True):
-        seen = float(moved @ moved) >= _CUT * len(moved)
-        step = _joint_step(channel, dimension, moved, slopes, space.names) if seen else None
-        if step is None:
-            unfollowed.append(channel)
-        else:
-            joints.append(step)
-    sensors = {
-        kernel.factor.name: found
-        for kernel in problem.kernels
-        if (found := _sensor(problem, values, records, kernel.factor.name, complete, slopes)) is not None
-    }
-    return Steps(tuple(joints), tuple(unfollowed), sensors)
+    problem, space, arms = observer.problem, observer.space, calibration.system.arms.values()
+    poses = _probing_poses(arms)
+    nothing, environment = np.zeros(len(poses)), problem.blueprint.environment
+    conditions = {name: nothing for arm in arms for name in arm.conditions}
+    try:
+        read, _ = calibration.predict(Dataset(poses.ids, {**poses.channels, **conditions, "payload": nothing}))
+        # Other channels of the kernels: those of a record at rest in the stated surroundings.
+        rest = {f"gravity_{a}": g for a, g in zip("xyz", environment.gravity, strict=True)}
+        rest |= {f"payload_{a}": g for a, g in zip("xyz", environment.payload_com, strict=True)}
+        rest["payload"] = environment.payload_mass
+        names = [channel for kernel in problem.kernels for channel in kernel.factor.channels]
+        others = {name: np.full(len(poses), rest.get(name, 0.0)) for name in names}
+        complete = Dataset(poses.ids, {**others, **poses.channels, **read})
+        records = problem.records(complete)
+        jacobians = problem.jacobians(values, records)
+        rows = [np.moveaxis(j, 2, 0).reshape(-1, j.shape[1]) for j in jacobians]  # record by record
+        slopes = space.by_coordinates(values, -np.concatenate(rows))
+        commanded = {f"{arm.name}.{joint}": dimension for arm in arms for joint, dimension in arm.commanded.items()}
+        by_joint = _whitened(problem, values, records, list(commanded))
+        motions = -np.concatenate([block.reshape(-1, len(commanded)) for block in by_joint])
+        steps = {
+            channel: _joint_step(channel, dimension, moved, slopes, space.names)
+            for (channel, dimension), moved in zip(commanded.items(), motions.T, strict=True)
+        }
+        factors = [kernel.factor.name for kernel in problem.kernels]
+        motions_of = {name: _sensor_motion(problem, values, records, name, complete, slopes) for name in factors}
+    except ArmcalError:
+        return Steps((), (), {})
+    return Steps(
+        tuple(step for step in steps.values() if step is not None),
+        tuple(channel for channel, step in steps.items() if step is None),
+        {name: motion for name, motion in motions_of.items() if motion is not None},
+    )
 
 
-def probing_poses(arms: Mapping[str, Arm]) -> Dataset:
+def _probing_poses(arms: Iterable[Arm]) -> Dataset:
     """Poses about zero within the joints' limits, approached from either side; always the same ones."""
     random, channels = np.random.default_rng(0), {}
-    for arm in arms.values():
+    for arm in arms:
         limits = {joint.name: joint.limits for joint in arm.nominal_chain.joints}
         for joint, dimension in arm.commanded.items():
             reach = _REACH[dimension]
@@ -107,85 +120,68 @@ def probing_poses(arms: Mapping[str, Arm]) -> Dataset:
     return Dataset(tuple(str(i) for i in range(_POSES)), channels)
 
 
-def _defaulted(problem: Problem, count: int) -> dict[str, Array]:
-    """Channels of the kernels that poses do not say: those of a record at rest in the stated surroundings."""
-    environment = problem.blueprint.environment
-    known = {f"gravity_{a}": g for a, g in zip("xyz", environment.gravity, strict=True)}
-    known |= {f"payload_{a}": g for a, g in zip("xyz", environment.payload_com, strict=True)}
-    known["payload"] = environment.payload_mass
-    names = [channel for kernel in problem.kernels for channel in kernel.factor.channels]
-    return {name: np.full(count, known.get(name, 0.0)) for name in names}
-
-
-def _rows(jacobian: Array) -> Array:
-    """Slopes (n_r x n x N) as rows, record by record."""
-    return np.ascontiguousarray(np.moveaxis(jacobian, 2, 0)).reshape(-1, jacobian.shape[1])
-
-
-def _whitened(problem: Problem, values: Array, records: Sequence[FactorRecords], channels: Sequence[str]) -> Array:
-    """d residual / d channels in units of the noise, rows as those of the Jacobians."""
-    parts = []
-    for kernel, slope in zip(problem.kernels, problem.channel_slopes(values, records, channels), strict=True):
-        parts.append(_rows(slope / np.array(kernel.factor.noise)[:, None, None]))
-    return np.concatenate(parts)
+def _whitened(
+    problem: Problem, values: Array, records: Sequence[FactorRecords], channels: Sequence[str]
+) -> list[Array]:
+    """d residual / d channels in units of the noise, by kernel (records x n_r x n_c)."""
+    slopes = zip(problem.kernels, problem.channel_slopes(values, records, channels), strict=True)
+    return [np.moveaxis(slope / np.array(kernel.factor.noise)[:, None, None], 2, 0) for kernel, slope in slopes]
 
 
 def _joint_step(channel: str, dimension: str, moved: Array, slopes: Array, names: Sequence[str]) -> JointStep | None:
-    size = np.sum(slopes**2, axis=0)
-    along = slopes.T @ moved
-    alike = np.where(size > 0, along**2 / np.where(size > 0, size, 1.0), 0.0) / float(moved @ moved)
+    """What makes a joint's motion (rows); None where it is not seen, or no combination of parameters makes it."""
+    power = float(moved @ moved)
+    if power < _CUT * len(moved):
+        return None
+    size, along = np.sum(slopes**2, axis=0), slopes.T @ moved
+    alike = np.where(size > 0, along**2 / np.where(size > 0, size, 1.0), 0.0) / power
+    # Coordinates that move every pose's prediction along the joint's own motion; one row alone has no direction.
+    local: list[int] = []
+    blocks = slopes.reshape(-1, 3, slopes.shape[1]) if len(slopes) % 3 == 0 else slopes[:, None]
+    if blocks.shape[1] > 1:
+        directions = moved.reshape(blocks.shape[:2])
+        norms = np.linalg.norm(directions, axis=1, keepdims=True)
+        unit = np.where(norms > 1e-9, directions / np.where(norms > 1e-9, norms, 1.0), 0.0)
+        inline = np.sum(np.einsum("kr,krn->kn", unit, blocks) ** 2, axis=0)
+        local = [i for i in range(slopes.shape[1]) if size[i] > _CUT and inline[i] > _LOCAL * size[i]]
     best = int(np.argmax(alike))
-    local = _local(moved, slopes, size)
     if alike[best] > _ALONE:
         direction = np.zeros(len(names))
         direction[best] = along[best] / size[best]
         return JointStep(channel, dimension, direction, tuple(i for i in local if i != best), names[best])
+    several = _combination(slopes, moved)
+    return None if several is None else JointStep(channel, dimension, several, tuple(local), "")
+
+
+def _combination(slopes: Array, moved: Array) -> Array | None:
+    """The parameters' combination (n) that makes a motion (rows); None where none explains it."""
     several = np.asarray(np.linalg.lstsq(slopes, moved, rcond=_CUT)[0])
     left = moved - slopes @ several
-    if float(left @ left) > (1 - _EXPLAINED) * float(moved @ moved):
-        return None
-    return JointStep(channel, dimension, several, tuple(local), "")
+    return several if float(left @ left) <= (1 - _EXPLAINED) * float(moved @ moved) else None
 
 
-def _local(moved: Array, slopes: Array, size: Array) -> list[int]:
-    """Coordinates that move every pose's prediction along the joint's own motion."""
-    blocks = slopes.reshape(-1, 3, slopes.shape[1]) if len(slopes) % 3 == 0 else slopes[:, None]
-    directions = moved.reshape(blocks.shape[:2])
-    norms = np.linalg.norm(directions, axis=1, keepdims=True)
-    unit = np.where(norms > 1e-9, directions / np.where(norms > 1e-9, norms, 1.0), 0.0)
-    if blocks.shape[1] < 2:
-        return []
-    along = np.sum(np.einsum("kr,krn->kn", unit, blocks) ** 2, axis=0)
-    return [i for i in range(slopes.shape[1]) if size[i] > _CUT and along[i] > _LOCAL * size[i]]
-
-
-def _sensor(
+def _sensor_motion(
     problem: Problem, values: Array, records: Sequence[FactorRecords], instance: str, poses: Dataset, slopes: Array
 ) -> tuple[Array, tuple[str, ...]] | None:
-    """How the free parameters make a rigid motion of what an instrument reads; None for one that reads no position."""
-    position = [f"{instance}.{axis}" for axis in "xyz"]
+    """How the free parameters make a rigid motion of an instrument's frame; None for one that reads no position."""
+    position, turn = ([f"{instance}.{axis}" for axis in axes] for axes in (_AXES[:3], ("qw", "qx", "qy", "qz")))
     if not all(poses.has(channel) for channel in position):
         return None
-    turned = [f"{instance}.q{axis}" for axis in "wxyz"]
-    channels = position + (turned if all(poses.has(channel) for channel in turned) else [])
-    by_channel = _whitened(problem, values, records, channels)
-    rows = len(by_channel) // max(len(poses), 1)
-    motion = np.zeros((len(by_channel), 6))
-    for k in range(len(poses)):
-        at = slice(rows * k, rows * (k + 1))
-        motion[at] = by_channel[at] @ _rigid(np.array([poses.column(c)[k] for c in channels]))
-    names, columns = ("x", "y", "z", "rx", "ry", "rz"), []
-    kept = []
-    for i, name in enumerate(names):
-        found = np.linalg.lstsq(slopes, motion[:, i], rcond=_CUT)[0]
-        left = motion[:, i] - slopes @ found
-        if float(left @ left) <= (1 - _EXPLAINED) * float(motion[:, i] @ motion[:, i]):
-            columns.append(found)
-            kept.append(name)
-    return (np.array(columns).T, tuple(kept)) if columns else None
+    channels = position + (turn if all(poses.has(channel) for channel in turn) else [])
+    moved = []
+    for kernel, block in zip(problem.kernels, _whitened(problem, values, records, channels), strict=True):
+        rows = np.zeros((*block.shape[:2], len(_AXES)))
+        if kernel.factor.name == instance:
+            for k in range(len(poses)):
+                rows[k] = block[k] @ _rigid([poses.column(c)[k] for c in channels])
+        moved.append(rows.reshape(-1, len(_AXES)))
+    motion = np.concatenate(moved)
+    made = {axis: _combination(slopes, column) for axis, column in zip(_AXES, motion.T, strict=True)}
+    columns = {axis: column for axis, column in made.items() if column is not None}
+    return (np.array([*columns.values()]).T, tuple(columns)) if columns else None
 
 
-def _rigid(read: Array) -> Array:
+def _rigid(read: Sequence[float]) -> Array:
     """How a reading (3, or 7 with a unit quaternion) changes with a shift and a turn of what it is read in (by 6)."""
     x, y, z = read[:3]
     change = np.zeros((len(read), 6))
@@ -195,5 +191,5 @@ def _rigid(read: Array) -> Array:
         for axis in range(3):
             turn = np.zeros(4)
             turn[1 + axis] = 0.5
-            change[3:, 3 + axis] = quaternion_matrix(turn) @ read[3:]
+            change[3:, 3 + axis] = quaternion_matrix(turn) @ np.array(read[3:])
     return change

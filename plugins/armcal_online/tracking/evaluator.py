@@ -20,15 +20,25 @@ _THREADS = "OPENBLAS_NUM_THREADS"
 
 
 def identity(problem: Problem, estimator: object) -> dict[str, Any]:
-    """Of a problem's functions, the code and libraries beside them and the machine, as JSON.
+    """Of a problem's functions, of the code and libraries beside them, and of the machine, as JSON.
 
     A kernel's key covers its expression, the generator, the compiler and its flags, and the processor.
     """
+    # A change of any code that may have a part in it may change the last bits.
+    sources, libraries = hashlib.sha256(), {}
+    for folder in (SOURCES, Path(inspect.getfile(type(estimator))).parent):
+        for path in sorted(folder.rglob("*.py")):
+            sources.update(path.relative_to(folder).as_posix().encode() + b"\0" + path.read_bytes())
+    for name in _LIBRARIES:
+        try:
+            libraries[name] = version(name)
+        except PackageNotFoundError:
+            libraries[name] = ""
     return {
         "armcal": __version__,
-        "sources": _sources(SOURCES, Path(inspect.getfile(type(estimator))).parent),
+        "sources": sources.hexdigest()[:12],
         "python": platform.python_version(),
-        "libraries": {name: _version(name) for name in _LIBRARIES},
+        "libraries": libraries,
         "backend": problem.backend,
         "kernels": {kernel.factor.name: kernel.identity for kernel in problem.kernels},
         "flags": " ".join(compiler.FLAGS) if problem.backend == "compiled" else "",
@@ -43,19 +53,3 @@ def differences(one: object, other: object, name: str = "") -> tuple[str, ...]:
         keys = dict.fromkeys([*one, *other])
         return tuple(t for k in keys for t in differences(one.get(k), other.get(k), f"{name}.{k}" if name else str(k)))
     return () if one == other else (f"{name} {one or 'none'} here, {other or 'none'} there",)
-
-
-def _sources(*folders: Path) -> str:
-    """A hash of all code that may have a part in it: a change of any of it may change the last bits."""
-    hashed = hashlib.sha256()
-    for folder in folders:
-        for path in sorted(folder.rglob("*.py")):
-            hashed.update(path.relative_to(folder).as_posix().encode() + b"\0" + path.read_bytes())
-    return hashed.hexdigest()[:12]
-
-
-def _version(library: str) -> str:
-    try:
-        return version(library)
-    except PackageNotFoundError:
-        return ""

@@ -1,4 +1,4 @@
-"""What a recalibration tells: one JSON object an event; a finished sentence wherever something was decided."""
+"""Events of a recalibration: one JSON object each, with a finished sentence wherever something was decided."""
 
 from __future__ import annotations
 
@@ -56,21 +56,30 @@ def judged(
     """A record that was accepted or rejected."""
     verdict = "rejected" if recent.rejected else "accepted"
     relation = "above" if recent.rejected else "within"
-    content = {
+    name = setup.problem.kernels[recent.readings[0].factor].factor.name
+    event = {
         **_record(incoming, state, verdict),
         "why": f"Its NIS {recent.nis:.3g} is {relation} the limit {limit:.3g}.",
         "nis": recent.nis,
         "limit": limit,
         "dof": recent.dof,
-        "measurement": setup.problem.kernels[recent.readings[0].factor].factor.name,
+        "measurement": name,
     }
-    position = _position(incoming, recent, first, setup)
-    return {**content, **position}
+    measured = np.array([incoming.channels.get(f"{name}.{axis}", math.nan) for axis in "xyz"])
+    if len(recent.readings) == 1 and len(first.innovation) >= 3 and np.isfinite(measured).all():
+        # A single instrument read a position.
+        residual = 1000 * first.innovation[:3]
+        event |= {
+            "residual_mm": residual.tolist(),
+            "measured_mm": (1000 * measured).tolist(),
+            "predicted_mm": (1000 * measured - residual).tolist(),
+        }
+    return event
 
 
 def decided(state: State, decision: Decision) -> dict[str, Any]:
     """Something that was decided."""
-    told = {
+    event = {
         "event": "decision",
         "sequence": state.sequence,
         "at": state.at,
@@ -79,13 +88,13 @@ def decided(state: State, decision: Decision) -> dict[str, Any]:
         "sentence": decision.sentence,
     }
     if decision.subject:
-        told["joint" if decision.kind.startswith("joint") else "measurement"] = decision.subject
+        event["joint" if decision.kind.startswith("joint") else "measurement"] = decision.subject
     if len(decision.candidates) > 1:
-        told["candidates"] = list(decision.candidates)
+        event["candidates"] = list(decision.candidates)
     if decision.size is not None:
         turned = decision.dimension == "angle"
-        told["size_deg" if turned else "size_mm"] = math.degrees(decision.size) if turned else 1000 * decision.size
-    return told
+        event["size_deg" if turned else "size_mm"] = math.degrees(decision.size) if turned else 1000 * decision.size
+    return event
 
 
 def noted(state: State, kind: str, text: str) -> dict[str, Any]:
@@ -120,18 +129,4 @@ def _record(incoming: Incoming, state: State, verdict: str) -> dict[str, Any]:
         "verdict": verdict,
         "level": state.health.level,
         "inputs": {name: value for name, value in incoming.channels.items() if np.isfinite(value)},
-    }
-
-
-def _position(incoming: Incoming, recent: Recent, first: Linearised, setup: FilterSetup) -> dict[str, Any]:
-    """Residual, measured and predicted position in mm, where a single instrument read one."""
-    name = setup.problem.kernels[recent.readings[0].factor].factor.name
-    measured = [incoming.channels.get(f"{name}.{axis}", math.nan) for axis in "xyz"]
-    if len(recent.readings) != 1 or len(first.innovation) < 3 or not np.isfinite(measured).all():
-        return {}
-    residual = 1000 * first.innovation[:3]
-    return {
-        "residual_mm": residual.tolist(),
-        "measured_mm": (1000 * np.array(measured)).tolist(),
-        "predicted_mm": (1000 * np.array(measured) - residual).tolist(),
     }

@@ -17,7 +17,7 @@ LEVELS: tuple[Level, ...] = ("nominal", "watch", "suspect", "lost")
 
 @dataclass(frozen=True)
 class Health:
-    """A level, since how many records nothing has troubled it, and why it is what it is."""
+    """A level, the number of records since the last trouble, and the reason of the level."""
 
     level: Level = "nominal"
     calm: int = 0
@@ -30,7 +30,7 @@ class Health:
         return cls(matching[0], int(calm), str(sentence))
 
     def troubled(self, level: Level, sentence: str) -> Health:
-        """After trouble: at least that bad, and calm no more."""
+        """After trouble: at least that bad, counting anew."""
         if LEVELS.index(level) > LEVELS.index(self.level):
             return Health(level, 0, sentence)
         return replace(self, calm=0)

@@ -20,11 +20,11 @@ class Decision:
     """Something that was decided.
 
     Attributes:
-        kind: what, in a word.
+        kind: in a word.
         sentence: what and why.
-        level: how bad.
-        subject: whom it concerns: a joint's channel, or a measurement.
-        candidates: joints that these records cannot tell apart, the likeliest first.
+        level: of health that it means.
+        subject: a joint's channel, or a measurement.
+        candidates: joints that these records cannot distinguish, the likeliest first.
         size: of a step (rad or m).
         dimension: of that.
         since: the first record after the change.
@@ -54,8 +54,8 @@ def change(
     since = state.recent[best.onset :]
     rival = f", {margin:.0f} above {_named(others[0].hypothesis)}" if others else ""
     because = (
-        f"{sum(each.rejected for each in since)} of the {len(since)} records since do not fit what was believed; it "
-        f"explains {100 * best.explanation:.0f} % of their misfit (log odds {best.log_odds:.1f}{rival})"
+        f"{sum(record.rejected for record in since)} of the {len(since)} records since do not fit the estimate before; "
+        f"it explains {100 * best.share:.0f} % of their misfit (log odds {best.log_odds:.1f}{rival})"
     )
     at = f"record {onset.sequence}"
     if hypothesis.kind == "general_change":
@@ -63,13 +63,13 @@ def change(
         text += f" All standard deviations are made {hypothesis.factor:g} times larger."
         return Decision("general_change", text, "suspect", since=onset.sequence)
     if hypothesis.kind == "sensor_moved":
-        text = f"What {hypothesis.subject} measures in has moved at {at}: {because}. Its place is found anew."
+        text = f"The frame of {hypothesis.subject} has moved at {at}: {because}. Its placement is found anew."
         return Decision("sensor_moved", text, "watch", hypothesis.subject, since=onset.sequence)
     names = tuple(explanation.hypothesis.subject for explanation in alike)
     dimension = next(joint.dimension for joint in steps.joints if joint.joint == hypothesis.subject)
     if len(names) > 1:
-        text = f"Joint {' or '.join(names)} has stepped at {at}: {because}. Poses since do not tell which of them; "
-        text += "the variance of their offsets alone was reopened, until a pose tells."
+        text = f"Joint {' or '.join(names)} has stepped at {at}: {because}. Poses since do not distinguish them; "
+        text += "the variance of their offsets alone is open until a pose does."
         return Decision("joint_stepped", text, "watch", names[0], names, None, dimension, onset.sequence)
     shown = _shown(size, dimension)
     what = f"slipped by {shown}" if hypothesis.kind == "joint_slipped" else f"acts like a new servo, {shown} off,"
@@ -90,13 +90,13 @@ def named(
     dimension = next(joint_step.dimension for joint_step in steps.joints if joint_step.joint == joint)
     text = (
         f"It was joint {joint}, by {_shown(size, dimension)}: its step makes the records since {margin:.1f} in log "
-        f"odds likelier than one of {' or '.join(others)}, which stand where they stood. Its variance alone stays open."
+        f"odds likelier than one of {' or '.join(others)}, whose offsets are as before. Its variance alone stays open."
     )
     return Decision("joint_named", text, "watch", joint, (joint,), size[0], dimension, state.suspected)
 
 
 def replaced(state: State, steps: Steps, hypothesis: Hypothesis, margin: float, size: tuple[float, float]) -> Decision:
-    """A joint that stepped is another one."""
+    """A joint that stepped acts like a new servo."""
     joint = hypothesis.subject
     dimension = next(joint_step.dimension for joint_step in steps.joints if joint_step.joint == joint)
     text = (
@@ -126,9 +126,9 @@ def unexplained(state: State, rejected: int, best: Explanation) -> Decision:
 
 
 def no_longer_fits(state: State, steps: Steps, why: str) -> Decision:
-    """Nothing that can be done here helps."""
-    beside = f" Steps of {', '.join(steps.unfollowed)} cannot be followed." if steps.unfollowed else ""
-    text = f"The model no longer fits: {why}. Calibrate again on a bench, or roll back.{beside}"
+    """No change that is followed here explains the records."""
+    unfollowed = f" Steps of {', '.join(steps.unfollowed)} cannot be followed." if steps.unfollowed else ""
+    text = f"The model no longer fits: {why}. Calibrate again on a bench, or roll back.{unfollowed}"
     return Decision("model_no_longer_fits", text, "lost", since=state.sequence)
 
 

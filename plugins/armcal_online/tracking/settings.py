@@ -13,17 +13,15 @@ from armcal.errors import ConfigError
 from pydantic import Field, model_validator
 
 SECTION = "recalibrate"
-"""A file may hold more than a recalibration: then it stands under this key."""
+"""A file may hold more than a recalibration: the recalibration then stands under this key."""
 DAY = 86400.0
 Probability = Annotated[float, Field(gt=0, lt=1)]
 
 
 class GateSettings(Settings):
-    """Which records are believed.
+    """Which records are accepted: chance makes a larger normalised innovation squared (NIS) in ``1 - probability``.
 
-    Those are not whose normalised innovation squared (NIS) chance exceeds with less than ``1 - probability``.
-
-    Of the last ``window`` records ``rejected`` have to be rejected before an unexplained change is suspected.
+    An unexplained change is suspected once ``rejected`` of the last ``window`` records are rejected.
     """
 
     probability: Probability = 0.999
@@ -65,10 +63,10 @@ class ChangeSettings(Settings):
 
 
 class LevelSettings(Settings):
-    """When health changes: after ``calm`` records without trouble it gets better by a level.
+    """When the health level changes: after ``calm`` records without trouble it gets better by one.
 
-    The mean NIS of the last ``window`` records is watched; it is trouble where chance would make it so large
-    with a probability below ``probability``. ``tip_sd`` is the largest tolerable standard deviation of a predicted tip.
+    Trouble is a mean NIS of the last ``window`` records that chance makes with less than ``probability``, and a
+    predicted tip with a standard deviation above ``tip_sd``.
     """
 
     calm: Annotated[int, Field(ge=1)] = 16
@@ -78,7 +76,7 @@ class LevelSettings(Settings):
 
 
 class ClockSettings(Settings):
-    """How time is believed: steps between records count as at most ``longest_step``; older ones are ``stale``.
+    """How the records' time is read: a step between two of them counts as ``longest_step`` at most.
 
     A record older than the last by more than ``tolerance`` is passed over. When ``reset_after`` records in a row are,
     the clock is taken to have been set back. ``longest_age`` is the greatest age on arrival; none by default.
@@ -108,10 +106,10 @@ class JournalSettings(Settings):
 class RecalibrateSettings(Settings):
     """How a calibration is kept true.
 
-    ``process_noise`` says how far a parameter may wander, by glob: ``0.05 deg in 30 d``. ``model_error``: a model that
-    is wrong errs alike in neighbouring records (``calibrated``: as much as the calibration's residuals did), or each
-    time anew (``white``). ``free`` opens parameters that the calibration held, with a standard deviation.
-    ``columns`` are the source's names for what is wanted, as in a configuration's data section.
+    ``process_noise`` is how far a parameter may wander, by glob: ``0.05 deg in 30 d``. ``model_error``: the error of a
+    wrong model is alike in neighbouring records (``calibrated``: as much as the calibration's residuals were), or
+    independent (``white``). ``free`` opens parameters that the calibration held, with a standard deviation.
+    ``columns`` are the source's names for the channels, as in a configuration's data section.
     """
 
     estimator: dict[str, Any] = Field(default_factory=lambda: {"type": "extended"})
@@ -131,7 +129,7 @@ class RecalibrateSettings(Settings):
 
 
 def load_settings(path: str | Path | None, overrides: Sequence[str] = ()) -> RecalibrateSettings:
-    """The settings in a file, checked; the ordinary ones without a file.
+    """The settings in a file, checked; the default ones without a file.
 
     Raises:
         ConfigError: no such file, not YAML, or a setting is refused, with file, line and field.

@@ -1,4 +1,4 @@
-"""From a calibration to what a recalibration starts with: problem, belief, noise to expect, what moves beside."""
+"""From a calibration to what a recalibration starts with: problem, belief, noise of records and of the process."""
 
 from __future__ import annotations
 
@@ -20,10 +20,15 @@ from armcal.measure.partners import PairedMeasurement
 from armcal.measure.reader import ReadRequest, requested_channels
 from armcal.problem.problem import Problem
 
-from armcal_online.tracking.belief import Belief, ProcessNoise
-from armcal_online.tracking.gauss_markov import GaussMarkovState, GaussMarkovStates, shared_error
+from armcal_online.tracking.belief import Belief
 from armcal_online.tracking.observer import Observer
-from armcal_online.tracking.process import variance_rates
+from armcal_online.tracking.process_noise import (
+    GaussMarkovState,
+    GaussMarkovStates,
+    ProcessNoise,
+    shared_error,
+    variance_rates,
+)
 from armcal_online.tracking.settings import RecalibrateSettings
 from armcal_online.tracking.state_space import StateSpace
 
@@ -32,14 +37,14 @@ _VECTORS = ("gravity", "payload", "force", "torque")
 
 @dataclass(frozen=True)
 class FilterSetup:
-    """What a recalibration stands on.
+    """What a recalibration starts with.
 
     Attributes:
         problem: compiled once.
         space: of its free parameters.
         observer: makes observations of records.
         belief: that of the calibration.
-        process_noise: how beliefs fade between records.
+        process_noise: how beliefs widen between records.
         request: what a source should look for.
         left_out: measurements that cannot be taken one record at a time.
     """
@@ -64,164 +69,129 @@ def filter_setup(calibration: Calibration, settings: RecalibrateSettings, shares
     Raises:
         ConfigError: the calibration keeps no covariance, or a glob or a quantity in the settings is refused.
     """
-    measurements = {n: m for n, m in calibration.system.measurements.items() if not isinstance(m, PairedMeasurement)}
+    system, noise = calibration.system, calibration.record.noise
+    measurements = {n: m for n, m in system.measurements.items() if not isinstance(m, PairedMeasurement)}
     parameters, opened = _parameters(calibration, settings)
     space = StateSpace(parameters)
+    record = _full_record(calibration, measurements)
+    groups = calibration.record.groups
     problem = Problem.build(
-        calibration.system.arms,
-        measurements,
-        parameters,
-        calibration.system.environment,
-        _channels(calibration, measurements),
-        settings.evaluator,
-        groups=calibration.record.groups,
+        system.arms, measurements, parameters, system.environment, record, settings.evaluator, groups=groups
     )
-    covariance = _covariance(calibration, space, opened)
-    white, gauss_markov, noisy = _errors(calibration, measurements, space, settings, shares)
-    size = len(space.scales) + len(gauss_markov)
-    mean, start = np.zeros(size), np.eye(size)
-    mean[: len(space.scales)] = _unconstrained(calibration, space)
-    start[: len(space.scales), : len(space.scales)] = covariance
+    follows = shares and settings.model_error == "calibrated"
+    white, shared = _white_and_shared_noise(calibration, measurements, follows)
+    drifts = _drifts(calibration, space)
+    gauss_markov = GaussMarkovStates((*drifts, *shared) if follows else ())
+    # The degrees of freedom of a measurement's noise are all of the fit's if its own are not kept.
+    own, degrees = noise.get("scatter") or {}, max(noise["degrees_of_freedom"], 1)
+    known = {entry.name.partition("[")[0] for entry in calibration.record.parameters if entry.free}
+    observer = Observer(
+        problem,
+        space,
+        gauss_markov,
+        GaussMarkovStates(() if follows else drifts),
+        white,
+        {name: float((own.get(name) or {}).get("freedom") or degrees) for name in white},
+        _defaults(calibration),
+        {block.name for block in calibration.parameters.nuisances if block.free} - known,
+        _noise_scale(calibration),
+    )
     return FilterSetup(
         problem,
         space,
-        _observer(calibration, problem, space, (gauss_markov, noisy), white),
-        Belief(parameters.nominal(), Gaussian(mean, start)),
+        observer,
+        _initial_belief(calibration, space, opened, observer.size),
         ProcessNoise(variance_rates(parameters, settings.process_noise), gauss_markov),
-        ReadRequest(
-            calibration.system.arms,
-            measurements,
-            requested_channels(calibration.system.arms, measurements, measured=True),
-        ),
-        tuple(sorted(set(calibration.system.measurements) - set(measurements))),
+        ReadRequest(system.arms, measurements, requested_channels(system.arms, measurements, measured=True)),
+        tuple(sorted(set(system.measurements) - set(measurements))),
     )
 
 
 def _parameters(calibration: Calibration, settings: RecalibrateSettings) -> tuple[Parameters, dict[str, float]]:
-    """Blocks about the calibrated values, those found then free, and the deviations of those opened now."""
+    """Blocks about the calibrated values, those that were free then free, and the deviations of those opened now."""
     parameters = calibration.parameters
-    texts = {entry.name.partition("[")[0] for entry in calibration.record.parameters if entry.free}
+    free = {entry.name.partition("[")[0] for entry in calibration.record.parameters if entry.free}
     opened: dict[str, float] = {}
     for glob, text in settings.free.items():
         names = fnmatch.filter(parameters.names, glob)
         if not names:
             raise ConfigError(f"no parameter is called {glob!r}.", where=Location(f"free.{glob}"))
-        opened |= {n: quantity(parameters[n], text, None, ()) for n in names if n not in texts}
+        opened |= {n: quantity(parameters[n], text, None, ()) for n in names if n not in free}
     beyond = {
         block.name: replace(block, domain=Interval())
         for block in parameters.blocks
         if isinstance(block.domain, Interval) and block.domain.check(np.array(block.nominal))
     }
-    return parameters.replaced(beyond).with_free([n for n in parameters.names if n in texts or n in opened]), opened
+    return parameters.replaced(beyond).with_free([n for n in parameters.names if n in free or n in opened]), opened
 
 
-def _covariance(calibration: Calibration, space: StateSpace, opened: Mapping[str, float]) -> Array:
-    """Of the scaled coordinates; parameters opened now are known to nobody."""
-    known = calibration.uncertainty.record
-    own = known.entries
-    lower = np.zeros((len(own), len(own)))
+def _initial_belief(calibration: Calibration, space: StateSpace, opened: Mapping[str, float], size: int) -> Belief:
+    """About the calibrated values: the mean where its records lead without bounds, its covariance, and 1 beside."""
+    values, known = space.parameters.nominal(), calibration.uncertainty.record
+    own = np.zeros((len(known.entries), len(known.entries)))
     for i, row in enumerate(known.covariance):
-        lower[i, : len(row)] = row
-    of_entries = lower + np.tril(lower, -1).T
+        own[i, : len(row)] = row
     names = [space.parameters.entry_names[i] for i in space.entries]
-    place = [names.index(name) for name in own]
+    place = [names.index(name) for name in known.entries]
     whole = np.zeros((len(names), len(names)))
-    whole[np.ix_(place, place)] = of_entries
-    covariance = space.of_entries(space.parameters.nominal(), whole)
+    whole[np.ix_(place, place)] = own + np.tril(own, -1).T
+    covariance = space.of_entries(values, whole)
     start = 0
     for block in space.parameters.free:
         if block.name in opened:
             at = np.arange(start, start + block.domain.dof)
             covariance[at, at] = (opened[block.name] / block.scale) ** 2
         start += block.domain.dof
-    return 0.5 * (covariance + covariance.T)
-
-
-def _unconstrained(calibration: Calibration, space: StateSpace) -> Array:
-    """Where the calibration's records would have the coordinates if no bound held any (n)."""
-    values = space.parameters.nominal()
-    free = values.copy()
+    unconstrained = values.copy()
     for position, entry in enumerate(calibration.record.parameters):
         if entry.unconstrained is not None:
-            free[position] = entry.unconstrained
-    return space.between(values, free)
+            unconstrained[position] = entry.unconstrained
+    n, mean, of_all = len(space.scales), np.zeros(size), np.eye(size)
+    mean[:n] = space.between(values, unconstrained)
+    of_all[:n, :n] = 0.5 * (covariance + covariance.T)
+    return Belief(values, Gaussian(mean, of_all))
 
 
-def _errors(
-    calibration: Calibration,
-    measurements: Mapping[str, Measurement],
-    space: StateSpace,
-    settings: RecalibrateSettings,
-    shares: bool,
-) -> tuple[dict[str, Array], GaussMarkovStates, GaussMarkovStates]:
-    """Each measurement's own error from record to record, what moves beside the parameters, and drifts
-    that count as noise."""
-    kept: Mapping[str, Any] = calibration.record.noise.get("scatter") or {}
-    scale = _scale(calibration)
-    followed = shares and settings.model_error == "calibrated"
-    gauss_markov: list[GaussMarkovState] = []
-    white = {}
+def _white_and_shared_noise(
+    calibration: Calibration, measurements: Mapping[str, Measurement], follows: bool
+) -> tuple[dict[str, Array], list[GaussMarkovState]]:
+    """Each measurement's own error from record to record (n_r x n_r), and what neighbours share if that is followed."""
+    variances: Mapping[str, Any] = calibration.record.noise.get("scatter") or {}
+    white: dict[str, Array] = {}
+    shared: list[GaussMarkovState] = []
     for name, measurement in measurements.items():
-        # Where joints are noisy the residuals scatter with the pose: their noise is carried over to each record.
-        noisy = any(calibration.system.arms[arm].joint_noise for arm in measurement.arms)
-        told = None if noisy else kept.get(name)
-        covariance = np.diag((np.array(measurement.noise()) * scale) ** 2)
-        if told is not None:
-            covariance = np.array(told["covariance"])
-            if followed and told["share"] > 0:
-                gauss_markov += shared_error(
-                    name, told["share"] * covariance, told["over"], told.get("channel", "record")
-                )
-                covariance = (1 - told["share"]) * covariance
+        # Where joints are noisy the residuals vary with the pose: their noise is carried over to each record.
+        is_noisy = any(calibration.system.arms[arm].joint_noise for arm in measurement.arms)
+        residuals = None if is_noisy else variances.get(name)
+        covariance = np.diag((np.array(measurement.noise()) * _noise_scale(calibration)) ** 2)
+        if residuals is not None:
+            covariance, share = np.array(residuals["covariance"]), residuals["share"]
+            if follows and share > 0:
+                channel = residuals.get("channel", "record")
+                shared += shared_error(name, share * covariance, residuals["over"], channel)
+                covariance = (1 - share) * covariance
         white[name] = covariance
-    drifts = tuple(_drifts(calibration, space))
-    if followed:
-        return white, GaussMarkovStates((*drifts, *gauss_markov)), GaussMarkovStates()
-    return white, GaussMarkovStates(tuple(gauss_markov)), GaussMarkovStates(drifts)
+    return white, shared
 
 
-def _observer(
-    calibration: Calibration,
-    problem: Problem,
-    space: StateSpace,
-    beside: tuple[GaussMarkovStates, GaussMarkovStates],
-    white: Mapping[str, Array],
-) -> Observer:
-    freedoms = {name: _freedom(calibration, name) for name in white}
-    defaults, unfound = _defaults(calibration), _unfound(calibration)
-    return Observer(problem, space, *beside, white, freedoms, defaults, unfound, _scale(calibration))
-
-
-def _freedom(calibration: Calibration, name: str) -> float:
-    """Degrees of freedom with which the noise of a measurement is known; all of the fit's if its own are not kept."""
-    kept = (calibration.record.noise.get("scatter") or {}).get(name) or {}
-    return float(kept.get("freedom") or max(calibration.record.noise["degrees_of_freedom"], 1))
-
-
-def _drifts(calibration: Calibration, space: StateSpace) -> list[GaussMarkovState]:
+def _drifts(calibration: Calibration, space: StateSpace) -> tuple[GaussMarkovState, ...]:
     """The parameters that drifted in the calibration drift anew."""
     recording = calibration.uncertainty.record.recording
     if recording is None:
-        return []
+        return ()
     place = {name: i for i, name in enumerate(space.names)}
-    return [
+    return tuple(
         GaussMarkovState(f"drift of {name}", d.over, d.channel, place[name], d.sd / float(space.scales[place[name]]))
         for name, d in recording.drifts.items()
-    ]
+    )
 
 
-def _unfound(calibration: Calibration) -> set[str]:
-    """Parameters of groups that are not known and that no record of the calibration told of."""
-    texts = {entry.name.partition("[")[0] for entry in calibration.record.parameters if entry.free}
-    return {block.name for block in calibration.parameters.nuisances if block.free} - texts
-
-
-def _scale(calibration: Calibration) -> float:
+def _noise_scale(calibration: Calibration) -> float:
     """Of the residuals against the noise that was stated."""
     return float(calibration.record.noise.get("scale") or 1.0)
 
 
-def _channels(calibration: Calibration, measurements: Mapping[str, Measurement]) -> Dataset:
+def _full_record(calibration: Calibration, measurements: Mapping[str, Measurement]) -> Dataset:
     """A record with everything that one may carry: functions are compiled for it."""
     arms = calibration.system.arms
     names = [w.channel for w in requested_channels(arms, measurements, measured=True) if "." in w.channel]
@@ -232,15 +202,14 @@ def _channels(calibration: Calibration, measurements: Mapping[str, Measurement])
 
 
 def _defaults(calibration: Calibration) -> dict[str, float]:
-    """What holds where a record does not say."""
+    """Channels that a record may leave out, and what then holds."""
     environment = calibration.system.environment
     vectors = (environment.gravity, environment.payload_com, environment.force, environment.torque)
-    found = {
+    components = {
         f"{name}_{axis}": float(value)
         for name, vector in zip(_VECTORS, vectors, strict=True)
         for axis, value in zip("xyz", vector, strict=True)
     }
-    approaches = {
-        f"{arm.name}.approach.{joint}": 0.0 for arm in calibration.system.arms.values() for joint in arm.commanded
-    }
-    return {**found, **approaches, "payload": environment.payload_mass}
+    arms = calibration.system.arms.values()
+    approaches = {f"{arm.name}.approach.{joint}": 0.0 for arm in arms for joint in arm.commanded}
+    return {**components, **approaches, "payload": environment.payload_mass}

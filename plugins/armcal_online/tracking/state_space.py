@@ -1,12 +1,13 @@
-"""Scaled coordinates about a value vector, and back: where a belief over parameters lives.
+"""Scaled coordinates about a value vector, and back: the space of a belief about parameters.
 
 Numbers between bounds and entries of semidefinite matrices are moved as they are, even out of their domain: the belief
 stays the Gaussian that the records make, and only what is taken from it is brought inside (see ``inside`` and
-``projection``). Rotations, poses and screw axes are moved within their domain.
+``belief.most_likely``). Rotations, poses and screw axes are moved within their domain.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -31,7 +32,7 @@ class StateSpace:
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """A name for each coordinate."""
+        """Of the coordinates (n)."""
         return self.parameters.coordinate_names
 
     @cached_property
@@ -40,30 +41,29 @@ class StateSpace:
         return np.array(self.parameters.free_entries, dtype=np.intp)
 
     @cached_property
-    def _turning(self) -> tuple[tuple[ParameterBlock, slice, slice], ...]:
-        """Blocks that do not just add, with their places in a value vector and among the coordinates."""
-        found, start = [], 0
+    def _blocks(self) -> tuple[tuple[ParameterBlock, slice, slice], ...]:
+        """The free blocks, with their places in a value vector and among the coordinates."""
+        blocks, start = [], 0
         for block in self.parameters.free:
-            if not isinstance(block.domain, (Interval, Semidefinite)):
-                place = self.parameters.entries_of(block.name)
-                found.append((block, place, slice(start, start + block.domain.dof)))
-            start += block.domain.dof
-        return tuple(found)
+            stop = start + block.domain.dof
+            blocks.append((block, self.parameters.entries_of(block.name), slice(start, stop)))
+            start = stop
+        return tuple(blocks)
+
+    @cached_property
+    def _turning(self) -> tuple[tuple[ParameterBlock, slice, slice], ...]:
+        """Blocks that do not just add."""
+        return tuple(b for b in self._blocks if not isinstance(b[0].domain, (Interval, Semidefinite)))
 
     @cached_property
     def _adding(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Positions in a value vector, and among the coordinates, of numbers that add."""
-        of_values, of_coordinates, start = [], [], 0
-        for block in self.parameters.free:
-            if isinstance(block.domain, (Interval, Semidefinite)):
-                of_values += [*range(*self.parameters.entries_of(block.name).indices(1 << 30))]
-                of_coordinates += [*range(start, start + block.domain.dof)]
-            start += block.domain.dof
-        return np.array(of_values, dtype=np.intp), np.array(of_coordinates, dtype=np.intp)
+        adding = [b for b in self._blocks if isinstance(b[0].domain, (Interval, Semidefinite))]
+        return _positions(entries for _, entries, _ in adding), _positions(coordinates for _, _, coordinates in adding)
 
-    def moved(self, values: Array, place: Array) -> Array:
+    def moved(self, values: Array, point: Array) -> Array:
         """The value vector at scaled coordinates (n) about another."""
-        step = place * self.scales
+        step = point * self.scales
         moved = values.copy()
         at, of = self._adding
         moved[at] += step[of]
@@ -80,11 +80,11 @@ class StateSpace:
             step[coordinates] = block.domain.local(values[entries], other[entries])
         return step / self.scales
 
-    def left(self, values: Array, place: Array, origin: Array) -> Array:
-        """Scaled coordinates about another origin of a place (n) about ``values``; numbers may be out of domain."""
-        left = place - self.between(values, origin)
+    def left(self, values: Array, point: Array, origin: Array) -> Array:
+        """Scaled coordinates about another origin of a point (n) about ``values``; numbers may be out of domain."""
+        left = point - self.between(values, origin)
         for block, entries, coordinates in self._turning:
-            there = block.domain.retract(values[entries], place[coordinates] * self.scales[coordinates])
+            there = block.domain.retract(values[entries], point[coordinates] * self.scales[coordinates])
             left[coordinates] = block.domain.local(origin[entries], there) / self.scales[coordinates]
         return left
 
@@ -124,23 +124,18 @@ class StateSpace:
     @cached_property
     def cones(self) -> tuple[tuple[slice, slice], ...]:
         """Of semidefinite blocks, the places in a value vector and among the coordinates."""
-        found, start = [], 0
-        for block in self.parameters.free:
-            if isinstance(block.domain, Semidefinite):
-                found.append((self.parameters.entries_of(block.name), slice(start, start + 6)))
-            start += block.domain.dof
-        return tuple(found)
+        return tuple((e, c) for block, e, c in self._blocks if isinstance(block.domain, Semidefinite))
 
     @cached_property
     def bounds(self) -> tuple[NDArray[np.intp], NDArray[np.intp], Array, Array]:
-        """Of numbers with bounds: places in a value vector and among the coordinates, lower and upper ones."""
-        found, start = [], 0
-        for b in self.parameters.free:
-            if isinstance(b.domain, Interval) and (np.isfinite(b.domain.lower) or np.isfinite(b.domain.upper)):
-                found.append((self.parameters.entries_of(b.name).start, start, b.domain.lower, b.domain.upper))
-            start += b.domain.dof
-        place, coordinate, lower, upper = zip(*found, strict=True) if found else ((), (), (), ())
-        return np.array(place, dtype=np.intp), np.array(coordinate, dtype=np.intp), np.array(lower), np.array(upper)
+        """Of numbers with bounds: places in a value vector and among the coordinates, lower and upper bounds."""
+        bounded = [
+            (entries.start, coordinates.start, block.domain.lower, block.domain.upper)
+            for block, entries, coordinates in self._blocks
+            if isinstance(block.domain, Interval) and np.isfinite([block.domain.lower, block.domain.upper]).any()
+        ]
+        entry, coordinate, lower, upper = zip(*bounded, strict=True) if bounded else ((), (), (), ())
+        return np.array(entry, dtype=np.intp), np.array(coordinate, dtype=np.intp), np.array(lower), np.array(upper)
 
     def inside(self, values: Array) -> Array:
         """The nearest values within the domains, each block by itself: where the model can be evaluated."""
@@ -155,7 +150,11 @@ class StateSpace:
     @cached_property
     def _matrices(self) -> NDArray[np.intp]:
         """Of semidefinite blocks, the places of their entries in a value vector (blocks x 6)."""
-        return np.array([range(*entries.indices(1 << 30)) for entries, _ in self.cones], dtype=np.intp)
+        return _positions(entries for entries, _ in self.cones).reshape(-1, 6)
+
+
+def _positions(slices: Iterable[slice]) -> NDArray[np.intp]:
+    return np.array([i for places in slices for i in range(places.start, places.stop)], dtype=np.intp)
 
 
 def nearest_semidefinite(entries: Array) -> Array:

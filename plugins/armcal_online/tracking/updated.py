@@ -1,4 +1,4 @@
-"""The calibration as it has become: the file of the one it started from, with what is believed now."""
+"""The updated calibration: the file of the one it started from, with the values and covariance of the belief."""
 
 from __future__ import annotations
 
@@ -13,8 +13,7 @@ from armcal.calibration.calibration_file import UNMOVED_SD, InformationRecord, s
 from armcal.calibration.intervals import covariance_rows
 from scipy.special import ndtri
 
-from armcal_online.tracking.belief import Belief
-from armcal_online.tracking.projection import most_likely
+from armcal_online.tracking.belief import Belief, most_likely
 from armcal_online.tracking.state_space import StateSpace
 
 _QUANTILE = float(ndtri(0.975))
@@ -28,65 +27,54 @@ def deviations(space: StateSpace, belief: Belief) -> Array:
     return np.sqrt(np.maximum(np.diag(covariance), 0.0))
 
 
-def calibration_text(calibration: Calibration, space: StateSpace, belief: Belief, told: Mapping[str, Any]) -> str:
-    """The text of calibration.yaml; ``told`` says by what it has become so (records, health, last record)."""
+def calibration_text(calibration: Calibration, space: StateSpace, belief: Belief, source: Mapping[str, Any]) -> str:
+    """The text of calibration.yaml; ``source`` is where it comes from (records, health level, last record)."""
     n, values, free = len(space.scales), most_likely(space, belief), belief.values(space)
     covariance = belief.gaussian.covariance[:n, :n]
     entries = space.to_entries(values, covariance)
-    sd = np.sqrt(np.maximum(np.diag(entries), 0.0))
-    place = {int(entry): i for i, entry in enumerate(space.entries)}
-    bounds = _bounds(space)
+    sd = dict(zip(space.entries.tolist(), np.sqrt(np.maximum(np.diag(entries), 0.0)).tolist(), strict=True))
+    bounds = {
+        space.parameters.entries_of(block.name).start: (block.domain.lower, block.domain.upper)
+        for block in space.parameters.free
+        if isinstance(block.domain, Interval)
+    }
     parameters = []
-    for position, record in enumerate(calibration.record.parameters):
-        i = place.get(position)
-        changed: dict[str, Any] = {"value": float(values[position])}
-        if i is not None:
-            low, high = bounds.get(position, (-np.inf, np.inf))
-            ends = free[position] - _QUANTILE * sd[i], free[position] + _QUANTILE * sd[i]
+    for i, record in enumerate(calibration.record.parameters):
+        changed: dict[str, Any] = {"value": float(values[i])}
+        if i in sd:
+            low, high = bounds.get(i, (-np.inf, np.inf))
+            is_moved = abs(free[i] - values[i]) > UNMOVED_SD * sd[i]
             changed |= {
                 "free": True,
-                "sd": float(sd[i]),
-                "lower": float(np.clip(ends[0], low, high)),
-                "upper": float(np.clip(ends[1], low, high)),
-                "at_bound": bool(values[position] <= low or values[position] >= high),
-                "unconstrained": float(free[position])
-                if abs(free[position] - values[position]) > UNMOVED_SD * sd[i]
-                else None,
+                "sd": sd[i],
+                "lower": float(np.clip(free[i] - _QUANTILE * sd[i], low, high)),
+                "upper": float(np.clip(free[i] + _QUANTILE * sd[i], low, high)),
+                "at_bound": bool(values[i] <= low or values[i] >= high),
+                "unconstrained": float(free[i]) if is_moved else None,
             }
         parameters.append(record.model_copy(update=changed))
-    names = tuple(space.parameters.entry_names[i] for i in space.entries)
-    prediction = calibration.uncertainty.record.model_copy(
-        update={"entries": names, "covariance": covariance_rows(entries)}
-    )
+    verdict = dict(calibration.record.verdict)
+    if source["level"] == "lost":
+        verdict["headline"] = f"Lost, do not use: {source['why']}"
     content = calibration.record.model_copy(
         update={
             "created": datetime.now(UTC).isoformat(timespec="seconds"),
             "parameters": tuple(parameters),
-            "prediction": prediction,
-            "information": InformationRecord(increments=space.names, square_root=_root(space, covariance)),
-            "verdict": _verdict(calibration.record.verdict, told),
-            "recalibrated": dict(told),
+            "prediction": calibration.uncertainty.record.model_copy(
+                update={
+                    "entries": tuple(space.parameters.entry_names[i] for i in space.entries),
+                    "covariance": covariance_rows(entries),
+                }
+            ),
+            "information": InformationRecord(increments=space.names, square_root=_square_root(space, covariance)),
+            "verdict": verdict,
+            "recalibrated": dict(source),
         }
     )
     return sealed(content.to_config())
 
 
-def _verdict(before: Mapping[str, Any], recalibrated: Mapping[str, Any]) -> dict[str, Any]:
-    """Of the calibration's own run, under another headline where it no longer holds."""
-    if recalibrated["level"] != "lost":
-        return dict(before)
-    return {**before, "headline": f"Lost, do not use: {recalibrated['why']}"}
-
-
-def _bounds(space: StateSpace) -> dict[int, tuple[float, float]]:
-    return {
-        space.parameters.entries_of(block.name).start: (block.domain.lower, block.domain.upper)
-        for block in space.parameters.free
-        if isinstance(block.domain, Interval)
-    }
-
-
-def _root(space: StateSpace, covariance: Array) -> tuple[tuple[float, ...], ...]:
+def _square_root(space: StateSpace, covariance: Array) -> tuple[tuple[float, ...], ...]:
     """R with R'R the information on the coordinates; directions that are known exactly are left out."""
     size, directions = np.linalg.eigh(covariance)
     known = size > _FLOOR * max(float(size[-1]), _FLOOR)
