@@ -24,10 +24,9 @@ from armcal.io.standard_output import StandardOutput
 from armcal.plugins import discover
 from armcal.run.experiment import Experiment
 from armcal_online.commands.recalibrate import setup_of
-from armcal_online.replaying.journal_replayer import NoVerifier
-from armcal_online.replaying.replay import kept, replay
-from armcal_online.replaying.replay_verifier import Comparer, DiffersError
-from armcal_online.replaying.state_distance import BOUND, distance
+from armcal_online.replaying.kept_journal import kept_calibration, kept_journal
+from armcal_online.replaying.replay import replay
+from armcal_online.replaying.replay_verifier import BOUND, Comparer, DiffersError, ReplayVerifier, distance
 from armcal_online.running.loop import Pace
 from armcal_online.running.session import Open, opened
 from armcal_online.sources.incoming import Incoming
@@ -199,7 +198,7 @@ def test_damage_is_told_and_everything_before_it_is_replayed(whole: Path, tmp_pa
 
 def test_a_state_or_a_decision_that_differs_is_told(whole: Path, calibration: Path) -> None:
     header = next(read_segments(whole / "journal")).header
-    journal = kept(whole / "journal")
+    journal = kept_journal(whole / "journal")
     nudged = Recalibrator.begin(Calibration.load(calibration), SETTINGS)
     belief = nudged.state.belief
     mean = belief.gaussian.mean.copy()
@@ -209,9 +208,11 @@ def test_a_state_or_a_decision_that_differs_is_told(whole: Path, calibration: Pa
     done = replay(journal, nudged, Comparer(header["evaluator"]), None, no_progress)
     assert done.difference is not None and done.replayer.entries < 10
     with pytest.raises(DiffersError, match="noted was"):
-        Comparer({}).told(7, [{"event": "decision", "kind": "drift", "sequence": 7, "sentence": "A drift."}], [])
+        Comparer({}).compare_events(
+            7, [{"event": "decision", "kind": "drift", "sequence": 7, "sentence": "A drift."}], []
+        )
     with pytest.raises(DiffersError, match="noted was nothing"):
-        Comparer({}).unnoted(7, [{"event": "decision", "kind": "drift", "sequence": 7, "sentence": "A drift."}])
+        Comparer({}).unnoted_events(7, [{"event": "decision", "kind": "drift", "sequence": 7, "sentence": "A drift."}])
 
 
 def test_what_cannot_be_replayed_ends_with_2(whole: Path, tmp_path: Path) -> None:
@@ -248,7 +249,7 @@ def test_distance_is_measured_in_standard_deviations(calibration: Path) -> None:
 
 def replayed(folder: Path, verifier: Any = None) -> tuple[Any, FakeRecalibrator]:
     fake: Any = FakeRecalibrator()
-    done = replay(kept(folder / "journal"), fake, verifier or Comparer(fake.evaluator), None, no_progress)
+    done = replay(kept_journal(folder / "journal"), fake, verifier or Comparer(fake.evaluator), None, no_progress)
     return done, fake
 
 
@@ -260,7 +261,7 @@ def test_a_journal_that_dropped_its_beginning_goes_on_from_what_it_keeps(tmp_pat
         steps(open_, 1)
     limits = JournalLimits(segment_bytes=3000, total_bytes=12000)
     left = run(folder, Listed(made(1, 90)), limits=limits)
-    journal = kept(folder / "journal")
+    journal = kept_journal(folder / "journal")
     assert journal.first.number > 1
     done, fake = replayed(folder)
     assert done.difference is None and fake.digest() == left.digest()
@@ -282,7 +283,7 @@ def test_a_rollback_to_what_is_no_longer_kept_goes_on_at_the_checkpoint_after_it
         sequence_of_first(done)
     ]
     with pytest.raises(DataError, match="no longer holds"):
-        replayed(folder, NoVerifier())
+        replayed(folder, ReplayVerifier())
 
 
 def sequence_of_first(done: Any) -> int:
@@ -291,8 +292,6 @@ def sequence_of_first(done: Any) -> int:
 
 
 def test_a_journal_without_its_calibration_is_refused(whole: Path) -> None:
-    from armcal_online.replaying.begin import kept_calibration
-
     header = next(read_segments(whole / "journal")).header
     for changed in ({"text": None}, {"text": header["text"] + " "}):
         with pytest.raises(DataError, match="calibration"):

@@ -17,12 +17,18 @@ from armcal.io.journal.files import REAL_FILES, write_whole
 from armcal.plugins import discover
 from rich.table import Table
 
-from armcal_online.replaying.begin import begun, journal_folder, kept_calibration, kept_settings
 from armcal_online.replaying.comparison import WARM_UP, Comparison, compared, side_by_side
-from armcal_online.replaying.journal_replayer import JournalReplayer, NoVerifier
-from armcal_online.replaying.replay import Kept, Replayed, check_until, kept, replay
-from armcal_online.replaying.replay_verifier import Comparer
+from armcal_online.replaying.kept_journal import (
+    KeptJournal,
+    journal_folder,
+    kept_calibration,
+    kept_journal,
+    kept_settings,
+)
+from armcal_online.replaying.replay import JournalReplayer, Replayed, replay
+from armcal_online.replaying.replay_verifier import Comparer, ReplayVerifier
 from armcal_online.running.session import OURS
+from armcal_online.tracking.recalibrator import Recalibrator
 from armcal_online.tracking.settings import RecalibrateSettings, load_settings
 
 _Evaluator = Literal["auto", "compiled", "interpreted"]
@@ -63,22 +69,22 @@ def replay_command(
     console.plugin_faults(registry)
     folder = journal_folder(journal)
     _check_out(calibration, folder)
-    held = kept(folder)
-    check_until(held, until)
+    held = kept_journal(folder)
+    held.check_until(until)
     header = held.first.header
     settings = _evaluated(kept_settings(header), evaluator)
     other_settings = kept_settings(header, overrides) if overrides else None
     if config is not None:
         other_settings = load_settings(config, overrides)
     begun_from = kept_calibration(header, folder, registry)
-    session = begun(begun_from, settings, registry)
+    session = Recalibrator.begin(begun_from, settings, registry)
     comparer = Comparer(session.evaluator)
     with console.progress() as progress:
         done = replay(held, session, comparer, until, progress)
         other = None
         if other_settings is not None:
-            others = begun(begun_from, _evaluated(other_settings, evaluator), registry)
-            replayer = replay(held, others, NoVerifier(), until, progress, "with other settings").replayer
+            others = Recalibrator.begin(begun_from, _evaluated(other_settings, evaluator), registry)
+            replayer = replay(held, others, ReplayVerifier(), until, progress, "with other settings").replayer
             other = _Other(replayer, compared(done.replayer, replayer))
     chosen = other.replayer if other else done.replayer
     written = calibration if calibration and not done.difference else None
@@ -108,7 +114,7 @@ def _check_out(out: Path | None, folder: Path) -> None:
         raise InputError("no file can be written there.", where=Location(str(out)), hint="Give a file in a folder.")
 
 
-def _leave(held: Kept, done: Replayed) -> None:
+def _leave(held: KeptJournal, done: Replayed) -> None:
     """End with what the replay found."""
     context = click.get_current_context()
     if held.damage is not None:
@@ -118,7 +124,7 @@ def _leave(held: Kept, done: Replayed) -> None:
         context.exit(EXIT_FAULT)
 
 
-def _show(console: Console, held: Kept, done: Replayed, comparer: Comparer, other: _Other | None) -> None:
+def _show(console: Console, held: KeptJournal, done: Replayed, comparer: Comparer, other: _Other | None) -> None:
     def say(text: str) -> None:
         console.out.print(text, markup=False, soft_wrap=True)
 
@@ -169,7 +175,7 @@ def _table(replayer: JournalReplayer, other: _Other) -> Table:
 
 
 def _as_json(
-    held: Kept, done: Replayed, comparer: Comparer, other: _Other | None, written: Path | None
+    held: KeptJournal, done: Replayed, comparer: Comparer, other: _Other | None, written: Path | None
 ) -> Mapping[str, Any]:
     difference, replayer = done.difference, done.replayer
     content: dict[str, Any] = {

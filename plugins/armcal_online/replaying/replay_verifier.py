@@ -1,24 +1,64 @@
-"""Compares a walk with its journal: to the last bit where everything is the same, within a bound where it is not."""
+"""Compares a replay with its journal: to the last bit where everything is the same, within a bound where it is not."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, ClassVar
 
+import numpy as np
 from armcal.io.journal.segment import Entry, Segment
+from typing_extensions import override
 
-from armcal_online.replaying.state_distance import BOUND, Distance, distance
 from armcal_online.running.state_replayer import Event, parsing
 from armcal_online.tracking.evaluator import differences
 from armcal_online.tracking.recalibrator import Recalibrator
 from armcal_online.tracking.state import State
+from armcal_online.tracking.state_space import StateSpace
 
-_NAMING = ("event", "sequence", "kind", "joint", "from", "to")
-"""What of a decision other last digits do not change."""
+BOUND = 1e-6
+"""Evaluators differ in the last digits: states that are nearer than this (in standard deviations) are the same."""
+_COMPARED = ("event", "sequence", "kind", "joint", "from", "to")
+"""Keys of a decision that other last digits do not change."""
+
+
+@dataclass(frozen=True)
+class Distance:
+    """Between two states.
+
+    Attributes:
+        values: the largest difference of a coordinate, in its standard deviation.
+        covariance: the largest difference of an entry, by the standard deviations of its row and column.
+    """
+
+    values: float = 0.0
+    covariance: float = 0.0
+
+    @property
+    def is_small(self) -> bool:
+        """Whether another evaluator explains it."""
+        return self.values <= BOUND and self.covariance <= BOUND
+
+    def widest(self, other: Distance) -> Distance:
+        """The larger of each."""
+        return Distance(max(self.values, other.values), max(self.covariance, other.covariance))
+
+
+def distance(space: StateSpace, one: State, other: State) -> Distance:
+    """Between two states of one problem; infinite where they do not have as many coordinates."""
+    ours, theirs = one.belief.gaussian, other.belief.gaussian
+    if ours.mean.shape != theirs.mean.shape:
+        return Distance(np.inf, np.inf)
+    moved = theirs.mean - ours.mean
+    moved[: len(space.scales)] = space.between(one.belief.values(space), other.belief.values(space))
+    deviations = np.sqrt(np.diag(ours.covariance))
+    deviations = np.where(deviations > 0, deviations, 1.0)
+    changed = (theirs.covariance - ours.covariance) / np.outer(deviations, deviations)
+    return Distance(float(np.abs(moved / deviations).max(initial=0.0)), float(np.abs(changed).max(initial=0.0)))
 
 
 class DiffersError(Exception):
-    """The first difference between a walk and its journal.
+    """The first difference between a replay and its journal.
 
     Attributes:
         sequence: after which entry.
@@ -30,8 +70,33 @@ class DiffersError(Exception):
         super().__init__(sentence)
 
 
-class Comparer:
-    """A ``ReplayVerifier`` that compares states and decisions; mutable.
+class ReplayVerifier:
+    """Compares nothing: for a session with other settings than the journal's.
+
+    Attributes:
+        resumes: whether the session may go on from a checkpoint's state where its own is lost.
+    """
+
+    resumes: ClassVar[bool] = False
+
+    def begin_segment(self, segment: Segment) -> None:
+        """A segment, whose checkpoint comes next."""
+
+    def compare_checkpoint(self, checkpoint: Entry, session: Recalibrator) -> None:
+        """A full state that was noted where the session is now."""
+
+    def compare_digest(self, sequence: int, noted: str, session: Recalibrator) -> None:
+        """The digest of a state that was noted where the session is now."""
+
+    def compare_events(self, sequence: int, noted: list[Event], replayed: list[Event]) -> None:
+        """The events of a record that were noted, and those of the replay."""
+
+    def unnoted_events(self, sequence: int, replayed: list[Event]) -> None:
+        """Events of a record in the replay, where none was noted though the writer went on."""
+
+
+class Comparer(ReplayVerifier):
+    """Compares states and decisions; mutable.
 
     Attributes:
         states, equal: how many states were noted, and how many of them came out to the last bit.
@@ -41,6 +106,8 @@ class Comparer:
         others: in what the journal's evaluators differ from this one's.
     """
 
+    resumes = True
+
     def __init__(self, evaluator: Mapping[str, Any]) -> None:
         self._evaluator = dict(evaluator)
         self._writer: Any = None
@@ -49,8 +116,8 @@ class Comparer:
         self.widest = Distance()
         self.others: tuple[str, ...] = ()
 
-    def begins(self, segment: Segment) -> None:
-        """As the protocol says."""
+    @override
+    def begin_segment(self, segment: Segment) -> None:
         writer = segment.header.get("evaluator")
         self._is_new = self._writer is not None and writer != self._writer
         self._writer = writer
@@ -58,8 +125,8 @@ class Comparer:
         self._is_ours = not texts
         self.others = tuple(dict.fromkeys([*self.others, *texts]))
 
-    def checkpoint(self, checkpoint: Entry, session: Recalibrator) -> None:
-        """As the protocol says. Where the journal's evaluator changes, the session goes on from its state."""
+    @override
+    def compare_checkpoint(self, checkpoint: Entry, session: Recalibrator) -> None:
         is_new, self._is_new = self._is_new, False
         self.states += 1
         with parsing(checkpoint.sequence):
@@ -76,39 +143,42 @@ class Comparer:
             raise DiffersError(checkpoint.sequence, f"{text}, and the evaluator is the same.")
         if not apart.is_small:
             raise DiffersError(checkpoint.sequence, f"{text}; {BOUND:g} is what another evaluator explains.")
-        if _judged(written) != _judged(session.state):
-            raise DiffersError(checkpoint.sequence, f"Found {_judged(session.state)}; noted was {_judged(written)}.")
+        if _summary(written) != _summary(session.state):
+            found, expected = _summary(session.state), _summary(written)
+            raise DiffersError(checkpoint.sequence, f"Found {found}; noted was {expected}.")
         if is_new:
+            # Where the journal's evaluator changes, the session goes on from its state.
             session.restore(noted["state"])
 
-    def digest(self, sequence: int, noted: str, session: Recalibrator) -> None:
-        """As the protocol says."""
-        text = session.digest()
+    @override
+    def compare_digest(self, sequence: int, noted: str, session: Recalibrator) -> None:
+        digest = session.digest()
         self.states += 1
-        self.equal += text == noted
-        if self._is_ours and text != noted:
-            raise DiffersError(sequence, f"The state is {text}, {noted} was noted.")
+        self.equal += digest == noted
+        if self._is_ours and digest != noted:
+            raise DiffersError(sequence, f"The state is {digest}, {noted} was noted.")
 
-    def told(self, sequence: int, noted: list[Event], found: list[Event]) -> None:
-        """As the protocol says."""
+    @override
+    def compare_events(self, sequence: int, noted: list[Event], replayed: list[Event]) -> None:
         self.decisions += len(noted)
-        shown = (noted, found) if self._is_ours else (_named(noted), _named(found))
-        if shown[0] != shown[1]:
-            raise DiffersError(sequence, f"Found {_listed(found)}; noted was {_listed(noted)}.")
+        compared = (noted, replayed) if self._is_ours else (_without_digits(noted), _without_digits(replayed))
+        if compared[0] != compared[1]:
+            raise DiffersError(sequence, f"Found {_listed(replayed)}; noted was {_listed(noted)}.")
 
-    def unnoted(self, sequence: int, found: list[Event]) -> None:
-        """As the protocol says. A full disk takes notes too, and where all bits are the same a state tells more."""
+    @override
+    def unnoted_events(self, sequence: int, replayed: list[Event]) -> None:
+        # A full disk takes notes too; where all bits are the same, the states are compared anyway.
         if not self._is_ours:
-            raise DiffersError(sequence, f"Found {_listed(found)}; noted was nothing.")
+            raise DiffersError(sequence, f"Found {_listed(replayed)}; noted was nothing.")
 
 
-def _named(events: Sequence[Event]) -> list[dict[str, Any]]:
-    return [{key: event[key] for key in _NAMING if key in event} for event in events]
+def _without_digits(events: Sequence[Event]) -> list[dict[str, Any]]:
+    return [{key: event[key] for key in _COMPARED if key in event} for event in events]
 
 
 def _listed(events: Sequence[Event]) -> str:
     return "; ".join(str(event.get("sentence") or event["event"]) for event in events) or "nothing"
 
 
-def _judged(state: State) -> str:
+def _summary(state: State) -> str:
     return ", ".join(f"{count} {what}" for what, count in state.counts.items()) + f", level {state.health.level}"

@@ -1,1 +1,1 @@
-"""A recalibration that runs: its loop, its outputs, and how it is told what to do."""
+"""A recalibration that runs: its loop, its outputs, and its control socket."""

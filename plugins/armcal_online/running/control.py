@@ -1,4 +1,4 @@
-"""The socket by which a running recalibration is asked things: a JSON object a line, a reply a line."""
+"""The control socket of a running recalibration: a request and a reply are a JSON object a line."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ COMMANDS = ("status", "pause", "resume", "rollback", "finish", "what_if")
 _LONGEST = 64 * 1024
 _CLIENTS = 8
 _PATIENCE_S = 10.0
-"""A client that neither asks nor reads for so long is let go of."""
+"""A client that neither asks nor reads for so long is dropped."""
 
 Answer = Callable[[Mapping[str, Any]], Mapping[str, Any]]
 """The reply to a request; an ArmcalError becomes an error reply."""
@@ -30,7 +30,7 @@ Answer = Callable[[Mapping[str, Any]], Mapping[str, Any]]
 class _Client:
     def __init__(self, connection: socket.socket) -> None:
         self.connection = connection
-        self.asked = bytearray()
+        self.received = bytearray()
         self.replies = bytearray()
         self.ends = False
         self.heard = time.monotonic()
@@ -50,7 +50,7 @@ class ControlServer:
         self._listener = listening(self._path, "a recalibration is running here.", "Give another --out.", _CLIENTS)
 
     def serve(self) -> None:
-        """Answer what was asked by now; returns at once."""
+        """Answer the requests that have come; returns at once."""
         open_now = [client.connection for client in self._clients]
         writing = [client.connection for client in self._clients if client.replies]
         try:
@@ -58,7 +58,12 @@ class ControlServer:
         except (OSError, ValueError):
             return
         if self._listener in readable:
-            self._accept()
+            with contextlib.suppress(OSError):
+                connection, _ = self._listener.accept()
+                connection.setblocking(False)
+                self._clients.append(_Client(connection))
+                if len(self._clients) > _CLIENTS:
+                    self._drop(self._clients[0])
         for client in [*self._clients]:
             if client.connection in readable:
                 self._read(client)
@@ -76,16 +81,6 @@ class ControlServer:
         with contextlib.suppress(OSError):
             self._path.unlink()
 
-    def _accept(self) -> None:
-        try:
-            connection, _ = self._listener.accept()
-        except OSError:
-            return
-        connection.setblocking(False)
-        self._clients.append(_Client(connection))
-        if len(self._clients) > _CLIENTS:
-            self._drop(self._clients[0])
-
     def _read(self, client: _Client) -> None:
         try:
             data = client.connection.recv(_LONGEST)
@@ -95,14 +90,14 @@ class ControlServer:
             data = b""
         client.heard = time.monotonic()
         client.ends |= not data
-        *lines, rest = bytes(client.asked + data).split(b"\n")
-        client.asked = bytearray(rest)
+        *lines, rest = bytes(client.received + data).split(b"\n")
+        client.received = bytearray(rest)
         for line in lines:
             if line.strip():
                 client.replies += as_line(self._reply(line)).encode() + b"\n"
-        if len(client.asked) > _LONGEST:
+        if len(client.received) > _LONGEST:
             client.replies += as_line(_refusal("The request has more than 64 KiB.")).encode() + b"\n"
-            client.asked.clear()
+            client.received.clear()
             client.ends = True
 
     def _write(self, client: _Client) -> None:
@@ -139,7 +134,7 @@ class ControlServer:
 
 
 def ask(folder: Path, request: Mapping[str, Any], timeout_s: float = 30.0) -> dict[str, Any]:
-    """The reply of the recalibration that runs in a folder: ``ok``, and what was asked for or an ``error``.
+    """The reply of the recalibration that runs in a folder: ``ok``, and the answer or an ``error``.
 
     Raises:
         InputError: none runs there, or it does not answer in time.

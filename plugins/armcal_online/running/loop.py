@@ -1,10 +1,9 @@
-"""The loop of a recalibration: a record is journalled, acknowledged, used and told of, one at a time."""
+"""The loop of a recalibration: a record is journalled, acknowledged, used and reported, one at a time."""
 
 from __future__ import annotations
 
 import os
 import time
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -13,18 +12,10 @@ from armcal.io.journal.journal import Journal, JournalFullError
 from armcal.io.signals import Signals
 
 from armcal_online.running.outputs import Outputs
-from armcal_online.running.state_replayer import (
-    DECISION,
-    PAUSE,
-    RECORD,
-    RESUME,
-    ROLLBACK,
-    Estimation,
-    Event,
-    StateReplayer,
-)
+from armcal_online.running.state_replayer import DECISION, NOTED, PAUSE, RECORD, RESUME, ROLLBACK, StateReplayer
 from armcal_online.sources.incoming import Incoming
 from armcal_online.sources.source import Source
+from armcal_online.tracking.recalibrator import Recalibrator
 
 WAIT_S = 0.1
 """How long a source is waited for before control and signals are looked at again."""
@@ -32,21 +23,11 @@ FULL_WAIT_S = 1.0
 """How long a record waits for room in the journal before it is tried again."""
 
 
-class Session(Estimation, Protocol):
-    """What the loop asks of a recalibrator."""
-
-    def status(self) -> dict[str, Any]:
-        """What there is to say of it now, as JSON."""
-
-    def calibration_text(self) -> str:
-        """The updated calibration, as the text of its file."""
-
-
 class Served(Protocol):
-    """What the loop asks of a control socket."""
+    """A control socket as the loop uses it."""
 
     def serve(self) -> None:
-        """Answer what was asked by now; returns at once."""
+        """Answer the requests that have come; returns at once."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +58,7 @@ class Recalibration:
         self,
         source: Source,
         journal: Journal,
-        session: Session,
+        session: Recalibrator,
         state_replayer: StateReplayer,
         outputs: Outputs,
         pace: Pace,
@@ -95,7 +76,7 @@ class Recalibration:
         self._is_written = False
         self._since_calibration = self._since_digest = 0
         self._since_checkpoint = since_checkpoint
-        self._calibrated = self._told = -float("inf")
+        self._calibrated = self._status_written = -float("inf")
         self.sequence = journal.sequence
         self.finishing = ""
 
@@ -105,7 +86,7 @@ class Recalibration:
         return self._state_replayer.progress.paused
 
     def run(self, control: Served) -> None:
-        """Until the source ends, a signal comes, or it is told to finish.
+        """Until the source ends, a signal comes, or a request to finish.
 
         Raises:
             JournalFailedError: the disk fails; what was acknowledged is safe.
@@ -114,21 +95,50 @@ class Recalibration:
             self.write_calibration()
             while not self.finishing:
                 control.serve()
-                self._heed(signals)
+                if signals.finish:
+                    self.finishing = "It was asked to finish by a signal."
+                if signals.rotate:
+                    signals.rotate = False
+                    self._outputs.rotate()
+                if signals.status:
+                    signals.status = False
+                    self._write_status()
                 if not self.finishing:
                     self.step(WAIT_S)
-            self._finish()
+            self._outputs.retry()
+            if self._since_checkpoint:
+                self._checkpoint()
+            if self._since_calibration or not self._is_written:
+                self.write_calibration()
+            sentence = f"{self.finishing} {self._state_replayer.progress.records} records were taken in all."
+            event = {"event": "finished", "sequence": self.sequence, "at": time.time(), "sentence": sentence}
+            self._outputs.event(event)
+            self._outputs.status({**self.status(), "finished": True})
             control.serve()
 
     def step(self, wait_s: float) -> None:
         """Take one record, if there is one within the wait, and write what is due."""
-        if self._waits():
+        if self._held is not None:
+            waits = time.monotonic() < self._held_until
+        else:
+            waits = self.paused and self._source.keeps_records
+        if waits:
             time.sleep(wait_s)
         elif (incoming := self._held or self._source.incoming(wait_s)) is not None:
             self._take(incoming)
         elif self._source.ended:
             self.finishing = "The source has ended."
-        self._write_due()
+        if self._since_checkpoint and (
+            self._journal.wants_checkpoint or self._since_checkpoint >= self._pace.checkpoint_records
+        ):
+            self._checkpoint()
+        now = time.monotonic()
+        enough = self._since_calibration >= self._pace.calibration_records
+        gap_s = self._pace.calibration_gap_s if enough else self._pace.calibration_s
+        if self._since_calibration and now - self._calibrated >= gap_s:
+            self.write_calibration()
+        if now - self._status_written >= self._pace.status_s:
+            self._write_status()
 
     def pause(self) -> None:
         """Pass records over, or leave them in the source."""
@@ -161,7 +171,7 @@ class Recalibration:
         self.write_calibration()
 
     def status(self) -> dict[str, Any]:
-        """What there is to say now."""
+        """Of session, journal and source now, as JSON."""
         return {
             **self._session.status(),
             "sequence": self.sequence,
@@ -181,12 +191,6 @@ class Recalibration:
             path = str(self._outputs.calibration_path)
             self._outputs.event({"event": "calibration", "sequence": self.sequence, "at": time.time(), "path": path})
 
-    def _waits(self) -> bool:
-        """Whether records stay where they are for now."""
-        if self._held is not None:
-            return time.monotonic() < self._held_until
-        return self.paused and self._source.keeps_records
-
     def _take(self, incoming: Incoming) -> None:
         self._held = None
         earlier = None if self._source.keeps_records else self._state_replayer.progress.repeated(incoming)
@@ -197,47 +201,36 @@ class Recalibration:
         try:
             self.sequence = self._journal.record(RECORD, content)
         except JournalFullError as fault:
-            self._hold(incoming, fault)
+            # The record is kept, unacknowledged, until there is room.
+            self._held, self._held_until = incoming, time.monotonic() + FULL_WAIT_S
+            self._lacks_room(fault)
             return
-        self._has_room()
+        if self._is_full:
+            self._is_full = False
+            self._outputs.alarm("The journal has room again.")
         self._source.acknowledge(incoming, self.sequence)
-        self._tell(self._state_replayer.apply(self.sequence, RECORD, content))
-
-    def _tell(self, events: tuple[Event, ...]) -> None:
-        """Events go out; decisions are noted, with the state that they led to, for a replay to be compared with."""
+        events = self._state_replayer.apply(self.sequence, RECORD, content)
         self._since_calibration += 1
         self._since_checkpoint += 1
         self._since_digest += 1
         for event in events:
             self._outputs.event(event)
-        decided = [finite(event) for event in events if event["event"] in ("decision", "level")]
-        if decided or self._since_digest >= self._pace.digest_records:
+        # Decisions are noted, with the state that they led to, for a replay to be compared with.
+        noted = [finite(event) for event in events if event["event"] in NOTED]
+        if noted or self._since_digest >= self._pace.digest_records:
             self._since_digest = 0
-            self._note({"after": self.sequence, "digest": self._session.digest(), "events": decided})
-        if any(event["event"] == "decision" for event in decided):
+            note = {"after": self.sequence, "digest": self._session.digest(), "events": noted}
+            try:
+                self._journal.note(DECISION, note)
+            except JournalFullError as fault:
+                self._lacks_room(fault)
+        if any(event["event"] == "decision" for event in noted):
             self.write_calibration()
-
-    def _note(self, content: Mapping[str, Any]) -> None:
-        try:
-            self._journal.note(DECISION, content)
-        except JournalFullError as fault:
-            self._lacks_room(fault)
-
-    def _hold(self, incoming: Incoming, fault: JournalFullError) -> None:
-        """Keep a record that could not be made safe, unacknowledged, until there is room."""
-        self._held = incoming
-        self._held_until = time.monotonic() + FULL_WAIT_S
-        self._lacks_room(fault)
 
     def _lacks_room(self, fault: JournalFullError) -> None:
         if not self._is_full:
             self._is_full = True
             self._outputs.alarm(f"The journal is full, and records wait. {fault}")
-
-    def _has_room(self) -> None:
-        if self._is_full:
-            self._is_full = False
-            self._outputs.alarm("The journal has room again.")
 
     def _command(self, kind: str) -> None:
         self.sequence = self._journal.record(kind, {"at": time.time()})
@@ -252,40 +245,6 @@ class Recalibration:
         else:
             self._since_checkpoint = 0
 
-    def _write_due(self) -> None:
-        """Checkpoint, calibration and status, where it is time."""
-        if self._since_checkpoint and (
-            self._journal.wants_checkpoint or self._since_checkpoint >= self._pace.checkpoint_records
-        ):
-            self._checkpoint()
-        now = time.monotonic()
-        enough = self._since_calibration >= self._pace.calibration_records
-        gap_s = self._pace.calibration_gap_s if enough else self._pace.calibration_s
-        if self._since_calibration and now - self._calibrated >= gap_s:
-            self.write_calibration()
-        if now - self._told >= self._pace.status_s:
-            self._write_status()
-
     def _write_status(self) -> None:
-        self._told = time.monotonic()
+        self._status_written = time.monotonic()
         self._outputs.status(self.status())
-
-    def _heed(self, signals: Signals) -> None:
-        if signals.finish:
-            self.finishing = "It was asked to finish by a signal."
-        if signals.rotate:
-            signals.rotate = False
-            self._outputs.rotate()
-        if signals.status:
-            signals.status = False
-            self._write_status()
-
-    def _finish(self) -> None:
-        self._outputs.retry()
-        if self._since_checkpoint:
-            self._checkpoint()
-        if self._since_calibration or not self._is_written:
-            self.write_calibration()
-        sentence = f"{self.finishing} {self._state_replayer.progress.records} records were taken in all."
-        self._outputs.event({"event": "finished", "sequence": self.sequence, "at": time.time(), "sentence": sentence})
-        self._outputs.status({**self.status(), "finished": True})

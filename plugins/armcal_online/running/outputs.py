@@ -1,4 +1,4 @@
-"""What a recalibration leaves for others: events, a status, the updated calibration. Trouble here never stops it."""
+"""Events, status and updated calibration of a recalibration. A fault in writing them never stops it."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Outputs:
     def event(self, event: Mapping[str, Any]) -> None:
         """One event, everywhere."""
         line = as_line(event)
-        self._say(line)
+        self._stream_line(line)
         if self._may("events"):
             try:
                 self._events.write(line)
@@ -68,8 +68,24 @@ class Outputs:
         """The updated calibration, in place of the one before; whether that went well."""
         if not self._may("calibration"):
             return False
+        data, reserve = text.encode(), self._folder / RESERVE
         try:
-            self._replace_calibration(text.encode())
+            try:
+                write_whole(self._files, self.calibration_path, data)
+            except OSError as fault:
+                if not is_full(fault):
+                    raise
+                # Events and reserve make room.
+                with contextlib.suppress(OSError):
+                    self._events.give_up()
+                self._failed("events", "The events of the past were dropped: the disk is full.")
+                with contextlib.suppress(OSError):
+                    self._files.remove(reserve)
+                write_whole(self._files, self.calibration_path, data)
+            with contextlib.suppress(OSError):
+                # Somewhat larger than the calibration: the next one can be written in its place.
+                if not reserve.exists() or self._files.size(reserve) < len(data):
+                    write_whole(self._files, reserve, b"\0" * (len(data) + len(data) // 4 + 4096))
         except OSError as fault:
             sentence = f"The calibration is not written ({fault.strerror}); the one before stands. It is tried again."
             self._failed("calibration", sentence)
@@ -83,7 +99,7 @@ class Outputs:
             self._events.rotate()
 
     def alarm(self, sentence: str) -> None:
-        """An event that somebody should see."""
+        """An event for the operator."""
         self.event({"event": "alarm", "at": time.time(), "sentence": sentence})
 
     def retry(self) -> None:
@@ -94,34 +110,7 @@ class Outputs:
         """Close the file of events."""
         self._events.close()
 
-    def _replace_calibration(self, data: bytes) -> None:
-        """The calibration; if the disk is full, in the place of the reserve."""
-        try:
-            write_whole(self._files, self.calibration_path, data)
-        except OSError as fault:
-            if not is_full(fault):
-                raise
-            self._make_room()
-            write_whole(self._files, self.calibration_path, data)
-        with contextlib.suppress(OSError):
-            self._keep_reserve(len(data))
-
-    def _make_room(self) -> None:
-        """Give up the events and the reserve."""
-        with contextlib.suppress(OSError):
-            self._events.give_up()
-        self._failed("events", "The events of the past were dropped: the disk is full.")
-        with contextlib.suppress(OSError):
-            self._files.remove(self._folder / RESERVE)
-
-    def _keep_reserve(self, size: int) -> None:
-        """A file somewhat larger than the calibration, in whose place the next one can be written."""
-        path = self._folder / RESERVE
-        if path.exists() and self._files.size(path) >= size:
-            return
-        write_whole(self._files, path, b"\0" * (size + size // 4 + 4096))
-
-    def _say(self, line: str) -> None:
+    def _stream_line(self, line: str) -> None:
         lost = self._stream.lost
         self._stream.write(line)
         if lost and self._stream.lost == lost:
@@ -137,17 +126,17 @@ class Outputs:
         self._silent_until[what] = time.monotonic() + RETRY_S
         if what not in self._troubled:
             self._troubled.add(what)
-            self._tell(what, sentence)
+            self._report(what, sentence)
 
     def _mended(self, what: str, sentence: str) -> None:
         self._silent_until.pop(what, None)
         if what in self._troubled:
             self._troubled.discard(what)
-            self._tell(what, sentence)
+            self._report(what, sentence)
 
-    def _tell(self, what: str, sentence: str) -> None:
+    def _report(self, what: str, sentence: str) -> None:
         """An alarm, which is not written to the file that is in trouble itself."""
         if what == "events":
-            self._say(as_line({"event": "alarm", "at": time.time(), "sentence": sentence}))
+            self._stream_line(as_line({"event": "alarm", "at": time.time(), "sentence": sentence}))
         else:
             self.alarm(sentence)

@@ -1,4 +1,4 @@
-"""How far a source has been taken: what a restart has to know besides the estimate, and no rollback takes back."""
+"""How far a source has been taken: what a restart needs besides the estimate, and no rollback changes."""
 
 from __future__ import annotations
 

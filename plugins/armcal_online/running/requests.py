@@ -1,9 +1,9 @@
-"""What may be asked of a running recalibration, and what it answers."""
+"""Requests to a running recalibration, and the replies."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Protocol
+from typing import Any
 
 from armcal.base.units import from_unit
 from armcal.errors import InputError, Location
@@ -11,23 +11,13 @@ from armcal.measure.column_match import spellings
 from armcal.measure.reader import ReadRequest
 
 from armcal_online.running.loop import Recalibration
-
-
-class Predicting(Protocol):
-    """What is asked of a recalibrator here."""
-
-    @property
-    def request(self) -> ReadRequest:
-        """What its records may hold."""
-
-    def what_if(self, joints: Mapping[str, float]) -> dict[str, Any]:
-        """What it would do at joint angles, by channel (SI)."""
+from armcal_online.tracking.recalibrator import Recalibrator
 
 
 class Requests:
     """Answers requests; commands act at once."""
 
-    def __init__(self, recalibration: Recalibration, session: Predicting) -> None:
+    def __init__(self, recalibration: Recalibration, session: Recalibrator) -> None:
         self._recalibration = recalibration
         self._session = session
 
@@ -35,7 +25,7 @@ class Requests:
         """The reply to one of the known commands.
 
         Raises:
-            ArmcalError: what is asked for cannot be done.
+            ArmcalError: the request cannot be met.
         """
         match request["command"]:
             case "pause":
@@ -45,7 +35,11 @@ class Requests:
             case "finish":
                 self._recalibration.finishing = "It was asked to finish."
             case "rollback":
-                self._recalibration.roll_back(_sequence(request.get("to")))
+                to = request.get("to")
+                if isinstance(to, bool) or not isinstance(to, int) or to < 0:
+                    hint = "Give the sequence number of a record; every event has it."
+                    raise InputError(f"found {to!r}, expected a sequence number.", where=Location("to"), hint=hint)
+                self._recalibration.roll_back(to)
             case "what_if":
                 return self._session.what_if(joint_values(request.get("joints"), self._session.request))
         return self._recalibration.status()
@@ -61,7 +55,7 @@ def joint_values(joints: Any, request: ReadRequest) -> dict[str, float]:
         raise InputError("found no joints.", where=Location("joints"), hint='For example {"q1_deg": 10}.')
     names = {name: (w.channel, unit) for w in request.channels for name, unit in spellings(w).items()}
     names |= {w.channel: (w.channel, "1") for w in request.channels}
-    found: dict[str, float] = {}
+    values: dict[str, float] = {}
     for name, value in joints.items():
         if name not in names:
             hint = f"Known are {', '.join([*names][:6])}, and others."
@@ -69,12 +63,5 @@ def joint_values(joints: Any, request: ReadRequest) -> dict[str, float]:
         if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= 1e9:
             raise InputError("it is no number.", where=Location(f"joints.{name[:60]}"), hint="Give a finite number.")
         channel, unit = names[name]
-        found[channel] = from_unit(float(value), unit)
-    return found
-
-
-def _sequence(value: Any) -> int:
-    if isinstance(value, bool) or not isinstance(value, int) or value < 0:
-        hint = "Give the sequence number of a record; every event has it."
-        raise InputError(f"found {value!r}, expected a sequence number.", where=Location("to"), hint=hint)
-    return value
+        values[channel] = from_unit(float(value), unit)
+    return values

@@ -1,4 +1,4 @@
-"""A recalibration in its folder: begun, or gone on with where it was left."""
+"""A recalibration in its folder: begun, or resumed where it was left."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from armcal.errors import DataError, InputError, Location
 from armcal.io.event_file import EARLIER, EVENTS, EventFile
@@ -18,51 +18,32 @@ from armcal.io.journal.files import REAL_FILES, FileLayer
 from armcal.io.journal.journal import Journal, JournalLimits
 from armcal.io.journal.reader import read_until, verify
 from armcal.io.standard_output import StandardOutput
-from armcal.measure.reader import ReadRequest
 
 from armcal_online.running.control import SOCKET, ControlServer
 from armcal_online.running.loop import Pace, Recalibration
-from armcal_online.running.loop import Session as LoopSession
 from armcal_online.running.outputs import CALIBRATION, RESERVE, STATUS, Outputs
 from armcal_online.running.requests import Requests
-from armcal_online.running.state_replayer import STARTED, Event, ReplayDiffersError, StateReplayer
+from armcal_online.running.state_replayer import STARTED, ReplayDiffersError, StateReplayer
 from armcal_online.sources.row_parser import RowParser
 from armcal_online.sources.source import Source
+from armcal_online.tracking.recalibrator import Recalibrator
 
 JOURNAL = "journal"
 _REPLACED = (CALIBRATION, STATUS, RESERVE)
 OURS = (JOURNAL, EVENTS, EARLIER, SOCKET, *_REPLACED, *(f"{name}.new" for name in _REPLACED))
 
 _DECIDING = ("calibration", "settings")
-"""Of the journal's header: what may not differ when it is gone on with."""
-
-
-class Recalibrating(LoopSession, Protocol):
-    """What is asked of a recalibrator."""
-
-    @property
-    def request(self) -> ReadRequest:
-        """What its records may hold."""
-
-    @property
-    def evaluator(self) -> Mapping[str, Any]:
-        """What evaluates it, for the journal."""
-
-    def what_if(self, joints: Mapping[str, float]) -> dict[str, Any]:
-        """What it would do at joint angles, by channel (SI)."""
-
-    def started_event(self, resumed: bool) -> Event:
-        """What there is to tell at the beginning."""
+"""Keys of the journal's header that may not differ when it is resumed."""
 
 
 @dataclass(frozen=True)
 class Setup:
-    """What a recalibration is made of, besides its source and its recalibrator.
+    """A recalibration, but for its source and its recalibrator.
 
     Attributes:
-        folder: where everything of it is kept.
+        folder: of everything that it keeps.
         calibration: the file it begins from.
-        settings: what its decisions hang on, as JSON.
+        settings: those that its decisions depend on, as JSON.
         columns: the source's own names (wanted name to own name).
         pace: how often things are written.
         limits: how large the journal may grow.
@@ -95,28 +76,38 @@ SourceOf = Callable[[RowParser], Source]
 
 
 @contextmanager
-def opened(setup: Setup, session: Recalibrating, source_of: SourceOf) -> Iterator[Open]:
+def opened(setup: Setup, session: Recalibrator, source_of: SourceOf) -> Iterator[Open]:
     """Begin in a new folder, or go on in one: its newest checkpoint, the entries after it, the source after these.
 
     Raises:
         InputError: the folder is another's, is in use, or belongs to another calibration or other settings.
         DataError: the journal is damaged, or going through it again gives another state.
     """
-    _check(setup)
+    folder, begun_from = setup.folder / JOURNAL, _calibration_text(setup)
     with ExitStack() as stack:
         source = source_of(RowParser(session.request, setup.columns))
         stack.callback(source.close)
-        header = _header(setup, session)
-        journal = stack.enter_context(
-            Journal.open(setup.folder / JOURNAL, header, files=setup.files, limits=setup.limits)
-        )
-        state_replayer = StateReplayer(session, partial(_reach, setup.folder / JOURNAL), str(setup.folder / JOURNAL))
+        # All that a replay needs besides the entries.
+        header = {
+            "calibration": hashlib.sha256(begun_from).hexdigest(),
+            "text": begun_from.decode("utf-8", errors="replace"),
+            "path": str(setup.calibration),
+            "settings": dict(setup.settings),
+            "evaluator": dict(session.evaluator),
+        }
+        journal = stack.enter_context(Journal.open(folder, header, files=setup.files, limits=setup.limits))
+        state_replayer = StateReplayer(session, partial(read_until, folder), str(folder))
         resumed = _recover(setup, journal, state_replayer, header)
         source.resume(state_replayer.progress.positions)
         outputs = Outputs(setup.folder, setup.stream, EventFile(setup.folder), setup.files)
         stack.callback(outputs.close)
-        _tell_start(journal, outputs, session, header, resumed)
-        _tell_damage(setup, outputs)
+        _report_start(journal, outputs, session, header, resumed)
+        try:
+            verify(folder, setup.files)
+        except DataError as fault:
+            # The newest checkpoint was checked: the estimate goes on from it.
+            text = "The estimate is not touched by it: only what lies before is out of reach."
+            outputs.alarm(f"{fault.message} {text}")
         left = len(journal.recovered.entries) if resumed else 0
         recalibration = Recalibration(source, journal, session, state_replayer, outputs, setup.pace, left)
         control = ControlServer(setup.folder, Requests(recalibration, session).answer)
@@ -124,7 +115,8 @@ def opened(setup: Setup, session: Recalibrating, source_of: SourceOf) -> Iterato
         yield Open(recalibration, control)
 
 
-def _check(setup: Setup) -> None:
+def _calibration_text(setup: Setup) -> bytes:
+    """The calibration to begin from, which the folder must not replace."""
     if setup.calibration.resolve() == (setup.folder / CALIBRATION).resolve():
         raise InputError(
             "the calibration to begin from would be replaced by the updated one.",
@@ -133,18 +125,7 @@ def _check(setup: Setup) -> None:
         )
     if not (setup.folder / JOURNAL).is_dir():
         check_folder(setup.folder, OURS)
-
-
-def _header(setup: Setup, session: Recalibrating) -> dict[str, Any]:
-    """What the journal says of its writer: all that a replay needs besides the entries."""
-    begun_from = setup.calibration.read_bytes()
-    return {
-        "calibration": hashlib.sha256(begun_from).hexdigest(),
-        "text": begun_from.decode("utf-8", errors="replace"),
-        "path": str(setup.calibration),
-        "settings": dict(setup.settings),
-        "evaluator": dict(session.evaluator),
-    }
+    return setup.calibration.read_bytes()
 
 
 def _recover(setup: Setup, journal: Journal, state_replayer: StateReplayer, header: Mapping[str, Any]) -> bool:
@@ -174,8 +155,8 @@ def _recover(setup: Setup, journal: Journal, state_replayer: StateReplayer, head
     return True
 
 
-def _tell_start(
-    journal: Journal, outputs: Outputs, session: Recalibrating, header: Mapping[str, Any], resumed: bool
+def _report_start(
+    journal: Journal, outputs: Outputs, session: Recalibrator, header: Mapping[str, Any], resumed: bool
 ) -> None:
     sequence = journal.record(STARTED, {"at": time.time(), "resumed": resumed, "evaluator": header["evaluator"]})
     content = {"sequence": sequence, "at": time.time(), "resumed": resumed, "calibration": header["path"]}
@@ -186,15 +167,3 @@ def _tell_start(
     before = journal.recovered.header.get("evaluator", header["evaluator"])
     if before != header["evaluator"]:
         outputs.alarm("Another evaluator than before is used: a replay has to go over from one to the other here.")
-
-
-def _tell_damage(setup: Setup, outputs: Outputs) -> None:
-    """The estimate goes on from the newest checkpoint, which was checked; what is damaged before it is told of."""
-    try:
-        verify(setup.folder / JOURNAL, setup.files)
-    except DataError as fault:
-        outputs.alarm(f"{fault.message} The estimate is not touched by it: only what lies before is out of reach.")
-
-
-def _reach(folder: Path, sequence: int) -> Any:
-    return read_until(folder, sequence)

@@ -1,4 +1,4 @@
-"""What the entries of a journal make of a recalibration: the same in the field, after a restart, and in a replay.
+"""What the entries of a journal do to a recalibration: the same in the field, after a restart, and in a replay.
 
 Everything that changes the estimate goes through ``StateReplayer.apply``, with what was journalled and nothing else.
 """
@@ -7,12 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any, Protocol
+from typing import Any
 
 from armcal.errors import ArmcalError, DataError, Location
+from armcal.io.journal.segment import Entry
 
 from armcal_online.running.progress import Progress
 from armcal_online.sources.incoming import Incoming
+from armcal_online.tracking.recalibrator import Recalibrator
 
 RECORD = "record"
 ROLLBACK = "rollback"
@@ -21,42 +23,12 @@ RESUME = "resume"
 STARTED = "started"
 DECISION = "decision"
 
+NOTED = ("decision", "level")
+"""Events that a journal notes."""
 Event = dict[str, Any]
 
 
-class Estimation(Protocol):
-    """What is asked of a recalibrator here."""
-
-    def take(self, incoming: Incoming, sequence: int) -> tuple[Event, ...]:
-        """Judge and use a record; what there is to tell of it. The state is as it was if this raises."""
-
-    def snapshot(self) -> dict[str, Any]:
-        """The whole state, as JSON, exactly."""
-
-    def restore(self, snapshot: Mapping[str, Any]) -> None:
-        """Take up a state."""
-
-    def digest(self) -> str:
-        """Of the state, bit for bit."""
-
-
-class JournalEntry(Protocol):
-    """An entry as the journal gives it."""
-
-    @property
-    def sequence(self) -> int:
-        """Its number."""
-
-    @property
-    def kind(self) -> str:
-        """Its kind."""
-
-    @property
-    def content(self) -> Any:
-        """What it says."""
-
-
-Reach = Callable[[int], tuple[JournalEntry, tuple[JournalEntry, ...]]]
+Reach = Callable[[int], tuple[Entry, tuple[Entry, ...]]]
 """The last checkpoint at or before a sequence number, and the entries after it up to that number."""
 
 
@@ -66,7 +38,7 @@ class ReplayDiffersError(DataError):
 
 @contextmanager
 def parsing(sequence: int, journal: str = "the journal") -> Iterator[None]:
-    """For what is read of an entry whose checksum is right.
+    """Around the reading of an entry whose checksum is right.
 
     Raises:
         DataError: it is not what this version writes there.
@@ -82,20 +54,20 @@ def parsing(sequence: int, journal: str = "the journal") -> Iterator[None]:
 
 
 class StateReplayer:
-    """An estimate and how far its source was taken, moved on by journal entries."""
+    """A session and how far its source was taken, moved on by journal entries."""
 
-    def __init__(self, estimation: Estimation, reach: Reach, journal_name: str = "") -> None:
-        self._estimation = estimation
+    def __init__(self, session: Recalibrator, reach: Reach, journal_name: str = "") -> None:
+        self._session = session
         self._reach = reach
         self._name = journal_name
-        self._initial = estimation.snapshot()
+        self._initial = session.snapshot()
         self.progress = Progress()
 
     def checkpoint(self) -> dict[str, Any]:
         """The whole state, for the journal."""
         return {
-            "state": self._estimation.snapshot(),
-            "digest": self._estimation.digest(),
+            "state": self._session.snapshot(),
+            "digest": self._session.digest(),
             "progress": self.progress.as_dict(),
         }
 
@@ -106,18 +78,18 @@ class StateReplayer:
             ReplayDiffersError: it is not the state that was noted with it.
         """
         if checkpoint is None:
-            self._estimation.restore(self._initial)
+            self._session.restore(self._initial)
             self.progress = Progress()
             return
         with parsing(sequence, self._name):
             state, digest = checkpoint["state"], str(checkpoint["digest"])
             progress = Progress.from_dict(checkpoint["progress"])
-            self._estimation.restore(state)
+            self._session.restore(state)
         self.progress = progress
         self._compare(digest, sequence)
 
     def apply(self, sequence: int, kind: str, content: Mapping[str, Any]) -> tuple[Event, ...]:
-        """What an entry does, and what there is to tell of it.
+        """Do what an entry says; the events of it.
 
         Raises:
             ReplayDiffersError: the entry notes a state, and this is another.
@@ -126,7 +98,15 @@ class StateReplayer:
         if kind == RECORD:
             with parsing(sequence, self._name):
                 incoming = Incoming.from_dict(content)
-            return self._take(sequence, incoming)
+            self.progress.take(incoming, sequence)
+            why = "The recalibration is paused."
+            if not self.progress.paused:
+                try:
+                    return self._session.take(incoming, sequence)
+                except ArmcalError as fault:
+                    why = f"It could not be used: {fault}"
+            event = {"event": RECORD, "sequence": sequence, "id": incoming.record_id, "at": incoming.arrived}
+            return ({**event, "verdict": "ignored", "why": why},)
         if kind in (PAUSE, RESUME):
             self.progress.paused = kind == PAUSE
         elif kind == ROLLBACK:
@@ -143,34 +123,23 @@ class StateReplayer:
         Raises:
             DataError: the journal does not reach there; nothing is changed.
         """
-        before = self._estimation.snapshot()
+        before = self._session.snapshot()
         try:
             checkpoint, entries = self._reach(sequence)
-            earlier = StateReplayer(self._estimation, self._reach, self._name)
+            earlier = StateReplayer(self._session, self._reach, self._name)
             earlier._initial = self._initial
             earlier.restore(checkpoint.content, checkpoint.sequence)
             for entry in entries:
                 earlier.apply(entry.sequence, entry.kind, entry.content)
         except BaseException:
-            self._estimation.restore(before)
+            self._session.restore(before)
             raise
 
-    def _take(self, sequence: int, incoming: Incoming) -> tuple[Event, ...]:
-        self.progress.take(incoming, sequence)
-        why = "The recalibration is paused."
-        if not self.progress.paused:
-            try:
-                return self._estimation.take(incoming, sequence)
-            except ArmcalError as fault:
-                why = f"It could not be used: {fault}"
-        event = {"event": RECORD, "sequence": sequence, "id": incoming.record_id, "at": incoming.arrived}
-        return ({**event, "verdict": "ignored", "why": why},)
-
     def _compare(self, noted: str, sequence: int) -> None:
-        text = self._estimation.digest()
-        if text != noted:
+        digest = self._session.digest()
+        if digest != noted:
             raise ReplayDiffersError(
-                f"after entry {sequence} the state is {text[:12]}, expected {noted[:12]} as was noted then.",
+                f"after entry {sequence} the state is {digest[:12]}, expected {noted[:12]} as was noted then.",
                 where=Location(self._name or None),
                 hint="Use the version of armcal, the libraries and the evaluator that wrote it, or begin a new --out "
                 "from its calibration.yaml.",
