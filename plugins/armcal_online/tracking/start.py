@@ -69,29 +69,27 @@ def filter_setup(calibration: Calibration, settings: RecalibrateSettings, shares
     Raises:
         ConfigError: the calibration keeps no covariance, or a glob or a quantity in the settings is refused.
     """
-    system, noise = calibration.system, calibration.record.noise
+    system, kept = calibration.system, calibration.record
     measurements = {n: m for n, m in system.measurements.items() if not isinstance(m, PairedMeasurement)}
     parameters, opened = _parameters(calibration, settings)
     space = StateSpace(parameters)
     record = _full_record(calibration, measurements)
-    groups = calibration.record.groups
     problem = Problem.build(
-        system.arms, measurements, parameters, system.environment, record, settings.evaluator, groups=groups
+        system.arms, measurements, parameters, system.environment, record, settings.evaluator, groups=kept.groups
     )
     follows = shares and settings.model_error == "calibrated"
     white, shared = _white_and_shared_noise(calibration, measurements, follows)
     drifts = _drifts(calibration, space)
-    gauss_markov = GaussMarkovStates((*drifts, *shared) if follows else ())
-    # The degrees of freedom of a measurement's noise are all of the fit's if its own are not kept.
-    own, degrees = noise.get("scatter") or {}, max(noise["degrees_of_freedom"], 1)
-    known = {entry.name.partition("[")[0] for entry in calibration.record.parameters if entry.free}
+    followed = GaussMarkovStates((*drifts, *shared) if follows else ())
+    own, degrees_of_fit = kept.noise.get("scatter") or {}, max(kept.noise["degrees_of_freedom"], 1)
+    known = {entry.name.partition("[")[0] for entry in kept.parameters if entry.free}
     observer = Observer(
         problem,
         space,
-        gauss_markov,
+        followed,
         GaussMarkovStates(() if follows else drifts),
         white,
-        {name: float((own.get(name) or {}).get("freedom") or degrees) for name in white},
+        {name: float((own.get(name) or {}).get("freedom") or degrees_of_fit) for name in white},
         _defaults(calibration),
         {block.name for block in calibration.parameters.nuisances if block.free} - known,
         _noise_scale(calibration),
@@ -101,7 +99,7 @@ def filter_setup(calibration: Calibration, settings: RecalibrateSettings, shares
         space,
         observer,
         _initial_belief(calibration, space, opened, observer.size),
-        ProcessNoise(variance_rates(parameters, settings.process_noise), gauss_markov),
+        ProcessNoise(variance_rates(parameters, settings.process_noise), followed),
         ReadRequest(system.arms, measurements, requested_channels(system.arms, measurements, measured=True)),
         tuple(sorted(set(system.measurements) - set(measurements))),
     )
