@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import accumulate, pairwise
 
 import numpy as np
 from armcal.base.domains import Array
@@ -146,7 +146,7 @@ class RecordsSince:
     ) -> tuple[Array, Array, Array, list[slice]]:
         """Innovations of chosen records, their slopes by a shift at the first, covariance without it, rows of each."""
         places = [int(i) for i in np.flatnonzero(chosen)]
-        ends = np.cumsum([0, *(len(records[i].innovation) for i in places)]).tolist()
+        ends = [0, *accumulate(len(records[i].innovation) for i in places)]
         rows = [slice(start, stop) for start, stop in pairwise(ends)]
         covariance = np.zeros((ends[-1], ends[-1]))
         scale = np.ones(len(self._means[0]))
