@@ -19,8 +19,8 @@ from armcal.problem.problem import Problem
 from armcal.run.experiment import Experiment
 from armcal_kalman.extended import ExtendedFilter, ExtendedSettings
 from armcal_online.tracking.belief import Belief
-from armcal_online.tracking.gauss_markov import GaussMarkovStates
-from armcal_online.tracking.observer import Observer, Reading, Seen
+from armcal_online.tracking.observer import Observer, Reading
+from armcal_online.tracking.process_noise import GaussMarkovStates
 from armcal_online.tracking.state_space import StateSpace
 from filterpy.kalman import ExtendedKalmanFilter
 
@@ -51,11 +51,11 @@ class Case:
 
     def run(self, updates: int = UPDATES, settings: ExtendedSettings = ONCE) -> Belief:
         """Take records one after another; the belief after them."""
-        estimator, belief, state_space = ExtendedFilter(settings), self.belief, self.observer.state_space
+        estimator, belief, space = ExtendedFilter(settings), self.belief, self.observer.space
         for i in range(updates):
             reading = self.readings[i % len(self.readings)]
-            seen = Seen(self.observer, belief.origin, belief.gaussian.mean, (reading,))
-            belief = belief.updated(state_space, estimator.update(belief.gaussian, [seen]).posterior)
+            observation = self.observer.observation(belief, (reading,))
+            belief = belief.updated(space, estimator.update(belief.gaussian, [observation]).posterior)
         return belief
 
 
@@ -81,7 +81,7 @@ def _compared(experiment: Experiment, parameters: Parameters, dataset: Dataset, 
     contenders: dict[str, Callable[[], object]] = {name: case.run for name, case in cases.items()}
     contenders |= {f"{name}, again": partial(case.run, settings=ExtendedSettings()) for name, case in cases.items()}
     times = best_times({**contenders, "plain": plain}, repeats=10)
-    apart = _apart(cases["compiled"].run(), plain(), cases["compiled"].observer.state_space)
+    apart = _apart(cases["compiled"].run(), plain(), cases["compiled"].observer.space)
     agreement = "the same estimate" if apart < SAME else f"bounds and cones kept, which moves it by {apart:.1g} sd"
     peer = "filterpy's ExtendedKalmanFilter fed by casadi.Function calls"
     for choice, case in cases.items():
@@ -98,7 +98,7 @@ def case_of(experiment: Experiment, parameters: Parameters, dataset: Dataset, ev
     problem = Problem.build(system.arms, system.measurements, parameters, system.environment, dataset, evaluator)
     state_space = StateSpace(parameters)
     noise = {"tracker": np.eye(3) * NOISE_M**2}
-    observer = Observer(problem, state_space, GaussMarkovStates(), GaussMarkovStates(), noise, {})
+    observer = Observer(problem, state_space, GaussMarkovStates(), GaussMarkovStates(), noise, {"tracker": np.inf}, {})
     size = observer.size
     belief = Belief(parameters.nominal(), Gaussian(np.zeros(size), np.eye(size) * 0.01**2))
     channels = dataset.channels
@@ -108,7 +108,7 @@ def case_of(experiment: Experiment, parameters: Parameters, dataset: Dataset, ev
 
 def _plain(case: Case, settle: ca.Function, linearise: ca.Function) -> tuple[Array, Array]:
     """The same updates in the obvious way: the state is the values, and CasADi takes and gives its own matrices."""
-    entries, scales = case.observer.state_space.entries, case.observer.state_space.scales
+    entries, scales = case.observer.space.entries, case.observer.space.scales
     one = ExtendedKalmanFilter(dim_x=len(scales), dim_z=3)
     one.x = case.belief.origin[entries]
     one.P = case.belief.gaussian.covariance * np.outer(scales, scales)

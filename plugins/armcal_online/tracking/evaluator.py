@@ -26,7 +26,7 @@ def identity(problem: Problem, estimator: object) -> dict[str, Any]:
     """
     # A change of any code that may have a part in it may change the last bits.
     sources, libraries = hashlib.sha256(), {}
-    for folder in (SOURCES, Path(inspect.getfile(type(estimator))).parent):
+    for folder in (SOURCES, Path(__file__).parents[1], Path(inspect.getfile(type(estimator))).parent):
         for path in sorted(folder.rglob("*.py")):
             sources.update(path.relative_to(folder).as_posix().encode() + b"\0" + path.read_bytes())
     for name in _LIBRARIES:
