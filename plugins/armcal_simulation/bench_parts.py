@@ -7,8 +7,8 @@ from typing import Annotated, Literal
 
 import numpy as np
 from armcal.arm.assembly import Arm
-from armcal.arm.holding import holding_function
 from armcal.arm.joints import unknown_joint
+from armcal.arm.loading import holding_function
 from armcal.base.domains import Array
 from armcal.base.pose_settings import PoseSettings
 from armcal.base.quaternions import rotation_matrix

@@ -21,7 +21,7 @@ from armcal.arm.clearance import (
     segment_to_box,
     segment_to_segment,
 )
-from armcal.arm.holding import holding_efforts
+from armcal.arm.loading import holding_efforts
 from armcal.errors import PluginError
 from armcal.run.plan_clearance import ClearanceSettings, clearance_check, enclosing_capsule
 from scipy.optimize import minimize

@@ -8,8 +8,7 @@ from dataclasses import replace
 import numpy as np
 import oracle
 import pytest
-from armcal.arm.holding import holding_efforts
-from armcal.arm.loading import LOAD_CHANNELS, site_loads
+from armcal.arm.loading import LOAD_CHANNELS, holding_efforts, site_loads
 from armcal.base.dataset import Dataset
 from armcal.diagnose.evidence import priors_alone, unseen_poses
 from armcal.diagnose.large_errors import Judged, large_errors

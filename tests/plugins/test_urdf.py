@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import yaml
 from armcal.arm.assembly import Arm
-from armcal.arm.holding import holding_efforts
+from armcal.arm.loading import holding_efforts
 from armcal.arm.model import forward
 from armcal.base.dataset import Dataset
 from armcal.calibration.calibration_file import dump

@@ -1,17 +1,19 @@
-"""What every site of an arm carries record by record, and how its turning would move the tip."""
+"""Statics of the rigid arm: what its sites carry and its joints hold, and how a turn of a site moves the tip."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
 
 from armcal.arm.assembly import Arm
-from armcal.arm.model import forward
-from armcal.arm.statics import Load, Mass, effort, wrenches
+from armcal.arm.environment import Environment
+from armcal.arm.model import Chain, Frames, Vector3, forward
+from armcal.arm.statics import Load, Mass, SiteWrench, joint_efforts, wrenches
 from armcal.base.domains import Array
+from armcal.base.se3 import Expression
 
 LOAD_CHANNELS = (
     *(f"gravity_{axis}" for axis in "xyz"),
@@ -58,16 +60,44 @@ def _function(arm: Arm, values: Mapping[str, Array]) -> ca.Function:
     """(commands, what acts) -> moments, efforts, levers, stacked."""
     chain = arm.chain({name: ca.SX(list(value)) for name, value in values.items()})
     commands, acting = ca.SX.sym("commands", len(chain.joints)), ca.SX.sym("acting", len(LOAD_CHANNELS))
-    frames = forward(chain, [joint.offset + commands[i] for i, joint in enumerate(chain.joints)], {})
-    masses = [Mass(m.name, ca.SX(m.mass), ca.SX(list(m.com)), m.frame, m.loads_up_to) for m in arm.masses]
     load = Load(acting[0:3], acting[3], acting[4:7], acting[7:10], acting[10:13])
-    loads = wrenches(chain, frames, masses, load)
-    moments, efforts, levers = [], [], []
-    for index, (site, wrench) in enumerate(zip(frames.sites, loads, strict=True)):
+    frames, loads = _rigid_statics(arm, chain, ca.vertsplit(commands), load)
+    moments, levers = [], []
+    for site, wrench in zip(frames.sites, loads, strict=True):
         moments.append(ca.mtimes(site.rotation.T, wrench.moment))
         lever = frames.base_T_tool.translation - site.origin
         levers += [ca.cross(ca.densify(site.rotation[:, axis]), ca.densify(lever)) for axis in range(3)]
-        if index:
-            efforts.append(effort(chain.joints[index - 1], site, wrench))
-    shown = ca.densify(ca.vertcat(*moments, *efforts, *levers))
+    shown = ca.densify(ca.vertcat(*moments, joint_efforts(chain, frames, loads), *levers))
     return ca.Function("site_loads", [commands, acting], [shown], {"cse": True})
+
+
+def holding_efforts(
+    arm: Arm, joint_angles: Array, gravity: Vector3, payload: float = 0.0, payload_com: Vector3 = (0.0, 0.0, 0.0)
+) -> Array:
+    """Static effort on each commanded joint (joints x N; N m or N) at commands (joints x N), rigid and nominal.
+
+    Gravity (m/s^2) in the base frame; the payload (kg) in the tool frame.
+    """
+    function = holding_function(arm, gravity, payload, payload_com)
+    return np.asarray(function.map(joint_angles.shape[1])(joint_angles).full())
+
+
+def holding_function(
+    arm: Arm, gravity: Vector3, payload: float = 0.0, payload_com: Vector3 = (0.0, 0.0, 0.0)
+) -> ca.Function:
+    """From commands (joints) to the efforts that ``holding_efforts`` gives of them, to be called often."""
+    chain, commands = arm.nominal_chain, ca.SX.sym("commands", len(arm.commanded))
+    load = Environment(gravity, payload, payload_com).load
+    frames, loads = _rigid_statics(arm, chain, arm.joint_commands(ca.vertsplit(commands)), load)
+    efforts = ca.vertsplit(ca.densify(joint_efforts(chain, frames, loads)))
+    own = [held for held, joint in zip(efforts, chain.joints, strict=True) if joint.mimic is None]
+    return ca.Function("efforts", [commands], [ca.vertcat(*own)], {"cse": True})
+
+
+def _rigid_statics(
+    arm: Arm, chain: Chain, commands: Sequence[Expression], load: Load
+) -> tuple[Frames, tuple[SiteWrench, ...]]:
+    """Frames and wrenches without effects, with the stated masses; ``commands`` are of all joints of the chain."""
+    frames = forward(chain, [joint.offset + commands[i] for i, joint in enumerate(chain.joints)], {})
+    masses = [Mass(m.name, ca.SX(m.mass), ca.SX(list(m.com)), m.frame, m.loads_up_to) for m in arm.masses]
+    return frames, wrenches(chain, frames, masses, load)

@@ -22,7 +22,7 @@ from armcal.base.settings import Angle3, Length3, Mass, Settings
 from armcal.calibration.compensation.compensator import Compensator
 from armcal.calibration.compensation.grid import over_grid
 from armcal.calibration.compensation.request import FARTHEST_M, Mask, Targets
-from armcal.calibration.compensation.turning import turn_between
+from armcal.calibration.rigid_chain import turn_between
 from armcal.config.validate import validate
 from armcal.config.yaml_source import load_config
 from armcal.errors import ConfigError, Location, ProblemError

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from armcal.arm.holding import holding_efforts
+from armcal.arm.loading import holding_efforts
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.base.parameters import Parameters

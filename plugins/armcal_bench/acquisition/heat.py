@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from armcal.arm.assembly import Arm
 from armcal.arm.environment import Environment
-from armcal.arm.holding import holding_function
 from armcal.arm.joints import unknown_joint
+from armcal.arm.loading import holding_function
 from armcal.base.domains import Array
 
 from armcal_bench.acquisition.settings import ServoHeatSettings

@@ -15,14 +15,13 @@ from armcal.calibration.compensation.counts import Counts, ServoCounts
 from armcal.calibration.compensation.equilibrium import Equilibrium, Standing
 from armcal.calibration.compensation.finder import Allowed, Rows, Solutions
 from armcal.calibration.compensation.limits import check_held, command_limits, held_joints
-from armcal.calibration.compensation.path import PathFinder
+from armcal.calibration.compensation.path import PathFinder, with_sides
 from armcal.calibration.compensation.reach import Reach, reach_of
 from armcal.calibration.compensation.reasons import why_not
 from armcal.calibration.compensation.request import Commands, Mask, Options, Targets
 from armcal.calibration.compensation.seeds import Seeds
-from armcal.calibration.compensation.sides import with_sides
 from armcal.calibration.compensation.target_kind import TargetKind
-from armcal.calibration.compensation.turning import turn_between
+from armcal.calibration.rigid_chain import turn_between
 from armcal.calibration.tool_expression import APPROACH, ToolExpression
 from armcal.functions.batch_function import EvaluatorChoice
 

@@ -1,11 +1,13 @@
 """Commands along a path: each target from the commands before it, several ways at once, and the best way of them.
 
 An arm reaches a target in several postures. Each way keeps to its own as long as it can; where it cannot, it jumps to
-another, and a way with fewer and shorter jumps is the better one.
+another, and a way with fewer and shorter jumps is the better one. The sides from which joints come follow from how
+they move, and how they move may depend on these where there is backlash.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,13 +15,16 @@ import numpy as np
 from armcal.base.domains import Array
 from armcal.calibration.compensation.finder import PARTS, Finder, Solutions
 from armcal.calibration.compensation.request import Mask
-from armcal.calibration.compensation.sides import sides_of, with_sides
 
 WAYS = 12
 _SAME = 1e-3
 """Commands nearer than this (rad or m) are the same posture."""
 _JUMP = 0.5
 """A longer move (rad or m) between neighbouring targets is a jump."""
+
+_ROUNDS = 3
+_STILL = 1e-9
+"""A joint that moves by less (rad or m) keeps its side."""
 
 
 @dataclass(frozen=True)
@@ -101,3 +106,33 @@ def _joined(solutions: list[Solutions], way: int) -> Solutions:
     """One way's findings, target by target."""
     parts = {name: np.stack([getattr(each, name)[..., way] for each in solutions], axis=-1) for name in PARTS}
     return Solutions(**parts)
+
+
+def sides_of(moved: Array, before: Array) -> Array:
+    """The side (-1, 0, 1) from which joints come that moved so far, and came from a side before (n x N each)."""
+    return np.where(np.abs(moved) > _STILL, np.sign(moved), before)
+
+
+def with_sides(record: Array, at: Array, before: Array, search: Callable[[Array], Solutions]) -> Solutions:
+    """Commands found under the sides from which they make the joints come; these are left in the record.
+
+    A joint that comes from the one side only if it is told to come from the other has no side: it gets 0, and its play
+    counts as uncertainty.
+
+    Args:
+        record: channels x N; the joints' commands and then their sides stand first.
+        at: commands from which the joints come (n x N).
+        before: the sides from which they came there (n x N).
+        search: from a record to commands.
+    """
+    place = slice(len(at), 2 * len(at))
+    record[place] = before
+    for _ in range(_ROUNDS):
+        found = search(record)
+        sides = sides_of(found.commands - at, before)
+        told = record[place].copy()
+        if (sides == told).all():
+            return found
+        record[place] = sides
+    record[place] = np.where(sides == told, told, 0.0)
+    return search(record)

@@ -11,7 +11,7 @@ from armcal.calibration.compensation.finder import Allowed, Solutions
 from armcal.calibration.compensation.request import Targets
 from armcal.calibration.compensation.solver import Solver
 from armcal.calibration.compensation.step import sample_inputs, slope_function
-from armcal.calibration.compensation.turning import turn_between
+from armcal.calibration.rigid_chain import turn_between
 from armcal.calibration.tool_expression import ToolExpression
 from armcal.functions.batch_function import BatchFunction, EvaluatorChoice
 
