@@ -93,12 +93,12 @@ def _names(out: str) -> FileNames:
     return FileNames(out, f"{stem}.h", f"{stem}_test.c")
 
 
-def _remarks(request: ExportRequest, told: Sequence[str]) -> list[str]:
+def _remarks(request: ExportRequest, conditions: Sequence[str]) -> list[str]:
     """What the code takes for granted."""
     texts = []
     if request.arm.deflection_size and not request.payload_stated:
         texts.append("the calibration does not say what hangs on the tool: the default payload is 0 kg")
-    untold = [name for name in request.arm.conditions if name not in told]
+    untold = [name for name in request.arm.conditions if name not in conditions]
     if untold:
         ask = f"--option conditions=[{', '.join(request.arm.conditions)}]"
         texts.append(f"the code takes {', '.join(untold)} as the calibration does where it is not recorded; {ask} asks")
@@ -157,7 +157,7 @@ def _about(request: ExportRequest, e: ToolExpression, limits: list[tuple[float, 
     springs = f"{e.state.numel()} elastic coordinates" if e.state.numel() else "rigid"
     effects = ", ".join(request.arm.effects) or "none"
     lines = [
-        f"{' '.join(each for each in known if each)}." if any(known) else "",
+        f"{' '.join(sentence for sentence in known if sentence)}." if any(known) else "",
         f"Identity {request.digest}.",
         f"Effects: {effects}; {springs}.",
         f"Limits: {'; '.join(ends)}.",

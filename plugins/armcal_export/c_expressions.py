@@ -55,7 +55,7 @@ def _tangent(e: ToolExpression, twist: Expression, direction: Expression) -> str
     """How state and tool follow one direction of commands and state."""
     expression, along = ca.SX.sym("told", len(e.joints)), ca.SX.sym("along", e.state.numel())
     both, ways = ca.vertcat(e.commands, e.state), ca.vertcat(expression, along)
-    moved = [ca.densify(ca.jtimes(each, both, ways)) for each in (e.next_state, twist)]
+    moved = [ca.densify(ca.jtimes(term, both, ways)) for term in (e.next_state, twist)]
     function = _function([e.record, e.state, expression, along], [moved[0], _at_tool(e, moved[1], direction)])
     return c_function(function, "tangent", ["record", "state", "told", "along"], ["next", "twist"])
 

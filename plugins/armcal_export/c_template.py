@@ -14,12 +14,12 @@ _PREFIX = re.compile(r"\b(arm|ARM)_")
 def filled(template: str, prefix: str, **values: str) -> str:
     """A template with its places filled, and its names that begin with ``arm_`` or ``ARM_`` under another prefix."""
     text = resources.files("armcal_export").joinpath("templates", template).read_text(encoding="utf-8")
-    return _PLACE.sub(lambda found: values[found[1]], with_prefix(text, prefix))
+    return _PLACE.sub(lambda match: values[match[1]], with_prefix(text, prefix))
 
 
 def with_prefix(text: str, prefix: str) -> str:
     """Names under another prefix."""
-    return _PREFIX.sub(lambda found: f"{prefix if found[1] == 'arm' else prefix.upper()}_", text)
+    return _PREFIX.sub(lambda match: f"{prefix if match[1] == 'arm' else prefix.upper()}_", text)
 
 
 def in_comment(text: str) -> str:

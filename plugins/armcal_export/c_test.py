@@ -17,10 +17,10 @@ TOLERANCE = 1e-12
 
 def test_source(e: ToolExpression, reference: Reference, prefix: str, places: Mapping[str, str]) -> str:
     """The program with armcal's own answers in it."""
-    each = zip(reference.records, reference.base_T_tool, reference.efforts, strict=True)
+    cases = zip(reference.records, reference.base_T_tool, reference.efforts, strict=True)
     rows = [
         f"  {{{input_row(e, list(record))},\n   {_listed(pose.ravel())},\n   {_listed(efforts)}}}"
-        for record, pose, efforts in each
+        for record, pose, efforts in cases
     ]
     filling = {"cases": str(len(rows)), "case_rows": ",\n".join(rows), "tolerance": repr(TOLERANCE)}
     return filled("arm_test.c.in", prefix, **{**places, **filling})

@@ -204,8 +204,8 @@ def _parameters(request: ExportRequest) -> list[Parameter]:
             for key, numbers in request.values.items()
             for name, nominal, value in zip(blocks[key].entry_names, blocks[key].nominal, numbers, strict=True)
         ]
-        told = {"free": False, "sd": None, "determined": None}
-        return [Parameter(name=n, unit=u, nominal=before, value=now, **told) for n, u, before, now in entries]
+        unknown = {"free": False, "sd": None, "determined": None}
+        return [Parameter(name=n, unit=u, nominal=before, value=now, **unknown) for n, u, before, now in entries]
     return [
         Parameter(
             name=e.name, unit=e.unit, nominal=e.nominal, value=e.value, free=e.free, sd=e.sd, determined=e.determined
@@ -215,4 +215,4 @@ def _parameters(request: ExportRequest) -> list[Parameter]:
 
 
 def _numbers(expression: ca.SX) -> list[float]:
-    return [float(each) for each in np.asarray(ca.evalf(ca.densify(expression)).full()).ravel()]
+    return [float(number) for number in np.asarray(ca.evalf(ca.densify(expression)).full()).ravel()]

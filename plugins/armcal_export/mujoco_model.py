@@ -75,14 +75,14 @@ class MujocoExporter:
         chain = chain_of(request)
         rigid, arm_description = rigid_chain(chain), describe(request)
         require_plain_axes(rigid, "mujoco")
-        found = _sorted(request, spring_numbers(request, chain), arm_description)
+        hinges = _sorted(request, spring_numbers(request, chain), arm_description)
         drive = Drive(self._settings.gain, self._settings.damping, self._settings.armature)
-        content = mjcf(arm_description, rigid, found.hinges, drive)
+        content = mjcf(arm_description, rigid, hinges.hinges, drive)
         loaded = _loaded(content, rigid)
         commands = random_commands(request.arm, POSES)
         _compare(loaded, rigid_tools(request.arm, request.values, commands), commands)
         reach = _reach(request, loaded, commands)
-        left_out = found.left_out or (("turns of second order in its springs",) if reach > TOLERANCE else ())
+        left_out = hinges.left_out or (("turns of second order in its springs",) if reach > TOLERANCE else ())
         return Exported(content, changed_numbers(request), left_out, reach=reach)
 
 
@@ -119,9 +119,9 @@ def _sorted(request: ExportRequest, springs: Sequence[SpringNumbers], arm_descri
     return _Sorted(hinges, _left_out(request, springs, arm_description))
 
 
-def _kept(found: Sequence[tuple[Array, float]], slides: bool) -> list[Hinge]:
+def _kept(axes: Sequence[tuple[Array, float]], slides: bool) -> list[Hinge]:
     return [
-        Hinge((float(a[0]), float(a[1]), float(a[2])), slides, float(size)) for a, size in found if size > _NO_SPRING
+        Hinge((float(a[0]), float(a[1]), float(a[2])), slides, float(size)) for a, size in axes if size > _NO_SPRING
     ]
 
 
@@ -160,8 +160,8 @@ def _displaces(request: ExportRequest, name: str) -> bool:
 
 
 def _compare(loaded: LoadedModel, expected: Array, commands: Array) -> None:
-    found = np.array([loaded.rigid_tool(command) for command in commands.T])
-    apart = float(np.abs(found - expected).max())
+    tools = np.array([loaded.rigid_tool(command) for command in commands.T])
+    apart = float(np.abs(tools - expected).max())
     if not apart <= TOLERANCE:
         raise ProblemError(
             f"MuJoCo's arm is {apart:.3g} m or 1 off the calibrated one, expected {TOLERANCE:g} at most.", hint=_REPORT

@@ -16,8 +16,8 @@ _TURNS, _AT_REST, _FARTHEST, _DIFFERENCE = 60, 1e-12, 1.5, 1e-6
 def _mujoco() -> ModuleType:
     import mujoco
 
-    found: ModuleType = mujoco
-    return found
+    module: ModuleType = mujoco
+    return module
 
 
 class LoadedModel:

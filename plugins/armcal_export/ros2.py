@@ -77,7 +77,7 @@ class Ros2Exporter:
 
 def _parameters(request: ExportRequest, arm_description: ArmDescription, rigid: RigidChain) -> dict[str, Value]:
     """By dotted name: what is known, then the chain, then the numbers of effects and masses."""
-    found: dict[str, Value] = {
+    parameters: dict[str, Value] = {
         "arm": request.name,
         "digest": arm_description.calibration.digest,
         "calibrated": arm_description.calibration.created or "unknown",
@@ -98,12 +98,12 @@ def _parameters(request: ExportRequest, arm_description: ArmDescription, rigid: 
         compliance = _own_compliance(arm_description, number, joint.axis)
         if compliance:
             entries["compliance"] = compliance
-        _add(found, f"joints.{name}", entries)
+        _add(parameters, f"joints.{name}", entries)
         here = placed.base_T_joint
-    _add(found, "tool", _placed(np.linalg.inv(here) @ rigid.base_T_tool))
-    _add(found, "gravity", {"base": arm_description.statics.gravity_m_s2})
+    _add(parameters, "tool", _placed(np.linalg.inv(here) @ rigid.base_T_tool))
+    _add(parameters, "gravity", {"base": arm_description.statics.gravity_m_s2})
     return (
-        found
+        parameters
         | _of_servos(arm_description)
         | _of_masses(arm_description)
         | _of_settings(arm_description)
@@ -111,16 +111,16 @@ def _parameters(request: ExportRequest, arm_description: ArmDescription, rigid: 
     )
 
 
-def _add(found: dict[str, Value], where: str, entries: Mapping[str, Any]) -> None:
+def _add(parameters: dict[str, Value], where: str, entries: Mapping[str, Any]) -> None:
     for name, value in entries.items():
         full = f"{where}.{name}"
-        if full in found:
+        if full in parameters:
             raise ConfigError(f"two joints or parameters would be called {full!r}.", hint="Rename one of them.")
-        found[full] = value
+        parameters[full] = value
 
 
 def _placed(matrix: Array) -> dict[str, list[float]]:
-    return {"xyz": [float(x) for x in matrix[:3, 3]], "rpy": [float(each) for each in rpy_of(matrix[:3, :3])]}
+    return {"xyz": [float(x) for x in matrix[:3, 3]], "rpy": [float(angle) for angle in rpy_of(matrix[:3, :3])]}
 
 
 def _own_compliance(arm_description: ArmDescription, number: int, axis: list[float]) -> float:
@@ -135,22 +135,22 @@ def _own_compliance(arm_description: ArmDescription, number: int, axis: list[flo
 
 def _of_servos(arm_description: ArmDescription) -> dict[str, Value]:
     """``joints.q2.servo.angles`` (rad), ``.pulses`` (s), ``.tick`` (s)."""
-    found: dict[str, Value] = {}
+    parameters: dict[str, Value] = {}
     for servo in arm_description.servos:
         table = {"angles": servo.angles_rad, "pulses": servo.pulses_s, "tick": servo.tick_s}
-        _add(found, f"joints.{_word(servo.joint)}.servo", table)
-    return found
+        _add(parameters, f"joints.{_word(servo.joint)}.servo", table)
+    return parameters
 
 
 def _of_settings(arm_description: ArmDescription) -> dict[str, Value]:
     """``effects.servo.type``, ``effects.servo.settings.gains``: what ROS 2 has a type for."""
-    found: dict[str, Value] = {}
+    parameters: dict[str, Value] = {}
     for effect in arm_description.effects:
         where = f"effects.{_word(effect.name)}"
-        _add(found, where, {"type": effect.type or "unknown"})
+        _add(parameters, where, {"type": effect.type or "unknown"})
         flat = {_word(name): value for name, value in effect.settings.items() if _is_flat(value)}
-        _add(found, f"{where}.settings", flat)
-    return found
+        _add(parameters, f"{where}.settings", flat)
+    return parameters
 
 
 def _is_flat(value: Any) -> bool:
@@ -160,16 +160,20 @@ def _is_flat(value: Any) -> bool:
 
 def _of_masses(arm_description: ArmDescription) -> dict[str, Value]:
     """``links.hand.mass``, its centre in the base frame at zero commands, and the joint that moves it."""
-    found: dict[str, Value] = {}
+    parameters: dict[str, Value] = {}
     for mass in arm_description.masses:
         moved_by = arm_description.joints[mass.moved_by - 1].name if mass.moved_by else "mount"
-        _add(found, f"links.{_word(mass.name)}", {"mass": mass.mass_kg, "base_com": mass.com_m, "moved_by": moved_by})
-    return found
+        _add(
+            parameters,
+            f"links.{_word(mass.name)}",
+            {"mass": mass.mass_kg, "base_com": mass.com_m, "moved_by": moved_by},
+        )
+    return parameters
 
 
 def _of_effects(request: ExportRequest) -> dict[str, Value]:
     """Every number of the effects: ``effects.servo.gain1``, ``effects.flex.C0_xx``."""
-    found: dict[str, Value] = {}
+    parameters: dict[str, Value] = {}
     blocks = {block.name: block for block in request.arm.parameters()}
     for effect in request.arm.effects:
         before = f"{request.name}.{effect}."
@@ -177,8 +181,8 @@ def _of_effects(request: ExportRequest) -> dict[str, Value]:
             local = full.removeprefix(before)
             for suffix, number in zip(blocks[full].domain.entries, request.values[full], strict=True):
                 name = _word(f"{local}_{suffix}" if suffix else local)
-                _add(found, f"effects.{_word(effect)}", {name: float(number)})
-    return found
+                _add(parameters, f"effects.{_word(effect)}", {name: float(number)})
+    return parameters
 
 
 def _word(name: str) -> str:
@@ -199,17 +203,17 @@ def _left_out(request: ExportRequest, arm_description: ArmDescription) -> tuple[
 def _compare(
     request: ExportRequest,
     again: Mapping[str, Mapping[str, Value]],
-    told: Mapping[str, Mapping[str, Value]],
+    parameters_by_node: Mapping[str, Mapping[str, Value]],
     before: str,
 ) -> None:
     """All parameters to the last bit, and the tool of the chain that they make."""
-    if again != told:
+    if again != parameters_by_node:
         raise ProblemError("the parameters do not read back as they were written.", hint=_REPORT)
     (parameters,) = again.values()
     commands = random_commands(request.arm)
-    found = rebuilt_tools({name.removeprefix(before): value for name, value in parameters.items()}, commands)
+    tools = rebuilt_tools({name.removeprefix(before): value for name, value in parameters.items()}, commands)
     expected = rigid_tools(request.arm, request.values, commands)
-    apart = float(np.abs(found - expected).max())
+    apart = float(np.abs(tools - expected).max())
     allowed = TOLERANCE * max(1.0, float(np.abs(expected).max()), float(np.abs(commands).max(initial=0.0)))
     if not apart <= allowed:
         raise ProblemError(f"what reads back is {apart:.3g} m or 1 off the calibrated arm.", hint=_REPORT)

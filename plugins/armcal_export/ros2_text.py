@@ -42,13 +42,13 @@ def read_ros2(text: str) -> dict[str, dict[str, Value]]:
         ValueError: ROS 2 would not take it.
     """
     root = yaml.compose(text, Loader=yaml.SafeLoader)
-    found: dict[str, dict[str, Value]] = {}
+    nodes: dict[str, dict[str, Value]] = {}
     for node, content in _entries(root, "the file"):
         held = dict(_entries(content, node))
         if list(held) != ["ros__parameters"]:
             raise ValueError(f"{node} holds {', '.join(held) or 'nothing'}, expected ros__parameters")
-        found[node] = dict(_flat(held["ros__parameters"], ""))
-    return found
+        nodes[node] = dict(_flat(held["ros__parameters"], ""))
+    return nodes
 
 
 def _lines(tree: Mapping[str, Any], depth: int) -> list[str]:
@@ -58,7 +58,7 @@ def _lines(tree: Mapping[str, Any], depth: int) -> list[str]:
         if isinstance(value, dict):
             texts += [start, *_lines(value, depth + 1)]
         elif isinstance(value, list):
-            texts.append(f"{start} [{', '.join(_scalar(each) for each in value)}]")
+            texts.append(f"{start} [{', '.join(_scalar(item) for item in value)}]")
         else:
             texts.append(f"{start} {_scalar(value)}")
     return texts
@@ -83,7 +83,13 @@ def _scalar(value: bool | int | float | str) -> str:
 
 
 def _quoted(text: str) -> str:
-    return '"' + "".join(_ESCAPES.get(each, each if each.isprintable() else _unicode(each)) for each in text) + '"'
+    return (
+        '"'
+        + "".join(
+            _ESCAPES.get(character, character if character.isprintable() else _unicode(character)) for character in text
+        )
+        + '"'
+    )
 
 
 def _unicode(character: str) -> str:
@@ -100,22 +106,22 @@ def _entries(node: Any, what: str) -> list[tuple[str, Any]]:
 
 
 def _flat(node: Any, above: str) -> list[tuple[str, Value]]:
-    found: list[tuple[str, Value]] = []
+    entries: list[tuple[str, Value]] = []
     for key, value in _entries(node, above or "ros__parameters"):
         name = f"{above}.{key}" if above else key
         if isinstance(value, yaml.MappingNode):
-            found += _flat(value, name)
+            entries += _flat(value, name)
         elif isinstance(value, yaml.SequenceNode):
-            found.append((name, _list(value, name)))
+            entries.append((name, _list(value, name)))
         else:
-            found.append((name, _typed(value, name)))
-    return found
+            entries.append((name, _typed(value, name)))
+    return entries
 
 
 def _list(node: Any, name: str) -> Any:
-    if any(not isinstance(each, yaml.ScalarNode) for each in node.value):
+    if any(not isinstance(item, yaml.ScalarNode) for item in node.value):
         raise ValueError(f"{name} is a list of lists or of mappings")
-    entries = [_typed(each, name) for each in node.value]
+    entries = [_typed(item, name) for item in node.value]
     if len({type(entry) for entry in entries}) != 1:
         raise ValueError(f"{name} is an empty list, or one of several types")
     return entries

@@ -60,13 +60,13 @@ def _numbers(effect: str, spring: Spring, chain: Chain) -> SpringNumbers:
     given = ca.densify(ca.SX(spring.law(load, command)))
     law = ca.Function("law", [load, recorded], [given, ca.densify(ca.jacobian(given, load))])
     compliance = np.asarray(law(np.zeros(spring.size), _COMMANDS[0])[1].full())
-    linear = all(_follows(law, compliance, size, told) for size in _LOADS for told in _COMMANDS)
+    linear = all(_follows(law, compliance, size, at) for size in _LOADS for at in _COMMANDS)
     return SpringNumbers(
         effect, spring.site, axes, own and joint is not None and not joint.is_revolute, own, compliance, linear
     )
 
 
-def _follows(law: ca.Function, compliance: Array, size: float, told: tuple[float, float]) -> bool:
+def _follows(law: ca.Function, compliance: Array, size: float, command: tuple[float, float]) -> bool:
     load = size * np.arange(1.0, compliance.shape[0] + 1)
-    given = np.asarray(law(load, told)[0].full()).ravel()
+    given = np.asarray(law(load, command)[0].full()).ravel()
     return bool(np.allclose(given, compliance @ load, rtol=_LINEAR, atol=_LINEAR * float(np.abs(compliance).max())))

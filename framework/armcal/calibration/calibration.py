@@ -194,14 +194,14 @@ class Calibration:
         self.require_payload(commands.has("payload"), commands.source)
         return predict(self.system, self.parameters, commands)
 
-    def require_payload(self, told: bool, source: str | None = None) -> None:
+    def require_payload(self, stated: bool, source: str | None = None) -> None:
         """An elastic arm needs to know what hangs on its tool, if not from the calibration then from the records.
 
         Raises:
             DataError: neither says.
         """
         elastic = any(arm.deflection_size for arm in self.system.arms.values())
-        if elastic and self.system.statics.payload is None and not told:
+        if elastic and self.system.statics.payload is None and not stated:
             raise DataError(
                 "the arm is elastic and its payload is not stated.",
                 where=Location(source or None),
@@ -231,7 +231,7 @@ class Calibration:
             )
         fitted = self.parameters.with_nominal(np.array([entry.nominal for entry in entries])).with_free(free)
         try:
-            components = tuple(_component(each) for each in noise.get("components", ()))
+            components = tuple(_component(component) for component in noise.get("components", ()))
             measure = (float(noise["scale"]), float(noise["degrees_of_freedom"]))
         except (KeyError, TypeError, ValueError) as fault:
             text = f"the noise in the calibration cannot be read ({type(fault).__name__}: {fault})."
@@ -305,13 +305,13 @@ class Calibration:
         arm: str | None = None,
         options: Options | None = None,
         point: Point = "tool",
-        **told: Any,
+        **recorded: Any,
     ) -> Commands:
         """What to command so that the tool is at positions (N x 3; m; base frame), turned as base_R_tool (N x 3 x 3).
 
         With the ``point`` ``target`` the target that was measured arrives there, in place of the tool frame's origin.
 
-        ``start`` (n or N x n; rad or m) is where the arm comes from, ``told`` the rest of ``Compensator.targets``:
+        ``start`` (n or N x n; rad or m) is where the arm comes from, ``recorded`` the rest of ``Compensator.targets``:
         payload, gravity, approach, conditions of the surroundings. Who asks often keeps a ``compensator``.
 
         Raises:
@@ -319,9 +319,9 @@ class Calibration:
             DataError: the arm is elastic and nothing says what hangs on the tool.
             ConfigError: no measurement reads the target that shall arrive.
         """
-        self.require_payload(told.get("payload") is not None)
-        compensator = self.compensator(arm, options, tuple(told.get("conditions") or ()), point)
-        return compensator.solve(compensator.targets(positions, rotations, **told), start)
+        self.require_payload(recorded.get("payload") is not None)
+        compensator = self.compensator(arm, options, tuple(recorded.get("conditions") or ()), point)
+        return compensator.solve(compensator.targets(positions, rotations, **recorded), start)
 
     def _named(self, arm: str | None) -> str:
         name = arm or next(iter(self.system.arms))

@@ -148,8 +148,8 @@ def read_record(path: str | Path, changed: bool = False) -> tuple[ConfigSource, 
     def look(text: str) -> None:
         states.append(_seal(text))
         if states == ["broken"] and not changed:
-            found = "its content is not what armcal wrote: it was edited or damaged."
-            raise ConfigError(found, where=Location(str(path)), hint=_CHANGED_HINT)
+            reason = "its content is not what armcal wrote: it was edited or damaged."
+            raise ConfigError(reason, where=Location(str(path)), hint=_CHANGED_HINT)
 
     source = load_config(path, check=look)
     schema = source.data.get("armcal_calibration")
@@ -170,8 +170,8 @@ def read_record(path: str | Path, changed: bool = False) -> tuple[ConfigSource, 
 
 def _seal(text: str) -> _Seal:
     """What a text's last line is; line ends may have become those of another system."""
-    above, found, kept = text.replace("\r\n", "\n").rpartition(_LAST_LINE)
-    if not found:
+    above, marker, kept = text.replace("\r\n", "\n").rpartition(_LAST_LINE)
+    if not marker:
         return "absent"
     return "whole" if kept == f"{_hash(above)}\n" else "broken"
 

@@ -64,13 +64,13 @@ def load_source(path: str | Path, arm: str | None, registry: PluginRegistry) -> 
     name = _named(source, arm)
     if "armcal_calibration" in source.data:
         loaded = Calibration.load(path, registry)
-        found = loaded.system.arms[name]
-        scope, values = f"{name}.{found.model_name}.", loaded.parameters.nominal()
+        source_arm = loaded.system.arms[name]
+        scope, values = f"{name}.{source_arm.model_name}.", loaded.parameters.nominal()
         blocks = [block for block in loaded.parameters.blocks if block.name.startswith(scope)]
         own = {b.name.removeprefix(scope): values[loaded.parameters.entries_of(b.name)] for b in blocks}
-        return ConvertSource(name, *_told(source, name, found.model, own))
+        return ConvertSource(name, *_described(source, name, source_arm.model, own))
     model = build_component(source, registry, "model", ("arms", name, "model"))[0]
-    return ConvertSource(name, *_told(source, name, model, nominal_values(model)))
+    return ConvertSource(name, *_described(source, name, model, nominal_values(model)))
 
 
 def nominal_values(model: ArmModel) -> dict[str, Array]:
@@ -124,7 +124,7 @@ def _named(source: ConfigSource, arm: str | None) -> str:
     return name
 
 
-def _told(
+def _described(
     source: ConfigSource, name: str, model: ArmModel, values: Mapping[str, Array]
 ) -> tuple[Chain, tuple[str, ...]]:
     chain = numeric_chain(model, values)

@@ -68,8 +68,8 @@ def _bounds(joint: RigidJoint) -> Iterator[str]:
     elif joint.slides:
         yield f'    <limit effort="{UNKNOWN}" velocity="{UNKNOWN}"/>'
     if joint.mimic is not None:
-        told = (f'{key}="{getattr(joint.mimic, key)!r}"' for key in ("multiplier", "offset"))
-        yield f"    <mimic joint={_attribute(joint.mimic.master)} {' '.join(told)}/>"
+        numbers = (f'{key}="{getattr(joint.mimic, key)!r}"' for key in ("multiplier", "offset"))
+        yield f"    <mimic joint={_attribute(joint.mimic.master)} {' '.join(numbers)}/>"
 
 
 def _unused(name: str, chain: RigidChain) -> str:

@@ -88,8 +88,8 @@ class ExportRequest:
     def digest(self) -> str:
         """SHA-256 of the arm's description and of its calibrated values, by which an export is known again."""
         numbers = {name: [float(x) for x in value] for name, value in {**self.values, **self.tilt}.items()}
-        told = {"arm": self.origin.identity.get("arm", ""), "name": self.name, "values": numbers}
-        return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()
+        content = {"arm": self.origin.identity.get("arm", ""), "name": self.name, "values": numbers}
+        return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
 @dataclass(frozen=True)
@@ -175,8 +175,8 @@ def rigid_tools(arm: Arm, values: Mapping[str, Array], commands: Array) -> Array
     moved = arm.joint_commands(ca.vertsplit(sx))
     frames = forward(chain, [joint.offset + moved[i] for i, joint in enumerate(chain.joints)], {})
     function = ca.Function("tool", [sx], [ca.vec(ca.densify(frames.base_T_tool.matrix()))], {"cse": True})
-    found = np.asarray(function.map(commands.shape[1])(commands).full())
-    return found.T.reshape(-1, 4, 4).transpose(0, 2, 1)
+    tools = np.asarray(function.map(commands.shape[1])(commands).full())
+    return tools.T.reshape(-1, 4, 4).transpose(0, 2, 1)
 
 
 def effects_reach(calibration: Calibration, request: ExportRequest) -> float | None:

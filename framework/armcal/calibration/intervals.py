@@ -156,16 +156,16 @@ class Uncertainty:
             DataError: in the same recording, and the records do not say their place in it.
             NotConvergedError: a record has no equilibrium.
         """
-        told, commands = self.record.recording, self._with_predictions(commands)
+        recording_record, commands = self.record.recording, self._with_predictions(commands)
         problem = self._problem(commands)
         near = np.zeros(len(commands), dtype=bool)
-        if recording == "same" and told is not None:
-            near = self._near(told, commands)
+        if recording == "same" and recording_record is not None:
+            near = self._near(recording_record, commands)
         parts = [self._apart(problem, commands.subset(chunk), chunk) for chunk in _chunks(np.flatnonzero(~near))]
-        if told is not None and near.any():
-            recorded = _dataset(told)
+        if recording_record is not None and near.any():
+            recorded = _dataset(recording_record)
             along = chain(problem, recorded, commands.subset(np.flatnonzero(near)))
-            drift = self._told(told, recorded, along)
+            drift = self._known_drift(recording_record, recorded, along)
             for chunk in _chunks(np.flatnonzero(near)):
                 parts.append(self._within(problem, commands.subset(chunk), chunk, drift, along))
         return _joined(problem, parts, len(commands), self.record.stretches)
@@ -191,12 +191,12 @@ class Uncertainty:
     def _predictor(self, problem: Problem, drift: KnownDrift | None) -> Predictor:
         return Predictor(problem, self.values, self._covariance, self.noise_scale, self.freedom, drift)
 
-    def _told(self, told: RecordingRecord, dataset: Dataset, along: Chain | None) -> KnownDrift:
+    def _known_drift(self, recording: RecordingRecord, dataset: Dataset, along: Chain | None) -> KnownDrift:
         """The drift of the recording, told by its records, along a chain of places."""
         problem = self._problem(dataset)
         records = self._drifted(problem, dataset, along)
-        if told.weights:
-            records = problem.weighted(records, [np.array(row) for row in told.weights])
+        if recording.weights:
+            records = problem.weighted(records, [np.array(row) for row in recording.weights])
         known_drift = KnownDrift.by(problem, self.values, records)
         if known_drift is None:
             raise TypeError("a recording is kept only where something drifts")
@@ -223,8 +223,8 @@ class Uncertainty:
 
     @cached_property
     def _drifting(self) -> Parameters:
-        told = self.record.recording
-        drifts = {} if told is None else told.drifts
+        recording = self.record.recording
+        drifts = {} if recording is None else recording.drifts
         return self.parameters.replaced(
             {n: replace(self.parameters[n], drift=Drift(d.sd, d.over, d.channel)) for n, d in drifts.items()}
         )
@@ -246,11 +246,11 @@ class Uncertainty:
         variance_components = VarianceComponents(self.components, (), (), 0.0)
         return apply_components(problem, self.values, records, variance_components, axes)
 
-    def _near(self, told: RecordingRecord, commands: Dataset) -> Array:
+    def _near(self, recording: RecordingRecord, commands: Dataset) -> Array:
         """Whether the recording says anything of each record's drift (N)."""
         near = np.ones(len(commands), dtype=bool)
-        recorded = _dataset(told)
-        for name, drift in told.drifts.items():
+        recorded = _dataset(recording)
+        for name, drift in recording.drifts.items():
             if not commands.has(drift.channel):
                 raise DataError(
                     f"{name} drifts over {drift.channel}, and the poses do not say theirs.",
@@ -318,10 +318,10 @@ def _chunks(places: Indices) -> list[Indices]:
     return [places[start : start + _AT_ONCE] for start in range(0, len(places), _AT_ONCE)]
 
 
-def _dataset(told: RecordingRecord) -> Dataset:
-    rows = np.array(told.records, dtype=float).reshape(len(told.records), len(told.channels))
+def _dataset(recording: RecordingRecord) -> Dataset:
+    rows = np.array(recording.records, dtype=float).reshape(len(recording.records), len(recording.channels))
     return Dataset(
         tuple(str(i) for i in range(1, len(rows) + 1)),
-        {name: np.ascontiguousarray(column) for name, column in zip(told.channels, rows.T, strict=True)},
+        {name: np.ascontiguousarray(column) for name, column in zip(recording.channels, rows.T, strict=True)},
         source="the recording that the calibration keeps",
     )

@@ -154,19 +154,19 @@ def absent(kept: tuple[ComponentRecord, ...], registry: PluginRegistry) -> Compo
 
 def differences(kept: tuple[ComponentRecord, ...], now: tuple[ComponentRecord, ...]) -> list[str]:
     """What is another than it was, a phrase each: versions, and sources of the same version."""
-    found: dict[str, None] = {}
+    texts: dict[str, None] = {}
     present = {(component_record.kind, component_record.name): component_record for component_record in now}
     for old in kept:
         new = present.get((old.kind, old.name))
         if new is None or new == old:
             continue
         if (old.distribution, old.version) != (new.distribution, new.version):
-            found[f"{_release(old)}, now {_release(new)}"] = None
+            texts[f"{_release(old)}, now {_release(new)}"] = None
         elif old.kind == "core":
-            found[f"the mechanics of {_release(old)}, now with another source"] = None
+            texts[f"the mechanics of {_release(old)}, now with another source"] = None
         else:
-            found[f"the {old.kind} {old.name} of {_release(old)}, now with another source"] = None
-    return list(found)
+            texts[f"the {old.kind} {old.name} of {_release(old)}, now with another source"] = None
+    return list(texts)
 
 
 def check_poses(system: System, dataset: Dataset, candidates: Indices) -> Dataset | None:
@@ -251,8 +251,8 @@ def _source(module: str) -> str:
     path, digest = Path(file), hashlib.sha256()
     try:
         packaged = getattr(loaded, "__package__", "") not in ("", plugin_files.__name__)
-        for each in sorted(path.parent.glob("*.py")) if packaged else [path]:
-            digest.update(f"{each.name}\0".encode() + each.read_bytes() + b"\0")
+        for module_file in sorted(path.parent.glob("*.py")) if packaged else [path]:
+            digest.update(f"{module_file.name}\0".encode() + module_file.read_bytes() + b"\0")
     except OSError:
         return ""
     return digest.hexdigest()[:16]

@@ -171,21 +171,21 @@ def _free(joint: RigidJoint) -> tuple[float, float]:
 
 def _rigid(joint: Joint, placed: Array) -> RigidJoint:
     """A joint whose frame, offset included, stands here; the frame is shifted onto an axis that lies beside it."""
-    told = (joint.limits, joint.endless, joint.mimic)
+    facts = (joint.limits, joint.endless, joint.mimic)
     if joint.twist is None:
         axis = np.array(joint.axis) / np.linalg.norm(joint.axis)
-        return RigidJoint(joint.name, placed, axis, not joint.is_revolute, 0.0, 1.0, *told)
+        return RigidJoint(joint.name, placed, axis, not joint.is_revolute, 0.0, 1.0, *facts)
     angular, linear = (_numbers(part).ravel() for part in joint.twist)
     if not joint.is_revolute:
         scale = float(np.linalg.norm(linear))
         return RigidJoint(
-            joint.name, placed, linear / scale, True, float(np.linalg.norm(angular)) / scale, scale, *told
+            joint.name, placed, linear / scale, True, float(np.linalg.norm(angular)) / scale, scale, *facts
         )
     scale = float(np.linalg.norm(angular))
     beside = np.eye(4)
     beside[:3, 3] = np.cross(angular, linear) / scale**2
     pitch = float(angular @ linear) / scale**2
-    return RigidJoint(joint.name, placed @ beside, angular / scale, False, pitch, scale, *told)
+    return RigidJoint(joint.name, placed @ beside, angular / scale, False, pitch, scale, *facts)
 
 
 def _pose(transform: Transform) -> Array:

@@ -98,12 +98,16 @@ def _content(experiment: Experiment, ready: Prepared, triangle: Array, known: Id
         "scaled_condition": known.condition if np.isfinite(known.condition) else None,
         "observability_of_the_determined": indices,
         "undetermined": [
-            {**_told(undetermined.combination), "cause": undetermined.cause, "priors": list(undetermined.priors)}
+            {
+                **_combination_content(undetermined.combination),
+                "cause": undetermined.cause,
+                "priors": list(undetermined.priors),
+            }
             for undetermined in explained
         ],
-        "held_by_nothing": [_told(combination) for combination in held_by_nothing(parameters, known)],
+        "held_by_nothing": [_combination_content(combination) for combination in held_by_nothing(parameters, known)],
         "hardly_determined": [
-            {**_told(combination), "sd_ordinary_sizes": _finite(sd)} for combination, sd in known.hardly
+            {**_combination_content(combination), "sd_ordinary_sizes": _finite(sd)} for combination, sd in known.hardly
         ],
         "correlated": [
             {"one": one, "other": other, "correlation": r}
@@ -114,7 +118,7 @@ def _content(experiment: Experiment, ready: Prepared, triangle: Array, known: Id
     }
 
 
-def _told(combination: Combination) -> dict[str, Any]:
+def _combination_content(combination: Combination) -> dict[str, Any]:
     return {
         "text": str(combination),
         "terms": [
@@ -138,7 +142,7 @@ def _minimal_content(minimal: MinimalSet) -> dict[str, Any]:
 
 
 def _dropped(dropped: Dropped) -> dict[str, Any]:
-    return {"name": dropped.name, "effect_left": dropped.left, **_told(dropped.absorbed_by)}
+    return {"name": dropped.name, "effect_left": dropped.left, **_combination_content(dropped.absorbed_by)}
 
 
 def _show(console: Console, content: dict[str, Any]) -> None:

@@ -229,9 +229,9 @@ def collected(
     result: dict[Recording, LargeErrors] = {}
     for split, large_errors in zip(splits, residuals, strict=True):
         for name, own in large_errors.items():
-            whole = result.setdefault(name, tuple(np.full((len(each), count), np.nan) for each in own))
-            for mine, each in zip(whole, own, strict=True):
-                mine[:, split.holdout] = each
+            whole = result.setdefault(name, tuple(np.full((len(rows), count), np.nan) for rows in own))
+            for mine, rows in zip(whole, own, strict=True):
+                mine[:, split.holdout] = rows
     return result
 
 

@@ -66,12 +66,12 @@ def moved_findings(moved: Sequence[Moved]) -> list[Finding]:
     return [
         Finding(
             "warning",
-            f"{each.key}: its first {each.before} records lie {each.distance * _MM:.1f} mm from the other {each.after}"
-            f", {each.distance / each.scatter:.0f} times as far as they scatter. Did it move, or the base?",
+            f"{group.key}: its first {group.before} records lie {group.distance * _MM:.1f} mm "
+            f"from the other {group.after}, {group.distance / group.scatter:.0f} times as far as they scatter. Did it move, or the base?",
             f"the best split in recorded order, limit {FAR:g} standard deviations",
             "Give the records before the move a label of their own, or leave them out.",
         )
-        for each in moved
+        for group in moved
     ]
 
 

@@ -165,8 +165,8 @@ def structure(
 
 def _alike(residual: Array, basis: Array, rows: FitRows, contest: Contest) -> TimeOrPose:
     time, pose = (smooth(residual, basis, rows.by_record, k) for k in (contest.time, contest.pose))
-    left = (left_out(each, residual, basis, rows.by_record) for each in (time, pose))
-    time_mm, pose_mm = (rows.mean_error(each) * _MM for each in left)
+    left = (left_out(one, residual, basis, rows.by_record) for one in (time, pose))
+    time_mm, pose_mm = (rows.mean_error(one) * _MM for one in left)
     return TimeOrPose(
         time.evidence,
         pose.evidence,
@@ -245,12 +245,12 @@ def _search(rows: FitRows, fit: Fit, contest: Contest, modelled: frozenset[str])
     return _Search(tuple(structures), tuple(settled), bool(np.any(test.adjusted <= LEVEL)), first, test, tested)
 
 
-def _settled(contest: Contest, found: Mapping[int, float], worth: float) -> dict[int, tuple[float, Odds]]:
+def _settled(contest: Contest, falls: Mapping[int, float], worth: float) -> dict[int, tuple[float, Odds]]:
     """Causes with p-values and odds, each beside the others: the likeliest in its place, none that chance beats.
 
     Something is significant in one of twenty recordings of nothing but noise; odds say which of them are chance.
     """
-    settled, p_values = list(found), list(found.values())
+    settled, p_values = list(falls), list(falls.values())
     for _ in range(len(settled)):
         before = list(settled)
         for place in range(len(settled)):
@@ -258,7 +258,7 @@ def _settled(contest: Contest, found: Mapping[int, float], worth: float) -> dict
             settled[place] = contest.likeliest(others, worth)
         if settled == before:
             break
-    odds = [contest.odds(each, [o for o in settled if o != each], worth) for each in settled]
+    odds = [contest.odds(cause, [o for o in settled if o != cause], worth) for cause in settled]
     whole = {i: (p, odd) for i, p, odd in zip(settled, p_values, odds, strict=True)}
     least = max(whole, key=lambda i: whole[i][1].chance, default=None)
     if least is None or whole[least][1].chance <= _LIKELIER:

@@ -49,13 +49,13 @@ class Smooth:
 class Kernels:
     """Correlations of records (N x N each), one a length scale, and their features (N x r each)."""
 
-    each: tuple[Array, ...]
+    kernels: tuple[Array, ...]
 
     @cached_property
     def features(self) -> tuple[Array, ...]:
         """So that features times their transposes are the kernels, but for their smallest parts."""
         features = []
-        for kernel in self.each:
+        for kernel in self.kernels:
             values, vectors = np.linalg.eigh(kernel)
             kept = values > _SMALLEST * values[-1]
             features.append(np.asarray(vectors[:, kept] * np.sqrt(values[kept]))[:, ::-1])
@@ -65,7 +65,7 @@ class Kernels:
         """Which share of a function (N x n_r) they predict of a record from the others."""
         centred = function - function.mean(axis=0)
         total, shares = float(np.sum(centred**2)), [0.0]
-        for kernel in self.each if total > 0 else ():
+        for kernel in self.kernels if total > 0 else ():
             inverse = np.linalg.inv(kernel + _RIDGE * np.eye(len(kernel)))
             left = inverse @ centred / np.diag(inverse)[:, None]
             shares.append(1 - float(np.sum(left**2)) / total)
@@ -93,7 +93,7 @@ def pose_kernels(problem: Problem, dataset: Dataset) -> Kernels:
     whole = np.sum(squares, axis=0)
     powers = [np.sum([np.exp(-i * square / 2) for square in squares], axis=0) for i in (1, 2, 3)]
     sums = [powers[0], powers[0] ** 2 - powers[1], powers[0] ** 3 - 3 * powers[0] * powers[1] + 2 * powers[2]]
-    own = [each / each[0, 0] for each in sums[: len(squares)]]
+    own = [kernel / kernel[0, 0] for kernel in sums[: len(squares)]]
     return Kernels((*(np.exp(-whole / (2 * length**2)) for length in _POSE_LENGTHS), *own))
 
 

@@ -161,8 +161,8 @@ class Experiment:
     def request(self, *, measured: bool) -> ReadRequest:
         """What a reader should look for; with ``measured`` the measured values are required."""
         system = self.system
-        wanted = requested_channels(system.arms, system.measurements, measured=measured)
-        return ReadRequest(system.arms, system.measurements, wanted)
+        channels = requested_channels(system.arms, system.measurements, measured=measured)
+        return ReadRequest(system.arms, system.measurements, channels)
 
     def provenance(self, dataset: Dataset) -> dict[str, Any]:
         """Where the numbers of a run on these records come from: files, hashes, versions."""

@@ -241,7 +241,7 @@ def _csv_text(result: StudyResult | TransferResult) -> str:
     payload = {"payload_g": dataset.column("payload") * 1000} if isinstance(result, TransferResult) else {}
     writer.writerow(["pose_id", "source_row", *payload, *columns])
     for i, record in enumerate(dataset.ids):
-        numbers = [*(each[i] for each in payload.values()), *(column[i] for column in columns.values())]
+        numbers = [*(numbers_of[i] for numbers_of in payload.values()), *(column[i] for column in columns.values())]
         row = dataset.rows[i] if dataset.rows else ""
         writer.writerow([record, row, *("" if not np.isfinite(x) else f"{x:.6f}" for x in numbers)])
     return text.getvalue()
