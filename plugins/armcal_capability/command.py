@@ -12,7 +12,6 @@ import click
 from armcal.base.config_text import as_json
 from armcal.cli.common import Console, command_line, overrides, speaking
 from armcal.io.folder import Reservation, reserved
-from armcal.plugins import discover
 from armcal.run.pipeline import Stopwatch
 from rich.box import SIMPLE_HEAD
 from rich.table import Table as ScreenTable
@@ -50,8 +49,7 @@ def capability(console: Console, source: Path, out: Path, settings: Path | None,
     watch = Stopwatch()
     kept = click.get_current_context().with_resource(reserved(out, OURS))
     import_module("matplotlib")  # if it is missing, the command ends now and not after the survey
-    registry = discover()
-    console.plugin_faults(registry)
+    registry = console.registry()
     task = load_task(source, settings, overrides, registry)
     with console.progress() as progress:
         with watch.stage("survey"):

@@ -9,9 +9,8 @@ import click
 
 from armcal.calibration.acceptance import accept as accepted
 from armcal.calibration.calibration_file import sealed
-from armcal.cli.common import Console, speaking
+from armcal.cli.common import FILE, Console, speaking
 from armcal.io.file_set import write_over
-from armcal.plugins import discover
 
 
 @click.group()
@@ -20,15 +19,14 @@ def calibration() -> None:
 
 
 @calibration.command()
-@click.argument("path", metavar="FILE", type=click.Path(path_type=Path))
+@click.argument("path", metavar="FILE", type=FILE)
 @speaking
 def accept(console: Console, path: Path) -> None:
     """Take FILE as it is, after it was edited by hand or is to be used with other versions of its plugins.
 
     All but its hash is checked again. The acceptance is noted in FILE, and every command that uses it says so.
     """
-    registry = discover()
-    console.plugin_faults(registry)
+    registry = console.registry()
     record = accepted(path, datetime.now(UTC).date().isoformat(), registry)
     if record.was_needed:
         write_over({path.resolve(): sealed(record.calibration.record.to_config()).encode()})
@@ -38,4 +36,4 @@ def accept(console: Console, path: Path) -> None:
         "it keeps no check poses" if moved is None else f"tools at its check poses moved by up to {moved:.3f} mm"
     )
     done = "accepted" if record.was_needed else "nothing to accept, it is as armcal wrote it"
-    console.out.print(f"{done}: {path} ({moved_text})", markup=False, soft_wrap=True)
+    console.line(f"{done}: {path} ({moved_text})")

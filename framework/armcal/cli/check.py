@@ -11,26 +11,24 @@ import click
 import numpy as np
 from rich.table import Table
 
-from armcal.cli.common import Console, overrides, speaking
+from armcal.cli.common import FILE, Console, data, overrides, speaking
 from armcal.cli.outlet import say
 from armcal.errors import ProblemError
 from armcal.estimate.identifiability import Identifiability
 from armcal.estimate.structure import identify, require_solvable
-from armcal.plugins import discover
 from armcal.run.data_checks import gravity_findings
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import Prepared, Stopwatch, assemble
 
 
 @click.command()
-@click.argument("config", type=click.Path(path_type=Path))
-@click.option("--data", type=click.Path(path_type=Path), help="A dataset to read instead of the configured one.")
+@click.argument("config", type=FILE)
+@data
 @overrides
 @speaking
 def check(console: Console, config: Path, data: Path | None, overrides: tuple[str, ...]) -> None:
     """Check CONFIG and its data without solving: counts, units, rank, excitation."""
-    registry = discover()
-    console.plugin_faults(registry)
+    registry = console.registry()
     experiment = Experiment.load(config, overrides, data, registry)
     ready = assemble(experiment, Stopwatch())
     start = ready.problem.parameters.nominal()
@@ -56,11 +54,8 @@ def check(console: Console, config: Path, data: Path | None, overrides: tuple[st
 
 
 def _content(experiment: Experiment, ready: Prepared, known: Identifiability) -> dict[str, Any]:
-    angles = {
-        f"{name}.{joint}": _excitation(ready, f"{name}.{joint}")
-        for name, arm in experiment.system.arms.items()
-        for joint in arm.commanded
-    }
+    channels = [f"{name}.{joint}" for name, arm in experiment.system.arms.items() for joint in arm.commanded]
+    angles = {channel: ready.dataset.column(channel)[ready.split.train] for channel in channels}
     every = ready.problem.parameters.with_free(ready.problem.parameters.names)
     return {
         "experiment": experiment.name,
@@ -79,14 +74,12 @@ def _content(experiment: Experiment, ready: Prepared, known: Identifiability) ->
             "undetermined": [str(combination) for combination in known.undetermined],
             "weakest": str(known.weakest) if len(known) else "",
         },
-        "excitation_rad_or_m": angles,
+        "excitation_rad_or_m": {
+            channel: {"min": float(values.min()), "max": float(values.max()), "levels": len(np.unique(values))}
+            for channel, values in angles.items()
+        },
         "warnings": list(ready.warnings),
     }
-
-
-def _excitation(ready: Prepared, channel: str) -> dict[str, float | int]:
-    values = ready.dataset.column(channel)[ready.split.train]
-    return {"min": float(values.min()), "max": float(values.max()), "levels": len(np.unique(values))}
 
 
 def _show(console: Console, experiment: Experiment, content: dict[str, Any]) -> None:
@@ -94,8 +87,7 @@ def _show(console: Console, experiment: Experiment, content: dict[str, Any]) -> 
     out.print(
         f"{experiment.name}: {records['used']} records ({records['train']} train, {records['holdout']} held out, "
         f"{len(records['set_aside'])} set aside), {content['equations']} equations for "
-        f"{len(parameters['free'])} free of {len(parameters['all'])} parameters.",
-        markup=False,
+        f"{len(parameters['free'])} free of {len(parameters['all'])} parameters."
     )
     table = Table(title="Excitation of the joints", title_justify="left")
     for column in ("joint", "from", "to", "levels"):
@@ -106,11 +98,10 @@ def _show(console: Console, experiment: Experiment, content: dict[str, Any]) -> 
     condition = parameters["scaled_condition"]
     out.print(
         f"rank {parameters['rank']} of {len(parameters['free'])}, scaled condition "
-        + (f"{condition:.3g}." if condition is not None else "infinite."),
-        markup=False,
+        + (f"{condition:.3g}." if condition is not None else "infinite.")
     )
     if parameters["weakest"]:
-        out.print(f"least determined: {parameters['weakest']}.", markup=False)
+        out.print(f"least determined: {parameters['weakest']}.")
     if console.verbose:
         for name in parameters["all"]:
-            out.print(f"  {'free ' if name in parameters['free'] else 'fixed'} {name}", markup=False)
+            out.print(f"  {'free ' if name in parameters['free'] else 'fixed'} {name}")

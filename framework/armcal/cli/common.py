@@ -19,9 +19,10 @@ from armcal.cli.console import Screen
 from armcal.errors import CalibrationWarning, DataError, Location
 from armcal.estimate.estimator import Progress, no_progress
 from armcal.io.parallel import parse_executor
-from armcal.plugins import PluginRegistry
+from armcal.plugins import PluginRegistry, discover
 
 F = TypeVar("F", bound=Callable[..., Any])
+FILE = click.Path(path_type=Path)
 _SAME_POINT_M = 1e-5
 
 
@@ -45,22 +46,28 @@ class Console:
 
     def warn(self, text: str) -> None:
         """One warning line."""
-        self.err.print(f"warning: {text}", style="yellow", markup=False, soft_wrap=True)
+        self.err.print(f"warning: {text}", style="yellow", soft_wrap=True)
 
     def detail(self, text: str) -> None:
         """Only with -v."""
         if self.verbose:
-            self.err.print(text, style="dim", markup=False, soft_wrap=True)
+            self.err.print(text, style="dim", soft_wrap=True)
 
     def result(self, content: Mapping[str, Any]) -> None:
         """The machine-readable result, with --json."""
         if self.json:
             click.echo(as_json(content))
 
-    def plugin_faults(self, registry: PluginRegistry) -> None:
-        """One line a broken plugin."""
+    def line(self, text: str, style: str = "") -> None:
+        """One line of the result, which the terminal may wrap."""
+        self.out.print(text, style=style, soft_wrap=True)
+
+    def registry(self) -> PluginRegistry:
+        """The plugins; one warning for each broken one."""
+        registry = discover()
         for plugin in registry.faults:
             self.warn(f"plugin {plugin.name} ({plugin.module}) is left out: {plugin.fault}")
+        return registry
 
     @contextmanager
     def telling_notices(self) -> Iterator[None]:
@@ -121,34 +128,27 @@ def speaking(command: F) -> F:
     return wrapped  # type: ignore[return-value]
 
 
-def overrides(command: F) -> F:
-    """The option --set."""
-    return click.option(
-        "--set", "overrides", multiple=True, metavar="KEY=VALUE", help="Change a configured value: --set a.b=value."
-    )(command)
-
-
-def accept(command: F) -> F:
-    """The option --accept."""
-    text = "Use a calibration whose recalibration found that it no longer holds."
-    return click.option("--accept", is_flag=True, help=text)(command)
-
-
-def point(command: F) -> F:
-    """The option --point; None where it is not given."""
-    text = "What arrives: the tool frame's origin, or the target that was measured [default: tool]."
-    return click.option("--point", type=click.Choice(get_args(Point)), help=text)(command)
-
-
-def parallel(command: F) -> F:
-    """The option --parallel, handed on as an executor."""
-    return click.option(
-        "--parallel",
-        default="auto",
-        metavar="N|BACKEND",
-        callback=lambda ctx, option, text: parse_executor(text),
-        help="Processes for independent fits: N, threading:N, dask:ADDRESS, ray [default: auto].",
-    )(command)
+overrides = click.option(
+    "--set", "overrides", multiple=True, metavar="KEY=VALUE", help="Change a configured value: --set a.b=value."
+)
+data = click.option("--data", type=FILE, help="A dataset to read instead of the configured one.")
+accept = click.option(
+    "--accept", is_flag=True, help="Use a calibration whose recalibration found that it no longer holds."
+)
+arm = click.option("--arm", metavar="NAME", help="Which arm, where there are several.")
+within = click.option("--within", type=FILE, help="A configuration whose plan has limits and clearance.")
+point = click.option(
+    "--point",
+    type=click.Choice(get_args(Point)),
+    help="What arrives: the tool frame's origin, or the target that was measured [default: tool].",
+)
+parallel = click.option(
+    "--parallel",
+    default="auto",
+    metavar="N|BACKEND",
+    callback=lambda ctx, option, text: parse_executor(text),
+    help="Processes for independent fits: N, threading:N, dask:ADDRESS, ray [default: auto].",
+)
 
 
 def spare_inputs(out: Path, *given: Path | None) -> None:

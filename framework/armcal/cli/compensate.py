@@ -14,9 +14,8 @@ from armcal.base.units import parse_quantity
 from armcal.calibration.calibration import Calibration
 from armcal.calibration.compensation.compensator import Compensator
 from armcal.calibration.compensation.request import Redundancy
-from armcal.cli.common import Console, accept, point, spare_inputs, speaking, warn_of_target
+from armcal.cli.common import FILE, Console, accept, arm, point, spare_inputs, speaking, warn_of_target, within
 from armcal.errors import InputError, Location
-from armcal.plugins import discover
 from armcal.run.compensate import Assessed, Bench, assess, summary, write_commands
 from armcal.run.target_file import TargetFile, check_units
 
@@ -25,11 +24,11 @@ _ARRIVES = {"tool": "by the tool frame's origin", "target": "by the measured tar
 
 
 @click.command()
-@click.argument("calibration", type=click.Path(path_type=Path))
-@click.option("--targets", required=True, type=click.Path(path_type=Path), help="A CSV of positions or poses.")
-@click.option("--out", required=True, type=click.Path(path_type=Path), help="The CSV to write.")
-@click.option("--arm", metavar="NAME", help="Which arm, where there are several.")
-@click.option("--within", type=click.Path(path_type=Path), help="A configuration whose plan has limits and clearance.")
+@click.argument("calibration", type=FILE)
+@click.option("--targets", required=True, type=FILE, help="A CSV of positions or poses.")
+@click.option("--out", required=True, type=FILE, help="The CSV to write.")
+@arm
+@within
 @click.option("--path", "kind", flag_value="path", help="The targets are a path: one after another, without jumps.")
 @click.option("--start", multiple=True, metavar="JOINT=ANGLE", help="Where the arm comes from: --start 'q1=10 deg'.")
 @click.option(
@@ -46,8 +45,7 @@ _ARRIVES = {"tool": "by the tool frame's origin", "target": "by the measured tar
 def compensate(console: Console, calibration: Path, targets: Path, out: Path, angles: str, **options: Any) -> None:
     """Find what to command so that the arm in CALIBRATION, as it really is, arrives at targets."""
     spare_inputs(out, calibration, targets, options["within"])
-    registry = discover()
-    console.plugin_faults(registry)
+    registry = console.registry()
     loaded = Calibration.load(calibration, registry, options["accept"])
     bench = Bench.of(
         loaded, options["arm"], options["within"], options["redundancy"], registry, options["point"] or "tool"
@@ -57,24 +55,18 @@ def compensate(console: Console, calibration: Path, targets: Path, out: Path, an
         console.warn(text)
     compensator = bench.compensator(file.targets)
     check_units(targets, file.targets, compensator.reach)
-    _warn_of_free_joints(console, compensator)
-    if options["point"] is None:
-        warn_of_target(console, "these commands bring", bench.target)
-    start = _start(options["start"], compensator)
-    if options["kind"] == "path":
-        commands = compensator.follow(file.targets, start)
-    else:
-        commands = compensator.solve(file.targets, start)
-    assessed = assess(loaded, compensator, bench.nominal(), file.targets, commands)
-    write_commands(out, compensator, file.targets, file.dataset, assessed, angles)
-    _tell(console, file, assessed, bench, out)
-
-
-def _warn_of_free_joints(console: Console, compensator: Compensator) -> None:
     limits = zip(compensator.joints, compensator.limits, strict=True)
     free = [joint for joint, ends in limits if not np.isfinite(ends).all()]
     if free:
         console.warn(f"no limits are known of {', '.join(free)}: commands may lie beyond them. Give --within CONFIG.")
+    if options["point"] is None:
+        warn_of_target(console, "these commands bring", bench.target)
+    start = _start(options["start"], compensator)
+    reach = compensator.follow if options["kind"] == "path" else compensator.solve
+    commands = reach(file.targets, start)
+    assessed = assess(loaded, compensator, bench.nominal(), file.targets, commands)
+    write_commands(out, compensator, file.targets, file.dataset, assessed, angles)
+    _show(console, file, assessed, bench, out)
 
 
 def _start(stated: Sequence[str], compensator: Compensator) -> Array | None:
@@ -98,7 +90,7 @@ def _start(stated: Sequence[str], compensator: Compensator) -> Array | None:
     return np.array(list(at.values()))
 
 
-def _tell(console: Console, file: TargetFile, assessed: Assessed, bench: Bench, out: Path) -> None:
+def _show(console: Console, file: TargetFile, assessed: Assessed, bench: Bench, out: Path) -> None:
     figures, commands = summary(assessed), assessed.commands
     missed = [
         {"id": name, "reason": reason, "nearest_mm": 1000 * float(distance) if np.isfinite(distance) else None}
@@ -126,13 +118,9 @@ def _tell(console: Console, file: TargetFile, assessed: Assessed, bench: Bench, 
         console.warn(f"{len(missed) - _SHOWN} more targets cannot be reached; the file says why")
     for cell in set_aside[:_SHOWN]:
         console.warn(f"row {cell['row']} is set aside: {cell['reason']}")
-    console.out.print(
-        f"{figures['reached']} of {figures['targets']} targets are reached, {_ARRIVES[bench.point]}: {out}",
-        markup=False,
-        soft_wrap=True,
-    )
+    console.line(f"{figures['reached']} of {figures['targets']} targets are reached, {_ARRIVES[bench.point]}: {out}")
     if figures["reached"]:
-        console.out.print(f"error {_accuracy(figures)}", markup=False, soft_wrap=True)
+        console.line(f"error {_accuracy(figures)}")
 
 
 def _accuracy(accuracy: Any) -> str:

@@ -14,19 +14,19 @@ from armcal.calibration.convert_mdh import Convention, mdh_section
 from armcal.calibration.convert_poe import poe_section
 from armcal.calibration.convert_urdf import urdf_text
 from armcal.calibration.rigid_chain import rigid_chain
-from armcal.cli.common import Console, speaking
+from armcal.cli.common import FILE, Console, arm, speaking
 from armcal.errors import ArmcalError, InputError, Location, PluginError
 from armcal.io.plain_files import check_output
-from armcal.plugins import PluginRegistry, discover
+from armcal.plugins import PluginRegistry
 
 LARGEST = 1e-9
 """m and rad: a conversion that is further off is not written."""
 
 
 @click.command()
-@click.argument("source", metavar="CONFIG_OR_CALIBRATION", type=click.Path(path_type=Path))
+@click.argument("source", metavar="CONFIG_OR_CALIBRATION", type=FILE)
 @click.option("--to", "target", required=True, type=click.Choice(["mdh", "poe", "urdf"]), help="The form to write.")
-@click.option("--arm", default=None, help="Which arm, where there are several.")
+@arm
 @click.option(
     "--convention",
     type=click.Choice(["standard", "craig"]),
@@ -34,29 +34,25 @@ LARGEST = 1e-9
     show_default=True,
     help="Of Denavit-Hartenberg rows.",
 )
-@click.option("--out", default=None, type=click.Path(path_type=Path), help="The file to write [default: print it].")
+@click.option("--out", default=None, type=FILE, help="The file to write [default: print it].")
 @speaking
 def convert(
-    console: Console,
-    source: Path,
-    target: str,
-    arm: str | None,
-    convention: Convention,
-    out: Path | None,
+    console: Console, source: Path, target: str, arm: str | None, convention: Convention, out: Path | None
 ) -> None:
     """Write the geometry of an arm in another form, if that is exact.
 
     Of a configuration the nominal geometry, of a calibration the calibrated one. What was written is read back and
     compared with the original over 10,000 random poses.
     """
-    registry = discover()
-    console.plugin_faults(registry)
+    registry = console.registry()
     convert_source = load_source(source, arm, registry)
-    text, section = _converted(convert_source, target, convention)
-    off = _compared(convert_source, section, target, registry)
-    _tell_left(console, convert_source, target, off)
-    apart = f"{off.position_m:.1e} m in position, {off.angle_rad:.1e} rad in angle"
-    said = f"largest difference over {off.poses} poses: {apart}"
+    text, section = _sections(convert_source, target, convention)
+    off = _verified(convert_source, section, target, registry)
+    _warn_of_what_is_left(console, convert_source, target, off)
+    said = (
+        f"largest difference over {off.poses} poses: "
+        f"{off.position_m:.1e} m in position, {off.angle_rad:.1e} rad in angle"
+    )
     content = {
         "arm": convert_source.arm,
         "to": target,
@@ -68,15 +64,22 @@ def convert(
         console.result({**content, "text": text})
         if not console.json:
             click.echo(text, nl=False)
-        console.err.print(said, markup=False, soft_wrap=True)
+        console.err.print(said, soft_wrap=True)
         return
-    _write(out, source, text)
+    if out.resolve() == source.resolve():
+        raise InputError("it is the file to convert itself.", where=Location(str(out)), hint="Give another --out.")
+    try:
+        check_output(out, InputError)
+        out.write_text(text, encoding="utf-8")
+    except OSError as fault:
+        reason = f"the file cannot be written ({fault.strerror})."
+        raise InputError(reason, where=Location(str(out)), hint="Give another --out.") from fault
     console.result({**content, "out": str(out)})
-    console.out.print(f"{convert_source.arm} as {target} written: {out}", markup=False, soft_wrap=True)
-    console.out.print(said, markup=False, soft_wrap=True)
+    console.line(f"{convert_source.arm} as {target} written: {out}")
+    console.line(said)
 
 
-def _converted(convert_source: ConvertSource, target: str, convention: Convention) -> tuple[str, str]:
+def _sections(convert_source: ConvertSource, target: str, convention: Convention) -> tuple[str, str]:
     """What to write, and the section ``model:`` that reads it."""
     chain = rigid_chain(convert_source.chain)
     if target == "urdf":
@@ -91,7 +94,7 @@ def _yaml(section: Mapping[str, Any]) -> str:
     return yaml.safe_dump({"model": section}, sort_keys=False, allow_unicode=True, width=110, default_flow_style=None)
 
 
-def _compared(convert_source: ConvertSource, section: str, target: str, registry: PluginRegistry) -> Difference:
+def _verified(convert_source: ConvertSource, section: str, target: str, registry: PluginRegistry) -> Difference:
     try:
         off = difference(convert_source.chain, reload(section, registry))
     except PluginError as fault:
@@ -106,7 +109,7 @@ def _compared(convert_source: ConvertSource, section: str, target: str, registry
     return off
 
 
-def _tell_left(console: Console, convert_source: ConvertSource, target: str, off: Difference) -> None:
+def _warn_of_what_is_left(console: Console, convert_source: ConvertSource, target: str, off: Difference) -> None:
     left = list(convert_source.left)
     known = [joint.name for joint in convert_source.chain.joints if joint.limits]
     if known and target != "urdf":
@@ -114,19 +117,7 @@ def _tell_left(console: Console, convert_source: ConvertSource, target: str, off
     if left and not off.same_mount:
         left.append("the mount, about which springs at the base deflect")
     if left:
-        console.err.print(f"not converted: {'; '.join(left)}", markup=False, soft_wrap=True)
+        console.err.print(f"not converted: {'; '.join(left)}", soft_wrap=True)
     unknown = [joint.name for joint in convert_source.chain.joints if not joint.is_revolute and not joint.limits]
     if target == "urdf" and unknown:
         console.warn(f"the travel of {', '.join(unknown)} is not known; the URDF states none.")
-
-
-def _write(out: Path, source: Path, text: str) -> None:
-    if out.resolve() == source.resolve():
-        raise InputError("it is the file to convert itself.", where=Location(str(out)), hint="Give another --out.")
-    try:
-        check_output(out, InputError)
-        out.write_text(text, encoding="utf-8")
-    except OSError as fault:
-        raise InputError(
-            f"the file cannot be written ({fault.strerror}).", where=Location(str(out)), hint="Give another --out."
-        ) from fault

@@ -9,19 +9,18 @@ import numpy as np
 
 from armcal.calibration.calibration import Calibration
 from armcal.calibration.measured_point import Point
-from armcal.cli.common import Console, accept, point, spare_inputs, speaking, warn_of_target
-from armcal.plugins import discover
+from armcal.cli.common import FILE, Console, accept, arm, point, spare_inputs, speaking, warn_of_target, within
 from armcal.run.compensate import Bench
 from armcal.run.correction_table import correction_table as made_table
 from armcal.run.correction_table import read_table_settings, write_table
 
 
 @click.command("correction-table")
-@click.argument("calibration", type=click.Path(path_type=Path))
-@click.option("--grid", required=True, type=click.Path(path_type=Path), help="A YAML file that describes the grid.")
-@click.option("--out", required=True, type=click.Path(path_type=Path), help="The CSV to write.")
-@click.option("--arm", metavar="NAME", help="Which arm, where there are several.")
-@click.option("--within", type=click.Path(path_type=Path), help="A configuration whose plan has limits and clearance.")
+@click.argument("calibration", type=FILE)
+@click.option("--grid", required=True, type=FILE, help="A YAML file that describes the grid.")
+@click.option("--out", required=True, type=FILE, help="The CSV to write.")
+@arm
+@within
 @point
 @accept
 @speaking
@@ -37,8 +36,7 @@ def correction_table(
 ) -> None:
     """Make a table of what to tell a controller that takes the arm in CALIBRATION for the nominal one."""
     spare_inputs(out, calibration, grid, within)
-    registry = discover()
-    console.plugin_faults(registry)
+    registry = console.registry()
     settings = read_table_settings(grid)
     loaded = Calibration.load(calibration, registry, accept)
     loaded.require_payload(settings.payload is not None)
@@ -48,7 +46,7 @@ def correction_table(
     table = made_table(bench.compensator(), bench.nominal(), settings)
     write_table(out, table)
     with_table, without = (1000 * column[np.isfinite(column)] for column in table.tried.T)
-    found = {
+    figures = {
         "nodes": table.reached.size,
         "reached": int(table.reached.sum()),
         "tried": len(table.tried),
@@ -57,12 +55,12 @@ def correction_table(
         "error_95_mm": float(np.percentile(with_table, 95)) if with_table.size else None,
         "nominal_error_mm": float(without.mean()) if without.size else None,
     }
-    console.result({**found, "point": bench.point, "out": str(out)})
-    console.out.print(f"{found['reached']} of {found['nodes']} nodes are reached: {out}", markup=False, soft_wrap=True)
+    console.result({**figures, "point": bench.point, "out": str(out)})
+    console.line(f"{figures['reached']} of {figures['nodes']} nodes are reached: {out}")
     if not with_table.size:
         console.warn("no cell has all its corners: nothing between the nodes could be tried")
         return
-    text = f"between nodes {found['error_mm']:.3g} mm (95 %: {found['error_95_mm']:.3g} mm)"
-    if found["nominal_error_mm"] is not None:
-        text += f", without the table {found['nominal_error_mm']:.3g} mm"
-    console.out.print(text, markup=False, soft_wrap=True)
+    text = f"between nodes {figures['error_mm']:.3g} mm (95 %: {figures['error_95_mm']:.3g} mm)"
+    if figures["nominal_error_mm"] is not None:
+        text += f", without the table {figures['nominal_error_mm']:.3g} mm"
+    console.line(text)

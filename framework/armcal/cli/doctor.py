@@ -30,7 +30,15 @@ def doctor(as_json: bool, quiet: bool, verbose: bool) -> None:
     if as_json:
         click.echo(json.dumps({"works": healthy, "findings": [f.as_dict() for f in findings]}, indent=2))
     elif not quiet:
-        click.echo(f"\n{_summary(findings)}")
+        warnings = sum(finding.state == "warning" for finding in findings)
+        text = "Everything works."
+        if not healthy:
+            text = "Arms cannot be calibrated here; mend what is marked FAIL."
+        elif warnings:
+            text = (
+                f"Arms can be calibrated here. {warnings} of the rest {'is' if warnings == 1 else 'are'} marked warn."
+            )
+        click.echo(f"\n{text}")
     if not healthy:
         broken = ", ".join(f.subject for f in findings if f.state == "fault")
         click.echo(f"armcal: arms cannot be calibrated here, see: {broken}.", err=True)
@@ -46,12 +54,3 @@ def _show(finding: Finding, begins: bool, quiet: bool, verbose: bool) -> None:
     click.echo(f"{mark} {finding.subject}: {finding.text}")
     if finding.hint and (verbose or finding.state != "note"):
         click.echo(f"     {finding.hint}")
-
-
-def _summary(findings: list[Finding]) -> str:
-    warnings = sum(finding.state == "warning" for finding in findings)
-    if not works(findings):
-        return "Arms cannot be calibrated here; mend what is marked FAIL."
-    if warnings:
-        return f"Arms can be calibrated here. {warnings} of the rest {'is' if warnings == 1 else 'are'} marked warn."
-    return "Everything works."

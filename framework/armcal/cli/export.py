@@ -8,21 +8,21 @@ import click
 
 from armcal.calibration.calibration import Calibration
 from armcal.calibration.exporter import POSES, Exported, Exporter, ExportRequest, effects_reach, request_of
-from armcal.cli.common import Console, accept, speaking
+from armcal.cli.common import FILE, Console, accept, arm, speaking
 from armcal.config.options import settings_from
 from armcal.errors import InputError, Location, PluginError
 from armcal.io.file_set import require_new, write_new, write_over
 from armcal.io.plain_files import check_output
-from armcal.plugins import PluginRegistry, discover
+from armcal.plugins import PluginRegistry
 
 _NOTHING_MM = 1e-6
 
 
 @click.command()
-@click.argument("calibration", type=click.Path(path_type=Path))
+@click.argument("calibration", type=FILE)
 @click.option("--format", "kind", required=True, metavar="NAME", help="The format: c, json, mujoco, ros2, urdf, yaml.")
-@click.option("--out", required=True, type=click.Path(path_type=Path), help="The file to write.")
-@click.option("--arm", metavar="NAME", help="Which arm, where there are several.")
+@click.option("--out", required=True, type=FILE, help="The file to write.")
+@arm
 @click.option("--option", "options", multiple=True, metavar="KEY=VALUE", help="A setting of the format: prefix=lrm.")
 @click.option("--force", is_flag=True, help="Overwrite files that are there.")
 @accept
@@ -41,18 +41,19 @@ def export(
 
     Some formats write further files beside --out. What a format cannot hold is told.
     """
-    registry = discover()
-    console.plugin_faults(registry)
+    registry = console.registry()
     exporter = _exporter(registry, kind, options)
     _check_place(out, calibration, force)
     loaded = Calibration.load(calibration, registry, accept)
     request = request_of(loaded, arm, out.name)
     exported = exporter.export(request)
-    reach = _reach(loaded, request, exported)
+    moved_m: float | None = 0.0  # by what is left out; None where the arm does not settle
+    if exported.left_out:
+        moved_m = effects_reach(loaded, request) if exported.reach is None else exported.reach
     files = _files(out, exported, calibration)
     new = {file: content for file, content in files.items() if not _holds(file, content)}
     (write_over if force else write_new)(new)
-    _tell(console, request, exported, reach, list(files), kind)
+    _show(console, request, exported, moved_m, list(files), kind)
 
 
 def _exporter(registry: PluginRegistry, kind: str, options: tuple[str, ...]) -> Exporter:
@@ -65,13 +66,6 @@ def _exporter(registry: PluginRegistry, kind: str, options: tuple[str, ...]) -> 
         raise
     exporter: Exporter = made(settings_from(made.Settings, options, "--option"))
     return exporter
-
-
-def _reach(loaded: Calibration, request: ExportRequest, exported: Exported) -> float | None:
-    """How far what is left out moves the tool (m); None where the arm does not settle."""
-    if not exported.left_out:
-        return 0.0
-    return effects_reach(loaded, request) if exported.reach is None else exported.reach
 
 
 def _check_place(out: Path, calibration: Path, force: bool) -> None:
@@ -115,10 +109,10 @@ def _holds(file: Path, content: bytes) -> bool:
         return False
 
 
-def _tell(
-    console: Console, request: ExportRequest, exported: Exported, reach: float | None, files: list[Path], kind: str
+def _show(
+    console: Console, request: ExportRequest, exported: Exported, moved_m: float | None, files: list[Path], kind: str
 ) -> None:
-    apart = None if reach is None else reach * 1000
+    apart = None if moved_m is None else moved_m * 1000
     console.result(
         {
             "out": str(files[0]),
@@ -132,17 +126,17 @@ def _tell(
         }
     )
     listed = ", ".join(str(file) for file in files)
-    console.out.print(f"{request.name}: {exported.changed} numbers changed: {listed}", markup=False, soft_wrap=True)
+    console.line(f"{request.name}: {exported.changed} numbers changed: {listed}")
     for remark in exported.remarks:
         console.warn(f"{remark}.")
     if exported.left_out:
-        words = "the calibrated arm does not settle in all poses" if apart is None else _up_to(apart)
+        if apart is None:
+            words = "the calibrated arm does not settle in all poses"
+        elif apart < _NOTHING_MM:  # rounding
+            words = "which does not move the tool"
+        else:
+            words = f"up to {apart:.3g} mm"
         console.warn(
             f"left out, a {kind} file cannot hold it: {', '.join(exported.left_out)} "
             f"({words}, in {POSES} random poses)."
         )
-
-
-def _up_to(apart_mm: float) -> str:
-    """In significant digits: a thousandth of a micrometre is rounding, and said as none."""
-    return f"up to {apart_mm:.3g} mm" if apart_mm >= _NOTHING_MM else "which does not move the tool"

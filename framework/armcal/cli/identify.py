@@ -9,23 +9,21 @@ import click
 import numpy as np
 
 from armcal.base.domains import Array
-from armcal.base.parameters import Parameters
-from armcal.cli.common import Console, overrides, speaking
+from armcal.cli.common import FILE, Console, data, overrides, speaking
 from armcal.diagnose.minimal import Dropped, MinimalSet, minimal_set
 from armcal.errors import ConfigError, Location
 from armcal.estimate.combination import Combination
 from armcal.estimate.identifiability import CORRELATED, Identifiability, correlated_pairs, expected_covariance
 from armcal.estimate.structure import CAUSES, explain, held_by_nothing, identify_from
 from armcal.planning.criterion import observability
-from armcal.plugins import discover
 from armcal.problem.projection import factor_at_zero
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import Prepared, Stopwatch, assemble
 
 
 @click.command()
-@click.argument("config", type=click.Path(path_type=Path))
-@click.option("--data", type=click.Path(path_type=Path), help="A dataset to read instead of the configured one.")
+@click.argument("config", type=FILE)
+@data
 @click.option("--minimal", is_flag=True, help="Also choose a minimal set of the free parameters.")
 @click.option("--prefer", multiple=True, metavar="GLOB", help="Keep these in the minimal set if possible; repeatable.")
 @click.option("--most", type=click.IntRange(min=0), help="Keep no more than so many in the minimal set.")
@@ -47,14 +45,19 @@ def identify(
     overrides: tuple[str, ...],
 ) -> None:
     """Tell which combinations of CONFIG's free parameters its poses determine. Refuses no rank, solves nothing."""
-    registry = discover()
-    console.plugin_faults(registry)
+    registry = console.registry()
     experiment = Experiment.load(config, overrides, data, registry)
     ready = assemble(experiment, Stopwatch())
     parameters = ready.problem.parameters
     if not parameters.free:
         raise ConfigError("no parameter is free.", where=Location(str(config)), hint="Name some under parameters.free.")
-    preferred = [_preferred(parameters, glob) for glob in prefer]
+    preferred = [parameters.select([glob]) for glob in prefer]
+    for glob, names in zip(prefer, preferred, strict=True):
+        if not any(parameters[name].free for name in names):
+            raise ConfigError(
+                f"--prefer {glob}: none of the parameters it names is free.",
+                hint="Name them under parameters.free as well; a minimal set is chosen from the free ones.",
+            )
     triangle = factor_at_zero(ready.problem, parameters.nominal(), ready.training)
     known = identify_from(triangle, parameters)
     content = _content(experiment, ready, triangle, known)
@@ -67,17 +70,6 @@ def identify(
     _show(console, content)
     if "minimal" in content:
         _show_minimal(console, content["minimal"])
-
-
-def _preferred(parameters: Parameters, glob: str) -> tuple[str, ...]:
-    names = parameters.select([glob])
-    free = {block.name for block in parameters.free}
-    if not free.intersection(names):
-        raise ConfigError(
-            f"--prefer {glob}: none of the parameters it names is free.",
-            hint="Name them under parameters.free as well; a minimal set is chosen from the free ones.",
-        )
-    return names
 
 
 def _content(experiment: Experiment, ready: Prepared, triangle: Array, known: Identifiability) -> dict[str, Any]:
@@ -98,16 +90,12 @@ def _content(experiment: Experiment, ready: Prepared, triangle: Array, known: Id
         "scaled_condition": known.condition if np.isfinite(known.condition) else None,
         "observability_of_the_determined": indices,
         "undetermined": [
-            {
-                **_combination_content(undetermined.combination),
-                "cause": undetermined.cause,
-                "priors": list(undetermined.priors),
-            }
+            {**_terms(undetermined.combination), "cause": undetermined.cause, "priors": list(undetermined.priors)}
             for undetermined in explained
         ],
-        "held_by_nothing": [_combination_content(combination) for combination in held_by_nothing(parameters, known)],
+        "held_by_nothing": [_terms(combination) for combination in held_by_nothing(parameters, known)],
         "hardly_determined": [
-            {**_combination_content(combination), "sd_ordinary_sizes": _finite(sd)} for combination, sd in known.hardly
+            {**_terms(combination), "sd_ordinary_sizes": _finite(sd)} for combination, sd in known.hardly
         ],
         "correlated": [
             {"one": one, "other": other, "correlation": r}
@@ -118,7 +106,7 @@ def _content(experiment: Experiment, ready: Prepared, triangle: Array, known: Id
     }
 
 
-def _combination_content(combination: Combination) -> dict[str, Any]:
+def _terms(combination: Combination) -> dict[str, Any]:
     return {
         "text": str(combination),
         "terms": [
@@ -142,25 +130,22 @@ def _minimal_content(minimal: MinimalSet) -> dict[str, Any]:
 
 
 def _dropped(dropped: Dropped) -> dict[str, Any]:
-    return {"name": dropped.name, "effect_left": dropped.left, **_combination_content(dropped.absorbed_by)}
+    return {"name": dropped.name, "effect_left": dropped.left, **_terms(dropped.absorbed_by)}
 
 
 def _show(console: Console, content: dict[str, Any]) -> None:
     free, rank = len(content["free"]), content["rank"]
     condition = content["scaled_condition"]
-    _line(
-        console,
+    console.line(
         f"{content['experiment']}: {content['records']} records, {content['equations']} equations, {free} free "
         f"parameters.",
     )
     by_qr = f" ({content['rank_by_qr']} by QR)" if content["rank_by_qr"] != rank else ""
     text = f", scaled condition {condition:.3g}" if condition is not None else ""
-    _line(console, f"rank {rank} of {free}{by_qr}{text}.")
+    console.line(f"rank {rank} of {free}{by_qr}{text}.")
     if content["observability_of_the_determined"]:
         shown = ", ".join(f"{n.upper()} {v:.3g}" for n, v in content["observability_of_the_determined"].items())
-        _line(
-            console, f"observability of {'them' if rank == free else f'the {rank} determined combinations'}: {shown}."
-        )
+        console.line(f"observability of {'them' if rank == free else f'the {rank} determined combinations'}: {shown}.")
     _show_undetermined(console, content)
     hardly = [
         f"{pair['text']}: sd {pair['sd_ordinary_sizes'] or np.inf:.3g} typical scales"
@@ -186,9 +171,9 @@ def _show_undetermined(console: Console, content: dict[str, Any]) -> None:
         _section(console, f"Undetermined, {words} ({len(determined)}):", determined)
     free = content["held_by_nothing"]
     if not content["undetermined"]:
-        _line(console, "No combination is undetermined.", "green")
+        console.line("No combination is undetermined.", "green")
     elif not free:
-        _line(console, "Priors hold every undetermined combination: what they say of it is all that will be known.")
+        console.line("Priors hold every undetermined combination: what they say of it is all that will be known.")
     else:
         _section(
             console,
@@ -207,17 +192,13 @@ def _show_minimal(console: Console, content: dict[str, Any]) -> None:
     _section(console, f"Left out as asked, though determined ({len(left_out)}):", left_out)
     within = sorted({name for name, sd in content["sd_ordinary_sizes"].items() if sd is None})
     _section(console, "Kept, and undetermined in part (these need priors):", within)
-    _line(console, f"A minimal set of {len(content['kept'])}:", "bold")
+    console.line(f"A minimal set of {len(content['kept'])}:", "bold")
     for text in ("parameters:", "  free:", *(f"    - {name}" for name in content["kept"])):
-        _line(console, text)
+        console.line(text)
 
 
 def _section(console: Console, title: str, lines: list[str]) -> None:
     if lines:
-        _line(console, title, "bold")
+        console.line(title, "bold")
         for text in lines:
-            _line(console, f"  {text}")
-
-
-def _line(console: Console, text: str, style: str = "") -> None:
-    console.out.print(text, style=style, markup=False, soft_wrap=True)
+            console.line(f"  {text}")

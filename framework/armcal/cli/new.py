@@ -7,8 +7,7 @@ from typing import Any
 
 import click
 
-from armcal.cli.common import Console, speaking
-from armcal.plugins import discover
+from armcal.cli.common import FILE, Console, speaking
 from armcal.scaffold.naming import plugin_name
 from armcal.scaffold.plugin_files import KINDS, write_plugin
 
@@ -22,12 +21,11 @@ def new() -> None:
 @click.argument("name")
 @click.option("--kind", required=True, type=click.Choice(KINDS), help="What it adds to armcal.")
 @click.option("--package", is_flag=True, help="To be installed by pip, in place of one file.")
-@click.option("--out", type=click.Path(path_type=Path), help="The folder to make [default: armcal-NAME].")
+@click.option("--out", type=FILE, help="The folder to make [default: armcal-NAME].")
 @speaking
 def new_plugin(console: Console, name: str, kind: str, package: bool, out: Path | None) -> None:
     """Write one file that adds a component called NAME, and a test of it: they work, and are yours to change."""
-    registry = discover()
-    console.plugin_faults(registry)
+    registry = console.registry()
     chosen = plugin_name(name, registry)
     folder = out or Path(f"armcal-{chosen.replace('_', '-')}")
     files = write_plugin(chosen, kind, folder, package)
@@ -42,18 +40,18 @@ def new_plugin(console: Console, name: str, kind: str, package: bool, out: Path 
         *(f"  {c}" for c in after),
     )
     for text in texts:
-        console.out.print(text, markup=False, soft_wrap=True)
+        console.line(text)
 
 
 @new.command("robot")
 @click.argument("name")
-@click.option("--dh", type=click.Path(path_type=Path), help="A CSV of Denavit-Hartenberg rows, units in its header.")
+@click.option("--dh", type=FILE, help="A CSV of Denavit-Hartenberg rows, units in its header.")
 @click.option("--convention", type=click.Choice(("standard", "modified")), help="Of the rows in --dh.")
-@click.option("--urdf", type=click.Path(path_type=Path), help="A URDF.")
+@click.option("--urdf", type=FILE, help="A URDF.")
 @click.option("--tip", metavar="LINK", help="The URDF's link at the arm's end, where there are several.")
 @click.option("--up", metavar="AXIS|X,Y,Z", help="Which way is up in the tracker's frame: z, -y, or three numbers.")
 @click.option("--target", metavar="X,Y,Z", help="Where the target sits in the tool's frame, roughly, in mm or as 2 cm.")
-@click.option("--out", type=click.Path(path_type=Path), help="The folder to make [default: NAME].")
+@click.option("--out", type=FILE, help="The folder to make [default: NAME].")
 @speaking
 def new_robot(console: Console, name: str, out: Path | None, **source: Any) -> None:
     """Write all that the robot NAME needs to be calibrated, and try it on simulated records.

@@ -10,7 +10,7 @@ from armcal.cli.common import Console, command_line
 from armcal.cli.outlet import say
 from armcal.cli.robot_questions import ask_rows, ask_target, ask_up, direction, place
 from armcal.errors import EXIT_FAULT, EXIT_NOT_CONVERGED, ConfigError
-from armcal.plugins import PluginRegistry, discover
+from armcal.plugins import PluginRegistry
 from armcal.scaffold.dh_table import read_rows
 from armcal.scaffold.naming import robot_name
 from armcal.scaffold.robot import Convention, Robot, robot_of_rows
@@ -35,9 +35,14 @@ class Source:
 
 def begin(console: Console, name: str, source: Source, folder: Path) -> None:
     """Write a robot's folder, calibrate its simulated records, and say how that went."""
-    registry = discover()
-    console.plugin_faults(registry)
-    robot = _measured(_upright(_robot(robot_name(name), source, registry), source.up), source.target)
+    registry = console.registry()
+    robot = _robot(robot_name(name), source, registry)
+    up, target = source.up, source.target
+    if up is None and robot.has_masses and sys.stdin.isatty():  # gravity bends the arm, and somebody is there to ask
+        up = ask_up()
+    if target is None and sys.stdin.isatty():
+        target = ask_target()
+    robot = replace(robot, up=direction(up) if up else robot.up, target=place(target) if target else robot.target)
     made = write_robot(robot, folder, registry)
     with console.progress() as progress:
         trial = try_out(made, registry, command_line(), progress)
@@ -67,20 +72,6 @@ def _robot(name: str, source: Source, registry: PluginRegistry) -> Robot:
     return robot_of_rows(name, CONVENTIONS[source.convention], read_rows(source.dh))
 
 
-def _upright(robot: Robot, up: str | None) -> Robot:
-    """With which way is up in the tracker's frame, asked where gravity bends the arm and somebody is there to ask."""
-    if up is None and robot.has_masses and sys.stdin.isatty():
-        up = ask_up()
-    return replace(robot, up=direction(up)) if up else robot
-
-
-def _measured(robot: Robot, target: str | None) -> Robot:
-    """With the target's place on the tool, asked where somebody is there to ask."""
-    if target is None and sys.stdin.isatty():
-        target = ask_target()
-    return replace(robot, target=place(target)) if target else robot
-
-
 def _show(console: Console, robot: Robot, made: RobotFolder, trial: Trial) -> None:
     content = {
         "robot": robot.name,
@@ -96,23 +87,16 @@ def _show(console: Console, robot: Robot, made: RobotFolder, trial: Trial) -> No
     console.result(content)
     for text in trial.result.warnings:
         console.warn(text)
-    _say(
-        console, f"{robot.name}: {len(robot.joints)} joints, {len(made.choice.kept)} free parameters, in {made.folder}"
-    )
+    console.line(f"{robot.name}: {len(robot.joints)} joints, {len(made.choice.kept)} free parameters, in {made.folder}")
     assumed = [joint.name for joint in robot.joints if joint.assumed]
     if assumed:
-        _say(console, f"limits were assumed for {', '.join(assumed)}: correct them in plan.yaml before the arm moves")
-    _say(
-        console,
+        console.line(f"limits were assumed for {', '.join(assumed)}: correct them in plan.yaml before the arm moves")
+    console.line(
         f"held-out tips of simulated records: nominal {trial.nominal_mm:.3f} mm, calibrated "
         f"{trial.calibrated_mm:.3f} mm (the noise alone: {trial.noise_mm:.3f} mm)",
     )
     findings = [f for f in trial.result.verdict.findings if f.grade in ("bad", "warning")]
     for finding in findings:
-        _say(console, f"{finding.grade}: {finding.text}")
-    _say(console, trial.result.verdict.headline)
-    _say(console, f"report: {trial.results / 'report.html'}; next: {made.folder / 'README.md'}")
-
-
-def _say(console: Console, text: str) -> None:
-    console.out.print(text, markup=False, soft_wrap=True)
+        console.line(f"{finding.grade}: {finding.text}")
+    console.line(trial.result.verdict.headline)
+    console.line(f"report: {trial.results / 'report.html'}; next: {made.folder / 'README.md'}")

@@ -12,29 +12,27 @@ import numpy as np
 from rich.table import Table
 
 from armcal.base.units import display_unit, to_unit
-from armcal.cli.common import Console, overrides, speaking
+from armcal.cli.common import FILE, Console, overrides, speaking
 from armcal.config.selection import DIMENSION_OF_UNIT
 from armcal.errors import ConfigError
 from armcal.measure.csv_writer import write_csv
 from armcal.planning.criterion import GOALS
-from armcal.plugins import discover
 from armcal.run.experiment import Experiment
 from armcal.run.plan import PlanResult, make_plan
 from armcal.run.plan_poses import counts_text
 from armcal.run.settings import PlanSettings
 
 _SHOWN = 8
-_FILE = click.Path(path_type=Path)
 
 
 @click.command()
-@click.argument("config", type=_FILE)
+@click.argument("config", type=FILE)
 @click.option("--poses", "count", type=click.IntRange(min=1), required=True, help="How many poses to plan.")
-@click.option("--out", required=True, type=_FILE, help="The CSV to write, in the order of visit.")
-@click.option("--data", type=_FILE, help="A dataset to choose from instead of the configured one.")
-@click.option("--candidates", type=_FILE, help="A CSV of poses to choose from.")
-@click.option("--given", type=_FILE, help="Records that are there already: a CSV of them, or of their ids.")
-@click.option("--calibration", type=_FILE, help="Plan about the values of this calibration.yaml.")
+@click.option("--out", required=True, type=FILE, help="The CSV to write, in the order of visit.")
+@click.option("--data", type=FILE, help="A dataset to choose from instead of the configured one.")
+@click.option("--candidates", type=FILE, help="A CSV of poses to choose from.")
+@click.option("--given", type=FILE, help="Records that are there already: a CSV of them, or of their ids.")
+@click.option("--calibration", type=FILE, help="Plan about the values of this calibration.yaml.")
 @click.option("--goal", type=click.Choice(GOALS), help="D, A, E, or O1 to O5 [default: D, or the configured one].")
 @click.option("--order", type=click.Choice(["travel", "torque", "none"]), help="Order of visit [default: travel].")
 @overrides
@@ -42,9 +40,10 @@ _FILE = click.Path(path_type=Path)
 def plan(console: Console, config: Path, count: int, out: Path, overrides: tuple[str, ...], **given: Any) -> None:
     """Choose the poses that determine the free parameters of CONFIG best, and say how good any could be."""
     began = time.perf_counter()
-    _check_out(out)
-    registry = discover()
-    console.plugin_faults(registry)
+    if out.is_dir() or not out.absolute().parent.is_dir():
+        text = "it is a directory" if out.is_dir() else "its directory is not there"
+        raise ConfigError(f"--out {out}: {text}.", hint="Give the path of a CSV in a directory that is there.")
+    registry = console.registry()
     chosen = [f"plan.{key}={given[key]}" for key in ("goal", "order") if given[key]]
     experiment = Experiment.load(config, (*overrides, *chosen), given["data"], registry)
     with console.progress() as progress:
@@ -55,12 +54,6 @@ def plan(console: Console, config: Path, count: int, out: Path, overrides: tuple
     for text in experiment.warnings:
         console.warn(text)
     _show(console, content)
-
-
-def _check_out(out: Path) -> None:
-    if out.is_dir() or not out.absolute().parent.is_dir():
-        text = "it is a directory" if out.is_dir() else "its directory is not there"
-        raise ConfigError(f"--out {out}: {text}.", hint="Give the path of a CSV in a directory that is there.")
 
 
 def _content(experiment: Experiment, result: PlanResult) -> dict[str, Any]:
@@ -118,30 +111,23 @@ def _show(console: Console, content: dict[str, Any]) -> None:
     given = f" after {content['given_records']} given records" if content["given_records"] else ""
     moved = f"; {pool['refined']} of the plan moved on from there" if pool["refined"] else ""
     kinds = {"continuous": "spread through joint space", "grid": "of a grid", "listed": "listed"}
-    out.print(
+    console.line(
         f"{content['experiment']}: {content['poses']} of {pool['count']} candidates "
         f"{kinds.get(pool['kind'], pool['kind'])}{left}{moved}{given}, goal {content['goal']}, for "
-        f"{len(content['parameters'])} parameters; {content['starts']} starts.",
-        markup=False,
-        soft_wrap=True,
+        f"{len(content['parameters'])} parameters; {content['starts']} starts."
     )
-    out.print(f"log determinant {content['log_det']:.4f}" + _goal_text(content), markup=False, soft_wrap=True)
-    out.print(_bound_text(content), markup=False, soft_wrap=True)
+    goal_value = "" if content["goal"] in ("D", "O1") else f", goal's value {content['value']:.6g}"
+    console.line(f"log determinant {content['log_det']:.4f}" + goal_value)
+    console.line(_bound_text(content))
     indices = "  ".join(f"{name.upper()} {value:.4g}" for name, value in content["observability"].items())
-    out.print(f"observability: {indices}", markup=False, soft_wrap=True)
+    console.line(f"observability: {indices}")
     out.print(_table(content["parameters"]))
-    out.print(f"least determined: {content['weakest']}.", markup=False, soft_wrap=True)
+    console.line(f"least determined: {content['weakest']}.")
     visit = content["visit"]
     hot = visit["peak_squared_torque"]
     heat_text = f", squared torque averaged over 5 poses at most {hot:.2f} of the largest" if hot is not None else ""
-    out.print(
-        f"visited by {visit['order']}: {visit['travel_s']:.0f} s on the way{heat_text}.", markup=False, soft_wrap=True
-    )
-    out.print(f"plan: {content['out']}  ({content['seconds']:.1f} s)", markup=False, soft_wrap=True)
-
-
-def _goal_text(content: dict[str, Any]) -> str:
-    return "" if content["goal"] in ("D", "O1") else f", goal's value {content['value']:.6g}"
+    console.line(f"visited by {visit['order']}: {visit['travel_s']:.0f} s on the way{heat_text}.")
+    console.line(f"plan: {content['out']}  ({content['seconds']:.1f} s)")
 
 
 def _bound_text(content: dict[str, Any]) -> str:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from armcal.errors import EXIT_BAD_INPUT, PluginError
-from armcal.plugins import Component, PluginInfo, PluginRegistry, discover
+from armcal.plugins import PluginInfo, PluginRegistry, discover
 
 if TYPE_CHECKING:
     from armcal.testing.results import CheckResult
@@ -33,19 +33,15 @@ def list_plugins(as_json: bool, quiet: bool, verbose: bool) -> None:
         click.echo(json.dumps(_content(registry), indent=2))
     else:
         for plugin in registry.plugins:
-            _show(plugin, registry, quiet, verbose)
-
-
-def _show(plugin: PluginInfo, registry: PluginRegistry, quiet: bool, verbose: bool) -> None:
-    if quiet:
-        click.echo(plugin.name)
-        return
-    click.echo(f"{plugin.name}  ({plugin.distribution} {plugin.version}, {plugin.module})")
-    if plugin.fault:
-        click.echo(f"  does not load: {plugin.fault}")
-    for component in registry.announced_by(plugin):
-        place = f"  [{component.target}]" if verbose else ""
-        click.echo(f"  {component.kind:<12} {component.name:<18} {component.summary}{place}")
+            if quiet:
+                click.echo(plugin.name)
+                continue
+            click.echo(f"{plugin.name}  ({plugin.distribution} {plugin.version}, {plugin.module})")
+            if plugin.fault:
+                click.echo(f"  does not load: {plugin.fault}")
+            for component in registry.announced_by(plugin):
+                place = f"  [{component.target}]" if verbose else ""
+                click.echo(f"  {component.kind:<12} {component.name:<18} {component.summary}{place}")
 
 
 def _content(registry: PluginRegistry) -> dict[str, Any]:
@@ -57,16 +53,14 @@ def _content(registry: PluginRegistry) -> dict[str, Any]:
                 "distribution": plugin.distribution,
                 "version": plugin.version,
                 "fault": plugin.fault or None,
-                "components": [_told(component) for component in registry.announced_by(plugin)],
+                "components": [
+                    {name: getattr(component, name) for name in ("kind", "name", "target", "summary")}
+                    for component in registry.announced_by(plugin)
+                ],
             }
             for plugin in registry.plugins
         ],
     }
-
-
-def _told(component: Component) -> dict[str, Any]:
-    names = ("kind", "name", "target", "summary")
-    return {name: getattr(component, name) for name in names}
 
 
 @dataclass(frozen=True)

@@ -18,22 +18,22 @@ from armcal.base.pose_settings import quaternion_of
 from armcal.base.units import DIMENSIONLESS, split_suffix, to_unit
 from armcal.calibration.calibration import Calibration
 from armcal.calibration.intervals import PlusMinus
-from armcal.cli.common import Console, accept, speaking
+from armcal.cli.common import FILE, Console, accept, speaking
 from armcal.errors import DataError, InputError, Location
 from armcal.io.plain_files import input_file
 from armcal.measure.csv_writer import column_names, write_csv
 from armcal.measure.environment import noticed
 from armcal.measure.reader import ReadRequest, RequestedChannel, requested_channels
-from armcal.plugins import PluginRegistry, discover
+from armcal.plugins import PluginRegistry
 
 _MOST_BYTES, _LONGEST_HEADER = 1 << 31, 1 << 20
 _RECORDINGS: Mapping[str, Literal["same", "new"]] = {"calibrated": "same", "new": "new"}
 
 
 @click.command()
-@click.argument("calibration", type=click.Path(path_type=Path))
-@click.option("--poses", required=True, type=click.Path(path_type=Path), help="A CSV of commanded joint angles.")
-@click.option("--out", required=True, type=click.Path(path_type=Path), help="The CSV to write.")
+@click.argument("calibration", type=FILE)
+@click.option("--poses", required=True, type=FILE, help="A CSV of commanded joint angles.")
+@click.option("--out", required=True, type=FILE, help="The CSV to write.")
 @click.option(
     "--recording",
     type=click.Choice(list(_RECORDINGS)),
@@ -48,12 +48,11 @@ def predict(
     console: Console, calibration: Path, poses: Path, out: Path, recording: str, columns: tuple[str, ...], accept: bool
 ) -> None:
     """Predict the tip of the arm in CALIBRATION for each row of commanded joint angles, and how far it may be off."""
-    registry = discover()
-    console.plugin_faults(registry)
+    registry = console.registry()
     loaded = Calibration.load(calibration, registry, accept)
     system = loaded.system
     commands = read_commands(registry, loaded, poses, columns)
-    _tell_missing(console, loaded, commands, recording)
+    _warn_of_missing(console, loaded, commands, recording)
     channels, placed = loaded.predict(commands)
     plus_minus = None
     if not loaded.readable:
@@ -73,10 +72,10 @@ def predict(
     shown = [channel for channel in requested if channel.channel in channels]
     extra, medians = (_columns(plus_minus, shown), _medians(plus_minus, shown)) if plus_minus else ({}, {})
     write_csv(out, replace(commands, channels=channels, extra=extra), shown)
-    _report(console, commands, out, recording, plus_minus, medians)
+    _show(console, commands, out, recording, plus_minus, medians)
 
 
-def _report(
+def _show(
     console: Console,
     commands: Dataset,
     out: Path,
@@ -84,31 +83,27 @@ def _report(
     plus_minus: PlusMinus | None,
     medians: Mapping[str, float],
 ) -> None:
+    typical = _typical(plus_minus)
     console.result(
         {
             "poses": len(commands),
             "set_aside": len(commands.set_aside),
             "out": str(out),
             "recording": recording,
-            **_typical(plus_minus),
+            **typical,
             "half_width_90": medians,
         }
     )
-    console.out.print(f"{len(commands)} poses predicted: {out}", markup=False)
-    _show_typical(console, _typical(plus_minus), medians)
-
-
-def _show_typical(console: Console, typical: Mapping[str, Any], medians: Mapping[str, float]) -> None:
-    """How far a prediction may be off in the median pose: of a position, else of every column."""
+    console.out.print(f"{len(commands)} poses predicted: {out}")
     text = ", ".join(f"{column} {half:.2g}" for column, half in medians.items())
-    if typical:
+    if typical:  # of a position; else of every column
         text = (
             f"{typical['half_width_90_mm']:.2f} mm a coordinate (90 %), {typical['radius_95_mm']:.2f} mm in all (95 %)"
         )
     elif text:
         text += " (90 %)"
     if text:
-        console.out.print(f"+- {text}, in the median pose", markup=False, soft_wrap=not typical)
+        console.out.print(f"+- {text}, in the median pose", soft_wrap=not typical)
 
 
 def _tools(placed: Array, arms: Sequence[str]) -> dict[str, Array]:
@@ -134,12 +129,12 @@ def read_commands(registry: PluginRegistry, loaded: Calibration, poses: Path, co
     arms = loaded.system.arms
     requested = requested_channels(arms, {}, measured=False)
     reader_class = registry.find("reader", "csv").load()
-    named = {**_kept(loaded, poses, requested), **_given(columns)}
+    named = {**_known_columns(loaded, poses, requested), **_named_columns(columns)}
     reader = reader_class(reader_class.Settings(path=ConfigText(str(poses)), columns=named))
     return noticed(reader.read(ReadRequest(arms, {}, requested)))
 
 
-def _kept(loaded: Calibration, poses: Path, requested: Sequence[RequestedChannel]) -> dict[str, str]:
+def _known_columns(loaded: Calibration, poses: Path, requested: Sequence[RequestedChannel]) -> dict[str, str]:
     """What the calibration's data called the columns that a prediction uses, as far as the file has them."""
     kept = loaded.record.prediction
     used = {name for channel in requested for name in channel.columns}
@@ -157,7 +152,7 @@ def _kept(loaded: Calibration, poses: Path, requested: Sequence[RequestedChannel
     }
 
 
-def _given(columns: Sequence[str]) -> dict[str, str]:
+def _named_columns(columns: Sequence[str]) -> dict[str, str]:
     for text in columns:
         name, equals, own = text.partition("=")
         if not (name.strip() and equals and own.strip()):
@@ -169,7 +164,7 @@ def _given(columns: Sequence[str]) -> dict[str, str]:
     return {text.partition("=")[0].strip(): text.partition("=")[2].strip() for text in columns}
 
 
-def _tell_missing(console: Console, loaded: Calibration, commands: Dataset, recording: str) -> None:
+def _warn_of_missing(console: Console, loaded: Calibration, commands: Dataset, recording: str) -> None:
     """What the calibration knew and these poses do not say."""
     order = ("time", "sequence")
     missing = [name for name in loaded.record.environment_columns if not commands.has(name) and name not in order]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import click
@@ -19,7 +19,6 @@ from armcal.scaffold.robot import (
     MOST_JOINTS,
     Convention,
     Mass,
-    Range,
     RobotJoint,
     Row,
 )
@@ -47,16 +46,10 @@ def ask_rows(conventions: Mapping[str, Convention]) -> tuple[Convention, tuple[R
 def ask_up() -> str:
     """Which way is up, as ``direction`` takes it; empty if nobody knows."""
     words = "up in the tracker's base frame (x, y, z, -x, -y, -z, three numbers, or unknown)"
-    answer = click.prompt(words, default=_UNKNOWN, value_proc=lambda text: text if text == _UNKNOWN else _known(text))
+    answer = click.prompt(
+        words, default=_UNKNOWN, value_proc=lambda text: text if text == _UNKNOWN else _checked(direction, text)
+    )
     return "" if answer == _UNKNOWN else str(answer)
-
-
-def _known(text: str) -> str:
-    try:
-        direction(text)
-    except ConfigError as fault:
-        raise click.BadParameter(fault.message) from fault
-    return text
 
 
 def direction(text: str) -> tuple[float, float, float]:
@@ -83,13 +76,18 @@ def direction(text: str) -> tuple[float, float, float]:
 def ask_target() -> str:
     """Where the target sits in the tool's frame, as ``place`` takes it."""
     return str(
-        click.prompt("the target in the tool's frame, roughly, x,y,z in mm", default="0,0,0", value_proc=_placed)
+        click.prompt(
+            "the target in the tool's frame, roughly, x,y,z in mm",
+            default="0,0,0",
+            value_proc=lambda text: _checked(place, text),
+        )
     )
 
 
-def _placed(text: str) -> str:
+def _checked(read: Callable[[str], object], text: str) -> str:
+    """A text that can be read; else click asks again."""
     try:
-        place(text)
+        read(text)
     except ConfigError as fault:
         raise click.BadParameter(fault.message) from fault
     return text
@@ -117,20 +115,14 @@ def _row(number: int) -> Row:
     turns = click.prompt("  it is", type=click.Choice(("revolute", "prismatic")), default="revolute") == "revolute"
     alpha, a = _ask("  alpha", "deg", "angle"), _ask("  a", "mm", "length")
     theta, d = _ask("  theta", "deg", "angle"), _ask("  d", "mm", "length")
-    limits = _limits(turns)
+    unit, dimension = ("deg", "angle") if turns else ("mm", "length")
+    low, high = (round(end / from_unit(1.0, unit)) for end in (ASSUMED_TURN if turns else ASSUMED_TRAVEL))
+    lower = _ask("  lower limit", unit, dimension, default=low)
+    upper = _ask("  upper limit", unit, dimension, default=high, above=lower)
     mass = _ask("  mass of its link, 0 if not known", "g", "mass", lowest=0.0)
     com = [_ask(f"  its centre, {axis} in the row's frame", "mm", "length") for axis in "xyz"] if mass else []
     known = Mass(mass, (com[0], com[1], com[2])) if mass else None
-    return Row(RobotJoint(name, turns, limits), alpha, a, theta, d, known)
-
-
-def _limits(turns: bool) -> Range:
-    unit, dimension = ("deg", "angle") if turns else ("mm", "length")
-    low, high = ASSUMED_TURN if turns else ASSUMED_TRAVEL
-    scale = from_unit(1.0, unit)
-    lower = _ask("  lower limit", unit, dimension, default=round(low / scale))
-    upper = _ask("  upper limit", unit, dimension, default=round(high / scale), above=lower)
-    return lower, upper
+    return Row(RobotJoint(name, turns, (lower, upper)), alpha, a, theta, d, known)
 
 
 def _ask(

@@ -7,13 +7,12 @@ from pathlib import Path
 
 import click
 
-from armcal.cli.common import Console, command_line, overrides, parallel, speaking
+from armcal.cli.common import FILE, Console, command_line, data, overrides, parallel, speaking
 from armcal.cli.outlet import say
 from armcal.cli.tables import show_run
 from armcal.errors import EXIT_DO_NOT_USE, EXIT_NOT_CONVERGED
 from armcal.estimate.estimator import CHECK_THE_DATA
 from armcal.io.parallel import Executor
-from armcal.plugins import discover
 from armcal.report import render
 from armcal.run import outputs
 from armcal.run.experiment import Experiment
@@ -22,9 +21,9 @@ from armcal.run.result import RunResult
 
 
 @click.command()
-@click.argument("config", type=click.Path(path_type=Path))
-@click.option("--data", type=click.Path(path_type=Path), help="A dataset to read instead of the configured one.")
-@click.option("--out", type=click.Path(path_type=Path), help="Where the results go [default: runs/NAME of CONFIG].")
+@click.argument("config", type=FILE)
+@data
+@click.option("--out", type=FILE, help="Where the results go [default: runs/NAME of CONFIG].")
 @click.option("--accept", is_flag=True, help="Write calibration.yaml although its verdict is bad.")
 @overrides
 @parallel
@@ -42,8 +41,7 @@ def run(
     watch = Stopwatch()
     folder = out or Path("runs") / config.stem
     reserved = click.get_current_context().with_resource(outputs.reserved(folder))
-    registry = discover()
-    console.plugin_faults(registry)
+    registry = console.registry()
     experiment = Experiment.load(config, overrides, data, registry)
     with console.progress() as progress:
         result = calibrate(experiment, command_line(), progress, watch, parallel)

@@ -6,26 +6,24 @@ from pathlib import Path
 
 import click
 
-from armcal.cli.common import Console, overrides, speaking
+from armcal.cli.common import FILE, Console, overrides, speaking
 from armcal.estimate.simulation import SimulationRequest
 from armcal.measure.csv_writer import write_csv
-from armcal.plugins import discover
 from armcal.run.experiment import Experiment
 
 
 @click.command()
-@click.argument("config", type=click.Path(path_type=Path))
-@click.option("--out", required=True, type=click.Path(path_type=Path), help="The CSV to write.")
+@click.argument("config", type=FILE)
+@click.option("--out", required=True, type=FILE, help="The CSV to write.")
 @overrides
 @speaking
 def simulate(console: Console, config: Path, out: Path, overrides: tuple[str, ...]) -> None:
     """Simulate measurements as the simulation section of CONFIG says."""
-    registry = discover()
-    console.plugin_faults(registry)
+    registry = console.registry()
     experiment = Experiment.load(config, overrides, registry=registry)
     system = experiment.system
     request = SimulationRequest(system.arms, system.measurements, experiment.parameters, system.environment)
     dataset = experiment.simulator().simulate(request)
     write_csv(out, dataset, experiment.request(measured=True).channels)
     console.result({"records": len(dataset), "out": str(out)})
-    console.out.print(f"{len(dataset)} records written: {out}", markup=False)
+    console.out.print(f"{len(dataset)} records written: {out}")

@@ -8,10 +8,9 @@ from pathlib import Path
 import click
 from rich.table import Table
 
-from armcal.cli.common import Console, command_line, overrides, parallel, speaking
+from armcal.cli.common import FILE, Console, command_line, data, overrides, parallel, speaking
 from armcal.io.folder import reserved
 from armcal.io.parallel import Executor
-from armcal.plugins import discover
 from armcal.report.study_page import conclusions, render_study, render_transfer, transfer_conclusions, transfer_table
 from armcal.run import study_result
 from armcal.run.load_transfer import transfer
@@ -22,9 +21,9 @@ from armcal.run.study_result import StudyResult, TransferResult
 
 
 @click.command()
-@click.argument("config", type=click.Path(path_type=Path))
-@click.option("--data", type=click.Path(path_type=Path), help="A dataset to read instead of the configured one.")
-@click.option("--out", type=click.Path(path_type=Path), help="Where the results go [default: runs/NAME of CONFIG].")
+@click.argument("config", type=FILE)
+@data
+@click.option("--out", type=FILE, help="Where the results go [default: runs/NAME of CONFIG].")
 @overrides
 @parallel
 @speaking
@@ -35,28 +34,27 @@ def study(
     watch = Stopwatch()
     folder = out or Path("runs") / config.stem
     kept = click.get_current_context().with_resource(reserved(folder, study_result.FILES))
-    registry = discover()
-    console.plugin_faults(registry)
-    asked = Study.load(config, overrides, data, registry)
+    registry = console.registry()
+    configured = Study.load(config, overrides, data, registry)
     result: StudyResult | TransferResult
     with console.progress() as progress:
-        if isinstance(asked.settings, LoadTransferSettings):
-            result = transfer(asked, parallel, command_line(), progress, watch)
+        if isinstance(configured.settings, LoadTransferSettings):
+            result = transfer(configured, parallel, command_line(), progress, watch)
         else:
-            result = compare(asked, parallel, command_line(), progress, watch)
+            result = compare(configured, parallel, command_line(), progress, watch)
     for text in result.warnings:
         console.warn(text)
     for stage, seconds in result.seconds.items():
         console.detail(f"{stage}: {seconds:.3f} s")
     result.seconds["total"] = watch.total()
     page = render_study(result) if isinstance(result, StudyResult) else render_transfer(result)
-    kept.place(study_result.files(result, asked, page))
+    kept.place(study_result.files(result, configured, page))
     console.result({**result.as_dict(), "folder": str(folder)})
     if isinstance(result, StudyResult):
         _show_study(console, result)
     else:
         _show_transfer(console, result)
-    console.out.print(f"page: {folder / 'study.html'}  ({watch.total():.1f} s)", markup=False, soft_wrap=True)
+    console.line(f"page: {folder / 'study.html'}  ({watch.total():.1f} s)")
 
 
 def _show_study(console: Console, result: StudyResult) -> None:
@@ -68,25 +66,25 @@ def _show_study(console: Console, result: StudyResult) -> None:
         moved = ["", "", ""]
         if v.change:
             moved = [f"{v.change.mean:+.3f}", f"{v.change.standard_error:.3f}", f"{v.change.helped:.0%}"]
-        figures = [_number(x) for x in (v.train.mean, v.crossed.mean, v.crossed.p95)]
+        figures = ["-" if x is None else f"{x:.3f}" for x in (v.train.mean, v.crossed.mean, v.crossed.p95)]
         if v.failed_folds:  # over fewer records than the others
             figures[1:] = [f"({x})" for x in figures[1:]]
         table.add_row(v.name, str(v.free), *figures, *moved)
         console.detail(f"{v.name}: {v.fit_seconds:.2f} s for the fit on all records, {v.seconds:.2f} s for all fits")
     console.out.print(table)
     for text in conclusions(result):
-        console.out.print(text, markup=False, soft_wrap=True)
+        console.line(text)
 
 
 def _show_transfer(console: Console, result: TransferResult) -> None:
     shown = transfer_table(result)
-    words = [[name for name, number in shown.headings if number is wanted] for wanted in (False, True)]
+    words = [[name for name, number in shown.headings if number is is_number] for is_number in (False, True)]
     table = _table(f"{result.name}: {shown.caption}", words[0], words[1])
     for row in shown.rows:
         table.add_row(*row)
     console.out.print(table)
     for text in transfer_conclusions(result):
-        console.out.print(text, markup=False, soft_wrap=True)
+        console.line(text)
 
 
 def _table(title: str, words: Sequence[str], numbers: Sequence[str]) -> Table:
@@ -96,7 +94,3 @@ def _table(title: str, words: Sequence[str], numbers: Sequence[str]) -> Table:
     for column in numbers:
         table.add_column(column, justify="right")
     return table
-
-
-def _number(value: float | None) -> str:
-    return "-" if value is None else f"{value:.3f}"

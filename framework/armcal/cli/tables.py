@@ -12,7 +12,6 @@ from rich.text import Text
 from armcal.base.domains import Semidefinite, symmetric
 from armcal.cli.common import Console
 from armcal.estimate.bootstrap import Bootstrap
-from armcal.estimate.estimator import Estimate
 from armcal.estimate.validation import ErrorSummary
 from armcal.report.numbers import MINUS, NONE, decimals_for, shown_unit, significant
 from armcal.report.record_tables import part_of
@@ -35,10 +34,10 @@ def show_run(console: Console, result: RunResult, folder: Path, seconds: float) 
     if result.bootstrap:
         out.print(_bootstrap(result, result.bootstrap))
     out.print(_findings(result))
-    out.print(result.verdict.headline, style="bold", markup=False)
+    out.print(result.verdict.headline, style="bold")
     if result.verdict.paragraph:
-        out.print(result.verdict.paragraph, markup=False)
-    out.print(f"report: {folder / 'report.html'}  ({seconds:.1f} s)", markup=False, soft_wrap=True)
+        out.print(result.verdict.paragraph)
+    console.line(f"report: {folder / 'report.html'}  ({seconds:.1f} s)")
 
 
 def _findings(result: RunResult) -> Table:
@@ -81,13 +80,10 @@ def _groups(result: RunResult) -> Table:
     for group in result.groups.errors:
         numbers = [f"{group.nominal_error_mm:.3f}", f"-> {group.error_mm:.3f}"]
         if distances:
-            numbers += _before_after(group.nominal_distance_error_mm, group.distance_error_mm)
+            before, after = group.nominal_distance_error_mm, group.distance_error_mm
+            numbers += ["-", ""] if before is None or after is None else [f"{before:.3f}", f"-> {after:.3f}"]
         table.add_row(group.name, str(group.records), part_of(group), *numbers)
     return table
-
-
-def _before_after(before: float | None, after: float | None) -> list[str]:
-    return ["-", ""] if before is None or after is None else [f"{before:.3f}", f"-> {after:.3f}"]
 
 
 def _numbers(summary: ErrorSummary) -> list[str]:
@@ -102,7 +98,11 @@ def _compliances(result: RunResult) -> Table:
     for i, row in enumerate(parameter_rows(estimate)):
         if row.si_unit != "rad_per_Nm" or estimate.parameters[row.name.partition("[")[0]].size > 1:
             continue
-        flag = "at its bound" if row.at_bound else _held(estimate, i)
+        flag = ""
+        if row.at_bound:
+            flag = "at its bound"
+        elif not estimate.identified_by_data[i]:
+            flag = "held by its prior" if estimate.determined[i] else "not determined"
         table.add_row(row.name, *map(_in_ascii, (row.value, row.sd, row.interval)), flag)
     return table
 
@@ -112,12 +112,6 @@ def _in_ascii(text: str) -> str:
     for sign, word in ((MINUS, "-"), (NONE, "-"), ("≤", "up to"), ("≥", "from")):
         text = text.replace(sign, word)
     return text.strip()
-
-
-def _held(estimate: Estimate, index: int) -> str:
-    if estimate.identified_by_data[index]:
-        return ""
-    return "held by its prior" if estimate.determined[index] else "not determined"
 
 
 def _matrices(result: RunResult) -> Table:

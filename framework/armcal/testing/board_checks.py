@@ -1,4 +1,4 @@
-"""Checks on links to servo boards and on devices; no port is opened, for something may be plugged in there."""
+"""Checks on links to servo boards, devices, simulated benches; no port is opened, for something may be plugged in."""
 
 from __future__ import annotations
 
@@ -24,51 +24,62 @@ _SAME_RAD = 1e-9
 
 def check_link(record: Recorder, subject: Subject) -> None:
     """That it is a link, and says so when it is not open."""
-    link: Any = record.check("it builds", lambda: subject.made(subject.settings))
+    link: Any = record.check("it builds", subject.build)
     if link is None:
         return
     for name in ("open", "write", "read"):
-        record.check(f"it has {name}()", lambda n=name: _callable(link, n))  # type: ignore[misc]
+        record.check(f"it has {name}()", _callable, link, name)
     record.check("it may be closed before it was opened, and twice", lambda: (link.close(), link.close()))
-    record.check("reading before it is opened is an error of the device", lambda: _lost(lambda: link.read(64, 0, 1)))
-    record.check("writing before it is opened is one too", lambda: _lost(lambda: link.write(64, b"\0\0")))
+    record.check("reading before it is opened is an error of the device", _lost, lambda: link.read(64, 0, 1))
+    record.check("writing before it is opened is one too", _lost, lambda: link.write(64, b"\0\0"))
     if isinstance(link, GuardedLink):
-        record.check("a beat before it is opened is one too", lambda: _lost(link.beat))
+        record.check("a beat before it is opened is one too", _lost, link.beat)
         record.check("nobody took over before it was opened", lambda: expect(not link.took_over, "found that it was"))
 
 
 def check_device(record: Recorder, subject: Subject) -> None:
     """That it moves the joints that it is given, and passes on what its link says."""
-    device: Any = record.check("it builds", lambda: subject.made(subject.settings, JOINTS, NoLink()))
+    device: Any = record.check("it builds", subject.build, JOINTS, NoLink())
     if device is None:
         return
     for name in [name for name in vars(JointDevice) if not name.startswith("_") and name != "joint_names"]:
-        record.check(f"it has {name}()", lambda n=name: _callable(device, n))  # type: ignore[misc]
+        record.check(f"it has {name}()", _callable, device, name)
     names = device.joint_names
     record.check("it moves its joints", lambda: expect(tuple(names) == JOINTS, f"found {names}, expected {JOINTS}"))
     record.check("it may be closed before it was opened, and twice", lambda: (device.close(), device.close()))
-    record.check("a link without anybody is an error of the device", lambda: _lost(lambda: device.open(RealClock())))
+    record.check("a link without anybody is an error of the device", _lost, lambda: device.open(RealClock()))
     for call in (device.state, device.keep_alive, lambda: device.energise(JOINTS[0], 0.0)):
-        record.check("so is every call before it is opened", lambda c=call: _lost(c))  # type: ignore[misc]
-    record.check("angles that pulses can set stand where they are told", lambda: _stands(device))
+        record.check("so is every call before it is opened", _lost, call)
+    record.check("angles that pulses can set stand where they are told", _stands, device)
     for angle in (math.nan, 1e3):
-        record.check(f"an angle of {angle:g} rad is refused", lambda a=angle: _refused(device, a))  # type: ignore[misc]
+        record.check(f"an angle of {angle:g} rad is refused", _refused, device, angle)
     _check_on_a_bus(record, subject)
+
+
+def check_bench(record: Recorder, subject: Subject) -> None:
+    """That it can be asked to serve; serving takes an experiment and does not end by itself."""
+    bench: Any = record.check("it builds", subject.build)
+    if bench is not None:
+        record.check("it serves", lambda: expect(callable(getattr(bench, "serve", None)), "found no method serve"))
 
 
 def _check_on_a_bus(record: Recorder, subject: Subject) -> None:
     """What it does with a board that keeps what is written to it."""
     link = MemoryLink()
-    device = record.check("it opens on a bus of registers", lambda: _opened(subject, link))
-    record.check("it sets the angles that it says", lambda: _sets(_needed(device)))
-    record.check("its state is read from the board, not remembered", lambda: _reads(_needed(device), link))
-    record.check("a joint that is let go has no angle", lambda: _lets_go(_needed(device)))
+    device = record.check("it opens on a bus of registers", _opened, subject, link)
+    record.check("it sets the angles that it says", _sets, device)
+    record.check("its state is read from the board, not remembered", _reads, device, link)
+    record.check("a joint that is let go has no angle", _lets_go, device)
     link.is_lost = True
-    for call in ("state", "command", "energise", "keep_alive", "release"):
-        record.check(
-            f"{call}() passes on that the link was lost",
-            lambda c=call: _lost(_calls(_needed(device))[c]),  # type: ignore[misc]
-        )
+    calls: dict[str, Callable[[Any], Any]] = {
+        "state": lambda opened: opened.state(),
+        "command": lambda opened: opened.command({JOINTS[1]: -0.2}),
+        "energise": lambda opened: opened.energise(JOINTS[0], 0.1),
+        "keep_alive": lambda opened: opened.keep_alive(),
+        "release": lambda opened: opened.release(JOINTS[0]),
+    }
+    for name, call in calls.items():
+        record.check(f"{name}() passes on that the link was lost", _passes_on_loss, device, call)
 
 
 def _opened(subject: Subject, link: MemoryLink) -> Any:
@@ -80,24 +91,13 @@ def _opened(subject: Subject, link: MemoryLink) -> Any:
     return device
 
 
-def _needed(device: Any) -> Any:
+def _require_open(device: Any) -> None:
     if device is None:
         raise NotRun("it did not open")
-    return device
-
-
-def _calls(device: Any) -> dict[str, Callable[[], Any]]:
-    first = JOINTS[0]
-    return {
-        "state": device.state,
-        "command": lambda: device.command({JOINTS[1]: -0.2}),
-        "energise": lambda: device.energise(first, 0.1),
-        "keep_alive": device.keep_alive,
-        "release": lambda: device.release(first),
-    }
 
 
 def _sets(device: Any) -> None:
+    _require_open(device)
     for joint, angle in zip(JOINTS, (0.2, -0.3), strict=True):
         device.energise(joint, angle)
     _at(device, dict(zip(JOINTS, (0.2, -0.3), strict=True)), "energise()")
@@ -120,6 +120,7 @@ def _at(device: Any, commands: Mapping[str, float], after: str) -> None:
 
 
 def _reads(device: Any, link: MemoryLink) -> None:
+    _require_open(device)
     before, there = link.snapshot(), device.state().angles
     device.command(dict.fromkeys(JOINTS, 0.15))
     expect(link.snapshot() != before, "found nothing written to the board by command()")
@@ -132,6 +133,7 @@ def _reads(device: Any, link: MemoryLink) -> None:
 
 
 def _lets_go(device: Any) -> None:
+    _require_open(device)
     device.release(JOINTS[0])
     angles = device.state().angles
     expect(JOINTS[0] not in angles, f"found {JOINTS[0]} with an angle after release(), expected it to hang free")
@@ -160,6 +162,11 @@ def _lost(call: Callable[[], Any]) -> None:
             f"found {type(fault).__name__} ({fault}), expected armcal.devices.faults.DeviceError"
         ) from fault
     expect(False, "found no error, expected armcal.devices.faults.DeviceError")
+
+
+def _passes_on_loss(device: Any, call: Callable[[Any], Any]) -> None:
+    _require_open(device)
+    _lost(lambda: call(device))
 
 
 def _stands(device: Any) -> None:

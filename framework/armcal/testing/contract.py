@@ -11,12 +11,11 @@ from typing import Any
 import click
 
 from armcal.plugins import Component, PluginInfo, PluginRegistry
-from armcal.testing.bench_checks import check_bench
-from armcal.testing.board_checks import check_device, check_link
+from armcal.testing.board_checks import check_bench, check_device, check_link
 from armcal.testing.effect_checks import check_effect
 from armcal.testing.estimator_checks import check_estimator
 from armcal.testing.exporter_checks import check_exporter
-from armcal.testing.joint_stream_checks import check_joint_stream
+from armcal.testing.live_checks import check_joint_stream, check_tracker
 from armcal.testing.manners import watched
 from armcal.testing.measurement_checks import check_measurement
 from armcal.testing.model_checks import check_model
@@ -25,7 +24,6 @@ from armcal.testing.reader_checks import check_reader
 from armcal.testing.results import CheckResult, ContractError, Recorder, expect
 from armcal.testing.settings_checks import Subject, check_settings
 from armcal.testing.simulator_checks import check_simulator
-from armcal.testing.tracker_checks import check_tracker
 
 __all__ = ["CheckResult", "check_component", "check_plugin"]
 
@@ -63,11 +61,11 @@ def check_plugin(plugin: PluginInfo, registry: PluginRegistry) -> list[CheckResu
     if plugin.fault:
         return record.results
     if not plugin.is_file:
-        record.check("its registration imports nothing heavy", lambda: _light(plugin.module))
+        record.check("its registration imports nothing heavy", _imports_light, plugin.module)
     own = registry.announced_by(plugin)
     for component in own:
         name = f"the {component.kind} {component.name!r} is offered once"
-        record.check(name, lambda c=component: registry.find(c.kind, c.name))  # type: ignore[misc]
+        record.check(name, registry.find, component.kind, component.name)
     return record.results + [result for component in own for result in check_component(component)]
 
 
@@ -81,7 +79,7 @@ def check_made(kind: str, name: str, load: Callable[[], Any]) -> list[CheckResul
 def _check(record: Recorder, kind: str, load: Callable[[], Any]) -> None:
     if kind == "command":  # it is imported for one call of armcal, and may do to the process what it needs
         command = record.check("it imports", load)
-        record.check("it is a click command that says what it does", lambda: _check_command(command))
+        record.check("it is a click command that says what it does", _check_command, command)
         return
     with watched(record) as begin:
         made = record.check("it imports", load)
@@ -96,7 +94,7 @@ def _check_command(made: Any) -> None:
     expect(bool(made.help), f"found no help of the command {made.name!r}, expected a docstring")
 
 
-def _light(target: str) -> None:
+def _imports_light(target: str) -> None:
     """Import the registration module in a fresh interpreter and see what came with it, and what it said."""
     module = target.partition(":")[0]
     code = (

@@ -40,35 +40,31 @@ _STATES = ([0.0, 0.0], [0.4, 1.0], [-1.2, -1.0])
 
 def check_effect(record: Recorder, subject: Subject) -> None:
     """Everything that an arm asks of a joint effect, on joints q1, q2 and q3."""
-    effect: JointEffect | None = record.check(
-        f"it builds for the joints {', '.join(JOINTS)}", lambda: subject.made(subject.settings, JOINTS)
-    )
-    derived = None if effect is None else record.check("it derives from armcal.JointEffect", lambda: _derived(effect))
+    effect: JointEffect | None = record.check(f"it builds for the joints {', '.join(JOINTS)}", subject.build, JOINTS)
+    derived = None if effect is None else record.check("it derives from armcal.JointEffect", _derived, effect)
     blocks = check_parameters(record, effect.parameters) if effect is not None and derived else None
     if effect is None or blocks is None:
         return
     values = symbols(blocks)
     given = stacked(list(values.values()))
-    added = record.check("it gives a displacement for every joint", lambda: _displacement(effect, values))
+    added = record.check("it gives a displacement for every joint", _displacement, effect, values)
     if added is not None:
         recorded, moved = added
         record.check("displacements depend on what is given", lambda: expect_only(moved, [recorded, given]))
-        record.check("displacements do not branch on a parameter", lambda: expect_no_choice(moved, recorded, given))
-        record.check("displacements are finite", lambda: _finite_displacement(blocks, given, recorded, moved))
-        record.check(
-            "lengths and angles move a joint by as much", lambda: _displacement_gains(blocks, given, recorded, moved)
-        )
-    record.check("it is the same each time", lambda: _repeated(subject, effect, blocks))
+        record.check("displacements do not branch on a parameter", expect_no_choice, moved, recorded, given)
+        record.check("displacements are finite", _finite_displacement, blocks, given, recorded, moved)
+        record.check("lengths and angles move a joint by as much", _displacement_gains, blocks, given, recorded, moved)
+    record.check("it is the same each time", _repeated, subject, effect, blocks)
     record.check("every parameter has an influence", lambda: expect_all_used(_all_of(effect, values), values))
     if reshapes(effect) or effect.conditions:
-        record.check("the columns it reads are declared, each with its dimension", lambda: _columns(effect))
-        record.check("its shape changes with every column it declares", lambda: _read(effect, values))
-    springs = record.check("its springs have a site and unit directions", lambda: _springs(effect, values))
+        record.check("the columns it reads are declared, each with its dimension", _columns, effect)
+        record.check("its shape changes with every column it declares", _read, effect, values)
+    springs = record.check("its springs have a site and unit directions", _springs, effect, values)
     if not springs:
         return
     loads = ca.SX.sym("loads", sum(spring.size for spring in springs))
     recorded = ca.SX.sym("recorded", 2 * len(JOINTS))
-    laws = record.check("every law gives one deflection a coordinate", lambda: _laws(springs, loads, recorded))
+    laws = record.check("every law gives one deflection a coordinate", _laws, springs, loads, recorded)
     if laws is None:
         return
     record.check("laws depend on what is given", lambda: expect_only(laws, [loads, recorded, given]))
@@ -77,7 +73,7 @@ def check_effect(record: Recorder, subject: Subject) -> None:
         lambda: expect_no_choice(laws, recorded, stacked([loads, given])),
     )
     expressions = [ca.substitute(laws, recorded, ca.SX(state * len(JOINTS))) for state in _STATES]
-    record.check("laws are finite and smooth, at zero load too", lambda: _smooth(blocks, given, loads, expressions))
+    record.check("laws are finite and smooth, at zero load too", _smooth, blocks, given, loads, expressions)
     record.check(
         "deflections are in rad, of loads in N m", lambda: _law_gains(blocks, given, loads, stacked(expressions))
     )
@@ -174,7 +170,7 @@ def _repeated(subject: Subject, effect: JointEffect, blocks: tuple[ParameterBloc
         function = ca.Function("all", [stacked(list(values.values())), recorded], [stacked([moved, *laws])])
         return np.asarray(function(entries, [0.4, 1.0] * len(JOINTS)))
 
-    expect_repeated(lambda: picture(effect), lambda: picture(subject.made(subject.settings, JOINTS)))
+    expect_repeated(lambda: picture(effect), lambda: picture(subject.build(JOINTS)))
 
 
 def _law_gains(blocks: Sequence[ParameterBlock], given: Expression, loads: Expression, laws: Expression) -> None:

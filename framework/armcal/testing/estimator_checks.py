@@ -41,25 +41,25 @@ class _Case:
 
 def check_estimator(record: Recorder, subject: Subject) -> None:
     """Truth, bounds, priors, verdict; and an honest verdict when it is cut short."""
-    estimator: Any = record.check("it builds", lambda: subject.made(subject.settings))
+    estimator: Any = record.check("it builds", subject.build)
     if estimator is None:
         return
     bounded = _case(Interval(upper=UPPER_SIDE_M), None, UPPER_SIDE_M)
     name = "it gives a value for every entry, and a verdict"
-    solution = record.check(name, lambda: _solve(estimator, bounded))
+    solution = record.check(name, _solve, estimator, bounded)
     if solution is None:
         return
-    record.check("it reports that it converged", lambda: _converged(solution))
-    record.check("it keeps to the bounds", lambda: _inside(bounded, solution))
-    record.check("it finds the truth, one bound active", lambda: _near(bounded, solution))
-    record.check("it does the same twice", lambda: _repeats(estimator, bounded, solution))
+    record.check("it reports that it converged", _converged, solution)
+    record.check("it keeps to the bounds", _inside, bounded, solution)
+    record.check("it finds the truth, one bound active", _near, bounded, solution)
+    record.check("it does the same twice", _repeats, estimator, bounded, solution)
     case = _case(Interval(), PRIOR_SD_M, _with_prior())
     record.check("it weighs priors", lambda: _near(case, _solve(estimator, case)))
     scattered = _scattered()
     record.check("it weighs records", lambda: _near(scattered, _solve(estimator, scattered), scattered.known))
-    record.check("the order of records changes nothing", lambda: _any_order(estimator, scattered))
+    record.check("the order of records changes nothing", _any_order, estimator, scattered)
     record.check("a second one of equal settings does the same", lambda: _repeats(_fresh(subject), bounded, solution))
-    record.check("cut short, it reports that it did not converge", lambda: _cut_short(subject, bounded))
+    record.check("cut short, it reports that it did not converge", _cut_short, subject, bounded)
 
 
 def _case(side: Interval, prior_sd: float | None, side_answer: float) -> _Case:

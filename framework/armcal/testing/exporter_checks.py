@@ -16,12 +16,12 @@ from armcal.testing.settings_checks import Subject
 
 def check_exporter(record: Recorder, subject: Subject) -> None:
     """That it writes an arm that it did not make, or refuses it as a user's fault."""
-    exporter: Any = record.check("it builds", lambda: subject.made(subject.settings))
+    exporter: Any = record.check("it builds", subject.build)
     if exporter is None:
         return
     written = record.check("an arm is written, or refused by an armcal error", lambda: _written(exporter, _request()))
-    record.check("it writes the same each time", lambda: _same(subject, exporter, written))
-    record.check("it changes nothing that it is given", lambda: _untouched(exporter))
+    record.check("it writes the same each time", _same, subject, exporter, written)
+    record.check("it changes nothing that it is given", _untouched, exporter)
 
 
 def _request() -> ExportRequest:

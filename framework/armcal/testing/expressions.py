@@ -35,10 +35,10 @@ def check_parameters(
     blocks = record.check("its parameters are named, each once", lambda: _named(tuple(declared())))
     if blocks is None:
         return None
-    well_valued = record.check("their nominal values are finite and in their domains", lambda: _valued(blocks))
-    well_sized = record.check("their scales are positive and move them", lambda: _movable(blocks))
-    record.check("their units are SI", lambda: _in_si(blocks))
-    record.check("their values and scales are plausible in their units", lambda: expect_plausible(blocks))
+    well_valued = record.check("their nominal values are finite and in their domains", _valued, blocks)
+    well_sized = record.check("their scales are positive and move them", _movable, blocks)
+    record.check("their units are SI", _in_si, blocks)
+    record.check("their values and scales are plausible in their units", expect_plausible, blocks)
     return None if well_valued is None or well_sized is None else blocks
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from types import MappingProxyType
 
 import casadi as ca
@@ -40,48 +41,86 @@ _INSTRUMENT = "instrument"
 _GROUP = "front/hole"
 
 
+@dataclass(frozen=True)
+class _Case:
+    """A measurement on arms, the parameters of both (all free, the arms' first), and the factor made of them."""
+
+    measurement: Measurement
+    own: Sequence[ParameterBlock]
+    channels: Sequence[Channel]
+    parameters: Parameters
+    factor: Factor
+
+    @property
+    def arm_blocks(self) -> tuple[ParameterBlock, ...]:
+        """The arms' parameters."""
+        return self.parameters.blocks[: len(self.parameters.blocks) - len(self.own)]
+
+    @property
+    def other_blocks(self) -> tuple[ParameterBlock, ...]:
+        """The measurement's own, then those of one group that is not known beforehand."""
+        own = self.parameters.blocks[len(self.parameters.blocks) - len(self.own) :]
+        return (*own, *_group_blocks(self.measurement))
+
+    def point(self, seed: int = 1) -> tuple[Array, Array]:
+        """Values, and a record with random joint angles whose measured channels have what would be read."""
+        random = np.random.default_rng(seed)
+        values = near_nominal((*self.arm_blocks, *self.other_blocks), random)
+        record = random.uniform(-1, 1, self.factor.record.numel())
+        shown = self.numbers(self.factor.outputs, (values, record))
+        read = dict(zip(self.factor.output_channels, shown, strict=True))
+        return values, np.array([read.get(name, record[i]) for i, name in enumerate(self.factor.channels)])
+
+    def function(self, expression: Expression) -> ca.Function:
+        """An expression as a function of values and record, one below the other."""
+        return ca.Function("shown", [stacked([self.factor.values, self.factor.record])], [stacked([expression])])
+
+    def numbers(self, expression: Expression, at: tuple[Array, Array]) -> Array:
+        """An expression's numbers (n) at values and a record."""
+        return np.asarray(self.function(expression)(np.concatenate(at))).ravel()
+
+
 def check_measurement(record: Recorder, subject: Subject) -> None:
     """Everything that a factor asks of a measurement, on planar arms."""
-    built = record.check("it builds for one arm, or for two", lambda: _build(subject))
+    built = record.check("it builds for one arm, or for two", _build, subject)
     if built is None:
         return
-    measurement, arms = built
+    measurement, names = built
     blocks = check_parameters(record, measurement.parameters)
-    channels = record.check("its channels have names and dimensions", lambda: _channels(measurement))
+    channels = record.check("its channels have names and dimensions", _channels, measurement)
     if blocks is None or channels is None:
         return
-    factor = record.check("it makes a residual", lambda: _factor(measurement, arms, blocks, channels))
-    if factor is None:
+    case = record.check("it makes a residual", _case, measurement, planar_arms(names), blocks, channels)
+    if case is None:
         return
-    record.check("noise is positive", lambda: _noise(factor))
-    record.check("residuals depend on what is given", lambda: _closed(factor))
-    measured = [f"{_INSTRUMENT}.{channel.name}" for channel in channels]
-    record.check("outputs are channels", lambda: _outputs(factor, measured))
-    record.check(
-        "the residual is zero where outputs are measured", lambda: _zero(factor, measurement, arms, blocks, measured)
-    )
-    record.check(
-        "its Jacobian is finite and agrees with differences", lambda: _jacobian(factor, measurement, arms, blocks)
-    )
-    record.check("it is the same each time", lambda: _repeated(subject, factor, measurement, arms, blocks))
-    skewed = skewed_arms(tuple(arms))
-    general = record.check("it makes a residual of any arm", lambda: _factor(measurement, skewed, blocks, channels))
+    record.check("noise is positive", _noise, case.factor)
+    shown = stacked([case.factor.residual, case.factor.outputs])
+    record.check("residuals depend on what is given", expect_only, shown, [case.factor.values, case.factor.record])
+    record.check("outputs are channels", _outputs, case)
+    record.check("the residual is zero where outputs are measured", _zero, case)
+    record.check("its Jacobian is finite and agrees with differences", _jacobian, case)
+    record.check("it is the same each time", _repeated, subject, case, names)
+    skewed = skewed_arms(names)
+    general = record.check("it makes a residual of any arm", _case, measurement, skewed, blocks, channels)
     if general is None:
         return
-    record.check("every parameter has an influence", lambda: _all_used(general, measurement, arms, blocks))
-    record.check("its residual is in m and rad", lambda: _gains(general, measurement, arms, blocks, channels))
-    if general.output_channels:
-        _check_readings(record, general, measurement, arms, blocks)
+    record.check("every parameter has an influence", _all_used, general)
+    record.check("its residual is in m and rad", _gains, general)
+    if general.factor.output_channels:
+        slopes = record.check("the noise of every reading follows from its residual", _readings, general)
+        axes = [name.rpartition(".")[2] for name in general.factor.output_channels]
+        if slopes is not None and set("xyz") <= set(axes):
+            record.check("a position's residual is x, y, z, measured minus predicted", _position, axes, slopes)
     if isinstance(measurement, GroupedMeasurement):
-        record.check("all groups have the same parameters", lambda: _groups(measurement))
-        record.check("what a record says of its group fits it", lambda: _told(factor, measurement, arms, blocks))
+        record.check("all groups have the same parameters", _groups, measurement)
+        record.check("what a record says of its group fits it", _fits_group, case)
 
 
-def _build(subject: Subject) -> tuple[Measurement, dict[str, Arm]]:
+def _build(subject: Subject) -> tuple[Measurement, tuple[str, ...]]:
     refused = []
     for names in ARM_NAMES:
         try:
-            measurement: Measurement = subject.made(subject.settings, names)
+            measurement: Measurement = subject.build(names)
         except PLUGIN_FAULTS as fault:
             refused.append(f"{', '.join(names)}: {fault}")
             continue
@@ -90,7 +129,7 @@ def _build(subject: Subject) -> tuple[Measurement, dict[str, Arm]]:
             len(measurement.arms) > 0 and not unknown,
             f"found the arms {tuple(measurement.arms)}, expected some of {names}",
         )
-        return measurement, planar_arms(names)
+        return measurement, names
     raise ContractError("it refuses every choice of arms; " + "; ".join(refused))
 
 
@@ -107,24 +146,17 @@ def _channels(measurement: Measurement) -> tuple[Channel, ...]:
     return channels
 
 
-def _factor(
-    measurement: Measurement,
-    arms: Mapping[str, Arm],
-    blocks: Sequence[ParameterBlock],
-    channels: Sequence[Channel],
-) -> Factor:
-    parameters = _parameters(arms, blocks)
+def _case(
+    measurement: Measurement, arms: Mapping[str, Arm], own: Sequence[ParameterBlock], channels: Sequence[Channel]
+) -> _Case:
+    of_arms = (block for arm in arms.values() for block in arm.parameters())
+    parameters = Parameters((*of_arms, *prefixed(f"{_INSTRUMENT}.", own)))
+    parameters = parameters.with_free(parameters.names)
     available = frozenset(f"{_INSTRUMENT}.{channel.name}" for channel in channels)
     factor = build_factor(_INSTRUMENT, measurement, arms, parameters, GRAVITY, available)
     rows, columns = factor.residual.shape
     expect(rows > 0 and columns == 1, f"found a residual of {rows} x {columns}, expected n x 1")
-    return factor
-
-
-def _parameters(arms: Mapping[str, Arm], blocks: Sequence[ParameterBlock]) -> Parameters:
-    own = prefixed(f"{_INSTRUMENT}.", blocks)
-    all_blocks = Parameters((*(block for arm in arms.values() for block in arm.parameters()), *own))
-    return all_blocks.with_free(all_blocks.names)
+    return _Case(measurement, own, channels, parameters, factor)
 
 
 def _noise(factor: Factor) -> None:
@@ -135,13 +167,9 @@ def _noise(factor: Factor) -> None:
     expect_small_noise(factor.noise, factor.dimensions)
 
 
-def _closed(factor: Factor) -> None:
-    shown = stacked([factor.residual, factor.outputs])
-    expect_only(shown, [factor.values, factor.record])
-
-
-def _outputs(factor: Factor, measured: Sequence[str]) -> None:
-    unknown = [name for name in factor.output_channels if name not in measured]
+def _outputs(case: _Case) -> None:
+    measured = [f"{_INSTRUMENT}.{channel.name}" for channel in case.channels]
+    unknown = [name for name in case.factor.output_channels if name not in measured]
     expect(not unknown, f"found the outputs {', '.join(unknown)}, expected names of channels")
 
 
@@ -160,123 +188,58 @@ def _groups(measurement: GroupedMeasurement) -> None:
     expect(measurement.mean_weight >= 1, f"found the mean weight {measurement.mean_weight}, expected at least 1")
 
 
-def _told(factor: Factor, measurement: Measurement, arms: Mapping[str, Arm], blocks: Sequence[ParameterBlock]) -> None:
-    """What a record says of its group fits that record."""
-    own = _group_blocks(measurement)
-    if not factor.nuisance_names or set(factor.nuisance_names) != {block.name for block in own}:
+def _fits_group(case: _Case) -> None:
+    """The values that a record gives its group make that record's residual zero."""
+    names = case.factor.nuisance_names
+    if not names or set(names) != {block.name for block in _group_blocks(case.measurement)}:
         raise NotRun("a record alone does not say all of its group's parameters")
-    values, record = _point(factor, measurement, arms, blocks)
-    said = np.asarray(_function(factor, factor.nuisance_starts)(np.concatenate([values, record]))).ravel()
-    values[len(values) - len(said) :] = said
-    residual = np.asarray(_function(factor, factor.residual)(np.concatenate([values, record]))).ravel()
-    worst = float(np.abs(residual).max())
+    values, record = case.point()
+    starts = case.numbers(case.factor.nuisance_starts, (values, record))
+    values[len(values) - len(starts) :] = starts
+    worst = float(np.abs(case.numbers(case.factor.residual, (values, record))).max())
     expect(worst <= 1e-9, f"found a residual of {worst:.1e} with what the record itself says, expected zero")
 
 
-def _point(
-    factor: Factor, measurement: Measurement, arms: Mapping[str, Arm], blocks: Sequence[ParameterBlock], seed: int = 1
-) -> tuple[Array, Array]:
-    """Values, and a record with random joint angles whose measured channels say what would be read."""
-    random = np.random.default_rng(seed)
-    values = near_nominal((*_parameters(arms, blocks).blocks, *_group_blocks(measurement)), random)
-    record = random.uniform(-1, 1, factor.record.numel())
-    shown = np.asarray(_function(factor, factor.outputs)(np.concatenate([values, record]))).ravel()
-    read = dict(zip(factor.output_channels, shown, strict=True))
-    return values, np.array([read.get(name, record[i]) for i, name in enumerate(factor.channels)])
-
-
-def _function(factor: Factor, expression: Expression) -> ca.Function:
-    return ca.Function("shown", [stacked([factor.values, factor.record])], [stacked([expression])])
-
-
-def _zero(
-    factor: Factor,
-    measurement: Measurement,
-    arms: Mapping[str, Arm],
-    blocks: Sequence[ParameterBlock],
-    measured: Sequence[str],
-) -> None:
-    if not factor.output_channels:
+def _zero(case: _Case) -> None:
+    if not case.factor.output_channels:
         raise NotRun("it reads nothing")
-    if set(factor.output_channels) != set(measured):
+    if set(case.factor.output_channels) != {f"{_INSTRUMENT}.{channel.name}" for channel in case.channels}:
         raise NotRun("it has channels without an output")
-    residual = np.asarray(
-        _function(factor, factor.residual)(np.concatenate(_point(factor, measurement, arms, blocks)))
-    ).ravel()
-    worst = float(np.abs(residual).max())
+    worst = float(np.abs(case.numbers(case.factor.residual, case.point())).max())
     expect(worst <= 1e-9, f"found a residual of {worst:.1e}, expected zero")
 
 
-def _jacobian(
-    factor: Factor, measurement: Measurement, arms: Mapping[str, Arm], blocks: Sequence[ParameterBlock]
-) -> None:
-    values, record = _point(factor, measurement, arms, blocks)
+def _jacobian(case: _Case) -> None:
+    values, record = case.point()
     disturbed = record + 0.01 * np.random.default_rng(2).uniform(-1, 1, len(record))
-    at = np.concatenate([values, disturbed])
-    of_group = [name for block in _group_blocks(measurement) for name in block.entry_names]
-    names = (*_parameters(arms, blocks).entry_names, *of_group, *factor.channels)
-    expect_derivatives(_function(factor, factor.residual), at, "the residual", names)
+    of_group = [name for block in _group_blocks(case.measurement) for name in block.entry_names]
+    names = (*case.parameters.entry_names, *of_group, *case.factor.channels)
+    expect_derivatives(case.function(case.factor.residual), np.concatenate([values, disturbed]), "the residual", names)
 
 
-def _repeated(
-    subject: Subject,
-    factor: Factor,
-    measurement: Measurement,
-    arms: Mapping[str, Arm],
-    blocks: Sequence[ParameterBlock],
-) -> None:
+def _repeated(subject: Subject, case: _Case, names: tuple[str, ...]) -> None:
     def picture(made: Measurement) -> Array:
-        same = tuple(made.parameters()) == tuple(blocks)
+        same = tuple(made.parameters()) == tuple(case.own)
         expect(same, "found other parameters another time, expected them from its settings alone")
-        own = _factor(made, arms, blocks, tuple(made.channels()))
-        shown = stacked([own.residual, own.outputs, own.nuisance_starts])
-        at = np.concatenate(_point(factor, measurement, arms, blocks))
-        return np.concatenate([np.asarray(_function(own, shown)(at)).ravel(), own.noise])
+        again = _case(made, planar_arms(names), case.own, tuple(made.channels()))
+        shown = stacked([again.factor.residual, again.factor.outputs, again.factor.nuisance_starts])
+        return np.concatenate([again.numbers(shown, case.point()), again.factor.noise])
 
-    expect_repeated(lambda: picture(measurement), lambda: picture(subject.made(subject.settings, tuple(arms))))
-
-
-def _own_entries(
-    factor: Factor, measurement: Measurement, arms: Mapping[str, Arm], blocks: Sequence[ParameterBlock]
-) -> tuple[tuple[ParameterBlock, ...], tuple[ParameterBlock, ...]]:
-    """The arms' blocks, and the measurement's own with those of a group; together all entries in their order."""
-    own = prefixed(f"{_INSTRUMENT}.", blocks)
-    every = _parameters(arms, blocks).blocks
-    return every[: len(every) - len(own)], (*every[len(every) - len(own) :], *_group_blocks(measurement))
+    expect_repeated(lambda: picture(case.measurement), lambda: picture(subject.build(names)))
 
 
-def _all_used(
-    factor: Factor, measurement: Measurement, arms: Mapping[str, Arm], blocks: Sequence[ParameterBlock]
-) -> None:
-    others, own = _own_entries(factor, measurement, arms, blocks)
-    place, values = sum(block.size for block in others), {}
-    for block in own:
-        values[block.name.removeprefix(f"{_INSTRUMENT}.")] = factor.values[place : place + block.size]
+def _all_used(case: _Case) -> None:
+    place, values = sum(block.size for block in case.arm_blocks), {}
+    for block in case.other_blocks:
+        values[block.name.removeprefix(f"{_INSTRUMENT}.")] = case.factor.values[place : place + block.size]
         place += block.size
-    expect_all_used(stacked([factor.residual, factor.outputs]), values)
+    expect_all_used(stacked([case.factor.residual, case.factor.outputs]), values)
 
 
-def _check_readings(
-    record: Recorder,
-    factor: Factor,
-    measurement: Measurement,
-    arms: Mapping[str, Arm],
-    blocks: Sequence[ParameterBlock],
-) -> None:
-    names = [name.rpartition(".")[2] for name in factor.output_channels]
-    slopes = record.check(
-        "the noise of every reading follows from its residual", lambda: _readings(factor, measurement, arms, blocks)
-    )
-    if slopes is not None and set("xyz") <= set(names):
-        record.check("a position's residual is x, y, z, measured minus predicted", lambda: _position(names, slopes))
-
-
-def _readings(
-    factor: Factor, measurement: Measurement, arms: Mapping[str, Arm], blocks: Sequence[ParameterBlock]
-) -> Array:
+def _readings(case: _Case) -> Array:
     """Slopes of the residual by the readings (n_r x outputs), from which noise in the readings is worked out."""
-    function = _function(factor, factor.residual)
-    at = np.concatenate(_point(factor, measurement, arms, blocks))
+    factor, function = case.factor, case.function(case.factor.residual)
+    at = np.concatenate(case.point())
     slope, start = np.asarray(function.jacobian()(at, function(at))), factor.values.numel()
     places = [factor.channels.index(name) if name in factor.channels else None for name in factor.output_channels]
     none = np.zeros(len(slope))
@@ -301,29 +264,23 @@ def _position(names: Sequence[str], slopes: Array) -> None:
     )
 
 
-def _gains(
-    factor: Factor,
-    measurement: Measurement,
-    arms: Mapping[str, Arm],
-    blocks: Sequence[ParameterBlock],
-    channels: Sequence[Channel],
-) -> None:
+def _gains(case: _Case) -> None:
     """What a length or an angle, of a parameter or as it is read, changes in a residual of the same dimension."""
-    function, slopes = _function(factor, factor.residual), []
+    factor, function, slopes = case.factor, case.function(case.factor.residual), []
     for seed in range(_POINTS):
-        at = np.concatenate(_point(factor, measurement, arms, blocks, seed))
+        at = np.concatenate(case.point(seed))
         at[factor.values.numel() :] += 0.01
         slopes.append(np.abs(np.asarray(function.jacobian()(at, function(at)))))
     slope = np.max(slopes, axis=0)
     rows = {dimension: np.array([d == dimension for d in factor.dimensions]) for dimension in _UNITS}
-    others, own = _own_entries(factor, measurement, arms, blocks)
+    others, own = case.arm_blocks, case.other_blocks
     of_arms = [place for place, _ in scalars(others, "m", "rad")]
     both = scalars((*others, *own), "m", "rad")[len(of_arms) :]
     gains = [(dimension_of(b), b.name, slope[:, place]) for place, b in both]
     for unit, dimension in (("m", "length"), ("rad", "angle")):
         places = [place for place, _ in scalars(others, unit)]
         gains.append((dimension, "the arm's parameters", slope[:, places].max(axis=1)))
-    for channel in channels:
+    for channel in case.channels:
         name = f"{_INSTRUMENT}.{channel.name}"
         if name in factor.channels and channel.dimension in _UNITS:
             column = factor.values.numel() + factor.channels.index(name)

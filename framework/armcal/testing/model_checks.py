@@ -54,10 +54,10 @@ class _Kinematics:
 
 def check_model(record: Recorder, subject: Subject) -> None:
     """Everything that a problem asks of an arm model."""
-    model: ArmModel | None = record.check("it builds", lambda: subject.made(subject.settings))
+    model: ArmModel | None = record.check("it builds", subject.build)
     if model is None:
         return
-    names = record.check("its joints are named, each once", lambda: _joint_names(model))
+    names = record.check("its joints are named, each once", _joint_names, model)
     blocks = check_parameters(record, model.parameters)
     if names is None or blocks is None:
         return
@@ -66,22 +66,22 @@ def check_model(record: Recorder, subject: Subject) -> None:
     if chain is None:
         return
     if isinstance(model, MassiveModel):
-        record.check("its masses stand in its frames", lambda: _masses(model, chain))
+        record.check("its masses stand in its frames", _masses, model, chain)
     parts = stacked(_parts(chain))
     record.check("the chain depends on its parameters alone", lambda: expect_only(parts, list(values.values())))
     record.check(
         "the chain does not branch on a parameter",
         lambda: expect_no_choice(parts, ca.SX(0, 1), stacked(list(values.values()))),
     )
-    record.check("every parameter has an influence", lambda: expect_all_used(parts, values))
-    known = record.check("its kinematics can be evaluated", lambda: _kinematics(blocks, values, chain))
+    record.check("every parameter has an influence", expect_all_used, parts, values)
+    known = record.check("its kinematics can be evaluated", _kinematics, blocks, values, chain)
     if known is None:
         return
-    record.check("it is the same each time", lambda: _repeated(subject, model, blocks))
-    record.check(f"{POSES} random poses are rigid motions", lambda: _rigid(known))
-    record.check("derivatives agree with differences", lambda: _derivatives(known))
-    record.check("lengths move it by lengths, and angles by angles", lambda: _gains(known))
-    record.check("springs on it settle under gravity", lambda: _settles(model, chain))
+    record.check("it is the same each time", _repeated, subject, model, blocks)
+    record.check(f"{POSES} random poses are rigid motions", _rigid, known)
+    record.check("derivatives agree with differences", _derivatives, known)
+    record.check("lengths move it by lengths, and angles by angles", _gains, known)
+    record.check("springs on it settle under gravity", _settles, model, chain)
 
 
 def _joint_names(model: ArmModel) -> tuple[str, ...]:

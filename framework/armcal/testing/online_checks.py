@@ -35,22 +35,22 @@ class _Line(Observation):
 
 def check_online(record: Recorder, subject: Subject) -> None:
     """The information of prior and records, once each; nothing that it was given is changed, nothing is kept."""
-    estimator: Any = record.check("it builds", lambda: subject.made(subject.settings))
+    estimator: Any = record.check("it builds", subject.build)
     if estimator is None:
         return
-    window = record.check("it says how many records it wants to see again", lambda: _window(estimator))
+    window = record.check("it says how many records it wants to see again", _window, estimator)
     if window is None:
         return
     prior, lines = _case()
-    updates = record.check("it takes a record", lambda: _taken(estimator, window, prior, lines))
+    updates = record.check("it takes a record", _taken, estimator, window, prior, lines)
     if updates is None:
         return
-    record.check("its covariance is exactly symmetric and positive", lambda: _sound(updates))
-    record.check("it finds what prior and records say together", lambda: _near(updates, prior, lines))
+    record.check("its covariance is exactly symmetric and positive", _sound, updates)
+    record.check("it finds what prior and records say together", _near, updates, prior, lines)
     record.check("it reports the NIS of the last record", lambda: _nis(updates[0], prior, lines[0]))
-    record.check("it changes nothing that it is given", lambda: _untouched(estimator, prior, lines))
-    record.check("it keeps nothing from one update to the next", lambda: _repeats(estimator, window, updates))
-    record.check("a variance below zero is an error", lambda: _refuses(estimator, prior, lines))
+    record.check("it changes nothing that it is given", _untouched, estimator, prior, lines)
+    record.check("it keeps nothing from one update to the next", _repeats, estimator, window, updates)
+    record.check("a variance below zero is an error", _refuses, estimator, prior, lines)
 
 
 def _case() -> tuple[Gaussian, tuple[_Line, ...]]:

@@ -33,17 +33,17 @@ _DAMAGED: Mapping[str, bytes] = {
 
 def check_reader(record: Recorder, subject: Subject) -> None:
     """That it refuses what it cannot read as a user's fault, and says of a known file what is in it."""
-    reader: Any = record.check("it builds", lambda: subject.made(subject.settings))
+    reader: Any = record.check("it builds", subject.build)
     if reader is None:
         return
-    record.check("it reads", lambda: _has_read(reader))
-    record.check("a missing file is refused by an armcal error", lambda: _large_errors(subject))
+    record.check("it reads", _has_read, reader)
+    record.check("a missing file is refused by an armcal error", _large_errors, subject)
     for name, content in _DAMAGED.items():
-        record.check(f"damaged files are refused: {name}", lambda c=content: _refuses(subject, c))  # type: ignore[misc]
-    record.check("a folder in place of a file, or a file in place of a folder, is refused", lambda: _confused(subject))
-    example = record.check("it reads a known file in SI, a record a row", lambda: _known(subject))
-    record.check("it reads the same each time", lambda: _repeats(subject, example))
-    record.check("a cell that is wrong or empty is told, never passed over", lambda: _told(subject, example))
+        record.check(f"damaged files are refused: {name}", _refuses, subject, content)
+    record.check("a folder in place of a file, or a file in place of a folder, is refused", _confused, subject)
+    example = record.check("it reads a known file in SI, a record a row", _known, subject)
+    record.check("it reads the same each time", _repeats, subject, example)
+    record.check("a cell that is wrong or empty is told, never passed over", _told, subject, example)
 
 
 def _has_read(reader: Any) -> None:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TypeVar
+from typing import ParamSpec, TypeVar
 
+P = ParamSpec("P")
 T = TypeVar("T")
 
 MOST_CHARACTERS = 400
@@ -41,10 +42,10 @@ class Recorder:
     component: str
     results: list[CheckResult] = field(default_factory=list)
 
-    def check(self, name: str, run: Callable[[], T]) -> T | None:
-        """Run a check; what it returned, or None if it found a fault or did not run."""
+    def check(self, name: str, run: Callable[P, T], /, *arguments: P.args, **options: P.kwargs) -> T | None:
+        """Run a check with these arguments; what it returned, or None if it found a fault or did not run."""
         try:
-            value = run()
+            value = run(*arguments, **options)
         except NotRun as reason:
             self.results.append(CheckResult(self.component, f"{name} (not run: {reason})", not_run=str(reason)))
         except PLUGIN_FAULTS as fault:

@@ -35,22 +35,26 @@ class Subject:
     example: Mapping[str, Any]
     settings: Settings
 
+    def build(self, *arguments: Any) -> Any:
+        """A component of the example settings."""
+        return self.made(self.settings, *arguments)
+
 
 def check_settings(record: Recorder, kind: str, made: Any) -> Subject | None:
     """The component with settings to build it from, if it has any that hold."""
-    settings_class = record.check("it has checked settings", lambda: _settings_class(made))
+    settings_class = record.check("it has checked settings", _settings_class, made)
     if settings_class is None:
         return None
-    record.check("every setting is typed or documented", lambda: _described(settings_class))
-    record.check("every quantity has its unit", lambda: _with_units(settings_class))
-    example = record.check("its EXAMPLE is a mapping", lambda: _example(kind, made, settings_class))
+    record.check("every setting is typed or documented", _described, settings_class)
+    record.check("every quantity has its unit", _with_units, settings_class)
+    example = record.check("its EXAMPLE is a mapping", _example, kind, made, settings_class)
     if example is None:
         return None
-    settings = record.check("its example settings are accepted", lambda: _accepted(kind, made, settings_class, example))
-    record.check("an unknown key is refused", lambda: _refuses_unknown(settings_class, example))
+    settings = record.check("its example settings are accepted", _accepted, kind, made, settings_class, example)
+    record.check("an unknown key is refused", _refuses_unknown, settings_class, example)
     if settings is None:
         return None
-    record.check("its settings survive to_config()", lambda: _survives(settings))
+    record.check("its settings survive to_config()", _survives, settings)
     return Subject(made, example, settings)
 
 

@@ -25,12 +25,12 @@ def _has(component: Any, method: str) -> None:
 
 def check_simulator(record: Recorder, subject: Subject) -> None:
     """That the same request gives the same records."""
-    simulator: Any = record.check("it builds", lambda: subject.made(subject.settings))
+    simulator: Any = record.check("it builds", subject.build)
     if simulator is None:
         return
-    record.check("it simulates", lambda: _has(simulator, "simulate"))
+    record.check("it simulates", _has, simulator, "simulate")
     name = "it gives what every instrument reads, the same each time"
-    record.check(name, lambda: _repeats(subject, simulator))
+    record.check(name, _repeats, subject, simulator)
 
 
 def _repeats(subject: Subject, simulator: Simulator) -> None:

@@ -10,7 +10,6 @@ from typing import Any, TypeVar
 import click
 from armcal.cli.common import Console, overrides, speaking
 from armcal.errors import InputError
-from armcal.plugins import discover
 from armcal.run.experiment import Experiment
 
 from armcal_bench.hazards import FirstMotion, Hazard
@@ -35,8 +34,7 @@ def plan_option(command: F) -> F:
 
 def load(console: Console, config: Path, overrides: tuple[str, ...]) -> Experiment:
     """The experiment of CONFIG; plugins that are broken are named."""
-    registry = discover()
-    console.plugin_faults(registry)
+    registry = console.registry()
     return Experiment.load(config, overrides, registry=registry)
 
 

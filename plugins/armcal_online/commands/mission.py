@@ -13,7 +13,7 @@ from armcal.calibration.calibration import Calibration
 from armcal.cli.common import Console, overrides, speaking
 from armcal.io.folder import reserved
 from armcal.io.standard_output import StandardOutput
-from armcal.plugins import PluginRegistry, discover
+from armcal.plugins import PluginRegistry
 from armcal.run.pipeline import Stopwatch
 from rich.table import Table
 
@@ -43,8 +43,7 @@ def mission(console: Console, config: Path, out: Path, overrides: tuple[str, ...
     """Simulate the mission of CONFIG, recalibrate over all of it, and judge that against the truth."""
     watch = Stopwatch()
     kept = click.get_current_context().with_resource(reserved(out, OURS))
-    registry = discover()
-    console.plugin_faults(registry)
+    registry = console.registry()
     plan = MissionPlan.load(config, overrides, registry)
     kept.place({})
     with console.progress() as progress:

@@ -11,7 +11,6 @@ from armcal.calibration.calibration import Calibration
 from armcal.cli.common import Console, overrides, speaking
 from armcal.io.journal.journal import JournalLimits
 from armcal.io.standard_output import StandardOutput
-from armcal.plugins import discover
 
 from armcal_online.running.loop import Pace
 from armcal_online.running.session import Setup, opened
@@ -51,8 +50,7 @@ def recalibrate(
 
     Given the same folder again, it goes on where it was left.
     """
-    registry = discover()
-    console.plugin_faults(registry)
+    registry = console.registry()
     settings = load_settings(config, overrides)
     loaded = Calibration.load(calibration, registry)
     session = Recalibrator.begin(loaded, settings, registry)

@@ -14,7 +14,6 @@ from armcal.cli.common import Console, overrides, speaking
 from armcal.cli.outlet import say
 from armcal.errors import EXIT_BAD_INPUT, EXIT_FAULT, InputError, Location
 from armcal.io.journal.files import REAL_FILES, write_whole
-from armcal.plugins import discover
 from rich.table import Table
 
 from armcal_online.replaying.comparison import WARM_UP, Comparison, compared, side_by_side
@@ -65,8 +64,7 @@ def replay_command(
     JOURNAL is the folder of a recalibration, or the journal in it; nothing is written there. With --config or --set,
     what other settings would have done is shown beside what was done, and --calibration writes theirs.
     """
-    registry = discover()
-    console.plugin_faults(registry)
+    registry = console.registry()
     folder = journal_folder(journal)
     _check_out(calibration, folder)
     held = kept_journal(folder)

@@ -14,7 +14,6 @@ from armcal.cli.predict import read_commands
 from armcal.errors import InputError, Location
 from armcal.estimate.validation import error_unit
 from armcal.io.plain_files import check_output
-from armcal.plugins import discover
 from rich.table import Table
 
 from armcal_online.tracking.settings import RecalibrateSettings
@@ -36,8 +35,7 @@ def what_if(console: Console, calibration: Path, poses: Path, out: Path | None, 
     Shown are the information in bits, the standard deviation of the prediction there, and the parameters whose
     standard deviations would shrink most.
     """
-    registry = discover()
-    console.plugin_faults(registry)
+    registry = console.registry()
     loaded = Calibration.load(calibration, registry)
     commands = read_commands(registry, loaded, poses, columns)
     if out is not None and (out.resolve() in (poses.resolve(), calibration.resolve()) or not out.parent.is_dir()):
