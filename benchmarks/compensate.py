@@ -103,7 +103,7 @@ def run() -> Iterator[Row]:
 def _timed(arm: TrueArm, kind: str, targets: Targets) -> Iterator[Row]:
     compensator = arm.compensator()
     found = compensator.solve(targets)
-    had = found.found & (found.distances <= _HAD_M)
+    had = found.reached & (found.distances <= _HAD_M)
     peer, note = _toolbox(arm, targets)
     contenders: dict[str, Callable[[], object]] = {"armcal": lambda: compensator.solve(targets)}
     best = best_times({**contenders, **({"peer": peer} if peer else {})}, 4)
@@ -166,7 +166,7 @@ def _out_of_reach(arm: TrueArm, targets: Targets) -> Row:
     found = compensator.solve(targets)
     seconds = best_times({"armcal": lambda: compensator.solve(targets)}, 2)["armcal"]
     apart = 1000 * (found.distances - found.bounds)
-    told = f"{int(found.found.sum())} had; nearest {apart.mean():.2f} mm (at least {apart.min():.2f}) above the bound"
+    told = f"{int(found.reached.sum())} had; nearest {apart.mean():.2f} mm (at least {apart.min():.2f}) above the bound"
     return Row(NAME, "positions beyond reach", seconds, "", None, told, len(targets))
 
 
@@ -190,12 +190,12 @@ def with_counts() -> Iterator[Errors]:
     compensator, rigid, nominal = arm.compensator(), arm.rigid(arm.parameters), arm.nominal
     targets = reachable(compensator, ROUNDED)
     thought = nominal.solve(targets)
-    yield Errors("nominal", _away(compensator, thought.joint_angles[thought.found], targets, thought.found))
+    yield Errors("nominal", _away(compensator, thought.joint_angles[thought.reached], targets, thought.reached))
     few = targets.subset(np.arange(SEARCHED))
     yield Errors("fixed point", _fixed_point(compensator, rigid, targets))
     yield Errors(f"search in the 1 cm cube ({SEARCHED} targets)", _cube(compensator, rigid, few))
     exact = arm.exact().solve(targets)
-    rounded = _away(compensator, exact.joint_angles[exact.found], targets, exact.found)
+    rounded = _away(compensator, exact.joint_angles[exact.reached], targets, exact.reached)
     yield Errors("exact commands, each joint to its nearest count", rounded)
     yield Errors("armcal, poses", compensator.solve(targets).distances)
     yield Errors("armcal, positions", compensator.solve(replace(targets, rotations=None)).distances)
@@ -216,7 +216,7 @@ def _fixed_point(compensator: Compensator, rigid: Compensator, targets: Targets)
         found: Commands = rigid.solve(replace(targets, positions=told), near)
         stands = compensator.stand(found.joint_angles, targets, np.zeros_like(found.joint_angles))
         missed = targets.positions - stands.base_T_tool[:, :3, 3]
-        best = np.minimum(best, np.where(found.found, np.linalg.norm(missed, axis=1), np.inf))
+        best = np.minimum(best, np.where(found.reached, np.linalg.norm(missed, axis=1), np.inf))
         told, near = told + missed, found.joint_angles
     return best[np.isfinite(best)]
 
@@ -231,7 +231,7 @@ def _cube(compensator: Compensator, rigid: Compensator, targets: Targets) -> Arr
     found = rigid.solve(told)
     stands = compensator.stand(found.joint_angles, asked, np.zeros_like(found.joint_angles))
     away = np.linalg.norm(stands.base_T_tool[:, :3, 3] - asked.positions, axis=1)
-    best = np.where(found.found, away, np.inf).reshape(len(targets), -1).min(axis=1)
+    best = np.where(found.reached, away, np.inf).reshape(len(targets), -1).min(axis=1)
     return np.asarray(best[np.isfinite(best)])
 
 

@@ -99,7 +99,7 @@ def _client(
         while (began := time.perf_counter()) < ends:
             answer = client.ask(json.loads(requests[at % len(requests)]))
             waits.append(time.perf_counter() - began)
-            if not (answer["ok"] and answer["commands"][0]["found"]):
+            if not (answer["ok"] and answer["commands"][0]["reached"]):
                 raise RuntimeError(f"a request was not answered: {answer}")
             seen.add(answer["calibration"]["sequence"])
             at += 1

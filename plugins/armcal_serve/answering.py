@@ -220,7 +220,7 @@ def command_rows(arm: ServedArm, commands: Commands, units: Units) -> list[Comma
     return [
         {
             **_commanded(arm, commands, i, units),  # type: ignore[typeddict-item]
-            "found": bool(commands.found[i]),
+            "reached": bool(commands.reached[i]),
             "why_not": commands.reasons[i],
             "error_mm": float(commands.distances[i]) * 1000,
             "error_deg": math.degrees(float(commands.turns[i])),

@@ -219,7 +219,7 @@ class Command(TypedDict):
         joint_angles_rad, joint_angles_deg: the commands; of an arm with sliding joints ``joints`` in their place, by
             name with the unit.
         counts, pulse_us: for the servo board; null for a joint without a pulse table.
-        found: whether the target is reached; ``why_not`` says why not, and the command is the nearest that was found.
+        reached: whether the target is reached; ``why_not`` says why not, and the command is the nearest that was found.
         error_mm, error_deg: what remains.
         nearest_mm: no command comes nearer than this, as far as is known.
         approach: the assumed side from which each joint comes: -1, 0 (not known), 1.
@@ -231,7 +231,7 @@ class Command(TypedDict):
     joints: NotRequired[dict[str, float]]
     counts: NotRequired[list[int | None]]
     pulse_us: NotRequired[list[float | None]]
-    found: bool
+    reached: bool
     why_not: str
     error_mm: float
     error_deg: float

@@ -223,9 +223,9 @@ def test_what_to_tell_a_controller_of_the_nominal_arm(desk: Desk) -> None:
     wrong = nominal.solve(nominal.targets(desk.places_mm / 1000), commands)
     away = predicted(calibration("three"), wrong.joint_angles)[:, :3, 3] - desk.places_mm / 1000
     stated = [row["nominal_error_mm"] for row in desk.answers()]
-    assert [text != "" for text in stated] == wrong.found.tolist()
+    assert [text != "" for text in stated] == wrong.reached.tolist()
     had = [float(text) for text in stated if text]
-    assert had == pytest.approx(1000 * np.linalg.norm(away[wrong.found], axis=1), rel=1e-3)
+    assert had == pytest.approx(1000 * np.linalg.norm(away[wrong.reached], axis=1), rel=1e-3)
 
 
 def test_one_arm_of_two(tmp_path: Path) -> None:
@@ -363,7 +363,7 @@ def test_limits_of_the_plan_are_kept(tmp_path: Path) -> None:
     q = q[bench.space.allowed(q.T)][:4]
     assert len(q) == 4
     commands = found.solve(found.targets(found.forward(q)[:, :3, 3]))
-    assert commands.found.all()
+    assert commands.reached.all()
     assert bench.space.allowed(commands.joint_angles.T).all()
     assert (np.abs(commands.joint_angles[:, 1]) <= np.radians(50) + 1e-12).all()
 

@@ -85,7 +85,7 @@ def _inside(calibration: Calibration, held: tuple[str, ...], measured: Dataset, 
     function: ca.Function = slope_function(compensator.expression, False)
     slopes = np.asarray(function.map(len(q))(record, states)).reshape(6, 3, -1).transpose(2, 1, 0)[:, :, free]
     told = np.linalg.svd(slopes, compute_uv=False)[:, -1] > LEAST_M_PER_RAD
-    assert commands.found[told].all()
+    assert commands.reached[told].all()
     back = np.linalg.inv(slopes[told])
     half_widths = np.sqrt(np.einsum("nij,njk,nik->ni", back, covariance[told], back))
     moved = (commands.joint_angles - q)[told][:, free]

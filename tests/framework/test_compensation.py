@@ -14,6 +14,7 @@ from armcal.calibration.compensation.finder import Solutions
 from armcal.calibration.compensation.path import with_sides
 from armcal.calibration.compensation.request import Commands, Options, Targets
 from armcal.calibration.compensation.seeds import Seeds
+from armcal.calibration.rigid_chain import turn_between
 from armcal.functions.compiler import find_compiler
 from scipy.optimize import least_squares, minimize
 from scipy.spatial.transform import Rotation
@@ -35,7 +36,7 @@ def acting(found: Compensator, count: int, **told) -> np.ndarray:
 
 def arrives(found: Compensator, targets: Targets, commands: Commands, name: str) -> None:
     """All are reached, within the limits, and the calibration's own prediction agrees."""
-    assert commands.found.mean() >= 0.999
+    assert commands.reached.mean() >= 0.999
     assert set(commands.reasons) == {""}
     assert commands.distances.max() <= NEAR_M
     assert commands.turns.max() <= NEAR_RAD
@@ -106,7 +107,7 @@ def test_other_random_starts_find_all_targets_too() -> None:
     for seed in (1, 2):
         found = with_options("lrm", Options(limits=LRM_LIMITS, seed=seed))
         commands = found.solve(of(found, drawn(found, 40, seed=seed), turns=True))
-        assert commands.found.all()
+        assert commands.reached.all()
 
 
 def test_where_the_arm_stands_is_its_own_nearest_command() -> None:
@@ -146,7 +147,7 @@ def test_beyond_its_reach_the_arm_comes_as_near_as_it_can(name: str) -> None:
     positions = np.array([[1.5, 0.2, 0.1], [0.1, -0.2, 0.9], [-0.4, 0.5, -0.6]])
     commands = found.solve(found.targets(positions))
     tried = found.forward(drawn(found, 1000, widest=np.pi))[:, :3, 3]
-    assert not commands.found.any()
+    assert not commands.reached.any()
     for i, position in enumerate(positions):
         assert "out of reach: no command comes nearer than" in commands.reasons[i]
         assert commands.bounds[i] <= np.linalg.norm(tried - position, axis=1).min()
@@ -159,7 +160,7 @@ def test_too_near_is_out_of_reach_too() -> None:
     """Links of 600 mm and 200 mm leave a hole in the middle."""
     found = calibration("two_links").compensator(choice="interpreted")
     commands = found.solve(found.targets(np.array([[0.1, 0.0, 0.0], [0.5, 0.1, 0.0]])))
-    assert commands.found.tolist() == [False, False]
+    assert commands.reached.tolist() == [False, False]
     assert commands.bounds[0] == pytest.approx(found.reach.nearest - 0.1, abs=5e-3)
     other = nearest_by_scipy(found, np.array([0.1, 0, 0]), commands.joint_angles[0])
     assert commands.bounds[0] <= commands.distances[0] <= other + 1e-6
@@ -179,7 +180,7 @@ def test_limits_are_kept_and_named() -> None:
     found = with_options("three", Options(limits={"q1": (-0.5, 0.5), "q2": (0.0, 1.0)}))
     targets = of(free, np.array([[1.0, 0.5, 0.4], [-1.5, 0.3, 0.2], [0.2, 0.6, 0.3]]))
     commands = found.solve(targets)
-    assert commands.found.tolist() == [False, False, True]
+    assert commands.reached.tolist() == [False, False, True]
     assert within(found, commands)
     for i in range(2):
         assert "no command was found that reaches it; the nearest has q1" in commands.reasons[i]
@@ -192,7 +193,7 @@ def test_a_rotation_that_cannot_be_had_is_told_from_a_position_that_cannot() -> 
     found = compensator("three")
     place = found.forward(np.array([[0.3, 0.5, -0.4]]))[:, :3, 3]
     commands = found.solve(found.targets(place, Rotation.from_euler("x", [1.0]).as_matrix()))
-    assert not commands.found[0]
+    assert not commands.reached[0]
     assert "the position can be reached, but not with this rotation" in commands.reasons[0]
 
 
@@ -220,7 +221,7 @@ def test_starts_lie_within_limits_however_they_lie(limits) -> None:
     assert np.ptp(starts) > 6
     free = compensator("rigid")
     commands = found.solve(of(free, drawn(free, 10)))
-    assert commands.found.all()
+    assert commands.reached.all()
     assert within(found, commands)
 
 
@@ -269,7 +270,7 @@ def test_no_targets_have_no_commands() -> None:
 def test_more_than_the_springs_hold_is_not_had() -> None:
     found = compensator("three")
     commands = found.solve(found.targets(found.forward(drawn(found, 3))[:, :3, 3], payload=300.0))
-    assert not commands.found.any()
+    assert not commands.reached.any()
     assert all(commands.reasons)
 
 
@@ -281,7 +282,7 @@ def test_clearance_chooses_the_other_posture() -> None:
     found = with_options("rigid", Options(), allowed=lambda q: q[2] > 0)
     free = compensator("rigid")
     commands = found.solve(of(free, np.array([[0.3, 0.8, -0.9], [0.5, 0.9, -0.5], [0.1, 0.2, 0.7]])))
-    assert commands.found.all()
+    assert commands.reached.all()
     assert (commands.joint_angles[:, 2] > 0).all()
 
 
@@ -289,7 +290,7 @@ def test_clearance_chooses_the_other_posture() -> None:
 def test_clearance_that_forbids_everything_says_so(name: str) -> None:
     found = with_options(name, Options(), allowed=lambda q: np.zeros(q.shape[1], dtype=bool))
     commands = found.solve(of(compensator(name), np.array([[0.3, 0.8, -0.9], [0.1, 0.2, 0.7]])))
-    assert not commands.found.any()
+    assert not commands.reached.any()
     assert set(commands.reasons) == {"all commands found that reach it are too near to something"}
 
 
@@ -299,7 +300,7 @@ def test_counts_that_stand_too_near_are_not_had() -> None:
     found = with_options("servos", Options(), allowed=lambda q: np.abs(q - exact[:, None]).max(axis=0) < 1e-5)
     target = compensator("servos").exact(exact[None], acting(found, 1))[:, :3, 3]
     commands = found.solve(found.targets(target), exact)
-    assert not commands.found[0]
+    assert not commands.reached[0]
     assert commands.reasons[0] == "all commands found that reach it are too near to something"
 
 
@@ -308,10 +309,10 @@ def test_held_joints_stay_exactly_where_they_are() -> None:
     at = drawn(found, 8, seed=3)
     moved = at + np.random.default_rng(1).uniform(-0.2, 0.2, at.shape) * np.array([1, 0, 1, 0, 1])
     commands = found.solve(of(found, moved), at)
-    assert commands.found.all()
+    assert commands.reached.all()
     assert (commands.joint_angles[:, [1, 3]] == at[:, [1, 3]]).all()
     path = found.follow(of(found, at[0] + np.linspace(0, 0.3, 5)[:, None] * np.array([1, 0, 1, 0, 1])), at[0])
-    assert path.found.all()
+    assert path.reached.all()
     assert (path.joint_angles[:, [1, 3]] == at[0, [1, 3]]).all()
     far = found.solve(of(found, at[:1] + np.array([0, 1.5, 0, 0, 0])), at[0])
     assert (far.joint_angles[:, [1, 3]] == at[0, [1, 3]]).all()
@@ -337,7 +338,7 @@ def test_a_held_joint_is_held_too_where_a_position_alone_is_asked() -> None:
     start = np.array([0.0, 0.5, -0.4])
     tools = found.forward(np.array([[1.2, 0.5, -0.4]]))
     commands = found.solve(found.targets(tools[:, :3, 3], tools[:, :3, :3]), start)
-    assert not commands.found[0]
+    assert not commands.reached[0]
     assert "the position can be reached" not in commands.reasons[0]
 
 
@@ -371,7 +372,7 @@ def test_the_nearest_commands_cannot_be_bettered(count: int) -> None:
     start = np.array([0.9, -0.8, 1.0, -1.0, 0.6])
     targets = of(found, drawn(found, count, seed=11))
     commands = found.solve(targets, start)
-    assert commands.found.all()
+    assert commands.reached.all()
     assert within(found, commands)
     for i in range(count):
 
@@ -388,7 +389,7 @@ def test_what_redundancy_makes_small_cannot_be_made_much_smaller(redundancy: str
     found = with_options("five", Options(limits=NARROW, redundancy=redundancy))
     targets = of(found, drawn(found, 2, seed=3))
     commands = found.solve(targets)
-    assert commands.found.all()
+    assert commands.reached.all()
     assert commands.distances.max() <= NEAR_M
     assert within(found, commands)
     ordinary = with_options("five", Options(limits=NARROW)).solve(targets)
@@ -440,7 +441,7 @@ def test_a_path_that_can_be_had_is_followed_without_jumps(name: str, turns: bool
     targets = of(found, along, turns)
     told, chosen = found.follow(targets, along[0]), found.follow(targets)
     for commands in (told, chosen):
-        assert commands.found.all()
+        assert commands.reached.all()
         assert commands.distances.max() <= NEAR_M
         moves = np.diff(commands.joint_angles, axis=0)
         assert moves == pytest.approx(commands.moves[1:], abs=1e-9)
@@ -456,12 +457,12 @@ def test_the_side_from_which_joints_come_follows_from_the_motion() -> None:
     there = line(found, [0.2, 0.3, 0.5], [0.5, 0.6, 0.2])
     exact = found.forward(there)[:, :3, 3]
     forth = found.follow(found.targets(exact), there[0] - np.array([0.05, 0.05, -0.05]))
-    assert forth.found.all()
+    assert forth.reached.all()
     moved = np.diff(forth.joint_angles, axis=0)
     assert (np.sign(moved) == forth.approach[1:]).all()
     assert (forth.approach[1:] == [1, 1, -1]).all()
     back = found.follow(found.targets(exact[::-1]), forth.joint_angles[-1])
-    assert back.found.all()
+    assert back.reached.all()
     assert (back.approach[1:] == [-1, -1, 1]).all()
     assert np.abs(back.joint_angles[::-1][:-1] - forth.joint_angles[:-1]).max() > 1e-3  # the play is taken up
     sides = {f"arm.approach.q{i + 1}": forth.approach[:, i] for i in range(3)}
@@ -502,7 +503,7 @@ def test_a_single_command_comes_from_where_the_arm_stands() -> None:
     start = np.array([0.1, 0.9, 0.2])
     targets = of(found, np.array([[0.3, 0.5, 0.7]]))
     commands = found.solve(targets, start)
-    assert commands.found[0]
+    assert commands.reached[0]
     assert (commands.approach[0] == np.sign(commands.joint_angles[0] - start)).all()
     sides = {f"arm.approach.q{i + 1}": commands.approach[:, i] for i in range(3)}
     tool = predicted(calibration("play"), commands.joint_angles, **sides)
@@ -515,7 +516,7 @@ def test_a_path_that_must_jump_says_where() -> None:
     free = compensator("rigid")
     along = line(free, [1.2, 0.9, -2.0], [1.9, 0.9, -2.0], 15)
     commands = found.follow(of(free, along), along[0])
-    assert commands.found.all()
+    assert commands.reached.all()
     assert within(found, commands)
     longest = np.abs(commands.moves).max(axis=1)
     jump = int(np.argmax(longest))
@@ -530,7 +531,7 @@ def test_a_place_out_of_reach_does_not_end_a_path() -> None:
     positions = found.forward(along)[:, :3, 3]
     positions[4] *= 3
     commands = found.follow(found.targets(positions), along[0])
-    assert commands.found.tolist() == [True] * 4 + [False] + [True] * 4
+    assert commands.reached.tolist() == [True] * 4 + [False] + [True] * 4
     assert "out of reach" in commands.reasons[4]
 
 
@@ -563,7 +564,7 @@ def test_commands_are_what_the_board_sets(name: str) -> None:
     found = compensator(name)
     targets = of(found, drawn(found, 30))
     commands = found.solve(targets)
-    assert commands.found.all()
+    assert commands.reached.all()
     assert np.abs(set_angles(found, commands.joint_angles) - commands.joint_angles).max() < 1e-12
     for i, joint in enumerate(found.joints):
         if joint not in found.expression.servos:
@@ -630,7 +631,7 @@ def test_counts_stay_within_limits_and_held_joints_are_only_rounded() -> None:
     start = np.array([0.2, 0.1, 0.7])
     edge = np.array([[0.4, 0.5, 0.7], [0.0, 1.0, 0.7], [0.2, -1.0, 0.7]])
     commands = found.solve(found.targets(found.exact(edge, acting(found, 3))[:, :3, 3]), start)
-    assert commands.found.all()
+    assert commands.reached.all()
     assert within(found, commands)
     nearest = set_angles(found, np.array([[0.0, 0.0, 0.7]]))[0, 2]
     assert commands.joint_angles[:, 2] == pytest.approx(nearest, abs=1e-12)
@@ -641,5 +642,12 @@ def test_many_joints_without_servos_cost_nothing() -> None:
     found = calibration("ten").compensator(choice="interpreted")
     targets = of(found, drawn(found, 20))
     commands = found.solve(targets)
-    assert commands.found.all()
+    assert commands.reached.all()
     assert (np.delete(commands.counts, [0, 2], axis=1) == 0).all()
+
+
+def test_a_half_turn_between_rotations_is_one():
+    """Its sine is zero, as that of no turn."""
+    turned = np.stack([np.diag([1.0, -1, -1]), np.diag([-1.0, 1, -1]), np.diag([-1.0, -1, 1]), np.eye(3)])
+    turns = turn_between(np.broadcast_to(np.eye(3), turned.shape), turned)
+    np.testing.assert_allclose(np.abs(turns), np.pi * np.vstack([np.eye(3), np.zeros(3)]), atol=1e-12)

@@ -107,7 +107,7 @@ def test_commands_bring_the_calibrated_arm_there(answerer: Answerer, calibration
         answer = told(answerer, do="compensate", targets=target, start_deg=start, units="deg", **LOAD)
         TypeAdapter(CompensateAnswer).validate_python(answer)
         (command,) = answer["commands"]
-        assert command["found"] and command["error_mm"] < 1e-5 and command["why_not"] == ""
+        assert command["reached"] and command["error_mm"] < 1e-5 and command["why_not"] == ""
         found.append(command["joint_angles_deg"])
     assert found[0] == pytest.approx(Q_DEG, abs=1e-5)
     assert found[1] == pytest.approx(Q_DEG, abs=1e-5)
@@ -124,7 +124,7 @@ def test_a_path_is_followed_and_what_is_out_of_reach_is_told(answerer: Answerer,
     poses = calibration.forward(commands)
     assert poses[:, :3, 3] * 1000 == pytest.approx(np.array([t["position_mm"] for t in targets]), abs=1e-4)
     far = told(answerer, do="compensate", targets=[{"position_m": [9, 0, 0]}])["commands"][0]
-    assert not far["found"] and far["why_not"] and far["error_mm"] > 8000
+    assert not far["reached"] and far["why_not"] and far["error_mm"] > 8000
 
 
 @pytest.mark.parametrize(
@@ -220,7 +220,7 @@ def commands(counts: Any = None) -> Commands:
         base_T_tool=np.eye(4)[None],
         distances=one + 1e-3,
         turns=one + np.pi / 180,
-        found=one > -1,
+        reached=one > -1,
         reasons=("",),
         bounds=one,
         approach=np.array([[-1.0, 0.0]]),
@@ -283,7 +283,7 @@ def test_commands_stay_within_what_a_configuration_allows(path: Path) -> None:
     for q1, found in ((3.0, True), (30.0, False)):
         target = told(narrow, do="forward", joint_angles_deg=[q1, -20, 30, 40, -50, 20])["tools"][0]
         (command,) = told(narrow, do="compensate", targets=target, units="deg")["commands"]
-        assert command["found"] is found and abs(command["joint_angles_deg"][0]) <= 5 + 1e-9
+        assert command["reached"] is found and abs(command["joint_angles_deg"][0]) <= 5 + 1e-9
     with pytest.raises(ConfigError, match="no plan"):
         loaded(Order("c.yaml", 1, sha256(text), within=str(folder / "demo.yaml")), text.encode())
 

@@ -53,7 +53,7 @@ def places_mm(postures_deg: Any, **channels: Any) -> np.ndarray:
 
 
 def commanded(answer: dict[str, Any]) -> np.ndarray:
-    assert all(command["found"] for command in answer["commands"]), answer
+    assert all(command["reached"] for command in answer["commands"]), answer
     return np.array([command["joint_angles_deg"] for command in answer["commands"]])
 
 

@@ -82,7 +82,7 @@ def test_both_arms_of_two_stand_where_they_are_predicted() -> None:
         found = both.compensator(arm, choice="interpreted")
         assert apart(found.forward(commands), both.forward(commands, arm)) < 1e-12
         had = found.solve(found.targets(both.forward(commands, arm)[:, :3, 3]))
-        assert had.found.all()
+        assert had.reached.all()
         assert apart(both.forward(had.joint_angles, arm)[:, :3, 3], both.forward(commands, arm)[:, :3, 3]) < 1e-9
 
 
@@ -115,7 +115,7 @@ def test_a_joint_that_follows_another_is_not_commanded_and_moves_all_the_same(tm
     tools = found.forward(commands)
     assert apart(tools, predicted(given, commands)) < 1e-12
     had = found.solve(found.targets(tools[:, :3, 3]))
-    assert had.found.all()
+    assert had.reached.all()
     assert apart(predicted(given, had.joint_angles)[:, :3, 3], tools[:, :3, 3]) < 1e-9
     assert (had.joint_angles >= found.limits[:, 0]).all()
     assert (had.joint_angles <= found.limits[:, 1]).all()
@@ -130,7 +130,7 @@ def test_lengths_grow_with_the_temperature_that_is_told() -> None:
     assert apart(tools, predicted(given, commands, temperature=told)) < 1e-12
     assert apart(found.forward(commands, conditions={"temperature": 20.0}), predicted(given, commands)) < 1e-12
     had = found.solve(found.targets(tools[:, :3, 3], conditions={"temperature": told}))
-    assert had.found.all()
+    assert had.reached.all()
     reached = predicted(given, had.joint_angles, temperature=told)
     assert apart(reached[:, :3, 3], tools[:, :3, 3]) < 1e-9
 
@@ -252,7 +252,7 @@ def test_moving_the_base_moves_the_targets_and_not_the_commands() -> None:
     assert apart(here[:, :3, 3] + shift, there[:, :3, 3]) < 1e-12
     first = one.solve(one.targets(here[:, :3, 3]), commands[0])
     second = two.solve(two.targets(there[:, :3, 3]), commands[0])
-    assert first.found.all()
+    assert first.reached.all()
     assert apart(first.joint_angles, second.joint_angles) < 1e-6
 
 

@@ -100,13 +100,13 @@ class Clearance:
 
     def pairs(self, rule: Rule, moved_by: Mapping[str, int]) -> tuple[tuple[str, str], ...]:
         """The pairs of parts that a rule is about; ``moved_by`` gives each frame's joint (0: none)."""
-        found = {
+        pairs = {
             (min(a, b), max(a, b))
             for a in self._matching(rule.between[0], rule)
             for b in self._matching(rule.between[1], rule)
             if a != b and not self._adjacent(a, b, moved_by)
         }
-        return tuple(sorted(found))
+        return tuple(sorted(pairs))
 
     def _matching(self, glob: str, rule: Rule) -> list[str]:
         kept = [name for name in self.parts if not any(fnmatchcase(name, other) for other in rule.besides)]
@@ -269,8 +269,8 @@ def _point_function(arm: Arm, points: Sequence[Point]) -> ca.Function:
     """Joint commands to the points in the base frame, stacked."""
     chain = arm.nominal_chain
     commands = ca.SX.sym("commands", len(arm.commanded))
-    told = arm.joint_commands(ca.vertsplit(commands))
-    frames = forward(chain, [joint.offset + told[i] for i, joint in enumerate(chain.joints)], {})
+    commanded = arm.joint_commands(ca.vertsplit(commands))
+    frames = forward(chain, [joint.offset + commanded[i] for i, joint in enumerate(chain.joints)], {})
     mount = frames.sites[0]
     stacked = []
     for point in points:

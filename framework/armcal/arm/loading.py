@@ -49,10 +49,10 @@ def site_loads(arm: Arm, values: Mapping[str, Array], commands: Array, acting: A
     count = len(arm.joint_names)
     sites = count + 1
     function = _function(arm, values)
-    found = np.asarray(function.map(commands.shape[1])(commands, acting).full())
-    moments = found[: 3 * sites].reshape(sites, 3, -1)
-    efforts = found[3 * sites : 3 * sites + count]
-    levers = found[3 * sites + count :].reshape(sites, 3, 3, -1).swapaxes(1, 2)
+    loads = np.asarray(function.map(commands.shape[1])(commands, acting).full())
+    moments = loads[: 3 * sites].reshape(sites, 3, -1)
+    efforts = loads[3 * sites : 3 * sites + count]
+    levers = loads[3 * sites + count :].reshape(sites, 3, 3, -1).swapaxes(1, 2)
     return SiteLoads(moments, efforts, levers)
 
 

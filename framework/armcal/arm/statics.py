@@ -99,8 +99,8 @@ def effort(joint: Joint, site: Site, wrench: SiteWrench) -> Expression:
 
 def joint_efforts(chain: Chain, frames: Frames, acting: Sequence[SiteWrench]) -> Expression:
     """What wrenches do about or along each joint's own axis (joints x 1; N m, N on sliding joints)."""
-    each = zip(chain.joints, frames.sites[1:], acting[1:], strict=True)
-    return ca.vertcat(*[effort(joint, site, wrench) for joint, site, wrench in each])
+    joints = zip(chain.joints, frames.sites[1:], acting[1:], strict=True)
+    return ca.vertcat(*[effort(joint, site, wrench) for joint, site, wrench in joints])
 
 
 def _frame(chain: Chain, frames: Frames, name: str) -> tuple[se3.Transform, int]:

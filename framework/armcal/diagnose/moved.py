@@ -66,8 +66,8 @@ def moved_findings(moved: Sequence[Moved]) -> list[Finding]:
     return [
         Finding(
             "warning",
-            f"{group.key}: its first {group.before} records lie {group.distance * _MM:.1f} mm "
-            f"from the other {group.after}, {group.distance / group.scatter:.0f} times as far as they scatter. Did it move, or the base?",
+            f"{group.key}: its first {group.before} records lie {group.distance * _MM:.1f} mm from the other "
+            f"{group.after}, {group.distance / group.scatter:.0f} times their spread. Did it move, or the base?",
             f"the best split in recorded order, limit {FAR:g} standard deviations",
             "Give the records before the move a label of their own, or leave them out.",
         )

@@ -103,7 +103,7 @@ class BatchFunction:
         if not whole and count:
             return self._rest(inputs, 0)
         outputs = [np.empty((size, count)) for size in self._sizes_out]
-        _evaluate(self._library.armcal_evaluate, [_rows(each) for each in inputs], outputs, whole)
+        _evaluate(self._library.armcal_evaluate, [_rows(array) for array in inputs], outputs, whole)
         if whole < count:
             for target, source in zip(outputs, self._rest(inputs, whole), strict=True):
                 target[:, whole:] = source
@@ -119,9 +119,9 @@ class BatchFunction:
         """Records from ``start`` on, fewer than one vector of them: the last one fills it up."""
         count, row = inputs[0].shape[1] - start, 0
         given = np.empty((self._all_in, c_source.LANES))
-        for each in inputs:
-            given[row : row + len(each), :count] = each[:, start:]
-            row += len(each)
+        for array in inputs:
+            given[row : row + len(array), :count] = array[:, start:]
+            row += len(array)
         given[:, count:] = given[:, count - 1 : count]
         taken = np.empty((sum(self._sizes_out), c_source.LANES))
         self._library.armcal_evaluate_vector(given.ctypes.data, taken.ctypes.data)
@@ -187,7 +187,7 @@ def _addresses(name: str, sizes: Sequence[int]) -> list[str]:
 
 def _trial(batch: BatchFunction, sample: Sequence[Array]) -> compiler.Trial:
     """What a new library has to give for the sample, all inputs in one piece of memory and so all outputs."""
-    given = [np.ascontiguousarray(each[:, : c_source.LANES], dtype=float) for each in sample]
+    given = [np.ascontiguousarray(array[:, : c_source.LANES], dtype=float) for array in sample]
     expected = np.concatenate(batch.interpreted(*given))
     return compiler.Trial(_VECTOR, (np.concatenate(given), np.zeros_like(expected)), {1: expected}, _AGREEMENT)
 
@@ -197,7 +197,7 @@ def _agreeing(batch: BatchFunction, library: ctypes.CDLL | None, sample: Sequenc
     if library is None:
         return None
     library.armcal_evaluate_vector.argtypes = [ctypes.c_void_p, ctypes.c_void_p]
-    given = [np.ascontiguousarray(each[:, : c_source.LANES]) for each in sample]
+    given = [np.ascontiguousarray(array[:, : c_source.LANES]) for array in sample]
     mine = [np.empty((size, c_source.LANES)) for size, _ in batch.places]
     _evaluate(library.armcal_evaluate, given, mine, c_source.LANES)
     for one, two in zip(batch(*given), mine, strict=True):

@@ -41,10 +41,10 @@ _BUILD = ".build-"
 @cache
 def find_compiler() -> str | None:
     """The C compiler's path, or None."""
-    asked = os.environ.get("ARMCAL_CC", "")
-    if asked == "none":
+    named = os.environ.get("ARMCAL_CC", "")
+    if named == "none":
         return None
-    for name in [asked] if asked else [os.environ.get("CC", ""), "cc", "gcc", "clang"]:
+    for name in [named] if named else [os.environ.get("CC", ""), "cc", "gcc", "clang"]:
         text = shutil.which(name) if name else None
         if text:
             return text

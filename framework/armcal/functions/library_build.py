@@ -56,7 +56,7 @@ def passes(folder: Path) -> bool:
     """Whether the library gives the numbers that its trial expects."""
     trial = json.loads((folder / "job.json").read_text(encoding="utf-8"))["trial"]
     entry = getattr(ctypes.CDLL(str(folder / "kernel.so")), trial["entry"])
-    arguments = [_argument(each) for each in trial["arguments"]]
+    arguments = [_argument(argument) for argument in trial["arguments"]]
     entry(*arguments)
     return all(_agree(arguments[int(at)], numbers, trial) for at, numbers in trial["expected"].items())
 
@@ -67,12 +67,12 @@ def _argument(given: int | float | list[float]) -> Any:
     return ctypes.c_double(given) if isinstance(given, float) else ctypes.c_long(given)
 
 
-def _agree(found: Any, expected: list[float], trial: Mapping[str, Any]) -> bool:
+def _agree(result: Any, expected: list[float], trial: Mapping[str, Any]) -> bool:
     """Within a share of the largest number, or exactly where one is not finite."""
     finite = all(math.isfinite(x) or math.isnan(x) for x in expected)
     scale = max([1.0, *(abs(x) for x in expected if not math.isnan(x))])
     limit = trial["tolerance"] * scale if finite else 0.0
-    pairs = zip(found, expected, strict=False)
+    pairs = zip(result, expected, strict=False)
     return all(a == b or (math.isnan(a) and math.isnan(b)) or abs(a - b) <= limit for a, b in pairs)
 
 

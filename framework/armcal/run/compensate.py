@@ -145,7 +145,7 @@ def assess(
     away = np.linalg.norm(reached.base_T_tool[:, :3, 3] - targets.positions, axis=1)
     return Assessed(
         commands=commands,
-        nominal_distances=np.where(thought.found & reached.settled, away, np.nan),
+        nominal_distances=np.where(thought.reached & reached.settled, away, np.nan),
         tools=_of_tool(compensator, commands.base_T_tool),
         nominal_T_tool=_of_tool(nominal, nominal.forward(commands.joint_angles)),
         radii=_radii(calibration, compensator, targets, commands),
@@ -172,7 +172,7 @@ def _radii(calibration: Calibration, compensator: Compensator, targets: Targets,
     """95 % radii of the first position that is measured of this arm alone."""
     if len(calibration.system.arms) > 1 or not calibration.readable or calibration.record.prediction is None:
         return None
-    settled = np.flatnonzero(commands.found)
+    settled = np.flatnonzero(commands.reached)
     radii = np.full(len(commands), np.nan)
     if not settled.size:
         return radii
@@ -188,7 +188,7 @@ def _radii(calibration: Calibration, compensator: Compensator, targets: Targets,
 
 def summary(assessed: Assessed) -> Mapping[str, float | int | None]:
     """In mm, over the targets that are reached."""
-    reached = assessed.commands.found
+    reached = assessed.commands.reached
     away = 1000 * assessed.commands.distances[reached]
     nominal = 1000 * assessed.nominal_distances[reached & np.isfinite(assessed.nominal_distances)]
     radii = None if assessed.radii is None else 1000 * assessed.radii[reached]
@@ -238,7 +238,7 @@ def _columns(compensator: Compensator, assessed: Assessed) -> Iterator[tuple[str
                 tick = compensator.expression.servos[joint][1].tick
                 yield f"{joint}_counts", tuple(str(count) for count in commands.counts[:, i])
                 yield f"{joint}_pulse_us", _texts(1e6 * tick * commands.counts[:, i])
-    yield "reached", tuple(_ENGLISH[bool(reached)] for reached in commands.found)
+    yield "reached", tuple(_ENGLISH[bool(reached)] for reached in commands.reached)
     yield from _pose("tool", assessed.tools)
     yield "error_mm", _texts(1000 * commands.distances)
     yield "error_deg", _texts(np.asarray(np.degrees(commands.turns)))

@@ -106,15 +106,15 @@ def correction_table(compensator: Compensator, nominal: Compensator, settings: T
     axes = [np.linspace(*ends) for ends in zip(settings.low, settings.high, settings.nodes, strict=True)]
     nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     commands = over_grid(compensator, _targets(compensator, nodes, settings), settings.nodes)
-    if not commands.found.any():
+    if not commands.reached.any():
         raise ProblemError("no node of the grid can be reached.", hint="Move the grid, or change the rotation.")
     commanded = nominal.forward(commands.joint_angles)  # where the nominal arm takes these commands to lead
     shape = settings.nodes
-    nothing = np.where(commands.found, 1.0, np.nan)[:, None]
+    nothing = np.where(commands.reached, 1.0, np.nan)[:, None]
     rotations = np.repeat(_rotation(settings)[None], len(nodes), axis=0)
     table = CorrectionTable(
         axes=(axes[0], axes[1], axes[2]),
-        reached=commands.found.reshape(shape),
+        reached=commands.reached.reshape(shape),
         shifts=((commanded[:, :3, 3] - nodes) * nothing).reshape(*shape, 3),
         turns=(turn_between(rotations, commanded[:, :3, :3]) * nothing).reshape(*shape, 3),
         tried=np.zeros((0, 2)),
@@ -159,7 +159,7 @@ def _tried(
         targets = _targets(compensator, points, settings)
         stands = compensator.stand(thought.joint_angles, targets, np.zeros_like(thought.joint_angles))
         away = np.linalg.norm(stands.base_T_tool[:, :3, 3] - points, axis=1)
-        errors.append(np.where(thought.found & stands.settled, away, np.nan))
+        errors.append(np.where(thought.reached & stands.settled, away, np.nan))
     return CorrectionTable(table.axes, table.reached, table.shifts, table.turns, np.stack(errors, axis=1))
 
 

@@ -59,9 +59,9 @@ class _Kept:
     distances: Array
     turns: Array
 
-    def take(self, better: Mask, *found: Array) -> None:
+    def take(self, better: Mask, *better_ones: Array) -> None:
         """What became better."""
-        for mine, new in zip((self.commands, self.states, self.distances, self.turns), found, strict=True):
+        for mine, new in zip((self.commands, self.states, self.distances, self.turns), better_ones, strict=True):
             np.copyto(mine, new, where=better)
 
     def subset(self, on: Mask) -> _Kept:
@@ -143,11 +143,11 @@ class _Search:
         size = np.abs(step).max(axis=0)
         scale = np.minimum(1.0, LONGEST / np.maximum(size, LONGEST))
         finite = np.isfinite(size)
-        wanted = here + np.where(finite, scale * step, 0.0)
-        new = np.clip(wanted, low, high)
-        self._free = np.where(new != wanted, 0.0, np.where(self.pulled_back(pull, 0.0), 1.0, self._free))
+        target = here + np.where(finite, scale * step, 0.0)
+        new = np.clip(target, low, high)
+        self._free = np.where(new != target, 0.0, np.where(self.pulled_back(pull, 0.0), 1.0, self._free))
         self._free[list(goal.held)] = 0.0
-        along = np.where((new == wanted).all(axis=0), scale, 0.0)
+        along = np.where((new == target).all(axis=0), scale, 0.0)
         ahead = goal.state + left + along * moved
         goal.state[:] = np.where(finite & (np.abs(ahead) < WILD), ahead, 0.0)
         goal.record[: self._joints] = new

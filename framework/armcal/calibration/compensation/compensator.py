@@ -116,8 +116,8 @@ class Compensator:
             acting[:3] = np.broadcast_to(np.asarray(gravity, dtype=float), (count, 3)).T
         sides = np.zeros((joints, count)) if approach is None else self._commanded(approach, count)
         turned = None if rotations is None else np.asarray(rotations, dtype=float).reshape(-1, 3, 3)
-        told = {name: np.broadcast_to(value, count) for name, value in (conditions or {}).items()}
-        return Targets(positions, turned, acting, sides, told)
+        columns = {name: np.broadcast_to(value, count) for name, value in (conditions or {}).items()}
+        return Targets(positions, turned, acting, sides, columns)
 
     def solve(self, targets: Targets, start: Array | None = None) -> Commands:
         """Commands for each target by itself.
@@ -135,10 +135,12 @@ class Compensator:
         record = self._record(targets)
         towards = None if start is None else self._commanded(start, len(targets))
         if towards is None or not self._tells_approach or targets.approach.any():
-            found = self._found(record, targets, towards)
+            solutions = self._found(record, targets, towards)
         else:
-            found = with_sides(record, towards, targets.approach, lambda told: self._found(told, targets, towards))
-        return self._commands(record, targets, found)
+            solutions = with_sides(
+                record, towards, targets.approach, lambda sided: self._found(sided, targets, towards)
+            )
+        return self._commands(record, targets, solutions)
 
     def follow(self, targets: Targets, start: Array | None = None) -> Commands:
         """Commands along a path: one target after another, without jumps where that can be.
@@ -157,7 +159,7 @@ class Compensator:
         at = None if start is None else self._commanded(start, 1)[:, 0]
         path = finder(record, _goal(targets), at)
         record[len(self.joints) : 2 * len(self.joints)] = path.approach
-        return replace(self._commands(record, targets, path.found), moves=path.moves.T)
+        return replace(self._commands(record, targets, path.solutions), moves=path.moves.T)
 
     def postures(self, target: Targets) -> Array:
         """Different commands (n x ways) that have a target (one), in the postures that are found.
@@ -172,8 +174,8 @@ class Compensator:
     def onward(self, targets: Targets, at: Array) -> Commands:
         """Commands for targets straight on from others (N x n): no other posture is looked for."""
         record = self._record(targets)
-        found = self._kind(targets).finder.straight(record, _goal(targets), self._commanded(at, len(targets)))
-        return self._commands(record, targets, found)
+        solutions = self._kind(targets).finder.straight(record, _goal(targets), self._commanded(at, len(targets)))
+        return self._commands(record, targets, solutions)
 
     def forward(
         self,
@@ -243,28 +245,28 @@ class Compensator:
         def score(commands: Array, states: Array, rows: Rows) -> Array:
             return kind.descent.score(record[:, rows], commands, states)
 
-        found = kind.finder(record, goal, start, score)
+        solutions = kind.finder(record, goal, start, score)
         if choice:
-            kind.descent.improve(record, goal, found, self._allowed)
-        return found
+            kind.descent.improve(record, goal, solutions, self._allowed)
+        return solutions
 
-    def _commands(self, record: Array, targets: Targets, found: Solutions) -> Commands:
+    def _commands(self, record: Array, targets: Targets, solutions: Solutions) -> Commands:
         """What is commanded: exact, or the best counts; and where that leads."""
         joints, counts = len(self.joints), None
-        record[:joints] = found.commands
+        record[:joints] = solutions.commands
         rounding = self._kind(targets).rounding
         if rounding is not None:
-            counts, record[:joints] = rounding(record, found, targets, self._allowed)
+            counts, record[:joints] = rounding(record, solutions, targets, self._allowed)
             if self._allowed is not None:
-                barred = found.there & ~self._allowed(record[:joints])
-                found.there[barred], found.forbidden[barred] = False, True
-        standing = self._equilibrium(record, None if counts is not None else found.states)
-        return self._answer(record, targets, found, standing, counts)
+                barred = solutions.there & ~self._allowed(record[:joints])
+                solutions.there[barred], solutions.forbidden[barred] = False, True
+        standing = self._equilibrium(record, None if counts is not None else solutions.states)
+        return self._answer(record, targets, solutions, standing, counts)
 
     def _answer(
-        self, record: Array, targets: Targets, found: Solutions, standing: Standing, counts: Counts | None
+        self, record: Array, targets: Targets, solutions: Solutions, standing: Standing, counts: Counts | None
     ) -> Commands:
-        tools, had = standing.base_T_tool, found.there & standing.settled
+        tools, had = standing.base_T_tool, solutions.there & standing.settled
         bounds = self.reach.bounds(targets.positions)
         turns = np.zeros(len(tools))
         if targets.rotations is not None:
@@ -274,7 +276,7 @@ class Compensator:
         def position_can_be_had(rows: Rows) -> Mask:
             return self._positions.finder(record[:, rows], targets.positions[rows].T, commands[:, rows]).there
 
-        reasons = why_not(self.joints, self.limits, commands, targets, found, had, bounds, position_can_be_had)
+        reasons = why_not(self.joints, self.limits, commands, targets, solutions, had, bounds, position_can_be_had)
         return Commands(
             joints=self.joints,
             joint_angles=commands.T.copy(),
@@ -282,7 +284,7 @@ class Compensator:
             base_T_tool=tools,
             distances=np.linalg.norm(tools[:, :3, 3] - targets.positions, axis=1),
             turns=turns,
-            found=had,
+            reached=had,
             reasons=reasons,
             bounds=np.where(had, 0.0, bounds),
             approach=record[len(self.joints) : 2 * len(self.joints)].T.copy(),

@@ -49,12 +49,12 @@ class ServoCounts:
 
     def counts(self, commands: Array) -> Counts:
         """The whole counts nearest to commands (n x N; rad)."""
-        found = np.zeros(commands.shape, dtype=np.int64)
+        whole = np.zeros(commands.shape, dtype=np.int64)
         for i, servo in enumerate(self._servos):
             if servo is not None:
                 table, clock = servo
-                found[i] = np.floor(_piecewise(commands[i], table.angles, table.pulses) / clock.tick + 0.5)
-        return found
+                whole[i] = np.floor(_piecewise(commands[i], table.angles, table.pulses) / clock.tick + 0.5)
+        return whole
 
     def angles(self, counts: Counts, commands: Array) -> Array:
         """What counts make (n x N; rad); joints without a pulse table stand at their commands."""

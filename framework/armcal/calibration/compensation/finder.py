@@ -94,10 +94,10 @@ class Finder:
             score: to choose by among several commands; without one the first that is found is taken.
         """
         count = record.shape[1]
-        found = Solutions.nothing(len(self._solver.limits), len(self._seeds.states), count)
+        solutions = Solutions.nothing(len(self._solver.limits), len(self._seeds.states), count)
         lost: Rows = np.arange(count)
         if start is not None and score is None:
-            lost = self._from(record, target, start, found)
+            lost = self._from(record, target, start, solutions)
         used = 0
         for wide in _ROUNDS if score is None else _CANDIDATES:
             if not lost.size or used >= self._seeds.commands.shape[1]:
@@ -105,11 +105,11 @@ class Finder:
             wide = min(wide, self._seeds.commands.shape[1] - used)
             for todo in _chunks(lost, wide):
                 picks = self._picked(target[:, todo], used, wide)
-                self._round(record, target, todo, picks, found, score, start)
-            lost = lost[~found.there[lost]]
+                self._round(record, target, todo, picks, solutions, score, start)
+            lost = lost[~solutions.there[lost]]
             used += wide
-        self._nearest(record, target, lost, found, start)
-        return found
+        self._nearest(record, target, lost, solutions, start)
+        return solutions
 
     @property
     def states(self) -> int:
@@ -118,19 +118,19 @@ class Finder:
 
     def spread(self, record: Array, target: Array) -> Solutions:
         """Commands for the same target (columns alike), each from another seed, in whatever posture it leads to."""
-        found = Solutions.nothing(len(self._solver.limits), self.states, record.shape[1])
+        solutions = Solutions.nothing(len(self._solver.limits), self.states, record.shape[1])
         apart = self._seeds.apart(target[:, :1], self._solver.length)[0]
         picks = np.argsort(apart)[: record.shape[1]]
         rows = np.arange(len(picks))
-        self._round(record, target, rows, picks[:, None], found, None, None)
-        return found
+        self._round(record, target, rows, picks[:, None], solutions, None, None)
+        return solutions
 
     def straight(self, record: Array, target: Array, at: Array) -> Solutions:
         """Commands from others (n x N) straight on: no other posture is looked for."""
-        found = Solutions.nothing(len(self._solver.limits), self.states, record.shape[1])
-        found.commands[:] = at
-        self._from(record, target, at, found)
-        return found
+        solutions = Solutions.nothing(len(self._solver.limits), self.states, record.shape[1])
+        solutions.commands[:] = at
+        self._from(record, target, at, solutions)
+        return solutions
 
     def onward(self, record: Array, target: Array, at: Array) -> Solutions:
         """The commands nearest to others (n x N): beside them, else in whatever posture is nearest of many."""
@@ -146,56 +146,56 @@ class Finder:
 
     def _of_many(self, record: Array, target: Array, at: Array) -> Solutions:
         """From many starts, each brought as near to commands (n x N) as its target allows: the nearest of them."""
-        found = Solutions.nothing(len(self._solver.limits), self.states, record.shape[1])
+        solutions = Solutions.nothing(len(self._solver.limits), self.states, record.shape[1])
         wide = min(_POSTURES, self._seeds.commands.shape[1])
         for todo in _chunks(np.arange(record.shape[1]), wide):
             rows, first = np.repeat(todo, wide), np.arange(len(todo)) * wide
             attempts = Solutions.nothing(len(self._solver.limits), self.states, len(rows))
             picks = self._picked_for(target[:, todo], at[:, todo], wide).ravel()[:, None]
-            records, targets, preferred = (chosen_of(each, rows) for each in (record, target, at))
+            records, targets, preferred = (chosen_of(array, rows) for array in (record, target, at))
             self._round(records, targets, np.arange(len(rows)), picks, attempts, None, preferred)
             self.towards(records, targets, preferred, attempts)
             apart = np.where(attempts.there, _apart(attempts.commands, preferred), np.inf)
-            found.replace(todo, attempts.subset(apart.reshape(-1, wide).argmin(axis=1) + first))
-        lost = np.flatnonzero(~found.there)
+            solutions.replace(todo, attempts.subset(apart.reshape(-1, wide).argmin(axis=1) + first))
+        lost = np.flatnonzero(~solutions.there)
         if lost.size:
             parts = (record[:, lost], target[:, lost], at[:, lost])
             more = self(*parts)
             self.towards(*parts, more)
-            found.replace(lost, more)
-        return found
+            solutions.replace(lost, more)
+        return solutions
 
     def _beside(self, record: Array, target: Array, at: Array) -> Solutions:
         """Searches from commands that wish to stay there; what is not found so is sought without the wish."""
-        found = Solutions.nothing(len(self._solver.limits), self.states, record.shape[1])
+        solutions = Solutions.nothing(len(self._solver.limits), self.states, record.shape[1])
         goal = Goal(_at(record, at), np.zeros((self.states, record.shape[1])), target, at, self._held)
         attempt = self._solver(goal, WISHED)
         good = np.flatnonzero(attempt.there & self._may(attempt.commands))
-        found.put(good, attempt, good)
-        found.there[good] = True
-        lost = np.flatnonzero(~found.there)
+        solutions.put(good, attempt, good)
+        solutions.there[good] = True
+        lost = np.flatnonzero(~solutions.there)
         if lost.size:
-            found.replace(lost, self.straight(record[:, lost], target[:, lost], at[:, lost]))
-        return found
+            solutions.replace(lost, self.straight(record[:, lost], target[:, lost], at[:, lost]))
+        return solutions
 
-    def towards(self, record: Array, target: Array, preferred: Array, found: Solutions) -> None:
+    def towards(self, record: Array, target: Array, preferred: Array, solutions: Solutions) -> None:
         """As near to wished commands (n x N) as the targets allow, in place; only those that are reached."""
-        at = np.flatnonzero(found.there)
+        at = np.flatnonzero(solutions.there)
         goal = Goal(
-            _at(record, found.commands)[:, at], found.states[:, at], target[:, at], preferred[:, at], self._held
+            _at(record, solutions.commands)[:, at], solutions.states[:, at], target[:, at], preferred[:, at], self._held
         )
         attempt = self._solver(goal, WISHED)
-        nearer = _apart(attempt.commands, preferred[:, at]) < _apart(found.commands[:, at], preferred[:, at])
+        nearer = _apart(attempt.commands, preferred[:, at]) < _apart(solutions.commands[:, at], preferred[:, at])
         good = np.flatnonzero(attempt.there & nearer & self._may(attempt.commands))
-        found.put(at[good], attempt, good)
+        solutions.put(at[good], attempt, good)
 
-    def _from(self, record: Array, target: Array, start: Array, found: Solutions) -> Rows:
-        goal = Goal(_at(record, start), np.zeros((len(found.states), record.shape[1])), target, None, self._held)
+    def _from(self, record: Array, target: Array, start: Array, solutions: Solutions) -> Rows:
+        goal = Goal(_at(record, start), np.zeros((len(solutions.states), record.shape[1])), target, None, self._held)
         attempt = self._solver(goal)
         good = attempt.there & self._may(attempt.commands)
         at = np.flatnonzero(good)
-        found.put(at, attempt, at)
-        found.there[at] = True
+        solutions.put(at, attempt, at)
+        solutions.there[at] = True
         return np.flatnonzero(~good)
 
     def _picked(self, target: Array, used: int, wide: int) -> NDArray[np.intp]:
@@ -221,7 +221,7 @@ class Finder:
         target: Array,
         todo: Rows,
         picks: NDArray[np.intp],
-        found: Solutions,
+        solutions: Solutions,
         score: Score | None,
         start: Array | None,
     ) -> None:
@@ -237,27 +237,27 @@ class Finder:
         value = left if score is None else score(attempt.commands, attempt.states, rows)
         best = np.where(good, value, np.inf).reshape(-1, wide).argmin(axis=1) + np.arange(len(todo)) * wide
         had = good[best]
-        found.put(todo[had], attempt, best[had])
-        found.there[todo[had]] = True
-        found.forbidden[todo] |= (attempt.there & ~good).reshape(-1, wide).any(axis=1)
+        solutions.put(todo[had], attempt, best[had])
+        solutions.there[todo[had]] = True
+        solutions.forbidden[todo] |= (attempt.there & ~good).reshape(-1, wide).any(axis=1)
         near = np.where(attempt.there, np.inf, left).reshape(-1, wide).argmin(axis=1) + np.arange(len(todo)) * wide
-        closer = ~had & (left[near] < found.distances[todo] + self._solver.length * found.turns[todo])
-        found.put(todo[closer], attempt, near[closer])
+        closer = ~had & (left[near] < solutions.distances[todo] + self._solver.length * solutions.turns[todo])
+        solutions.put(todo[closer], attempt, near[closer])
 
-    def _nearest(self, record: Array, target: Array, lost: Rows, found: Solutions, start: Array | None) -> None:
+    def _nearest(self, record: Array, target: Array, lost: Rows, solutions: Solutions, start: Array | None) -> None:
         """Of targets that cannot be reached, the commands that come nearest."""
         wide = min(_NEAREST_STARTS, self._seeds.commands.shape[1] - 1)
         for todo in _chunks(lost, wide + 1):
             picks = self._picked(target[:, todo], 0, wide)
             rows = np.repeat(todo, wide + 1)
-            commands = np.concatenate([found.commands[:, todo, None], self._seeds.commands[:, picks]], axis=2)
-            states = np.concatenate([found.states[:, todo, None], self._seeds.states[:, picks]], axis=2)
-            commands, states = (each.reshape(len(each), len(rows)) for each in (commands, states))
+            commands = np.concatenate([solutions.commands[:, todo, None], self._seeds.commands[:, picks]], axis=2)
+            states = np.concatenate([solutions.states[:, todo, None], self._seeds.states[:, picks]], axis=2)
+            commands, states = (part.reshape(len(part), len(rows)) for part in (commands, states))
             attempt = self._solver(self._goal(record, target, rows, commands, states, start), NEAREST)
             left = attempt.distances + self._solver.length * attempt.turns
             left = np.where(self._may(attempt.commands), left, np.inf)
             best = left.reshape(-1, wide + 1).argmin(axis=1) + np.arange(len(todo)) * (wide + 1)
-            found.put(todo, attempt, best)
+            solutions.put(todo, attempt, best)
 
     def _goal(
         self, record: Array, target: Array, rows: Rows, commands: Array, states: Array, start: Array | None

@@ -43,7 +43,7 @@ class Goal:
     def subset(self, chosen: Chosen) -> Goal:
         """Some of them."""
         towards = None if self.towards is None else chosen_of(self.towards, chosen)
-        record, state, target = (chosen_of(each, chosen) for each in (self.record, self.state, self.target))
+        record, state, target = (chosen_of(array, chosen) for array in (self.record, self.state, self.target))
         return Goal(record, state, target, towards, self.held)
 
 

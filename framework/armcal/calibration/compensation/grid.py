@@ -22,14 +22,14 @@ def over_grid(compensator: Compensator, targets: Targets, shape: Sequence[int]) 
     middle = np.argsort(((nodes - (np.array(shape) - 1) / 2) ** 2).sum(axis=1), kind="stable")[:_BEGINNINGS]
     first = compensator.solve(targets.subset(middle))
     widest, most = np.full((len(targets), len(compensator.joints)), np.nan), 0
-    for row in middle[first.found][:1]:
+    for row in middle[first.reached][:1]:
         for begun in compensator.postures(targets.subset(np.array([row]))).T[:_POSTURES]:
             outward = _outward(compensator, targets, tuple(shape), int(row), begun)
             had = int(np.isfinite(outward[:, 0]).sum())
             widest, most = (outward, had) if had > most else (widest, most)
     known = np.isfinite(widest[:, 0])
     answer = compensator.onward(targets, np.where(known[:, None], widest, 0.0))
-    return replace(answer, found=answer.found & known)
+    return replace(answer, reached=answer.reached & known)
 
 
 def _outward(compensator: Compensator, targets: Targets, shape: tuple[int, ...], begin: int, posture: Array) -> Array:
@@ -42,8 +42,8 @@ def _outward(compensator: Compensator, targets: Targets, shape: tuple[int, ...],
         rows, neighbours = _edge(had.reshape(shape), tried)
         if not rows.size:
             return commands
-        found = compensator.onward(targets.subset(rows), commands[neighbours])
-        commands[rows[found.found]] = found.joint_angles[found.found]
+        onward = compensator.onward(targets.subset(rows), commands[neighbours])
+        commands[rows[onward.reached]] = onward.joint_angles[onward.reached]
 
 
 def _edge(had: Mask, tried: set[tuple[int, int]]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

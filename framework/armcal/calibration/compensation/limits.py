@@ -50,11 +50,11 @@ def command_limits(expression: ToolExpression, stated: Mapping[str, Limits]) -> 
         ValueError: limits of a joint that is not there, or in falling order.
     """
     known = joint_limits(expression.arm.nominal_chain, stated)
-    found = np.array([known[joint] or (-np.inf, np.inf) for joint in expression.joints])
+    limits = np.array([known[joint] or (-np.inf, np.inf) for joint in expression.joints])
     for i, joint in enumerate(expression.joints):
         if joint in expression.servos:
             angles = expression.servos[joint][0].angles
-            found[i] = max(found[i, 0], angles[0]), min(found[i, 1], angles[-1])
-        if not found[i, 0] < found[i, 1]:
-            raise ValueError(f"the limits of {joint}, {found[i, 0]:g} to {found[i, 1]:g}, leave it no room")
-    return found
+            limits[i] = max(limits[i, 0], angles[0]), min(limits[i, 1], angles[-1])
+        if not limits[i, 0] < limits[i, 1]:
+            raise ValueError(f"the limits of {joint}, {limits[i, 0]:g} to {limits[i, 1]:g}, leave it no room")
+    return limits

@@ -32,12 +32,12 @@ class Path:
     """Commands along a path.
 
     Attributes:
-        found: what was found for each target.
+        solutions: the commands for each target.
         approach: from where each joint came (n x N).
         moves: of each joint to each target from the one before it (n x N; rad or m; 0 for the first without a start).
     """
 
-    found: Solutions
+    solutions: Solutions
     approach: Array
     moves: Array
 
@@ -66,9 +66,9 @@ class PathFinder:
                 moves[i], sides[i] = following.commands - at, side
             solutions.append(following)
             at = following.commands
-            kept = self._as_good_as_any([each.there for each in solutions], moves[: i + 1])
+            kept = self._as_good_as_any([candidates.there for candidates in solutions], moves[: i + 1])
             if not kept.all():
-                solutions = [each.subset(kept) for each in solutions]
+                solutions = [candidates.subset(kept) for candidates in solutions]
                 sides, moves, at, side = sides[:, :, kept], moves[:, :, kept], at[:, kept], side[:, kept]
                 wide = int(kept.sum())
         longest = np.abs(moves).max(axis=1)
@@ -78,21 +78,21 @@ class PathFinder:
     def beginnings(self, record: Array, target: Array) -> Array:
         """Commands in different postures that have the first target (n x ways); the nearest if there are none."""
         many = np.zeros(4 * WAYS, dtype=int)
-        found = self._finder.spread(record[:, many], target[:, many])
+        solutions = self._finder.spread(record[:, many], target[:, many])
         kept: list[Array] = []
-        for commands in found.commands[:, found.there].T:
+        for commands in solutions.commands[:, solutions.there].T:
             if len(kept) < WAYS and all(np.abs(commands - other).max() > _SAME for other in kept):
                 kept.append(commands)
-        return np.stack(kept, axis=1) if kept else found.commands[:, :1]
+        return np.stack(kept, axis=1) if kept else solutions.commands[:, :1]
 
     def _next(self, record: Array, target: Array, at: Array, side: Array) -> tuple[Solutions, Array]:
         """The next target from each way's commands; the side from which joints come is told as they move."""
         if not self._tells_approach:
-            found = self._finder.onward(record, target, at)
-            return found, sides_of(found.commands - at, side)
+            solutions = self._finder.onward(record, target, at)
+            return solutions, sides_of(solutions.commands - at, side)
         record = record.copy()
-        found = with_sides(record, at, side, lambda told: self._finder.onward(told, target, at))
-        return found, record[self._joints : 2 * self._joints]
+        solutions = with_sides(record, at, side, lambda sided: self._finder.onward(sided, target, at))
+        return solutions, record[self._joints : 2 * self._joints]
 
     @staticmethod
     def _as_good_as_any(there: list[Mask], moves: Array) -> Mask:
@@ -104,7 +104,7 @@ class PathFinder:
 
 def _joined(solutions: list[Solutions], way: int) -> Solutions:
     """One way's findings, target by target."""
-    parts = {name: np.stack([getattr(each, name)[..., way] for each in solutions], axis=-1) for name in PARTS}
+    parts = {name: np.stack([getattr(part, name)[..., way] for part in solutions], axis=-1) for name in PARTS}
     return Solutions(**parts)
 
 
@@ -128,11 +128,11 @@ def with_sides(record: Array, at: Array, before: Array, search: Callable[[Array]
     place = slice(len(at), 2 * len(at))
     record[place] = before
     for _ in range(_ROUNDS):
-        found = search(record)
-        sides = sides_of(found.commands - at, before)
-        told = record[place].copy()
-        if (sides == told).all():
-            return found
+        solutions = search(record)
+        sides = sides_of(solutions.commands - at, before)
+        side_record = record[place].copy()
+        if (sides == side_record).all():
+            return solutions
         record[place] = sides
-    record[place] = np.where(sides == told, told, 0.0)
+    record[place] = np.where(sides == side_record, side_record, 0.0)
     return search(record)

@@ -62,10 +62,10 @@ def reach_of(arm: Arm, parameters: Parameters, limits: Array, tool_T_point: Tran
 def _travel(arm: Arm, chain: Chain, limits: Array) -> float:
     """How far sliding joints move at most (m)."""
     most = 0.0
-    told = {joint: i for i, joint in enumerate(arm.commanded)}
+    places = {joint: i for i, joint in enumerate(arm.commanded)}
     for joint in chain.joints:
         if not joint.is_revolute:
-            own = limits[told[joint.name]] if joint.name in told else np.array([-np.inf, np.inf])
+            own = limits[places[joint.name]] if joint.name in places else np.array([-np.inf, np.inf])
             most += float(np.abs(own + float(_numbers(ca.SX(joint.offset)).item())).max())
     return most
 

@@ -18,7 +18,7 @@ def why_not(
     limits: Array,
     commands: Array,
     targets: Targets,
-    found: Solutions,
+    solutions: Solutions,
     had: Mask,
     bounds: Array,
     position_can_be_had: Callable[[Rows], Mask],
@@ -30,30 +30,30 @@ def why_not(
         limits: n x 2 (rad or m).
         commands: the nearest ones (n x N).
         targets: what was asked.
-        found: what was found.
+        solutions: what was found.
         had: which are reached.
         bounds: how near the arm can come at most (N; m).
         position_can_be_had: from targets' rows to whether their positions can be reached with any rotation.
     """
     lost = np.flatnonzero(~had)
     turned = np.zeros(len(had), dtype=bool)
-    near = lost[(bounds[lost] == 0) & ~found.forbidden[lost]]
+    near = lost[(bounds[lost] == 0) & ~solutions.forbidden[lost]]
     if targets.rotations is not None and near.size:
         turned[near] = position_can_be_had(near)
     said = [""] * len(had)
     for row in lost.tolist():
-        said[row] = _sentence(joints, limits, commands[:, row], found, bounds[row], bool(turned[row]), row)
+        said[row] = _sentence(joints, limits, commands[:, row], solutions, bounds[row], bool(turned[row]), row)
     return tuple(said)
 
 
 def _sentence(
-    joints: Sequence[str], limits: Array, commands: Array, found: Solutions, bound: float, turned: bool, row: int
+    joints: Sequence[str], limits: Array, commands: Array, solutions: Solutions, bound: float, turned: bool, row: int
 ) -> str:
-    if found.there[row]:
+    if solutions.there[row]:
         return "the load is more than the springs hold there"
     if bound > 0:
         return f"out of reach: no command comes nearer than {1000 * bound:.1f} mm"
-    if found.forbidden[row]:
+    if solutions.forbidden[row]:
         return "all commands found that reach it are too near to something"
     held = [
         joint

@@ -68,12 +68,12 @@ class Descent:
     ) -> None:
         """``still`` joints do not move."""
         small = ca.densify(wanted_small(expression, redundancy))
-        found, count = slopes(expression), len(expression.joints)
+        own_slopes, count = slopes(expression), len(expression.joints)
         by_commands = ca.jacobian(small, expression.record)[:, :count]
-        slope = by_commands + ca.mtimes(ca.jacobian(small, expression.state), found.state)
+        slope = by_commands + ca.mtimes(ca.jacobian(small, expression.state), own_slopes.state)
         self._shape = (small.numel(), count)
-        here = ca.reshape(found.corrected[:9], 3, 3) if solver.turns else None
-        held = tool_error(found, found.corrected[9:], here)[1]
+        here = ca.reshape(own_slopes.corrected[:9], 3, 3) if solver.turns else None
+        held = tool_error(own_slopes, own_slopes.corrected[9:], here)[1]
         self._held = held.size1()
         outputs = [small, ca.vec(ca.densify(slope)), ca.vec(ca.densify(held))]
         function = ca.Function("redundancy", [expression.record, expression.state], outputs, {"cse": True})
@@ -87,12 +87,12 @@ class Descent:
         small = self._function(moved, states)[0]
         return np.asarray(0.5 * np.einsum("kn,kn->n", small, small))
 
-    def improve(self, record: Array, target: Array, found: Solutions, allowed: Allowed | None) -> None:
+    def improve(self, record: Array, target: Array, solutions: Solutions, allowed: Allowed | None) -> None:
         """Walk down from what was found, in place; only those that reach their target."""
-        at = np.flatnonzero(found.there)
+        at = np.flatnonzero(solutions.there)
         record, target = record[:, at], target[:, at]
-        commands, states = found.commands[:, at], found.states[:, at]
-        left = np.stack([found.distances[at], found.turns[at]])
+        commands, states = solutions.commands[:, at], solutions.states[:, at]
+        left = np.stack([solutions.distances[at], solutions.turns[at]])
         value, trust = self.score(record, commands, states), np.full(len(at), _FIRST)
         for _ in range(_STEPS):
             if not (trust > _LEAST).any():
@@ -108,8 +108,8 @@ class Descent:
             flat = good & (value - new < 1e-7 * value)
             value = np.where(good, new, value)
             trust = np.where(flat, 0.0, np.where(good, np.minimum(1.5 * trust, _MOST), 0.3 * trust))
-        found.commands[:, at], found.states[:, at] = commands, states
-        found.distances[at], found.turns[at] = left
+        solutions.commands[:, at], solutions.states[:, at] = commands, states
+        solutions.distances[at], solutions.turns[at] = left
 
     def _step(self, record: Array, commands: Array, states: Array, trust: Array) -> Array:
         """Least squares of what is to be small along commands that keep the target; joints at limits stay (n x N)."""

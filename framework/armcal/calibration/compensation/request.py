@@ -61,8 +61,8 @@ class Targets:
     def subset(self, rows: NDArray[np.intp]) -> Targets:
         """Some of them."""
         turned = None if self.rotations is None else self.rotations[rows]
-        told = {name: values[rows] for name, values in self.conditions.items()}
-        return Targets(self.positions[rows], turned, self.acting[:, rows], self.approach[:, rows], told)
+        conditions = {name: values[rows] for name, values in self.conditions.items()}
+        return Targets(self.positions[rows], turned, self.acting[:, rows], self.approach[:, rows], conditions)
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ class Commands:
         base_T_tool: where the calibrated arm then is (N x 4 x 4), quantisation and elasticity included.
         distances: from there to the target (N; m).
         turns: from there to the target's rotation (N; rad); zeros where only positions count.
-        found: whether the target is reached, up to what the counts leave (N).
+        reached: whether the target is reached, up to what the counts leave (N).
         reasons: why not; empty for those that are reached (N).
         bounds: no command brings the arm nearer than this (N; m); zero where nothing is known.
         moves: along a path, of each joint from the target before (N x n; rad or m); None for single targets.
@@ -90,7 +90,7 @@ class Commands:
     base_T_tool: Array
     distances: Array
     turns: Array
-    found: Mask
+    reached: Mask
     reasons: tuple[str, ...]
     bounds: Array
     approach: Array
@@ -122,8 +122,8 @@ class Options:
     seed: int = 0
 
 
-def _check(what: str, found: Array, shape: tuple[int, ...]) -> None:
-    if found.shape != shape:
-        raise ValueError(f"found {what} of the shape {found.shape}, expected {shape}")
-    if not np.isfinite(found).all():
+def _check(what: str, array: Array, shape: tuple[int, ...]) -> None:
+    if array.shape != shape:
+        raise ValueError(f"found {what} of the shape {array.shape}, expected {shape}")
+    if not np.isfinite(array).all():
         raise ValueError(f"found {what} that are not finite numbers")

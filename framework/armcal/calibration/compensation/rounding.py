@@ -37,28 +37,28 @@ class Rounding:
         self._weights = np.array([1.0] * 3 + [solver.length] * (3 if solver.turns else 0))
 
     def __call__(
-        self, record: Array, found: Solutions, targets: Targets, allowed: Allowed | None
+        self, record: Array, solutions: Solutions, targets: Targets, allowed: Allowed | None
     ) -> tuple[Counts, Array]:
         """Counts and what they make (n x N each) for records with the exact commands."""
-        counts, commands = np.zeros(found.commands.shape, dtype=np.int64), np.zeros_like(found.commands)
+        counts, commands = np.zeros(solutions.commands.shape, dtype=np.int64), np.zeros_like(solutions.commands)
         for start in range(0, record.shape[1], _AT_ONCE):
             part = slice(start, start + _AT_ONCE)
-            counts[:, part], commands[:, part] = self._part(record[:, part], found, targets, part, allowed)
+            counts[:, part], commands[:, part] = self._part(record[:, part], solutions, targets, part, allowed)
         return counts, commands
 
     def _part(
-        self, record: Array, found: Solutions, targets: Targets, part: slice, allowed: Allowed | None
+        self, record: Array, solutions: Solutions, targets: Targets, part: slice, allowed: Allowed | None
     ) -> tuple[Counts, Array]:
-        exact = found.commands[:, part]
+        exact = solutions.commands[:, part]
         joints, count = exact.shape
-        slopes = self._slope(record, found.states[:, part])[0].reshape(joints, len(self._weights), count)
+        slopes = self._slope(record, solutions.states[:, part])[0].reshape(joints, len(self._weights), count)
         weighted = slopes.transpose(2, 1, 0) * self._weights[None, :, None]
-        left = self._left(self._equilibrium(record, found.states[:, part]).base_T_tool, targets, part)
+        left = self._left(self._equilibrium(record, solutions.states[:, part]).base_T_tool, targets, part)
         near = self._counts.near(exact, self._solver.limits, self._held)
         counts, commands = self._counts.best(near, exact, weighted, left * self._weights[:, None])
         tried = np.repeat(record, TRIED, axis=1)
         tried[:joints] = commands.reshape(joints, -1)
-        standing = self._equilibrium(tried, np.repeat(found.states[:, part], TRIED, axis=1))
+        standing = self._equilibrium(tried, np.repeat(solutions.states[:, part], TRIED, axis=1))
         away = self._left(standing.base_T_tool, targets, np.repeat(np.arange(len(targets))[part], TRIED))
         cost = ((away * self._weights[:, None]) ** 2).sum(axis=0)
         barred = ~standing.settled if allowed is None else ~(standing.settled & allowed(tried[:joints]))

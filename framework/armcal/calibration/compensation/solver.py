@@ -57,10 +57,10 @@ class Solver:
         return first
 
     def _search(
-        self, expression: ToolExpression, found: Slopes, choice: EvaluatorChoice
+        self, expression: ToolExpression, slope: Slopes, choice: EvaluatorChoice
     ) -> ArraySearch | CompiledSearch:
         """In C from beginning to end where the step function is compiled, step by step elsewhere."""
-        function = step_function(expression, found, self.turns, self.length)
+        function = step_function(expression, slope, self.turns, self.length)
         sizes = [function.numel_in(i) for i in range(function.n_in())]
         steps = BatchFunction(function, _sample(expression, sizes), choice, loop_source())
         kind = CompiledSearch if steps.compiled else ArraySearch

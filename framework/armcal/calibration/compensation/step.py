@@ -61,20 +61,20 @@ def rough_slopes(expression: ToolExpression) -> Slopes:
     return Slopes(expression.next_state - state, ca.SX(state.numel(), commands.numel()), by_commands, pose)
 
 
-def tool_error(found: Slopes, position: Expression, rotation: Expression | None) -> tuple[Expression, Expression]:
+def tool_error(own_slopes: Slopes, position: Expression, rotation: Expression | None) -> tuple[Expression, Expression]:
     """From where the tool is to a target: metres, then a rotation vector in the base frame; and its slope (m x n)."""
-    away, slope = position - found.corrected[9:], found.tool[9:, :]
+    away, slope = position - own_slopes.corrected[9:], own_slopes.tool[9:, :]
     if rotation is None:
         return away, slope
-    here = ca.reshape(found.corrected[:9], 3, 3)
+    here = ca.reshape(own_slopes.corrected[:9], 3, 3)
     turns = []
     for joint in range(slope.size2()):
-        moved = ca.reshape(found.tool[:9, joint], 3, 3)
+        moved = ca.reshape(own_slopes.tool[:9, joint], 3, 3)
         turns.append(sum((ca.cross(here[:, i], moved[:, i]) for i in range(3)), ca.SX(3, 1)) / 2)
     return ca.vertcat(away, _rotation_vector(here, rotation)), ca.vertcat(slope, ca.horzcat(*turns))
 
 
-def step_function(expression: ToolExpression, found: Slopes, turns: bool, length: float) -> ca.Function:
+def step_function(expression: ToolExpression, own_slopes: Slopes, turns: bool, length: float) -> ca.Function:
     """(record, target, wish, free, damping, state) -> (step, state left, state moved, error, pull).
 
     ``target`` is a position (3; m) and, where the tool ``turns`` to one, a rotation (9, column by column);
@@ -85,20 +85,20 @@ def step_function(expression: ToolExpression, found: Slopes, turns: bool, length
     count = len(expression.joints)
     target = ca.SX.sym("target", 12 if turns else 3)
     preference, free, damping = ca.SX.sym("wish", count), ca.SX.sym("free", count), ca.SX.sym("damping")
-    error, slope = tool_error(found, target[:3], ca.reshape(target[3:], 3, 3) if turns else None)
+    error, slope = tool_error(own_slopes, target[:3], ca.reshape(target[3:], 3, 3) if turns else None)
     weight = ca.SX([1.0] * 3 + [length] * (error.numel() - 3))
     weighted = ca.diag(weight) @ slope
     step, pull = _step(weighted, weight * error, preference, free, damping)
-    outputs = [step, found.left, ca.mtimes(found.state, step), error, pull]
+    outputs = [step, own_slopes.left, ca.mtimes(own_slopes.state, step), error, pull]
     inputs = [expression.record, target, preference, free, damping, expression.state]
     return ca.Function("compensation_step", inputs, [ca.densify(output) for output in outputs], {"cse": True})
 
 
 def slope_function(expression: ToolExpression, turns: bool) -> ca.Function:
     """(record, state) -> the tool's slope by the commands (3 x n; m), where it ``turns`` rotation too (6 x n; rad)."""
-    found = slopes(expression)
-    here = ca.reshape(found.corrected[:9], 3, 3)
-    slope = tool_error(found, found.corrected[9:], here if turns else None)[1]
+    own_slopes = slopes(expression)
+    here = ca.reshape(own_slopes.corrected[:9], 3, 3)
+    slope = tool_error(own_slopes, own_slopes.corrected[9:], here if turns else None)[1]
     inputs = [expression.record, expression.state]
     return ca.Function("tool_slope", inputs, [ca.vec(ca.densify(slope))], {"cse": True})
 
