@@ -14,7 +14,7 @@ import pytest
 from armcal.cli.main import cli
 from armcal.doctor import child, examination, libraries, machine, workings
 from armcal.doctor.finding import Finding
-from armcal.doctor.purposes import EXTRAS, LIBRARIES
+from armcal.doctor.libraries import EXTRAS, LIBRARIES
 from armcal.doctor.requirements import Requirement, declared, parse
 from click.testing import CliRunner
 

@@ -120,13 +120,10 @@ def _show(console: Console, file: TargetFile, assessed: Assessed, bench: Bench, 
         console.warn(f"row {cell['row']} is set aside: {cell['reason']}")
     console.line(f"{figures['reached']} of {figures['targets']} targets are reached, {_ARRIVES[bench.point]}: {out}")
     if figures["reached"]:
-        console.line(f"error {_accuracy(figures)}")
-
-
-def _accuracy(accuracy: Any) -> str:
-    text = f"{accuracy['error_mm']:.3g} mm by the calibration's model (at most {accuracy['largest_error_mm']:.3g} mm)"
-    if accuracy["nominal_error_mm"] is not None:
-        text += f"; nominal commands: {accuracy['nominal_error_mm']:.3g} mm"
-    if accuracy["radius_95_mm"] is not None:
-        text += f"; measured places lie within {accuracy['radius_95_mm']:.3g} mm (95 %, median)"
-    return text
+        text = f"error {figures['error_mm']:.3g} mm by the calibration's model "
+        text += f"(at most {figures['largest_error_mm']:.3g} mm)"
+        if figures["nominal_error_mm"] is not None:
+            text += f"; nominal commands: {figures['nominal_error_mm']:.3g} mm"
+        if figures["radius_95_mm"] is not None:
+            text += f"; measured places lie within {figures['radius_95_mm']:.3g} mm (95 %, median)"
+        console.line(text)

@@ -30,13 +30,11 @@ class Screen(Console):
 
     def print(self, *objects: Any, **more: Any) -> None:
         """As rich does; a table whose words and numbers would be cut is shown row by row."""
-        super().print(*(self._fitting(part) for part in objects), **more)
-
-    def _fitting(self, shown_object: Any) -> Any:
-        if not isinstance(shown_object, Table):
-            return shown_object
-        lines = self.render_lines(shown_object, pad=False)
-        return as_list(shown_object) if any(_CUT in part.text for line in lines for part in line) else shown_object
+        fitting = []
+        for part in objects:
+            lines = self.render_lines(part, pad=False) if isinstance(part, Table) else []
+            fitting.append(as_list(part) if any(_CUT in piece.text for line in lines for piece in line) else part)
+        super().print(*fitting, **more)
 
     def on_broken_pipe(self) -> None:
         """Nobody reads any longer: said to nobody, as ``Outlet`` has it."""
@@ -51,11 +49,9 @@ def as_list(table: Table) -> Group:
         above = first or above
         lines.append(above)
         headings = [str(column.header) for column in table.columns[1:]]
-        cells = [(heading, cell) for heading, cell in zip(headings, others, strict=True) if cell]
-        lines += [Padding(_under(heading, cell), (0, 0, 0, 2), expand=False) for heading, cell in cells]
+        for heading, cell in zip(headings, others, strict=True):
+            if cell:
+                text = cell if isinstance(cell, Text) else Text(str(cell))
+                line = Text.assemble(f"{heading}: ", text) if heading else text
+                lines.append(Padding(line, (0, 0, 0, 2), expand=False))
     return Group(*lines)
-
-
-def _under(heading: str, cell: RenderableType) -> Text:
-    text = cell if isinstance(cell, Text) else Text(str(cell))
-    return Text.assemble(f"{heading}: ", text) if heading else text

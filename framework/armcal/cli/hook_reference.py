@@ -195,18 +195,14 @@ def _explained(
         return "see above."
     if parameter.name in WORDS:
         return WORDS[parameter.name]
-    hint = _hints(function).get(parameter.name)
+    try:
+        hint = typing.get_type_hints(function).get(parameter.name)
+    except (NameError, TypeError):  # of a type that is only imported for type checkers
+        return ""
     if isinstance(hint, type) and hint.__module__.partition(".")[0] == "armcal" and hint.__doc__:
         first = inspect.cleandoc(hint.__doc__).split("\n\n")[0]
         return f"`{hint.__module__}.{hint.__name__}`. {' '.join(first.split())}"
     return ""
-
-
-def _hints(function: Callable[..., Any]) -> dict[str, Any]:
-    try:
-        return typing.get_type_hints(function)
-    except (NameError, TypeError):  # of a type that is only imported for type checkers
-        return {}
 
 
 def _sections(text: str) -> tuple[str, dict[str, dict[str, str]]]:
@@ -268,20 +264,16 @@ def as_markdown(reference: Reference) -> str:
 
 
 def _markdown(entry: Entry) -> list[str]:
-    lines = ["```py", *_wrapped(entry.call), "```", "", *_paragraphs(entry.text)]
+    call = entry.call
+    if len(call) > 110:  # an argument a line
+        head, _, rest = call.partition("(")
+        inner, _, after = rest.rpartition(")")
+        arguments = "".join(f"    {part},\n" for part in re.split(r", (?=\w+: )", inner))
+        call = f"{head}(\n{arguments}){after}"
+    lines = ["```py", call, "```", "", *_paragraphs(entry.text)]
     listed = [f"- `{a.name}`: {_marked(a.explained)}" for a in entry.arguments]
     listed += [f"- raises `{error}`: {_marked(why)}" for error, why in entry.raises]
     return [*lines, *listed, ""] if listed else lines
-
-
-def _wrapped(call: str) -> list[str]:
-    """A signature, an argument a line where it is long."""
-    if len(call) <= 110:
-        return [call]
-    head, _, rest = call.partition("(")
-    inner, _, after = rest.rpartition(")")
-    parts = re.split(r", (?=\w+: )", inner)
-    return [f"{head}(", *(f"    {part}," for part in parts), f"){after}"]
 
 
 def _paragraphs(text: str) -> list[str]:

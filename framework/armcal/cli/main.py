@@ -65,8 +65,16 @@ class LazyGroup(click.Group):
         return command
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Options of the whole program may also stand after the command."""
-        return super().parse_args(ctx, _global_first(args))
+        """Options of the whole program may also stand after the command, but not after ``--``."""
+        first, rest, waiting = list[str](), list[str](), iter(args)
+        for text in waiting:
+            if text == "--":
+                rest += [text, *waiting]
+            elif text in _GLOBAL:
+                first += [text, *itertools.islice(waiting, 1)]
+            else:
+                (first if text.startswith(tuple(f"{name}=" for name in _GLOBAL)) else rest).append(text)
+        return super().parse_args(ctx, first + rest)
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]
@@ -149,19 +157,6 @@ def main() -> None:
         for outlet in outlets.values():
             outlet.finish()
     sys.exit(code)
-
-
-def _global_first(args: list[str]) -> list[str]:
-    """The same arguments, those about plugins before the others; what stands after ``--`` stays."""
-    first, rest, waiting = list[str](), list[str](), iter(args)
-    for text in waiting:
-        if text == "--":
-            rest += [text, *waiting]
-        elif text in _GLOBAL:
-            first += [text, *itertools.islice(waiting, 1)]
-        else:
-            (first if text.startswith(tuple(f"{name}=" for name in _GLOBAL)) else rest).append(text)
-    return first + rest
 
 
 def _exit_code() -> int:

@@ -98,32 +98,26 @@ class Outlet:
             with self._changed:
                 self._changed.wait_for(lambda: bool(self._texts))
                 data = self._texts.popleft()
-            try:
-                self._put(data)
-            except OSError as fault:
-                self._end(fault)
+            left = memoryview(data)
+            while left:
+                try:
+                    count = os.write(self._descriptor, left)
+                except BlockingIOError:  # somebody else made the descriptor so
+                    poll = select.poll()
+                    poll.register(self._descriptor, select.POLLOUT)
+                    poll.poll(1000)
+                except OSError as fault:
+                    with self._changed:
+                        self.fault = fault
+                        self._texts.clear()
+                        self._size = 0
+                    break
+                else:
+                    left = left[count:]
+                    self._written += count
             with self._changed:
                 self._size = max(0, self._size - len(data))
                 self._changed.notify_all()
-
-    def _put(self, data: bytes) -> None:
-        left = memoryview(data)
-        while left:
-            try:
-                count = os.write(self._descriptor, left)
-            except BlockingIOError:  # somebody else made the descriptor so
-                poll = select.poll()
-                poll.register(self._descriptor, select.POLLOUT)
-                poll.poll(1000)
-                continue
-            left = left[count:]
-            self._written += count
-
-    def _end(self, fault: OSError) -> None:
-        with self._changed:
-            self.fault = fault
-            self._texts.clear()
-            self._size = 0
 
     def lost(self) -> str:
         """Once all is written: what went wrong, other than a reader that went away; empty if nothing did."""

@@ -6,7 +6,7 @@ import csv
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import click
 import numpy as np
@@ -83,7 +83,11 @@ def _show(
     plus_minus: PlusMinus | None,
     medians: Mapping[str, float],
 ) -> None:
-    typical = _typical(plus_minus)
+    typical = {}  # medians over the poses
+    if plus_minus is not None and plus_minus.radii:
+        half = [plus_minus.half_widths[f"{name}.{axis}"] for name in plus_minus.radii for axis in "xyz"]
+        typical["half_width_90_mm"] = float(np.median(np.concatenate(half))) * 1000
+        typical["radius_95_mm"] = float(np.median(np.concatenate(list(plus_minus.radii.values())))) * 1000
     console.result(
         {
             "poses": len(commands),
@@ -207,14 +211,3 @@ def _medians(plus_minus: PlusMinus, shown: Sequence[RequestedChannel]) -> dict[s
 
 def _texts(values: Array) -> tuple[str, ...]:
     return tuple(f"{value:.6g}" if np.isfinite(value) else "" for value in values.tolist())
-
-
-def _typical(plus_minus: PlusMinus | None) -> dict[str, Any]:
-    """Medians over the poses (mm)."""
-    if plus_minus is None or not plus_minus.radii:
-        return {}
-    half = [plus_minus.half_widths[f"{name}.{axis}"] for name in plus_minus.radii for axis in "xyz"]
-    return {
-        "half_width_90_mm": float(np.median(np.concatenate(half))) * 1000,
-        "radius_95_mm": float(np.median(np.concatenate(list(plus_minus.radii.values())))) * 1000,
-    }

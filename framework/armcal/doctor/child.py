@@ -41,7 +41,15 @@ def ask(probe: str, *arguments: str, longest_s: float = LONGEST_S) -> Mapping[st
         if line.startswith(_MARK):
             content: dict[str, Any] = json.loads(line.removeprefix(_MARK))
             return content
-    return {"fault": _ending(done.returncode, done.stderr)}
+    if done.returncode < 0:
+        try:
+            name = signal.Signals(-done.returncode).name
+        except ValueError:
+            name = f"signal {-done.returncode}"
+        return {"fault": f"the process crashed ({name})"}
+    last = next((line.strip() for line in reversed(done.stderr.splitlines()) if line.strip()), "")
+    said = f" ({last[:160]})" if last else ""
+    return {"fault": f"the process ended with {done.returncode} and no answer{said}"}
 
 
 def answer(probe: str, arguments: list[str]) -> None:
@@ -58,14 +66,3 @@ def one_line(fault: BaseException) -> str:
     """An exception in one line, cut to what a terminal shows well."""
     text = " ".join(f"{type(fault).__name__}: {fault}".split())
     return text if len(text) <= 200 else text[:197] + "..."
-
-
-def _ending(code: int, errors: str) -> str:
-    last = next((line.strip() for line in reversed(errors.splitlines()) if line.strip()), "")
-    if code < 0:
-        try:
-            name = signal.Signals(-code).name
-        except ValueError:
-            name = f"signal {-code}"
-        return f"the process crashed ({name})"
-    return f"the process ended with {code} and no answer" + (f" ({last[:160]})" if last else "")

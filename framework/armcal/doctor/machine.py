@@ -73,17 +73,13 @@ def _device(path: str, kind: str, known: str) -> Finding:
     about = f"{kind}, {known}" if known else kind
     if facts["allowed"]:
         return Finding("bench", path, "ok", f"{about}, may be opened (it was not)", detail=facts)
-    group = _group(path)
-    hint = f"sudo usermod -aG {group} $USER, then log in anew." if group else "Ask for the right to open it."
-    return Finding("bench", path, "warning", f"{about}, may not be opened by you", hint, facts)
-
-
-def _group(path: str) -> str:
     try:
-        name = grp.getgrgid(Path(path).stat().st_gid).gr_name
+        group = grp.getgrgid(Path(path).stat().st_gid).gr_name
     except (OSError, KeyError):
-        return ""
-    return "" if name == "root" else name
+        group = "root"
+    join = f"sudo usermod -aG {group} $USER, then log in anew."
+    hint = join if group != "root" else "Ask for the right to open it."
+    return Finding("bench", path, "warning", f"{about}, may not be opened by you", hint, facts)
 
 
 def rooms() -> Iterator[Finding]:

@@ -10,12 +10,9 @@ import tempfile
 import time
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from armcal.doctor.kernel_probe import kernel
-
-if TYPE_CHECKING:
-    from armcal.plugins import Component
 
 __all__ = ["calibration", "components", "convex", "imported", "ipopt", "kalman", "kernel"]
 
@@ -48,29 +45,25 @@ def imported(module: str) -> dict[str, Any]:
 
 def components() -> dict[str, Any]:
     """Every plugin, with what its registration lacks; and every component imported, with what that lacks."""
+    from armcal.errors import PluginError
     from armcal.plugins import discover
 
     registry = discover()
     lines = []
     for plugin in registry.plugins:
         own = registry.announced_by(plugin)
-        broken = [{"kind": c.kind, "name": c.name, "fault": fault} for c in own if (fault := _fault_of(c))]
+        broken = []
+        for component in own:
+            try:
+                component.load()
+            except PluginError as fault:
+                cause = fault.__cause__ or fault
+                text = " ".join(f"{type(cause).__name__}: {cause}".split())[:200]
+                broken.append({"kind": component.kind, "name": component.name, "fault": text})
         origin = f"{plugin.distribution} {plugin.version}".strip()
         facts = {"name": plugin.name, "module": plugin.module, "distribution": origin, "fault": plugin.fault or None}
         lines.append({**facts, "components": len(own), "broken": broken})
     return {"plugins": lines}
-
-
-def _fault_of(component: Component) -> str:
-    """Why a component does not load; empty if it does."""
-    from armcal.errors import PluginError
-
-    try:
-        component.load()
-    except PluginError as fault:
-        cause = fault.__cause__ or fault
-        return " ".join(f"{type(cause).__name__}: {cause}".split())[:200]
-    return ""
 
 
 def ipopt() -> dict[str, Any]:
@@ -148,7 +141,7 @@ def calibration() -> dict[str, Any]:
     with tempfile.TemporaryDirectory(prefix="armcal-doctor-") as text:
         place = Path(text)
         (place / "arm.yaml").write_text(_CONFIG.format(*_NOMINAL_LENGTHS_M), encoding="utf-8")
-        (place / "poses.csv").write_text(_made_up(), encoding="utf-8")
+        (place / "poses.csv").write_text(_simulated_poses(), encoding="utf-8")
         experiment = Experiment.load(place / "arm.yaml", (), None, discover())
         result = calibrate(experiment, "armcal doctor")
         outputs.write(result, experiment, place / "run", render)
@@ -160,7 +153,7 @@ def calibration() -> dict[str, Any]:
     return {"off_mm": round(off * 1000, 4)}
 
 
-def _made_up() -> str:
+def _simulated_poses() -> str:
     """Poses of a planar arm of two links, with a scatter that comes out the same each time."""
     lines = ["pose_id,q1_rad,q2_rad,x_m,y_m,z_m"]
     one, two = TRUE_LENGTHS_M

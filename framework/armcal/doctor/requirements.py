@@ -64,7 +64,8 @@ def _admits(clause: str, version: str) -> bool:
     if match is None:
         return True
     installed, required = _release(version), _release(match[2])
-    order = _compared(installed, required)
+    pairs = zip_longest(installed, required, fillvalue=0)
+    order = next((a - b for a, b in pairs if a != b), 0)
     same_series = installed[: len(required) - 1] == required[:-1]
     return {
         ">=": order >= 0,
@@ -80,10 +81,3 @@ def _admits(clause: str, version: str) -> bool:
 def _release(version: str) -> tuple[int, ...]:
     match = re.match(r"\D*(\d+(?:\.\d+)*)", version)
     return tuple(int(part) for part in match[1].split(".")) if match else ()
-
-
-def _compared(one: tuple[int, ...], two: tuple[int, ...]) -> int:
-    for a, b in zip_longest(one, two, fillvalue=0):
-        if a != b:
-            return 1 if a > b else -1
-    return 0

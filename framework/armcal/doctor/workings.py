@@ -19,7 +19,12 @@ def plugins(ask: Ask) -> Iterator[Finding]:
     if "fault" in content:
         text = f"cannot be tried together: {content['fault']}"
         yield Finding("plugins", "all plugins", "warning", text, "What stands above and below says more.", content)
-        yield from _one_by_one(ask)
+        # Registrations may fail on their own, and one of them may end the whole process.
+        for point in sorted(entry_points(group=DISTRIBUTION), key=lambda p: p.name):
+            own = ask("imported", point.module)
+            if "fault" in own:
+                text = f"does not load: {own['fault']}"
+                yield Finding("plugins", point.name, "warning", text, "Uninstall it.", own)
         return
     if not content["plugins"]:
         yield Finding("plugins", "plugins", "fault", "found none, not even armcal's own", _CORE)
@@ -38,16 +43,6 @@ def _plugin(facts: Mapping[str, Any]) -> Finding:
         text = f"{origin} {len(broken)} of {count} do not load: {lost} ({broken[0]['fault']})"
         return Finding("plugins", name, "warning", text, f"armcal plugins check {name} says more.", facts)
     return Finding("plugins", name, "ok", f"{origin} {count} component{'' if count == 1 else 's'}", detail=facts)
-
-
-def _one_by_one(ask: Ask) -> Iterator[Finding]:
-    """Registrations that fail on their own: one of them may end the whole process."""
-    for point in sorted(entry_points(group=DISTRIBUTION), key=lambda p: p.name):
-        content = ask("imported", point.module)
-        if "fault" in content:
-            yield Finding(
-                "plugins", point.name, "warning", f"does not load: {content['fault']}", "Uninstall it.", content
-            )
 
 
 def solvers(ask: Ask) -> Iterator[Finding]:

@@ -13,7 +13,7 @@ from armcal.base.units import Unit, display_unit, from_unit, split_suffix, units
 from armcal.errors import DataError, Location
 from armcal.io.cells import CellFault, read_cell
 from armcal.io.plain_files import input_bytes
-from armcal.scaffold.joint_names import check_joint_names
+from armcal.scaffold.naming import check_joint_names
 from armcal.scaffold.robot import (
     ASSUMED_TRAVEL,
     ASSUMED_TURN,

@@ -7,9 +7,8 @@ from pathlib import Path
 from types import MappingProxyType
 
 from armcal.hooks import KINDS as HOOKS
-from armcal.scaffold.folder import staged, write_texts
 from armcal.scaffold.naming import PREFIX
-from armcal.scaffold.rendering import rendered_file
+from armcal.scaffold.rendering import rendered_file, staged, write_texts
 
 _EXAMPLES: Mapping[str, str] = MappingProxyType(
     {

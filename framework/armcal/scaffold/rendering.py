@@ -1,14 +1,19 @@
-"""Texts from the templates beside this file. Jinja is imported when it is needed."""
+"""Texts from the templates beside this file, and folders that appear whole or not at all."""
 
 from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping
+import shutil
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from armcal.errors import InputError, Location
 
 TEMPLATES = Path(__file__).with_name("templates")
 SUFFIX = ".j2"
@@ -50,3 +55,44 @@ def number(value: float) -> str:
     """A number as YAML 1.1 and people read it: no exponent, 12 digits."""
     text = np.format_float_positional(float(f"{value:.{_DIGITS}g}"), trim="-")
     return "0" if text == "-0" else text
+
+
+@contextmanager
+def staged(folder: Path) -> Iterator[Path]:
+    """A folder beside ``folder`` that takes its place at the end; on any fault nothing is left of it.
+
+    Raises:
+        InputError: something is there already, or the place cannot be written.
+    """
+    where = Location(str(folder))
+    if folder.exists() or folder.is_symlink():
+        raise InputError("it is there already.", where=where, hint="Give another --out, or move it away.")
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        place = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
+    except OSError as fault:
+        raise _unwritable(folder, fault) from fault
+    try:
+        yield place
+        place.chmod(0o755)
+        place.rename(folder)
+    except OSError as fault:
+        raise _unwritable(folder, fault) from fault
+    finally:
+        shutil.rmtree(place, ignore_errors=True)
+
+
+def write_texts(folder: Path, texts: Mapping[str, str]) -> None:
+    """Texts by their path in a folder, in UTF-8 with plain line ends."""
+    for name, text in texts.items():
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text, encoding="utf-8", newline="\n")
+
+
+def _unwritable(folder: Path, fault: OSError) -> InputError:
+    return InputError(
+        f"it cannot be written ({fault.strerror or fault}).",
+        where=Location(str(folder)),
+        hint="Give --out a place that can be written.",
+    )

@@ -13,17 +13,20 @@ import numpy as np
 
 from armcal.base.dataset import Dataset
 from armcal.base.units import display_unit, to_unit
+from armcal.diagnose.minimal import minimal_set
 from armcal.errors import InputError
 from armcal.estimate.simulation import SimulationRequest, measured_without_noise
 from armcal.measure.csv_writer import write_csv
 from armcal.plugins import PluginRegistry
+from armcal.problem.projection import factor_at_zero
 from armcal.run.experiment import Experiment
+from armcal.run.pipeline import Stopwatch, assemble
 from armcal.scaffold import truth
-from armcal.scaffold.folder import staged, write_texts
-from armcal.scaffold.free_choice import FreeChoice, choose_free
-from armcal.scaffold.rendering import number, rendered
+from armcal.scaffold.rendering import number, rendered, staged, write_texts
 from armcal.scaffold.robot import Robot, RobotJoint
 
+MOST_UNCERTAIN = 0.5
+"""In typical scales: what the declared noise leaves less certain than this is held."""
 SIMULATED, RECORDS = "simulated.yaml", "simulated.csv"
 NOISE_MM, NOISE_SEED = 0.1, 4
 GRAVITY_M_S2 = 9.81
@@ -32,6 +35,15 @@ _TRIED_POSES = 60
 RECORDS_MADE = 600
 """Of so many, chance makes one verdict in twenty warn; of 100 to 200 it is one in five, for each finding has a level of
 its own."""
+
+
+@dataclass(frozen=True)
+class FreeChoice:
+    """Names to free, names that these stand in for, names that the data hardly determines."""
+
+    kept: tuple[str, ...]
+    redundant: tuple[str, ...]
+    left_out: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -53,7 +65,9 @@ def write_robot(robot: Robot, folder: Path, registry: PluginRegistry) -> RobotFo
         try:
             chosen = _fill(place, robot, registry)
         except InputError as fault:
-            raise _of_robot(fault, robot, place, folder) from fault
+            text = str(fault).replace(str(place.resolve()), str(folder)).replace(str(place), str(folder))
+            reason = f"the files of {robot.name} would be refused: {text}"  # nobody sees them, as they are not kept
+            raise InputError(reason, hint="Correct what they are made from.") from fault
     return RobotFolder(folder, chosen)
 
 
@@ -65,19 +79,36 @@ def _fill(place: Path, robot: Robot, registry: PluginRegistry) -> FreeChoice:
     _write(place, robot, nothing, {})
     experiment = Experiment.load(place / SIMULATED, registry=registry)
     parameters = experiment.parameters
-    true = truth.made_up(parameters, _weight(experiment) * _reach(experiment, robot))
+    masses = [b for b in parameters.blocks if b.name.startswith("arm.links.") and b.name.endswith(".mass")]
+    weight_N = GRAVITY_M_S2 * sum(block.nominal[0] for block in masses)
+    true = truth.made_up(parameters, weight_N * _reach(experiment, robot))
     _write(place, robot, nothing, truth.as_text(parameters, true))
-    _simulate(place, registry)
+    experiment = Experiment.load(place / SIMULATED, registry=registry)
+    system = experiment.system
+    request = SimulationRequest(system.arms, system.measurements, experiment.parameters, system.environment)
+    dataset = experiment.simulator().simulate(request)
+    write_csv(place / RECORDS, dataset, experiment.request(measured=True).channels)
     freed = f"parameters.free={json.dumps(truth.candidates(parameters))}"
-    chosen = choose_free(Experiment.load(place / SIMULATED, [freed], registry=registry), robot)
+    chosen = _choose_free(Experiment.load(place / SIMULATED, [freed], registry=registry), robot)
     _write(place, robot, chosen, truth.as_text(parameters, true))
     return chosen
 
 
-def _of_robot(fault: InputError, robot: Robot, place: Path, folder: Path) -> InputError:
-    """A refusal of files that nobody sees, since they are not kept."""
-    text = str(fault).replace(str(place.resolve()), str(folder)).replace(str(place), str(folder))
-    return InputError(f"the files of {robot.name} would be refused: {text}", hint="Correct what they are made from.")
+def _choose_free(experiment: Experiment, robot: Robot) -> FreeChoice:
+    """A minimal set of the experiment's free parameters, for its training records (see ``armcal identify``)."""
+    ready = assemble(experiment, Stopwatch())
+    parameters = ready.problem.parameters
+    triangle = factor_at_zero(ready.problem, parameters.nominal(), ready.training)
+    free = [block.name for block in parameters.free]
+    preferred = [
+        [name for name in free if any(fnmatch.fnmatchcase(name, glob) for glob in globs)] for globs in robot.preferred
+    ]
+    minimal = minimal_set(triangle, parameters, preferred, most_uncertain=MOST_UNCERTAIN)
+    return FreeChoice(
+        minimal.kept,
+        tuple(dropped.name for dropped in minimal.redundant),
+        tuple(dropped.name for dropped in minimal.left_out),
+    )
 
 
 def _write(place: Path, robot: Robot, choice: FreeChoice, true: Mapping[str, str]) -> None:
@@ -113,12 +144,6 @@ def _levels(joint: RobotJoint) -> list[str]:
     return [_shown(value, "angle" if joint.turns else "length") for value in (low, 0.5 * (low + high), high)]
 
 
-def _weight(experiment: Experiment) -> float:
-    """Of all masses that are known (N)."""
-    masses = [b for b in experiment.parameters.blocks if b.name.startswith("arm.links.") and b.name.endswith(".mass")]
-    return GRAVITY_M_S2 * sum(block.nominal[0] for block in masses)
-
-
 def _reach(experiment: Experiment, robot: Robot) -> float:
     random = np.random.default_rng(truth.SEED)
     commands = {f"arm.{j.name}": random.uniform(*j.limits, _TRIED_POSES) for j in robot.joints}
@@ -133,11 +158,3 @@ def _reach(experiment: Experiment, robot: Robot) -> float:
             hint="Check the lengths a and d and their units.",
         )
     return reach
-
-
-def _simulate(place: Path, registry: PluginRegistry) -> None:
-    experiment = Experiment.load(place / SIMULATED, registry=registry)
-    system = experiment.system
-    request = SimulationRequest(system.arms, system.measurements, experiment.parameters, system.environment)
-    dataset = experiment.simulator().simulate(request)
-    write_csv(place / RECORDS, dataset, experiment.request(measured=True).channels)

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from armcal.base.domains import Array, Rotation
-from armcal.base.parameters import ParameterBlock, Parameters
+from armcal.base.parameters import Parameters
 from armcal.base.units import to_unit
 from armcal.scaffold.rendering import number
 
@@ -43,7 +43,17 @@ def made_up(parameters: Parameters, load_Nm: float) -> dict[str, float]:
     """
     random = np.random.default_rng(SEED)
     names = [name for name in candidates(parameters) if parameters[name].size == 1]
-    return {name: _true(parameters[name], load_Nm, random) for name in names}
+    values = {}
+    for name in names:
+        block = parameters[name]
+        if block.unit == "rad_per_Nm":
+            drawn = float(random.uniform(*_SPRING))
+            error = drawn * SAG_RAD / (0.5 * load_Nm) if load_Nm > 0 else 0.0
+        else:
+            deviation = LENGTH_SD_M if block.unit == "m" else ANGLE_SD_RAD
+            error = deviation * float(np.clip(random.normal(), -_MOST_SD, _MOST_SD))
+        values[name] = float(block.nominal[0]) + error
+    return values
 
 
 def as_text(parameters: Parameters, values: Mapping[str, float]) -> dict[str, str]:
@@ -53,15 +63,6 @@ def as_text(parameters: Parameters, values: Mapping[str, float]) -> dict[str, st
         unit = _SHOWN[parameters[name].unit]
         lines[name] = f"{number(float(f'{to_unit(value, unit):.6g}'))} {_WRITTEN.get(unit, unit)}"
     return lines
-
-
-def _true(block: ParameterBlock, load_Nm: float, random: np.random.Generator) -> float:
-    nominal = float(block.nominal[0])
-    if block.unit == "rad_per_Nm":
-        drawn = float(random.uniform(*_SPRING))
-        return nominal + (drawn * SAG_RAD / (0.5 * load_Nm) if load_Nm > 0 else 0.0)
-    deviation = LENGTH_SD_M if block.unit == "m" else ANGLE_SD_RAD
-    return nominal + deviation * float(np.clip(random.normal(), -_MOST_SD, _MOST_SD))
 
 
 def reach(tips: Array) -> float:

@@ -13,7 +13,7 @@ from armcal.calibration.convert_check import nominal_values
 from armcal.calibration.rigid_chain import numeric_chain
 from armcal.errors import ConfigError, DataError, Location
 from armcal.plugins import PluginRegistry
-from armcal.scaffold.joint_names import check_joint_names
+from armcal.scaffold.naming import check_joint_names
 from armcal.scaffold.robot import ASSUMED_TRAVEL, ASSUMED_TURN, FEWEST_JOINTS, MOST_JOINTS, Robot, RobotJoint
 
 _MOST_TRAVEL_RAD = 3.2
@@ -38,12 +38,19 @@ def robot_of_urdf(name: str, path: Path, tip: str | None, registry: PluginRegist
             hint="Name the link at the arm's end: --tip LINK.",
         )
     check_joint_names([joint.name for joint in joints], [where] * len(joints))
+    priors = {}  # how far joints may be off the URDF; where the arm stands before the tracker has none
+    for joint in joints:
+        priors[f"arm.urdf.{joint.name}_[xyz]"] = "10 mm"
+        priors[f"arm.urdf.{joint.name}_[rpy][oia]*"] = "2 deg"
+    moving = tuple(f"arm.urdf.{joint.name}_*" for joint in joints)
+    # Without a placement of its own the tracker's frame would end up in the first joint, and with it in every export.
+    placed = ((f"arm.{PLACEMENT}_*",), ("tracker.target_*",))
     return Robot(
         name=name,
         joints=joints,
         has_masses=isinstance(model, MassiveModel) and bool(model.masses()),
-        preferred=_preferred(joints),
-        priors=_priors(joints),
+        preferred=(*placed, moving, ("arm.urdf.*",), ("arm.spring.*",)),
+        priors=priors,
         urdf=path.read_bytes(),
         urdf_file=f"{name}.urdf",
         tip=model.settings.tip,
@@ -71,21 +78,3 @@ def _joint(joint: Joint, where: Location) -> RobotJoint:
     if turns and not joint.endless:
         low, high = max(low, -_MOST_TRAVEL_RAD), min(high, _MOST_TRAVEL_RAD)
     return RobotJoint(joint.name, turns, (low, high))
-
-
-def _preferred(joints: tuple[RobotJoint, ...]) -> tuple[tuple[str, ...], ...]:
-    """The placement and the target, which say how arm and tracker stand; then joints that move, then the others.
-
-    Without a placement of its own the tracker's frame would end up in the first joint, and with it in every export.
-    """
-    moving = tuple(f"arm.urdf.{joint.name}_*" for joint in joints)
-    return ((f"arm.{PLACEMENT}_*",), ("tracker.target_*",), moving, ("arm.urdf.*",), ("arm.spring.*",))
-
-
-def _priors(joints: tuple[RobotJoint, ...]) -> dict[str, str]:
-    """How far each joint's origin may be off the URDF; where the arm stands before the tracker has none."""
-    priors = {}
-    for joint in joints:
-        priors[f"arm.urdf.{joint.name}_[xyz]"] = "10 mm"
-        priors[f"arm.urdf.{joint.name}_[rpy][oia]*"] = "2 deg"
-    return priors

@@ -72,11 +72,11 @@ def check_plugin(plugin: PluginInfo, registry: PluginRegistry) -> list[CheckResu
 def check_made(kind: str, name: str, load: Callable[[], Any]) -> list[CheckResult]:
     """Every check of a kind on what ``load`` gives: a component's class."""
     record = Recorder(f"{kind} {name}")
-    record.guard(lambda: _check(record, kind, load))
+    record.guard(lambda: _check_kind(record, kind, load))
     return record.results
 
 
-def _check(record: Recorder, kind: str, load: Callable[[], Any]) -> None:
+def _check_kind(record: Recorder, kind: str, load: Callable[[], Any]) -> None:
     if kind == "command":  # it is imported for one call of armcal, and may do to the process what it needs
         command = record.check("it imports", load)
         record.check("it is a click command that says what it does", _check_command, command)

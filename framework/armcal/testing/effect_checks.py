@@ -55,7 +55,7 @@ def check_effect(record: Recorder, subject: Subject) -> None:
         record.check("displacements are finite", _finite_displacement, blocks, given, recorded, moved)
         record.check("lengths and angles move a joint by as much", _displacement_gains, blocks, given, recorded, moved)
     record.check("it is the same each time", _repeated, subject, effect, blocks)
-    record.check("every parameter has an influence", lambda: expect_all_used(_all_of(effect, values), values))
+    record.check("every parameter has an influence", _all_used, effect, values)
     if reshapes(effect) or effect.conditions:
         record.check("the columns it reads are declared, each with its dimension", _columns, effect)
         record.check("its shape changes with every column it declares", _read, effect, values)
@@ -121,13 +121,13 @@ def _displacement_gains(
         expect_gain(float(gains[place]), "a joint's displacement", block.name, block.unit)
 
 
-def _all_of(effect: JointEffect, values: Mapping[str, Expression]) -> Expression:
-    """Everything that an effect says, on an arm of its joints."""
+def _all_used(effect: JointEffect, values: Mapping[str, Expression]) -> None:
+    """Every parameter changes a displacement, a law or the shape of an arm of the effect's joints."""
     loads = ca.SX.sym("loads", 3 * len(JOINTS) + 3)
     recorded = ca.SX.sym("recorded", 2 * len(JOINTS))
     laws = [spring.law(loads[: spring.size], _command(spring, recorded)) for spring in effect.springs(values)]
     shape = _shape(effect, {name: ca.SX.sym(name) for name in _arm_of(effect).conditions}, values)
-    return stacked([_displacement(effect, values)[1], *laws, shape])
+    expect_all_used(stacked([_displacement(effect, values)[1], *laws, shape]), values)
 
 
 def _shape(effect: JointEffect, conditions: Mapping[str, Expression], values: Mapping[str, Expression]) -> Expression:

@@ -53,12 +53,13 @@ def check_estimator(record: Recorder, subject: Subject) -> None:
     record.check("it keeps to the bounds", _inside, bounded, solution)
     record.check("it finds the truth, one bound active", _near, bounded, solution)
     record.check("it does the same twice", _repeats, estimator, bounded, solution)
-    case = _case(Interval(), PRIOR_SD_M, _with_prior())
+    data, prior = POSES / NOISE_M**2, 1 / PRIOR_SD_M**2  # information on ``side``, which the prior puts at zero
+    case = _case(Interval(), PRIOR_SD_M, TRUTH["side"] * data / (data + prior))
     record.check("it weighs priors", lambda: _near(case, _solve(estimator, case)))
     scattered = _scattered()
     record.check("it weighs records", lambda: _near(scattered, _solve(estimator, scattered), scattered.known))
     record.check("the order of records changes nothing", _any_order, estimator, scattered)
-    record.check("a second one of equal settings does the same", lambda: _repeats(_fresh(subject), bounded, solution))
+    record.check("a second one of equal settings does the same", lambda: _repeats(subject.build(), bounded, solution))
     record.check("cut short, it reports that it did not converge", _cut_short, subject, bounded)
 
 
@@ -99,17 +100,6 @@ def _any_order(estimator: Estimator, case: _Case) -> None:
     shuffled = _solve(estimator, replace(case, records=case.problem.subset(case.records, order)))
     off = float(np.abs(shuffled.values - solution.values).max())
     expect(off <= TOLERANCE, f"found values that differ by {off:.1e} with the records in another order")
-
-
-def _fresh(subject: Subject) -> Estimator:
-    made: Estimator = subject.made(subject.settings)
-    return made
-
-
-def _with_prior() -> float:
-    """The mean of the data's ``side`` and the prior's zero, each by its information."""
-    data, prior = POSES / NOISE_M**2, 1 / PRIOR_SD_M**2
-    return TRUTH["side"] * data / (data + prior)
 
 
 def _solve(estimator: Estimator, case: _Case) -> Solution:

@@ -32,7 +32,7 @@ def check_parameters(
     record: Recorder, declared: Callable[[], Sequence[ParameterBlock]]
 ) -> tuple[ParameterBlock, ...] | None:
     """The blocks that a component declares, if they can be worked with."""
-    blocks = record.check("its parameters are named, each once", lambda: _named(tuple(declared())))
+    blocks = record.check("its parameters are named, each once", _named, declared)
     if blocks is None:
         return None
     well_valued = record.check("their nominal values are finite and in their domains", _valued, blocks)
@@ -42,7 +42,8 @@ def check_parameters(
     return None if well_valued is None or well_sized is None else blocks
 
 
-def _named(blocks: tuple[ParameterBlock, ...]) -> tuple[ParameterBlock, ...]:
+def _named(declared: Callable[[], Sequence[ParameterBlock]]) -> tuple[ParameterBlock, ...]:
+    blocks = tuple(declared())
     for block in blocks:
         expect(
             isinstance(block, ParameterBlock),

@@ -33,10 +33,10 @@ def watched(record: Recorder) -> Iterator[Callable[[Any], None]]:
 
     with redirect_stdout(heard):
         yield begin
-    record.check("it prints nothing to standard output", lambda: _quiet(heard.getvalue()))
+    record.check("it prints nothing to standard output", _quiet, heard.getvalue())
     record.check("it leaves the process alone", lambda: _unchanged(process, _process(), "armcal's own process"))
     if modules:
-        record.check("it keeps nothing in its modules", lambda: _unchanged(modules, _again(modules), "its modules"))
+        record.check("it keeps nothing in its modules", _unchanged_modules, modules)
 
 
 def _quiet(heard: str) -> None:
@@ -94,8 +94,8 @@ def _places(module: ModuleType) -> Iterator[tuple[str, _Place]]:
                 yield where, _Place(owner, name, None).again()
 
 
-def _again(places: Mapping[str, _Place]) -> dict[str, _Place]:
-    return {where: place.again() for where, place in places.items()}
+def _unchanged_modules(places: Mapping[str, _Place]) -> None:
+    _unchanged(places, {where: place.again() for where, place in places.items()}, "its modules")
 
 
 def _unchanged(before: Mapping[str, Any], after: Mapping[str, Any], what: str) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 
 from armcal.arm.assembly import Arm, MassiveModel, MassSpec
 from armcal.arm.environment import Environment
-from armcal.arm.model import ArmModel, Chain, Joint, forward
+from armcal.arm.model import ArmModel, Chain, forward
 from armcal.arm.statics import MOUNT_FRAME, TOOL_FRAME, frame_names
 from armcal.base.domains import Array
 from armcal.base.parameters import ParameterBlock
@@ -62,7 +62,7 @@ def check_model(record: Recorder, subject: Subject) -> None:
     if names is None or blocks is None:
         return
     values = symbols(blocks)
-    chain = record.check("its chain has one joint for each name", lambda: _chain(model.chain(values), names))
+    chain = record.check("its chain has one joint for each name", _chain, model, values, names)
     if chain is None:
         return
     if isinstance(model, MassiveModel):
@@ -94,12 +94,18 @@ def _joint_names(model: ArmModel) -> tuple[str, ...]:
     return names
 
 
-def _chain(chain: Chain, names: Sequence[str]) -> Chain:
+def _chain(model: ArmModel, values: dict[str, Expression], names: Sequence[str]) -> Chain:
+    chain = model.chain(values)
     expect(isinstance(chain, Chain), f"found a chain of type {type(chain).__name__}, expected Chain")
     texts = tuple(joint.name for joint in chain.joints)
     expect(texts == tuple(names), f"found the joints {texts}, expected {tuple(names)}")
     for joint in chain.joints:
-        _axis(joint)
+        turns, slides = (float(np.linalg.norm(axis)) for axis in (joint.angular, joint.linear))
+        expect(
+            sorted((turns, slides)) == [0.0, max(turns, slides)] and abs(max(turns, slides) - 1) <= 1e-9,
+            f"joint {joint.name}: found angular {joint.angular} and linear {joint.linear}, "
+            "expected a unit vector for one and zeros for the other",
+        )
     for name, at in {TOOL_FRAME: chain.tool, **chain.frames}.items():
         expect(0 <= at.joint <= len(names), f"the frame {name} hangs on joint {at.joint}, expected 0 to {len(names)}")
     taken = sorted({MOUNT_FRAME, TOOL_FRAME} & set(chain.frames))
@@ -115,15 +121,6 @@ def _masses(model: MassiveModel, chain: Chain) -> None:
         expect(mass.frame in frames, f"the mass {mass.name} is in {mass.frame!r}, expected one of {', '.join(frames)}")
     names = [mass.name for mass in masses]
     expect(len(set(names)) == len(names), f"found {', '.join(names)}, expected every name once")
-
-
-def _axis(joint: Joint) -> None:
-    turns, slides = (float(np.linalg.norm(axis)) for axis in (joint.angular, joint.linear))
-    expect(
-        sorted((turns, slides)) == [0.0, max(turns, slides)] and abs(max(turns, slides) - 1) <= 1e-9,
-        f"joint {joint.name}: found angular {joint.angular} and linear {joint.linear}, "
-        "expected a unit vector for one and zeros for the other",
-    )
 
 
 def _parts(chain: Chain) -> list[Expression]:

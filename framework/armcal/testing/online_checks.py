@@ -47,7 +47,7 @@ def check_online(record: Recorder, subject: Subject) -> None:
         return
     record.check("its covariance is exactly symmetric and positive", _sound, updates)
     record.check("it finds what prior and records say together", _near, updates, prior, lines)
-    record.check("it reports the NIS of the last record", lambda: _nis(updates[0], prior, lines[0]))
+    record.check("it reports the NIS of the last record", _nis, updates[0], prior, lines[0])
     record.check("it changes nothing that it is given", _untouched, estimator, prior, lines)
     record.check("it keeps nothing from one update to the next", _repeats, estimator, window, updates)
     record.check("a variance below zero is an error", _refuses, estimator, prior, lines)

@@ -36,19 +36,15 @@ def check_reader(record: Recorder, subject: Subject) -> None:
     reader: Any = record.check("it builds", subject.build)
     if reader is None:
         return
-    record.check("it reads", _has_read, reader)
-    record.check("a missing file is refused by an armcal error", _large_errors, subject)
+    method = getattr(reader, "read", None)
+    record.check("it reads", expect, callable(method), f"found read = {method!r}, expected a method")
+    record.check("a missing file is refused by an armcal error", _missing_file, subject)
     for name, content in _DAMAGED.items():
         record.check(f"damaged files are refused: {name}", _refuses, subject, content)
     record.check("a folder in place of a file, or a file in place of a folder, is refused", _confused, subject)
     example = record.check("it reads a known file in SI, a record a row", _known, subject)
     record.check("it reads the same each time", _repeats, subject, example)
-    record.check("a cell that is wrong or empty is told, never passed over", _told, subject, example)
-
-
-def _has_read(reader: Any) -> None:
-    method = getattr(reader, "read", None)
-    expect(callable(method), f"found read = {method!r}, expected a method")
+    record.check("a cell that is wrong or empty is reported, never passed over", _wrong_cells, subject, example)
 
 
 def _read(subject: Subject, path: str, read_request: ReadRequest | None = None) -> Dataset:
@@ -67,7 +63,7 @@ def _read(subject: Subject, path: str, read_request: ReadRequest | None = None) 
         ) from fault
 
 
-def _large_errors(subject: Subject) -> None:
+def _missing_file(subject: Subject) -> None:
     try:
         _read(subject, MISSING_FILE)
     except (InputError, ValidationError):
@@ -139,7 +135,7 @@ def _repeats(subject: Subject, example: Source | None) -> None:
         expect(np.array_equal(values, again.channels[name], equal_nan=True), f"found other numbers in {name}")
 
 
-def _told(subject: Subject, example: Source | None) -> None:
+def _wrong_cells(subject: Subject, example: Source | None) -> None:
     """The last number of the second to last line is made wrong, then empty, in each file that has such a line."""
     if example is None:
         raise NotRun("no known file was read")

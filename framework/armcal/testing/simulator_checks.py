@@ -18,17 +18,13 @@ from armcal.testing.results import NotRun, Recorder, expect
 from armcal.testing.settings_checks import Subject
 
 
-def _has(component: Any, method: str) -> None:
-    attribute = getattr(component, method, None)
-    expect(callable(attribute), f"found {method} = {attribute!r}, expected a method")
-
-
 def check_simulator(record: Recorder, subject: Subject) -> None:
     """That the same request gives the same records."""
     simulator: Any = record.check("it builds", subject.build)
     if simulator is None:
         return
-    record.check("it simulates", _has, simulator, "simulate")
+    method = getattr(simulator, "simulate", None)
+    record.check("it simulates", expect, callable(method), f"found simulate = {method!r}, expected a method")
     name = "it gives what every instrument reads, the same each time"
     record.check(name, _repeats, subject, simulator)
 
