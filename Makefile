@@ -31,6 +31,7 @@ bench: $(READY)
 lint: $(READY)
 	$(BIN)/ruff check framework plugins tests benchmarks docs/tools
 	$(BIN)/ruff format --check framework plugins tests benchmarks docs/tools
+	$(BIN)/python -m tests.words framework plugins docs README.md CONTRIBUTING.md
 
 types: $(READY)
 	$(BIN)/mypy

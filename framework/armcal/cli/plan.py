@@ -57,12 +57,12 @@ def plan(console: Console, config: Path, count: int, out: Path, overrides: tuple
 
 
 def _content(experiment: Experiment, result: PlanResult) -> dict[str, Any]:
-    settings, found = experiment.settings.plan or PlanSettings(), result.certificate
-    certificate = found and {
-        "upper": found.bound,
-        "gap": found.bound - result.value,
-        "efficiency": found.efficiency,
-        "by": found.how,
+    settings, bound = experiment.settings.plan or PlanSettings(), result.certificate
+    certificate = bound and {
+        "upper": bound.bound,
+        "gap": bound.bound - result.value,
+        "efficiency": bound.efficiency,
+        "by": bound.how,
     }
     return {
         "experiment": experiment.name,

@@ -144,8 +144,8 @@ class Comparer(ReplayVerifier):
         if not apart.is_small:
             raise DiffersError(checkpoint.sequence, f"{text}; {BOUND:g} is what another evaluator explains.")
         if _summary(written) != _summary(session.state):
-            found, expected = _summary(session.state), _summary(written)
-            raise DiffersError(checkpoint.sequence, f"Found {found}; noted was {expected}.")
+            replayed, noted = _summary(session.state), _summary(written)
+            raise DiffersError(checkpoint.sequence, f"Found {replayed}; noted was {noted}.")
         if is_new:
             # Where the journal's evaluator changes, the session goes on from its state.
             session.restore(noted["state"])

@@ -73,13 +73,13 @@ class CompiledSearch:
         for name, array, size in zip(_ARRAYS[: len(given)], given, self._sizes, strict=True):
             if array is not None and array.shape != (size, count):
                 raise ValueError(f"found {name} of the shape {array.shape}, expected {(size, count)}")
-        arrays = [None if each is None else np.ascontiguousarray(each, dtype=float) for each in given]
+        arrays = [None if column is None else np.ascontiguousarray(column, dtype=float) for column in given]
         arrays += [self._low, self._high, held]
         commands, states = np.empty((joints, count)), np.empty((len(goal.state), count))
         distances, turns, there = np.empty((3, count))
         numbers = (manner.damping, manner.patience, manner.steps, near.metres, near.radians, near.rest)
         constants = (self._length, LONGEST, FIRST_DAMPING, LEAST_DAMPING, WISHED_ENOUGH, WILD)
         results = (commands, states, distances, turns, there)
-        pointers = (None if each is None else each.ctypes.data for each in (*arrays, *results))
+        pointers = (None if array is None else array.ctypes.data for array in (*arrays, *results))
         self._search(ctypes.byref(_Search(count, *pointers, *numbers, *constants)))
         return Attempt(commands, states, distances, turns, there > 0)
