@@ -129,13 +129,13 @@ def reshapes(effect: JointEffect) -> bool:
     return type(effect).shaped is not JointEffect.shaped
 
 
-def chosen(texts: JointChoice, joint_names: Sequence[str]) -> tuple[int, ...]:
+def chosen(joints: JointChoice, joint_names: Sequence[str]) -> tuple[int, ...]:
     """The numbers (from 1) of the joints wanted, in the order of the chain.
 
     Raises:
         ValueError: a name is not one of the joints'.
     """
-    names = joint_names if texts == "all" else texts
+    names = joint_names if joints == "all" else joints
     if fault := unknown_joint(names, joint_names):
         raise ValueError(fault)
     return tuple(i for i, name in enumerate(joint_names, start=1) if name in names)

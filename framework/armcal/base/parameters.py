@@ -135,22 +135,22 @@ class Parameters:
         """
         chosen: set[str] = set()
         for pattern in patterns:
-            texts = fnmatch.filter(self.names, pattern)
-            if not texts:
+            matching = fnmatch.filter(self.names, pattern)
+            if not matching:
                 near = difflib.get_close_matches(pattern, self.names, n=3, cutoff=0.5) or list(self.names[:3])
                 raise ConfigError(
                     f"no parameter is called {pattern!r}.",
                     hint=f"Nearest: {', '.join(near)}. `armcal check -v` lists all {len(self.names)} names.",
                 )
-            chosen.update(texts)
+            chosen.update(matching)
         return tuple(name for name in self.names if name in chosen)
 
     def with_free(self, names: Iterable[str]) -> Parameters:
         """Exactly these blocks free, all others fixed."""
-        texts = set(names)
-        if unknown := sorted(texts - set(self.names)):
+        freed = set(names)
+        if unknown := sorted(freed - set(self.names)):
             raise ConfigError(f"no parameter is called {unknown[0]!r}.", hint="Take names from `Parameters.select`.")
-        return self.replaced({block.name: replace(block, free=block.name in texts) for block in self.blocks})
+        return self.replaced({block.name: replace(block, free=block.name in freed) for block in self.blocks})
 
     def with_nominal(self, values: Array) -> Parameters:
         """The same blocks about other nominal values."""

@@ -74,13 +74,13 @@ class Console:
         """One line, once, for each notice about a calibration."""
         with warnings.catch_warnings():
             warnings.simplefilter("always", CalibrationWarning)
-            others, texts = warnings.showwarning, set()
+            others, shown = warnings.showwarning, set()
 
             def show(message: Any, category: type[Warning], *where: Any, **more: Any) -> None:
                 if not issubclass(category, CalibrationWarning):
                     others(message, category, *where, **more)
-                elif str(message) not in texts:
-                    texts.add(str(message))
+                elif str(message) not in shown:
+                    shown.add(str(message))
                     self.warn(str(message))
 
             warnings.showwarning = show

@@ -41,7 +41,7 @@ from armcal.problem.problem import FactorRecords, Problem
 
 Recording = Literal["same", "new"]
 """Whether what is predicted lies within the recording of the fit, whose drift is known, or in another one."""
-LargeErrors = tuple[Array, ...]
+Residuals = tuple[Array, ...]
 """Raw residuals, one (n_r x N) a factor."""
 FEWEST = 40
 """Judged records for a stretch to be found."""
@@ -91,10 +91,10 @@ class PredictedFit(JudgedFit):
     """A fit with how its predictions missed.
 
     Attributes:
-        large_errors: raw residuals of the records that judge, by recording (``new`` only where something drifts).
+        held_residuals: raw residuals of the records that judge, by recording (``new`` only where something drifts).
     """
 
-    large_errors: Mapping[Recording, LargeErrors]
+    held_residuals: Mapping[Recording, Residuals]
 
 
 @dataclass(frozen=True)
@@ -154,17 +154,17 @@ def predictor(problem: Problem, fitted: WeighedFit) -> Predictor:
     )
 
 
-def missed(by: Predictor, held: Sequence[FactorRecords]) -> dict[Recording, LargeErrors]:
+def missed(by: Predictor, held: Sequence[FactorRecords]) -> dict[Recording, Residuals]:
     """Residuals of records that a fit did not see; nan where a measurement was not made."""
-    residuals: dict[Recording, LargeErrors] = {"same": by.residuals(held)}
+    residuals: dict[Recording, Residuals] = {"same": by.residuals(held)}
     if by.drifts:
         residuals["new"] = by.problem.residuals(by.values, held)
     return {
         name: tuple(
             np.where(factor_records.measured, own, np.nan)
-            for factor_records, own in zip(held, large_errors, strict=True)
+            for factor_records, own in zip(held, held_residuals, strict=True)
         )
-        for name, large_errors in residuals.items()
+        for name, held_residuals in residuals.items()
     }
 
 
@@ -174,7 +174,7 @@ def score(by: Predictor, held: Sequence[FactorRecords]) -> dict[Recording, Score
     return {name: scored(by.problem, residuals, spreads[name](held)) for name, residuals in missed(by, held).items()}
 
 
-def scored(problem: Problem, residuals: LargeErrors, spreads: Sequence[Spread]) -> Scores:
+def scored(problem: Problem, residuals: Residuals, spreads: Sequence[Spread]) -> Scores:
     """Residuals in units of what is predicted for them; nan where there are none."""
     errors = [residual / spread.deviations for residual, spread in zip(residuals, spreads, strict=True)]
     reaches = [
@@ -207,12 +207,12 @@ def fit_and_predict(task: FitTask) -> JudgedFit:
         judged = judged_fit(task, fitted.solution, train, held, began)
         if not judged.converged:
             return judged
-        large_errors = missed(
+        held_residuals = missed(
             predictor(task.problem, fitted), whitened_like(task.problem, fitted, held, task.estimator)
         )
     except NotConvergedError:
         return failed_fit(task, began)
-    return PredictedFit(judged.errors, judged.at_rest, True, time.perf_counter() - began, large_errors)
+    return PredictedFit(judged.errors, judged.at_rest, True, time.perf_counter() - began, held_residuals)
 
 
 def besides(scores: Scores, places: Indices) -> Scores:
@@ -223,12 +223,12 @@ def besides(scores: Scores, places: Indices) -> Scores:
 
 
 def collected(
-    splits: Sequence[Split], residuals: Sequence[Mapping[Recording, LargeErrors]], count: int
-) -> dict[Recording, LargeErrors]:
+    splits: Sequence[Split], residuals: Sequence[Mapping[Recording, Residuals]], count: int
+) -> dict[Recording, Residuals]:
     """The residuals of all folds in the order of the records; nan where a fold has none."""
-    result: dict[Recording, LargeErrors] = {}
-    for split, large_errors in zip(splits, residuals, strict=True):
-        for name, own in large_errors.items():
+    result: dict[Recording, Residuals] = {}
+    for split, held_residuals in zip(splits, residuals, strict=True):
+        for name, own in held_residuals.items():
             whole = result.setdefault(name, tuple(np.full((len(rows), count), np.nan) for rows in own))
             for mine, rows in zip(whole, own, strict=True):
                 mine[:, split.holdout] = rows

@@ -121,14 +121,14 @@ def check_folder(folder: Path, ours: Collection[str]) -> None:
         )
 
 
-def place(folder: Path, texts: Mapping[str, str | bytes], ours: Collection[str]) -> None:
+def place(folder: Path, contents: Mapping[str, str | bytes], ours: Collection[str]) -> None:
     """Write a set of files; that of an earlier run moves to ``earlier/N``.
 
     Raises:
         InputError: the folder is not ours to write to, another run writes to it, or it cannot be written.
     """
     with reserved(folder, ours) as held:
-        held.place(texts)
+        held.place(contents)
 
 
 def _locked(folder: Path) -> int:
@@ -168,12 +168,12 @@ def _beside(folder: Path) -> str:
     return f"{_STAGING}{folder.name[:_LONGEST_NAME]}-"
 
 
-def _staged(texts: Mapping[str, str | bytes], beside: Path, prefix: str) -> Path:
+def _staged(contents: Mapping[str, str | bytes], beside: Path, prefix: str) -> Path:
     """A new directory with all files, durable."""
     staging = Path(tempfile.mkdtemp(prefix=prefix, dir=beside))
     try:
         (staging / _UNFINISHED).touch()
-        for name, text in texts.items():
+        for name, text in contents.items():
             with (staging / name).open("wb") as file:
                 file.write(text.encode() if isinstance(text, str) else text)
                 file.flush()

@@ -181,10 +181,10 @@ def refuse_missing(header: Header, w: RequestedChannel, unused: Sequence[str]) -
     )
 
 
-def _nearest(names: Iterable[str], texts: Sequence[str]) -> str:
+def _nearest(names: Iterable[str], columns: Sequence[str]) -> str:
     """The names in the file that come nearest, for a message."""
-    shown = {name.lower()[:64]: name[:64] for name in texts}
+    shown = {name.lower()[:64]: name[:64] for name in columns}
     near = [shown[n] for name in names for n in difflib.get_close_matches(name.lower()[:64], shown, n=2)]
     if near:
         return f"; the nearest is {' or '.join(dict.fromkeys(near))}"
-    return f"; found {', '.join(name[:64] for name in texts[:8]) or 'no other'}"
+    return f"; found {', '.join(name[:64] for name in columns[:8]) or 'no other'}"

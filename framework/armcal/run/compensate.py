@@ -114,10 +114,10 @@ class Bench:
         Raises:
             ConfigError: the limits leave a joint no room, or no measurement reads the target that shall arrive.
         """
-        texts = () if targets is None else tuple(targets.conditions)
+        conditions = () if targets is None else tuple(targets.conditions)
         choice: EvaluatorChoice = "compiled" if targets is not None and len(targets) >= _WORTH_COMPILING else "auto"
         try:
-            expression = self.calibration.expression(self.arm, texts, self.point)
+            expression = self.calibration.expression(self.arm, conditions, self.point)
             return Compensator(expression, self.calibration.parameters, self.options, self.space.allowed, choice)
         except ValueError as fault:
             raise ConfigError(f"{fault}.", hint="Correct the limits in the plan.") from fault

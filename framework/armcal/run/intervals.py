@@ -142,9 +142,9 @@ def _crossed(
         return {}, {}, {}
     judged, splits = crossed
     fits = [fit if isinstance(fit, PredictedFit) else None for fit in judged.fits]
-    large_errors = collected(splits, [fit.large_errors if fit else {} for fit in fits], len(split.train))
+    held_residuals = collected(splits, [fit.held_residuals if fit else {} for fit in fits], len(split.train))
     ways = {"same": by.left_out_of_recording, "new": by.left_out_of_new_recording}
-    scores = {name: scored(by.problem, own, ways[name](fitted.records)) for name, own in large_errors.items()}
+    scores = {name: scored(by.problem, own, ways[name](fitted.records)) for name, own in held_residuals.items()}
     shares: dict[Recording, Coverage] = {}
     for name, own in scores.items():
         others: list[Stretch | None] = [None] * len(split.train)

@@ -89,8 +89,8 @@ def prepare(experiment: Experiment, watch: Stopwatch) -> Prepared:
     """
     ready = assemble(experiment, watch)
     with watch.stage("check"):
-        texts = require_solvable(ready.problem, ready.training, ready.problem.parameters.nominal())
-    return replace(ready, warnings=(*ready.warnings, *texts))
+        problems = require_solvable(ready.problem, ready.training, ready.problem.parameters.nominal())
+    return replace(ready, warnings=(*ready.warnings, *problems))
 
 
 def assemble(experiment: Experiment, watch: Stopwatch) -> Prepared:

@@ -110,9 +110,9 @@ def _imports_light(target: str) -> None:
     shown = " ".join(said.split())[:60]
     expect(not shown, f"found {shown!r} printed when {module} is imported, expected nothing")
     own = {module.partition(".")[0], "armcal"}
-    texts = [name for name in imported.split() if name not in own and name not in sys.stdlib_module_names]
+    foreign = [name for name in imported.split() if name not in own and name not in sys.stdlib_module_names]
     expect(
-        not texts,
-        f"found {', '.join(texts)} imported by {module}, expected only armcal.hooks: "
+        not foreign,
+        f"found {', '.join(foreign)} imported by {module}, expected only armcal.hooks: "
         "components are imported when they are used",
     )

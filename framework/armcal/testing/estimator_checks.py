@@ -124,8 +124,8 @@ def _inside(case: _Case, solution: Solution) -> None:
     case.parameters.check(solution.values)
 
 
-def _near(case: _Case, solution: Solution, texts: Sequence[str] | None = None) -> None:
-    known = [texts is None or name in texts for name in case.parameters.entry_names]
+def _near(case: _Case, solution: Solution, entries: Sequence[str] | None = None) -> None:
+    known = [entries is None or name in entries for name in case.parameters.entry_names]
     off = np.where(known, np.abs(solution.values - case.answer), 0.0)
     worst = int(np.argmax(off))
     expect(

@@ -97,8 +97,8 @@ def _joint_names(model: ArmModel) -> tuple[str, ...]:
 def _chain(model: ArmModel, values: dict[str, Expression], names: Sequence[str]) -> Chain:
     chain = model.chain(values)
     expect(isinstance(chain, Chain), f"found a chain of type {type(chain).__name__}, expected Chain")
-    texts = tuple(joint.name for joint in chain.joints)
-    expect(texts == tuple(names), f"found the joints {texts}, expected {tuple(names)}")
+    joint_names = tuple(joint.name for joint in chain.joints)
+    expect(joint_names == tuple(names), f"found the joints {joint_names}, expected {tuple(names)}")
     for joint in chain.joints:
         turns, slides = (float(np.linalg.norm(axis)) for axis in (joint.angular, joint.linear))
         expect(
