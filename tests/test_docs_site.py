@@ -10,6 +10,7 @@ import sys
 from collections.abc import Iterator
 from html.parser import HTMLParser
 from pathlib import Path
+from pkgutil import resolve_name
 
 import pytest
 import yaml
@@ -207,3 +208,11 @@ def test_the_search_works_from_a_disk_without_a_network(site: Path, browser: Bro
 def test_pages_that_are_not_run_here_are_done_by_their_tests() -> None:
     for page, test in DONE_BY_TESTS.items():
         assert page in (ROOT / test).read_text(encoding="utf-8"), f"{test} no longer does docs/{page}"
+
+
+def test_every_function_that_the_mathematics_name_is_there() -> None:
+    table = (DOCS / "mathematics.md").read_text("utf-8").partition("## Where each formula is computed")[2]
+    names = re.findall(r"`(armcal[\w.]*)`", table)
+    assert len(names) > 30
+    for name in names:
+        assert resolve_name(name), name
