@@ -201,9 +201,7 @@ def upgraded(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[], None]]:
     later = replace(now, plugins=tuple(replace(p, version="99.1") for p in now.plugins))
 
     def install() -> None:
-        commands = [f"armcal.cli.{name}" for name in ("predict", "export", "compensate", "calibration")]
-        for module in (*commands, "armcal_online.commands.recalibrate"):
-            monkeypatch.setattr(f"{module}.discover", lambda: later)
+        monkeypatch.setattr("armcal.cli.common.discover", lambda: later)
         monkeypatch.setattr("armcal.calibration.calibration.discover", lambda: later)
 
     yield install

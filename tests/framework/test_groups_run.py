@@ -170,7 +170,7 @@ def test_a_missing_label_column_is_refused(data, tmp_path):
     [
         ({"sockets_of": "nosuch"}, ("nosuch", "balls")),
         ({"arm": "middle"}, ("middle", "left", "run.yaml")),
-        ({"noise_mm": 0}, ("noise", "above zero", "run.yaml")),
+        ({"noise_mm": 0}, ("noise", "greater than 0", "run.yaml")),
         ({"distances": [{"between": ["a", "a"], "distance_mm": 50, "noise_mm": 1}]}, ("twice", "two sockets")),
         ({"group_labels": ["position", "hole"]}, ("hole",)),
     ],
