@@ -130,13 +130,13 @@ def _show(
     for remark in exported.remarks:
         console.warn(f"{remark}.")
     if exported.left_out:
-        if apart is None:
-            words = "the calibrated arm does not settle in all poses"
-        elif apart < _NOTHING_MM:  # rounding
-            words = "which does not move the tool"
-        else:
-            words = f"up to {apart:.3g} mm"
+        words = "the calibrated arm does not settle in all poses" if apart is None else _up_to(apart)
         console.warn(
             f"left out, a {kind} file cannot hold it: {', '.join(exported.left_out)} "
             f"({words}, in {POSES} random poses)."
         )
+
+
+def _up_to(apart_mm: float) -> str:
+    """In significant digits; less than a thousandth of a micrometre is rounding."""
+    return f"up to {apart_mm:.3g} mm" if apart_mm >= _NOTHING_MM else "which does not move the tool"

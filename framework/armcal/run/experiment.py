@@ -129,7 +129,7 @@ class Experiment:
             raise ConfigError(
                 f"compliances are calibrated ({elastic[0]}, ...) and the payload is not stated.",
                 where=self.source.where(("statics", "payload")),
-                hint="State what hung on the tool beyond the links: payload_g, 0 if nothing, or a column payload_g.",
+                hint="State what hung on the tool beyond the links: payload_g: 0 if nothing, or a column payload_g.",
             )
         require_conditions(dataset, request.channels)
         dataset = warn_beyond_limits(noticed(dataset), self.system.arms)
