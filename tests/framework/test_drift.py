@@ -11,7 +11,7 @@ import oracle
 import pytest
 from armcal.base.parameters import Drift
 from armcal.cli.main import cli
-from armcal.diagnose.evidence import Evidence, NewRecording
+from armcal.diagnose.evidence import Evidence
 from armcal.diagnose.verdict import LEVEL, _good_for, _size
 from armcal.errors import DataError
 from armcal.estimate.estimator import estimate
@@ -32,10 +32,10 @@ DRIFTS = {"base_x": (0.8e-3, 7.0), "base_z": (0.5e-3, 7.0), "theta1": (2e-3, 12.
 SOLVER = CvxpyEstimator(CvxpyEstimator.Settings())
 
 
-def parameters_of(lrm, drifts, channel="sequence"):
+def parameters_of(lrm, drifts, channel="sequence", *, experiment=None):
     """Few free parameters, some of which drift."""
     names = [oracle.armcal_name(name) for name in FREE]
-    parameters = lrm.experiment().parameters.with_free(names)
+    parameters = (experiment or lrm.experiment()).parameters.with_free(names)
     drifting = {oracle.armcal_name(name): Drift(sd, over, channel) for name, (sd, over) in drifts.items()}
     return parameters.replaced({name: replace(parameters[name], drift=drift) for name, drift in drifting.items()})
 
@@ -330,6 +330,7 @@ def test_drifts_over_records_and_over_time_at_once(lrm):
 
 # ---------------------------------------------------------------- planted drifts
 
+QUATERNION = ("qw", "qx", "qy", "qz")
 PLANTED = dict.fromkeys(("base_x", "base_y", "base_z"), (0.6e-3, 10.0))
 
 
@@ -516,11 +517,10 @@ def test_a_run_on_a_drifting_recording_states_both_errors(tmp_path):
 
 def new_recording(problem, records, fitted):
     """What a run gathers of a fit to all records."""
-    n = records[0].count
     known = estimate(problem, records, fitted)
     drift = KnownDrift.by(problem, known.values, records)
     by = Predictor(problem, known.values, known.covariance, known.noise_scale, known.degrees_of_freedom, drift)
-    return NewRecording(by.new_over_held(records)[:n], *records[0].correlation.degrees_of_freedom(n))
+    return by.new_recording(records, np.arange(records[0].count))
 
 
 @pytest.mark.parametrize("over", [0.01, 8.0])
@@ -529,14 +529,28 @@ def test_records_count_as_their_drift_lets_them(lrm, over):
     drifts = {"base_x": (1.5e-3, over), "base_z": (1.5e-3, over)}
     dataset = recorded(lrm, 60, 3, drifts)
     problem, records = posed(lrm, dataset, drifts)
-    many, independent = records[0].correlation.degrees_of_freedom(60)
-    inverse = Dense(dataset, drifts).inverse
-    covariance = np.linalg.inv(inverse)
-    assert np.trace(covariance) ** 2 / np.sum(covariance**2) == pytest.approx(many, rel=1e-6)
-    assert (many == pytest.approx(independent)) == (over < 1)
-    fitted = SOLVER.solve(problem, records, problem.parameters.nominal())
-    ratio = new_recording(problem, records, fitted).ratio
-    assert np.all(ratio > 0.999) and (ratio.mean() < 1.03) == (over < 1)
+    new = new_recording(problem, records, SOLVER.solve(problem, records, problem.parameters.nominal()))
+    covariance = np.linalg.inv(Dense(dataset, drifts).inverse)
+    assert np.trace(covariance) ** 2 / np.sum(covariance**2) == pytest.approx(new.freedom, rel=1e-6)
+    assert (new.freedom == pytest.approx(new.independent)) == (over < 1)
+    assert np.all(new.ratio > 0.999) and (new.ratio.mean() < 1.03) == (over < 1)
+
+
+def test_angles_do_not_count_where_errors_are_lengths(lrm):
+    """Nor do records that nobody judges: without any nothing is said."""
+    drifts = {"base_x": (1.5e-3, 8.0)}
+    dataset = recorded(lrm, 40, 3, drifts, **{f"tracker.{name}": np.full(40, name == "qw") for name in QUATERNION})
+    pose = ("measurements.tracker.type=tip_pose", "measurements.tracker.orientation_noise_deg=0.01")
+    known = []
+    for experiment in (lrm.experiment(), lrm.experiment("option1", *pose)):
+        problem = lrm.problem(experiment, dataset, "interpreted", parameters_of(lrm, drifts, experiment=experiment))
+        values = problem.parameters.nominal()
+        records = with_drift(problem, problem.records(dataset), dataset, values)
+        free = len(problem.free_names)
+        by = Predictor(problem, values, np.eye(free) * 1e-8, 1.0, 99.0, KnownDrift.by(problem, values, records))
+        known.append(by.new_recording(records, np.arange(40)))
+        assert by.new_recording(records, np.arange(0)) is None
+    assert known[0].freedom == pytest.approx(known[1].freedom) and known[0].freedom < known[0].independent
 
 
 @pytest.mark.slow

@@ -13,6 +13,7 @@ from armcal.base.domains import Array
 from armcal.diagnose.large_errors import LargeErrors
 from armcal.diagnose.residual_structure import ResidualStructure
 from armcal.estimate.estimator import Estimate
+from armcal.estimate.prediction import NewRecording
 from armcal.planning.candidates import whitened_rows
 from armcal.problem.problem import Problem
 from armcal.problem.tool_motion import along, apart_from, tools, unseen_motions
@@ -35,21 +36,6 @@ class PriorsAlone:
     worst_mm: float
     poses: int
     up_to: str = ""
-
-
-@dataclass(frozen=True)
-class NewRecording:
-    """What the errors of one recording say of another one, where something drifts.
-
-    Attributes:
-        ratio: typical error in a new recording over that of each judged record (n).
-        freedom: degrees of freedom of the errors' mean square, as their records share a drift.
-        independent: the same, if the records were independent.
-    """
-
-    ratio: Array
-    freedom: float
-    independent: float
 
 
 @dataclass(frozen=True)

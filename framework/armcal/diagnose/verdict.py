@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.special import bdtr, chdtri, ndtri
 
 from armcal.base.domains import Array
-from armcal.diagnose.evidence import Evidence, NewRecording
+from armcal.diagnose.evidence import Evidence
 from armcal.diagnose.evidence_findings import (
     MOST_TOLD,
     determined_finding,
@@ -23,6 +23,7 @@ from armcal.diagnose.evidence_findings import (
 from armcal.diagnose.noise_findings import Finding, component_findings, suspect_findings
 from armcal.estimate.estimator import CHECK_THE_DATA, Estimate
 from armcal.estimate.identifiability import POOR_CONDITION, bound_together, correlated_pairs
+from armcal.estimate.prediction import NewRecording
 from armcal.estimate.validation import summarise
 from armcal.estimate.weighing import WeighedFit
 from armcal.planning.suggestion import CANDIDATES, Suggestion

@@ -15,9 +15,11 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import fdtri, stdtrit
 
 from armcal.base.domains import Array
+from armcal.estimate.validation import error_dimension
 from armcal.problem.factor_records import noise_roots
 from armcal.problem.kernel import Kernel
 from armcal.problem.problem import FactorRecords, Problem
@@ -30,6 +32,8 @@ RADIUS_LEVEL = 0.95
 _POSITION = ["x", "y", "z"]
 _LEAST_LEFT = 1e-3
 """Of the information on a direction that a record alone gives: without it next to nothing would be known."""
+_MOST_COMPARED = 2000
+"""Records of which all pairs are compared; the degrees of freedom of more grow in proportion."""
 _Parts = tuple[Array, Array, Array]
 
 
@@ -94,6 +98,21 @@ class KnownDrift:
         jacobians = [np.moveaxis(jacobian, 1, 2) for jacobian in problem.jacobians(values, records)]
         states = shared.states([r[:, :, None] for r in problem.weighted_residuals(values, records)])
         return cls(states, shared.states(jacobians), shared.covariance)
+
+
+@dataclass(frozen=True)
+class NewRecording:
+    """What the errors of one recording say of another one, where something drifts.
+
+    Attributes:
+        ratio: typical error in a new recording over that of each judged record (n).
+        freedom: degrees of freedom of the errors' mean square, as their records share a drift.
+        independent: the same, if the records were independent.
+    """
+
+    ratio: Array
+    freedom: float
+    independent: float
 
 
 @dataclass(frozen=True)
@@ -164,24 +183,35 @@ class Predictor:
             for factor_records, (noise, values, drift) in parts
         )
 
-    def new_over_held(self, records: Sequence[FactorRecords]) -> Array | None:
-        """Typical error in a new recording over that of held-out records of this one (N); None without drift.
+    def new_recording(self, records: Sequence[FactorRecords], judged: NDArray[np.intp]) -> NewRecording | None:
+        """What the errors of judged records, held out of this recording, say of a new one.
+
+        None where nothing drifts, or no record is judged.
 
         A fit takes up part of this recording's drift, which moves its held-out records as well: their errors lack
         that part, and in a new recording it is an error. For residuals of slopes J and the covariance S, of which D
         is the drift's, what both have in common is J C J' S^-1 D, with C the covariance of the values.
         """
         here, there = records[0].correlation, self.drift
-        if here is None or there is None:
+        if here is None or there is None or not len(judged):
             return None
-        new, common = 0.0, 0.0
-        for i, (slope, parts) in enumerate(
-            zip(self._slopes(records), self._parts_in_new_recording(records), strict=True)
-        ):
-            drift = np.moveaxis(here.shift(i, there.slopes)[:, : slope.shape[2]], 1, 2)
-            new = new + np.einsum("nrr->n", sum(parts))
-            common = common + np.einsum("rvn,vw,rwn->n", slope, self.covariance, drift, optimize=True)
-        return np.asarray(np.sqrt(new / np.maximum(new - 2 * common, _LEAST_LEFT * new)))
+        counted, whole, common = error_dimension(self.problem), 0.0, 0.0
+        noises: list[Array] = []
+        roots: list[Array] = []
+        parts = zip(self.problem.kernels, self._slopes(records), self._parts_in_new_recording(records), strict=True)
+        for i, (kernel, slope, (noise, values, drift)) in enumerate(parts):
+            rows = np.flatnonzero([dimension == counted for dimension in kernel.factor.dimensions])
+            taken_up = np.moveaxis(here.shift(i, there.slopes)[:, : slope.shape[2]], 1, 2)
+            whole = whole + np.einsum("nrr->n", (noise + values + drift)[:, rows][:, :, rows])
+            common = common + np.einsum("rvn,vw,rwn->n", slope[rows], self.covariance, taken_up[rows], optimize=True)
+            noises.append(noise[:, rows][:, :, rows])
+            roots.append(self.noise_scale * np.moveaxis(here.raw[i][rows], 0, 1)[: len(noise)])
+        ratio = np.sqrt(whole / np.maximum(whole - 2 * common, _LEAST_LEFT * whole))
+        near = judged[np.argsort(here.node[judged], kind="stable")][:_MOST_COMPARED]
+        own = [noise[near] for noise in noises], [root[near] for root in roots]
+        freedom, independent = _degrees_of_freedom(*own, here.kernels(near))
+        part = len(judged) / len(near)
+        return NewRecording(ratio[judged], part * freedom, part * independent)
 
     def _parts_in_new_recording(self, records: Sequence[FactorRecords]) -> list[_Parts]:
         """Covariances in a recording whose drift is not known."""
@@ -242,3 +272,30 @@ def _without_itself(noise: Array, known: Array, factor_records: FactorRecords) -
     left = np.maximum(1.0 - factor_records.weight[: factor_records.count, None] * sizes, _LEAST_LEFT)
     turned = root @ axes
     return np.asarray(noise + np.einsum("nrk,nk,nsk->nrs", turned, sizes / left, turned))
+
+
+def _degrees_of_freedom(
+    noises: Sequence[Array], roots: Sequence[Array], kernels: Sequence[Array]
+) -> tuple[float, float]:
+    """Of the mean square of all rows, as records are correlated and if they were independent.
+
+    Those of the chi-square with its mean and variance, tr(C)^2 / tr(C^2) [Satterthwaite1946].
+
+    Args:
+        noises: covariance of each measurement's rows that no other record shares (N x n_r x n_r).
+        roots: the same rows by the drifts (N x n_r x n_s).
+        kernels: correlation of each drift between the records (N x N).
+    """
+    across = np.sum([np.einsum("nrs,nrt->nst", own, own) for own in roots], axis=0)
+    trace = sum(float(np.einsum("nrr->", noise)) for noise in noises) + float(np.einsum("nss->", across))
+    alone = sum(
+        float(np.sum(noise**2) + 2 * np.einsum("nrq,nrs,nqs->", noise, own, own, optimize=True))
+        for noise, own in zip(noises, roots, strict=True)
+    )
+    independent = alone + float(np.einsum("nst,nst->", across, across))
+    shared = alone + sum(
+        float(across[:, s, t] @ (one * other) @ across[:, s, t])
+        for s, one in enumerate(kernels)
+        for t, other in enumerate(kernels)
+    )
+    return trace**2 / shared, trace**2 / independent

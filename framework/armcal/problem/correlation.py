@@ -9,10 +9,9 @@ gives the states [Rasmussen2006].
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,8 +22,6 @@ from armcal.base.process import kept, passed_on
 
 _LEAST_SHARED = 1e-3
 """Of the noise's variance: a part of the covariance that is smaller is left out of its root."""
-_MOST_COMPARED = 2000
-"""Records of which all pairs are compared; the degrees of freedom of more grow in proportion."""
 
 
 @dataclass(frozen=True)
@@ -118,7 +115,7 @@ class Correlation:
         stacked = self._stacked(self.slopes)
         count, size = stacked.shape[:2]
         whole = np.zeros((count, size, count, size))
-        for state, kernel in enumerate(self._kernels(count)):
+        for state, kernel in enumerate(self.kernels(np.arange(count))):
             own = stacked[:, :, state]
             whole += own[:, :, None, None] * kernel[:, None, :, None] * own
         root, order, rank, _ = dpstrf(whole.reshape(count * size, -1), tol=_LEAST_SHARED, lower=1)
@@ -126,30 +123,10 @@ class Correlation:
         made[order - 1] = np.tril(root)[:, :rank]
         return self._apart(made.reshape(count, size, rank), self.slopes)
 
-    def degrees_of_freedom(self, count: int) -> tuple[float, float]:
-        """Of the mean square of the first records' rows: as they are correlated, and if records were independent.
-
-        Those of the chi-square that has its mean and variance, tr(C)^2 / tr(C^2) [Satterthwaite1946].
-        """
-        kept_count = min(count, _MOST_COMPARED)
-        slopes = self._stacked(self.slopes)[:kept_count]
-        own = np.eye(slopes.shape[1]) + slopes @ slopes.transpose(0, 2, 1)
-        trace, independent = float(np.einsum("nrr->", own)), float(np.sum(own**2))
-        across = np.einsum("nrs,nrt->stn", slopes, slopes)
-        kernels = list(self._kernels(kept_count))
-        shared = independent
-        for (s, one), (t, other) in product(enumerate(kernels), repeat=2):
-            beside = one * other
-            np.fill_diagonal(beside, 0.0)
-            shared += float(across[s, t] @ beside @ across[s, t])
-        part = count / kept_count * trace**2
-        return part / shared, part / independent
-
-    def _kernels(self, count: int) -> Iterator[Array]:
-        """Correlations of each state between the first records (count x count)."""
-        place = np.vstack([np.zeros_like(self._start), np.cumsum(self.apart, axis=0)])[self.node[:count]]
-        for at in place.T:
-            yield np.asarray(kept(np.abs(at[:, None] - at)))
+    def kernels(self, records: NDArray[np.intp]) -> list[Array]:
+        """Correlation of each state between records (n x n each)."""
+        place = np.vstack([np.zeros_like(self._start), np.cumsum(self.apart, axis=0)])[self.node[records]]
+        return [kept(np.abs(at[:, None] - at)) for at in place.T]
 
     def subset(self, chosen: NDArray[np.intp]) -> Correlation:
         """Some records of all; the same states."""

@@ -6,12 +6,11 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from armcal.base.domains import Array
 from armcal.config.system import System
 from armcal.diagnose.coverage import predictor
-from armcal.diagnose.evidence import Evidence, NewRecording, priors_alone, unseen_poses
+from armcal.diagnose.evidence import Evidence, priors_alone, unseen_poses
 from armcal.diagnose.evidence_findings import worse_than_nominal
 from armcal.diagnose.fit_rows import FitRows
 from armcal.diagnose.gross import MOST_RECORDS, figure_of, scale_deviation, thinned
@@ -103,17 +102,8 @@ def gather(run: FittedRecords, judged_mm: Array, system: System, limit: float | 
     acting = problem.weighted(run.fitted.records, run.fitted.weights)
     own = (training, motion.subset(train), position[train])
     left = structure(problem, acting, estimate, *own, modelled=effect_types(system))
-    return Evidence(left, missed, alone, error_unit(problem), _new_recording(run, np.isfinite(judged_mm)))
-
-
-def _new_recording(run: FittedRecords, judged: NDArray[np.bool_]) -> NewRecording | None:
-    """What the judged records (N) say of a new recording; None where nothing drifts."""
-    ratio = predictor(run.problem, run.fitted).new_over_held(run.records)
-    correlation = run.records[0].correlation
-    if ratio is None or correlation is None:
-        return None
-    at = np.flatnonzero(judged)
-    return NewRecording(ratio[at], *correlation.subset(at).degrees_of_freedom(len(at)))
+    new = predictor(problem, run.fitted).new_recording(run.records, np.flatnonzero(np.isfinite(judged_mm)))
+    return Evidence(left, missed, alone, error_unit(problem), new)
 
 
 def _gross(run: FittedRecords, acting: Sequence[FactorRecords], judged_mm: Array, evidence: Evidence) -> list[Finding]:
