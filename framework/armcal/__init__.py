@@ -54,6 +54,7 @@ if TYPE_CHECKING:
     from armcal.measure.instrument import InstrumentSettings as InstrumentSettings
     from armcal.measure.measurement import Channel as Channel
     from armcal.plugin_files import use_plugins as use_plugins
+    from armcal.report.sections import ReportSection as ReportSection
     from armcal.run.pipeline import calibrate as calibrate
     from armcal.run.result import RunResult as RunResult
 
@@ -83,6 +84,7 @@ _FOR_PLUGINS = {
     "armcal.measure.instrument": "Instrument InstrumentSettings",
     "armcal.measure.measurement": "Channel",
     "armcal.plugin_files": "use_plugins",
+    "armcal.report.sections": "ReportSection",
 }
 """What plugins are made of."""
 _HOMES = {name: home for homes in (_FOR_USERS, _FOR_PLUGINS) for home, names in homes.items() for name in names.split()}

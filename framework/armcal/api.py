@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ from armcal.diagnose.verdict import Verdict
 from armcal.errors import NotConvergedError
 from armcal.estimate.estimator import CHECK_THE_DATA, Estimate
 from armcal.io.parallel import Executor
-from armcal.report import render
+from armcal.report import plugin_sections, render
 from armcal.run import experiment, outputs
 from armcal.run.pipeline import calibrate
 from armcal.run.result import RunResult
@@ -76,7 +77,8 @@ class Run:
         Raises:
             InputError: the folder holds other things, or cannot be written.
         """
-        outputs.write(self.result, self.experiment, Path(folder), render, accept)
+        sections = plugin_sections(self.result, self.experiment.registry)
+        outputs.write(self.result, self.experiment, Path(folder), partial(render, sections=sections), accept)
         return Path(folder)
 
 

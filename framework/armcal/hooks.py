@@ -129,6 +129,11 @@ def armcal_register_commands(register: Register) -> None:
 
 
 @hookspec
+def armcal_register_report_sections(register: Register) -> None:
+    """Report sections: what a plugin adds to ``report.html`` of each run."""
+
+
+@hookspec
 def armcal_run_started(name: str, records: int) -> None:
     """A calibration run begins.
 
@@ -231,6 +236,9 @@ COMPONENTS: Mapping[str, ComponentKind] = MappingProxyType(
         ),
         "bench": ComponentKind("armcal_register_benches", "Bench(settings)", "armcal.devices.simulated:SimulatedBench"),
         "command": ComponentKind("armcal_register_commands", "Command", "armcal.hooks:Command"),
+        "report_section": ComponentKind(
+            "armcal_register_report_sections", "Section(result)", "armcal.report.sections:SectionMaker"
+        ),
     }
 )
 """The kinds of component."""

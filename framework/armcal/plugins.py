@@ -138,7 +138,12 @@ class PluginRegistry:
 
 def _spoken(kind: str) -> str:
     """A kind with its article."""
-    name = {"online": "online estimator", "joints": "joint stream", "bench": "simulated bench"}.get(kind, kind)
+    name = {
+        "online": "online estimator",
+        "joints": "joint stream",
+        "bench": "simulated bench",
+        "report_section": "report section",
+    }.get(kind, kind)
     return f"{'an' if name[0] in 'aeiou' else 'a'} {name}"
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from functools import partial
 from pathlib import Path
 
 import click
@@ -13,7 +14,7 @@ from armcal.cli.tables import show_run
 from armcal.errors import EXIT_DO_NOT_USE, EXIT_NOT_CONVERGED
 from armcal.estimate.estimator import CHECK_THE_DATA
 from armcal.io.parallel import Executor
-from armcal.report import render
+from armcal.report import plugin_sections, render
 from armcal.run import outputs
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import Stopwatch, calibrate
@@ -47,7 +48,11 @@ def run(
         result = calibrate(experiment, command_line(), progress, watch, parallel)
     _show_details(console, result)
     result.seconds["total"] = watch.total()
-    outputs.place(reserved, result, experiment, render, accept)
+    sections = plugin_sections(result, registry)
+    for section in sections:
+        if section.fault:
+            console.warn(section.fault)
+    outputs.place(reserved, result, experiment, partial(render, sections=sections), accept)
     converged = result.estimate.verdict.converged
     for text in registry.notify("armcal_run_ended", name=result.name, folder=str(folder), converged=converged):
         console.warn(text)

@@ -3,5 +3,6 @@
 from __future__ import annotations
 
 from armcal.report.page import render
+from armcal.report.sections import plugin_sections
 
-__all__ = ["render"]
+__all__ = ["plugin_sections", "render"]

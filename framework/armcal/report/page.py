@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,7 @@ from armcal.estimate.identifiability import CORRELATED, POOR_CONDITION, bound_to
 from armcal.report import error_figures, interval_figures, parameter_figures, workspace
 from armcal.report.numbers import NONE, common_decimals, count, duration, fixed, plural, ratio, significant, unbroken
 from armcal.report.record_tables import group_rows, missed_records, scatter_rows, suspicious_rows
+from armcal.report.sections import PluginSection
 from armcal.report.tables import (
     Fact,
     error_rows,
@@ -33,8 +34,8 @@ _WORDS = {"bad": "Bad", "warning": "Warning", "note": "Note", "good": "Good"}
 _SYMBOLS = {"bad": "✕", "warning": "!", "note": "i", "good": "✓"}
 
 
-def render(result: RunResult) -> str:
-    """One self-contained HTML file: no scripts, no references to anything outside of it."""
+def render(result: RunResult, sections: Sequence[PluginSection] = ()) -> str:
+    """One self-contained HTML file, plugins' sections too: no scripts, no references to anything outside of it."""
     grades = [finding.grade for finding in result.verdict.findings]
     parameters, aside, worst = parameter_rows(result.estimate), result.dataset.set_aside, worst_records(result)
     springs = [row for row in parameters if row.si_unit == "rad_per_Nm"]
@@ -67,6 +68,7 @@ def render(result: RunResult) -> str:
         "suspicious": suspicious_rows(result.noise, MOST_LISTED),
         "more_suspicious": max(len(result.noise.suspicious) - MOST_LISTED, 0),
         "scatter": scatter_rows(result.noise),
+        "sections": sections,
         "aside": aside[:MOST_LISTED],
         "more_aside": max(len(aside) - MOST_LISTED, 0),
         "warnings": tuple(dict.fromkeys((*result.warnings, *result.dataset.warnings))),

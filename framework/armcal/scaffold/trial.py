@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from armcal.estimate.estimator import Progress, no_progress
 from armcal.plugins import PluginRegistry
-from armcal.report import render
+from armcal.report import plugin_sections, render
 from armcal.run import outputs
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import Stopwatch, calibrate
@@ -59,7 +60,8 @@ def try_out(made: RobotFolder, registry: PluginRegistry, command: str = "", prog
     experiment = Experiment.load(made.folder / SIMULATED, registry=registry)
     result = calibrate(experiment, command, progress, watch)
     result.seconds["total"] = watch.total()
-    outputs.write(result, experiment, folder, render)
+    sections = plugin_sections(result, registry)
+    outputs.write(result, experiment, folder, partial(render, sections=sections))
     table = result.table
     held = (table.nominal["holdout"].mean, table.calibrated["holdout"].mean)
     nominal, calibrated = (math.nan if error is None else error for error in held)

@@ -15,7 +15,7 @@ KNOWN_CHECKS: Mapping[str, int] = MappingProxyType(
     {
         "model": 28,
         "effect": 26,
-        "measurement": 28,
+        "measurement": 29,
         "reader": 23,
         "estimator": 22,
         "online": 20,
@@ -26,6 +26,8 @@ KNOWN_CHECKS: Mapping[str, int] = MappingProxyType(
         "tracker": 18,
         "joints": 19,
         "bench": 13,
+        "command": 2,
+        "report_section": 2,
     }
 )
 """How many checks run on any component of a kind; what a component has beside the rest adds to them."""

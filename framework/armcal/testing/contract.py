@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import subprocess
 import sys
 from collections.abc import Callable, Mapping
@@ -81,6 +82,9 @@ def _check_kind(record: Recorder, kind: str, load: Callable[[], Any]) -> None:
         command = record.check("it imports", load)
         record.check("it is a click command that says what it does", _check_command, command)
         return
+    if kind == "report_section":
+        record.check("it is a function of a run's result", _check_section, record.check("it imports", load))
+        return
     with watched(record) as begin:
         made = record.check("it imports", load)
         begin(made)
@@ -92,6 +96,12 @@ def _check_kind(record: Recorder, kind: str, load: Callable[[], Any]) -> None:
 def _check_command(made: Any) -> None:
     expect(isinstance(made, click.Command), f"found {type(made).__name__}, expected a click.Command")
     expect(bool(made.help), f"found no help of the command {made.name!r}, expected a docstring")
+
+
+def _check_section(made: Any) -> None:
+    expect(callable(made), f"found {type(made).__name__}, expected a function of a RunResult")
+    required = [p for p in inspect.signature(made).parameters.values() if p.default is p.empty]
+    expect(len(required) == 1, f"found {len(required)} arguments without a default, expected one: the RunResult")
 
 
 def _imports_light(target: str) -> None:
