@@ -296,3 +296,35 @@ def _mappings(content: object) -> list[dict[str, object]]:
     inner = content.values() if isinstance(content, dict) else content if isinstance(content, list) else ()
     own = [content] if isinstance(content, dict) else []
     return own + [found for part in inner for found in _mappings(part)]
+
+
+@pytest.mark.slow
+def test_an_application_can_be_a_distribution_of_its_own(tree: Path, tmp_path: Path) -> None:
+    """The core without it knows nothing of it; beside the core it is an application like the others."""
+    pytest.importorskip("pip", reason="pip is not installed here, and installs the wheels")
+    core, own = Path(shutil.copytree(tree, tmp_path / "core")), tmp_path / "own"
+    own.mkdir()
+    shutil.move(core / "plugins" / "armcal_serve", own / "armcal_serve")
+    text = (core / "pyproject.toml").read_text(encoding="utf-8")
+    entry = 'serve = "armcal_serve.plugin"\n'
+    assert entry in text
+    (core / "pyproject.toml").write_text(text.replace(entry, ""), encoding="utf-8")
+    (own / "pyproject.toml").write_text(
+        '[build-system]\nrequires = ["hatchling"]\nbuild-backend = "hatchling.build"\n\n'
+        '[project]\nname = "armcal-serve"\nversion = "7.1"\ndependencies = ["armcal"]\n\n'
+        f"[project.entry-points.armcal]\n{entry}",
+        encoding="utf-8",
+    )
+    interpreter = new_environment(tmp_path / "env", Path(sysconfig.get_paths()["purelib"]))
+    for folder, known in ((core, False), (own, True)):
+        (wheel,) = build(folder, tmp_path / "wheels" / folder.name, "-t", "wheel").glob("*.whl")
+        installed = pip(interpreter, "--no-deps", "--no-index", str(wheel))
+        assert installed.returncode == 0, installed.stderr
+        helped = armcal_in(interpreter, tmp_path, "serve", "--help")
+        assert helped.returncode == (0 if known else 2), helped.stderr
+        assert known or "No such command 'serve'" in helped.stderr
+    listed = armcal_in(interpreter, tmp_path, "plugins", "list", "--json")
+    assert listed.returncode == 0, listed.stderr
+    assert '"armcal-serve"' in listed.stdout and '"7.1"' in listed.stdout
+    missing = armcal_in(interpreter, tmp_path, "serve", "calibration.yaml")
+    assert missing.returncode == 2 and "calibration.yaml" in missing.stderr and "Traceback" not in missing.stderr
