@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, ClassVar
 
 from armcal.arm.effects import JointCommand, chosen
-from armcal.arm.servo import PulseClock, PulseTable, SteppedEffect, quantised
+from armcal.arm.servo import PulseClock, PulseTable, SteppedEffect, quantised, without_slope
 from armcal.base.config_text import resolve_path
 from armcal.base.quantities import UnitOf
 from armcal.base.settings import Settings
@@ -111,4 +111,4 @@ class Quantisation(SteppedEffect):
     def displacement(self, command: JointCommand, values: Mapping[str, Any]) -> Any:
         """From the commanded angle to the one that is set (rad)."""
         servo = self._servos.get(command.index)
-        return 0 if servo is None else quantised(command.commanded, *servo) - command.commanded
+        return 0 if servo is None else without_slope(quantised(command.commanded, *servo) - command.commanded)

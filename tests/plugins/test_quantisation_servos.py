@@ -74,3 +74,23 @@ def test_what_is_refused(tmp_path):
 def test_a_joint_that_the_file_lacks_is_refused(tmp_path):
     with pytest.raises(ValueError, match="no servo elbow"):
         Quantisation(settings_from(tmp_path), ("q1", "elbow"))
+
+
+def test_a_joint_that_is_off_moves_the_tip_whatever_the_counts(lrm):
+    """So that a joint's error, its noise or its slip is seen at its own size: as of the arm without a board."""
+    steps = ", ".join(f"{joint}: {{angles_deg: [-100, 100], pulses_us: [600, 2400]}}" for joint in ARM)
+    stepped = f"arms.arm.effects.steps={{type: quantisation, tables: {{{steps}}}}}"
+    q = np.random.default_rng(7).uniform(-1.5, 1.5, (20, 6))
+    with_board = lrm.problem(lrm.experiment("option1", stepped), lrm.dataset(q, np.zeros((20, 3))))
+    effect = with_board.blueprint.arms["arm"].effects["steps"]
+    stood = q + [[displacement(effect, index, angle) for index, angle in enumerate(row)] for row in q]
+    assert 1e-4 < np.abs(stood - q).max() < 0.1
+    without = lrm.problem(lrm.experiment(), lrm.dataset(stood, np.zeros((20, 3))))
+    channels, at_rest = [f"arm.{joint}" for joint in ARM], []
+    for problem, angles in ((with_board, q), (without, stood)):
+        records, values = problem.records(lrm.dataset(angles, np.zeros((20, 3)))), problem.parameters.nominal()
+        residuals = problem.residuals(values, records)
+        at_rest.append((residuals[0], problem.channel_slopes(values, records, channels)[0]))
+    (residual, slopes), (same, expected) = at_rest
+    assert residual == pytest.approx(same, abs=1e-9) and slopes == pytest.approx(expected, abs=1e-6)
+    assert np.abs(expected).max() > 0.1

@@ -19,6 +19,7 @@ COUNTS = 4096
 """In one period."""
 PRESCALES = (3, 255)
 """The smallest and the largest."""
+_FINE = 2.0**60
 
 
 @dataclass(frozen=True)
@@ -98,10 +99,16 @@ def quantised(angle: Expression, table: PulseTable, clock: PulseClock) -> Expres
     return table.angle(clock.counts(table.pulse(angle)) * clock.tick)
 
 
+def without_slope(expression: Expression) -> Expression:
+    """An expression's value (to 1e-18) whose derivative is zero: the derivative of ``floor`` is."""
+    return ca.floor(expression * _FINE) / _FINE
+
+
 class SteppedEffect(JointEffect):
     """A joint effect by which only some displacements can be set: those of the whole counts of a servo board.
 
-    Its expression has no slope. What chooses commands leaves it out, and chooses among the counts afterwards.
+    Its displacement is ``without_slope``, so that a joint that is off by a little moves what it carries as if nothing
+    were stepped. What chooses commands leaves the effect out, and chooses among the counts afterwards.
     """
 
     def servos(self) -> Mapping[int, tuple[PulseTable, PulseClock]]:
