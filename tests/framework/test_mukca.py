@@ -84,6 +84,8 @@ BEST = {
 FIRST = (("panda", "front_center"), ("kinova", "left"))
 POLISHED = (("kuka", "front"), ("kinova", "left"))
 ROWS = (*FIRST, *POLISHED)
+MOVED = {("kinova", "front")}
+"""Published figures that armcal refuses: a socket or the base moved while these records were taken."""
 SLOW = pytest.mark.slow
 
 
@@ -102,8 +104,13 @@ def run(tmp_path_factory):
         out = tmp_path_factory.mktemp("run") / "out"
         asked = [f"validation.train_groups=[{','.join(trained)}]", "evaluator=interpreted"]
         arguments = ["run", str(config), "--data", str(data), "--out", str(out), "--json"]
-        result = CliRunner().invoke(cli, arguments + [x for s in asked for x in ("--set", s)])
+        refused = (config.stem, *trained) in MOVED
+        result = CliRunner().invoke(cli, arguments + [x for s in asked for x in ("--set", s)] + ["--accept"] * refused)
         assert result.exit_code == 0, result.output
+        bad = [
+            finding["text"] for finding in json.loads(result.stdout)["verdict"]["findings"] if finding["grade"] == "bad"
+        ]
+        assert bool(bad) == refused and all("contradict the others" in text for text in bad)
         kept = yaml.safe_load((out / "calibration.yaml").read_text())["parameters"]
         return json.loads(result.stdout), {p["name"]: p["value"] for p in kept}
 
