@@ -1,4 +1,4 @@
-"""Searches in C go the way of those in arrays: the same commands, and the same ends."""
+"""Searches in C go the way of those by the interpreter: the same commands, and the same ends."""
 
 from __future__ import annotations
 
@@ -7,11 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from armcal.calibration.compensation.array_search import ArraySearch
-from armcal.calibration.compensation.compiled_search import CompiledSearch, loop_source
-from armcal.calibration.compensation.goal import NEAREST, QUICK, WISHED, Goal, Manner, Near
-from armcal.calibration.compensation.step import sample_inputs, slopes, step_function
-from armcal.functions.batch_function import BatchFunction
+from armcal.calibration.compensation.search import NEAREST, QUICK, WISHED, Goal, Manner, Near, Search
+from armcal.calibration.compensation.step import slopes, step_function
+from armcal.functions.batch_function import EvaluatorChoice
 from armcal.functions.compiler import find_compiler
 from small_arms import compensator, drawn
 
@@ -24,18 +22,16 @@ NEAR = Near(metres=1e-10, radians=1e-9, rest=1e-11)
 class Pair:
     """Both searches of one arm and kind of target."""
 
-    def __init__(self, name: str, turns: bool) -> None:
+    def __init__(self, name: str, turns: bool, limits: np.ndarray | None = None) -> None:
         self.found, self.turns = compensator(name), turns
+        self.limits = self.found.limits if limits is None else limits
+        self.compiled, self.interpreted = self.search("compiled"), self.search("interpreted")
+        assert self.compiled.compiled
+        assert not self.interpreted.compiled
+
+    def search(self, choice: EvaluatorChoice) -> Search:
         expression = self.found.expression
-        function = step_function(expression, slopes(expression), turns, LENGTH)
-        record, state = sample_inputs(expression)
-        sizes = [function.numel_in(i) for i in range(1, function.n_in() - 1)]
-        sample = [record, *(np.full((size, 8), 0.2) for size in sizes), state]
-        steps = BatchFunction(function, sample, "compiled", loop_source())
-        assert steps.compiled
-        limits = self.found.limits
-        self.steps = steps
-        self.compiled, self.arrays = CompiledSearch(steps, limits, LENGTH), ArraySearch(steps, limits, LENGTH)
+        return Search(expression, slopes(expression), self.limits, self.turns, LENGTH, choice)
 
     def goal(self, count: int, stretch: float = 1.0) -> Goal:
         """Targets of random commands (farther out where they are stretched), from other random commands."""
@@ -51,7 +47,7 @@ class Pair:
 
     def alike(self, goal: Goal, manner: Manner) -> float:
         """The share of targets that are reached; everything else must agree."""
-        one, two = self.compiled(goal, manner, NEAR), self.arrays(goal, manner, NEAR)
+        one, two = self.compiled(goal, manner, NEAR), self.interpreted(goal, manner, NEAR)
         # Rounding grows where a search wanders: a few may end elsewhere.
         same = np.abs(one.commands - two.commands).max(axis=0) < 1e-7
         assert same.mean() > 0.97
@@ -133,14 +129,13 @@ def test_other_shapes_are_refused() -> None:
 
 def test_neighbours_do_not_matter() -> None:
     """Alone, in another order, or beside joints that were turned a thousand times: the same to the last bit."""
-    pair = Pair("three", False)
-    limits = np.tile([-np.inf, np.inf], (3, 1))
+    pair = Pair("three", False, np.tile([-np.inf, np.inf], (3, 1)))
     goal = pair.goal(61)
     goal = replace(goal, towards=drawn(pair.found, 61, seed=3).T)
     wild = goal.record.copy()
     wild[:3, ::8] = 1e6
     order = np.random.default_rng(0).permutation(61)
-    for search in (CompiledSearch(pair.steps, limits, LENGTH), ArraySearch(pair.steps, limits, LENGTH)):
+    for search in (pair.compiled, pair.interpreted):
         answer = search(goal, WISHED, NEAR)
         turned = search(goal.subset(order), WISHED, NEAR)
         beside = search(replace(goal, record=wild), WISHED, NEAR)
@@ -163,7 +158,7 @@ def test_several_threads_may_search_at_once() -> None:
         assert (found == pair.compiled(goal, QUICK, NEAR).commands).all()
 
 
-@pytest.mark.parametrize("kind", ["compiled", "arrays"])
+@pytest.mark.parametrize("kind", ["compiled", "interpreted"])
 @pytest.mark.slow
 def test_what_counts_as_there_is_what_is_given(kind: str) -> None:
     """Not an earlier step that moved less but was not at rest, or was turned too far: a few of 1000 have such steps."""
@@ -172,8 +167,10 @@ def test_what_counts_as_there_is_what_is_given(kind: str) -> None:
     found = getattr(pair, kind)(replace(goal, towards=drawn(pair.found, 1000, seed=3).T), WISHED, near)
     record, free = goal.record.copy(), np.ones((6, 1000))
     record[:6] = found.commands
-    answers = pair.steps(record, goal.target, 0 * free, free, free[:1], found.states)
-    _, left, _, error, _ = (each[:, found.there] for each in answers)
+    expression = pair.found.expression
+    step = step_function(expression, slopes(expression), True, LENGTH).map(1000)
+    answers = step(record, goal.target, 0 * free, free, free[:1], found.states)
+    _, left, _, error, _ = (each.full()[:, found.there] for each in answers)
     assert np.linalg.norm(error[:3], axis=0).max() <= near.metres
     assert np.linalg.norm(error[3:], axis=0).max() <= near.radians
     assert np.abs(left).max() <= near.rest
@@ -181,9 +178,7 @@ def test_what_counts_as_there_is_what_is_given(kind: str) -> None:
 
 @pytest.mark.parametrize("held", [(), (1,), (0, 1, 2)])
 def test_without_limits_and_with_nothing_that_may_move(held: tuple[int, ...]) -> None:
-    pair = Pair("lift", False)
-    limits = np.array([[-np.inf, np.inf], [-np.inf, 0.3], [-0.2, np.inf]])
-    pair.compiled, pair.arrays = (kind(pair.steps, limits, LENGTH) for kind in (CompiledSearch, ArraySearch))
+    pair = Pair("lift", False, np.array([[-np.inf, np.inf], [-np.inf, 0.3], [-0.2, np.inf]]))
     goal = replace(pair.goal(100), held=held)
     assert (pair.alike(goal, QUICK) > 0.3) == (not held)
     pair.alike(replace(goal, towards=drawn(pair.found, 100, seed=3).T), WISHED)

@@ -6,8 +6,7 @@ Arrays are stored channel by channel, (entries x records).
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import accumulate
 from typing import Any, Literal
@@ -21,33 +20,10 @@ from armcal.functions.interpreted import InterpretedFunction
 
 EvaluatorChoice = Literal["auto", "compiled", "interpreted"]
 
-_ENTRY, _VECTOR = "armcal_evaluate", "armcal_evaluate_vector"
+_ENTRY, _VECTOR, _ITERATE = "armcal_evaluate", "armcal_evaluate_vector", "armcal_iterate"
 _AGREEMENT = 1e-9
 _WORTH_COMPILING = 100_000
 """Records that the interpreter takes longer for than the compiler takes to make a library."""
-
-
-@dataclass(frozen=True)
-class Loop:
-    """More C that is compiled together with a function, which it knows as ``evaluate``.
-
-    Attributes:
-        entry: the C function to be called.
-        inputs: names of the sizes of inputs, by the inputs' places.
-        outputs: names of the sizes of outputs, by their places.
-        text: the source.
-    """
-
-    entry: str
-    inputs: Mapping[str, int]
-    outputs: Mapping[str, int]
-    text: str
-
-    def source(self, function: ca.Function) -> str:
-        """For one function."""
-        sizes = {name: function.numel_in(place) for name, place in self.inputs.items()}
-        sizes |= {name: function.numel_out(place) for name, place in self.outputs.items()}
-        return "".join(f"#define {name} {size}\n" for name, size in sizes.items()) + self.text
 
 
 class BatchFunction:
@@ -64,13 +40,13 @@ class BatchFunction:
         function: ca.Function,
         sample: Sequence[Array],
         choice: EvaluatorChoice = "auto",
-        loop: Loop | None = None,
+        iterated: bool = False,
     ) -> None:
         """Build it; ``sample`` are inputs (entries x 8 each) on which C must agree with the interpreter.
 
         ``auto`` takes what was compiled before, and else lets the compiler work for the next time once so many records
-        were asked for that it would have paid; ``compiled`` waits for it; ``interpreted`` does without. A ``loop`` is
-        compiled with the function.
+        were asked for that it would have paid; ``compiled`` waits for it; ``interpreted`` does without. A function of
+        one output that follows on its last input can be ``iterated``.
         """
         self.function, self.interpreted = function, InterpretedFunction(function)
         self._sizes_out = [function.numel_out(i) for i in range(function.n_out())]
@@ -81,17 +57,13 @@ class BatchFunction:
         self._compile_later: Callable[[], None] | None = None
         if choice != "interpreted" and compiler.find_compiler() is not None:
             trial = partial(_trial, self, sample)
-            library, self._compile_later = _library(function, choice, loop, trial)
+            library, self._compile_later = _library(function, choice, iterated, trial)
             self._library = _agreeing(self, library, sample)
 
     @property
     def compiled(self) -> bool:
         """Whether C serves it."""
         return self._library is not None
-
-    def entry(self, name: str) -> Any:
-        """A C function of its library, where it is compiled."""
-        return getattr(self._library, name)
 
     def __call__(self, *inputs: Array) -> list[Array]:
         """The outputs (entries x N each) for inputs (entries x N each)."""
@@ -108,6 +80,27 @@ class BatchFunction:
             for target, source in zip(outputs, self._rest(inputs, whole), strict=True):
                 target[:, whole:] = source
         return outputs
+
+    def iterate(self, progress: Array, *inputs: Array) -> None:
+        """Put the output in the place of ``progress`` (entries x N) until its last entry is not zero, record by record.
+
+        ``inputs`` (entries x N each) come before it among the function's inputs. C would read beyond other shapes.
+        """
+        if self._library is not None:
+            given = [*(np.asarray(array, dtype=float) for array in inputs), progress]
+            pointers = (ctypes.c_void_p * len(given))(*(array.ctypes.data for array in given))
+            strides = (ctypes.c_long * (2 * len(given)))(*(stride // 8 for array in given for stride in array.strides))
+            self._library.armcal_iterate(ctypes.c_long(progress.shape[1]), pointers, strides)
+            return
+        active, now, rest = np.arange(progress.shape[1]), progress, list(inputs)
+        while active.size:
+            (now,) = self(*rest, now)
+            ended = now[-1] != 0
+            if ended.any():
+                progress[:, active[ended]] = now[:, ended]
+                # not by plain indexing, which would turn the storage round
+                now, *rest = (np.compress(~ended, array, axis=1) for array in (now, *rest))
+                active = active[~ended]
 
     def _count(self, records: int) -> None:
         self._asked += records
@@ -129,11 +122,11 @@ class BatchFunction:
 
 
 def _library(
-    function: ca.Function, choice: EvaluatorChoice, loop: Loop | None, trial: Callable[[], compiler.Trial]
+    function: ca.Function, choice: EvaluatorChoice, iterated: bool, trial: Callable[[], compiler.Trial]
 ) -> tuple[ctypes.CDLL | None, Callable[[], None]]:
     """The library if there is one by now, and what has it compiled for the next time."""
-    driver = _driver(function) + (loop.source(function) if loop else "")
-    entries = (_ENTRY, _VECTOR, *([loop.entry] if loop else []))
+    driver = _driver(function) + (_iteration(function) if iterated else "")
+    entries = (_ENTRY, _VECTOR, *([_ITERATE] if iterated else []))
     text = function.serialize() + c_source.support_source() + c_source.generator_source() + driver
     key = compiler.library_key(f"{_ENTRY} {c_source.LANES} lanes {text}")
 
@@ -178,6 +171,48 @@ def _driver(function: ca.Function) -> str:
         f"  for (int i = 0; i < {max(len(ins), len(outs))}; ++i) step[i] = LANES;\n"
         f"  {_ENTRY}(LANES, from, step, onto, step);\n}}\n"
     )
+
+
+def _iteration(function: ca.Function) -> str:
+    """The loop over iterations: LANES records side by side, where one that ends makes room for the next.
+
+    Of each input follow its two strides, from entry to entry and from record to record.
+    """
+    sizes = [function.numel_in(i) for i in range(function.n_in())]
+    names, last = [f"in{i}" for i in range(len(sizes))], len(sizes) - 1
+    vectors = [f"V in{i}[{max(1, n)}]; memset(in{i}, 0, sizeof in{i});" for i, n in enumerate(sizes)]
+    loads = [
+        f"for (int k = 0; k < {n}; ++k) in{i}[k][l] = in[{i}][k * stride[{2 * i}] + at[l] * stride[{2 * i + 1}]];"
+        for i, n in enumerate(sizes)
+    ]
+    return f"""
+void {_ITERATE}(long n, double **in, const long *stride) {{
+  double c[HOISTED];
+  V after[{sizes[last]}];
+  long at[LANES], next = 0;
+  {" ".join(vectors)}
+  evaluate_hoist(c);
+  for (int l = 0; l < LANES; ++l) at[l] = -1;
+  for (;;) {{
+    long busy = 0;
+    for (int l = 0; l < LANES; ++l) {{
+      if (at[l] >= 0 && in{last}[{sizes[last] - 1}][l] != 0) {{
+        for (int k = 0; k < {sizes[last]}; ++k)
+          in[{last}][k * stride[{2 * last}] + at[l] * stride[{2 * last + 1}]] = in{last}[k][l];
+        at[l] = -1;
+      }}
+      if (at[l] < 0 && next < n) {{
+        at[l] = next++;
+        {" ".join(loads)}
+      }}
+      busy += at[l] >= 0;
+    }}
+    if (!busy) return;
+    evaluate(c, {", ".join(names)}, after);
+    memcpy(in{last}, after, sizeof after);
+  }}
+}}
+"""
 
 
 def _addresses(name: str, sizes: Sequence[int]) -> list[str]:

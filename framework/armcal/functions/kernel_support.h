@@ -21,6 +21,9 @@ BOTH double s_negation(double a) { return !(a != 0); }
 BOTH double s_both(double a, double b) { return (a != 0) && (b != 0); }
 BOTH double s_either(double a, double b) { return (a != 0) || (b != 0); }
 BOTH double s_if_else_zero(double a, double b) { return a != 0 ? b : 0; }
+BOTH double s_fmin(double a, double b) { return fmin(a, b); }
+BOTH double s_fmax(double a, double b) { return fmax(a, b); }
+BOTH double s_fabs(double a) { return fabs(a); }
 BOTH double s_sine(double x) { return sin(x); }
 BOTH double s_cosine(double x) { return cos(x); }
 
@@ -30,16 +33,20 @@ BOTH double s_cosine(double x) { return cos(x); }
 #define LIBRARY2(name) \
   BOTH double s_##name(double x, double y) { return name(x, y); } \
   BOTH V v_##name(V x, V y) { for (int i = 0; i < LANES; ++i) x[i] = name(x[i], y[i]); return x; }
-#define LANEWISE1(name) \
-  BOTH V v_##name(V x) { for (int i = 0; i < LANES; ++i) x[i] = s_##name(x[i]); return x; }
-#define LANEWISE2(name) \
-  BOTH V v_##name(V x, V y) { for (int i = 0; i < LANES; ++i) x[i] = s_##name(x[i], y[i]); return x; }
 LIBRARY1(sqrt) LIBRARY1(tan) LIBRARY1(asin) LIBRARY1(acos) LIBRARY1(atan) LIBRARY1(exp) LIBRARY1(log)
-LIBRARY1(sinh) LIBRARY1(cosh) LIBRARY1(tanh) LIBRARY1(fabs) LIBRARY1(erf) LIBRARY1(floor) LIBRARY1(ceil)
-LIBRARY2(atan2) LIBRARY2(pow) LIBRARY2(fmin) LIBRARY2(fmax) LIBRARY2(copysign)
-LANEWISE1(sign_of) LANEWISE1(negation)
-LANEWISE2(less) LANEWISE2(less_equal) LANEWISE2(equal) LANEWISE2(unequal) LANEWISE2(both) LANEWISE2(either)
-LANEWISE2(if_else_zero)
+LIBRARY1(sinh) LIBRARY1(cosh) LIBRARY1(tanh) LIBRARY1(erf) LIBRARY1(floor) LIBRARY1(ceil)
+LIBRARY2(atan2) LIBRARY2(pow) LIBRARY2(copysign)
+
+/* What a branch is made of, without a branch: true is 1.0. */
+#define MASKED(name, mask) BOTH V v_##name(V a, V b) { return (V)((mask) & (I)broadcast(1.0)); }
+MASKED(less, a < b) MASKED(less_equal, a <= b) MASKED(equal, a == b) MASKED(unequal, a != b)
+MASKED(both, (a != 0) & (b != 0)) MASKED(either, (a != 0) | (b != 0))
+BOTH V v_negation(V a) { return (V)((a == 0) & (I)broadcast(1.0)); }
+BOTH V v_if_else_zero(V a, V b) { return (V)((a != 0) & (I)b); }
+BOTH V v_fmin(V a, V b) { return choose((a < b) | (b != b), a, b); }
+BOTH V v_fmax(V a, V b) { return choose((a > b) | (b != b), a, b); }
+BOTH V v_fabs(V a) { return (V)((I)a & INT64_MAX); }
+BOTH V v_sign_of(V a) { return choose(a > 0, broadcast(1.0), choose(a < 0, broadcast(-1.0), a)); }
 
 /* Sine and cosine together. The angle is reduced to within pi/4 of a multiple of pi/2 in three parts
    [Cody1980], then Taylor polynomials serve: within 2 units in the last place for |x| below 1e5, beyond

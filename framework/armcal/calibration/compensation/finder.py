@@ -9,10 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armcal.base.domains import Array
-from armcal.calibration.compensation.goal import NEAREST, WISHED, Attempt, Goal, chosen_of
 from armcal.calibration.compensation.request import Mask
+from armcal.calibration.compensation.search import NEAREST, WISHED, Attempt, Goal, Solver, chosen_of
 from armcal.calibration.compensation.seeds import Seeds
-from armcal.calibration.compensation.solver import Solver
 
 Rows = NDArray[np.intp]
 Allowed = Callable[[Array], Mask]

@@ -14,9 +14,8 @@ import numpy as np
 from armcal.base.domains import Array
 from armcal.base.se3 import Expression
 from armcal.calibration.compensation.finder import Allowed, Solutions
-from armcal.calibration.compensation.goal import Goal
 from armcal.calibration.compensation.request import Redundancy
-from armcal.calibration.compensation.solver import Solver
+from armcal.calibration.compensation.search import Goal, Solver
 from armcal.calibration.compensation.step import sample_inputs, slopes, tool_error
 from armcal.calibration.tool_expression import ToolExpression
 from armcal.functions.batch_function import BatchFunction, EvaluatorChoice

@@ -9,7 +9,7 @@ from armcal.calibration.compensation.counts import TRIED, Counts, ServoCounts
 from armcal.calibration.compensation.equilibrium import Equilibrium
 from armcal.calibration.compensation.finder import Allowed, Solutions
 from armcal.calibration.compensation.request import Targets
-from armcal.calibration.compensation.solver import Solver
+from armcal.calibration.compensation.search import Solver
 from armcal.calibration.compensation.step import sample_inputs, slope_function
 from armcal.calibration.rigid_chain import turn_between
 from armcal.calibration.tool_expression import ToolExpression

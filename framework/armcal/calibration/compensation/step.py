@@ -1,4 +1,4 @@
-"""One step towards a target: damped Gauss-Newton on commands, Newton on the elastic equilibrium, together.
+"""One step of a search for commands: damped Gauss-Newton on commands, Newton on the elastic equilibrium, together.
 
 At commands q and elastic state d, with pass F, everything follows from one pass and a small solve: what is left of the
 equilibrium, d0 = (I - F_d)^-1 (F - d), and how the state follows the commands, D = (I - F_d)^-1 F_q. The tool's
@@ -8,11 +8,18 @@ slope is T_q + T_d D. With the error e (position, and turn times a length) and t
 
 M the joints that are free to move and r what is wished beside the target, which only moves the arm where the target
 does not care [Nakamura1986]; or the same by the joints where there are fewer of them than equations.
+
+Near a pose in which the arm cannot turn some way, the way to the target is long and bent: errors may grow for a few
+steps before they vanish. So steps are not taken back; their damping grows with the squared error [Sugihara2011], and
+the best of all steps is kept. A joint that meets its limit is held there until the target pulls it back.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import reduce
+from itertools import accumulate
 
 import casadi as ca
 import numpy as np
@@ -21,6 +28,19 @@ from armcal.base import se3
 from armcal.base.domains import Array
 from armcal.base.se3 import Expression
 from armcal.calibration.tool_expression import ToolExpression
+
+FIRST_DAMPING, _LEAST_DAMPING = 1e-3, 1e-14
+_LONGEST = 0.4
+"""rad or m in one step."""
+_WISHED_ENOUGH = 1e-4
+"""Wishes beside the target count as met when they move no joint by more (rad or m)."""
+_WILD = 2.0
+"""A deflection beyond this (rad or m) is started anew."""
+_FINITE = 1e300
+SETTINGS = ("damping", "patience", "steps", "metres", "radians", "rest", "wished")
+"""Of a search; after them come the lowest and the highest command of each joint, and whether it is held."""
+REACHED = 2.0
+"""How a search ends that reaches its target; others end with 1, and go on at 0."""
 
 
 @dataclass(frozen=True)
@@ -92,6 +112,125 @@ def step_function(expression: ToolExpression, own_slopes: Slopes, turns: bool, l
     outputs = [step, own_slopes.left, ca.mtimes(own_slopes.state, step), error, pull]
     inputs = [expression.record, target, preference, free, damping, expression.state]
     return ca.Function("compensation_step", inputs, [ca.densify(output) for output in outputs], {"cse": True})
+
+
+def progress_places(joints: int, states: int) -> dict[str, slice]:
+    """Where each number of a search stands that changes from step to step; ``best`` is the nearest so far."""
+    sizes = {"commands": joints, "state": states, "free": joints, "best_commands": joints, "best_state": states}
+    sizes |= dict.fromkeys(("damping", "distance", "turn", "cost", "milestone", "waited", "steps", "end"), 1)
+    ends = accumulate(sizes.values())
+    return {name: slice(end - size, end) for (name, size), end in zip(sizes.items(), ends, strict=True)}
+
+
+def search_function(expression: ToolExpression, own_slopes: Slopes, turns: bool, length: float) -> ca.Function:
+    """(settings, record, target, towards, progress) -> progress, one step on.
+
+    ``target`` is a position (3; m) and, where the tool ``turns`` to one, a rotation (9, column by column); ``towards``
+    are commands to come near to where that is ``wished``. A radian counts as ``length`` metres.
+    """
+    joints, states = len(expression.joints), expression.state.numel()
+    settings, progress = ca.SX.sym("settings", len(SETTINGS) + 3 * joints), progress_places(joints, states)
+    target, towards = ca.SX.sym("target", 12 if turns else 3), ca.SX.sym("towards", joints)
+    before = ca.SX.sym("progress", progress["end"].stop)
+    search = _Search(joints, settings, {name: before[place] for name, place in progress.items()})
+    now = search.now
+    preference = search.stated["wished"] * (towards - now["commands"])
+    preference *= _shortening(_largest(preference))  # as a whole: joint by joint it would point elsewhere
+    record = ca.vertcat(now["commands"], expression.record[joints:])
+    one_step = step_function(expression, own_slopes, turns, length)
+    outputs = one_step(record, target, preference, now["free"], now["damping"], now["state"])
+    step, left, along, error, pull = outputs
+    after = search.judged(step, left, error, pull, length) | search.moved(step, left, along, pull)
+    inputs = [settings, expression.record, target, towards, before]
+    names = ["settings", "record", "target", "towards", "progress"]
+    output = ca.densify(ca.vertcat(*[after[name] for name in progress]))
+    return ca.Function("search", inputs, [output], names, ["after"], {"cse": True})
+
+
+class _Search:
+    """What a step makes of the progress of a search.
+
+    Attributes:
+        stated: SETTINGS.
+        now: the progress by name.
+    """
+
+    def __init__(self, joints: int, settings: Expression, now: Mapping[str, Expression]) -> None:
+        self.stated = dict(zip(SETTINGS, ca.vertsplit(settings[: len(SETTINGS)]), strict=True))
+        self._low, self._high, self._held = ca.vertsplit(settings[len(SETTINGS) :], joints)
+        self.now = now
+
+    def judged(
+        self, step: Expression, left: Expression, error: Expression, pull: Expression, length: float
+    ) -> dict[str, Expression]:
+        """The best so far, and whether the search is at an end.
+
+        With a wish, how far that moves the arm counts. What has reached its target need not be the best: an earlier
+        step may have been better by this measure, and turned too far or not at rest.
+        """
+        now, stated = self.now, self.stated
+        distance, turn, size = _norm(error[:3]), _norm(error[3:]), _largest(step)
+        wishes = ca.logic_and(size <= _WISHED_ENOUGH, ca.logic_not(_any(self._pulled_back(pull, _WISHED_ENOUGH))))
+        near = ca.logic_and(distance <= stated["metres"], turn <= stated["radians"])
+        at_rest = ca.logic_not(_any(ca.logic_not(ca.fabs(left) <= stated["rest"])))
+        reached = ca.logic_and(ca.logic_and(near, at_rest), ca.logic_or(ca.logic_not(stated["wished"]), wishes))
+        error_cost = distance**2 + (length * turn) ** 2
+        cost = error_cost + ca.if_else(stated["wished"], (length * size) ** 2, 0)
+        is_least = cost < now["cost"]
+        is_best = ca.logic_or(reached, is_least)
+        least = ca.if_else(is_least, cost, now["cost"])
+        halved = least < 0.25 * now["milestone"]
+        waited, steps = ca.if_else(halved, 0, now["waited"] + 1), now["steps"] + 1
+        given_up = ca.logic_or(waited >= stated["patience"], steps >= stated["steps"])
+        here = {"best_commands": now["commands"], "best_state": now["state"], "distance": distance, "turn": turn}
+        return {name: ca.if_else(is_best, value, now[name]) for name, value in here.items()} | {
+            "damping": stated["damping"] * ca.if_else(error_cost < 1, error_cost, 1) + _LEAST_DAMPING,
+            "cost": least,
+            "milestone": ca.if_else(halved, least, now["milestone"]),
+            "waited": waited,
+            "steps": steps,
+            "end": ca.if_else(reached, REACHED, given_up),
+        }
+
+    def moved(self, step: Expression, left: Expression, along: Expression, pull: Expression) -> dict[str, Expression]:
+        """Commands and state a step on; ``along`` is how the state follows it."""
+        commands, size = self.now["commands"], _largest(step)
+        finite = size < ca.inf
+        aim = commands + ca.if_else(finite, _shortening(size) * step, 0)
+        new = ca.if_else(aim < self._low, self._low, ca.if_else(aim > self._high, self._high, aim))
+        inside = new == aim
+        free = ca.if_else(self._pulled_back(pull, 0.0), 1, self.now["free"])
+        unhindered = ca.logic_not(_any(ca.logic_not(inside)))
+        ahead = self.now["state"] + left + ca.if_else(unhindered, _shortening(size), 0) * along
+        tame = ca.logic_and(finite, ca.fabs(ahead) < _WILD)
+        return {"commands": new, "state": ca.if_else(tame, ahead, 0), "free": ca.if_else(inside, free, 0)}
+
+    def _pulled_back(self, pull: Expression, least: float) -> Expression:
+        """Which joints stand at a limit and are pulled away from it."""
+        commands = self.now["commands"]
+        from_low = ca.logic_and(commands <= self._low, pull > least)
+        from_high = ca.logic_and(commands >= self._high, pull < -least)
+        stuck = ca.logic_and(self.now["free"] == 0, self._held == 0)
+        return ca.logic_and(stuck, ca.logic_or(from_low, from_high))
+
+
+def _any(conditions: Expression) -> Expression:
+    return reduce(ca.logic_or, ca.vertsplit(conditions), ca.SX(0))
+
+
+def _norm(vector: Expression) -> Expression:
+    return ca.sqrt(ca.sumsqr(vector))
+
+
+def _largest(vector: Expression) -> Expression:
+    """The largest size; infinite where any is no number."""
+    sizes = ca.vertsplit(ca.fabs(vector))
+    return ca.if_else(sum(sizes) <= _FINITE, reduce(ca.fmax, sizes), ca.inf)
+
+
+def _shortening(size: Expression) -> Expression:
+    """Times a step of this size: none is longer than the longest."""
+    return ca.if_else(size > _LONGEST, _LONGEST / size, 1)
 
 
 def slope_function(expression: ToolExpression, turns: bool) -> ca.Function:

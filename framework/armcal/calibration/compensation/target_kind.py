@@ -12,8 +12,8 @@ from armcal.calibration.compensation.finder import Allowed, Finder
 from armcal.calibration.compensation.redundancy import Descent
 from armcal.calibration.compensation.request import Options
 from armcal.calibration.compensation.rounding import Rounding
+from armcal.calibration.compensation.search import Solver
 from armcal.calibration.compensation.seeds import Seeds
-from armcal.calibration.compensation.solver import Solver
 from armcal.calibration.tool_expression import ToolExpression
 from armcal.functions.batch_function import EvaluatorChoice
 

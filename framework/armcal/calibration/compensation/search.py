@@ -1,0 +1,209 @@
+"""Searches for commands: from where one starts to where its target is reached, or no longer comes nearer."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armcal.base.domains import Array
+from armcal.calibration.compensation.request import Mask
+from armcal.calibration.compensation.step import (
+    FIRST_DAMPING,
+    REACHED,
+    Slopes,
+    progress_places,
+    rough_slopes,
+    sample_inputs,
+    search_function,
+    slopes,
+)
+from armcal.calibration.tool_expression import ToolExpression
+from armcal.functions.batch_function import BatchFunction, EvaluatorChoice
+
+Chosen = Mask | NDArray[np.intp]
+"""Some columns: whether, or which."""
+
+
+@dataclass(frozen=True)
+class Goal:
+    """What commands are sought for.
+
+    Attributes:
+        record: channels x N; with the commands from which the search starts.
+        state: n_d x N; where the search starts.
+        target: position, and where turns count the rotation column by column (3 or 12 x N).
+        towards: commands to come near to where the target leaves a choice (n x N); None for no such wish.
+        held: joints that stay where the search starts, by index.
+    """
+
+    record: Array
+    state: Array
+    target: Array
+    towards: Array | None = None
+    held: tuple[int, ...] = ()
+
+    def subset(self, chosen: Chosen) -> Goal:
+        """Some of them."""
+        towards = None if self.towards is None else chosen_of(self.towards, chosen)
+        record, state, target = (chosen_of(array, chosen) for array in (self.record, self.state, self.target))
+        return Goal(record, state, target, towards, self.held)
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """Where searches came nearest: commands (n x N), states (n_d x N), distances (m), turns (rad); there or not."""
+
+    commands: Array
+    states: Array
+    distances: Array
+    turns: Array
+    there: Mask
+
+    def put(self, at: NDArray[np.intp], other: Attempt) -> None:
+        """Another attempt's outcomes at their places."""
+        self.commands[:, at], self.states[:, at] = other.commands, other.states
+        self.distances[at], self.turns[at], self.there[at] = other.distances, other.turns, other.there
+
+
+@dataclass(frozen=True)
+class Manner:
+    """How a search goes on.
+
+    Attributes:
+        damping: times the squared error.
+        patience: steps in which an error must halve, or the search ends.
+        steps: at most.
+    """
+
+    damping: float
+    patience: int
+    steps: int
+
+
+QUICK = Manner(damping=1e-2, patience=5, steps=40)
+"""To a target that can be reached."""
+NEAREST = Manner(damping=1.0, patience=25, steps=100)
+"""To the nearest where it cannot: what is left must not throw the arm about."""
+WISHED = Manner(damping=1e-2, patience=20, steps=100)
+"""Along targets towards wished commands."""
+
+
+@dataclass(frozen=True)
+class Near:
+    """What counts as being there.
+
+    Attributes:
+        metres: from the target.
+        radians: from the target.
+        rest: what may be left of the equilibrium (rad or m).
+    """
+
+    metres: float
+    radians: float
+    rest: float
+
+
+_REST = 1e-11
+_ROUGH = Near(metres=1e-3, radians=5e-3, rest=1e-2)
+"""Where rough steps end."""
+
+
+class Search:
+    """Searches by one form of a step, of one arm and kind of target."""
+
+    def __init__(
+        self,
+        expression: ToolExpression,
+        own_slopes: Slopes,
+        limits: Array,
+        turns: bool,
+        length: float,
+        choice: EvaluatorChoice = "auto",
+    ) -> None:
+        """Limits are n x 2 (rad or m); a radian counts as ``length`` metres."""
+        function = search_function(expression, own_slopes, turns, length)
+        random, record = np.random.default_rng(0), sample_inputs(expression)[0]
+        sample = [random.uniform(0.1, 0.3, (function.numel_in(i), 8)) for i in range(function.n_in())]
+        sample[1] = record
+        self._iteration = BatchFunction(function, sample, choice, iterated=True)
+        self._limits, self._places = limits, progress_places(len(limits), expression.state.numel())
+        self._sizes = [*(function.numel_in(i) for i in (1, 2, 3)), expression.state.numel()]
+
+    @property
+    def compiled(self) -> bool:
+        """Whether C serves it."""
+        return self._iteration.compiled
+
+    def __call__(self, goal: Goal, manner: Manner, near: Near) -> Attempt:
+        """Search until it is near, or no longer comes nearer.
+
+        Raises:
+            ValueError: an array of another shape.
+        """
+        joints, count, places = len(self._limits), goal.record.shape[1], self._places
+        towards = np.zeros((joints, count)) if goal.towards is None else goal.towards
+        given = {"record": goal.record, "target": goal.target, "towards": towards, "state": goal.state}
+        for (name, array), size in zip(given.items(), self._sizes, strict=True):
+            if array.shape != (size, count):
+                raise ValueError(f"found {name} of the shape {array.shape}, expected {(size, count)}")
+        held = np.zeros(joints)
+        held[list(goal.held)] = 1.0
+        stated = (manner.damping, manner.patience, manner.steps, near.metres, near.radians, near.rest)
+        settings = np.concatenate([stated, [goal.towards is not None], *self._limits.T, held])
+        progress = np.zeros((places["end"].stop, count))
+        begun = np.clip(goal.record[:joints], self._limits[:, :1], self._limits[:, 1:])
+        progress[places["commands"]] = progress[places["best_commands"]] = begun
+        progress[places["state"]] = progress[places["best_state"]] = goal.state
+        progress[places["free"]], progress[places["damping"]] = 1 - held[:, None], FIRST_DAMPING
+        progress[places["distance"].start : places["milestone"].stop] = np.inf
+        shared = np.broadcast_to(settings[:, None], (len(settings), count))
+        self._iteration.iterate(progress, shared, goal.record, goal.target, towards)
+        best, (distances, turns) = progress[places["best_commands"]], progress[places["distance"].start :][:2]
+        return Attempt(best, progress[places["best_state"]], distances, turns, progress[-1] == REACHED)
+
+
+class Solver:
+    """Searches for one arm and one kind of target: with rough steps until one is near, exactly from there.
+
+    Attributes:
+        limits: n x 2 (rad or m).
+        turns: whether rotations count.
+        length: how many metres a radian counts for.
+    """
+
+    def __init__(
+        self,
+        expression: ToolExpression,
+        limits: Array,
+        turns: bool,
+        length: float,
+        tolerance: tuple[float, float],
+        choice: EvaluatorChoice = "auto",
+    ) -> None:
+        """Targets are reached within tolerances in m and rad."""
+        self.length, self.turns, self.limits = length, turns, limits
+        self._near = Near(*tolerance, _REST)
+        self._exact = Search(expression, slopes(expression), limits, turns, length, choice)
+        rough = rough_slopes(expression) if expression.state.numel() else None
+        self._rough = None if rough is None else Search(expression, rough, limits, turns, length, choice)
+
+    def __call__(self, goal: Goal, manner: Manner = QUICK) -> Attempt:
+        """Search from where the goal starts."""
+        if self._rough is None:
+            return self._exact(goal, manner, self._near)
+        first = self._rough(replace(goal, towards=None), manner, _ROUGH)
+        near = np.flatnonzero(first.there) if manner is QUICK else np.arange(len(first.there))
+        begun = replace(goal, record=goal.record.copy(), state=first.states)
+        begun.record[: len(self.limits)] = first.commands
+        second = self._exact(begun.subset(near), manner, self._near)
+        first.there[:] = False
+        first.put(near, second)
+        return first
+
+
+def chosen_of(array: Array, chosen: Chosen) -> Array:
+    """Some columns, channel by channel in one piece: plain indexing would turn the storage round."""
+    places = np.flatnonzero(chosen) if chosen.dtype == bool else chosen
+    return np.asarray(np.take(array, places, axis=1))
