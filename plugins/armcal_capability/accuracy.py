@@ -9,8 +9,7 @@ from armcal.arm.servo import PulseClock, PulseTable, SteppedEffect
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.calibration.calibration import Calibration
-from armcal.calibration.compensation.equilibrium import Equilibrium
-from armcal.calibration.tool_expression import ToolExpression
+from armcal.calibration.tool_expression import Equilibrium, ToolExpression
 from armcal.functions.batch_function import EvaluatorChoice
 from armcal.measure.contact import ArmsAlone
 from armcal.measure.measurement import residual_dimensions

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from armcal import report
-from armcal.report.numbers import count, plural, unbroken
+from armcal.report.numbers import count
+from armcal.report.page import rendered
 from armcal.version import __version__
 
 from armcal_capability.quantities import BY_NAME
@@ -148,12 +148,5 @@ def render_capability(
     title: str, sentences: Sequence[str], tables: Sequence[Table], pictures: Sequence[Picture], facts: Mapping[str, str]
 ) -> str:
     """One self-contained HTML file."""
-    from jinja2 import Environment, FileSystemLoader, StrictUndefined
-
-    loader = FileSystemLoader([Path(__file__).parent, Path(report.__file__).parent])
-    environment = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True)
-    environment.lstrip_blocks = True
-    environment.filters.update(count=count, plural=plural, unbroken=unbroken)
-    return environment.get_template("capability.html.j2").render(
-        title=title, sentences=sentences, tables=tables, pictures=pictures, facts=facts, version=__version__
-    )
+    content = {"title": title, "sentences": sentences, "tables": tables, "pictures": pictures, "facts": facts}
+    return rendered("capability.html.j2", content | {"version": __version__}, Path(__file__).parent)

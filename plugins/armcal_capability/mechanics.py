@@ -10,8 +10,7 @@ from armcal.arm.clearance import Mask
 from armcal.arm.loading import LOAD_CHANNELS
 from armcal.base.domains import Array
 from armcal.base.se3 import Expression
-from armcal.calibration.compensation.equilibrium import Equilibrium
-from armcal.calibration.tool_expression import ToolExpression
+from armcal.calibration.tool_expression import Equilibrium, ToolExpression
 from armcal.functions.batch_function import BatchFunction, EvaluatorChoice
 
 from armcal_capability.settings import LoadSettings

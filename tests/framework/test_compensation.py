@@ -9,12 +9,11 @@ import numpy as np
 import pytest
 from armcal.arm.servo import quantised
 from armcal.calibration.compensation.compensator import SEEDS, Compensator
-from armcal.calibration.compensation.equilibrium import Equilibrium
-from armcal.calibration.compensation.finder import Solutions
+from armcal.calibration.compensation.finder import Seeds, Solutions
 from armcal.calibration.compensation.path import with_sides
 from armcal.calibration.compensation.request import Commands, Options, Targets
-from armcal.calibration.compensation.seeds import Seeds
 from armcal.calibration.rigid_chain import turn_between
+from armcal.calibration.tool_expression import Equilibrium
 from armcal.functions.compiler import find_compiler
 from scipy.optimize import least_squares, minimize
 from scipy.spatial.transform import Rotation

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 import yaml
 from armcal.base.dataset import Dataset
-from armcal.calibration.compensation.grid import over_grid
 from armcal.calibration.measured_point import measured_point
 from armcal.cli.main import cli
 from armcal.plugins import discover
 from armcal.run.compensate import Bench, commanded
+from armcal.run.correction_table import over_grid
 from armcal_serve.loaded import Order, loaded
 from click.testing import CliRunner, Result
 from made_calibrations import written

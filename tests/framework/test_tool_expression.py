@@ -153,7 +153,7 @@ def test_slopes_are_those_of_finite_differences(name: str) -> None:
     commands = drawn(found, 4, seed=5) + 0.01
     record = np.repeat(found.expression.defaults[:, None], 4, axis=1)
     record[: len(found.joints)] = commands.T
-    states = found._equilibrium.required(record).states
+    states = found._equilibrium(record).states
     h = 1e-6
     slopes = np.asarray(slope_function(found.expression, True).map(4)(record, states).full())
     slopes = slopes.reshape(len(found.joints), 6, 4).transpose(2, 1, 0)

@@ -8,14 +8,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import casadi as ca
 import numpy as np
 from typing_extensions import override
 
 from armcal.arm.assembly import Arm, ArmInputs, scoped
+from armcal.arm.clearance import Mask
 from armcal.arm.environment import STATICS, Environment, tilted
-from armcal.arm.evaluator import ElasticPass
+from armcal.arm.evaluator import ElasticPass, Evaluator
 from armcal.arm.loading import LOAD_CHANNELS
 from armcal.arm.servo import PulseClock, PulseTable, SteppedEffect
 from armcal.arm.statics import Load
@@ -23,6 +25,7 @@ from armcal.base import se3
 from armcal.base.domains import Array
 from armcal.base.parameters import Parameters
 from armcal.base.se3 import Expression, Transform
+from armcal.functions.batch_function import BatchFunction, EvaluatorChoice
 
 APPROACH = "approach."
 _VECTORS = ("gravity", "payload", "force", "torque")
@@ -149,3 +152,51 @@ def _defaults(channels: Sequence[str], environment: Environment) -> Array:
         for axis, value in zip("xyz", vector, strict=True)
     }
     return np.array([{**said, "payload": environment.payload_mass}.get(channel, 0.0) for channel in channels])
+
+
+def sample_inputs(expression: ToolExpression) -> list[Array]:
+    """A made-up record and state (8 columns each), to compare two forms of a function."""
+    record = np.repeat(expression.defaults[:, None], 8, axis=1)
+    count = len(expression.joints)
+    record[:count] = np.random.default_rng(0).uniform(-1, 1, (count, 8))
+    return [record, np.zeros((expression.state.numel(), 8))]
+
+
+@dataclass(frozen=True)
+class Standing:
+    """Arms in equilibrium: states (n_d x N), tools (N x 4 x 4), and which settled where their springs hold them (N)."""
+
+    states: Array
+    base_T_tool: Array
+    settled: Mask
+
+
+class Equilibrium:
+    """The equilibria of one arm."""
+
+    def __init__(self, expression: ToolExpression, choice: EvaluatorChoice = "auto") -> None:
+        self._size = expression.state.numel()
+        many = partial(BatchFunction, sample=sample_inputs(expression), choice=choice)
+        self._evaluator = Evaluator(expression, expression.base_T_tool.matrix()[:3, :], many)
+
+    def __call__(self, record: Array, state: Array | None = None) -> Standing:
+        """Arms for records (channels x N), from states near or from none."""
+        states = np.zeros((self._size, record.shape[1])) if state is None else state.copy()
+        tools, settled = self._evaluator.settle(np.zeros(0), record, states)
+        return Standing(states, _poses(tools), settled)
+
+    def required(self, record: Array) -> Array:
+        """base_T_tool (N x 4 x 4) for records that must settle.
+
+        Raises:
+            NotConvergedError: one has no equilibrium.
+        """
+        return _poses(self._evaluator(np.zeros(0), record, np.zeros((self._size, record.shape[1]))))
+
+
+def _poses(tools: Array) -> Array:
+    """Columns of 3x4 matrices (12 x N) as homogeneous ones (N x 4 x 4)."""
+    poses = np.zeros((tools.shape[1], 4, 4))
+    poses[:, :3, :] = tools.reshape(4, 3, -1).transpose(2, 1, 0)
+    poses[:, 3, 3] = 1.0
+    return poses

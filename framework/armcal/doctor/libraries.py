@@ -11,9 +11,13 @@ from importlib.util import find_spec
 from types import MappingProxyType
 from typing import Any
 
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+
 from armcal.doctor.finding import Finding, State
-from armcal.doctor.requirements import DISTRIBUTION, Requirement, declared, installed
 from armcal.version import SOURCES, __version__
+
+DISTRIBUTION = "armcal"
 
 
 @dataclass(frozen=True)
@@ -45,6 +49,7 @@ LIBRARIES: Mapping[str, Purpose] = MappingProxyType(
         "typing-extensions": Purpose(
             "typing_extensions", "no application of armcal runs, and some devices do not", needed=True
         ),
+        "packaging": Purpose("packaging", "armcal doctor does not run", needed=True),
         "joblib": Purpose("joblib", "folds, starts and studies run in one process only"),
     }
 )
@@ -90,10 +95,11 @@ def itself() -> Iterator[Finding]:
 
 def library(requirement: Requirement, ask: Ask) -> Finding:
     """One library that armcal declares: whether it imports, in what time, and whether its version is in the range."""
-    purpose = LIBRARIES.get(requirement.key) or Purpose(requirement.key.replace("-", "_"), "a part of armcal")
+    key, range_text = canonicalize_name(requirement.name), str(requirement.specifier)
+    purpose = LIBRARIES.get(key) or Purpose(key.replace("-", "_"), "a part of armcal")
     version, content = installed(requirement.name), ask("imported", purpose.module)
-    facts = {"version": version, "range": requirement.range, "needed": purpose.needed, **content}
-    pip = f"pip install '{requirement.name}{requirement.range}'."
+    facts = {"version": version, "range": range_text, "needed": purpose.needed, **content}
+    pip = f"pip install '{requirement.name}{range_text}'."
 
     def finding(state: State, text: str, hint: str = "") -> Finding:
         return Finding("libraries", requirement.name, state, text, hint, facts)
@@ -103,10 +109,10 @@ def library(requirement: Requirement, ask: Ask) -> Finding:
         if version is None:
             return finding(broken, f"not installed: {purpose.lost}", f"Install it: {pip}")
         text = f"{version} does not load{_origin(purpose.module)} ({content['fault']}): {purpose.lost}"
-        return finding(broken, text, f"{_ANEW} '{requirement.name}{requirement.range}'.")
+        return finding(broken, text, f"{_ANEW} '{requirement.name}{range_text}'.")
     shown = f"{version or 'of no known version'}, loads in {content['import_s']:.2f} s"
-    if version and not requirement.admits(version):
-        return finding("warning", f"{shown}, but armcal asks for {requirement.range}", f"Change it: {pip}")
+    if version and not requirement.specifier.contains(version, prereleases=True):
+        return finding("warning", f"{shown}, but armcal asks for {range_text}", f"Change it: {pip}")
     return finding("ok", shown)
 
 
@@ -128,23 +134,33 @@ def extra(name: str, needed: tuple[Requirement, ...], ask: Ask) -> Finding:
     if missing:
         return Finding("extras", name, "note", f"not here: {', '.join(missing)}; for {use}", hint, facts)
     for requirement in needed:
-        module = EXTRA_MODULES.get(requirement.key)
+        module = EXTRA_MODULES.get(canonicalize_name(requirement.name))
         content = ask("imported", module) if module else {}
         if "fault" in content:
             text = f"{requirement.name} does not load ({content['fault']}); for {use}"
             return Finding("extras", name, "warning", text, f"{_ANEW} '{requirement.name}'.", facts)
-    old = [f"{r.name} {installed(r.name)} ({r.range})" for r in needed if not r.admits(installed(r.name) or "")]
+    versions = [(r, installed(r.name) or "0") for r in needed]
+    old = [f"{r.name} {v} ({r.specifier})" for r, v in versions if not r.specifier.contains(v, prereleases=True)]
     if old:
         return Finding("extras", name, "warning", f"out of range: {', '.join(old)}; for {use}", hint, facts)
     return Finding("extras", name, "ok", f"installed; for {use}", detail=facts)
 
 
+def installed(name: str) -> str | None:
+    """The installed version of a distribution, or None."""
+    try:
+        return metadata.version(name)
+    except metadata.PackageNotFoundError:
+        return None
+
+
 def requirements() -> tuple[tuple[Requirement, ...], Mapping[str, tuple[Requirement, ...]]]:
     """What armcal always needs, and each extra's own; what this list knows where metadata is missing."""
     try:
-        everything = declared()
+        everything = [Requirement(text) for text in metadata.requires(DISTRIBUTION) or []]
+        names = metadata.metadata(DISTRIBUTION).get_all("Provides-Extra") or []
     except metadata.PackageNotFoundError:
-        everything = tuple(Requirement(name, "") for name in LIBRARIES)
-    always = tuple(r for r in everything if not r.extra)
-    names = dict.fromkeys(r.extra for r in everything if r.extra)
-    return always, {name: tuple(r for r in everything if r.extra == name) for name in names}
+        everything, names = [Requirement(name) for name in LIBRARIES], []
+    always = tuple(r for r in everything if r.marker is None or r.marker.evaluate({"extra": ""}))
+    others = [r for r in everything if r.marker and r not in always]
+    return always, {name: tuple(r for r in others if r.marker and r.marker.evaluate({"extra": name})) for name in names}

@@ -7,8 +7,7 @@ from importlib.metadata import entry_points
 from typing import Any
 
 from armcal.doctor.finding import Finding
-from armcal.doctor.libraries import Ask
-from armcal.doctor.requirements import DISTRIBUTION
+from armcal.doctor.libraries import DISTRIBUTION, Ask
 
 _CORE = "Install armcal anew: pip install --force-reinstall armcal (or pip install -e . in a checkout)."
 

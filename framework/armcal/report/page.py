@@ -77,11 +77,11 @@ def render(result: RunResult, sections: Sequence[PluginSection] = ()) -> str:
     return rendered("template.html.j2", content)
 
 
-def rendered(template: str, content: Mapping[str, Any]) -> str:
-    """A page of this folder's templates."""
+def rendered(template: str, content: Mapping[str, Any], *folders: Path) -> str:
+    """A page of this folder's templates, or of others' that stand before them."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-    loader = FileSystemLoader(Path(__file__).parent)
+    loader = FileSystemLoader([*folders, Path(__file__).parent])
     environment = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True)
     environment.lstrip_blocks = True
     environment.filters.update(count=count, plural=plural, unbroken=unbroken, signed=lambda x: fixed(x, 3, signed=True))

@@ -26,7 +26,7 @@ def drawing_of(path: Path) -> Drawing:
     import casadi as ca
     import numpy as np
     from armcal.calibration.calibration import Calibration
-    from armcal.calibration.compensation.equilibrium import Equilibrium
+    from armcal.calibration.tool_expression import Equilibrium
 
     calibration = Calibration.load(path, accept=True)
     arms = {}

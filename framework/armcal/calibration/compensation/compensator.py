@@ -11,18 +11,15 @@ import numpy as np
 from armcal.arm.loading import LOAD_CHANNELS
 from armcal.base.domains import Array
 from armcal.base.parameters import Parameters
-from armcal.calibration.compensation.counts import Counts, ServoCounts
-from armcal.calibration.compensation.equilibrium import Equilibrium, Standing
-from armcal.calibration.compensation.finder import Allowed, Rows, Solutions
-from armcal.calibration.compensation.limits import check_held, command_limits, held_joints
+from armcal.calibration.compensation.counts import Counts, Rounding, ServoCounts
+from armcal.calibration.compensation.finder import Allowed, Finder, Seeds
 from armcal.calibration.compensation.path import PathFinder, with_sides
-from armcal.calibration.compensation.reach import Reach, reach_of
-from armcal.calibration.compensation.reasons import why_not
+from armcal.calibration.compensation.reach import Reach, check_held, command_limits, held_joints, reach_of, why_not
+from armcal.calibration.compensation.redundancy import Descent
 from armcal.calibration.compensation.request import Commands, Mask, Options, Targets
-from armcal.calibration.compensation.seeds import Seeds
-from armcal.calibration.compensation.target_kind import TargetKind
+from armcal.calibration.compensation.search import Rows, Solutions, Solver
 from armcal.calibration.rigid_chain import turn_between
-from armcal.calibration.tool_expression import APPROACH, ToolExpression
+from armcal.calibration.tool_expression import APPROACH, Equilibrium, Standing, ToolExpression
 from armcal.functions.batch_function import EvaluatorChoice
 
 SEEDS = 512
@@ -65,19 +62,9 @@ class Compensator:
         self.reach: Reach = reach_of(expression.arm, parameters, self.limits, expression.tool_T_point)
         self._equilibrium = Equilibrium(expression, choice)
         self._counts = ServoCounts(expression.joints, expression.servos) if expression.servos else None
-        self._positions = TargetKind(
-            expression=expression,
-            options=self.options,
-            limits=self.limits,
-            held=self._held,
-            seeds=Seeds(expression, self._equilibrium, self.limits, SEEDS, self.options.seed),
-            equilibrium=self._equilibrium,
-            counts=self._counts,
-            allowed=allowed,
-            choice=choice,
-            turns=False,
-        )
-        self._poses = replace(self._positions, turns=True)
+        self._seeds = Seeds(expression, self._equilibrium, self.limits, SEEDS, self.options.seed)
+        self._choice: EvaluatorChoice = choice
+        self._positions, self._poses = _TargetKind(self, turns=False), _TargetKind(self, turns=True)
 
     @property
     def joints(self) -> tuple[str, ...]:
@@ -200,7 +187,7 @@ class Compensator:
             record[len(commands) : 2 * len(commands)] = np.asarray(approach, dtype=float).T
         if acting is not None:
             record[2 * len(commands) : 2 * len(commands) + len(LOAD_CHANNELS)] = acting
-        return self._equilibrium.required(record).base_T_tool
+        return self._equilibrium.required(record)
 
     def exact(self, joint_angles: Array, acting: Array) -> Array:
         """base_T_tool (N x 4 x 4) where joints stand at commands (N x n) to the last digit, as no board sets them.
@@ -213,7 +200,7 @@ class Compensator:
         nowhere = self.targets(np.zeros((len(joint_angles), 3)))
         record = self._record(replace(nowhere, acting=acting))
         record[: len(self.joints)] = joint_angles.T
-        return self._equilibrium.required(record).base_T_tool
+        return self._equilibrium.required(record)
 
     def stand(self, joint_angles: Array, targets: Targets, approach: Array) -> Standing:
         """Where the arm stands at commands (N x n), rounded to counts, under what acts on it at targets."""
@@ -231,6 +218,7 @@ class Compensator:
         return np.broadcast_to(numbers, (count, len(self.joints))).T.copy()
 
     def _set(self, commands: Array) -> Array:
+        """What the board makes of commands (n x N)."""
         if self._counts is None:
             return commands
         return self._counts.angles(self._counts.counts(commands), commands)
@@ -303,7 +291,7 @@ class Compensator:
             record[self.expression.channels.index(name)] = values
         return record
 
-    def _kind(self, targets: Targets) -> TargetKind:
+    def _kind(self, targets: Targets) -> _TargetKind:
         return self._positions if targets.rotations is None else self._poses
 
     @cached_property
@@ -311,6 +299,39 @@ class Compensator:
         """Whether it matters from where a joint comes."""
         names = [f"{APPROACH}{joint}" for joint in self.joints]
         return self.expression.uses(names)
+
+
+class _TargetKind:
+    """What finds commands for positions alone, or (``turns``) whole poses; each part is made when it is first used."""
+
+    def __init__(self, arm: Compensator, turns: bool) -> None:
+        self._arm, self._turns = arm, turns
+
+    @cached_property
+    def solver(self) -> Solver:
+        """Of one search."""
+        arm, options = self._arm, self._arm.options
+        tolerance, length = (options.reach_m, options.reach_rad), arm._seeds.spread / 2
+        return Solver(arm.expression, arm.limits, self._turns, length, tolerance, arm._choice)
+
+    @cached_property
+    def finder(self) -> Finder:
+        """Of many."""
+        return Finder(self.solver, self._arm._seeds, self._arm._allowed, self._arm._held)
+
+    @cached_property
+    def descent(self) -> Descent:
+        """To better commands for the same target."""
+        arm = self._arm
+        return Descent(arm.expression, arm.options.redundancy, self.solver, arm._held, arm._choice)
+
+    @cached_property
+    def rounding(self) -> Rounding | None:
+        """To counts of servos; None where there are none."""
+        arm = self._arm
+        if arm._counts is None:
+            return None
+        return Rounding(arm.expression, arm._counts, arm._equilibrium, self.solver, arm._held, arm._choice)
 
 
 def _goal(targets: Targets) -> Array:

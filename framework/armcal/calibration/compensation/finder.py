@@ -3,17 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from armcal.base.domains import Array
-from armcal.calibration.compensation.request import Mask
-from armcal.calibration.compensation.search import NEAREST, WISHED, Attempt, Goal, Solver, chosen_of
-from armcal.calibration.compensation.seeds import Seeds
+from armcal.calibration.compensation.request import FARTHEST_M, Mask
+from armcal.calibration.compensation.search import (
+    NEAREST,
+    QUICK,
+    WISHED,
+    Goal,
+    Rows,
+    Solutions,
+    Solver,
+    chosen_of,
+    with_commands,
+)
+from armcal.calibration.tool_expression import Equilibrium, ToolExpression
 
-Rows = NDArray[np.intp]
 Allowed = Callable[[Array], Mask]
 """From commands (n x N) to whether the arm may be there."""
 Score = Callable[[Array, Array, Rows], Array]
@@ -23,55 +31,16 @@ _ROUNDS = (1, 1, 2, 4, 8, 16, 32, 64)
 _CANDIDATES = (12, 16, 32, 64)
 """Where the best of several is wanted."""
 _AT_ONCE = 4096
-PARTS = ("commands", "states", "distances", "turns", "there", "forbidden")
 _BESIDE = 0.6
 """Commands that moved no joint farther (rad or m) are taken for the nearest without a look at other postures."""
 _POSTURES, _MOVED = 24, 0.2
 """Starts from which the nearest of all commands is sought; what their distance from where the arm is counts beside
 that of their tool from the target."""
 _NEAREST_STARTS = 4
-
-
-@dataclass(frozen=True)
-class Solutions:
-    """What was found of targets (N).
-
-    Attributes:
-        commands: n x N (rad or m); of those that are not had, the nearest.
-        states: n_d x N.
-        distances: what is left (m).
-        turns: what is left (rad).
-        there: whether it is reached.
-        forbidden: of those that are not had, whether only clearance forbids it.
-    """
-
-    commands: Array
-    states: Array
-    distances: Array
-    turns: Array
-    there: Mask
-    forbidden: Mask
-
-    @classmethod
-    def nothing(cls, joints: int, state: int, count: int) -> Solutions:
-        """Nothing found yet."""
-        far = np.full((2, count), np.inf)
-        no = np.zeros((2, count), dtype=bool)
-        return cls(np.zeros((joints, count)), np.zeros((state, count)), far[0], far[1], no[0], no[1])
-
-    def put(self, at: Rows, attempt: Attempt, chosen: Rows) -> None:
-        """Candidates of an attempt at their targets' places."""
-        self.commands[:, at], self.states[:, at] = attempt.commands[:, chosen], attempt.states[:, chosen]
-        self.distances[at], self.turns[at] = attempt.distances[chosen], attempt.turns[chosen]
-
-    def subset(self, chosen: Mask | Rows) -> Solutions:
-        """Some of them."""
-        return Solutions(*(getattr(self, name)[..., chosen] for name in PARTS))
-
-    def replace(self, at: Rows, other: Solutions) -> None:
-        """Others' findings at their places."""
-        for name in PARTS:
-            getattr(self, name)[..., at] = getattr(other, name)
+FREE_ANGLE, FREE_TRAVEL = np.pi, 0.5
+"""How far joints without limits are tried (rad, m)."""
+_WIDEST = 2 * np.pi
+"""To either side; a joint that goes farther is tried about where it is nearest to zero."""
 
 
 class Finder:
@@ -92,11 +61,9 @@ class Finder:
             start: commands to come from (n x N); the first search starts there.
             score: to choose by among several commands; without one the first that is found is taken.
         """
-        count = record.shape[1]
-        solutions = Solutions.nothing(len(self._solver.limits), len(self._seeds.states), count)
-        lost: Rows = np.arange(count)
-        if start is not None and score is None:
-            lost = self._from(record, target, start, solutions)
+        begun = None if score else start
+        solutions = self._nothing(record.shape[1]) if begun is None else self._direct(record, target, begun)
+        lost: Rows = np.flatnonzero(~solutions.there)
         used = 0
         for wide in _ROUNDS if score is None else _CANDIDATES:
             if not lost.size or used >= self._seeds.commands.shape[1]:
@@ -110,14 +77,9 @@ class Finder:
         self._nearest(record, target, lost, solutions, start)
         return solutions
 
-    @property
-    def states(self) -> int:
-        """How many numbers an elastic state has."""
-        return len(self._seeds.states)
-
     def spread(self, record: Array, target: Array) -> Solutions:
         """Commands for the same target (columns alike), each from another seed, in whatever posture it leads to."""
-        solutions = Solutions.nothing(len(self._solver.limits), self.states, record.shape[1])
+        solutions = self._nothing(record.shape[1])
         apart = self._seeds.apart(target[:, :1], self._solver.length)[0]
         picks = np.argsort(apart)[: record.shape[1]]
         rows = np.arange(len(picks))
@@ -126,14 +88,16 @@ class Finder:
 
     def straight(self, record: Array, target: Array, at: Array) -> Solutions:
         """Commands from others (n x N) straight on: no other posture is looked for."""
-        solutions = Solutions.nothing(len(self._solver.limits), self.states, record.shape[1])
-        solutions.commands[:] = at
-        self._from(record, target, at, solutions)
+        solutions = self._direct(record, target, at)
+        solutions.commands[:, ~solutions.there] = at[:, ~solutions.there]
         return solutions
 
     def onward(self, record: Array, target: Array, at: Array) -> Solutions:
         """The commands nearest to others (n x N): beside them, else in whatever posture is nearest of many."""
-        beside = self._beside(record, target, at)
+        beside = self._direct(record, target, at, at)
+        lost = np.flatnonzero(~beside.there)  # with the wish to stay
+        if lost.size:
+            beside.replace(lost, self.straight(record[:, lost], target[:, lost], at[:, lost]))
         far = np.flatnonzero(~beside.there | (np.abs(beside.commands - at).max(axis=0) > _BESIDE))
         if not far.size:
             return beside
@@ -145,11 +109,11 @@ class Finder:
 
     def _of_many(self, record: Array, target: Array, at: Array) -> Solutions:
         """From many starts, each brought as near to commands (n x N) as its target allows: the nearest of them."""
-        solutions = Solutions.nothing(len(self._solver.limits), self.states, record.shape[1])
+        solutions = self._nothing(record.shape[1])
         wide = min(_POSTURES, self._seeds.commands.shape[1])
         for todo in _chunks(np.arange(record.shape[1]), wide):
             rows, first = np.repeat(todo, wide), np.arange(len(todo)) * wide
-            attempts = Solutions.nothing(len(self._solver.limits), self.states, len(rows))
+            attempts = self._nothing(len(rows))
             picks = self._picked_for(target[:, todo], at[:, todo], wide).ravel()[:, None]
             records, targets, preferred = (chosen_of(array, rows) for array in (record, target, at))
             self._round(records, targets, np.arange(len(rows)), picks, attempts, None, preferred)
@@ -164,38 +128,23 @@ class Finder:
             solutions.replace(lost, more)
         return solutions
 
-    def _beside(self, record: Array, target: Array, at: Array) -> Solutions:
-        """Searches from commands that wish to stay there; what is not found so is sought without the wish."""
-        solutions = Solutions.nothing(len(self._solver.limits), self.states, record.shape[1])
-        goal = Goal(_at(record, at), np.zeros((self.states, record.shape[1])), target, at, self._held)
-        attempt = self._solver(goal, WISHED)
-        good = np.flatnonzero(attempt.there & self._may(attempt.commands))
-        solutions.put(good, attempt, good)
-        solutions.there[good] = True
-        lost = np.flatnonzero(~solutions.there)
-        if lost.size:
-            solutions.replace(lost, self.straight(record[:, lost], target[:, lost], at[:, lost]))
-        return solutions
-
     def towards(self, record: Array, target: Array, preferred: Array, solutions: Solutions) -> None:
         """As near to wished commands (n x N) as the targets allow, in place; only those that are reached."""
         at = np.flatnonzero(solutions.there)
-        goal = Goal(
-            _at(record, solutions.commands)[:, at], solutions.states[:, at], target[:, at], preferred[:, at], self._held
-        )
-        attempt = self._solver(goal, WISHED)
+        goal = Goal(with_commands(record, solutions.commands), solutions.states, target, preferred, self._held)
+        attempt = self._solver(goal.subset(at), WISHED)
         nearer = _apart(attempt.commands, preferred[:, at]) < _apart(solutions.commands[:, at], preferred[:, at])
         good = np.flatnonzero(attempt.there & nearer & self._may(attempt.commands))
         solutions.put(at[good], attempt, good)
 
-    def _from(self, record: Array, target: Array, start: Array, solutions: Solutions) -> Rows:
-        goal = Goal(_at(record, start), np.zeros((len(solutions.states), record.shape[1])), target, None, self._held)
-        attempt = self._solver(goal)
-        good = attempt.there & self._may(attempt.commands)
-        at = np.flatnonzero(good)
-        solutions.put(at, attempt, at)
-        solutions.there[at] = True
-        return np.flatnonzero(~good)
+    def _direct(self, record: Array, target: Array, at: Array, towards: Array | None = None) -> Solutions:
+        """One search from commands (n x N), near to others where such are wished: what it reaches."""
+        solutions = self._nothing(record.shape[1])
+        goal = Goal(with_commands(record, at), np.zeros_like(solutions.states), target, towards, self._held)
+        attempt = self._solver(goal, QUICK if towards is None else WISHED)
+        good = np.flatnonzero(attempt.there & self._may(attempt.commands))
+        solutions.replace(good, attempt.subset(good))
+        return solutions
 
     def _picked(self, target: Array, used: int, wide: int) -> NDArray[np.intp]:
         """The next seeds of each target (N x wide)."""
@@ -265,7 +214,10 @@ class Finder:
         if self._held and start is not None:
             held = list(self._held)
             commands[held] = start[held][:, rows]
-        return Goal(_at(chosen_of(record, rows), commands), states, chosen_of(target, rows), None, self._held)
+        return Goal(with_commands(chosen_of(record, rows), commands), states, chosen_of(target, rows), None, self._held)
+
+    def _nothing(self, count: int) -> Solutions:
+        return Solutions.nothing(len(self._solver.limits), len(self._seeds.states), count)
 
     def _may(self, commands: Array) -> Mask:
         if self._allowed is None or not commands.shape[1]:
@@ -278,14 +230,67 @@ def _apart(commands: Array, others: Array) -> Array:
     return np.asarray(((commands - others) ** 2).sum(axis=0))
 
 
-def _at(record: Array, commands: Array) -> Array:
-    """Records with other commands."""
-    moved = record.copy()
-    moved[: len(commands)] = commands
-    return moved
-
-
 def _chunks(rows: Rows, wide: int) -> Iterator[Rows]:
     size = max(1, _AT_ONCE // wide)
     for start in range(0, len(rows), size):
         yield rows[start : start + size]
+
+
+class Seeds:
+    """Commands spread over what the joints allow, with the tools there.
+
+    Attributes:
+        commands: n x M (rad or m).
+        states: n_d x M.
+    """
+
+    def __init__(
+        self, expression: ToolExpression, equilibrium: Equilibrium, limits: Array, count: int, seed: int
+    ) -> None:
+        """Spread evenly; commands at which the springs do not hold are left out."""
+        tried = _tried(expression, limits)
+        points = _spread_evenly(len(limits), count, seed)
+        commands = tried[:, :1] + points * (tried[:, 1:] - tried[:, :1])
+        record = np.repeat(expression.defaults[:, None], count, axis=1)
+        record[: len(commands)] = commands
+        standing = equilibrium(record)
+        kept = standing.settled
+        self.commands, self.states = commands[:, kept], standing.states[:, kept]
+        self._tools = standing.base_T_tool[kept]
+
+    @property
+    def spread(self) -> float:
+        """How far the tool typically is from the middle of all its places (m)."""
+        places = self._tools[:, :3, 3]
+        return float(np.median(np.linalg.norm(places - places.mean(axis=0), axis=1)))
+
+    def apart(self, targets: Array, length: float) -> Array:
+        """How far each seed is from targets (3 or 12 x N), but for what is the same for all seeds (N x M; m^2)."""
+        scales = np.array([1.0] * 3 + [length / np.sqrt(2)] * (len(targets) - 3))[:, None]
+        mine = np.concatenate([self._tools[:, :3, 3].T, self._tools[:, :3, :3].transpose(0, 2, 1).reshape(-1, 9).T])
+        mine = (mine[: len(targets)] * scales).astype(np.float32)
+        theirs = (-2.0 * np.clip(targets, -FARTHEST_M, FARTHEST_M) * scales).astype(np.float32)
+        return np.asarray(theirs.T @ mine + np.einsum("km,km->m", mine, mine))
+
+
+def _spread_evenly(dimensions: int, count: int, seed: int) -> Array:
+    """Points of the unit cube (dimensions x count): multiples of irrational numbers, without their whole part.
+
+    The numbers are powers of the inverse of the root of x^(d+1) = x + 1. [Roberts2018]
+    """
+    root = 2.0
+    for _ in range(60):
+        root = (1 + root) ** (1 / (dimensions + 1))
+    steps = root ** -np.arange(1.0, dimensions + 1)
+    shift = np.random.default_rng(seed).random(dimensions)
+    return np.asarray((shift[:, None] + steps[:, None] * np.arange(count)) % 1.0)
+
+
+def _tried(expression: ToolExpression, limits: Array) -> Array:
+    kinds = [expression.arm.commanded[joint] for joint in expression.joints]
+    reach = np.array([FREE_ANGLE if kind == "angle" else FREE_TRAVEL for kind in kinds])
+    low = np.where(np.isfinite(limits[:, 0]), limits[:, 0], np.minimum(-reach, limits[:, 1] - 2 * reach))
+    high = np.where(np.isfinite(limits[:, 1]), limits[:, 1], np.maximum(reach, limits[:, 0] + 2 * reach))
+    wide = high - low > 2 * _WIDEST
+    middle = np.minimum(np.maximum(0.0, low + _WIDEST), high - _WIDEST)
+    return np.stack([np.where(wide, middle - _WIDEST, low), np.where(wide, middle + _WIDEST, high)], axis=1)

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from armcal.base.domains import Array
-from armcal.calibration.compensation.finder import PARTS, Finder, Solutions
-from armcal.calibration.compensation.request import Mask
+from armcal.calibration.compensation.finder import Finder
+from armcal.calibration.compensation.search import Solutions
 
 WAYS = 12
 _SAME = 1e-3
@@ -66,14 +66,18 @@ class PathFinder:
                 moves[i], sides[i] = following.commands - at, side
             solutions.append(following)
             at = following.commands
-            kept = self._as_good_as_any([candidates.there for candidates in solutions], moves[: i + 1])
+            jumps = (np.abs(moves[: i + 1]).max(axis=1) > _JUMP).sum(axis=0)
+            spoilt = jumps + sum(~candidates.there for candidates in solutions)
+            kept = np.asarray(spoilt == spoilt.min())
             if not kept.all():
                 solutions = [candidates.subset(kept) for candidates in solutions]
                 sides, moves, at, side = sides[:, :, kept], moves[:, :, kept], at[:, kept], side[:, kept]
                 wide = int(kept.sum())
         longest = np.abs(moves).max(axis=1)
         best = int((longest.max(axis=0) + longest.mean(axis=0)).argmin())
-        return Path(_joined(solutions, best), sides[:, :, best].T, moves[:, :, best].T)
+        columns = zip(*(vars(candidates).values() for candidates in solutions), strict=True)
+        along = Solutions(*(np.stack([column[..., best] for column in part], axis=-1) for part in columns))
+        return Path(along, sides[:, :, best].T, moves[:, :, best].T)
 
     def beginnings(self, record: Array, target: Array) -> Array:
         """Commands in different postures that have the first target (n x ways); the nearest if there are none."""
@@ -93,19 +97,6 @@ class PathFinder:
         record = record.copy()
         solutions = with_sides(record, at, side, lambda sided: self._finder.onward(sided, target, at))
         return solutions, record[self._joints : 2 * self._joints]
-
-    @staticmethod
-    def _as_good_as_any(there: list[Mask], moves: Array) -> Mask:
-        """Which ways have missed no more targets, and jumped no more often, than any other."""
-        jumps = (np.abs(moves).max(axis=1) > _JUMP).sum(axis=0)
-        spoilt = (~np.array(there)).sum(axis=0) + jumps
-        return np.asarray(spoilt == spoilt.min())
-
-
-def _joined(solutions: list[Solutions], way: int) -> Solutions:
-    """One way's findings, target by target."""
-    parts = {name: np.stack([getattr(part, name)[..., way] for part in solutions], axis=-1) for name in PARTS}
-    return Solutions(**parts)
 
 
 def sides_of(moved: Array, before: Array) -> Array:

@@ -1,17 +1,71 @@
-"""How near a command can come at all: no arm reaches farther than its links are long."""
+"""What an arm cannot reach: limits of commands, the shell that its links span, and why a target is not reached."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
 
 from armcal.arm.assembly import Arm
+from armcal.arm.joints import Limits, joint_limits, unknown_joint
 from armcal.arm.model import Chain
 from armcal.base.domains import Array
 from armcal.base.parameters import Parameters
 from armcal.base.se3 import Transform, identity
+from armcal.calibration.compensation.request import Mask, Targets
+from armcal.calibration.compensation.search import Rows, Solutions
+from armcal.calibration.tool_expression import ToolExpression
+
+
+def held_joints(expression: ToolExpression, names: Sequence[str]) -> tuple[int, ...]:
+    """Places of joints that shall not move.
+
+    Raises:
+        ValueError: there is no such joint, or none is left to move.
+    """
+    if fault := unknown_joint(names, expression.joints):
+        raise ValueError(fault)
+    if len(set(names)) == len(expression.joints):
+        raise ValueError("all joints shall stay: none is left to move")
+    return tuple(expression.joints.index(name) for name in dict.fromkeys(names))
+
+
+def check_held(joints: Sequence[str], held: Sequence[int], limits: Array, start: Array | None) -> None:
+    """Joints that shall stay must be told where (n or N x n), and may be there.
+
+    Raises:
+        ValueError: nothing says where, or it is beyond their limits (n x 2).
+    """
+    if not held:
+        return
+    if start is None:
+        raise ValueError(f"{', '.join(joints[i] for i in held)} shall stay, and no start says where")
+    for i in held:
+        stays = np.atleast_2d(np.asarray(start, dtype=float))[:, i]
+        if (stays < limits[i, 0]).any() or (stays > limits[i, 1]).any():
+            raise ValueError(f"{joints[i]} shall stay where the start has it, and that is beyond its limits")
+
+
+def command_limits(expression: ToolExpression, stated: Mapping[str, Limits]) -> Array:
+    """Lowest and highest command of each joint (n x 2; rad or m), infinite where nothing limits it.
+
+    ``stated`` take the place of the model's. A servo's pulse table is known between its ends only, so a joint with one
+    stays between them too.
+
+    Raises:
+        ValueError: limits of a joint that is not there, or in falling order.
+    """
+    known = joint_limits(expression.arm.nominal_chain, stated)
+    limits = np.array([known[joint] or (-np.inf, np.inf) for joint in expression.joints])
+    for i, joint in enumerate(expression.joints):
+        if joint in expression.servos:
+            angles = expression.servos[joint][0].angles
+            limits[i] = max(limits[i, 0], angles[0]), min(limits[i, 1], angles[-1])
+        if not limits[i, 0] < limits[i, 1]:
+            raise ValueError(f"the limits of {joint}, {limits[i, 0]:g} to {limits[i, 1]:g}, leave it no room")
+    return limits
 
 
 @dataclass(frozen=True)
@@ -72,3 +126,56 @@ def _travel(arm: Arm, chain: Chain, limits: Array) -> float:
 
 def _numbers(expression: ca.SX) -> Array:
     return np.asarray(ca.evalf(ca.densify(ca.SX(expression))).full())
+
+
+def why_not(
+    joints: Sequence[str],
+    limits: Array,
+    commands: Array,
+    targets: Targets,
+    solutions: Solutions,
+    had: Mask,
+    bounds: Array,
+    position_can_be_had: Callable[[Rows], Mask],
+) -> tuple[str, ...]:
+    """A sentence for each target that is not had; empty for the others.
+
+    Args:
+        joints: their names (n).
+        limits: n x 2 (rad or m).
+        commands: the nearest ones (n x N).
+        targets: what was asked.
+        solutions: what was found.
+        had: which are reached.
+        bounds: how near the arm can come at most (N; m).
+        position_can_be_had: from targets' rows to whether their positions can be reached with any rotation.
+    """
+    lost = np.flatnonzero(~had)
+    turned = np.zeros(len(had), dtype=bool)
+    near = lost[(bounds[lost] == 0) & ~solutions.forbidden[lost]]
+    if targets.rotations is not None and near.size:
+        turned[near] = position_can_be_had(near)
+    said = [""] * len(had)
+    for row in lost.tolist():
+        said[row] = _sentence(joints, limits, commands[:, row], solutions, bounds[row], bool(turned[row]), row)
+    return tuple(said)
+
+
+def _sentence(
+    joints: Sequence[str], limits: Array, commands: Array, solutions: Solutions, bound: float, turned: bool, row: int
+) -> str:
+    if solutions.there[row]:
+        return "the load is more than the springs hold there"
+    if bound > 0:
+        return f"out of reach: no command comes nearer than {1000 * bound:.1f} mm"
+    if solutions.forbidden[row]:
+        return "all commands found that reach it are too near to something"
+    held = [
+        joint
+        for joint, q, (low, high) in zip(joints, commands, limits, strict=True)
+        if q <= low + 1e-6 or q >= high - 1e-6
+    ]
+    at_limits = f"; the nearest has {', '.join(held)} at the limit" if held else ""
+    if turned:
+        return f"the position can be reached, but not with this rotation{at_limits}"
+    return f"no command was found that reaches it{at_limits}"

@@ -6,18 +6,16 @@ step counts only if what is to be small became smaller. [Nocedal2006]
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import casadi as ca
 import numpy as np
 
 from armcal.base.domains import Array
 from armcal.base.se3 import Expression
-from armcal.calibration.compensation.finder import Allowed, Solutions
+from armcal.calibration.compensation.finder import Allowed
 from armcal.calibration.compensation.request import Redundancy
-from armcal.calibration.compensation.search import Goal, Solver
-from armcal.calibration.compensation.step import sample_inputs, slopes, tool_error
-from armcal.calibration.tool_expression import ToolExpression
+from armcal.calibration.compensation.search import Goal, Solutions, Solver, with_commands
+from armcal.calibration.compensation.step import slopes, tool_error
+from armcal.calibration.tool_expression import ToolExpression, sample_inputs
 from armcal.functions.batch_function import BatchFunction, EvaluatorChoice
 
 _STEPS = 25
@@ -45,15 +43,6 @@ def wanted_small(expression: ToolExpression, redundancy: Redundancy) -> Expressi
     return ca.vec(ca.mtimes(ca.jacobian(pose, state), expression.to_equilibrium(by_force)[0]))
 
 
-@dataclass(frozen=True)
-class _Local:
-    """What is to be small (k x N), its slope (N x k x n) and that of what is held (N x 3 or 6 x n)."""
-
-    small: Array
-    slope: Array
-    held: Array
-
-
 class Descent:
     """From commands that reach a target to better ones that reach it too."""
 
@@ -70,10 +59,8 @@ class Descent:
         own_slopes, count = slopes(expression), len(expression.joints)
         by_commands = ca.jacobian(small, expression.record)[:, :count]
         slope = by_commands + ca.mtimes(ca.jacobian(small, expression.state), own_slopes.state)
-        self._shape = (small.numel(), count)
         here = ca.reshape(own_slopes.corrected[:9], 3, 3) if solver.turns else None
         held = tool_error(own_slopes, own_slopes.corrected[9:], here)[1]
-        self._held = held.size1()
         outputs = [small, ca.vec(ca.densify(slope)), ca.vec(ca.densify(held))]
         function = ca.Function("redundancy", [expression.record, expression.state], outputs, {"cse": True})
         self._function = BatchFunction(function, sample_inputs(expression), choice)
@@ -81,9 +68,7 @@ class Descent:
 
     def score(self, record: Array, commands: Array, states: Array) -> Array:
         """Half of the squares of what is to be small (N), for commands (n x N) in equilibrium."""
-        moved = record.copy()
-        moved[: len(commands)] = commands
-        small = self._function(moved, states)[0]
+        small = self._function(with_commands(record, commands), states)[0]
         return np.asarray(0.5 * np.einsum("kn,kn->n", small, small))
 
     def improve(self, record: Array, target: Array, solutions: Solutions, allowed: Allowed | None) -> None:
@@ -97,7 +82,7 @@ class Descent:
             if not (trust > _LEAST).any():
                 break
             step = self._step(record, commands, states, trust)
-            attempt = self._solver(Goal(_moved(record, commands + step), states, target, None, self._still))
+            attempt = self._solver(Goal(with_commands(record, commands + step), states, target, None, self._still))
             new = self.score(record, attempt.commands, attempt.states)
             good = attempt.there & (new < value * (1 - 1e-9))
             if allowed is not None:
@@ -112,19 +97,20 @@ class Descent:
 
     def _step(self, record: Array, commands: Array, states: Array, trust: Array) -> Array:
         """Least squares of what is to be small along commands that keep the target; joints at limits stay (n x N)."""
-        local = self._local(_moved(record, commands), states)
-        pull = -np.einsum("nki,kn->ni", local.slope, local.small)
+        small, slopes_of_small, slopes_of_tool = self._function(with_commands(record, commands), states)
+        slope, held = (_by_record(array, len(commands)) for array in (slopes_of_small, slopes_of_tool))
+        pull = -np.einsum("nki,kn->ni", slope, small)
         low, high = self._solver.limits[:, 0], self._solver.limits[:, 1]
         at = commands.T
         stuck = ((at <= low) & (pull < 0)) | ((at >= high) & (pull > 0))
         free = np.where(stuck, 0.0, 1.0)
         free[:, list(self._still)] = 0.0
-        n, k = len(commands), self._held
-        square = np.einsum("nki,nkj->nij", local.slope, local.slope) * free[:, :, None] * free[:, None, :]
+        n, k = held.shape[2], held.shape[1]
+        square = np.einsum("nki,nkj->nij", slope, slope) * free[:, :, None] * free[:, None, :]
         size = np.maximum(np.trace(square, axis1=1, axis2=2), 1e-300)[:, None, None]
         whole = np.zeros((len(at), n + k, n + k))
         whole[:, :n, :n] = square / size + _SOFTENED * np.eye(n)
-        held = local.held * free[:, None, :]
+        held = held * free[:, None, :]
         whole[:, :n, n:], whole[:, n:, :n] = held.transpose(0, 2, 1), held
         whole[:, n:, n:] = -1e-12 * np.eye(k)
         right = np.concatenate([pull * free / size[:, :, 0], np.zeros((len(at), k))], axis=1)
@@ -133,14 +119,7 @@ class Descent:
         step *= np.minimum(1.0, trust[:, None] / np.maximum(length, 1e-300))
         return np.asarray(np.clip(at + step, low, high) - at).T
 
-    def _local(self, record: Array, states: Array) -> _Local:
-        small, slope, held = self._function(record, states)
-        rows, count = self._shape
-        slope = slope.reshape(count, rows, -1).transpose(2, 1, 0)
-        return _Local(small, slope, held.reshape(count, self._held, -1).transpose(2, 1, 0))
 
-
-def _moved(record: Array, commands: Array) -> Array:
-    moved = record.copy()
-    moved[: len(commands)] = commands
-    return moved
+def _by_record(slopes: Array, count: int) -> Array:
+    """Slopes of several rows by commands, column by column (rows n x N), as N x rows x n."""
+    return slopes.reshape(count, -1, slopes.shape[1]).transpose(2, 1, 0)

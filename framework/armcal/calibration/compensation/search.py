@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,14 +15,14 @@ from armcal.calibration.compensation.step import (
     Slopes,
     progress_places,
     rough_slopes,
-    sample_inputs,
     search_function,
     slopes,
 )
-from armcal.calibration.tool_expression import ToolExpression
+from armcal.calibration.tool_expression import ToolExpression, sample_inputs
 from armcal.functions.batch_function import BatchFunction, EvaluatorChoice
 
-Chosen = Mask | NDArray[np.intp]
+Rows = NDArray[np.intp]
+Chosen = Mask | Rows
 """Some columns: whether, or which."""
 
 
@@ -52,19 +52,45 @@ class Goal:
 
 
 @dataclass(frozen=True)
-class Attempt:
-    """Where searches came nearest: commands (n x N), states (n_d x N), distances (m), turns (rad); there or not."""
+class Solutions:
+    """What was found of targets (N).
+
+    Attributes:
+        commands: n x N (rad or m); of those that are not reached, the nearest.
+        states: n_d x N.
+        distances: what is left (m).
+        turns: what is left (rad).
+        there: whether it is reached.
+        forbidden: of those that are not reached, whether only clearance forbids it.
+    """
 
     commands: Array
     states: Array
     distances: Array
     turns: Array
     there: Mask
+    forbidden: Mask
 
-    def put(self, at: NDArray[np.intp], other: Attempt) -> None:
-        """Another attempt's outcomes at their places."""
-        self.commands[:, at], self.states[:, at] = other.commands, other.states
-        self.distances[at], self.turns[at], self.there[at] = other.distances, other.turns, other.there
+    @classmethod
+    def nothing(cls, joints: int, state: int, count: int) -> Solutions:
+        """Nothing found yet."""
+        far = np.full((2, count), np.inf)
+        no = np.zeros((2, count), dtype=bool)
+        return cls(np.zeros((joints, count)), np.zeros((state, count)), far[0], far[1], no[0], no[1])
+
+    def put(self, at: Rows, attempt: Solutions, chosen: Rows) -> None:
+        """Some of an attempt's commands at their targets' places; whether they are reached is the caller's to say."""
+        self.commands[:, at], self.states[:, at] = attempt.commands[:, chosen], attempt.states[:, chosen]
+        self.distances[at], self.turns[at] = attempt.distances[chosen], attempt.turns[chosen]
+
+    def subset(self, chosen: Chosen) -> Solutions:
+        """Some of them."""
+        return Solutions(*(getattr(self, part.name)[..., chosen] for part in fields(self)))
+
+    def replace(self, at: Rows, other: Solutions) -> None:
+        """Others' findings at their places."""
+        for part in fields(self):
+            getattr(self, part.name)[..., at] = getattr(other, part.name)
 
 
 @dataclass(frozen=True)
@@ -136,7 +162,7 @@ class Search:
         """Whether C serves it."""
         return self._iteration.compiled
 
-    def __call__(self, goal: Goal, manner: Manner, near: Near) -> Attempt:
+    def __call__(self, goal: Goal, manner: Manner, near: Near) -> Solutions:
         """Search until it is near, or no longer comes nearer.
 
         Raises:
@@ -161,7 +187,8 @@ class Search:
         shared = np.broadcast_to(settings[:, None], (len(settings), count))
         self._iteration.iterate(progress, shared, goal.record, goal.target, towards)
         best, (distances, turns) = progress[places["best_commands"]], progress[places["distance"].start :][:2]
-        return Attempt(best, progress[places["best_state"]], distances, turns, progress[-1] == REACHED)
+        there, forbidden = progress[-1] == REACHED, np.zeros(count, dtype=bool)
+        return Solutions(best, progress[places["best_state"]], distances, turns, there, forbidden)
 
 
 class Solver:
@@ -189,18 +216,24 @@ class Solver:
         rough = rough_slopes(expression) if expression.state.numel() else None
         self._rough = None if rough is None else Search(expression, rough, limits, turns, length, choice)
 
-    def __call__(self, goal: Goal, manner: Manner = QUICK) -> Attempt:
+    def __call__(self, goal: Goal, manner: Manner = QUICK) -> Solutions:
         """Search from where the goal starts."""
         if self._rough is None:
             return self._exact(goal, manner, self._near)
         first = self._rough(replace(goal, towards=None), manner, _ROUGH)
         near = np.flatnonzero(first.there) if manner is QUICK else np.arange(len(first.there))
-        begun = replace(goal, record=goal.record.copy(), state=first.states)
-        begun.record[: len(self.limits)] = first.commands
+        begun = replace(goal, record=with_commands(goal.record, first.commands), state=first.states)
         second = self._exact(begun.subset(near), manner, self._near)
         first.there[:] = False
-        first.put(near, second)
+        first.replace(near, second)
         return first
+
+
+def with_commands(record: Array, commands: Array) -> Array:
+    """Records (channels x N) with other commands (n x N)."""
+    moved = record.copy()
+    moved[: len(commands)] = commands
+    return moved
 
 
 def chosen_of(array: Array, chosen: Chosen) -> Array:

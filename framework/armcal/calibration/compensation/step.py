@@ -22,10 +22,8 @@ from functools import reduce
 from itertools import accumulate
 
 import casadi as ca
-import numpy as np
 
 from armcal.base import se3
-from armcal.base.domains import Array
 from armcal.base.se3 import Expression
 from armcal.calibration.tool_expression import ToolExpression
 
@@ -240,14 +238,6 @@ def slope_function(expression: ToolExpression, turns: bool) -> ca.Function:
     slope = tool_error(own_slopes, own_slopes.corrected[9:], here if turns else None)[1]
     inputs = [expression.record, expression.state]
     return ca.Function("tool_slope", inputs, [ca.vec(ca.densify(slope))], {"cse": True})
-
-
-def sample_inputs(expression: ToolExpression) -> list[Array]:
-    """A made-up record and state (8 columns each), to compare two forms of a function."""
-    record = np.repeat(expression.defaults[:, None], 8, axis=1)
-    count = len(expression.joints)
-    record[:count] = np.random.default_rng(0).uniform(-1, 1, (count, 8))
-    return [record, np.zeros((expression.state.numel(), 8))]
 
 
 def _step(
