@@ -10,6 +10,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import forked
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -21,13 +22,17 @@ COMMANDS = re.compile(r"^```(\w+)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 
 def run(*command: str, cwd: Path, site: Path | None = None) -> Ran:
     """A command with this Python's own programs first; pip installs into ``site`` alone, and downloads nothing."""
-    environment = {
-        **os.environ,
+    environment = {**os.environ, "PYTHONPATH": str(site or ""), **variables(site or cwd / "site")}
+    return subprocess.run(command, capture_output=True, text=True, env=environment, cwd=cwd, check=False)
+
+
+def variables(site: Path) -> dict[str, str]:
+    """Of the environment of each command."""
+    return {
         "PATH": f"{BIN}{os.pathsep}{os.environ.get('PATH', '')}",
-        "PYTHONPATH": str(site or ""),
         "COLUMNS": "1000",
         "ARMCAL_CC": "none",
-        "PIP_TARGET": str(site or cwd / "site"),
+        "PIP_TARGET": str(site),
         "PIP_UPGRADE": "1",
         "PIP_NO_DEPS": "1",
         "PIP_NO_BUILD_ISOLATION": "0",  # pip's own words for --no-build-isolation
@@ -36,12 +41,11 @@ def run(*command: str, cwd: Path, site: Path | None = None) -> Ran:
         "PIP_DISABLE_PIP_VERSION_CHECK": "1",
         "PYTEST_ADDOPTS": "-p no:cacheprovider",
     }
-    return subprocess.run(command, capture_output=True, text=True, env=environment, cwd=cwd, check=False)
 
 
 def armcal(*arguments: str, cwd: Path, site: Path | None = None) -> Ran:
     """The command line, whether or not its script is installed."""
-    return run(sys.executable, "-m", "armcal.cli", *arguments, cwd=cwd, site=site)
+    return forked.armcal(*arguments, cwd=cwd, path=site, environment=variables(site or cwd / "site"))
 
 
 def install(package: Path, site: Path) -> None:

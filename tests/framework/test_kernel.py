@@ -7,7 +7,6 @@ import os
 import shutil
 import stat
 import subprocess
-import sys
 import textwrap
 import threading
 from concurrent.futures import ThreadPoolExecutor
@@ -23,6 +22,7 @@ from armcal.problem import kernel
 from armcal.problem.factor import Factor
 from armcal.problem.grouped_kernel import BLOCK_RECORDS
 from armcal.problem.kernel import build_kernel, kernel_source
+from forked import run_code
 
 AGREEMENT = 1e-12
 needs_compiler = pytest.mark.skipif(compiler.find_compiler() is None, reason="no C compiler on this machine")
@@ -561,20 +561,22 @@ SCRIPT = """
 """
 
 
+STARTERS = ThreadPoolExecutor(2)
+
+
 def start(repository, cache, evaluator="compiled", **environment):
-    """A process that evaluates the arm once."""
+    """A process that evaluates the arm once; two of them may run at once."""
     config = repository / "configs" / "lrm_arm" / "option3.yaml"
     text = SCRIPT.format(tests=str(repository / "tests"), config=str(config), evaluator=evaluator)
-    command = [sys.executable, "-c", textwrap.dedent(text)]
-    variables = {**os.environ, "ARMCAL_CACHE_DIR": str(cache), **environment}
-    return subprocess.Popen(command, env=variables, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    variables = {"ARMCAL_CACHE_DIR": str(cache), **environment}
+    return STARTERS.submit(run_code, textwrap.dedent(text), environment=variables)
 
 
 def finish(process):
     """Its backend and cost."""
-    out, err = process.communicate(timeout=100)
-    assert process.returncode == 0, err[-2000:]
-    backend, cost = json.loads(out.splitlines()[-1])
+    ran = process.result()
+    assert ran.returncode == 0, ran.stderr[-2000:]
+    backend, cost = json.loads(ran.stdout.splitlines()[-1])
     return backend, cost
 
 

@@ -13,6 +13,7 @@ from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import Any
 
+import forked
 import pytest
 import yaml
 from armcal.cli.main import cli
@@ -45,7 +46,8 @@ def armcal(*arguments: str, path: Path | None = None, cwd: Path | None = None, c
     if path is None and cwd is None:
         done = CliRunner().invoke(cli, arguments, env={"COLUMNS": str(columns)})
         return Ran(arguments, done.exit_code, done.stdout, done.stderr)
-    return python("-m", "armcal.cli", *arguments, path=path, cwd=cwd, columns=columns)
+    environment = {"COLUMNS": str(columns), "ARMCAL_CC": "none"}
+    return forked.armcal(*arguments, path=path, cwd=cwd, environment=environment)
 
 
 # Light registration
