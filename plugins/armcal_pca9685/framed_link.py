@@ -26,8 +26,8 @@ _TARGETS_AT_ONCE = MAX_PAYLOAD // 6
 _REFUSALS: Mapping[int, tuple[str, str]] = {
     Code.UNKNOWN_TYPE: ("its firmware does not know this request", "Load newer firmware."),
     Code.BAD_PAYLOAD: ("its firmware does not understand this request", "Load newer firmware."),
-    Code.NO_ADDRESS: ("no device answers at this I2C address", "Check address, power and wires."),
-    Code.NO_DATA: ("the device refuses byte {byte}", "Check its power and wires."),
+    Code.NO_ADDRESS: ("no device answers at the I2C address {address}", "Check address, power and wires."),
+    Code.NO_DATA: ("the device at {address} refuses {what}", "Check its power and wires."),
     Code.STUCK: ("its I2C bus is stuck: a line is held low", "Switch the servo board off and on."),
 }
 """Why a board refuses a request, and what to do."""
@@ -170,10 +170,10 @@ class FramedLink(GuardedLink, Link):
             while (left := until - time.monotonic()) > 0:
                 for frame in self._decoder.feed(self._port.read(left)):
                     if frame.sequence == self._sequence and frame.kind in (kind | Kind.REPLY, Kind.REFUSED):
-                        return self._read_reply(frame, kind)
+                        return self._read_reply(frame, kind, payload)
         return None
 
-    def _read_reply(self, frame: Frame, kind: Kind) -> bytes:
+    def _read_reply(self, frame: Frame, kind: Kind, payload: bytes) -> bytes:
         try:
             head, rest = messages.read_head(frame.payload)
             refusal = messages.Refusal.read(rest) if frame.kind == Kind.REFUSED else None
@@ -196,7 +196,11 @@ class FramedLink(GuardedLink, Link):
             raise DeviceResetError("the board has started anew.", where=self._where, hint="Look at its power.")
         unknown = (f"it gives code {refusal.code}", "Load newer firmware.")
         meaning, hint = _REFUSALS.get(refusal.code, unknown)
-        text = f"the board refuses {kind.name}: {meaning.format(byte=refusal.detail)}."
+        address, what = payload[0] if payload else 0, f"byte {refusal.detail}"
+        targets = messages.Set.read(payload).targets if kind == Kind.SET else ()
+        if refusal.detail < len(targets):
+            address, what = targets[refusal.detail].address, f"channel {targets[refusal.detail].channel}"
+        text = f"the board refuses {kind.name}: {meaning.format(what=what, address=f'0x{address:02x}')}."
         raise DeviceError(text, where=self._where, hint=hint)
 
     def _lose_to_board(self) -> NoReturn:

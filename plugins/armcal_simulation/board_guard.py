@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
 import struct
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from armcal.devices.framed.messages import Guard, GuardedChannel
 
@@ -43,6 +42,7 @@ class BoardGuard:
         self.took_over = False
         self._clock, self._bus = clock, bus
         self._guard: Guard | None = None
+        self._driven: tuple[GuardedChannel, ...] = ()
         self._heard = clock()
         self._leg: _Leg | None = None
         self._left: list[tuple[int, ...]] = []
@@ -59,7 +59,7 @@ class BoardGuard:
         self._heard = self._clock()
 
     def set(self, guard: Guard) -> None:
-        """Replace the guard set before; without channels, watch no more. A drive under way goes on.
+        """Replace the guard set before; without channels, watch no more. A drive under way goes on as it began.
 
         Raises:
             ValueError: a channel is none, or could never arrive.
@@ -86,22 +86,25 @@ class BoardGuard:
         """Do what is due."""
         now = self._clock()
         if not self.took_over and self._guard is not None and now >= self.next_event():
-            self.took_over, self._left = True, list(self._guard.waypoints)
+            self.took_over, self._left, self._driven = True, list(self._guard.waypoints), self._guard.channels
             self._next_tick = now
         if self.took_over and now >= self._next_tick:
             self._next_tick = now + TICK_S
-            with contextlib.suppress(BusStuckError):  # it tries again at the next tick
+            try:
                 self._drive(now)
+            except BusStuckError:  # it tries again at the next tick, and makes up for no time
+                if self._leg is not None:
+                    self._leg = replace(self._leg, begin=self._leg.begin + TICK_S)
 
     def _drive(self, now: float) -> None:
         if self._leg is None:
-            if not self._left or self._guard is None:
+            if not self._left:
                 self._next_tick = math.inf
                 return
             # channels without pulses stay without: nobody knows where their servos stand
             start: dict[GuardedChannel, int] = {}
             end: dict[GuardedChannel, int] = {}
-            for channel, target in zip(self._guard.channels, self._left[0], strict=True):
+            for channel, target in zip(self._driven, self._left[0], strict=True):
                 registers = self._bus.read(channel.address, LED0 + 4 * channel.channel, 4)
                 if registers is None or registers[3] & FULL or registers[1] & FULL:
                     continue

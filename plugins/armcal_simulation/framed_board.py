@@ -169,9 +169,9 @@ class FramedBoard:
         if any(target.channel > 15 for target in targets):
             raise ValueError("no such channel")
         self._require_host()
-        for target in targets:
+        for index, target in enumerate(targets):
             register = LED0 + 4 * target.channel
-            self._transaction(target.address, struct.pack("<BHH", register, target.on, target.off))
+            self._transaction(target.address, struct.pack("<BHH", register, target.on, target.off), index)
         return b""
 
     def _beat(self, payload: bytes) -> bytes:
@@ -187,9 +187,10 @@ class FramedBoard:
         if self.guard.took_over:
             raise _RefusedError(Code.TOOK_OVER)
 
-    def _transaction(self, address: int, data: bytes) -> None:
+    def _transaction(self, address: int, data: bytes, target: int | None = None) -> None:
+        """One write; a refusal's detail is the target's index, if there are several, else the byte's."""
         acknowledged = self._bus.write(address, data)
         if acknowledged == 0:
-            raise _RefusedError(Code.NO_ADDRESS)
+            raise _RefusedError(Code.NO_ADDRESS, target or 0)
         if acknowledged <= len(data):
-            raise _RefusedError(Code.NO_DATA, acknowledged - 1)
+            raise _RefusedError(Code.NO_DATA, acknowledged - 1 if target is None else target)

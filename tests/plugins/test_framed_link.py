@@ -146,8 +146,10 @@ def test_a_silent_board_is_lost(board):
 def test_what_the_board_refuses_is_told(board):
     link = link_to(board)
     link.open(board.clock)
-    with pytest.raises(DeviceError, match=r"WRITE.*no device answers"):
+    with pytest.raises(DeviceError, match=r"WRITE.*no device answers at the I2C address 0x55"):
         link.write(0x55, b"\0\0")
+    with pytest.raises(DeviceError, match=r"SET.*no device answers at the I2C address 0x41"):
+        link.set_counts({(0x40, 0): (0, 300), (0x41, 0): (0, 300)})
     with board.paused():
         board.bus.plan_nack(1)
     with pytest.raises(DeviceError, match="refuses byte 1"):

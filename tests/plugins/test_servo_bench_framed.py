@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import re
 import struct
 import zlib
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -163,9 +165,20 @@ def test_what_cannot_be_done_is_refused(at: BoardAtPty, kind: int, payload: byte
     assert found[0] == REFUSED and found[4] == bytes([kind, code, detail])
 
 
-def test_a_byte_that_is_not_acknowledged_is_told_with_its_index(at: BoardAtPty) -> None:
+def test_what_is_not_acknowledged_is_told_with_its_index(at: BoardAtPty) -> None:
+    at.bus.plan_nack(2)
+    assert one(at, WRITE, 1, bytes([ADDRESS, 0xFE, 121, 0]))[4] == bytes([WRITE, 4, 2])
     at.bus.plan_nack(3)
-    assert one(at, SET, 1, target(0, 0, 300))[4] == bytes([SET, 4, 3])
+    assert one(at, SET, 2, target(0, 0, 300))[4] == bytes([SET, 4, 0])
+
+
+def test_a_set_that_fails_in_the_middle_has_done_what_came_before(at: BoardAtPty) -> None:
+    sequence = woken(at)
+    one(at, SET, sequence, target(0, 0, 300) + target(1, 0, 300))
+    absent = bytes([ADDRESS + 1]) + target(0, 0, 350)[1:]
+    refused = one(at, SET, sequence + 1, target(0, 0, 310) + absent + target(1, 0, 310))
+    assert refused[0] == REFUSED and refused[4] == bytes([SET, 3, 1])
+    assert (counts(at, 0), counts(at, 1)) == (310, 300)
 
 
 def test_a_stuck_bus_is_told_and_flagged(at: BoardAtPty) -> None:
@@ -184,6 +197,20 @@ def test_a_reset_raises_the_counter_and_leaves_the_pulses(at: BoardAtPty) -> Non
     assert one(at, BEAT, 200)[2:4] == (8, 0)
     at.run(10.0)
     assert counts(at, 0) == 300
+
+
+def test_the_vectors_of_the_specification(at: BoardAtPty, repository: Path) -> None:
+    """Its table, request by request: what goes over the wire both ways; every message is among them."""
+    text = (repository / "docs" / "link_protocol.md").read_text(encoding="utf-8").partition("## Test vectors")[2]
+    rows = re.findall(r"^\| ([^|]*) \| `([0-9a-f ]+)` \| `([0-9a-f ]+)` \|$", text, flags=re.MULTILINE)
+    kinds = set()
+    for words, request, reply in rows:
+        at.run(2.0 if "2 s of silence" in words else 0.0)
+        assert at.ask(bytes.fromhex(request)).hex(" ") == reply, words
+        kinds.add(unstuffed(bytes.fromhex(request)[:-1])[0])
+    assert kinds >= {HELLO, TAKE, WRITE, READ, SET, BEAT, GUARD}
+    codes = {body[8] for _, _, r in rows if (body := unstuffed(bytes.fromhex(r)[:-1]))[0] == REFUSED}
+    assert codes == {1, 2, 3, 5, 6}
 
 
 class TestGuard:
@@ -254,6 +281,49 @@ class TestGuard:
         assert one(at, GUARD, sequence, guard(500, {}, []))[3] == 0
         at.run(5.0)
         assert counts(at, 0) == 300
+
+    def test_a_guard_that_comes_while_it_drives_is_for_the_next_time(self, at: BoardAtPty) -> None:
+        sequence = self.guarded(at)
+        at.run(1.0)
+        assert one(at, GUARD, sequence, guard(500, {0: 50.0}, [[100]]))[3] == GUARDED | TOOK_OVER
+        at.run(10.0)
+        assert (counts(at, 0), counts(at, 1)) == (340, 300), "it ends the drive that it began"
+        one(at, TAKE, sequence + 1, struct.pack("<I", 7))
+        at.run(10.0)
+        assert (counts(at, 0), counts(at, 1)) == (100, 300)
+
+    def test_a_guard_that_is_cleared_while_it_drives_ends_no_drive(self, at: BoardAtPty) -> None:
+        sequence = self.guarded(at)
+        at.run(1.0)
+        assert one(at, GUARD, sequence, guard(500, {}, []))[3] == TOOK_OVER
+        at.run(10.0)
+        assert (counts(at, 0), counts(at, 1)) == (340, 300)
+        one(at, TAKE, sequence + 1, struct.pack("<I", 7))
+        at.run(10.0)
+        assert one(at, BEAT, sequence + 2)[3] == 0
+
+    def test_after_a_takeover_the_next_drive_begins_at_the_first_waypoint(self, at: BoardAtPty) -> None:
+        sequence = self.guarded(at)
+        at.run(10.0)
+        assert counts(at, 0) == 340
+        one(at, TAKE, sequence, struct.pack("<I", 7))
+        seen = []
+        for _ in range(100):
+            at.run(0.02)
+            seen.append(counts(at, 0))
+        assert max(seen) == 350 and seen[-1] == 340
+
+    def test_a_bus_that_is_stuck_on_the_way_makes_the_drive_no_faster(self, at: BoardAtPty) -> None:
+        self.guarded(at)
+        at.run(1.0)
+        at.bus.hold_down(1.0)
+        seen = []
+        for _ in range(400):
+            at.run(0.01)
+            if not at.bus.stuck:
+                seen.append(counts(at, 1))
+        assert max(abs(b - a) for a, b in pairwise(seen)) <= 2, "40 counts a second at most"
+        assert seen[-1] == 300
 
     def test_a_stuck_bus_delays_the_drive_and_does_not_end_it(self, at: BoardAtPty) -> None:
         self.guarded(at)

@@ -234,7 +234,7 @@ class Guard:
 
 @dataclass(frozen=True)
 class Refusal:
-    """Why a request was refused; ``detail`` is the index of the byte that was not acknowledged."""
+    """Why a request was refused; ``detail`` is the index of what was not acknowledged: a byte of WRITE, a target of SET."""
 
     request: int
     code: int
