@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any, Literal
 
 import numpy as np
-from scipy.optimize import brentq
 
 from armcal.base.domains import Array
 from armcal.planning.relaxation import (
@@ -113,6 +112,8 @@ def _solve(cp: Any, problem: Any, solvers: tuple[str, ...]) -> None:
 
 def _feasible(task: Task, weights: Array | None) -> Array:
     """A solver's weights, put between their limits and on their sum by a shift."""
+    from scipy.optimize import brentq  # here, for it takes 0.2 s that no other command needs
+
     if weights is None or not np.isfinite(weights).all():
         raise ArithmeticError("cvxpy gave no weights")
     upper = float(task.limit)

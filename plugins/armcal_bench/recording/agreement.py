@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.stats import f as f_distribution
+from scipy.special import fdtri
 
 from armcal_bench.recording.quick_fit import Fitted, PredictedResidual, QuickFitter
 
@@ -133,7 +133,7 @@ def _is_beyond(distance: float, numbers: int, freedom: float, chance: float) -> 
 
 
 def _limit(numbers: int, freedom: float, chance: float) -> float:
-    return float(numbers * f_distribution.isf(chance, numbers, max(freedom, 1.0)))
+    return float(numbers * fdtri(numbers, max(freedom, 1.0), 1.0 - chance))
 
 
 def _offset(predicted: PredictedResidual) -> Offset:
