@@ -27,6 +27,7 @@ DEG = np.pi / 180
 LEVELS = np.array([100, 50, 100, 100, 100, 50]) * DEG
 DEMO = Path(__file__).resolve().parents[2] / "configs" / "lrm_arm"
 COUNT = 150
+QUICKLY = ("--set", "validation.folds=0", "--set", "evaluator=interpreted")
 NAMED = {
     "gravity": ("gravity", "", "the direction of gravity"),
     "payload": ("load", "", "a load at the tool"),
@@ -116,6 +117,7 @@ def said(found):
 
 
 @pytest.mark.parametrize("name", NAMED)
+@pytest.mark.quick("gravity", "heavy payload", "coupling", "step")
 def test_a_planted_cause_is_named_or_said_to_be_open(lrm, name):
     found = found_in(lrm, name, 3)
     assert graded(found, name) in (("open",) if name == "heavy payload" else ("right", "open"))
@@ -159,7 +161,7 @@ def test_noise_that_grows_is_noise_that_depends_on_the_order(lrm):
 
 def test_larger_noise_is_not_said_to_be_the_models_error(tmp_path):
     """Nothing but noise, of twice the declared size, through the command line."""
-    flags = ["--set", "measurements.tracker.noise_mm=0.25", "--set", "validation.folds=0", "--json"]
+    flags = ["--set", "measurements.tracker.noise_mm=0.25", *QUICKLY, "--json"]
     result = CliRunner().invoke(cli, ["run", str(DEMO / "demo.yaml"), "--out", str(tmp_path / "out"), *flags])
     assert result.exit_code == 0, result.output
     findings = json.loads(result.stdout)["verdict"]["findings"]
@@ -175,7 +177,7 @@ def test_a_stretched_instrument_is_named_by_the_command(tmp_path):
     rows = [[*line[:z], str(1.004 * float(line[z])), *line[z + 1 :]] for line in lines[1:]]
     (tmp_path / "data.csv").write_text("\n".join(",".join(line) for line in [lines[0], *rows]) + "\n")
     arguments = ["run", str(DEMO / "demo.yaml"), "--data", str(tmp_path / "data.csv"), "--out", str(tmp_path / "out")]
-    result = CliRunner().invoke(cli, [*arguments, "--json", "--set", "validation.folds=0"])
+    result = CliRunner().invoke(cli, [*arguments, "--json", *QUICKLY])
     assert result.exit_code == 0, result.output
     structure = json.loads((tmp_path / "out" / "metrics.json").read_text())["structure"]
     first = structure["residual_structure"]["structures"][0]

@@ -14,6 +14,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from armcal.cli.main import cli
 from recordings import DEMO, QUICK, ROOT, GuidedArm, Recording, angles_of, command, postures, recorded, still_lines
 
 
@@ -135,7 +136,7 @@ def test_keys_of_a_terminal_which_is_left_as_it_was(tmp_path: Path, arm: GuidedA
         os.close(follower)
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize("number", [signal.SIGTERM, pytest.param(signal.SIGHUP, marks=pytest.mark.slow)])
 def test_a_signal_ends_it_and_restores_the_terminal(tmp_path: Path, arm: GuidedArm, number: int) -> None:
     leader, follower = pty.openpty()
     before = termios.tcgetattr(follower)
@@ -236,9 +237,14 @@ class GuidedStep:
         (("--from", "-"), "nobody can say when to capture"),
     ],
 )
-def test_bad_requests_are_refused_before_anything_is_written(tmp_path: Path, more: tuple[str, ...], said: str) -> None:
-    done = command("record", DEMO, "--out", tmp_path / "out", *more, given="")
-    assert done.returncode == 2 and said in done.stderr and "Traceback" not in done.stderr, done.stderr
+def test_bad_requests_are_refused_before_anything_is_written(
+    tmp_path: Path, more: tuple[str, ...], said: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    with Path("/dev/null").open() as nothing, pytest.raises(SystemExit) as end:
+        monkeypatch.setattr(sys, "stdin", nothing)
+        cli.main(["record", str(DEMO), "--out", str(tmp_path / "out"), *more])
+    stderr = capsys.readouterr().err
+    assert end.value.code == 2 and said in stderr and "Traceback" not in stderr, stderr
     assert not (tmp_path / "out" / "dataset.csv").exists()
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -53,10 +52,10 @@ def test_weights_and_stiffness_are_the_derivatives_of_the_loss(name, dimension):
 
 @pytest.mark.parametrize("name", ["huber", "cauchy"])
 def test_a_location_in_space_keeps_its_stated_efficiency(name):
-    """Ten thousand experiments, located by plain reweighting."""
+    """Three thousand experiments, located by plain reweighting."""
     rng, count = np.random.default_rng(0), 20
     loss = tuned(name, 3)
-    data = rng.normal(size=(10000, count, 3))
+    data = rng.normal(size=(3000, count, 3))
     centre = data.mean(axis=1)
     for _ in range(60):
         weight = loss.weight(np.linalg.norm(data - centre[:, None], axis=2))[..., None]
@@ -73,6 +72,7 @@ def test_the_median_norm_is_that_of_the_chi_distribution():
 
 @every_loss
 @pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.quick("1-huber", "1-cauchy", "1-reject")
 def test_planted_outliers_do_not_move_the_answer(lrm, loss, seed):
     """5 % of the records are off by 20 mm: 40 times the noise."""
     q, points, wrong = measured(120, seed, outliers=0.05)
@@ -143,8 +143,8 @@ def test_hardly_any_experiment_without_outliers_has_a_record_set_aside(lrm):
 @pytest.mark.parametrize("loss", [pytest.param("huber", marks=pytest.mark.slow), "cauchy"])
 def test_the_answer_minimises_the_robust_cost(lrm, loss):
     """Against scipy on the loss itself, at the scale that was found."""
-    q, points, _ = measured(60, 7, outliers=0.05)
-    problem, records, start = posed(lrm, q, points, FEW[:5])
+    q, points, _ = measured(30, 7, outliers=0.1)
+    problem, records, start = posed(lrm, q, points, FEW[:4])
     found = fitted(problem, records, start, loss)
     kind, scale = tuned(loss, 3), scale_of(problem, records, start, loss)
     free, sd = list(problem.parameters.free_entries), found.estimate.deviations
@@ -155,9 +155,9 @@ def test_the_answer_minimises_the_robust_cost(lrm, loss):
         residual = np.linalg.norm(problem.residuals(values, records)[0], axis=0) / NOISE_M
         return scale**2 * kind.rho(residual / scale).sum()
 
-    best = minimize(cost, np.full(5, 0.3), method="BFGS")
-    assert cost(np.zeros(5)) <= best.fun + 1e-6
-    slopes = [(cost(1e-3 * e) - cost(-1e-3 * e)) / 2e-3 for e in np.eye(5)]
+    best = minimize(cost, np.full(4, 0.3), method="BFGS")
+    assert cost(np.zeros(4)) <= best.fun + 1e-6
+    slopes = [(cost(1e-3 * e) - cost(-1e-3 * e)) / 2e-3 for e in np.eye(4)]
     assert np.abs(slopes).max() < 1e-3
 
 
@@ -169,6 +169,7 @@ def scale_of(problem, records, start, loss):
 
 
 @pytest.mark.parametrize("loss", ["huber", "cauchy"])
+@pytest.mark.quick("huber")
 def test_once_the_scale_is_held_the_robust_cost_never_rises(lrm, loss, monkeypatch):
     monkeypatch.setattr(robust, "SCALE_SETTLED", 0.1)
     q, points, _ = measured(60, 8, outliers=0.1)
@@ -218,6 +219,7 @@ def test_neither_order_nor_unit_nor_axes_of_the_noise_matter(lrm, loss):
 
 
 @every_loss
+@pytest.mark.quick("reject")
 def test_both_solvers_give_the_same_robust_answer(lrm, loss):
     q, points, _ = measured(60, 12, outliers=0.05)
     problem, records, start = posed(lrm, q, points)
@@ -291,13 +293,15 @@ def test_a_record_that_was_set_aside_wrongly_comes_back(lrm):
     np.testing.assert_array_equal(found.weights[0] == 0, wrong)
 
 
-def test_measurements_without_any_noise_and_outliers(lrm):
+@every_loss
+@pytest.mark.parametrize("kind", [IpoptEstimator, CvxpyEstimator], ids=["ipopt", "cvxpy"])
+@pytest.mark.quick("ipopt-huber", "cvxpy-cauchy", "cvxpy-reject")
+def test_measurements_without_any_noise_and_outliers(lrm, kind, loss):
     q, points, wrong = measured(60, 17, outliers=0.05, noise=0.0)
     problem, records, truth = posed(lrm, q, points)
-    for loss, kind in itertools.product(LOSSES, (IpoptEstimator, CvxpyEstimator)):
-        found = fitted(problem, records, truth, loss, kind(kind.Settings()))
-        np.testing.assert_allclose(found.estimate.values, truth, atol=1e-6)
-        assert set(np.flatnonzero(wrong)) <= {s.record for s in found.suspects}
+    found = fitted(problem, records, truth, loss, kind(kind.Settings()))
+    np.testing.assert_allclose(found.estimate.values, truth, atol=1e-6)
+    assert set(np.flatnonzero(wrong)) <= {s.record for s in found.suspects}
 
 
 class _GivesUp:
@@ -316,6 +320,7 @@ class _GivesUp:
 
 @every_loss
 @pytest.mark.parametrize("good", [0, 1, 3])
+@pytest.mark.quick("0-huber", "1-cauchy", "3-reject")
 def test_a_solver_that_gives_up_on_the_way_is_not_called_converged(lrm, loss, good):
     q, points, _ = measured(60, 18, outliers=0.05)
     problem, records, start = posed(lrm, q, points)

@@ -29,6 +29,7 @@ SAME_SD, SAME_M = 1e-4, 1e-7
 PRIOR = 'parameters.priors={"arm.flex.*": 0.03 rad/Nm}'
 """What the arm can be: under a looser one a few dozen poses leave several minima, a deviation's fraction apart."""
 FREE = ("arm.mdh.theta?", "arm.mdh.d[45]", "arm.mdh.base_[xyz]", "arm.mdh.tool_[yz]", "arm.flex.*")
+FEW = ("arm.mdh.theta?", "arm.mdh.d[45]", "arm.flex.C[1-3]")
 
 
 def flexible(lrm, *overrides, free=FREE, start="0.005"):
@@ -201,6 +202,7 @@ def test_cone_and_root_agree_where_matrices_end_on_the_boundary(lrm, seed, count
 
 
 @pytest.mark.parametrize("solver", [CONE, ROOT], ids=["cone", "root"])
+@pytest.mark.quick("cone")
 def test_an_answer_meets_the_conditions_of_a_minimum_on_the_cone(lrm, solver):
     """Where a matrix gives, its gradient vanishes; where it does not, more compliance would cost."""
     problem, records = springs_measured(lrm, 4, 60)
@@ -226,7 +228,7 @@ def test_cone_and_root_agree_on_random_training_sets(lrm, seed):
     agree(lrm, seed, 40 + 20 * (seed % 4))
 
 
-@pytest.mark.parametrize("tight", ["0.01 rad/Nm", "0.001 rad/Nm"])
+@pytest.mark.parametrize("tight", ["0.01 rad/Nm", pytest.param("0.001 rad/Nm", marks=pytest.mark.slow)])
 def test_cone_and_root_agree_under_priors_on_everything(lrm, tight):
     """So few records that priors hold much of it."""
     every = f'"arm.flex.*": {tight}, "arm.mdh.theta?": 0.5 deg, "arm.mdh.[bdt]*_?": 1 mm, "arm.mdh.d?": 1 mm'
@@ -242,6 +244,7 @@ def rank_one(problem):
 
 
 @pytest.mark.parametrize("solver", [CONE, ROOT], ids=["cone", "root"])
+@pytest.mark.quick("root")
 def test_a_start_on_the_boundary_does_not_keep_a_solver_there(lrm, solver):
     q = oracle.random_poses(80, 7)
     definite = [np.diag([0.03, 0.02, 0.05])] * 7
@@ -286,7 +289,7 @@ def training_sets(lrm, seeds, solver):
 
 @pytest.mark.parametrize("solver", [CONE, pytest.param(ROOT, marks=pytest.mark.slow)], ids=["cone", "root"])
 def test_no_fit_has_a_negative_eigenvalue(lrm, solver):
-    assert min(training_sets(lrm, range(3), solver)) >= LEAST_EIGENVALUE
+    assert min(training_sets(lrm, range(1), solver)) >= LEAST_EIGENVALUE
 
 
 @pytest.mark.slow
@@ -299,7 +302,7 @@ def test_no_fit_of_many_has_a_negative_eigenvalue(lrm, solver, count):
 
 
 def test_the_order_of_the_records_does_not_matter(lrm):
-    problem, records = springs_measured(lrm, 11, 50)
+    problem, records = springs_measured(lrm, 11, 50, f"parameters.free={json.dumps(FEW)}")
     turned = problem.subset(records, np.random.default_rng(1).permutation(50))
     start = problem.parameters.nominal()
     one, other = (found(CONE.solve(problem, each, start)) for each in (records, turned))
@@ -330,7 +333,7 @@ def test_an_arm_ten_times_as_large_is_the_same_arm_in_another_unit(lrm, tmp_path
         config = {
             "extends": "arm.yaml",
             "arms": {"arm": {"effects": {"spring": None, "flex": {"type": "compliance"}}}},
-            "parameters": {"free": list(FREE), "priors": {"arm.flex.*": f"{0.03 / factor} rad/Nm"}},
+            "parameters": {"free": list(FEW), "priors": {"arm.flex.*": f"{0.03 / factor} rad/Nm"}},
         }
         config["arms"]["arm"]["effects"]["flex"]["compliance_rad_per_Nm"] = 0.005 / factor
         (tmp_path / "case.yaml").write_text(yaml.safe_dump(config))
@@ -385,7 +388,7 @@ def coverage(lrm, seeds, count=150, noise=2e-4):
 
 
 def test_truths_lie_within_a_few_deviations(lrm):
-    held, scores = coverage(lrm, range(3))
+    held, scores = coverage(lrm, range(2))
     assert held > 0.85 and np.abs(scores).max() < 4.5
     assert 0.6 < np.sqrt(np.mean(scores**2)) < 1.5
 
