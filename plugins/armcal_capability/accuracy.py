@@ -131,11 +131,7 @@ def _spread_root(calibration: Calibration) -> Array:
     kept = calibration.record.prediction
     if kept is None:
         raise TypeError("the calibration keeps no covariance")
-    rows = kept.covariance
-    covariance = np.zeros((len(rows), len(rows)))
-    for i, row in enumerate(rows):
-        covariance[i, : i + 1] = row
-    covariance += np.tril(covariance, -1).T
+    covariance = kept.symmetric_covariance
     scale = float(calibration.record.noise["scale"])
     for name, drift in (kept.recording.drifts if kept.recording else {}).items():
         for i, entry in enumerate(kept.entries):

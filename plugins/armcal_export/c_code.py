@@ -15,12 +15,10 @@ from armcal.calibration.tool_expression import ToolExpression
 from armcal.errors import ConfigError, InputError, Location
 from pydantic import field_validator
 
-from armcal_export.c_check import FileNames, compiled_and_run
+from armcal_export.c_check import FileNames, compiled_and_run, input_row, test_source
 from armcal_export.c_expressions import arm_functions
 from armcal_export.c_servos import servo_parts
-from armcal_export.c_template import filled, in_comment, quoted
-from armcal_export.c_test import input_row, test_source
-from armcal_export.c_writer import c_number
+from armcal_export.c_text import c_number, filled, in_comment, quoted
 from armcal_export.reference import reference_of
 
 CASES = 24

@@ -8,8 +8,7 @@ import casadi as ca
 from armcal.base.se3 import Expression
 from armcal.calibration.tool_expression import ToolExpression
 
-from armcal_export.c_template import filled
-from armcal_export.c_writer import c_function
+from armcal_export.c_text import c_function, filled
 
 MOST_WHOLE = 12000
 """Operations: slopes of more are evaluated column by column, so that they compile in seconds and fit small memories."""

@@ -6,8 +6,7 @@ import casadi as ca
 import numpy as np
 from armcal.calibration.tool_expression import ToolExpression
 
-from armcal_export.c_template import filled, with_prefix
-from armcal_export.c_writer import c_number
+from armcal_export.c_text import c_number, filled, with_prefix
 
 _DECLARATIONS = """
 /* The counts that a servo board is told for a command of a joint (from 0), the nearest; -1 of a joint that has no pulse

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import casadi as ca
 import numpy as np
@@ -11,8 +11,10 @@ from armcal.arm.environment import STATICS, tilted
 from armcal.arm.model import Chain, forward
 from armcal.arm.statics import MOUNT_FRAME, TOOL_FRAME, Load, frame_names
 from armcal.base.domains import Array
-from armcal.calibration.exporter import ExportRequest
+from armcal.calibration.exporter import ExportRequest, random_commands, rigid_tools
 from armcal.calibration.rigid_chain import RigidJoint, rigid_chain
+from armcal.errors import ProblemError
+from scipy.spatial.transform import Rotation
 
 from armcal_export.description import (
     SCHEMA,
@@ -30,7 +32,9 @@ from armcal_export.description import (
 )
 from armcal_export.springs import spring_numbers
 
-_UNKNOWN_KEYS = ("type",)
+TOLERANCE = 1e-12
+"""m, and entries of rotation matrices, for each metre and radian that a pose is made of."""
+REPORT = "Nothing was written. Please report this with the calibration."
 
 
 def chain_of(request: ExportRequest) -> Chain:
@@ -60,10 +64,23 @@ def describe(request: ExportRequest) -> ArmDescription:
         base_T_mount=_pose(rigid.base_T_mount),
         base_T_tool=_pose(rigid.base_T_tool),
         effects=_effects(request),
-        springs=_springs(request, chain),
+        springs=[
+            SpringEntry(
+                effect=spring.effect,
+                site=spring.site,
+                axes=spring.axes.T.tolist(),
+                along=spring.along,
+                compliance=spring.compliance.tolist(),
+                linear=spring.linear,
+            )
+            for spring in spring_numbers(request, chain)
+        ],
         masses=_masses(request, chain),
         statics=_statics(request),
-        servos=_servos(request),
+        servos=[
+            Servo(joint=name, angles_rad=list(table.angles), pulses_s=list(table.pulses), tick_s=clock.tick)
+            for name, (table, clock) in request.expression().servos.items()
+        ],
         parameters=_parameters(request),
     )
 
@@ -79,20 +96,33 @@ def rebuilt_tools(arm_description: ArmDescription, commands: Array) -> Array:
         follows = joint.follows
         q = given[joint.name] if follows is None else follows.multiplier * given[follows.joint] + follows.offset
         at = _matrix(joint.base_T_joint)
-        tools = tools @ at @ _motion(joint, q) @ np.linalg.inv(at)
+        moved = joint.scale * q
+        beside = joint.pitch * moved
+        turns, slides = (moved, beside) if joint.kind == "revolute" else (beside, moved)
+        tools = tools @ at @ motion(np.array(joint.axis), turns, slides) @ np.linalg.inv(at)
     return np.asarray(tools @ _matrix(arm_description.base_T_tool))
 
 
-def _motion(joint: Joint, q: Array) -> Array:
-    """Of a joint in its own frame (N x 4 x 4); Rodrigues' formula [Murray1994]."""
-    moved = joint.scale * q
-    turns, slides = (moved, joint.pitch * moved) if joint.kind == "revolute" else (joint.pitch * moved, moved)
-    axis = np.array(joint.axis)
-    cross = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
-    result = np.tile(np.eye(4), (len(moved), 1, 1))
-    result[:, :3, :3] += np.sin(turns)[:, None, None] * cross + (1 - np.cos(turns))[:, None, None] * (cross @ cross)
+def motion(axis: Array, turns: Array, slides: Array) -> Array:
+    """About and along a unit vector (N x 4 x 4); rad and m (N each)."""
+    result = np.tile(np.eye(4), (len(turns), 1, 1))
+    result[:, :3, :3] = Rotation.from_rotvec(turns[:, None] * axis).as_matrix()
     result[:, :3, 3] = slides[:, None] * axis
     return result
+
+
+def require_same_tools(request: ExportRequest, rebuilt: Callable[[Array], Array]) -> None:
+    """What reads back must put the tool (N x 4 x 4, of commands: joints x N) where the rigid arm has it.
+
+    Raises:
+        ProblemError: it does not.
+    """
+    commands = random_commands(request.arm)
+    expected = rigid_tools(request.arm, request.values, commands)
+    apart = float(np.abs(rebuilt(commands) - expected).max())
+    allowed = TOLERANCE * max(1.0, float(np.abs(expected).max()), float(np.abs(commands).max(initial=0.0)))
+    if not apart <= allowed:
+        raise ProblemError(f"what reads back is {apart:.3g} m or 1 off the calibrated arm.", hint=REPORT)
 
 
 def _matrix(pose: Pose) -> Array:
@@ -130,23 +160,9 @@ def _effects(request: ExportRequest) -> list[Effect]:
         Effect(
             name=name,
             type=str(described.get(name, {}).get("type", "")),
-            settings={key: value for key, value in described.get(name, {}).items() if key not in _UNKNOWN_KEYS},
+            settings={key: value for key, value in described.get(name, {}).items() if key != "type"},
         )
         for name in request.arm.effects
-    ]
-
-
-def _springs(request: ExportRequest, chain: Chain) -> list[SpringEntry]:
-    return [
-        SpringEntry(
-            effect=spring.effect,
-            site=spring.site,
-            axes=spring.axes.T.tolist(),
-            along=spring.along,
-            compliance=spring.compliance.tolist(),
-            linear=spring.linear,
-        )
-        for spring in spring_numbers(request, chain)
     ]
 
 
@@ -187,13 +203,6 @@ def _statics(request: ExportRequest) -> Statics:
         force_N=list(e.force),
         torque_Nm=list(e.torque),
     )
-
-
-def _servos(request: ExportRequest) -> list[Servo]:
-    return [
-        Servo(joint=name, angles_rad=list(table.angles), pulses_s=list(table.pulses), tick_s=clock.tick)
-        for name, (table, clock) in request.expression().servos.items()
-    ]
 
 
 def _parameters(request: ExportRequest) -> list[Parameter]:

@@ -7,20 +7,17 @@ from collections.abc import Mapping
 from importlib import resources
 from typing import Any, ClassVar, Literal
 
-import numpy as np
 import yaml
 from armcal.base.settings import Settings
-from armcal.calibration.exporter import Exported, ExportRequest, changed_numbers, random_commands, rigid_tools
+from armcal.calibration.exporter import Exported, ExportRequest, changed_numbers
 from armcal.errors import ProblemError
 from pydantic import ValidationError
+from typing_extensions import override
 
-from armcal_export.describe import describe, rebuilt_tools
+from armcal_export.describe import REPORT, describe, rebuilt_tools, require_same_tools
 from armcal_export.description import SCHEMA_FILE, ArmDescription
 
-TOLERANCE = 1e-12
-"""m, and entries of rotation matrices, for each metre and radian that a pose is made of."""
 _HEAD = "# A calibrated robot arm; {file} says what each field means. Units are SI, angles in rad.\n"
-_REPORT = "Nothing was written. Please report this with the calibration."
 
 
 class DescriptionSettings(Settings):
@@ -49,21 +46,33 @@ class YamlExporter:
             ProblemError: the tool hangs on a joint before the last, or what reads back is another arm.
         """
         arm_description = describe(request)
-        return _checked(request, arm_description, _yaml(arm_description), self._settings)
+        content = self.written(arm_description)
+        try:
+            again = read_description(content)
+        except (ValueError, ValidationError) as fault:
+            raise ProblemError(f"the description does not read back: {str(fault)[:300]}.", hint=REPORT) from fault
+        require_same_tools(request, lambda commands: rebuilt_tools(again, commands))
+        if again != arm_description:
+            raise ProblemError("what reads back is not the calibrated arm to the last digit.", hint=REPORT)
+        beside = {SCHEMA_FILE: schema()} if self._settings.beside == "schema" else {}
+        return Exported(content, changed_numbers(request), companions=beside)
+
+    def written(self, arm_description: ArmDescription) -> bytes:
+        """The file's content."""
+        text = yaml.dump(
+            arm_description.model_dump(mode="json"), Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=110,
+            default_flow_style=None,
+        )  # fmt: skip
+        return (_HEAD.format(file=SCHEMA_FILE) + text).encode("utf-8")
 
 
 class JsonExporter(YamlExporter):
     """As JSON."""
 
-    def export(self, request: ExportRequest) -> Exported:
-        """The description and its schema.
-
-        Raises:
-            ProblemError: the tool hangs on a joint before the last, or what reads back is another arm.
-        """
-        arm_description = describe(request)
-        text = json.dumps(arm_description.model_dump(mode="json"), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
-        return _checked(request, arm_description, text.encode("utf-8"), self._settings)
+    @override
+    def written(self, arm_description: ArmDescription) -> bytes:
+        text = json.dumps(arm_description.model_dump(mode="json"), indent=2, ensure_ascii=False, allow_nan=False)
+        return f"{text}\n".encode()
 
 
 def read_description(content: bytes) -> ArmDescription:
@@ -88,14 +97,6 @@ def schema() -> bytes:
     return resources.files("armcal_export").joinpath(SCHEMA_FILE).read_bytes()
 
 
-def _yaml(arm_description: ArmDescription) -> bytes:
-    text = yaml.dump(
-        arm_description.model_dump(mode="json"), Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=110,
-        default_flow_style=None,
-    )  # fmt: skip
-    return (_HEAD.format(file=SCHEMA_FILE) + text).encode("utf-8")
-
-
 class _Dumper(yaml.SafeDumper):
     """Rows of numbers on one line, and text of several lines in double quotes, which keep every kind of line end."""
 
@@ -105,20 +106,3 @@ def _quoted(dumper: yaml.SafeDumper, text: str) -> yaml.ScalarNode:
 
 
 _Dumper.add_representer(str, _quoted)
-
-
-def _checked(
-    request: ExportRequest, arm_description: ArmDescription, content: bytes, settings: DescriptionSettings
-) -> Exported:
-    try:
-        again = read_description(content)
-    except (ValueError, ValidationError) as fault:
-        raise ProblemError(f"the description does not read back: {str(fault)[:300]}.", hint=_REPORT) from fault
-    commands = random_commands(request.arm)
-    tools = rebuilt_tools(again, commands), rigid_tools(request.arm, request.values, commands)
-    apart = float(np.abs(tools[0] - tools[1]).max())
-    allowed = TOLERANCE * max(1.0, float(np.abs(tools[1]).max()), float(np.abs(commands).max(initial=0.0)))
-    if again != arm_description or not apart <= allowed:
-        raise ProblemError(f"what reads back is {apart:.3g} m or 1 off the calibrated arm.", hint=_REPORT)
-    beside = {SCHEMA_FILE: schema()} if settings.beside == "schema" else {}
-    return Exported(content, changed_numbers(request), companions=beside)

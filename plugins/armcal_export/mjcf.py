@@ -79,12 +79,7 @@ def _body(above: ElementTree.Element, name: str, pose: Array) -> ElementTree.Ele
 
 
 def _placed(pose: Array) -> dict[str, str]:
-    return {"pos": _row(pose[:3, 3]), "quat": _row(_quaternion(pose[:3, :3]))}
-
-
-def _quaternion(rotation: Array) -> Array:
-    """w, x, y, z, as MuJoCo has it."""
-    return np.array(quaternion_of(rotation))
+    return {"pos": _row(pose[:3, 3]), "quat": _row(quaternion_of(pose[:3, :3]))}
 
 
 def _joint(body: ElementTree.Element, joint: RigidJoint, drive: Drive) -> None:

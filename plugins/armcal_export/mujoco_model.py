@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar
 
 import casadi as ca
@@ -19,7 +18,7 @@ from armcal.calibration.rigid_chain import RigidChain, require_plain_axes, rigid
 from armcal.errors import InputError, NotConvergedError, ProblemError
 from pydantic import Field
 
-from armcal_export.describe import chain_of, describe
+from armcal_export.describe import REPORT, chain_of, describe
 from armcal_export.description import ArmDescription
 from armcal_export.mjcf import Drive, Hinge, mjcf
 from armcal_export.mujoco_rest import LoadedModel
@@ -31,7 +30,6 @@ TOLERANCE = 1e-9
 _COMMANDS = (-0.31, 0.42)
 _NO_SPRING = 1e-12
 """rad/(N m) or m/N: what gives less than this is no spring."""
-_REPORT = "Nothing was written. Please report this with the calibration."
 
 
 class MujocoSettings(Settings):
@@ -46,14 +44,6 @@ class MujocoSettings(Settings):
     gain: Annotated[float, Field(gt=0)] = 1000.0
     damping: Annotated[float, Field(ge=0)] = 20.0
     armature: Annotated[float, Field(gt=0)] = 0.01
-
-
-@dataclass(frozen=True)
-class _Sorted:
-    """The springs that MJCF holds, by site, and what it does not hold."""
-
-    hinges: Mapping[int, Sequence[Hinge]]
-    left_out: tuple[str, ...]
 
 
 class MujocoExporter:
@@ -75,14 +65,15 @@ class MujocoExporter:
         chain = chain_of(request)
         rigid, arm_description = rigid_chain(chain), describe(request)
         require_plain_axes(rigid, "mujoco")
-        hinges = _sorted(request, spring_numbers(request, chain), arm_description)
+        springs = spring_numbers(request, chain)
         drive = Drive(self._settings.gain, self._settings.damping, self._settings.armature)
-        content = mjcf(arm_description, rigid, hinges.hinges, drive)
+        content = mjcf(arm_description, rigid, _hinges(springs), drive)
         loaded = _loaded(content, rigid)
         commands = random_commands(request.arm, POSES)
         _compare(loaded, rigid_tools(request.arm, request.values, commands), commands)
         reach = _reach(request, loaded, commands)
-        left_out = hinges.left_out or (("turns of second order in its springs",) if reach > TOLERANCE else ())
+        left_out = _left_out(request, springs, arm_description)
+        left_out = left_out or (("turns of second order in its springs",) if reach > TOLERANCE else ())
         return Exported(content, changed_numbers(request), left_out, reach=reach)
 
 
@@ -94,11 +85,11 @@ def _loaded(content: bytes, rigid: RigidChain) -> LoadedModel:
             "the format mujoco needs MuJoCo, which is not installed.", hint="Install it: pip install armcal[mujoco]."
         ) from fault
     except ValueError as fault:
-        raise ProblemError(f"MuJoCo does not take the model: {str(fault)[:300]}.", hint=_REPORT) from fault
+        raise ProblemError(f"MuJoCo does not take the model: {str(fault)[:300]}.", hint=REPORT) from fault
 
 
-def _sorted(request: ExportRequest, springs: Sequence[SpringNumbers], arm_description: ArmDescription) -> _Sorted:
-    """Linear springs as hinges along principal axes; the rest by name."""
+def _hinges(springs: Sequence[SpringNumbers]) -> Mapping[int, Sequence[Hinge]]:
+    """Linear springs as hinges along principal axes, by site."""
     turning: dict[int, Array] = defaultdict(lambda: np.zeros((3, 3)))
     sliding: dict[int, float] = defaultdict(float)
     axes: dict[int, Array] = {}
@@ -116,7 +107,7 @@ def _sorted(request: ExportRequest, springs: Sequence[SpringNumbers], arm_descri
     for site, matrix in turning.items():
         sizes, directions = np.linalg.eigh(0.5 * (matrix + matrix.T))
         hinges[site] += _kept([(_snapped(directions[:, i]), sizes[i]) for i in range(3)], slides=False)
-    return _Sorted(hinges, _left_out(request, springs, arm_description))
+    return hinges
 
 
 def _kept(axes: Sequence[tuple[Array, float]], slides: bool) -> list[Hinge]:
@@ -164,7 +155,7 @@ def _compare(loaded: LoadedModel, expected: Array, commands: Array) -> None:
     apart = float(np.abs(tools - expected).max())
     if not apart <= TOLERANCE:
         raise ProblemError(
-            f"MuJoCo's arm is {apart:.3g} m or 1 off the calibrated one, expected {TOLERANCE:g} at most.", hint=_REPORT
+            f"MuJoCo's arm is {apart:.3g} m or 1 off the calibrated one, expected {TOLERANCE:g} at most.", hint=REPORT
         )
 
 

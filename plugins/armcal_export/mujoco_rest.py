@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -11,13 +10,6 @@ from armcal.calibration.rigid_chain import RigidChain
 from armcal.errors import NotConvergedError
 
 _TURNS, _AT_REST, _FARTHEST, _DIFFERENCE = 60, 1e-12, 1.5, 1e-6
-
-
-def _mujoco() -> ModuleType:
-    import mujoco
-
-    module: ModuleType = mujoco
-    return module
 
 
 class LoadedModel:
@@ -29,14 +21,15 @@ class LoadedModel:
     """
 
     def __init__(self, content: bytes, rigid: RigidChain) -> None:
-        self._mujoco = _mujoco()
+        import mujoco
+
+        self._mujoco: Any = mujoco
         self._model: Any = self._mujoco.MjModel.from_xml_string(content.decode("utf-8"))
         self._data: Any = self._mujoco.MjData(self._model)
         self._rigid = rigid
         self._site = self._model.site("tool").id
-        places = {joint.name: int(self._model.joint(joint.name).qposadr[0]) for joint in rigid.joints}
-        self._places = places
-        driven = set(places.values())
+        self._places = {joint.name: int(self._model.joint(joint.name).qposadr[0]) for joint in rigid.joints}
+        driven = set(self._places.values())
         self._springs = np.array([i for i in range(self._model.nq) if i not in driven], dtype=int)
 
     def rigid_tool(self, command: Array) -> Array:

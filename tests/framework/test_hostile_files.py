@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 from armcal.base.shown import shown
 from armcal.cli.main import cli
-from armcal_export.c_template import in_comment
+from armcal_export.c_text import in_comment
 from armcal_export.ros2_text import read_ros2, ros2_text
 from click.testing import CliRunner, Result
 from made_calibrations import written

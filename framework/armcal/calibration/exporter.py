@@ -12,18 +12,16 @@ from typing import Any, Protocol
 import casadi as ca
 import numpy as np
 
-from armcal.arm.assembly import Arm, ArmState
+from armcal.arm.assembly import Arm
 from armcal.arm.environment import STATICS, Environment
-from armcal.arm.model import forward
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.base.parameters import ParameterBlock, Parameters
-from armcal.base.se3 import Expression
 from armcal.calibration.calibration import Calibration, arm_named
 from armcal.calibration.calibration_file import ParameterRecord
+from armcal.calibration.rigid_chain import tool_poses
 from armcal.calibration.tool_expression import ToolExpression, arm_expression
 from armcal.errors import NotConvergedError
-from armcal.measure.measurement import Channel
 
 POSES = 1000
 """So many random poses, within the joints' limits, are compared."""
@@ -171,12 +169,7 @@ def random_commands(arm: Arm, count: int = POSES, seed: int = 1) -> Array:
 def rigid_tools(arm: Arm, values: Mapping[str, Array], commands: Array) -> Array:
     """base_T_tool (N x 4 x 4) without effects, at commands (joints x N) and parameters by full name."""
     chain = arm.chain({name: ca.SX(list(value)) for name, value in values.items()})
-    sx = ca.SX.sym("commands", commands.shape[0])
-    moved = arm.joint_commands(ca.vertsplit(sx))
-    frames = forward(chain, [joint.offset + moved[i] for i, joint in enumerate(chain.joints)], {})
-    function = ca.Function("tool", [sx], [ca.vec(ca.densify(frames.base_T_tool.matrix()))], {"cse": True})
-    tools = np.asarray(function.map(commands.shape[1])(commands).full())
-    return tools.T.reshape(-1, 4, 4).transpose(0, 2, 1)
+    return tool_poses(chain, np.stack(arm.joint_commands([*commands]), axis=1))
 
 
 def effects_reach(calibration: Calibration, request: ExportRequest) -> float | None:
@@ -192,7 +185,7 @@ def effects_reach(calibration: Calibration, request: ExportRequest) -> float | N
     statics = calibration.system.statics
     if statics.payload is None:
         statics = statics.model_copy(update={"payload": 0.0})
-    alone = replace(calibration.system, measurements={"tool": _ToolOf(request.name)}, statics=statics)
+    alone = replace(calibration.system, arms={request.name: request.arm}, measurements={}, statics=statics)
     channels = {f"{request.name}.{joint}": row for joint, row in zip(request.arm.commanded, commands, strict=True)}
     poses = Dataset(tuple(str(i) for i in range(commands.shape[1])), channels)
     try:
@@ -201,37 +194,3 @@ def effects_reach(calibration: Calibration, request: ExportRequest) -> float | N
         return None
     apart = tools[0][:, :3, 3] - rigid_tools(request.arm, request.values, commands)[:, :3, 3]
     return float(np.linalg.norm(apart, axis=1).max())
-
-
-@dataclass(frozen=True)
-class _ToolOf:
-    """A measurement without an instrument, to have an arm's tool."""
-
-    arm: str
-
-    @property
-    def arms(self) -> tuple[str, ...]:
-        """One."""
-        return (self.arm,)
-
-    def parameters(self) -> tuple[ParameterBlock, ...]:
-        """None."""
-        return ()
-
-    def channels(self) -> tuple[Channel, ...]:
-        """None."""
-        return ()
-
-    def outputs(self, arms: Mapping[str, ArmState], values: Mapping[str, Expression]) -> Mapping[str, Expression]:
-        """Nothing."""
-        return {}
-
-    def residual(
-        self, arms: Mapping[str, ArmState], measured: Mapping[str, Expression], values: Mapping[str, Expression]
-    ) -> Expression:
-        """The tool's position (m)."""
-        return arms[self.arm].base_T_tool.translation
-
-    def noise(self) -> Sequence[float]:
-        """One metre."""
-        return (1.0, 1.0, 1.0)

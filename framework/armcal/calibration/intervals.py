@@ -71,6 +71,14 @@ class PredictionRecord(Settings):
     columns: dict[str, str] = Field(default_factory=dict)
     recording: RecordingRecord | None = None
 
+    @property
+    def symmetric_covariance(self) -> Array:
+        """Of the free entries, both triangles."""
+        lower = np.zeros((len(self.covariance), len(self.covariance)))
+        for i, row in enumerate(self.covariance):
+            lower[i, : i + 1] = row
+        return lower + np.tril(lower, -1).T
+
 
 @dataclass(frozen=True)
 class PlusMinus:
@@ -189,7 +197,7 @@ class Uncertainty:
         return _Part(places, "same", off, spreads, reading_slopes(problem, self.values, records))
 
     def _predictor(self, problem: Problem, drift: KnownDrift | None) -> Predictor:
-        return Predictor(problem, self.values, self._covariance, self.noise_scale, self.freedom, drift)
+        return Predictor(problem, self.values, self.record.symmetric_covariance, self.noise_scale, self.freedom, drift)
 
     def _known_drift(self, recording: RecordingRecord, dataset: Dataset, along: Chain | None) -> KnownDrift:
         """The drift of the recording, told by its records, along a chain of places."""
@@ -228,14 +236,6 @@ class Uncertainty:
         return self.parameters.replaced(
             {n: replace(self.parameters[n], drift=Drift(d.sd, d.over, d.channel)) for n, d in drifts.items()}
         )
-
-    @cached_property
-    def _covariance(self) -> Array:
-        rows = self.record.covariance
-        lower = np.zeros((len(rows), len(rows)))
-        for i, row in enumerate(rows):
-            lower[i, : i + 1] = row
-        return lower + np.tril(lower, -1).T
 
     def _whitened(self, problem: Problem, records: tuple[FactorRecords, ...]) -> tuple[FactorRecords, ...]:
         """With the noise that the calibration estimated, if it did."""

@@ -22,6 +22,7 @@ from armcal.base.domains import Array
 from armcal.base.parameters import Parameters
 from armcal.base.settings import Settings
 from armcal.calibration.intervals import PlusMinus
+from armcal.calibration.tool_expression import poses_of
 from armcal.config.system import System
 from armcal.estimate.validation import Indices
 from armcal.measure.contact import ArmsAlone
@@ -110,7 +111,7 @@ def predict(system: System, parameters: Parameters, commands: Dataset) -> tuple[
         for kernel, values in zip(problem.kernels, shown, strict=True)
         for row, channel in enumerate(kernel.factor.output_channels)
     }
-    return channels, _poses(shown[0][len(problem.kernels[0].factor.output_channels) :])
+    return channels, poses_of(shown[0][len(problem.kernels[0].factor.output_channels) :])
 
 
 def components(system: System, registry: PluginRegistry) -> tuple[ComponentRecord, ...]:
@@ -142,20 +143,13 @@ def components(system: System, registry: PluginRegistry) -> tuple[ComponentRecor
 def absent(kept: tuple[ComponentRecord, ...], registry: PluginRegistry) -> ComponentRecord | None:
     """The first component that no plugin offers."""
     offered = {(component.kind, component.name) for component in registry.components} | {("core", "arm")}
-    return next(
-        (
-            component_record
-            for component_record in kept
-            if (component_record.kind, component_record.name) not in offered
-        ),
-        None,
-    )
+    return next((record for record in kept if (record.kind, record.name) not in offered), None)
 
 
 def differences(kept: tuple[ComponentRecord, ...], now: tuple[ComponentRecord, ...]) -> list[str]:
     """What is another than it was, a phrase each: versions, and sources of the same version."""
     texts: dict[str, None] = {}
-    present = {(component_record.kind, component_record.name): component_record for component_record in now}
+    present = {(record.kind, record.name): record for record in now}
     for old in kept:
         new = present.get((old.kind, old.name))
         if new is None or new == old:
@@ -262,13 +256,3 @@ def _release(component: ComponentRecord) -> str:
     if component.distribution:
         return f"{component.distribution} {component.version}"
     return f"the plugin {component.plugin}"
-
-
-def _poses(tools: Array) -> Array:
-    """Stacked 3x4 columns (12 an arm x N) as homogeneous matrices (arms x N x 4 x 4)."""
-    count = tools.shape[1]
-    columns = tools.reshape(-1, 4, 3, count)
-    poses = np.zeros((len(columns), count, 4, 4))
-    poses[:, :, :3, :] = columns.transpose(0, 3, 2, 1)
-    poses[:, :, 3, 3] = 1.0
-    return poses

@@ -132,10 +132,7 @@ def tool_poses(chain: Chain, commands: Array) -> Array:
 def largest_difference(one: Array, two: Array) -> tuple[float, float]:
     """The largest distance (m) and the largest angle (rad) between poses (N x 4 x 4), pose by pose."""
     apart = float(np.linalg.norm(one[:, :3, 3] - two[:, :3, 3], axis=1).max())
-    turn = one[:, :3, :3].transpose(0, 2, 1) @ two[:, :3, :3]
-    vee = np.stack([turn[:, 2, 1] - turn[:, 1, 2], turn[:, 0, 2] - turn[:, 2, 0], turn[:, 1, 0] - turn[:, 0, 1]], 1)
-    angles = np.arctan2(0.5 * np.linalg.norm(vee, axis=1), 0.5 * (np.trace(turn, axis1=1, axis2=2) - 1))
-    return apart, float(angles.max())
+    return apart, float(np.linalg.norm(turn_between(one[:, :3, :3], two[:, :3, :3]), axis=1).max())
 
 
 def turn_between(here: Array, there: Array) -> Array:

@@ -19,21 +19,26 @@ LANES = 8
 
 _BINARY = {"ADD": "{} + {}", "SUB": "{} - {}", "MUL": "{} * {}", "DIV": "{} / {}"}
 _UNARY = {"NEG": "-{}", "SQ": "{0} * {0}", "TWICE": "{0} + {0}", "INV": "1.0 / {}", "ASSIGN": "{}"}
-_LIBRARY = {
+LIBRARY = {
     "SQRT": "sqrt", "TAN": "tan", "ASIN": "asin", "ACOS": "acos", "ATAN": "atan", "EXP": "exp", "LOG": "log",
     "SINH": "sinh", "COSH": "cosh", "TANH": "tanh", "FABS": "fabs", "ERF": "erf", "FLOOR": "floor",
-    "CEIL": "ceil", "ATAN2": "atan2", "POW": "pow",
-    "CONSTPOW": "pow", "FMIN": "fmin", "FMAX": "fmax", "COPYSIGN": "copysign", "SIGN": "sign_of", "LT": "less",
-    "LE": "less_equal", "EQ": "equal", "NE": "unequal", "NOT": "negation", "AND": "both", "OR": "either",
-    "IF_ELSE_ZERO": "if_else_zero", "SIN": "sine", "COS": "cosine",
+    "CEIL": "ceil", "ATAN2": "atan2", "POW": "pow", "CONSTPOW": "pow", "FMIN": "fmin", "FMAX": "fmax",
+    "COPYSIGN": "copysign",
 }  # fmt: skip
-_TWO_ARGUMENTS = {
+"""Operations of CasADi that are functions of the C library."""
+_OWN = {
+    "SIGN": "sign_of", "LT": "less", "LE": "less_equal", "EQ": "equal", "NE": "unequal", "NOT": "negation",
+    "AND": "both", "OR": "either", "IF_ELSE_ZERO": "if_else_zero", "SIN": "sine", "COS": "cosine",
+}  # fmt: skip
+_FUNCTIONS = LIBRARY | _OWN
+TWO_ARGUMENTS = {
     "ATAN2", "POW", "CONSTPOW", "FMIN", "FMAX", "COPYSIGN", "LT", "LE", "EQ", "NE", "AND", "OR", "IF_ELSE_ZERO",
 }  # fmt: skip
 
 
 @cache
-def _operations() -> Mapping[int, str]:
+def operations() -> Mapping[int, str]:
+    """CasADi's operations by number: ``ADD``, ``SIN``."""
     return {getattr(ca, name): name[3:] for name in dir(ca) if name.startswith("OP_")}
 
 
@@ -74,7 +79,7 @@ class _Writer:
         """Write every instruction."""
         f = self._function
         for k in range(f.n_instructions()):
-            self._instruction(_operations()[f.instruction_id(k)], f.instruction_input(k), f.instruction_output(k), k)
+            self._instruction(operations()[f.instruction_id(k)], f.instruction_input(k), f.instruction_output(k), k)
 
     def _instruction(self, operation: str, i: list[int], o: list[int], k: int) -> None:
         if operation == "INPUT":
@@ -92,9 +97,9 @@ class _Writer:
     def _operate(self, operation: str, arguments: list[_Term]) -> _Term:
         if operation in ("MUL", "ADD", "SUB", "DIV"):
             pass
-        elif operation in _UNARY or (operation in _LIBRARY and operation not in _TWO_ARGUMENTS):
+        elif operation in _UNARY or (operation in _FUNCTIONS and operation not in TWO_ARGUMENTS):
             arguments = arguments[:1]
-        elif operation not in _TWO_ARGUMENTS:
+        elif operation not in TWO_ARGUMENTS:
             raise UnsupportedExpressionError(operation)
         uniform = all(a.uniform for a in arguments)
         if operation in ("SIN", "COS") and not uniform:
@@ -105,7 +110,7 @@ class _Writer:
             return self._assign(pattern.format(*texts), uniform)
         prefix = "s_" if uniform else "v_"
         texts = [a.text if uniform else self._read(a, vector=True) for a in arguments]
-        return self._assign(f"{prefix}{_LIBRARY[operation]}({', '.join(texts)})", uniform)
+        return self._assign(f"{prefix}{_FUNCTIONS[operation]}({', '.join(texts)})", uniform)
 
     def _sine_and_cosine(self, operation: str, argument: _Term) -> _Term:
         """One call gives both; most angles want both."""

@@ -1,17 +1,21 @@
-"""CasADi functions as plain scalar C99: one assignment for each operation, no memory, no state.
+"""Text in C99: CasADi functions, numbers, words of a user's, and templates that are filled.
 
-CasADi's own generated C drags a calling convention of pointers to pointers and work arrays along, and does not pass
-``-pedantic -Wextra``. Its instruction list, written out over local constants, needs neither.
+A function is plain and scalar: one assignment for each operation, no memory, no state. CasADi's own generated C drags a
+calling convention of pointers to pointers and work arrays along, and does not pass ``-pedantic -Wextra``. Its
+instruction list, written out over local constants, needs neither.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from functools import cache
+import re
+from collections.abc import Sequence
+from importlib import resources
 
 import casadi as ca
+from armcal.base.shown import shown
 from armcal.errors import ConfigError
+from armcal.functions.c_source import LIBRARY, TWO_ARGUMENTS, operations
 
 _OPERATORS = {
     "ADD": "{0} + {1}", "SUB": "{0} - {1}", "MUL": "{0} * {1}", "DIV": "{0} / {1}", "NEG": "-{0}", "SQ": "{0} * {0}",
@@ -21,20 +25,9 @@ _OPERATORS = {
     "OR": "({0} != 0.0) || ({1} != 0.0) ? 1.0 : 0.0", "IF_ELSE_ZERO": "{0} != 0.0 ? {1} : 0.0",
     "SIGN": "{0} < 0.0 ? -1.0 : ({0} > 0.0 ? 1.0 : {0})",
 }  # fmt: skip
-_LIBRARY = {
-    "SIN": "sin", "COS": "cos", "TAN": "tan", "ASIN": "asin", "ACOS": "acos", "ATAN": "atan", "SQRT": "sqrt",
-    "EXP": "exp", "LOG": "log", "SINH": "sinh", "COSH": "cosh", "TANH": "tanh", "FABS": "fabs", "ERF": "erf",
-    "FLOOR": "floor", "CEIL": "ceil", "ATAN2": "atan2", "POW": "pow", "CONSTPOW": "pow", "FMIN": "fmin",
-    "FMAX": "fmax", "COPYSIGN": "copysign",
-}  # fmt: skip
-_OF_TWO = {"ADD", "SUB", "MUL", "DIV", "LT", "LE", "EQ", "NE", "AND", "OR", "IF_ELSE_ZERO"} | {
-    "ATAN2", "POW", "CONSTPOW", "FMIN", "FMAX", "COPYSIGN",
-}  # fmt: skip
-
-
-@cache
-def _operations() -> Mapping[int, str]:
-    return {getattr(ca, name): name[3:] for name in dir(ca) if name.startswith("OP_")}
+_PLACE = re.compile(r"\{\{(\w+)\}\}")
+_PREFIX = re.compile(r"\b(arm|ARM)_")
+_LIBRARY = {**LIBRARY, "SIN": "sin", "COS": "cos"}
 
 
 def c_number(value: float) -> str:
@@ -55,7 +48,7 @@ def c_function(function: ca.Function, name: str, inputs: Sequence[str], outputs:
     values: dict[int, str] = {}
     lines = [f"(void){text};" for text in (*inputs, *outputs)]
     for k in range(function.n_instructions()):
-        operation = _operations()[function.instruction_id(k)]
+        operation = operations()[function.instruction_id(k)]
         i, o = function.instruction_input(k), function.instruction_output(k)
         if operation == "OUTPUT":
             lines.append(f"{outputs[o[0]]}[{o[1]}] = {values[i[0]]};")
@@ -73,12 +66,34 @@ def c_function(function: ca.Function, name: str, inputs: Sequence[str], outputs:
 
 
 def _written(operation: str, arguments: list[str]) -> str:
-    used = arguments if operation in _OF_TWO else arguments[:1]
     if operation in _OPERATORS:
-        return _OPERATORS[operation].format(*used)
+        return _OPERATORS[operation].format(*arguments)
     if operation in _LIBRARY:
-        return f"{_LIBRARY[operation]}({', '.join(used)})"
+        return f"{_LIBRARY[operation]}({', '.join(arguments if operation in TWO_ARGUMENTS else arguments[:1])})"
     raise ConfigError(
         f"the arm's expression has the operation {operation}, which has no form in C99.",
         hint="Leave the effect that brings it out of the calibration.",
     )
+
+
+def filled(template: str, prefix: str, **values: str) -> str:
+    """A template with its places filled, and its names that begin with ``arm_`` or ``ARM_`` under another prefix."""
+    text = resources.files("armcal_export").joinpath("templates", template).read_text(encoding="utf-8")
+    return _PLACE.sub(lambda match: values[match[1]], with_prefix(text, prefix))
+
+
+def with_prefix(text: str, prefix: str) -> str:
+    """Names under another prefix."""
+    return _PREFIX.sub(lambda match: f"{prefix if match[1] == 'arm' else prefix.upper()}_", text)
+
+
+def in_comment(text: str) -> str:
+    """Text of a user's as it can stand in a comment: ASCII, one line, and no end of a comment."""
+    line = shown(" ".join(text.split())).encode("ascii", "replace").decode()
+    return line.replace("*/", "* /").replace("/*", "/ *").replace("\\", "/").replace("??", "? ?")
+
+
+def quoted(text: str) -> str:
+    """Text as a C string; what is not printable ASCII in octal."""
+    plain = {byte: chr(byte) for byte in range(32, 127) if chr(byte) not in '"\\?'}
+    return '"' + "".join(plain.get(byte, f"\\{byte:03o}") for byte in text.encode("utf-8")) + '"'
