@@ -5,12 +5,14 @@ from __future__ import annotations
 import inspect
 import subprocess
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from pkgutil import resolve_name
 from types import MappingProxyType
 from typing import Any
 
 import click
 
+from armcal.hooks import KINDS
 from armcal.plugins import Component, PluginInfo, PluginRegistry
 from armcal.testing.board_checks import check_bench, check_device, check_link
 from armcal.testing.effect_checks import check_effect
@@ -26,7 +28,28 @@ from armcal.testing.results import CheckResult, ContractError, Recorder, expect
 from armcal.testing.settings_checks import Subject, check_settings
 from armcal.testing.simulator_checks import check_simulator
 
-__all__ = ["CheckResult", "check_component", "check_plugin"]
+__all__ = ["KNOWN_CHECKS", "CheckResult", "assert_contract", "check_component", "check_plugin"]
+
+KNOWN_CHECKS: Mapping[str, int] = MappingProxyType(
+    {
+        "model": 28,
+        "effect": 26,
+        "measurement": 29,
+        "reader": 23,
+        "estimator": 22,
+        "online": 20,
+        "simulator": 14,
+        "exporter": 15,
+        "link": 18,
+        "device": 39,
+        "tracker": 18,
+        "joints": 19,
+        "bench": 13,
+        "command": 2,
+        "report_section": 2,
+    }
+)
+"""How many checks run on any component of a kind; what a component has beside the rest adds to them."""
 
 _MARK = "imported:"
 _LONGEST_IMPORT_S = 60
@@ -50,61 +73,91 @@ _CHECKS: Mapping[str, Callable[[Recorder, Subject], None]] = MappingProxyType(
 )
 
 
+def assert_contract(component: type | str, kind: str, *, at_least: int | None = None) -> Sequence[CheckResult]:
+    """Check a component, for a test of your own.
+
+    Args:
+        component: its class, or ``module:attribute`` of it.
+        kind: what it is registered as: ``model``, ``effect``, ``measurement`` and so on.
+        at_least: so many checks must run; by default as many as on any component of its kind.
+
+    Returns:
+        results: of all checks, those that did not run included.
+
+    Raises:
+        AssertionError: it breaks the contract, or fewer checks ran. All faults are listed.
+        ValueError: no such kind.
+    """
+    if kind not in KINDS:
+        raise ValueError(f"found the kind {kind!r}, expected one of {', '.join(KINDS)}")
+    name = component if isinstance(component, str) else component.__qualname__
+    results = _checked(kind, name, lambda: _loaded(component))
+    faults = [f"  {result.check}: {result.fault}" for result in results if result.fault]
+    left = [f"  {result.check}" for result in results if result.not_run]
+    ran, expected = len(results) - len(left), KNOWN_CHECKS[kind] if at_least is None else at_least
+    if faults:
+        raise AssertionError("\n".join([f"{kind} {name} breaks the plugin contract:", *faults]))
+    if ran < expected:
+        raise AssertionError("\n".join([f"{kind} {name}: {ran} checks ran, expected at least {expected}.", *left]))
+    return results
+
+
+def _loaded(component: type | str) -> Any:
+    if isinstance(component, str) and ":" not in component:
+        raise ValueError(f"found {component!r}, expected module:attribute")
+    return resolve_name(component) if isinstance(component, str) else component
+
+
 def check_component(component: Component) -> list[CheckResult]:
     """Every check of the component's kind; what the component raises becomes a fault, never an exception."""
-    return check_made(component.kind, component.name, component.load)
+    return _checked(component.kind, component.name, component.load)
 
 
 def check_plugin(plugin: PluginInfo, registry: PluginRegistry) -> list[CheckResult]:
     """The plugin's registration, then every component that it announced."""
     record = Recorder(f"plugin {plugin.name}")
-    record.check("it loads, with no hook that armcal does not know", lambda: expect(not plugin.fault, plugin.fault))
+    with record.check("it loads, with no hook that armcal does not know"):
+        expect(not plugin.fault, plugin.fault)
     if plugin.fault:
         return record.results
     if not plugin.is_file:
-        record.check("its registration imports nothing heavy", _imports_light, plugin.module)
+        with record.check("its registration imports nothing heavy"):
+            _expect_light(plugin.module)
     own = registry.announced_by(plugin)
     for component in own:
-        name = f"the {component.kind} {component.name!r} is offered once"
-        record.check(name, registry.find, component.kind, component.name)
+        with record.check(f"the {component.kind} {component.name!r} is offered once"):
+            registry.find(component.kind, component.name)
     return record.results + [result for component in own for result in check_component(component)]
 
 
-def check_made(kind: str, name: str, load: Callable[[], Any]) -> list[CheckResult]:
+def _checked(kind: str, name: str, load: Callable[[], Any]) -> list[CheckResult]:
     """Every check of a kind on what ``load`` gives: a component's class."""
     record = Recorder(f"{kind} {name}")
-    record.guard(lambda: _check_kind(record, kind, load))
+    with record.group():
+        if kind == "command":  # it is imported for one call of armcal, and may do to the process what it needs
+            with record.needed("it imports"):
+                command = load()
+            with record.check("it is a click command that says what it does"):
+                expect(isinstance(command, click.Command), f"found {type(command).__name__}, expected a click.Command")
+                expect(bool(command.help), f"found no help of the command {command.name!r}, expected a docstring")
+        elif kind == "report_section":
+            with record.needed("it imports"):
+                section = load()
+            with record.check("it is a function of a run's result"):
+                expect(callable(section), f"found {type(section).__name__}, expected a function of a RunResult")
+                needed = [p for p in inspect.signature(section).parameters.values() if p.default is p.empty]
+                count = len(needed)
+                expect(count == 1, f"found {count} arguments without a default, expected one: the RunResult")
+        else:
+            with watched(record) as begin, record.group():
+                with record.needed("it imports"):
+                    made = load()
+                begin(made)
+                _CHECKS[kind](record, check_settings(record, kind, made))
     return record.results
 
 
-def _check_kind(record: Recorder, kind: str, load: Callable[[], Any]) -> None:
-    if kind == "command":  # it is imported for one call of armcal, and may do to the process what it needs
-        command = record.check("it imports", load)
-        record.check("it is a click command that says what it does", _check_command, command)
-        return
-    if kind == "report_section":
-        record.check("it is a function of a run's result", _check_section, record.check("it imports", load))
-        return
-    with watched(record) as begin:
-        made = record.check("it imports", load)
-        begin(made)
-        subject = None if made is None else check_settings(record, kind, made)
-        if subject is not None:
-            record.guard(lambda: _CHECKS[kind](record, subject))
-
-
-def _check_command(made: Any) -> None:
-    expect(isinstance(made, click.Command), f"found {type(made).__name__}, expected a click.Command")
-    expect(bool(made.help), f"found no help of the command {made.name!r}, expected a docstring")
-
-
-def _check_section(made: Any) -> None:
-    expect(callable(made), f"found {type(made).__name__}, expected a function of a RunResult")
-    required = [p for p in inspect.signature(made).parameters.values() if p.default is p.empty]
-    expect(len(required) == 1, f"found {len(required)} arguments without a default, expected one: the RunResult")
-
-
-def _imports_light(target: str) -> None:
+def _expect_light(target: str) -> None:
     """Import the registration module in a fresh interpreter and see what came with it, and what it said."""
     module = target.partition(":")[0]
     code = (

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -41,26 +39,39 @@ class _Case:
 
 def check_estimator(record: Recorder, subject: Subject) -> None:
     """Truth, bounds, priors, verdict; and an honest verdict when it is cut short."""
-    estimator: Any = record.check("it builds", subject.build)
-    if estimator is None:
-        return
+    with record.needed("it builds"):
+        estimator: Estimator = subject.build()
     bounded = _case(Interval(upper=UPPER_SIDE_M), None, UPPER_SIDE_M)
-    name = "it gives a value for every entry, and a verdict"
-    solution = record.check(name, _solve, estimator, bounded)
-    if solution is None:
-        return
-    record.check("it reports that it converged", _converged, solution)
-    record.check("it keeps to the bounds", _inside, bounded, solution)
-    record.check("it finds the truth, one bound active", _near, bounded, solution)
-    record.check("it does the same twice", _repeats, estimator, bounded, solution)
-    data, prior = POSES / NOISE_M**2, 1 / PRIOR_SD_M**2  # information on ``side``, which the prior puts at zero
-    case = _case(Interval(), PRIOR_SD_M, TRUTH["side"] * data / (data + prior))
-    record.check("it weighs priors", lambda: _near(case, _solve(estimator, case)))
+    with record.needed("it gives a value for every entry, and a verdict"):
+        solution = _solve(estimator, bounded)
+    with record.check("it reports that it converged"):
+        expect(solution.verdict.converged, f"found the verdict {solution.verdict.status!r}, expected convergence")
+    with record.check("it keeps to the bounds"):
+        bounded.parameters.check(solution.values)
+    with record.check("it finds the truth, one bound active"):
+        _expect_near(bounded, solution)
+    with record.check("it does the same twice"):
+        _expect_same(estimator, bounded, solution)
+    with record.check("it weighs priors"):
+        data, prior = POSES / NOISE_M**2, 1 / PRIOR_SD_M**2  # information on ``side``, which the prior puts at zero
+        case = _case(Interval(), PRIOR_SD_M, TRUTH["side"] * data / (data + prior))
+        _expect_near(case, _solve(estimator, case))
     scattered = _scattered()
-    record.check("it weighs records", lambda: _near(scattered, _solve(estimator, scattered), scattered.known))
-    record.check("the order of records changes nothing", _any_order, estimator, scattered)
-    record.check("a second one of equal settings does the same", lambda: _repeats(subject.build(), bounded, solution))
-    record.check("cut short, it reports that it did not converge", _cut_short, subject, bounded)
+    with record.check("it weighs records"):
+        _expect_near(scattered, _solve(estimator, scattered))
+    with record.check("the order of records changes nothing"):
+        order = np.random.default_rng(7).permutation(POSES)
+        shuffled = replace(scattered, records=scattered.problem.subset(scattered.records, order))
+        off = float(np.abs(_solve(estimator, shuffled).values - _solve(estimator, scattered).values).max())
+        expect(off <= TOLERANCE, f"found values that differ by {off:.1e} with the records in another order")
+    with record.check("a second one of equal settings does the same"):
+        _expect_same(subject.build(), bounded, solution)
+    with record.check("cut short, it reports that it did not converge"):
+        if "max_iterations" not in type(subject.settings).model_fields:
+            raise NotRun("its settings have no max_iterations")
+        settings = subject.made.Settings.model_validate({**subject.example, "max_iterations": 1})
+        short = _solve(subject.made(settings), bounded)
+        expect(not short.verdict.converged, "found converged after one iteration, expected not converged")
 
 
 def _case(side: Interval, prior_sd: float | None, side_answer: float) -> _Case:
@@ -94,14 +105,6 @@ def _scattered() -> _Case:
     return replace(case, records=weighted, answer=answer, known=(_SIDE,))
 
 
-def _any_order(estimator: Estimator, case: _Case) -> None:
-    solution = _solve(estimator, case)
-    order = np.random.default_rng(7).permutation(POSES)
-    shuffled = _solve(estimator, replace(case, records=case.problem.subset(case.records, order)))
-    off = float(np.abs(shuffled.values - solution.values).max())
-    expect(off <= TOLERANCE, f"found values that differ by {off:.1e} with the records in another order")
-
-
 def _solve(estimator: Estimator, case: _Case) -> Solution:
     start = case.parameters.nominal()
     solution = estimator.solve(case.problem, case.records, start)
@@ -116,16 +119,8 @@ def _solve(estimator: Estimator, case: _Case) -> Solution:
     return solution
 
 
-def _converged(solution: Solution) -> None:
-    expect(solution.verdict.converged, f"found the verdict {solution.verdict.status!r}, expected convergence")
-
-
-def _inside(case: _Case, solution: Solution) -> None:
-    case.parameters.check(solution.values)
-
-
-def _near(case: _Case, solution: Solution, entries: Sequence[str] | None = None) -> None:
-    known = [entries is None or name in entries for name in case.parameters.entry_names]
+def _expect_near(case: _Case, solution: Solution) -> None:
+    known = [case.known is None or name in case.known for name in case.parameters.entry_names]
     off = np.where(known, np.abs(solution.values - case.answer), 0.0)
     worst = int(np.argmax(off))
     expect(
@@ -135,15 +130,7 @@ def _near(case: _Case, solution: Solution, entries: Sequence[str] | None = None)
     )
 
 
-def _repeats(estimator: Estimator, case: _Case, solution: Solution) -> None:
+def _expect_same(estimator: Estimator, case: _Case, solution: Solution) -> None:
     again = estimator.solve(case.problem, case.records, case.parameters.nominal())
     off = float(np.abs(again.values - solution.values).max())
     expect(off == 0.0, f"found values that differ by {off:.1e} from the first time")
-
-
-def _cut_short(subject: Subject, case: _Case) -> None:
-    if "max_iterations" not in type(subject.settings).model_fields:
-        raise NotRun("its settings have no max_iterations")
-    settings = subject.made.Settings.model_validate({**subject.example, "max_iterations": 1})
-    solution = _solve(subject.made(settings), case)
-    expect(not solution.verdict.converged, "found converged after one iteration, expected not converged")

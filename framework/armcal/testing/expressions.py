@@ -1,23 +1,32 @@
-"""What a plugin's parameter blocks and expressions must be, whatever the kind of component."""
+"""What a plugin's parameter blocks and expressions must be, whatever the kind of component, and in which units."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from types import MappingProxyType
+from typing import TypeVar
 
 import casadi as ca
 import numpy as np
 
-from armcal.base.domains import Array
+from armcal.base.domains import Array, Interval
 from armcal.base.parameters import FIT_NAME, ParameterBlock, Parameters
 from armcal.base.se3 import Expression
 from armcal.base.units import UNITS, si_unit
 from armcal.testing.results import ContractError, Recorder, expect
-from armcal.testing.unit_checks import expect_plausible
+
+C = TypeVar("C")
 
 JACOBIAN_TOLERANCE = 1e-6
 _STEP = 1e-5
+_LEAST_GAIN: Mapping[str, float] = MappingProxyType({"m": 5e-3, "rad": 0.05})
+_MOST_GAIN = 20.0
+"""What a unit of a parameter moves, in the same unit: about one. A degree is 0.017 rad, a millimetre 0.001 m."""
+_NOTHING = 1e-9
+_LARGEST: Mapping[str, tuple[float, float]] = MappingProxyType({"m": (100.0, 1.0), "rad": (4 * math.pi, math.pi)})
+"""By unit: the largest nominal value, and the largest ordinary correction, that any arm could mean."""
 _CHOICES = {
     getattr(ca, name): name.removeprefix("OP_").lower()
     for name in (
@@ -28,91 +37,76 @@ _CHOICES = {
 }
 
 
-def check_parameters(
-    record: Recorder, declared: Callable[[], Sequence[ParameterBlock]]
-) -> tuple[ParameterBlock, ...] | None:
-    """The blocks that a component declares, if they can be worked with."""
-    blocks = record.check("its parameters are named, each once", _named, declared)
-    if blocks is None:
-        return None
-    well_valued = record.check("their nominal values are finite and in their domains", _valued, blocks)
-    well_sized = record.check("their scales are positive and move them", _movable, blocks)
-    record.check("their units are SI", _in_si, blocks)
-    record.check("their values and scales are plausible in their units", expect_plausible, blocks)
-    return None if well_valued is None or well_sized is None else blocks
-
-
-def _named(declared: Callable[[], Sequence[ParameterBlock]]) -> tuple[ParameterBlock, ...]:
-    blocks = tuple(declared())
-    for block in blocks:
-        expect(
-            isinstance(block, ParameterBlock),
-            f"found {type(block).__name__} among the parameters, expected ParameterBlock",
-        )
-        expect(
-            FIT_NAME.fullmatch(block.name) is not None,
-            f"found the parameter {block.name!r}, expected a name without spaces, dots, quotes and * ? [ ] < > @",
-        )
-    names = [block.name for block in blocks]
-    twice = sorted({name for name in names if names.count(name) > 1})
-    expect(not twice, f"found {', '.join(twice)} more than once, expected every parameter once")
+def check_parameters(record: Recorder, declared: Callable[[], Sequence[ParameterBlock]]) -> tuple[ParameterBlock, ...]:
+    """The blocks that a component declares."""
+    with record.needed("its parameters are named, each once"):
+        blocks = tuple(declared())
+        for block in blocks:
+            found = type(block).__name__
+            expect(isinstance(block, ParameterBlock), f"found {found} among the parameters, expected ParameterBlock")
+            expect(
+                FIT_NAME.fullmatch(block.name) is not None,
+                f"found the parameter {block.name!r}, expected a name without spaces, dots, quotes and * ? [ ] < > @",
+            )
+        names = [block.name for block in blocks]
+        twice = sorted({name for name in names if names.count(name) > 1})
+        expect(not twice, f"found {', '.join(twice)} more than once, expected every parameter once")
+    with record.check("their units are SI"):
+        for block in blocks:
+            known = f"expected one of {', '.join(UNITS)}"
+            expect(block.unit in UNITS, f"{block.name}: found the unit {block.unit!r}, {known}")
+            text = si_unit(UNITS[block.unit].dimension).name
+            expect(block.unit == text, f"{block.name}: found the unit {block.unit}, expected SI: {text}")
+    with record.check("their values and scales are plausible in their units"):
+        for _, block in scalars(blocks, *_LARGEST):
+            _expect_plausible(block)
+    with record.needed("their nominal values are finite and in their domains"):
+        for block in blocks:
+            values = np.array(block.nominal, dtype=float)
+            sized = f"found {values.size} nominal numbers, expected {block.size}"
+            expect(values.shape == (block.size,), f"{block.name}: {sized}")
+            expect(bool(np.isfinite(values).all()), f"{block.name}: found the nominal value {block.nominal}")
+            fault = block.domain.check(values)
+            expect(not fault, f"{block.name}: {fault}")
+    with record.needed("their scales are positive and move them"):
+        for block in blocks:
+            _expect_movable(block)
     return blocks
 
 
-def _valued(blocks: tuple[ParameterBlock, ...]) -> bool:
-    for block in blocks:
-        values = np.array(block.nominal, dtype=float)
-        expect(
-            values.shape == (block.size,),
-            f"{block.name}: found {values.size} nominal numbers, expected {block.size}",
-        )
-        expect(bool(np.isfinite(values).all()), f"{block.name}: found the nominal value {block.nominal}")
-        fault = block.domain.check(values)
-        expect(not fault, f"{block.name}: {fault}")
-    return True
+def _expect_plausible(block: ParameterBlock) -> None:
+    """Raise ContractError if a length or an angle is of a size that only another unit explains."""
+    largest, widest = _LARGEST[block.unit]
+    worst = max((abs(number) for number in block.nominal), default=0.0)
+    other = "mm" if block.unit == "m" else "deg"
+    expect(
+        worst <= largest and block.scale <= widest,
+        f"{block.name}: found the nominal value {worst:g} and the scale {block.scale:g} {block.unit}, expected up "
+        f"to {largest:.3g} and {widest:.3g}: is it in {other}?",
+    )
 
 
-def _movable(blocks: tuple[ParameterBlock, ...]) -> bool:
-    for block in blocks:
-        expect(
-            math.isfinite(block.scale) and block.scale > 0,
-            f"{block.name}: found the scale {block.scale}, expected the size of an ordinary correction",
-        )
-        parameters = Parameters((replace(block, free=True),))
-        moves = np.linalg.matrix_rank(parameters.retract_jacobian(np.zeros(block.domain.dof)))
-        expect(
-            moves == block.domain.dof,
-            f"{block.name}: only {moves} of {block.domain.dof} increments move its nominal value; start elsewhere",
-        )
-        delta = _within(parameters, 0.5 * parameters.scales())
-        back = parameters.local(parameters.retract(delta))
-        expect(
-            bool(np.allclose(back, delta, rtol=1e-6, atol=1e-9 * block.scale)),
-            f"{block.name}: an increment does not come back from its domain's retract and local",
-        )
-    return True
-
-
-def _in_si(blocks: tuple[ParameterBlock, ...]) -> None:
-    for block in blocks:
-        expect(
-            block.unit in UNITS,
-            f"{block.name}: found the unit {block.unit!r}, expected one of {', '.join(UNITS)}",
-        )
-        text = si_unit(UNITS[block.unit].dimension).name
-        expect(block.unit == text, f"{block.name}: found the unit {block.unit}, expected SI: {text}")
-
-
-def _within(parameters: Parameters, delta: Array) -> Array:
-    lower, upper = parameters.increment_bounds()
-    return np.clip(delta, lower, upper)
+def _expect_movable(block: ParameterBlock) -> None:
+    expect(
+        math.isfinite(block.scale) and block.scale > 0,
+        f"{block.name}: found the scale {block.scale}, expected the size of an ordinary correction",
+    )
+    parameters, dof = Parameters((replace(block, free=True),)), block.domain.dof
+    moves = np.linalg.matrix_rank(parameters.retract_jacobian(np.zeros(dof)))
+    expect(moves == dof, f"{block.name}: only {moves} of {dof} increments move its nominal value; start elsewhere")
+    delta = np.clip(0.5 * parameters.scales(), *parameters.increment_bounds())
+    back = parameters.local(parameters.retract(delta))
+    expect(
+        bool(np.allclose(back, delta, rtol=1e-6, atol=1e-9 * block.scale)),
+        f"{block.name}: an increment does not come back from its domain's retract and local",
+    )
 
 
 def near_nominal(blocks: Sequence[ParameterBlock], random: np.random.Generator) -> Array:
     """Canonical entries an ordinary correction away from the nominal ones, in their domains."""
     parameters = Parameters(tuple(replace(block, free=True) for block in blocks))
     delta = random.uniform(-1, 1, len(parameters.scales())) * parameters.scales()
-    return parameters.retract(_within(parameters, delta))
+    return parameters.retract(np.clip(delta, *parameters.increment_bounds()))
 
 
 def entry_names(blocks: Sequence[ParameterBlock]) -> tuple[str, ...]:
@@ -186,11 +180,37 @@ def expect_all_used(expression: Expression, values: Mapping[str, Expression]) ->
     )
 
 
-def expect_repeated(picture: Callable[[], Array], again: Callable[[], Array]) -> None:
-    """Raise ContractError unless a component, asked again, and a second one like it give the same numbers."""
-    first, second, other = picture(), picture(), again()
+def expect_repeated(picture: Callable[[C], Array], made: C, other: C) -> None:
+    """Raise ContractError unless a component, asked twice, and a second one like it give the same numbers."""
+    first, second, third = picture(made), picture(made), picture(other)
     expect(np.array_equal(first, second, equal_nan=True), "found other numbers when it was asked a second time")
     expect(
-        np.array_equal(first, other, equal_nan=True),
+        np.array_equal(first, third, equal_nan=True),
         "found other numbers from a second component of equal settings: it keeps something between calls",
+    )
+
+
+def scalars(blocks: Sequence[ParameterBlock], *units: str) -> list[tuple[int, ParameterBlock]]:
+    """Blocks of one number in one of these units, each with the place of its entry among all entries."""
+    scalars, place = [], 0
+    for block in blocks:
+        if isinstance(block.domain, Interval) and block.unit in units:
+            scalars.append((place, block))
+        place += block.size
+    return scalars
+
+
+def expect_gain(gain: float, what: str, of: str, unit: str) -> None:
+    """Raise ContractError if something moves by far more or less than about one for each unit of something else.
+
+    Args:
+        gain: how far it moves at most; none at all is no fault here.
+        what: moves.
+        of: by which.
+        unit: of both.
+    """
+    expect(
+        gain <= _NOTHING or _LEAST_GAIN[unit] <= gain <= _MOST_GAIN,
+        f"found that {what} changes by {gain:.4g} {unit} for each {unit} of {of}, expected about 1: "
+        "is one of them in another unit?",
     )

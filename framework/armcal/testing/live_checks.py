@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import socket
-import tempfile
 import threading
 from collections.abc import Callable, Mapping
+from contextlib import closing, suppress
 from operator import methodcaller
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, TypeVar
 
 import numpy as np
@@ -16,7 +17,7 @@ from armcal.devices.clock import RealClock
 from armcal.devices.joint_stream import JointSample
 from armcal.devices.tracker import TrackerFrame
 from armcal.errors import InputError
-from armcal.testing.results import ContractError, NotRun, Recorder, expect
+from armcal.testing.results import ContractError, NotRun, Recorder, expect, raises_only
 from armcal.testing.settings_checks import Subject
 
 T = TypeVar("T")
@@ -51,22 +52,36 @@ def check_joint_stream(record: Recorder, subject: Subject) -> None:
 
 def _check_source(record: Recorder, subject: Subject, method: str, kind: type, *opening: object) -> None:
     """Check a source whose ``method`` gives what has come, objects of ``kind``; it opens with a clock and more."""
-    source: Any = record.check("it builds", subject.build)
-    if source is None:
-        return
-
-    def begin(made: Any) -> None:
-        made.open(RealClock(), *opening)
-
+    with record.needed("it builds"):
+        source = subject.build()
     take = methodcaller(method)
-    record.check("it may be closed before it was opened", source.close)
-    record.check("it opens, or refuses by an armcal error", _opens, lambda: begin(source))
-    record.check(f"{method}() gives a list of {method}, without waiting", _gives, source, take, kind)
+    with record.check("it may be closed before it was opened"):
+        source.close()
+    with record.check("it opens, or refuses by an armcal error"), suppress(InputError), raises_only(InputError):
+        _within(lambda: source.open(RealClock(), *opening))
+    with record.check(f"{method}() gives a list of {method}, without waiting"):
+        for item in _listed(source, take):
+            found = type(item).__name__
+            expect(isinstance(item, kind), f"found {found}, expected {kind.__module__}.{kind.__name__}")
     if kind is JointSample:
-        record.check("ended says whether nothing more will come", _ended, source)
-    record.check("refused counts by reason", lambda: _check_counts(source.refused))
-    record.check("it may be closed twice, and gives nothing then", _closes, source, take)
-    record.check("damaged bytes are passed over and counted", _survives_damage, subject, begin, take)
+        with record.check("ended says whether nothing more will come"):
+            expect(isinstance(source.ended, bool), f"found ended = {source.ended!r}, expected true or false")
+    with record.check("refused counts by reason"):
+        _counted(source.refused)
+    with record.check("it may be closed twice, and gives nothing then"):
+        source.close()
+        source.close()
+        expect(_within(lambda: take(source)) == [], "found something that came after close(), expected nothing")
+    with record.check("damaged bytes are passed over and counted"), TemporaryDirectory() as folder:
+        path = Path(folder, "live")
+        path.write_bytes(b"")
+        damaged = subject.made(subject.made.Settings.model_validate(_settings_to_feed(subject, path)))
+        try:
+            damaged.open(RealClock(), *opening)
+        except InputError as refusal:
+            raise NotRun(f"it does not open: {refusal}") from refusal
+        with closing(damaged):
+            _expect_damage_counted(damaged, take, path)
 
 
 def _within(call: Callable[[], T]) -> T:
@@ -94,35 +109,13 @@ def _within(call: Callable[[], T]) -> T:
     return items[0]
 
 
-def _opens(begin: Callable[[], None]) -> None:
-    try:
-        _within(begin)
-    except InputError:
-        return
-    except ContractError:
-        raise
-    except Exception as fault:
-        raise ContractError(f"found {type(fault).__name__} ({fault}), expected armcal.errors.InputError") from fault
-
-
-def _gives(source: Any, take: Callable[[Any], Any], kind: type) -> None:
+def _listed(source: Any, take: Callable[[Any], Any]) -> list[Any]:
     items = _within(lambda: take(source))
     expect(isinstance(items, list), f"found {type(items).__name__}, expected a list")
-    for item in items:
-        expect(isinstance(item, kind), f"found {type(item).__name__}, expected {kind.__module__}.{kind.__name__}")
+    return list(items)
 
 
-def _ended(stream: Any) -> None:
-    expect(isinstance(stream.ended, bool), f"found ended = {stream.ended!r}, expected true or false")
-
-
-def _closes(source: Any, take: Callable[[Any], Any]) -> None:
-    source.close()
-    source.close()
-    expect(_within(lambda: take(source)) == [], "found something that came after close(), expected nothing")
-
-
-def _check_counts(refused: Any) -> int:
+def _counted(refused: Any) -> int:
     """How many were passed over; a mapping from reason to count."""
     expect(isinstance(refused, Mapping), f"found {type(refused).__name__}, expected a mapping from reason to count")
     for reason, count in refused.items():
@@ -130,33 +123,23 @@ def _check_counts(refused: Any) -> int:
     return sum(refused.values())
 
 
-def _survives_damage(subject: Subject, begin: Callable[[Any], None], take: Callable[[Any], Any]) -> None:
+def _expect_damage_counted(source: Any, take: Callable[[Any], Any], path: Path) -> None:
     """Damaged bytes by UDP or in a file: each is passed over, and some of them are counted."""
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder, "live")
-        path.write_bytes(b"")
-        source = subject.made(subject.made.Settings.model_validate(_settings_to_feed(subject, path)))
-        try:
-            begin(source)
-        except InputError as refusal:
-            raise NotRun(f"it does not open: {refusal}") from refusal
-        try:
-            address = getattr(source, "address", None)
-            for data in _DAMAGED:
-                if address is None:
-                    with path.open("ab") as file:
-                        file.write(data)
-                else:
-                    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
-                        sender.sendto(data, tuple(address))
-                _passes_over(lambda: take(source), data)
-            for _ in range(_TRIES):
-                if _check_counts(source.refused):
-                    return
-                _within(lambda: take(source))
-        finally:
-            source.close()
-    expect(False, "found nothing in refused after damaged bytes, expected each to be counted by its reason")
+    address = getattr(source, "address", None)
+    for data in _DAMAGED:
+        if address is None:
+            with path.open("ab") as file:
+                file.write(data)
+        else:
+            with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+                sender.sendto(data, tuple(address))
+        with raises_only(expected="them counted in refused", when=f" for the bytes {data[:20]!r}"):
+            _listed(source, take)
+    for _ in range(_TRIES):
+        if _counted(source.refused):
+            return
+        _within(lambda: take(source))
+    raise ContractError("found nothing in refused after damaged bytes, expected each to be counted by its reason")
 
 
 def _settings_to_feed(subject: Subject, path: Path) -> Mapping[str, Any]:
@@ -168,15 +151,3 @@ def _settings_to_feed(subject: Subject, path: Path) -> Mapping[str, Any]:
         if name in fields:
             return {**example, name: str(path)}
     raise NotRun("its settings have no port, path or source by which the checks could feed it")
-
-
-def _passes_over(take: Callable[[], Any], data: bytes) -> None:
-    try:
-        taken = _within(take)
-    except ContractError:
-        raise
-    except Exception as fault:
-        raise ContractError(
-            f"found {type(fault).__name__} ({fault}) for the bytes {data[:20]!r}, expected them counted in refused"
-        ) from fault
-    expect(isinstance(taken, list), f"found {type(taken).__name__}, expected a list")

@@ -8,9 +8,7 @@ import random
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, redirect_stdout
-from dataclasses import dataclass
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -22,28 +20,30 @@ _DEEPEST = 4
 _SHOWN_CHARACTERS = 60
 _CONTAINERS = (list, tuple, set, frozenset)
 
+_Place = tuple[Any, str, Any]
+"""A module or a class, the name of a variable of it, and a picture of its value."""
+
 
 @contextmanager
 def watched(record: Recorder) -> Iterator[Callable[[Any], None]]:
     """Watch what runs inside, and record it at the end; call what is given with the component once it is imported."""
-    heard, process, modules = io.StringIO(), _process(), dict[str, Any]()
+    heard, process, places = io.StringIO(), _process(), dict[str, _Place]()
 
     def begin(made: Any) -> None:
-        modules.update(_of_modules(made))
+        places.update(_places(made))
 
     with redirect_stdout(heard):
         yield begin
-    record.check("it prints nothing to standard output", _quiet, heard.getvalue())
-    record.check("it leaves the process alone", lambda: _unchanged(process, _process(), "armcal's own process"))
-    if modules:
-        record.check("it keeps nothing in its modules", _unchanged_modules, modules)
-
-
-def _quiet(heard: str) -> None:
-    shown = " ".join(heard.split())[:_SHOWN_CHARACTERS]
-    expect(
-        not heard, f"found {shown!r} printed, expected nothing: results are armcal's to print; raise errors or return"
-    )
+    with record.check("it prints nothing to standard output"):
+        shown = " ".join(heard.getvalue().split())[:_SHOWN_CHARACTERS]
+        rule = "results are armcal's to print; raise errors or return"
+        expect(not heard.getvalue(), f"found {shown!r} printed, expected nothing: {rule}")
+    with record.check("it leaves the process alone"):
+        _expect_same(process, _process(), "armcal's own process")
+    if places:
+        with record.check("it keeps nothing in its modules"):
+            now = {where: (owner, name, _now(owner, name)) for where, (owner, name, _) in places.items()}
+            _expect_same(places, now, "its modules")
 
 
 def _process() -> dict[str, Any]:
@@ -57,48 +57,30 @@ def _process() -> dict[str, Any]:
     }
 
 
-@dataclass(frozen=True)
-class _Place:
-    """A variable of a module, or of a class in it, and a picture of its value."""
-
-    owner: Any
-    name: str
-    picture: Any
-
-    def again(self) -> _Place:
-        """As it is now."""
-        return _Place(self.owner, self.name, _picture(vars(self.owner).get(self.name), 0))
-
-
-def _of_modules(made: Any) -> dict[str, _Place]:
-    """Every variable of the modules of a component's package."""
+def _places(made: Any) -> Iterator[tuple[str, _Place]]:
+    """Every variable of the modules of a component's package, and of the classes in them."""
     own = str(getattr(made, "__module__", ""))
     package = own.partition(".")[0]
     if own.startswith(f"{plugin_files.__name__}."):
         modules = [sys.modules[own]]
     elif package in ("", "builtins", "armcal"):
-        return {}
+        modules = []
     else:
         modules = [module for name, module in sorted(sys.modules.items()) if name.partition(".")[0] == package]
-    return {f"{where}.{place.name}": place for module in modules for where, place in _places(module)}
+    for module in modules:
+        classes = [v for v in vars(module).values() if isinstance(v, type) and v.__module__ == module.__name__]
+        for owner in (module, *classes):
+            where = module.__name__ if owner is module else f"{module.__name__}.{getattr(owner, '__qualname__', '')}"
+            for name in list(vars(owner)):
+                if not name.startswith("__"):
+                    yield f"{where}.{name}", (owner, name, _now(owner, name))
 
 
-def _places(module: ModuleType) -> Iterator[tuple[str, _Place]]:
-    for owner in (module, *(v for v in vars(module).values() if isinstance(v, type))):
-        is_own = owner is module or owner.__module__ == module.__name__
-        for name in list(vars(owner)) if is_own else ():
-            if not name.startswith("__"):
-                where = (
-                    module.__name__ if owner is module else f"{module.__name__}.{getattr(owner, '__qualname__', '')}"
-                )
-                yield where, _Place(owner, name, None).again()
+def _now(owner: Any, name: str) -> Any:
+    return _picture(vars(owner).get(name), 0)
 
 
-def _unchanged_modules(places: Mapping[str, _Place]) -> None:
-    _unchanged(places, {where: place.again() for where, place in places.items()}, "its modules")
-
-
-def _unchanged(before: Mapping[str, Any], after: Mapping[str, Any], what: str) -> None:
+def _expect_same(before: Mapping[str, Any], after: Mapping[str, Any], what: str) -> None:
     changed = [name for name, value in before.items() if after[name] != value]
     expect(not changed, f"found {', '.join(changed[:3])} changed, expected {what} as before the checks")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
@@ -22,20 +23,23 @@ from armcal.testing.expressions import (
     check_parameters,
     expect_all_used,
     expect_derivatives,
+    expect_gain,
     expect_only,
     expect_repeated,
     near_nominal,
+    scalars,
     stacked,
 )
 from armcal.testing.planar import ARM, GRAVITY, planar_arms, skewed_arms
 from armcal.testing.results import PLUGIN_FAULTS, ContractError, NotRun, Recorder, expect
 from armcal.testing.settings_checks import Subject
-from armcal.testing.unit_checks import dimension_of, expect_gain, expect_small_noise, scalars
 
 ARM_NAMES = ((ARM,), ("left", "right"))
 """The arms that a measurement is built for: one, or if it refuses that, two."""
 _RATIO = "1"
 _UNITS: Mapping[str, str] = MappingProxyType({"length": "m", "angle": "rad"})
+_NOISIEST: Mapping[str, float] = MappingProxyType({"length": 0.1, "angle": 0.5})
+"""By dimension: the largest standard deviation (m, rad) of an example that is worth calibrating with."""
 _POINTS = 6
 _INSTRUMENT = "instrument"
 _GROUP = "front/hole"
@@ -82,38 +86,105 @@ class _Case:
 
 def check_measurement(record: Recorder, subject: Subject) -> None:
     """Everything that a factor asks of a measurement, on planar arms."""
-    built = record.check("it builds for one arm, or for two", _build, subject)
-    if built is None:
-        return
-    measurement, names = built
+    with record.needed("it builds for one arm, or for two"):
+        measurement, names = _build(subject)
     blocks = check_parameters(record, measurement.parameters)
-    channels = record.check("its channels have names and dimensions", _channels, measurement)
-    if blocks is None or channels is None:
-        return
-    case = record.check("it makes a residual", _case, measurement, planar_arms(names), blocks, channels)
-    if case is None:
-        return
-    record.check("noise is positive", _noise, case.factor)
-    shown = stacked([case.factor.residual, case.factor.outputs])
-    record.check("residuals depend on what is given", expect_only, shown, [case.factor.values, case.factor.record])
-    record.check("outputs are channels", _outputs, case)
-    record.check("the residual is zero where outputs are measured", _zero, case)
-    record.check("its Jacobian is finite and agrees with differences", _jacobian, case)
-    record.check("it is the same each time", _repeated, subject, case, names)
-    skewed = skewed_arms(names)
-    general = record.check("it makes a residual of any arm", _case, measurement, skewed, blocks, channels)
-    if general is None:
-        return
-    record.check("every parameter has an influence", _all_used, general)
-    record.check("its residual is in m and rad", _gains, general)
-    if general.factor.output_channels:
-        slopes = record.check("the noise of every reading follows from its residual", _readings, general)
-        axes = [name.rpartition(".")[2] for name in general.factor.output_channels]
-        if slopes is not None and set("xyz") <= set(axes):
-            record.check("a position's residual is x, y, z, measured minus predicted", _position, axes, slopes)
+    with record.needed("its channels have names and dimensions"):
+        channels = tuple(measurement.channels())
+        listed = [channel.name for channel in channels]
+        expect(len(set(listed)) == len(listed), f"found the channels {', '.join(listed)}, expected every name once")
+        for channel in channels:
+            found = f"found the channel {channel.name!r}"
+            expect(channel.name.isidentifier(), f"{found}, expected letters, digits, underscores")
+            if channel.dimension != _RATIO:
+                units_of(channel.dimension)
+    with record.needed("it makes a residual"):
+        case = _case(measurement, planar_arms(names), blocks, channels)
+    _check_residual(record, case)
+    with record.check("it is the same each time"):
+        expect_repeated(lambda made: _picture(made, case, names), measurement, subject.build(names))
+    with record.group():
+        with record.needed("it makes a residual of any arm"):
+            general = _case(measurement, skewed_arms(names), blocks, channels)
+        _check_influence(record, general)
     if isinstance(measurement, GroupedMeasurement):
-        record.check("all groups have the same parameters", _groups, measurement)
-        record.check("what a record says of its group fits it", _fits_group, case)
+        _check_groups(record, measurement, case)
+
+
+def _check_residual(record: Recorder, case: _Case) -> None:
+    factor = case.factor
+    with record.check("noise is positive"):
+        positive = all(np.isfinite(noise) and noise > 0 for noise in factor.noise)
+        expect(positive, f"found the noise {factor.noise}, expected standard deviations above zero")
+        for number, dimension in zip(factor.noise, factor.dimensions, strict=False):
+            largest = _NOISIEST.get(dimension, math.inf)
+            unit, other = ("m", "mm") if dimension == "length" else ("rad", "deg")
+            most = f"expected up to {largest:g} {unit} in an example: is it in {other}?"
+            expect(number <= largest, f"found a noise of {number:g} {unit}, {most}")
+    with record.check("residuals depend on what is given"):
+        expect_only(stacked([factor.residual, factor.outputs]), [factor.values, factor.record])
+    measured = {f"{_INSTRUMENT}.{channel.name}" for channel in case.channels}
+    with record.check("outputs are channels"):
+        unknown = [name for name in factor.output_channels if name not in measured]
+        expect(not unknown, f"found the outputs {', '.join(unknown)}, expected names of channels")
+    with record.check("the residual is zero where outputs are measured"):
+        if not factor.output_channels:
+            raise NotRun("it reads nothing")
+        if set(factor.output_channels) != measured:
+            raise NotRun("it has channels without an output")
+        worst = float(np.abs(case.numbers(factor.residual, case.point())).max())
+        expect(worst <= 1e-9, f"found a residual of {worst:.1e}, expected zero")
+    with record.check("its Jacobian is finite and agrees with differences"):
+        values, reading = case.point()
+        disturbed = reading + 0.01 * np.random.default_rng(2).uniform(-1, 1, len(reading))
+        of_group = [name for block in _group_blocks(case.measurement) for name in block.entry_names]
+        names = (*case.parameters.entry_names, *of_group, *factor.channels)
+        expect_derivatives(case.function(factor.residual), np.concatenate([values, disturbed]), "the residual", names)
+
+
+def _check_influence(record: Recorder, case: _Case) -> None:
+    """What moves the residual of an arm every point of whose tool moves in a way of its own."""
+    with record.check("every parameter has an influence"):
+        place, values = sum(block.size for block in case.arm_blocks), {}
+        for block in case.other_blocks:
+            values[block.name.removeprefix(f"{_INSTRUMENT}.")] = case.factor.values[place : place + block.size]
+            place += block.size
+        expect_all_used(stacked([case.factor.residual, case.factor.outputs]), values)
+    with record.check("its residual is in m and rad"):
+        _expect_gains(case)
+    if not case.factor.output_channels:
+        return
+    with record.needed("the noise of every reading follows from its residual"):
+        slopes = _readings(case)
+    axes = [name.rpartition(".")[2] for name in case.factor.output_channels]
+    if set("xyz") <= set(axes):
+        with record.check("a position's residual is x, y, z, measured minus predicted"):
+            slope = slopes[:3, [axes.index(axis) for axis in "xyz"]]
+            expect(
+                bool(np.allclose(slope, np.eye(3), atol=1e-6)),
+                f"found residuals that change by {np.round(slope, 3).tolist()} with x, y and z, expected measured "
+                "minus predicted of x, y and z in this order: a run tells by them how the arm and the instrument are "
+                "mistaken",
+            )
+
+
+def _check_groups(record: Recorder, measurement: GroupedMeasurement, case: _Case) -> None:
+    with record.check("all groups have the same parameters"):
+        keys = ("", _GROUP, f"{_GROUP}_2")
+        shapes = {tuple((b.name, b.domain, b.unit) for b in measurement.group_parameters(key)) for key in keys[:2]}
+        expect(len(shapes) == 1, "found groups with different parameters, expected the same names, domains and units")
+        strange = [tie.groups for tie in measurement.ties(keys[1:]) if not set(tie.groups) <= set(keys[1:])]
+        expect(not strange, f"found a tie of {strange}, expected only groups it was given")
+        expect(measurement.mean_weight >= 1, f"found the mean weight {measurement.mean_weight}, expected at least 1")
+    with record.check("what a record says of its group fits it"):
+        names = case.factor.nuisance_names
+        if not names or set(names) != {block.name for block in _group_blocks(case.measurement)}:
+            raise NotRun("a record alone does not say all of its group's parameters")
+        values, reading = case.point()
+        starts = case.numbers(case.factor.nuisance_starts, (values, reading))
+        values[len(values) - len(starts) :] = starts
+        worst = float(np.abs(case.numbers(case.factor.residual, (values, reading))).max())
+        expect(worst <= 1e-9, f"found a residual of {worst:.1e} with what the record itself says, expected zero")
 
 
 def _build(subject: Subject) -> tuple[Measurement, tuple[str, ...]]:
@@ -133,19 +204,6 @@ def _build(subject: Subject) -> tuple[Measurement, tuple[str, ...]]:
     raise ContractError("it refuses every choice of arms; " + "; ".join(refused))
 
 
-def _channels(measurement: Measurement) -> tuple[Channel, ...]:
-    channels = tuple(measurement.channels())
-    names = [channel.name for channel in channels]
-    expect(len(set(names)) == len(names), f"found the channels {', '.join(names)}, expected every name once")
-    for channel in channels:
-        expect(
-            channel.name.isidentifier(), f"found the channel {channel.name!r}, expected letters, digits, underscores"
-        )
-        if channel.dimension != _RATIO:
-            units_of(channel.dimension)
-    return channels
-
-
 def _case(
     measurement: Measurement, arms: Mapping[str, Arm], own: Sequence[ParameterBlock], channels: Sequence[Channel]
 ) -> _Case:
@@ -159,81 +217,18 @@ def _case(
     return _Case(measurement, own, channels, parameters, factor)
 
 
-def _noise(factor: Factor) -> None:
-    expect(
-        all(np.isfinite(noise) and noise > 0 for noise in factor.noise),
-        f"found the noise {factor.noise}, expected standard deviations above zero",
-    )
-    expect_small_noise(factor.noise, factor.dimensions)
-
-
-def _outputs(case: _Case) -> None:
-    measured = [f"{_INSTRUMENT}.{channel.name}" for channel in case.channels]
-    unknown = [name for name in case.factor.output_channels if name not in measured]
-    expect(not unknown, f"found the outputs {', '.join(unknown)}, expected names of channels")
-
-
 def _group_blocks(measurement: Measurement) -> tuple[ParameterBlock, ...]:
     """Of one group that is not known beforehand."""
     return tuple(measurement.group_parameters(_GROUP)) if isinstance(measurement, GroupedMeasurement) else ()
 
 
-def _groups(measurement: GroupedMeasurement) -> None:
-    """Every group has the same parameters, and ties hold groups that are there."""
-    shapes = {tuple((b.name, b.domain, b.unit) for b in measurement.group_parameters(key)) for key in ("", _GROUP)}
-    expect(len(shapes) == 1, "found groups with different parameters, expected the same names, domains and units")
-    keys = (_GROUP, f"{_GROUP}_2")
-    strange = [tie.groups for tie in measurement.ties(keys) if not set(tie.groups) <= set(keys)]
-    expect(not strange, f"found a tie of {strange}, expected only groups it was given")
-    expect(measurement.mean_weight >= 1, f"found the mean weight {measurement.mean_weight}, expected at least 1")
-
-
-def _fits_group(case: _Case) -> None:
-    """The values that a record gives its group make that record's residual zero."""
-    names = case.factor.nuisance_names
-    if not names or set(names) != {block.name for block in _group_blocks(case.measurement)}:
-        raise NotRun("a record alone does not say all of its group's parameters")
-    values, record = case.point()
-    starts = case.numbers(case.factor.nuisance_starts, (values, record))
-    values[len(values) - len(starts) :] = starts
-    worst = float(np.abs(case.numbers(case.factor.residual, (values, record))).max())
-    expect(worst <= 1e-9, f"found a residual of {worst:.1e} with what the record itself says, expected zero")
-
-
-def _zero(case: _Case) -> None:
-    if not case.factor.output_channels:
-        raise NotRun("it reads nothing")
-    if set(case.factor.output_channels) != {f"{_INSTRUMENT}.{channel.name}" for channel in case.channels}:
-        raise NotRun("it has channels without an output")
-    worst = float(np.abs(case.numbers(case.factor.residual, case.point())).max())
-    expect(worst <= 1e-9, f"found a residual of {worst:.1e}, expected zero")
-
-
-def _jacobian(case: _Case) -> None:
-    values, record = case.point()
-    disturbed = record + 0.01 * np.random.default_rng(2).uniform(-1, 1, len(record))
-    of_group = [name for block in _group_blocks(case.measurement) for name in block.entry_names]
-    names = (*case.parameters.entry_names, *of_group, *case.factor.channels)
-    expect_derivatives(case.function(case.factor.residual), np.concatenate([values, disturbed]), "the residual", names)
-
-
-def _repeated(subject: Subject, case: _Case, names: tuple[str, ...]) -> None:
-    def picture(made: Measurement) -> Array:
-        same = tuple(made.parameters()) == tuple(case.own)
-        expect(same, "found other parameters another time, expected them from its settings alone")
-        again = _case(made, planar_arms(names), case.own, tuple(made.channels()))
-        shown = stacked([again.factor.residual, again.factor.outputs, again.factor.nuisance_starts])
-        return np.concatenate([again.numbers(shown, case.point()), again.factor.noise])
-
-    expect_repeated(lambda: picture(case.measurement), lambda: picture(subject.build(names)))
-
-
-def _all_used(case: _Case) -> None:
-    place, values = sum(block.size for block in case.arm_blocks), {}
-    for block in case.other_blocks:
-        values[block.name.removeprefix(f"{_INSTRUMENT}.")] = case.factor.values[place : place + block.size]
-        place += block.size
-    expect_all_used(stacked([case.factor.residual, case.factor.outputs]), values)
+def _picture(made: Measurement, case: _Case, names: tuple[str, ...]) -> Array:
+    """Residual, outputs, starts and noise of a measurement at one point of a case."""
+    same = tuple(made.parameters()) == tuple(case.own)
+    expect(same, "found other parameters another time, expected them from its settings alone")
+    again = _case(made, planar_arms(names), case.own, tuple(made.channels()))
+    shown = stacked([again.factor.residual, again.factor.outputs, again.factor.nuisance_starts])
+    return np.concatenate([again.numbers(shown, case.point()), again.factor.noise])
 
 
 def _readings(case: _Case) -> Array:
@@ -255,16 +250,7 @@ def _readings(case: _Case) -> Array:
     return by_reading
 
 
-def _position(names: Sequence[str], slopes: Array) -> None:
-    slope = slopes[:3, [names.index(axis) for axis in "xyz"]]
-    expect(
-        bool(np.allclose(slope, np.eye(3), atol=1e-6)),
-        f"found residuals that change by {np.round(slope, 3).tolist()} with x, y and z, expected measured minus "
-        "predicted of x, y and z in this order: a run tells by them how the arm and the instrument are mistaken",
-    )
-
-
-def _gains(case: _Case) -> None:
+def _expect_gains(case: _Case) -> None:
     """What a length or an angle, of a parameter or as it is read, changes in a residual of the same dimension."""
     factor, function, slopes = case.factor, case.function(case.factor.residual), []
     for seed in range(_POINTS):
@@ -272,18 +258,17 @@ def _gains(case: _Case) -> None:
         at[factor.values.numel() :] += 0.01
         slopes.append(np.abs(np.asarray(function.jacobian()(at, function(at)))))
     slope = np.max(slopes, axis=0)
-    rows = {dimension: np.array([d == dimension for d in factor.dimensions]) for dimension in _UNITS}
-    others, own = case.arm_blocks, case.other_blocks
-    of_arms = [place for place, _ in scalars(others, "m", "rad")]
-    both = scalars((*others, *own), "m", "rad")[len(of_arms) :]
-    gains = [(dimension_of(b), b.name, slope[:, place]) for place, b in both]
-    for unit, dimension in (("m", "length"), ("rad", "angle")):
-        places = [place for place, _ in scalars(others, unit)]
-        gains.append((dimension, "the arm's parameters", slope[:, places].max(axis=1)))
+    gains = []
+    for unit in ("m", "rad"):
+        of_arms = [place for place, _ in scalars(case.arm_blocks, unit)]
+        others = scalars((*case.arm_blocks, *case.other_blocks), unit)[len(of_arms) :]
+        gains += [(unit, block.name, slope[:, place]) for place, block in others]
+        gains.append((unit, "the arm's parameters", slope[:, of_arms].max(axis=1)))
     for channel in case.channels:
         name = f"{_INSTRUMENT}.{channel.name}"
         if name in factor.channels and channel.dimension in _UNITS:
             column = factor.values.numel() + factor.channels.index(name)
-            gains.append((channel.dimension, f"the channel {channel.name}", slope[:, column]))
-    for dimension, name, column in gains:
-        expect_gain(float(column[rows[dimension]].max(initial=0.0)), "the residual", name, _UNITS[dimension])
+            gains.append((_UNITS[channel.dimension], f"the channel {channel.name}", slope[:, column]))
+    units = np.array([_UNITS.get(dimension, "") for dimension in factor.dimensions])
+    for unit, name, column in gains:
+        expect_gain(float(column[units == unit].max(initial=0.0)), "the residual", name, unit)

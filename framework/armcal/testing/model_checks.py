@@ -21,17 +21,18 @@ from armcal.testing.expressions import (
     entry_names,
     expect_all_used,
     expect_derivatives,
+    expect_gain,
     expect_no_choice,
     expect_only,
     expect_repeated,
     near_nominal,
+    scalars,
     stacked,
     symbols,
 )
 from armcal.testing.planar import ARM, TRACKER, Springs, Tip, all_parameters, commands, dataset
 from armcal.testing.results import Recorder, expect
 from armcal.testing.settings_checks import Subject
-from armcal.testing.unit_checks import dimension_of, expect_gain, scalars, size_of
 
 POSES = 20
 ROTATION_TOLERANCE = 1e-9
@@ -54,48 +55,66 @@ class _Kinematics:
 
 def check_model(record: Recorder, subject: Subject) -> None:
     """Everything that a problem asks of an arm model."""
-    model: ArmModel | None = record.check("it builds", subject.build)
-    if model is None:
-        return
-    names = record.check("its joints are named, each once", _joint_names, model)
+    with record.needed("it builds"):
+        model: ArmModel = subject.build()
+    with record.needed("its joints are named, each once"):
+        names = tuple(model.joint_names)
+        expect(len(names) > 0, "found no joints, expected at least one")
+        for name in names:
+            expect(isinstance(name, str) and bool(name), f"found the joint name {name!r}, expected text")
+            expect("." not in name, f"found the joint name {name!r}, expected one without a dot")
+        expect(len(set(names)) == len(names), f"found {', '.join(names)}, expected every name once")
     blocks = check_parameters(record, model.parameters)
-    if names is None or blocks is None:
-        return
     values = symbols(blocks)
-    chain = record.check("its chain has one joint for each name", _chain, model, values, names)
-    if chain is None:
-        return
+    with record.needed("its chain has one joint for each name"):
+        chain = model.chain(values)
+        _expect_chain(chain, names)
     if isinstance(model, MassiveModel):
-        record.check("its masses stand in its frames", _masses, model, chain)
+        with record.check("its masses stand in its frames"):
+            _expect_masses(model, chain)
     parts = stacked(_parts(chain))
-    record.check("the chain depends on its parameters alone", lambda: expect_only(parts, list(values.values())))
-    record.check(
-        "the chain does not branch on a parameter",
-        lambda: expect_no_choice(parts, ca.SX(0, 1), stacked(list(values.values()))),
-    )
-    record.check("every parameter has an influence", expect_all_used, parts, values)
-    known = record.check("its kinematics can be evaluated", _kinematics, blocks, values, chain)
-    if known is None:
-        return
-    record.check("it is the same each time", _repeated, subject, model, blocks)
-    record.check(f"{POSES} random poses are rigid motions", _rigid, known)
-    record.check("derivatives agree with differences", _derivatives, known)
-    record.check("lengths move it by lengths, and angles by angles", _gains, known)
-    record.check("springs on it settle under gravity", _settles, model, chain)
+    with record.check("the chain depends on its parameters alone"):
+        expect_only(parts, list(values.values()))
+    with record.check("the chain does not branch on a parameter"):
+        expect_no_choice(parts, ca.SX(0, 1), stacked(list(values.values())))
+    with record.check("every parameter has an influence"):
+        expect_all_used(parts, values)
+    with record.needed("its kinematics can be evaluated"):
+        known = _kinematics(blocks, values, chain)
+    with record.check("it is the same each time"):
+        expect_repeated(lambda made: _picture(made, blocks), model, subject.build())
+    _check_poses(record, known)
+    with record.check("springs on it settle under gravity"):
+        _expect_settled(model, chain)
 
 
-def _joint_names(model: ArmModel) -> tuple[str, ...]:
-    names = tuple(model.joint_names)
-    expect(len(names) > 0, "found no joints, expected at least one")
-    for name in names:
-        expect(isinstance(name, str) and bool(name), f"found the joint name {name!r}, expected text")
-        expect("." not in name, f"found the joint name {name!r}, expected one without a dot")
-    expect(len(set(names)) == len(names), f"found {', '.join(names)}, expected every name once")
-    return names
+def _check_poses(record: Recorder, known: _Kinematics) -> None:
+    with record.check(f"{POSES} random poses are rigid motions"):
+        random = np.random.default_rng(1)
+        for _ in range(POSES):
+            shown = np.asarray(known.poses(known.point(random))).reshape(-1, 4, 3).transpose(0, 2, 1)
+            expect(bool(np.isfinite(shown).all()), "found a pose that is not finite")
+            rotation = shown[:, :, :3]
+            off = float(np.abs(rotation @ rotation.transpose(0, 2, 1) - np.eye(3)).max())
+            expect(off <= ROTATION_TOLERANCE, f"found a rotation off orthonormal by {off:.1e}")
+            handed = float(np.abs(np.linalg.det(rotation) - 1).max())
+            expect(handed <= ROTATION_TOLERANCE, f"found a rotation with determinant off 1 by {handed:.1e}")
+    with record.check("derivatives agree with differences"):
+        names = (*entry_names(known.blocks), *(joint.name for joint in known.chain.joints))
+        expect_derivatives(known.poses, known.point(np.random.default_rng(2)), "the poses", names)
+    with record.check("lengths move it by lengths, and angles by angles"):  # m for each m, rad for each rad
+        random, jacobian = np.random.default_rng(5), known.poses.jacobian()
+        points = [known.point(random) for _ in range(3)]
+        slopes = np.array([np.asarray(jacobian(at, known.poses(at)))[:12].reshape(4, 3, -1) for at in points])
+        for place, block in scalars(known.blocks, "m"):
+            moved = np.linalg.norm(slopes[:, 3, :, place], axis=1)
+            expect_gain(float(moved.max()), "the tool's position", block.name, "m")
+        for place, block in scalars(known.blocks, "rad"):
+            turned = np.linalg.norm(slopes[:, :3, :, place], axis=(1, 2)) / np.sqrt(2)
+            expect_gain(float(turned.max()), "the tool's orientation", block.name, "rad")
 
 
-def _chain(model: ArmModel, values: dict[str, Expression], names: Sequence[str]) -> Chain:
-    chain = model.chain(values)
+def _expect_chain(chain: Chain, names: Sequence[str]) -> None:
     expect(isinstance(chain, Chain), f"found a chain of type {type(chain).__name__}, expected Chain")
     joint_names = tuple(joint.name for joint in chain.joints)
     expect(joint_names == tuple(names), f"found the joints {joint_names}, expected {tuple(names)}")
@@ -110,10 +129,9 @@ def _chain(model: ArmModel, values: dict[str, Expression], names: Sequence[str])
         expect(0 <= at.joint <= len(names), f"the frame {name} hangs on joint {at.joint}, expected 0 to {len(names)}")
     taken = sorted({MOUNT_FRAME, TOOL_FRAME} & set(chain.frames))
     expect(not taken, f"found a frame called {', '.join(taken)}, which armcal uses itself")
-    return chain
 
 
-def _masses(model: MassiveModel, chain: Chain) -> None:
+def _expect_masses(model: MassiveModel, chain: Chain) -> None:
     frames, masses = frame_names(chain), tuple(model.masses())
     for mass in masses:
         expect("." not in mass.name, f"found the mass {mass.name!r}, expected a name without a dot")
@@ -141,47 +159,15 @@ def _kinematics(blocks: tuple[ParameterBlock, ...], values: dict[str, Expression
     return _Kinematics(blocks, chain, poses)
 
 
-def _rigid(known: _Kinematics) -> None:
-    random = np.random.default_rng(1)
-    for _ in range(POSES):
-        shown = np.asarray(known.poses(known.point(random))).reshape(-1, 4, 3).transpose(0, 2, 1)
-        expect(bool(np.isfinite(shown).all()), "found a pose that is not finite")
-        rotation = shown[:, :, :3]
-        off = float(np.abs(rotation @ rotation.transpose(0, 2, 1) - np.eye(3)).max())
-        expect(off <= ROTATION_TOLERANCE, f"found a rotation off orthonormal by {off:.1e}")
-        handed = float(np.abs(np.linalg.det(rotation) - 1).max())
-        expect(handed <= ROTATION_TOLERANCE, f"found a rotation with determinant off 1 by {handed:.1e}")
+def _picture(model: ArmModel, blocks: tuple[ParameterBlock, ...]) -> Array:
+    """The poses of a model at one point."""
+    expect(tuple(model.parameters()) == blocks, "found other parameters another time")
+    values = symbols(blocks)
+    known = _kinematics(blocks, values, model.chain(values))
+    return np.asarray(known.poses(known.point(np.random.default_rng(4))))
 
 
-def _derivatives(known: _Kinematics) -> None:
-    names = (*entry_names(known.blocks), *(joint.name for joint in known.chain.joints))
-    expect_derivatives(known.poses, known.point(np.random.default_rng(2)), "the poses", names)
-
-
-def _repeated(subject: Subject, model: ArmModel, blocks: tuple[ParameterBlock, ...]) -> None:
-    def picture(made: ArmModel) -> Array:
-        expect(tuple(made.parameters()) == blocks, "found other parameters another time")
-        values = symbols(blocks)
-        known = _kinematics(blocks, values, made.chain(values))
-        return np.asarray(known.poses(known.point(np.random.default_rng(4))))
-
-    expect_repeated(lambda: picture(model), lambda: picture(subject.made(subject.settings)))
-
-
-def _gains(known: _Kinematics) -> None:
-    """How far the tool moves (m) with a parameter in m, and how far it turns (rad) with one in rad."""
-    random, jacobian = np.random.default_rng(5), known.poses.jacobian()
-    points = [known.point(random) for _ in range(3)]
-    slopes = [np.asarray(jacobian(at, known.poses(at)))[:12].reshape(4, 3, -1) for at in points]
-    for place, block in scalars(known.blocks, "m", "rad"):
-        turned = [size_of(slope[:3, :, place]) / np.sqrt(2) for slope in slopes]
-        moved = [size_of(slope[3, :, place]) for slope in slopes]
-        angular = dimension_of(block) == "angle"
-        what = "the tool's orientation" if angular else "the tool's position"
-        expect_gain(max(turned if angular else moved), what, block.name, block.unit)
-
-
-def _settles(model: ArmModel, chain: Chain) -> None:
+def _expect_settled(model: ArmModel, chain: Chain) -> None:
     """Gravity on a small mass in every frame, springs at the base and every joint."""
     frames = [MOUNT_FRAME, *chain.frames, TOOL_FRAME]
     masses = tuple(MassSpec(f"m{i}", 0.02, (0.0, 0.01, 0.0), frame) for i, frame in enumerate(frames))

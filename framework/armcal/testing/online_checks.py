@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from typing_extensions import override
@@ -35,22 +34,52 @@ class _Line(Observation):
 
 def check_online(record: Recorder, subject: Subject) -> None:
     """The information of prior and records, once each; nothing that it was given is changed, nothing is kept."""
-    estimator: Any = record.check("it builds", subject.build)
-    if estimator is None:
-        return
-    window = record.check("it says how many records it wants to see again", _window, estimator)
-    if window is None:
-        return
+    with record.needed("it builds"):
+        estimator: OnlineEstimator = subject.build()
+    with record.needed("it says how many records it wants to see again"):
+        window = estimator.window
+        whole = isinstance(window, int) and window >= 1
+        expect(whole, f"found window = {window!r}, expected a number of records from 1")
     prior, lines = _case()
-    updates = record.check("it takes a record", _taken, estimator, window, prior, lines)
-    if updates is None:
-        return
-    record.check("its covariance is exactly symmetric and positive", _sound, updates)
-    record.check("it finds what prior and records say together", _near, updates, prior, lines)
-    record.check("it reports the NIS of the last record", _nis, updates[0], prior, lines[0])
-    record.check("it changes nothing that it is given", _untouched, estimator, prior, lines)
-    record.check("it keeps nothing from one update to the next", _repeats, estimator, window, updates)
-    record.check("a variance below zero is an error", _refuses, estimator, prior, lines)
+    with record.needed("it takes a record"):
+        updates = _taken(estimator, prior, lines)
+    _check_updates(record, updates, prior, lines)
+    with record.check("it changes nothing that it is given"):
+        mean, covariance = prior.mean.copy(), prior.covariance.copy()
+        estimator.update(prior, lines[:1])
+        kept = bool(np.array_equal(mean, prior.mean) and np.array_equal(covariance, prior.covariance))
+        expect(kept, "it changed the prior that it was given")
+    with record.check("it keeps nothing from one update to the next"):
+        for before, update in zip(updates, _taken(estimator, *_case()), strict=True):
+            first, again = before.posterior, update.posterior
+            same = np.array_equal(first.mean, again.mean) and np.array_equal(first.covariance, again.covariance)
+            expect(same, "the same records gave other beliefs the second time")
+    with record.check("a variance below zero is an error"):
+        _expect_refusal(estimator, prior, lines[0])
+
+
+def _check_updates(record: Recorder, updates: Sequence[Update], prior: Gaussian, lines: Sequence[_Line]) -> None:
+    """After each record, against what prior and records say together; innovations against the first record's."""
+    with record.check("its covariance is exactly symmetric and positive"):
+        for place, update in enumerate(updates, start=1):
+            covariance = update.posterior.covariance
+            expect(bool((covariance == covariance.T).all()), f"found a covariance that is not symmetric after {place}")
+            lowest = float(np.linalg.eigvalsh(covariance)[0])
+            expect(lowest > 0, f"found the eigenvalue {lowest:.2g} after record {place}, expected all above zero")
+    with record.check("it finds what prior and records say together"):
+        for place, update in enumerate(updates, start=1):
+            known = _known(prior, lines[:place])
+            sd = np.sqrt(np.diag(known.covariance))
+            off = float(np.abs((update.posterior.mean - known.mean) / sd).max())
+            expect(off < TOLERANCE, f"found a mean {off:.1e} standard deviations off after record {place}")
+            wide = float(np.abs((update.posterior.covariance - known.covariance) / np.outer(sd, sd)).max())
+            expect(wide < TOLERANCE, f"found a covariance {wide:.1e} off after record {place}, in units of variances")
+    with record.check("it reports the NIS of the last record"):  # of the first: the prior is known, whatever the window
+        update, first = updates[0], lines[0]
+        innovation = update.innovation - (first.measured - first.slope @ prior.mean)
+        covariance = update.covariance - (first.slope @ prior.covariance @ first.slope.T + first.noise)
+        off = max(float(np.abs(innovation).max()), float(np.abs(covariance).max()))
+        expect(off < TOLERANCE, f"found an innovation or its covariance {off:.1e} off for the first record")
 
 
 def _case() -> tuple[Gaussian, tuple[_Line, ...]]:
@@ -63,15 +92,9 @@ def _case() -> tuple[Gaussian, tuple[_Line, ...]]:
     return prior, tuple(_Line(s @ truth + 0.3 * random.normal(size=ROWS), s, noise) for s in slopes)
 
 
-def _window(estimator: OnlineEstimator) -> int:
-    window = estimator.window
-    expect(isinstance(window, int) and window >= 1, f"found window = {window!r}, expected a number of records from 1")
-    return window
-
-
-def _taken(estimator: OnlineEstimator, window: int, prior: Gaussian, lines: Sequence[_Line]) -> list[Update]:
+def _taken(estimator: OnlineEstimator, prior: Gaussian, lines: Sequence[_Line]) -> list[Update]:
     """Each record in turn: a filter goes on from its posterior, a window from the prior of its first record."""
-    updates, known, belief = [], prior, prior
+    window, updates, known, belief = estimator.window, [], prior, prior
     held: list[_Line] = []
     for line in lines:
         held.append(line)
@@ -98,56 +121,13 @@ def _known(prior: Gaussian, lines: Sequence[_Line]) -> Gaussian:
     return Gaussian(covariance @ projected, covariance)
 
 
-def _sound(updates: Sequence[Update]) -> None:
-    for place, update in enumerate(updates):
-        covariance = update.posterior.covariance
-        expect(bool((covariance == covariance.T).all()), f"found a covariance that is not symmetric after {place + 1}")
-        lowest = float(np.linalg.eigvalsh(covariance)[0])
-        expect(lowest > 0, f"found the eigenvalue {lowest:.2g} after record {place + 1}, expected all above zero")
-
-
-def _near(updates: Sequence[Update], prior: Gaussian, lines: Sequence[_Line]) -> None:
-    for place, update in enumerate(updates):
-        known = _known(prior, lines[: place + 1])
-        deviations = np.sqrt(np.diag(known.covariance))
-        off = float(np.abs((update.posterior.mean - known.mean) / deviations).max())
-        expect(off < TOLERANCE, f"found a mean {off:.1e} standard deviations off after record {place + 1}")
-        wide = float(np.abs((update.posterior.covariance - known.covariance) / np.outer(deviations, deviations)).max())
-        expect(wide < TOLERANCE, f"found a covariance {wide:.1e} off after record {place + 1}, in units of variances")
-
-
-def _nis(update: Update, prior: Gaussian, first: _Line) -> None:
-    """Of the first record, where what was believed before it is the prior whatever the window."""
-    innovation = first.measured - first.slope @ prior.mean
-    covariance = first.slope @ prior.covariance @ first.slope.T + first.noise
-    off = max(float(np.abs(update.innovation - innovation).max()), float(np.abs(update.covariance - covariance).max()))
-    expect(off < TOLERANCE, f"found an innovation or its covariance {off:.1e} off for the first record")
-
-
-def _untouched(estimator: OnlineEstimator, prior: Gaussian, lines: Sequence[_Line]) -> None:
-    mean, covariance = prior.mean.copy(), prior.covariance.copy()
-    estimator.update(prior, lines[:1])
-    kept = bool(np.array_equal(mean, prior.mean) and np.array_equal(covariance, prior.covariance))
-    expect(kept, "it changed the prior that it was given")
-
-
-def _repeats(estimator: OnlineEstimator, window: int, updates: Sequence[Update]) -> None:
-    again = _taken(estimator, window, *_case())
-    same = all(
-        np.array_equal(a.posterior.mean, b.posterior.mean)
-        and np.array_equal(a.posterior.covariance, b.posterior.covariance)
-        for a, b in zip(updates, again, strict=True)
-    )
-    expect(same, "the same records gave other beliefs the second time")
-
-
-def _refuses(estimator: OnlineEstimator, prior: Gaussian, lines: Sequence[_Line]) -> None:
-    """A direction that no record sees keeps the variance that it had."""
+def _expect_refusal(estimator: OnlineEstimator, prior: Gaussian, line: _Line) -> None:
+    """A direction that no record sees keeps the variance that it had, which is below zero."""
     covariance = np.diag([1.0, 1.0, 1.0, -0.5])
-    blind = [_Line(line.measured, line.slope * [1, 1, 1, 0], line.noise) for line in lines[:1]]
+    blind = _Line(line.measured, line.slope * [1, 1, 1, 0], line.noise)
     try:
         with np.errstate(invalid="ignore"):
-            estimator.update(Gaussian(prior.mean, covariance), blind)
+            estimator.update(Gaussian(prior.mean, covariance), [blind])
     except (ProblemError, np.linalg.LinAlgError):
         return
     raise ContractError("found a belief made of a variance of -0.5, expected armcal.errors.ProblemError")

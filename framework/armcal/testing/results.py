@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import ParamSpec, TypeVar
-
-P = ParamSpec("P")
-T = TypeVar("T")
 
 MOST_CHARACTERS = 400
 PLUGIN_FAULTS = (Exception, SystemExit)
@@ -35,35 +32,46 @@ class NotRun(Exception):  # noqa: N818 (not an error: a reason)
     """A check does not apply; the text says why."""
 
 
+class _Ended(Exception):  # noqa: N818 (not an error: the end of a group of checks)
+    """A check failed that the rest of its group needs."""
+
+
 @dataclass
 class Recorder:
-    """Runs checks on one component and keeps their results."""
+    """The results of the checks on one component: each check is the block of a ``with`` statement."""
 
     component: str
     results: list[CheckResult] = field(default_factory=list)
 
-    def check(self, name: str, run: Callable[P, T], /, *arguments: P.args, **options: P.kwargs) -> T | None:
-        """Run a check with these arguments; what it returned, or None if it found a fault or did not run."""
+    @contextmanager
+    def check(self, name: str) -> Iterator[None]:
+        """Record whether the block ends, finds a fault or does not run; what follows it goes on."""
+        result = CheckResult(self.component, name)
         try:
-            value = run(*arguments, **options)
+            yield
         except NotRun as reason:
-            self.results.append(CheckResult(self.component, f"{name} (not run: {reason})", not_run=str(reason)))
+            result = CheckResult(self.component, f"{name} (not run: {reason})", not_run=str(reason))
         except PLUGIN_FAULTS as fault:
-            self._add(name, said(fault))
-        else:
-            self._add(name)
-            return value
-        return None
+            result = CheckResult(self.component, name, said(fault))
+        self.results.append(result)
 
-    def guard(self, run: Callable[[], None]) -> None:
-        """Run several checks; a fault that escapes them becomes a result."""
+    @contextmanager
+    def needed(self, name: str) -> Iterator[None]:
+        """The same of a check that those after it build on: unless it passes, their group ends."""
+        with self.check(name):
+            yield
+        if self.results[-1].fault or self.results[-1].not_run:
+            raise _Ended
+
+    @contextmanager
+    def group(self) -> Iterator[None]:
+        """Checks of which some build on others; a fault that escapes them becomes a result."""
         try:
-            run()
+            yield
+        except _Ended:
+            pass
         except PLUGIN_FAULTS as fault:
-            self._add("the remaining checks can run", said(fault))
-
-    def _add(self, name: str, fault: str = "") -> None:
-        self.results.append(CheckResult(self.component, name, fault))
+            self.results.append(CheckResult(self.component, "the remaining checks can run", said(fault)))
 
 
 def said(fault: BaseException) -> str:
@@ -75,6 +83,19 @@ def said(fault: BaseException) -> str:
     if not isinstance(fault, ContractError):
         text = f"{type(fault).__name__}: {text}"
     return text if len(text) <= MOST_CHARACTERS else f"{text[: MOST_CHARACTERS - 3]}..."
+
+
+@contextmanager
+def raises_only(*allowed: type[Exception], expected: str = "", when: str = "") -> Iterator[None]:
+    """Errors that the block may raise; any other is a fault, which names the first of these or ``expected``."""
+    passing: tuple[type[Exception], ...] = (ContractError, *allowed)
+    try:
+        yield
+    except passing:
+        raise
+    except Exception as fault:
+        expected = expected or f"{allowed[0].__module__}.{allowed[0].__name__}"
+        raise ContractError(f"found {type(fault).__name__} ({fault}){when}, expected {expected}") from fault
 
 
 def expect(holds: bool, fault: str) -> None:

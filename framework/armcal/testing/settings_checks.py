@@ -11,7 +11,7 @@ from pydantic import ValidationError
 
 from armcal.base.settings import Settings
 from armcal.base.units import split_suffix
-from armcal.testing.results import NotRun, Recorder, expect
+from armcal.testing.results import ContractError, NotRun, Recorder, expect
 
 MISSING_FILE = "/no/such/folder/measurements"
 _UNKNOWN_KEY = "no_component_has_this_key"
@@ -40,44 +40,48 @@ class Subject:
         return self.made(self.settings, *arguments)
 
 
-def check_settings(record: Recorder, kind: str, made: Any) -> Subject | None:
-    """The component with settings to build it from, if it has any that hold."""
-    settings_class = record.check("it has checked settings", _settings_class, made)
-    if settings_class is None:
-        return None
-    record.check("every setting is typed or documented", _described, settings_class)
-    record.check("every quantity has its unit", _with_units, settings_class)
-    example = record.check("its EXAMPLE is a mapping", _example, kind, made, settings_class)
-    if example is None:
-        return None
-    settings = record.check("its example settings are accepted", _accepted, kind, made, settings_class, example)
-    record.check("an unknown key is refused", _refuses_unknown, settings_class, example)
-    if settings is None:
-        return None
-    record.check("its settings survive to_config()", _survives, settings)
+def check_settings(record: Recorder, kind: str, made: Any) -> Subject:
+    """The component with settings to build it from."""
+    with record.needed("it has checked settings"):
+        settings_class: Any = getattr(made, "Settings", None)
+        expect(
+            isinstance(settings_class, type) and issubclass(settings_class, Settings),
+            f"found Settings = {settings_class!r}, expected a class attribute: "
+            "a subclass of armcal.base.settings.Settings",
+        )
+    fields = settings_class.model_fields
+    with record.check("every setting is typed or documented"):
+        bare = [n for n, info in fields.items() if info.annotation in (None, Any, object) and not info.description]
+        expect(not bare, f"found {', '.join(bare)} without a type, expected a type or Field(description=...)")
+    with record.check("every quantity has its unit"):
+        _expect_units(settings_class)
+    with record.needed("its EXAMPLE is a mapping"):
+        given = getattr(made, "EXAMPLE", {})
+        found = type(given).__name__
+        expect(isinstance(given, Mapping), f"found EXAMPLE of type {found}, expected a mapping of settings")
+        example = dict(given)
+        if kind == "reader" and "path" in fields and fields["path"].is_required():
+            example.setdefault("path", MISSING_FILE)
+    with record.check("an unknown key is refused"):
+        _expect_unknown_key_refused(settings_class, example)
+    with record.needed("its example settings are accepted"):
+        try:
+            settings = settings_class.model_validate(example)
+        except ValidationError as fault:
+            if hasattr(made, "EXAMPLE"):
+                raise
+            reason = "it has no EXAMPLE and needs settings"
+            if kind == "simulator":
+                raise NotRun(reason) from fault
+            add = "add the class attribute EXAMPLE, a mapping as a configuration would have it"
+            raise ContractError(f"{reason}: {add}") from fault
+    with record.check("its settings survive to_config()"):
+        again = settings_class.model_validate(settings.to_config())
+        expect(again == settings, f"found {again!r} after to_config(), expected {settings!r}")
     return Subject(made, example, settings)
 
 
-def _settings_class(made: Any) -> type[Settings]:
-    settings_class = getattr(made, "Settings", None)
-    expect(
-        isinstance(settings_class, type) and issubclass(settings_class, Settings),
-        f"found Settings = {settings_class!r}, expected a class attribute: a subclass of armcal.base.settings.Settings",
-    )
-    result: type[Settings] = made.Settings
-    return result
-
-
-def _described(settings_class: type[Settings]) -> None:
-    bare = [
-        name
-        for name, info in settings_class.model_fields.items()
-        if info.annotation in (None, Any, object) and not info.description
-    ]
-    expect(not bare, f"found {', '.join(bare)} without a type, expected a type or Field(description=...)")
-
-
-def _with_units(settings_class: type[Settings]) -> None:
+def _expect_units(settings_class: type[Settings]) -> None:
     """No plain number has a quantity's name; one that is none says so in ``Field(description=...)``."""
     quantities = settings_class.quantities()
     for name, info in settings_class.model_fields.items():
@@ -101,39 +105,11 @@ def _holds_floats(*parts: Any) -> bool:
     )
 
 
-def _example(kind: str, made: Any, settings_class: type[Settings]) -> Mapping[str, Any]:
-    given = getattr(made, "EXAMPLE", {})
-    expect(isinstance(given, Mapping), f"found EXAMPLE of type {type(given).__name__}, expected a mapping of settings")
-    example = dict(given)
-    path = settings_class.model_fields.get("path")
-    if kind == "reader" and path is not None and path.is_required():
-        example.setdefault("path", MISSING_FILE)
-    return example
-
-
-def _accepted(kind: str, made: Any, settings_class: type[Settings], example: Mapping[str, Any]) -> Settings:
-    try:
-        return settings_class.model_validate(example)
-    except ValidationError as fault:
-        if hasattr(made, "EXAMPLE"):
-            raise
-        reason = "it has no EXAMPLE and needs settings"
-        if kind == "simulator":
-            raise NotRun(reason) from fault
-        expect(False, f"{reason}: add the class attribute EXAMPLE, a mapping as a configuration would have it")
-        raise
-
-
-def _refuses_unknown(settings_class: type[Settings], example: Mapping[str, Any]) -> None:
+def _expect_unknown_key_refused(settings_class: type[Settings], example: Mapping[str, Any]) -> None:
     try:
         settings_class.model_validate({**example, _UNKNOWN_KEY: 1})
     except ValidationError as fault:
         named = any(_UNKNOWN_KEY in map(str, error["loc"]) for error in fault.errors())
         expect(named, "found an unknown key refused without being named, expected its name in the error")
     else:
-        expect(False, "found an unknown key accepted, expected it refused: keep extra='forbid'")
-
-
-def _survives(settings: Settings) -> None:
-    again = type(settings).model_validate(settings.to_config())
-    expect(again == settings, f"found {again!r} after to_config(), expected {settings!r}")
+        raise ContractError("found an unknown key accepted, expected it refused: keep extra='forbid'")

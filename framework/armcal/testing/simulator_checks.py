@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Mapping
 
 import numpy as np
 
-from armcal.arm.assembly import Arm
 from armcal.base.dataset import Dataset
 from armcal.errors import InputError
 from armcal.estimate.simulation import SimulationRequest, Simulator
@@ -20,33 +18,24 @@ from armcal.testing.settings_checks import Subject
 
 def check_simulator(record: Recorder, subject: Subject) -> None:
     """That the same request gives the same records."""
-    simulator: Any = record.check("it builds", subject.build)
-    if simulator is None:
-        return
-    method = getattr(simulator, "simulate", None)
-    record.check("it simulates", expect, callable(method), f"found simulate = {method!r}, expected a method")
-    name = "it gives what every instrument reads, the same each time"
-    record.check(name, _repeats, subject, simulator)
+    with record.needed("it builds"):
+        simulator: Simulator = subject.build()
+    with record.check("it simulates"):
+        method = getattr(simulator, "simulate", None)
+        expect(callable(method), f"found simulate = {method!r}, expected a method")
+    with record.check("it gives what every instrument reads, the same each time"):
+        request, first = _suited(simulator)
+        for requested in requested_channels(request.arms, request.measurements, measured=True):
+            given = first.has(requested.channel) or not requested.required
+            expect(given, f"found no {requested.channel} in the records, expected every required channel")
+        _expect_same(first, simulator.simulate(request), "the second time")
+        _expect_same(first, subject.build().simulate(request), "from a second simulator of equal settings")
 
 
-def _repeats(subject: Subject, simulator: Simulator) -> None:
-    arms = planar_arms([ARM])
-    request, first = _suited(simulator, arms, ({TRACKER: Tip()}, {WALLS: Walls()}))
-    measurements = request.measurements
-    for requested in requested_channels(arms, measurements, measured=True):
-        expect(
-            first.has(requested.channel) or not requested.required,
-            f"found no {requested.channel} in the records, expected every required channel",
-        )
-    _same(first, simulator.simulate(request), "the second time")
-    _same(first, subject.made(subject.settings).simulate(request), "from a second simulator of equal settings")
-
-
-def _suited(
-    simulator: Simulator, arms: Mapping[str, Arm], choices: Sequence[Mapping[str, Measurement]]
-) -> tuple[SimulationRequest, Dataset]:
-    """The first of some measurements that a simulator's EXAMPLE suits, an instrument or a contact, and its records."""
-    refused = []
+def _suited(simulator: Simulator) -> tuple[SimulationRequest, Dataset]:
+    """What a simulator's EXAMPLE suits, an instrument or a contact, and its records of it."""
+    arms, refused = planar_arms([ARM]), []
+    choices: tuple[Mapping[str, Measurement], ...] = ({TRACKER: Tip()}, {WALLS: Walls()})
     for measurements in choices:
         request = SimulationRequest(arms, measurements, all_parameters(arms), GRAVITY)
         try:
@@ -56,7 +45,7 @@ def _suited(
     raise NotRun(f"its EXAMPLE does not suit the arm of the check: {'; '.join(refused)}")
 
 
-def _same(first: Dataset, again: Dataset, when: str) -> None:
+def _expect_same(first: Dataset, again: Dataset, when: str) -> None:
     expect(first.ids == again.ids, f"found other record ids {when}")
     expect(set(first.channels) == set(again.channels), f"found other channels {when}")
     for name, values in first.channels.items():
