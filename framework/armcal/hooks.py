@@ -232,7 +232,7 @@ COMPONENTS: Mapping[str, ComponentKind] = MappingProxyType(
             "armcal_register_joint_streams",
             "Stream(settings)",
             "armcal.devices.joint_stream:JointStream",
-            ("armcal.devices.rest_stream:RestStream",),
+            ("armcal.devices.joint_stream:RestStream",),
         ),
         "bench": ComponentKind("armcal_register_benches", "Bench(settings)", "armcal.devices.simulated:SimulatedBench"),
         "command": ComponentKind("armcal_register_commands", "Command", "armcal.hooks:Command"),

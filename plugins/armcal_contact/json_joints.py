@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping
 from typing import Any, ClassVar, Literal
 
 from armcal.base.settings import Settings
 from armcal.base.units import split_suffix
 from armcal.devices.clock import Clock
-from armcal.devices.joint_stream import JointSample, JointStream
-from armcal.devices.line_source import Begin, LineSource, SourceName, open_lines
+from armcal.devices.joint_stream import JointSample
+from armcal.devices.line_source import Begin, LineJointStream, SourceName, open_lines
 from armcal.errors import ConfigError
 from pydantic import Field, field_validator
 from typing_extensions import override
 
 from armcal_contact.json_joint_message import JointMessages, RefusedLine
-
-_MOST_REASONS = 100
 
 
 class JsonLinesJointSettings(Settings):
@@ -47,29 +44,18 @@ class JsonLinesJointSettings(Settings):
         return name
 
 
-class JsonLinesJoints(JointStream):
+class JsonLinesJoints(LineJointStream):
     """Joint readings as ``json_joint_message`` reads them. See ``armcal.devices.joint_stream.JointStream``."""
 
     Settings: ClassVar[type[JsonLinesJointSettings]] = JsonLinesJointSettings
     EXAMPLE: ClassVar[Mapping[str, Any]] = {"source": "udp:0", "unit": "rad"}
 
     def __init__(self, settings: JsonLinesJointSettings) -> None:
+        super().__init__()
         self._settings = settings
-        self._source: LineSource | None = None
         self._messages: JointMessages | None = None
         self._clock: Clock | None = None
         self._last: float | None = None
-        self._refused: Counter[str] = Counter()
-
-    @property
-    @override
-    def refused(self) -> Mapping[str, int]:
-        return dict(self._refused)
-
-    @property
-    @override
-    def ended(self) -> bool:
-        return self._source is None or self._source.ended
 
     @override
     def open(self, clock: Clock, channels: tuple[str, ...]) -> None:
@@ -89,12 +75,6 @@ class JsonLinesJoints(JointStream):
         samples = (self._read(line, now) for line in self._source.lines())
         return [sample for sample in samples if sample is not None]
 
-    @override
-    def close(self) -> None:
-        if self._source is not None:
-            self._source.close()
-        self._source = None
-
     def _read(self, line: bytes | None, now: float) -> JointSample | None:
         assert self._messages is not None
         if line is not None and not line.strip():
@@ -104,9 +84,7 @@ class JsonLinesJoints(JointStream):
             if message.stamp is not None and message.stamp == self._last:
                 raise RefusedLine("its time is that of the line before: the source repeats itself")
         except RefusedLine as fault:
-            reason = str(fault)
-            known = reason in self._refused or len(self._refused) < _MOST_REASONS
-            self._refused[reason if known else "other reasons"] += 1
+            self._refuse(str(fault))
             return None
         self._last = message.stamp
         return JointSample(now, message.stamp, message.angles, message.labels)

@@ -21,7 +21,7 @@ from armcal.base.domains import Array
 from armcal.base.settings import InputPath, Settings
 from armcal.errors import DataError, Location
 from armcal.io.cells import is_missing, is_number
-from armcal.io.plain_files import input_bytes
+from armcal.io.plain_files import input_bytes, text_of
 from armcal.measure.checks import check_dataset, layout_of
 from armcal.measure.contact import named_arm
 from armcal.measure.measurement import GroupedMeasurement, noise_channels
@@ -153,15 +153,7 @@ def _file(path: Path, folder: Path) -> SocketFile:
     if not path.resolve().is_relative_to(folder.resolve()):
         _refuse(path, "it is a link that leads out of the folder.", "Put the recording itself there.")
     raw = input_bytes(path, MAX_BYTES, "a CSV file")
-    try:
-        text = raw.decode("utf-8-sig")
-    except UnicodeDecodeError as fault:
-        line = raw[: fault.start].count(b"\n") + 1
-        found_byte = f"found the byte 0x{raw[fault.start]:02x}, which is not UTF-8 text."
-        raise DataError(found_byte, where=Location(str(path), line=line), hint="Save it as CSV text.") from fault
-    if "\0" in text:
-        line = text[: text.index("\0")].count("\n") + 1
-        raise DataError("found a NUL byte.", where=Location(str(path), line=line), hint="Save it as CSV text.")
+    text = text_of(raw, path, "Save it as CSV text.")
     return SocketFile(path, path.parent.name, path.stem, text.replace("\r\n", "\n").replace("\r", "\n"), raw)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,17 +11,14 @@ import numpy as np
 from armcal.base.domains import Array
 from armcal.base.units import from_unit
 from armcal.devices.clock import Clock
-from armcal.devices.joint_stream import JointSample, JointStream
-from armcal.devices.line_source import Begin, FileLines, LineSource, SourceName, open_lines
-from armcal.devices.rest_stream import RestStream
+from armcal.devices.joint_stream import JointSample, RestStream
+from armcal.devices.line_source import Begin, FileLines, LineJointStream, SourceName, open_lines
 from armcal.errors import ConfigError, DataError
 from typing_extensions import override
 
 from armcal_dualarm.log_columns import LogColumns
-from armcal_dualarm.log_table import Column, cells_of, delimiter_of, is_header, number_of, place_of
+from armcal_dualarm.log_table import Column, cells_of, delimiter_of, is_header, number_of, place_of, text_of
 from armcal_dualarm.still import LiveRests, Rows
-
-_MOST_REASONS = 100
 
 
 class TwoArmStreamSettings(LogColumns):
@@ -74,14 +70,9 @@ class LiveTable:
         Raises:
             DataError: it cannot be read.
         """
-        try:
-            text = line.decode("utf-8-sig")
-        except UnicodeDecodeError as fault:
-            raise DataError("found bytes that are not UTF-8 text.") from fault
+        text = text_of(self._source, None, line)
         if not text.strip():
             return None
-        if "\0" in text:
-            raise DataError("found a NUL byte, expected text.")
         if self._form is None:
             delimiter = delimiter_of(text) if self._delimiter == "auto" else self._delimiter
             cells = cells_of(text, delimiter)
@@ -101,7 +92,7 @@ class LiveTable:
         return Row(np.array(numbers), tuple(chosen[count:]))
 
 
-class TwoArmLogStream(JointStream, RestStream):
+class TwoArmLogStream(LineJointStream, RestStream):
     """Readings, or with ``still`` the means of rests. See ``armcal.devices.joint_stream.JointStream``."""
 
     Settings: ClassVar[type[TwoArmStreamSettings]] = TwoArmStreamSettings
@@ -111,29 +102,18 @@ class TwoArmLogStream(JointStream, RestStream):
     }
 
     def __init__(self, settings: TwoArmStreamSettings) -> None:
+        super().__init__()
         self._settings = settings
-        self._source: LineSource | None = None
         self._table: LiveTable | None = None
         self._rests: LiveRests | None = None
         self._clock: Clock | None = None
         self._channels: tuple[str, ...] = ()
         self._ratios = np.ones(0)
-        self._refused: Counter[str] = Counter()
 
     @property
     @override
     def gives_rests(self) -> bool:
         return self._settings.still is not None
-
-    @property
-    @override
-    def refused(self) -> Mapping[str, int]:
-        return dict(self._refused)
-
-    @property
-    @override
-    def ended(self) -> bool:
-        return self._source is None or self._source.ended
 
     @override
     def open(self, clock: Clock, channels: tuple[str, ...]) -> None:
@@ -183,12 +163,6 @@ class TwoArmLogStream(JointStream, RestStream):
     def lasting(self) -> list[JointSample]:
         return [] if self._rests is None else self._samples(self._rests.lasting())
 
-    @override
-    def close(self) -> None:
-        if self._source is not None:
-            self._source.close()
-        self._source = None
-
     def _row(self, line: bytes | None) -> Row | None:
         assert self._table is not None
         try:
@@ -213,7 +187,3 @@ class TwoArmLogStream(JointStream, RestStream):
             labels = {name: cells[0] for name, cells in zip(self._settings.labels, rows.texts, strict=True)}
             samples.append(JointSample(now, stamp, angles, labels))
         return samples
-
-    def _refuse(self, reason: str) -> None:
-        known = reason in self._refused or len(self._refused) < _MOST_REASONS
-        self._refused[reason if known else "other reasons"] += 1

@@ -74,16 +74,26 @@ def read_table(path: Path, delimiter: str, numbers: Sequence[Column], texts: Seq
 def _rows(path: Path, raw: bytes, delimiter: str) -> Iterator[tuple[int, list[str]]]:
     """Rows that are not blank, each with its line."""
     for line, data in enumerate(raw.splitlines(), start=1):
-        try:
-            text = data.decode("utf-8-sig" if line == 1 else "utf-8")
-        except UnicodeDecodeError:
-            _refuse(path, "found bytes that are not UTF-8 text.", _SAVE_AS_TEXT, line)
-        if "\0" in text:
-            _refuse(path, "found a NUL byte, expected text.", _SAVE_AS_TEXT, line)
+        text = text_of(path, line, data)
         if not text.strip():
             continue
         delimiter = delimiter_of(text) if delimiter == "auto" else delimiter
         yield line, cells_of(text, delimiter)
+
+
+def text_of(path: Path, line: int | None, data: bytes) -> str:
+    """The text of a row.
+
+    Raises:
+        DataError: it is none.
+    """
+    try:
+        text = data.decode("utf-8" if line and line > 1 else "utf-8-sig")
+    except UnicodeDecodeError:
+        _refuse(path, "found bytes that are not UTF-8 text.", _SAVE_AS_TEXT, line)
+    if "\0" in text:
+        _refuse(path, "found a NUL byte, expected text.", _SAVE_AS_TEXT, line)
+    return text
 
 
 def delimiter_of(text: str) -> str:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
 import casadi as ca
@@ -76,8 +77,8 @@ class IpoptEstimator:
         starts = [posed.x(_definite(problem.parameters, start))]
         for _ in range(1, self._settings.starts):
             starts.append(np.clip(random.normal(size=len(posed.scales)), *posed.bounds()))
-        tasks = [_Start(self._settings, problem, tuple(records), x) for x in starts]
-        runs = self._executor.map(_solve_once, tasks, lambda done: progress("fit", done))
+        solve_once = partial(_solve_once, self._settings, problem, tuple(records))
+        runs = self._executor.map(solve_once, starts, lambda done: progress("fit", done))
         converged = [run for run in runs if run.converged]
         best = min(converged or runs, key=lambda run: run.cost)
         agreeing = sum(abs(run.cost - best.cost) <= _SAME_COST * max(1.0, best.cost) for run in converged)
@@ -86,27 +87,16 @@ class IpoptEstimator:
         return Solution(posed.values(x), SolverVerdict("ipopt", *ended, len(runs), agreeing))
 
 
-@dataclass(frozen=True)
-class _Start:
-    """One start: where from, on what."""
-
-    settings: IpoptSettings
-    problem: Problem
-    records: tuple[FactorRecords, ...]
-    x: Array
-
-
-def _solve_once(task: _Start) -> _Run:
+def _solve_once(settings: IpoptSettings, problem: Problem, records: tuple[FactorRecords, ...], start: Array) -> _Run:
     """From one start; on a copy of the records, so that no start warms another's equilibria."""
-    records = task.problem.subset(task.records, np.arange(task.records[0].count))
-    posed = PosedProblem(task.problem, records)
-    objective = _Objective(posed, task.x, exact=task.settings.hessian == "exact")
+    posed = PosedProblem(problem, problem.subset(records, np.arange(records[0].count)))
+    objective = _Objective(posed, start, exact=settings.hessian == "exact")
     lower, upper = posed.bounds()
     # CasADi holds callbacks weakly: they must outlive the solve here.
     callbacks = [_Callback(name, objective) for name in ("cost", "gradient", "hessian")]
     watch = _Watch(objective)
-    solver = _solver(task.settings, callbacks, watch, len(task.x))
-    answer = solver(x0=task.x, lbx=lower, ubx=upper)
+    solver = _solver(settings, callbacks, watch, len(start))
+    answer = solver(x0=start, lbx=lower, ubx=upper)
     stats = solver.stats()
     stopped = stats["return_status"] == "User_Requested_Stop"
     if objective.interrupted or (stopped and not objective.stuck):

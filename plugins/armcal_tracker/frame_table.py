@@ -92,19 +92,13 @@ def row_of(table: FrameTable, line: bytes) -> Frame | None:
     if not 0 <= counter < _MOST_FRAMES or counter != int(counter):
         raise UnreadableError("a frame that is no whole number")
     stamp = math.nan if table.time is None else from_unit(_number(cells[table.time[0]]), table.time[1])
-    bodies: dict[str, Array | None] = {}
-    wrong: list[str] = []
+    poses: dict[str, Array | str | None] = {}
     for name, columns in table.bodies.items():
         position = [from_unit(_number(cells[i]), unit) for i, unit in columns.position]
         turn = [_number(cells[i]) for i in columns.quaternion]
-        bodies[name] = None
-        if not any(map(math.isnan, position)):
-            pose = body_pose(position, None if not turn or any(map(math.isnan, turn)) else turn)
-            if isinstance(pose, str):
-                wrong.append(pose)
-            else:
-                bodies[name] = pose
-    return Frame(int(counter), None if math.isnan(stamp) else stamp, bodies, tuple(wrong))
+        known = None if not turn or any(map(math.isnan, turn)) else turn
+        poses[name] = None if any(map(math.isnan, position)) else body_pose(position, known)
+    return Frame.of(int(counter), None if math.isnan(stamp) else stamp, poses)
 
 
 def _body(name: str, columns: Mapping[str, str], places: Mapping[str, int], source: str) -> BodyColumns:

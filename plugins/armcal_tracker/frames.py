@@ -46,6 +46,12 @@ class Frame:
     bodies: Mapping[str, Array | None] = field(default_factory=dict)
     wrong: tuple[str, ...] = ()
 
+    @classmethod
+    def of(cls, counter: int, stamp: float | None, poses: Mapping[str, Array | str | None]) -> Frame:
+        """From the pose of each body, or why it cannot be believed; None where it is not seen."""
+        wrong = tuple(pose for pose in poses.values() if isinstance(pose, str))
+        return cls(counter, stamp, {n: None if isinstance(pose, str) else pose for n, pose in poses.items()}, wrong)
+
 
 def body_pose(position: Sequence[float], quaternion: Sequence[float] | None) -> Array | str:
     """``world_T_body`` (4 x 4, m), or why it cannot be believed.

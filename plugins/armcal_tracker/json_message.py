@@ -57,8 +57,7 @@ def json_frame(line: bytes) -> Frame:
         if body is not None:
             position = [from_unit(x, _POSITIONS[keys[0]]) for x in _numbers(body[keys[0]], 3)]
             poses[name] = body_pose(position, _numbers(body["q"], 4) if body.get("q") is not None else None)
-    wrong = tuple(pose for pose in poses.values() if isinstance(pose, str))
-    return Frame(counter, stamp, {n: None if isinstance(pose, str) else pose for n, pose in poses.items()}, wrong)
+    return Frame.of(counter, stamp, poses)
 
 
 def _numbers(values: Any, count: int) -> list[float]:

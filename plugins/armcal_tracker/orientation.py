@@ -161,9 +161,8 @@ class AnglesColumns(Orientation):
     def others(self, values: Array) -> dict[str, Rotation]:
         """Turns about the axes that turned before, and the other unit."""
         degrees = self.unit == "deg"
-        moving = Rotation.from_euler("XYZ", values, degrees=degrees)
         return {
-            "R = Rx(roll) Ry(pitch) Rz(yaw)": moving,
+            "R = Rx(roll) Ry(pitch) Rz(yaw)": Rotation.from_euler("XYZ", values, degrees=degrees),
             f"unit: {'rad' if degrees else 'deg'}": Rotation.from_euler("xyz", values, degrees=not degrees),
         }
 
@@ -186,10 +185,9 @@ class VectorColumns(AnglesColumns):
     def others(self, values: Array) -> dict[str, Rotation]:
         """The inverse, and the other unit."""
         degrees = self.unit == "deg"
-        other = Rotation.from_rotvec(values, degrees=not degrees)
         return {
             "it as that of body_T_base": self.rotations(values).inv(),
-            f"unit: {'rad' if degrees else 'deg'}": other,
+            f"unit: {'rad' if degrees else 'deg'}": Rotation.from_rotvec(values, degrees=not degrees),
         }
 
 

@@ -11,17 +11,18 @@ from armcal.arm.assembly import ArmState
 from armcal.base import se3
 from armcal.base.parameters import ParameterBlock
 from armcal.base.pose_blocks import NO_TURN, pose_blocks, pose_transform, quaternion_expression, rotation_of
-from armcal.base.settings import Angle, Angle3, Length, Length3
-from armcal.measure.instrument import Instrument, InstrumentSettings
+from armcal.base.settings import Angle, Angle3
 from armcal.measure.measurement import Channel
 from pydantic import field_validator
+
+from armcal_tracker.position import TipPosition, TipPositionSettings, three
 
 _QUATERNION = ("qw", "qx", "qy", "qz")
 _TURNS = ("rx", "ry", "rz")
 _UNIT = 1e-3
 
 
-class TipPoseSettings(InstrumentSettings):
+class TipPoseSettings(TipPositionSettings):
     """Which arm, how noisy the tracker is (standard deviations), how the body sits on the tool.
 
     ``noise`` is of each coordinate in the base frame, ``orientation_noise`` of the rotation vector about each axis of
@@ -30,23 +31,13 @@ class TipPoseSettings(InstrumentSettings):
     ``noise_rotation``.
     """
 
-    noise: Length | Length3
     orientation_noise: Angle | Angle3
-    target: Length3 = (0.0, 0.0, 0.0)
     target_rotation: tuple[float, float, float, float] = NO_TURN
-
-    @field_validator("noise")
-    @classmethod
-    def _positive(cls, value: float | tuple[float, ...]) -> float | tuple[float, ...]:
-        worst = min(_three(value))
-        if worst <= 0:
-            raise ValueError(f"a noise of {worst * 1000:g} mm is not above zero: give the tracker's standard deviation")
-        return value
 
     @field_validator("orientation_noise")
     @classmethod
     def _positive_angle(cls, value: float | tuple[float, ...]) -> float | tuple[float, ...]:
-        worst = min(_three(value))
+        worst = min(three(value))
         if worst <= 0:
             text = f"an orientation noise of {np.degrees(worst):g} deg is not above zero"
             raise ValueError(f"{text}: give the tracker's standard deviation")
@@ -61,7 +52,7 @@ class TipPoseSettings(InstrumentSettings):
         return tuple(float(x) / length for x in value)
 
 
-class TipPose(Instrument):
+class TipPose(TipPosition):
     """The measurement ``tip_pose``: channels x, y, z and qw, qx, qy, qz of base_T_body.
 
     Parameters target_x, target_y, target_z and target_rotation: tool_T_body.
@@ -81,8 +72,7 @@ class TipPose(Instrument):
 
     def channels(self) -> tuple[Channel, ...]:
         """Three coordinates and a quaternion, of either sign."""
-        lengths = tuple(Channel(axis, "length") for axis in "xyz")
-        return lengths + tuple(Channel(name, "dimensionless") for name in _QUATERNION)
+        return super().channels() + tuple(Channel(name, "dimensionless") for name in _QUATERNION)
 
     def outputs(self, arms: Mapping[str, ArmState], values: Mapping[str, Any]) -> dict[str, Any]:
         """The body's pose in the base frame (m, unit quaternion with qw >= 0)."""
@@ -107,7 +97,7 @@ class TipPose(Instrument):
 
     def noise(self) -> tuple[float, ...]:
         """Of each coordinate (m) and of each entry of the rotation vector (rad)."""
-        return _three(self.settings.noise) + _three(self.settings.orientation_noise)
+        return super().noise() + three(self.settings.orientation_noise)
 
     def dimensions(self) -> tuple[str, ...]:
         """Position, then rotation."""
@@ -115,13 +105,8 @@ class TipPose(Instrument):
 
     def noise_channels(self) -> tuple[tuple[Channel, ...], ...]:
         """Each entry's own, or one for all three."""
-        lengths = tuple((Channel(f"noise_{axis}", "length"), Channel("noise", "length")) for axis in "xyz")
         angles = tuple((Channel(f"noise_{turn}", "angle"), Channel("noise_rotation", "angle")) for turn in _TURNS)
-        return lengths + angles
+        return super().noise_channels() + angles
 
     def _pose(self, arms: Mapping[str, ArmState], values: Mapping[str, Any]) -> se3.Transform:
         return self.base_T_tool(arms) @ pose_transform("target", values)
-
-
-def _three(value: float | tuple[float, ...]) -> tuple[float, ...]:
-    return value if isinstance(value, tuple) else (value,) * 3

@@ -26,7 +26,7 @@ class TipPositionSettings(InstrumentSettings):
     @field_validator("noise")
     @classmethod
     def _positive(cls, value: float | tuple[float, ...]) -> float | tuple[float, ...]:
-        worst = min(value) if isinstance(value, tuple) else value
+        worst = min(three(value))
         if worst <= 0:
             raise ValueError(f"a noise of {worst * 1000:g} mm is not above zero: give the tracker's standard deviation")
         return value
@@ -53,9 +53,13 @@ class TipPosition(Instrument):
 
     def noise(self) -> tuple[float, ...]:
         """Of each coordinate (m)."""
-        noise = self.settings.noise
-        return noise if isinstance(noise, tuple) else (noise,) * 3
+        return three(self.settings.noise)
 
     def noise_channels(self) -> tuple[tuple[Channel, ...], ...]:
         """Each coordinate's own, or one for all three."""
         return tuple((Channel(f"noise_{axis}", "length"), Channel("noise", "length")) for axis in "xyz")
+
+
+def three(value: float | tuple[float, ...]) -> tuple[float, ...]:
+    """One number of each coordinate, where a single one stands for all."""
+    return value if isinstance(value, tuple) else (value,) * 3

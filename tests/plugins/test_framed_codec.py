@@ -7,8 +7,7 @@ import binascii
 import numpy as np
 import pytest
 from armcal.devices.framed import messages
-from armcal.devices.framed.cobs import cobs_decoded, cobs_encoded
-from armcal.devices.framed.frames import MAX_PAYLOAD, Frame, FrameDecoder, encoded
+from armcal.devices.framed.frames import MAX_PAYLOAD, Frame, FrameDecoder, cobs_decoded, cobs_encoded, encoded
 from hypothesis import given
 from hypothesis import strategies as st
 

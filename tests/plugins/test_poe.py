@@ -13,7 +13,7 @@ from armcal.arm.assembly import Arm, ArmInputs, MassSpec
 from armcal.arm.effects import JointEffect, Spring
 from armcal.arm.model import Joint, forward
 from armcal.arm.statics import Load, Mass, effort, wrenches
-from armcal.base import se3, twists
+from armcal.base import se3
 from armcal.base.directions import Direction
 from armcal.base.parameters import Parameters
 from armcal_poe.model import PoeModel
@@ -144,7 +144,7 @@ def test_an_axis_along_z_leaves_the_frame_of_its_joint_unturned():
 def test_a_general_motion_is_exact_up_to_a_whole_turn_and_its_slope_at_zero_is_the_twist():
     pin = pytest.importorskip("pinocchio")
     w, v, q = ca.SX.sym("w", 3), ca.SX.sym("v", 3), ca.SX.sym("q")
-    motion = ca.densify(twists.turning_motion(w, v, q).matrix())
+    motion = ca.densify(se3.turning_motion(w, v, q).matrix())
     function = ca.Function("f", [w, v, q], [motion])
     slope = ca.Function("s", [w, v, q], [ca.jacobian(ca.vec(motion), q)])
     random = np.random.default_rng(4)
@@ -161,7 +161,7 @@ def test_a_general_motion_is_exact_up_to_a_whole_turn_and_its_slope_at_zero_is_t
 
 
 def test_a_whole_turn_comes_back_and_slides_by_its_pitch():
-    turned = twists.turning_motion(ca.SX([0, 0, 1.0]), ca.SX([0.3, -0.2, 0.05]), 2 * np.pi)
+    turned = se3.turning_motion(ca.SX([0, 0, 1.0]), ca.SX([0.3, -0.2, 0.05]), 2 * np.pi)
     found = np.asarray(ca.evalf(ca.densify(turned.matrix())))
     expected = np.eye(4)
     expected[2, 3] = 0.05 * 2 * np.pi
@@ -171,7 +171,7 @@ def test_a_whole_turn_comes_back_and_slides_by_its_pitch():
 def test_a_sliding_twist_may_turn_a_little_and_is_smooth_where_it_does_not():
     pin = pytest.importorskip("pinocchio")
     w, v, q = ca.SX.sym("w", 3), ca.SX.sym("v", 3), ca.SX.sym("q")
-    motion = ca.densify(twists.sliding_motion(w, v, q).matrix())
+    motion = ca.densify(se3.sliding_motion(w, v, q).matrix())
     function = ca.Function("f", [w, v, q], [motion, ca.jacobian(ca.vec(motion), w)])
     random = np.random.default_rng(5)
     for size in (0.0, 1e-9, 0.1, 0.9):

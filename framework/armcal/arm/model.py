@@ -8,7 +8,7 @@ from typing import Protocol
 
 import casadi as ca
 
-from armcal.base import se3, twists
+from armcal.base import se3
 from armcal.base.parameters import ParameterBlock
 from armcal.base.se3 import Expression, Transform
 
@@ -69,7 +69,7 @@ class Joint:
     def motion(self, displacement: Expression) -> Transform:
         """The joint's own motion at a displacement (rad or m), in its frame."""
         if self.twist is not None:
-            along = twists.turning_motion if self.is_revolute else twists.sliding_motion
+            along = se3.turning_motion if self.is_revolute else se3.sliding_motion
             return along(*self.twist, displacement)
         for name, unit in zip("xyz", ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), Z_AXIS), strict=True):
             if self.angular == unit:

@@ -46,7 +46,7 @@ class PoseSettings(Settings):
             return tuple(float(x) for x in q)
         if self.rotation is not None:
             return quaternion_of(nearest_rotation(np.array(self.rotation)))
-        return NO_TURN if self.rpy is None else quaternion_of(_from_rpy(self.rpy))
+        return NO_TURN if self.rpy is None else quaternion_of(rpy_matrices(np.array(self.rpy)))
 
     def blocks(self, name: str) -> tuple[ParameterBlock, ...]:
         """As parameters; see ``pose_blocks``."""
@@ -88,12 +88,12 @@ def quaternion_of(rotation: Array) -> tuple[float, ...]:
     return tuple(float(x) for x in (q if q[0] >= 0 else -q))
 
 
-def _from_rpy(rpy: tuple[float, float, float]) -> Array:
-    (cr, cp, cy), (sr, sp, sy) = np.cos(rpy), np.sin(rpy)
-    return np.array(
-        [
-            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
-            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
-            [-sp, cp * sr, cp * cr],
-        ]
-    )
+def rpy_matrices(rpy: Array) -> Array:
+    """Rz(yaw) Ry(pitch) Rx(roll) (... x 3 x 3) from roll, pitch, yaw (... x 3; rad)."""
+    (cr, cp, cy), (sr, sp, sy) = np.moveaxis(np.cos(rpy), -1, 0), np.moveaxis(np.sin(rpy), -1, 0)
+    rows = [
+        [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+        [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+        [-sp, cp * sr, cp * cr],
+    ]
+    return np.moveaxis(np.array(rows), (0, 1), (-2, -1))

@@ -15,6 +15,7 @@ Expression = Any
 """A CasADi ``SX`` (or a number where a constant is meant)."""
 
 _SERIES_TERMS = 10
+_MOTION_TERMS = 12
 _HALVINGS = 3
 _ARCSINE_TERMS = 11
 _NO_AXIS = 1e-30
@@ -172,3 +173,40 @@ def solve_near_identity(matrix: Expression, right: Expression) -> Expression:
         known = [rows[i][k] * solved[k] for k in range(i + 1, size)]
         solved[i] = (rows[i][size:] - sum(known, ca.SX(0))) / rows[i][i]
     return ca.vertcat(*solved)
+
+
+def turning_motion(angular: Expression, linear: Expression, displacement: Expression) -> Transform:
+    """exp(twist * displacement) of a twist that turns: ``angular`` (3x1, not zero) and ``linear`` (3x1, m).
+
+    Nothing is divided by the displacement, so it is exact and smooth at zero and at any angle.
+    """
+    rate = ca.norm_2(angular)
+    cross = skew(angular / rate)
+    squared = ca.mtimes(cross, cross)
+    angle = rate * displacement
+    versine = 1 - ca.cos(angle)
+    rotation = ca.SX.eye(3) + ca.sin(angle) * cross + versine * squared
+    along = displacement * ca.SX.eye(3) + versine / rate * cross + (displacement - ca.sin(angle) / rate) * squared
+    return Transform(rotation, ca.mtimes(along, linear))
+
+
+def sliding_motion(angular: Expression, linear: Expression, displacement: Expression) -> Transform:
+    """exp(twist * displacement) of a twist that slides, and may turn a little: ``angular`` (3x1) may be zero.
+
+    By power series, smooth at zero ``angular``; exact to double precision while it turns by less than one radian.
+    """
+    vector = angular * displacement
+    squared_angle = ca.dot(vector, vector)
+    first, second, third = (_series(squared_angle, start) for start in (1, 2, 3))
+    cross = skew(vector)
+    squared = ca.mtimes(cross, cross)
+    along = ca.SX.eye(3) + second * cross + third * squared
+    return Transform(ca.SX.eye(3) + first * cross + second * squared, ca.mtimes(along, linear * displacement))
+
+
+def _series(squared: Expression, start: int) -> Expression:
+    """1/start! - squared/(start + 2)! + ..."""
+    total = ca.SX(0)
+    for term in reversed(range(_MOTION_TERMS)):
+        total = total * squared + (-1) ** term / math.factorial(2 * term + start)
+    return total

@@ -49,8 +49,8 @@ def _of_part(
         try:
             name, value = _entry(node, field)
         except LookupError:
-            end = _end(node.value[-1][1])
-            yield end, end, f", {key}: {text}" if _is_flow(node) else _new_line(node, key, text)
+            end, indent = _end(node.value[-1][1]), " " * node.value[0][0].start_mark.column
+            yield end, end, f", {key}: {text}" if _is_flow(node) else f"\n{indent}{key}: {text}"
             continue
         yield name.start_mark.index, _end(value), f"{key}: {text}"
 
@@ -88,7 +88,3 @@ def _end(node: yaml.Node) -> int:
 
 def _is_flow(node: yaml.Node) -> bool:
     return isinstance(node, yaml.CollectionNode) and bool(node.flow_style)
-
-
-def _new_line(node: yaml.Node, key: str, text: str) -> str:
-    return f"\n{' ' * node.value[0][0].start_mark.column}{key}: {text}"

@@ -155,7 +155,9 @@ def build_component(
         ConfigError: no ``type``, or settings or component refused.
         PluginError: the type is not known, or its plugin is broken.
     """
-    section = _at(source.data, at)
+    section: Any = source.data
+    for step in at:
+        section = section[step]
     if not isinstance(section, dict) or not isinstance(section.get("type"), str):
         raise ConfigError(
             f"found no type for this {kind}.",
@@ -275,12 +277,6 @@ def _refusable(source: ConfigSource, at: Path, build: Callable[[], T]) -> T:
         return build()
     except ValueError as fault:
         raise ConfigError(f"{fault}.", where=source.where(at)) from fault
-
-
-def _at(data: Any, path: Path) -> Any:
-    for step in path:
-        data = data[step]
-    return data
 
 
 def _with(source: ConfigSource, path: Path, value: Any) -> ConfigSource:

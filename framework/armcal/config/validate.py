@@ -13,7 +13,7 @@ from pydantic import ValidationError
 from armcal.base.settings import Fault, Settings
 from armcal.config.yaml_nodes import Step, dotted
 from armcal.config.yaml_source import ConfigSource, find_key
-from armcal.errors import ConfigError, Location
+from armcal.errors import ConfigError
 
 S = TypeVar("S", bound=Settings)
 
@@ -108,28 +108,23 @@ def _finding(error: Mapping[str, Any], raw: Any) -> _Finding:
         if key is not None:
             value = value[key]
             path.append(key)
-        elif index == len(loc) - 1 and (kind == "missing" or is_fault) and _holds(value, step):
+        elif (
+            index == len(loc) - 1
+            and (kind == "missing" or is_fault)
+            and isinstance(value, dict if isinstance(step, str) else list)
+        ):  # a key or an index of the value, not a union member
             path.append(step)
         else:
             branches.append((tuple(path), str(step)))
     made = _Finding(tuple(path), tuple(branches), kind, _shown(value, refused), "", "")
     if isinstance(refused, Fault):
         return replace(made, message=refused.message)
-    if kind == "missing":
-        return _missing(made, loc[-1], value)
-    return _explained(made, error)
-
-
-def _holds(value: Any, step: Step) -> bool:
-    """Whether a step that was not found may be a key or an index of the value, not a union member."""
-    return isinstance(value, dict) if isinstance(step, str) else isinstance(value, list)
-
-
-def _missing(made: _Finding, step: Step, value: Any) -> _Finding:
-    if isinstance(step, int) and isinstance(value, list):
-        message = f"found a list of {len(value)} values, expected at least {step + 1}: add the missing ones."
+    if kind != "missing":
+        return _explained(made, error)
+    if isinstance(loc[-1], int) and isinstance(value, list):
+        message = f"found a list of {len(value)} values, expected at least {loc[-1] + 1}: add the missing ones."
         return replace(made, path=made.path[:-1], message=message)
-    return replace(made, message=f"found nothing, expected the key {step!r}: write '{step}: ...'.")
+    return replace(made, message=f"found nothing, expected the key {loc[-1]!r}: write '{loc[-1]}: ...'.")
 
 
 def _explained(made: _Finding, error: Mapping[str, Any]) -> _Finding:
@@ -199,13 +194,10 @@ def _not_meant(path: tuple[Step, ...], findings: Sequence[_Finding], depth: int)
     likely = [name for name, own in members.items() if any(len(f.path) > len(path) for f in own)]
     if not likely:  # the value has no member's shape: say all that it could be
         return []
-    named = [name for name in likely if not any(_is_other_type(f) for f in members[name])] or likely
+    types = ("literal_error", ("type",)), ("literal_error", ("kind",))
+    named = [name for name in likely if not any((f.kind, f.path[-1:]) in types for f in members[name])] or likely
     meant = min(named, key=lambda name: len(members[name]))
     return [f for name, own in members.items() if name != meant for f in own]
-
-
-def _is_other_type(finding: _Finding) -> bool:
-    return finding.kind == "literal_error" and finding.path[-1:] in (("type",), ("kind",))
 
 
 def _merged(same: Sequence[_Finding]) -> Iterable[_Finding]:
@@ -219,7 +211,7 @@ def _merged(same: Sequence[_Finding]) -> Iterable[_Finding]:
 
 def _refusal(findings: Sequence[_Finding], source: ConfigSource, at: tuple[Step, ...]) -> ConfigError:
     placed = [(source.where((*at, *finding.path)), finding.text) for finding in findings]
-    placed.sort(key=_order)
+    placed.sort(key=lambda place: (place[0].file or "", place[0].line or 0))
     first, others = placed[0], placed[1:]
     lines = [first[1], *(f"{where}: {text}" for where, text in others[: _MOST_LISTED - 1])]
     if len(placed) > _MOST_LISTED:
@@ -227,7 +219,3 @@ def _refusal(findings: Sequence[_Finding], source: ConfigSource, at: tuple[Step,
     if others:
         lines.append(f"Correct these {len(placed)} places.")
     return ConfigError("\n".join(lines), where=first[0])
-
-
-def _order(placed: tuple[Location, str]) -> tuple[str, int]:
-    return placed[0].file or "", placed[0].line or 0

@@ -45,26 +45,17 @@ def read_plain(text: str) -> Scalar:
     if text in _TRUE or text in _FALSE:
         return text in _TRUE
     if _INTEGER.fullmatch(text):
-        return _integer(text)
+        if len(text) > _LONGEST_INTEGER:
+            raise ScalarError(f"found a number of {len(text)} digits", "Quote it if it is text.")
+        return int(text)
     if _HEX.fullmatch(text) and len(text) <= _LONGEST_INTEGER:
         return int(text, 16)
     if _FLOAT.fullmatch(text):
-        return _finite(text)
+        if not math.isfinite(float(text)):
+            raise ScalarError(f"{text} is too large to be a number", "Write a finite number.")
+        return float(text)
     _refuse_surprises(text)
     return text
-
-
-def _integer(text: str) -> int:
-    if len(text) > _LONGEST_INTEGER:
-        raise ScalarError(f"found a number of {len(text)} digits", "Quote it if it is text.")
-    return int(text)
-
-
-def _finite(text: str) -> float:
-    value = float(text)
-    if not math.isfinite(value):
-        raise ScalarError(f"{text} is too large to be a number", "Write a finite number.")
-    return value
 
 
 def _refuse_surprises(text: str) -> None:

@@ -128,7 +128,7 @@ def _read_text(path: Path) -> str:
         if path.is_dir():
             _refuse_file(path, "this is a directory, expected a YAML file.", "Name the file in it.")
         if not path.exists():
-            near = difflib.get_close_matches(path.name, _neighbours(path), n=1)
+            near = difflib.get_close_matches(path.name, sorted(p.name for p in path.parent.glob("*.y*ml")), n=1)
             hint = f"Did you mean {path.parent / near[0]}?" if near else "Check the spelling and the directory."
             _refuse_file(path, "there is no such file.", hint)
         if not path.is_file():
@@ -145,10 +145,6 @@ def _read_text(path: Path) -> str:
         line = raw.count(b"\n", 0, fault.start) + 1
         message = f"the byte 0x{raw[fault.start]:02x} at offset {fault.start} is not UTF-8."
         raise ConfigError(message, where=Location(str(path), line), hint="Save the file as UTF-8.") from fault
-
-
-def _neighbours(path: Path) -> list[str]:
-    return sorted(p.name for p in path.parent.glob("*.y*ml")) if path.parent.is_dir() else []
 
 
 @dataclass

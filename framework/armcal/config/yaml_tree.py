@@ -46,18 +46,30 @@ def override(tree: Node, text: str) -> Node:
     Raises:
         ConfigError: the text is not of that form, or does not fit the tree.
     """
-    name, equals, written = text.partition("=")
-    origin = Origin(f"command line (--set {name.strip()})", Path.cwd(), numbered=False)
-    steps = steps_of(name.strip())
-    if not equals or steps is None or not written.strip():
+    assigned = assignment(text, "--set")
+    if assigned is None:
         hint = "Write for example --set parameters.bounds=none; null as the value removes a key."
         where = Location(f"command line (--set {text})")
         raise ConfigError(f"found {text!r}, expected a dotted name, '=' and a value.", where=where, hint=hint)
-    origin = replace(origin, prefix=steps)
+    steps, value = assigned
     if steps[0] == "extends":
-        raise ConfigError("'extends' is read from files only.", where=origin.at(None), hint="Write it in the config.")
-    value = read_nodes(written, origin) or Node(origin, 1, None)
+        hint = "Write it in the config."
+        raise ConfigError("'extends' is read from files only.", where=value.origin.at(None), hint=hint)
     return set_at(tree, steps, value)
+
+
+def assignment(text: str, option: str) -> tuple[tuple[str, ...], Node] | None:
+    """The keys and the value of ``a.b=value`` from the command line; None if it is not of that form.
+
+    Raises:
+        ConfigError: the value is not YAML.
+    """
+    name, equals, written = text.partition("=")
+    steps = steps_of(name.strip())
+    if not equals or steps is None or not written.strip():
+        return None
+    origin = Origin(f"command line ({option} {name.strip()})", Path.cwd(), numbered=False, prefix=steps)
+    return steps, read_nodes(written, origin) or Node(origin, 1, None)
 
 
 def set_at(node: Node, steps: tuple[str, ...], value: Node) -> Node:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from armcal.devices.clock import Clock
 
@@ -50,3 +50,19 @@ class JointStream(Protocol):
 
     def close(self) -> None:
         """Stop. May be called twice."""
+
+
+@runtime_checkable
+class RestStream(Protocol):
+    """What a joint stream may provide beside the rest: each sample is then the mean of a whole rest, once it is over.
+
+    Attributes:
+        gives_rests: whether it is set to do so.
+    """
+
+    @property
+    def gives_rests(self) -> bool:
+        """See above."""
+
+    def lasting(self) -> list[JointSample]:
+        """The rest that still lasts, if it is one already; for when nobody waits for its end. It is given once."""

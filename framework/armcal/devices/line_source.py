@@ -7,6 +7,7 @@ import select
 import socket
 import stat
 import sys
+from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Literal, Protocol
@@ -16,6 +17,7 @@ from typing_extensions import override
 
 from armcal.base.config_text import resolve_path
 from armcal.devices.faults import DeviceRefusedError
+from armcal.devices.joint_stream import JointStream
 from armcal.errors import ConfigError, InputError, Location
 from armcal.io.line_cutter import LineCutter
 from armcal.io.udp import UDP_KINDS, listening, parsed
@@ -27,6 +29,7 @@ Begin = Literal["start", "end"]
 
 LONGEST_LINE_BYTES = 64 * 1024
 _CHUNK = 1 << 20
+_MOST_REASONS = 100
 _MOST_AT_ONCE = 16
 """Chunks, or thousands of datagrams, that are taken at once; the rest waits."""
 _BUFFER_BYTES = 4 << 20
@@ -51,14 +54,16 @@ SourceName = Annotated[str, BeforeValidator(_named)]
 
 
 class LineSource(Protocol):
-    """Where lines come from."""
+    """Where lines come from.
+
+    Attributes:
+        ended: whether nothing more will come.
+    """
+
+    ended: bool
 
     def lines(self) -> list[bytes | None]:
         """All that are complete since the last call, without their ends; None for one that was too long."""
-
-    @property
-    def ended(self) -> bool:
-        """Whether nothing more will come."""
 
     def close(self) -> None:
         """Let go. May be called twice."""
@@ -86,6 +91,34 @@ def open_lines(name: str, begin: Begin) -> LineSource:
     raise _refusal(name, "it is no file that can be read line by line")
 
 
+class LineJointStream(JointStream):
+    """A stream of joint readings that come as lines; those that are passed over are counted by reason."""
+
+    def __init__(self) -> None:
+        self._source: LineSource | None = None
+        self._refused: Counter[str] = Counter()
+
+    @property
+    @override
+    def refused(self) -> Mapping[str, int]:
+        return dict(self._refused)
+
+    @property
+    @override
+    def ended(self) -> bool:
+        return self._source is None or self._source.ended
+
+    @override
+    def close(self) -> None:
+        if self._source is not None:
+            self._source.close()
+        self._source = None
+
+    def _refuse(self, reason: str) -> None:
+        known = reason in self._refused or len(self._refused) < _MOST_REASONS
+        self._refused[reason if known else "other reasons"] += 1
+
+
 def refused_lines_text(refused: Mapping[str, int]) -> str:
     """Why lines were passed over, the commonest reasons in words; empty if none was."""
     if not refused:
@@ -100,19 +133,13 @@ class PipeLines(LineSource):
 
     def __init__(self, descriptor: int, *, owned: bool) -> None:
         self._descriptor, self._owned = descriptor, owned
-        self._cutter = LineCutter(LONGEST_LINE_BYTES)
-        self._open = True
-
-    @property
-    @override
-    def ended(self) -> bool:
-        return not self._open
+        self._cutter, self.ended = LineCutter(LONGEST_LINE_BYTES), False
 
     @override
     def lines(self) -> list[bytes | None]:
         lines: list[bytes | None] = []
         for _ in range(_MOST_AT_ONCE):
-            if not self._open or not select.select([self._descriptor], [], [], 0)[0]:
+            if self.ended or not select.select([self._descriptor], [], [], 0)[0]:
                 break
             try:
                 data = os.read(self._descriptor, _CHUNK)
@@ -121,7 +148,7 @@ class PipeLines(LineSource):
             except OSError:
                 data = b""
             # A pipe with a name has an end whenever nobody writes; the next writer may come.
-            self._open = bool(data) or self._owned
+            self.ended = not data and not self._owned
             lines += self._cutter.feed(data)
             if not data:
                 break
@@ -129,9 +156,9 @@ class PipeLines(LineSource):
 
     @override
     def close(self) -> None:
-        if self._owned and self._open:
+        if self._owned and not self.ended:
             os.close(self._descriptor)
-        self._open = False
+        self.ended = True
 
 
 class UdpLines(LineSource):
@@ -146,22 +173,17 @@ class UdpLines(LineSource):
         except InputError as fault:
             raise DeviceRefusedError(fault.message, where=Location(name), hint=fault.hint) from fault
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER_BYTES)
-        self._open = True
+        self.ended = False
 
     @property
     def port(self) -> int:
         """Its number."""
         return int(self._socket.getsockname()[1])
 
-    @property
-    @override
-    def ended(self) -> bool:
-        return not self._open
-
     @override
     def lines(self) -> list[bytes | None]:
         lines: list[bytes | None] = []
-        for _ in range(1000 * _MOST_AT_ONCE if self._open else 0):
+        for _ in range(1000 * _MOST_AT_ONCE if not self.ended else 0):
             try:
                 data, _, flags, sender = self._socket.recvmsg(LONGEST_LINE_BYTES)
             except OSError:  # nothing is left, or the network is gone for now: both are silence
@@ -173,7 +195,7 @@ class UdpLines(LineSource):
 
     @override
     def close(self) -> None:
-        self._open = False
+        self.ended = True
         self._socket.close()
 
 

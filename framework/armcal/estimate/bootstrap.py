@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Annotated, Literal
 
 import numpy as np
@@ -76,20 +77,6 @@ class Bootstrap:
         return len(self.values) >= _FEWEST
 
 
-@dataclass(frozen=True)
-class _Refit:
-    """One resample: which records, how often each, and perhaps other measured values."""
-
-    problem: Problem
-    estimator: Estimator
-    start: Array
-    records: tuple[FactorRecords, ...]
-    chosen: NDArray[np.intp]
-    weights: Array
-    seed: int | None
-    noise_scale: float
-
-
 def bootstrap(
     problem: Problem,
     records: Sequence[FactorRecords],
@@ -122,28 +109,38 @@ def bootstrap(
         weights = np.ones(count) if parametric else draw_weights(int(poses.max()) + 1, block, random)[poses]
         chosen = np.flatnonzero(weights).astype(np.intp)
         seed = int(random.integers(2**63)) if parametric else None
-        part = (tuple(records), chosen, weights[chosen], seed, estimate.noise_scale)
-        tasks.append(_Refit(problem, estimator, estimate.values, *part))
-    refits = (executor or Sequential()).map(_refit, tasks, lambda done: progress("bootstrap", done))
+        tasks.append((chosen, weights[chosen], seed))
+    refit = partial(_refit, problem, tuple(records), estimator, estimate.values, estimate.noise_scale)
+    refits = (executor or Sequential()).map(refit, tasks, lambda done: progress("bootstrap", done))
     free = list(estimate.free_entries)
     values = np.array([values[free] for values in refits if values is not None]).reshape(-1, len(free))
     return Bootstrap(estimate.names, values, settings.method, block, sum(values is None for values in refits))
 
 
-def _refit(task: _Refit) -> Array | None:
-    """The values of one refit; None if it did not converge."""
-    problem = task.problem
-    records = problem.subset(task.records, task.chosen)
-    if task.seed is not None:
-        random, noise = np.random.default_rng(task.seed), []
+def _refit(
+    problem: Problem,
+    records: tuple[FactorRecords, ...],
+    estimator: Estimator,
+    start: Array,
+    noise_scale: float,
+    resample: tuple[NDArray[np.intp], Array, int | None],
+) -> Array | None:
+    """The values of one refit; None if it did not converge.
+
+    A resample is which records, how often each, and the seed of other measured values if these are simulated.
+    """
+    chosen, weights, seed = resample
+    records = problem.subset(records, chosen)
+    if seed is not None:
+        random, noise = np.random.default_rng(seed), []
         for kernel, record in zip(problem.kernels, records, strict=True):
-            white = task.noise_scale * random.normal(size=(len(kernel.factor.noise), record.count))
+            white = noise_scale * random.normal(size=(len(kernel.factor.noise), record.count))
             noise.append(np.einsum("wrs,sw->rw", noise_roots(kernel.factor, record), white))
-        predicted = predicted_records(problem, task.start, records)
-        records = disturbed_records(problem, task.start, predicted, noise)
-    records = problem.weighted(records, [task.weights] * len(records))
+        predicted = predicted_records(problem, start, records)
+        records = disturbed_records(problem, start, predicted, noise)
+    records = problem.weighted(records, [weights] * len(records))
     try:
-        solution = task.estimator.solve(problem, records, task.start)
+        solution = estimator.solve(problem, records, start)
     except NotConvergedError:
         return None
     return solution.values if solution.verdict.converged else None

@@ -18,7 +18,7 @@ from scipy.special import ndtri
 from armcal.base.domains import Array
 from armcal.errors import ProblemError
 from armcal.estimate.estimator import CONFIDENCE, degrees_of_freedom
-from armcal.estimate.identifiability import CORRELATED
+from armcal.estimate.identifiability import correlated_pairs
 from armcal.estimate.likelihood import Term, maximise
 from armcal.problem.factor_records import by_covariance, noise_roots, transformed, whitening_of
 from armcal.problem.problem import FactorRecords, Problem
@@ -110,7 +110,7 @@ def estimate_components(
     rows = zip(chosen, maximum.theta / sizes, deviations, maximum.theta / maximum.theta.sum(), rms, strict=True)
     return VarianceComponents(
         tuple(_component(source, *map(float, numbers)) for source, *numbers in rows),
-        _inseparable(maximum.covariance, [source.name for source in chosen]),
+        correlated_pairs(maximum.covariance, tuple(source.name for source in chosen)),
         tuple(source.name for source, moves in zip(sources, seen, strict=True) if not moves),
         maximum.log_likelihood,
     )
@@ -223,15 +223,3 @@ def _component(source: _Source, variance: float, deviation: float, share: float,
     error = deviation / (2 * sd) if sd > 0 else float("nan")
     lower, upper = float(np.sqrt(max(variance - reach, 0.0))), float(np.sqrt(variance + reach))
     return Component(source.name, source.kind, source.unit, sd, error, lower, upper, share, rms)
-
-
-def _inseparable(covariance: Array, names: Sequence[str]) -> tuple[tuple[str, str, float], ...]:
-    """Pairs of components whose estimates are correlated."""
-    deviation = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
-    correlation = covariance / np.outer(deviation, deviation)
-    rows, columns = np.triu_indices(len(names), 1)
-    return tuple(
-        (names[i], names[j], float(correlation[i, j]))
-        for i, j in zip(rows.tolist(), columns.tolist(), strict=True)
-        if abs(correlation[i, j]) > CORRELATED
-    )

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import csv
+import io
+import math
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -77,6 +79,16 @@ def read_cell(cell: str) -> float | CellFault:
 def with_point(text: str) -> str:
     """A decimal comma as a point."""
     return text.strip().replace(",", ".")
+
+
+def csv_text(rows: Iterable[Iterable[object]], number: str = ".6f") -> str:
+    """Rows as the text of a CSV file, floats in a format; one that is not finite is an empty cell."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    for row in rows:
+        cells = [(format(x, number) if math.isfinite(x) else "") if isinstance(x, float) else x for x in row]
+        writer.writerow(cells)
+    return text.getvalue()
 
 
 def split(line: str, delimiter: str) -> list[str]:

@@ -63,7 +63,12 @@ def _write(files: Mapping[Path, bytes], keep: bool) -> None:
             ready.replace(place)
             done.append(place)
     except BaseException as fault:  # an interrupt too must leave the earlier files
-        _undo(done, kept)
+        for written in done:
+            with suppress(OSError):
+                if written in kept:
+                    kept[written].replace(written)
+                else:
+                    written.unlink()
         if not isinstance(fault, OSError):
             raise
         hint = "Give --out a place that can be written."
@@ -71,15 +76,6 @@ def _write(files: Mapping[Path, bytes], keep: bool) -> None:
     finally:
         for left in (*staged.values(), *kept.values()):
             left.unlink(missing_ok=True)
-
-
-def _undo(done: list[Path], kept: Mapping[Path, Path]) -> None:
-    for place in done:
-        with suppress(OSError):
-            if place in kept:
-                kept[place].replace(place)
-            else:
-                place.unlink()
 
 
 def _clean_up(place: Path) -> None:

@@ -8,6 +8,8 @@ what is put last is away first.
 
 from __future__ import annotations
 
+import ctypes
+import errno
 import fcntl
 import os
 import re
@@ -20,13 +22,17 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from armcal.errors import InputError, Location
-from armcal.io.swap import change_places
 
 EARLIER = "earlier"
 _LONGEST_NAME = 200
 _STAGING = ".armcal-"
 _UNFINISHED = f"{_STAGING}unfinished"
 """In a set that is being made: without it, a directory beside ours is an earlier set that is on its way."""
+_HERE = -100
+"""AT_FDCWD: paths are as they are."""
+_EXCHANGE = 2
+"""RENAME_EXCHANGE"""
+_CANNOT = {errno.ENOSYS, errno.EINVAL, errno.EOPNOTSUPP, errno.EBUSY, errno.EXDEV, errno.EPERM, errno.EACCES}
 
 
 @dataclass(frozen=True)
@@ -264,3 +270,20 @@ def _sync(folder: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+def change_places(one: Path, two: Path) -> bool:
+    """Whether they did; nothing has changed where system or file system cannot do it.
+
+    Raises:
+        OSError: something else was in the way; nothing has changed.
+    """
+    library = ctypes.CDLL(None, use_errno=True)
+    if not hasattr(library, "renameat2"):
+        return False
+    if not library.renameat2(_HERE, os.fsencode(one), _HERE, os.fsencode(two), _EXCHANGE):
+        return True
+    code = ctypes.get_errno()
+    if code in _CANNOT:
+        return False
+    raise OSError(code, os.strerror(code), str(two))

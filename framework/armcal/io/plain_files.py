@@ -59,6 +59,23 @@ def input_bytes(path: Path, most: int, expected: str, refusal: type[InputError] 
         return stream.read(most)
 
 
+def text_of(content: bytes, path: Path, hint: str) -> str:
+    """Text in UTF-8, without a byte order mark.
+
+    Raises:
+        DataError: with the line of a byte that is none.
+    """
+    try:
+        text, at, fault = content.decode("utf-8-sig"), content.find(b"\0"), "a NUL byte, expected text"
+    except UnicodeDecodeError as undecodable:
+        text, at = "", undecodable.start
+        fault = f"the byte 0x{content[at]:02x}, which is not UTF-8 text"
+    if at >= 0:
+        line = content.count(b"\n", 0, at) + 1
+        raise DataError(f"found {fault}.", where=Location(str(path), line=line), hint=hint)
+    return text
+
+
 def check_output(path: Path, refusal: type[InputError] = DataError) -> None:
     """What stands at an output's path must be nothing, or a regular file that may be replaced.
 

@@ -244,7 +244,10 @@ def set_aside_frozen(dataset: Dataset, layout: Layout) -> Dataset:
     if not layout.joints or len(dataset) < FROZEN_RECORDS:
         return dataset
     joints = np.array([_known(dataset, channel) for channel in layout.joints])
-    for instance, channels in _instances(layout.measured).items():
+    by_instance: dict[str, list[str]] = {}
+    for channel in layout.measured:
+        by_instance.setdefault(channel.rpartition(".")[0], []).append(channel)
+    for instance, channels in by_instance.items():
         read = dataset.stacked(channels)
         made = np.flatnonzero(~np.isnan(read).any(axis=0))
         for start, stop in _runs(read[:, made]):
@@ -289,14 +292,6 @@ def _known(dataset: Dataset, channel: str) -> NDArray[np.float64]:
     """A channel with zeros for what was not recorded."""
     values = dataset.column(channel)
     return np.where(np.isnan(values), 0.0, values)
-
-
-def _instances(channels: Sequence[str]) -> dict[str, list[str]]:
-    """Measured channels by the instrument they come from."""
-    grouped: dict[str, list[str]] = {}
-    for channel in channels:
-        grouped.setdefault(channel.rpartition(".")[0], []).append(channel)
-    return grouped
 
 
 def _runs(values: NDArray[np.float64]) -> list[tuple[int, int]]:

@@ -151,12 +151,6 @@ def spellings(w: RequestedChannel) -> dict[str, str]:
     return {f"{name}_{u.name}": u.name for name in w.columns for u in units_of(w.dimension)}
 
 
-def _written(w: RequestedChannel) -> str:
-    """How to name a channel's column, for a message."""
-    short = replace(w, columns=(min(w.columns, key=len),))
-    return " or ".join(spellings(short))
-
-
 def _refuse_unit(header: Header, w: RequestedChannel, unused: Mapping[str, Column]) -> None:
     """A column that would be the channel's if it had a unit of its dimension."""
     for name in w.columns:
@@ -173,7 +167,7 @@ def _refuse_unit(header: Header, w: RequestedChannel, unused: Mapping[str, Colum
 
 def refuse_missing(header: Header, w: RequestedChannel, unused: Sequence[str]) -> NoReturn:
     """Raise a DataError: no column is this channel's; ``unused`` names come near it, perhaps."""
-    written = _written(w)
+    written = " or ".join(spellings(replace(w, columns=(min(w.columns, key=len),))))
     header.refuse(
         f"found no column for {w.what}, expected {written}{_nearest(written.split(' or '), unused)}.",
         f"Add it, or say which column it is: columns: {{{written.split(' or ')[0]}: NAME}} in the data section.",

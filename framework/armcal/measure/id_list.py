@@ -6,7 +6,7 @@ import csv
 from pathlib import Path
 
 from armcal.errors import DataError, Location
-from armcal.io.plain_files import input_bytes
+from armcal.io.plain_files import input_bytes, text_of
 
 MAX_BYTES = 1 << 26
 
@@ -18,10 +18,7 @@ def read_ids(path: Path) -> tuple[str, ...]:
         DataError: no such file, no text, no ids, or an id stands twice.
     """
     where = Location(str(path))
-    try:
-        text = input_bytes(path, MAX_BYTES, "a list of ids").decode("utf-8-sig")
-    except UnicodeDecodeError as fault:
-        raise DataError(f"it cannot be read as UTF-8 text ({fault}).", where=where) from fault
+    text = text_of(input_bytes(path, MAX_BYTES, "a list of ids"), path, "Save it as CSV text in UTF-8.")
     rows = [row for row in csv.reader(text.splitlines()) if any(cell.strip() for cell in row)]
     if not rows:
         raise DataError("it is empty.", where=where, hint="Give a header pose_id and an id a line.")

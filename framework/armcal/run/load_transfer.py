@@ -18,7 +18,6 @@ from armcal.estimate.validation import (
     Indices,
     Split,
     error_unit,
-    fit_and_judge,
     folds,
     record_errors,
     summarise,
@@ -28,7 +27,7 @@ from armcal.problem.drift import with_drift
 from armcal.problem.problem import Problem
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import Prepared, Stopwatch
-from armcal.run.study import LoadTransferSettings, Study, compiled, fit_task, interpreted_first, naming
+from armcal.run.study import LoadTransferSettings, Study, interpreted_first, judged_fits, naming
 from armcal.run.study_result import TransferCell, TransferResult
 
 _MM = 1000.0
@@ -72,11 +71,7 @@ def transfer(
         groups, payloads = _groups(dataset, settings)
         ready = {name: naming(name, partial(_prepared, e, dataset, groups)) for name, e in study.experiments.items()}
     plan = [fit for name in ready for fit in _plan(name, groups, settings)]
-    with watch.stage("compile"):
-        ready = compiled(study.experiments, ready, len(dataset) * len(plan) // len(ready), executor, progress)
-    tasks = [fit_task(study.experiments[fit.variant], ready[fit.variant], fit.split) for fit in plan]
-    with watch.stage("fits"):
-        fits = executor.map(fit_and_judge, tasks, lambda done: progress("fits", done))
+    fits = judged_fits(study, ready, [(fit.variant, fit.split) for fit in plan], executor, progress, watch)
     errors = {fit.key: np.full(len(dataset), np.nan) for fit in plan}
     for fit, judged in zip(plan, fits, strict=True):
         errors[fit.key][fit.split.holdout] = judged.errors * _MM

@@ -18,7 +18,6 @@ from armcal.estimate.validation import (
     JudgedFit,
     Split,
     error_unit,
-    fit_and_judge,
     folds,
     record_errors,
     summarise,
@@ -26,7 +25,7 @@ from armcal.estimate.validation import (
 from armcal.io.parallel import Executor
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import Prepared, Stopwatch, prepare
-from armcal.run.study import PREVIOUS, ModelStudySettings, Study, compiled, fit_task, interpreted_first, naming
+from armcal.run.study import PREVIOUS, ModelStudySettings, Study, interpreted_first, judged_fits, naming
 from armcal.run.study_result import NestedResult, StudyResult, VariantResult
 
 _MM = 1000.0
@@ -54,11 +53,7 @@ def compare(
     drawn = [folds(len(dataset), settings.folds, settings.seed + r, poses) for r in range(settings.repeats)]
     inner = [_inside(outer, settings, poses) for outer in drawn[0]] if settings.nested else []
     splits = [Split(every, every), *chain.from_iterable(drawn), *chain.from_iterable(inner)]
-    with watch.stage("compile"):
-        ready = compiled(study.experiments, ready, len(dataset) * len(splits), executor, progress)
-    tasks = [fit_task(study.experiments[name], ready[name], split) for name in ready for split in splits]
-    with watch.stage("fits"):
-        fits = executor.map(fit_and_judge, tasks, lambda done: progress("fits", done))
+    fits = judged_fits(study, ready, [(name, split) for name in ready for split in splits], executor, progress, watch)
     by_name = {name: fits[i * len(splits) : (i + 1) * len(splits)] for i, name in enumerate(ready)}
     variants = _compared([_judged(n, ready[n], by_name[n], drawn) for n in ready], settings, dataset.ids)
     best, simplest = _choices(variants, settings, dataset.ids)

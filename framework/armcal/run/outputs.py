@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import tempfile
 import warnings
 from collections.abc import Callable
@@ -31,6 +29,7 @@ from armcal.errors import ArmcalError, CalibrationWarning, NotConvergedError
 from armcal.estimate.bootstrap import Bootstrap
 from armcal.estimate.validation import in_unit
 from armcal.io import folder as folders
+from armcal.io.cells import csv_text
 from armcal.measure.reader import surroundings
 from armcal.plugins import PluginRegistry
 from armcal.run.experiment import Experiment
@@ -127,7 +126,7 @@ def place(
 
 def metrics(result: RunResult) -> dict[str, Any]:
     """The numbers of a run for other programs."""
-    estimate, solver_verdict, known = result.estimate, result.estimate.verdict, result.estimate.identifiability
+    estimate, known = result.estimate, result.estimate.identifiability
     content = {
         "experiment": result.name,
         "error_mm": _errors(result),
@@ -150,15 +149,7 @@ def metrics(result: RunResult) -> dict[str, Any]:
             "scaled_condition": _finite(known.condition),
         },
         "noise": _noise(result),
-        "solver": {
-            "name": solver_verdict.name,
-            "status": solver_verdict.status,
-            "converged": solver_verdict.converged,
-            "iterations": solver_verdict.iterations,
-            "seconds": solver_verdict.seconds,
-            "starts": solver_verdict.starts,
-            "agreeing_starts": solver_verdict.agreeing_starts,
-        },
+        "solver": asdict(estimate.verdict),
         "verdict": {"usable": not result.verdict.bad, **asdict(result.verdict)},
         "structure": result.evidence.as_dict(),
         "prediction_intervals": result.intervals.as_dict(),
@@ -257,33 +248,27 @@ def residuals_text(result: RunResult) -> str:
     held[result.split.holdout] = True
     numbered = [f"residual{i}_{errors.unit}" for i in range(1, len(errors.calibrated_residual_mm) + 1)]
     axes = list(errors.residual_columns) or numbered
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
     columns = ["pose_id", "source_row", "set", "weight"]
     columns += [*(f"{model}_{errors.unit}" for model in ("nominal", "calibrated", "cross_validated")), *axes]
-    writer.writerow(columns)
+    rows: list[list[object]] = [[*columns]]
     for i, record in enumerate(dataset.ids):
-        numbers = [errors.nominal_mm[i], errors.calibrated_mm[i], errors.cross_validated_mm[i]]
-        numbers += list(errors.calibrated_residual_mm[:, i])
         row = dataset.rows[i] if dataset.rows else ""
-        shown = ["" if not np.isfinite(x) else f"{x:.6f}" for x in numbers]
         weight = "" if held[i] or result.noise.weights is None else f"{result.noise.weights[i]:.6g}"
-        writer.writerow([record, row, "holdout" if held[i] else "train", weight, *shown])
-    return text.getvalue()
+        numbers = [errors.nominal_mm[i], errors.calibrated_mm[i], errors.cross_validated_mm[i]]
+        residual = errors.calibrated_residual_mm[:, i]
+        rows.append([record, row, "holdout" if held[i] else "train", weight, *numbers, *residual])
+    return csv_text(rows)
 
 
 def bootstrap_text(resampled: Bootstrap, result: RunResult) -> str:
     """A row a free canonical entry (SI): by the curvature at the estimate, and by refits to resampled records."""
-    estimate, text = result.estimate, io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    columns = ("sd", "lower", "upper")
-    writer.writerow(["parameter", "value", *columns, *(f"bootstrap_{name}" for name in columns)])
+    estimate, columns = result.estimate, ("sd", "lower", "upper")
+    rows: list[list[object]] = [["parameter", "value", *columns, *(f"bootstrap_{name}" for name in columns)]]
     for i, name in enumerate(resampled.names):
         interval, sd = estimate.intervals[i], estimate.deviations[i]
-        numbers = [estimate.values[estimate.free_entries[i]], sd, interval.lower, interval.upper]
-        numbers += [resampled.deviations[i], *resampled.intervals[i]]
-        writer.writerow([name, *("" if not np.isfinite(x) else f"{x:.9g}" for x in numbers)])
-    return text.getvalue()
+        own = [estimate.values[estimate.free_entries[i]], sd, interval.lower, interval.upper]
+        rows.append([name, *own, resampled.deviations[i], *resampled.intervals[i]])
+    return csv_text(rows, ".9g")
 
 
 def log_text(result: RunResult) -> str:

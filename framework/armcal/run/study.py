@@ -16,12 +16,12 @@ from armcal.config.variants import load_variants
 from armcal.config.yaml_source import ConfigSource
 from armcal.errors import ConfigError, InputError
 from armcal.estimate.estimator import Progress
-from armcal.estimate.validation import FitTask, Split
+from armcal.estimate.validation import FitTask, JudgedFit, Split, fit_and_judge
 from armcal.io.parallel import Executor
 from armcal.plugins import PluginRegistry, discover
 from armcal.problem.problem import Problem
 from armcal.run.experiment import Experiment
-from armcal.run.pipeline import Prepared
+from armcal.run.pipeline import Prepared, Stopwatch
 from armcal.run.settings import ExperimentSettings, ValidationSettings
 
 R = TypeVar("R")
@@ -62,14 +62,6 @@ class LoadTransferSettings(Settings):
     payloads: tuple[Mass, ...] = ()
     folds: Annotated[int, Field(ge=2)] = 5
     seed: Annotated[int, Field(ge=0)] = 0
-
-
-class _ModelStudyFile(Settings):
-    study: ModelStudySettings
-
-
-class _LoadTransferFile(Settings):
-    study: LoadTransferSettings
 
 
 @dataclass(frozen=True)
@@ -130,9 +122,9 @@ def study_settings(source: ConfigSource) -> ModelStudySettings | LoadTransferSet
             where=source.where(("study",)),
             hint="Give study: {variants: {NAME: {extends: FILE}, ...}}; see docs/study.md.",
         )
-    kind, own = section.get("kind", "models"), replace(source, data={"study": section})
+    kind = section.get("kind", "models")
     if kind == "load_transfer":
-        transfer = validate(_LoadTransferFile, own).study
+        transfer = validate(LoadTransferSettings, source, ("study",))
         grams = [round(payload * 1e4) for payload in transfer.payloads]
         if len(set(grams)) < len(grams) or len(grams) == 1 or min(grams, default=0) < 0:
             raise ConfigError(
@@ -145,7 +137,7 @@ def study_settings(source: ConfigSource) -> ModelStudySettings | LoadTransferSet
         raise ConfigError(
             f"found kind {kind!r}, expected models or load_transfer.", where=source.where(("study", "kind"))
         )
-    models = validate(_ModelStudyFile, own).study
+    models = validate(ModelStudySettings, source, ("study",))
     if models.reference not in (PREVIOUS, *models.variants):
         names = ", ".join(models.variants)
         raise ConfigError(
@@ -161,24 +153,31 @@ def interpreted_first(experiment: Experiment) -> ExperimentSettings:
     return settings.model_copy(update={"evaluator": "interpreted"}) if settings.evaluator == "auto" else settings
 
 
-def compiled(
-    experiments: Mapping[str, Experiment],
+def judged_fits(
+    study: Study,
     ready: Mapping[str, Prepared],
-    work: int,
+    plan: Sequence[tuple[str, Split]],
     executor: Executor,
     progress: Progress,
-) -> dict[str, Prepared]:
-    """The same by compiled functions, where the choice was left open and so much work (records to fit) is worth it."""
-    worth_it = work >= WORTH_COMPILING
-    chosen = [name for name in ready if worth_it and experiments[name].settings.evaluator == "auto"]
-    executor.map(_compile, [ready[name].problem for name in chosen], lambda done: progress("compile", done))
-    faster = {name: replace(ready[name], problem=ready[name].problem.evaluated_by("compiled")) for name in chosen}
-    return {**ready, **faster}
+    watch: Stopwatch,
+) -> list[JudgedFit]:
+    """Each variant of a plan fitted to the records that train and judged on those held out.
 
-
-def fit_task(experiment: Experiment, ready: Prepared, split: Split) -> FitTask:
-    """A fit to the records that train, judged on those held out."""
-    return FitTask(ready.problem, experiment.estimator, ready.problem.parameters.nominal(), ready.records, split)
+    By compiled functions where the choice was left open and the work (records to fit) is worth it.
+    """
+    work = len(next(iter(ready.values())).dataset) * len(plan) // len(ready)
+    with watch.stage("compile"):
+        open_choice = [name for name in ready if study.experiments[name].settings.evaluator == "auto"]
+        chosen = open_choice if work >= WORTH_COMPILING else []
+        executor.map(_compile, [ready[name].problem for name in chosen], lambda done: progress("compile", done))
+        problems = {name: own.problem for name, own in ready.items()}
+        problems |= {name: problems[name].evaluated_by("compiled") for name in chosen}
+    tasks = []
+    for name, split in plan:
+        start = problems[name].parameters.nominal()
+        tasks.append(FitTask(problems[name], study.experiments[name].estimator, start, ready[name].records, split))
+    with watch.stage("fits"):
+        return executor.map(fit_and_judge, tasks, lambda done: progress("fits", done))
 
 
 def _compile(problem: Problem) -> None:

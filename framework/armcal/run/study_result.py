@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from dataclasses import dataclass
 from typing import Any
-
-import numpy as np
 
 from armcal.base.config_text import as_json
 from armcal.base.dataset import Dataset
@@ -16,6 +12,7 @@ from armcal.calibration.calibration_file import dump
 from armcal.config.variants import SECTION
 from armcal.diagnose.comparison import Change
 from armcal.estimate.validation import ErrorSummary, in_unit
+from armcal.io.cells import csv_text
 from armcal.run.study import Study
 
 FILES = ("experiment.yaml", "study.csv", "study.json", "study.html")
@@ -235,13 +232,9 @@ def _csv_text(result: StudyResult | TransferResult) -> str:
             f"{name}_trained_at_{'_and_'.join(f'{g:g}' for g in trained)}_g_{result.unit}": errors
             for (name, trained), errors in result.errors_mm.items()
         }
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
     dataset = result.dataset
-    payload = {"payload_g": dataset.column("payload") * 1000} if isinstance(result, TransferResult) else {}
-    writer.writerow(["pose_id", "source_row", *payload, *columns])
-    for i, record in enumerate(dataset.ids):
-        numbers = [*(numbers_of[i] for numbers_of in payload.values()), *(column[i] for column in columns.values())]
-        row = dataset.rows[i] if dataset.rows else ""
-        writer.writerow([record, row, *("" if not np.isfinite(x) else f"{x:.6f}" for x in numbers)])
-    return text.getvalue()
+    if isinstance(result, TransferResult):
+        columns = {"payload_g": dataset.column("payload") * 1000, **columns}
+    rows = dataset.rows or ("",) * len(dataset)
+    body = zip(dataset.ids, rows, *columns.values(), strict=True)
+    return csv_text([["pose_id", "source_row", *columns], *body])

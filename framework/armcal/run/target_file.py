@@ -12,6 +12,7 @@ from armcal.arm.loading import LOAD_CHANNELS
 from armcal.base.config_text import ConfigText
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
+from armcal.base.pose_settings import rpy_matrices
 from armcal.base.quaternions import rotation_matrix
 from armcal.base.units import DIMENSIONLESS, split_suffix
 from armcal.calibration.compensation.reach import Reach
@@ -76,17 +77,6 @@ def read_targets(path: Path, expression: ToolExpression, registry: PluginRegistr
     loads, approaches = acting[2 * joints : 2 * joints + len(LOAD_CHANNELS)], acting[joints : 2 * joints]
     conditions = {name: dataset.column(name) for name in expression.arm.conditions if dataset.has(name)}
     return TargetFile(Targets(positions, _rotations(path, dataset), loads, approaches, conditions), dataset)
-
-
-def rpy_matrices(rpy: Array) -> Array:
-    """Rz(yaw) Ry(pitch) Rx(roll) (N x 3 x 3) from roll, pitch, yaw (N x 3; rad)."""
-    (a, b, c), (sa, sb, sc) = np.cos(rpy.T), np.sin(rpy.T)
-    rows = [
-        [c * b, c * sb * sa - sc * a, c * sb * a + sc * sa],
-        [sc * b, sc * sb * sa + c * a, sc * sb * a - c * sa],
-        [-sb, b * sa, b * a],
-    ]
-    return np.array(rows).transpose(2, 0, 1)
 
 
 def check_units(path: Path, targets: Targets, reach: Reach) -> None:

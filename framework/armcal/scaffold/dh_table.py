@@ -12,7 +12,7 @@ from typing import NoReturn
 from armcal.base.units import Unit, display_unit, from_unit, split_suffix, units_of
 from armcal.errors import DataError, Location
 from armcal.io.cells import CellFault, read_cell
-from armcal.io.plain_files import input_bytes
+from armcal.io.plain_files import input_bytes, text_of
 from armcal.scaffold.naming import check_joint_names
 from armcal.scaffold.robot import (
     ASSUMED_TRAVEL,
@@ -88,7 +88,7 @@ def read_rows(path: Path) -> tuple[Row, ...]:
     Raises:
         DataError: with file, line and column.
     """
-    lines = _lines(path, _text(path))
+    lines = _lines(path, text_of(input_bytes(path, MAX_BYTES, "a CSV file, a table of joints"), path, _AS_TEXT))
     rows = tuple(_row(line, number) for number, line in enumerate(lines, start=1))
     if not FEWEST_JOINTS <= len(rows) <= MOST_JOINTS:
         raise DataError(
@@ -98,20 +98,6 @@ def read_rows(path: Path) -> tuple[Row, ...]:
         )
     check_joint_names([row.joint.name for row in rows], [Location(str(path), line=line.line) for line in lines])
     return rows
-
-
-def _text(path: Path) -> str:
-    content = input_bytes(path, MAX_BYTES, "a CSV file, a table of joints")
-    try:
-        text = content.decode("utf-8-sig")
-    except UnicodeDecodeError as fault:
-        line = content.count(b"\n", 0, fault.start) + 1
-        reason = f"found the byte 0x{content[fault.start]:02x}, which is not UTF-8 text."
-        raise DataError(reason, where=Location(str(path), line=line), hint=_AS_TEXT) from fault
-    if "\0" in text:
-        line = text.count("\n", 0, text.index("\0")) + 1
-        raise DataError("found a NUL byte, expected text.", where=Location(str(path), line=line), hint=_AS_TEXT)
-    return text
 
 
 def _lines(path: Path, text: str) -> list[_Line]:

@@ -118,8 +118,8 @@ def _check_laws(
         for spring in springs:
             part = ca.SX(spring.law(loads[start : start + spring.size], _command(spring, recorded)))
             start += spring.size
-            found = f"the spring at site {spring.site} gives {part.shape}"
-            expect(part.shape == (spring.size, 1), f"{found}, expected {spring.size} x 1")
+            result = f"the spring at site {spring.site} gives {part.shape}"
+            expect(part.shape == (spring.size, 1), f"{result}, expected {spring.size} x 1")
             parts.append(part)
         laws = stacked(parts)
     with record.check("laws depend on what is given"):

@@ -42,8 +42,8 @@ def check_parameters(record: Recorder, declared: Callable[[], Sequence[Parameter
     with record.needed("its parameters are named, each once"):
         blocks = tuple(declared())
         for block in blocks:
-            found = type(block).__name__
-            expect(isinstance(block, ParameterBlock), f"found {found} among the parameters, expected ParameterBlock")
+            kind = type(block).__name__
+            expect(isinstance(block, ParameterBlock), f"found {kind} among the parameters, expected ParameterBlock")
             expect(
                 FIT_NAME.fullmatch(block.name) is not None,
                 f"found the parameter {block.name!r}, expected a name without spaces, dots, quotes and * ? [ ] < > @",

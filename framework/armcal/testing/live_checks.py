@@ -61,8 +61,8 @@ def _check_source(record: Recorder, subject: Subject, method: str, kind: type, *
         _within(lambda: source.open(RealClock(), *opening))
     with record.check(f"{method}() gives a list of {method}, without waiting"):
         for item in _listed(source, take):
-            found = type(item).__name__
-            expect(isinstance(item, kind), f"found {found}, expected {kind.__module__}.{kind.__name__}")
+            name = type(item).__name__
+            expect(isinstance(item, kind), f"found {name}, expected {kind.__module__}.{kind.__name__}")
     if kind is JointSample:
         with record.check("ended says whether nothing more will come"):
             expect(isinstance(source.ended, bool), f"found ended = {source.ended!r}, expected true or false")

@@ -94,8 +94,8 @@ def check_measurement(record: Recorder, subject: Subject) -> None:
         listed = [channel.name for channel in channels]
         expect(len(set(listed)) == len(listed), f"found the channels {', '.join(listed)}, expected every name once")
         for channel in channels:
-            found = f"found the channel {channel.name!r}"
-            expect(channel.name.isidentifier(), f"{found}, expected letters, digits, underscores")
+            called = f"found the channel {channel.name!r}"
+            expect(channel.name.isidentifier(), f"{called}, expected letters, digits, underscores")
             if channel.dimension != _RATIO:
                 units_of(channel.dimension)
     with record.needed("it makes a residual"):

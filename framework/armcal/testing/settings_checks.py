@@ -57,8 +57,8 @@ def check_settings(record: Recorder, kind: str, made: Any) -> Subject:
         _expect_units(settings_class)
     with record.needed("its EXAMPLE is a mapping"):
         given = getattr(made, "EXAMPLE", {})
-        found = type(given).__name__
-        expect(isinstance(given, Mapping), f"found EXAMPLE of type {found}, expected a mapping of settings")
+        type_name = type(given).__name__
+        expect(isinstance(given, Mapping), f"found EXAMPLE of type {type_name}, expected a mapping of settings")
         example = dict(given)
         if kind == "reader" and "path" in fields and fields["path"].is_required():
             example.setdefault("path", MISSING_FILE)

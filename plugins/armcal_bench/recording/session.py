@@ -8,8 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from armcal.devices.clock import Clock
-from armcal.devices.joint_stream import JointStream
-from armcal.devices.rest_stream import RestStream
+from armcal.devices.joint_stream import JointStream, RestStream
 from armcal.errors import ConfigError
 
 from armcal_bench.bench import SECTION, Bench

@@ -1,11 +1,9 @@
-"""Frames on a serial line: COBS, then a zero. Inside: type, sequence, payload, CRC-32, little endian."""
+"""Frames on a serial line: COBS [Cheshire1999], then a zero. Inside: type, sequence, payload, CRC-32, little endian."""
 
 from __future__ import annotations
 
 import zlib
 from typing import NamedTuple
-
-from armcal.devices.framed.cobs import cobs_decoded, cobs_encoded
 
 MAX_PAYLOAD = 240
 """Bytes."""
@@ -81,3 +79,39 @@ class FrameDecoder:
     def forget(self) -> None:
         """Drop an unfinished piece, as after a line was opened anew."""
         self._rest = b""
+
+
+_LONGEST_BLOCK = 254
+
+
+def cobs_encoded(data: bytes) -> bytes:
+    """The bytes without zeros; no delimiter is added."""
+    parts: list[bytes] = []
+    pieces = data.split(b"\0")
+    for piece in pieces:
+        start, length = 0, len(piece)
+        while length - start >= _LONGEST_BLOCK:
+            parts += (b"\xff", piece[start : start + _LONGEST_BLOCK])
+            start += _LONGEST_BLOCK
+        parts += (bytes((length - start + 1,)), piece[start:])
+    if pieces[-1] and len(pieces[-1]) % _LONGEST_BLOCK == 0:
+        del parts[-2:]  # a full block at the very end needs no empty one after it
+    return b"".join(parts)
+
+
+def cobs_decoded(data: bytes) -> bytes | None:
+    """What was encoded; None if these bytes are not COBS."""
+    if not data or 0 in data:
+        return None
+    parts: list[bytes] = []
+    start, length = 0, len(data)
+    while start < length:
+        code = data[start]
+        end = start + code
+        if end > length:
+            return None
+        parts.append(data[start + 1 : end])
+        if code != _LONGEST_BLOCK + 1 and end < length:
+            parts.append(b"\0")
+        start = end
+    return b"".join(parts)

@@ -194,15 +194,13 @@ class Journal:
                 if not is_full(fault):
                     self._failure = str(fault)
                     raise self._failed() from fault
-                if not self._gave_room():
+                try:
+                    gave_room = self._room.give_up_something()
+                except (SegmentBrokenError, OSError) as broken:
+                    self._failure = str(broken)
+                    raise self._failed() from broken
+                if not gave_room:
                     raise _full(self._folder, fault) from fault
-
-    def _gave_room(self) -> bool:
-        try:
-            return self._room.give_up_something()
-        except (SegmentBrokenError, OSError) as fault:
-            self._failure = str(fault)
-            raise self._failed() from fault
 
     def _failed(self) -> JournalFailedError:
         return JournalFailedError(

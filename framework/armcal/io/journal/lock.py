@@ -5,6 +5,7 @@ from __future__ import annotations
 import fcntl
 import os
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -49,14 +50,7 @@ def lock_folder(folder: Path) -> WriterLock:
     except BaseException:
         os.close(descriptor)
         raise
-    _sign(descriptor)
-    return WriterLock(descriptor)
-
-
-def _sign(descriptor: int) -> None:
-    """Leave the process id for others to read. A full disk must not keep the only writer out."""
-    try:
+    with suppress(OSError):  # a full disk must not keep the only writer out
         os.ftruncate(descriptor, 0)
-        os.pwrite(descriptor, f"{os.getpid()}\n".encode("ascii"), 0)
-    except OSError:
-        return
+        os.pwrite(descriptor, f"{os.getpid()}\n".encode("ascii"), 0)  # for others to read
+    return WriterLock(descriptor)
