@@ -234,7 +234,7 @@ class Guard:
 
 @dataclass(frozen=True)
 class Refusal:
-    """Why a request was refused; ``detail`` is the index of what was not acknowledged: a byte of WRITE, a target of SET."""
+    """Why a request was refused; ``detail`` is the index of what failed: a byte of WRITE, a target of SET."""
 
     request: int
     code: int
