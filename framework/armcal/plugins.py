@@ -6,9 +6,9 @@ import difflib
 import time
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, lru_cache
 from importlib import import_module
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import Distribution, EntryPoint, entry_points
 from typing import Any
 
 import pluggy
@@ -200,4 +200,10 @@ def _release(point: EntryPoint) -> tuple[str, str]:
     """Distribution and version of an entry point; empty where it has none."""
     if isinstance(point, plugin_files.FilePoint):
         return point.file.name, plugin_files.digest(point.file)
-    return (point.dist.name, point.dist.version) if point.dist else ("", "")
+    return _published(point.dist) if point.dist else ("", "")
+
+
+@lru_cache(maxsize=64)
+def _published(distribution: Distribution) -> tuple[str, str]:
+    """Its name and version, for each of which it parses its metadata anew: many plugins share a distribution."""
+    return distribution.name, distribution.version
