@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 from armcal.base.dataset import Dataset
+from armcal.cli.main import cli
 from armcal.devices.clock import SimulatedClock
 from armcal.devices.simulated import CLOCK, BenchRequest
 from armcal.errors import ArmcalError, InputError
@@ -92,7 +93,7 @@ class BenchRun:
         if child == 0:
             _in_child(lambda: Bench.of(self.experiment).simulator().serve(BenchRequest(self.experiment, self.bench)))
         try:
-            clock = self._connected()
+            clock = _connected(self.bench)
             try:
                 yield clock
             finally:
@@ -100,16 +101,6 @@ class BenchRun:
         finally:
             os.kill(child, signal.SIGTERM)
             _wait(child)
-
-    def _connected(self) -> SimulatedClock:
-        until = time.monotonic() + 30
-        while True:
-            try:
-                return SimulatedClock(self.bench / CLOCK)
-            except InputError:
-                if time.monotonic() > until:
-                    raise
-                time.sleep(0.01)
 
     def prepared(self) -> Prepared:
         """The plan, ready to be driven."""
@@ -161,6 +152,31 @@ def positions(dataset: Dataset) -> dict[str, np.ndarray]:
     """Measured positions by pose (m)."""
     xyz = dataset.stacked(["tracker.x", "tracker.y", "tracker.z"]).T
     return dict(zip(dataset.ids, xyz, strict=True))
+
+
+@contextmanager
+def bench_served_by_the_command(config: Path, folder: Path) -> Iterator[None]:
+    """``armcal simulated-bench`` in a child, once it is ready."""
+    child = os.fork()
+    if child == 0:
+        _in_child(lambda: cli(["simulated-bench", str(config), "--dir", str(folder)], standalone_mode=False))
+    try:
+        _connected(folder).close()
+        yield
+    finally:
+        os.kill(child, signal.SIGTERM)
+        _wait(child)
+
+
+def _connected(bench: Path) -> SimulatedClock:
+    until = time.monotonic() + 30
+    while True:
+        try:
+            return SimulatedClock(bench / CLOCK)
+        except InputError:
+            if time.monotonic() > until:
+                raise
+            time.sleep(0.01)
 
 
 def _in_child(action: Callable[[], object]) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import graphlib
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
@@ -45,16 +46,42 @@ def _module(path: Path) -> str:
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 
+@dataclass(frozen=True)
+class Source:
+    """What a file says.
+
+    Attributes:
+        lines: how many it has.
+        imports: every armcal module, or name in one, that it imports, anywhere in it.
+        packages: of every import, by its first word; of an import of a package's own files the word is empty.
+        functions: each with its lines less one.
+        calls: names of what it calls by a plain name.
+    """
+
+    lines: int
+    imports: frozenset[str]
+    packages: frozenset[str]
+    functions: tuple[tuple[str, int], ...]
+    calls: frozenset[str]
+
+
 @cache
-def _imports(path: Path) -> frozenset[str]:
-    """Every armcal module, or name in one, that a file imports, anywhere in it."""
-    found: set[str] = set()
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+def _source(path: Path) -> Source:
+    text = path.read_text(encoding="utf-8")
+    names, packages, functions, calls = set[str](), set[str](), list[tuple[str, int]](), set[str]()
+    for node in ast.walk(ast.parse(text)):
         if isinstance(node, ast.Import):
-            found |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom) and node.module:
-            found |= {f"{node.module}.{alias.name}" for alias in node.names}
-    return frozenset(name for name in found if name.startswith("armcal"))
+            names |= {alias.name for alias in node.names}
+            packages |= {alias.name.split(".")[0] for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            packages.add((node.module or "").split(".")[0])
+            names |= {f"{node.module}.{alias.name}" for alias in node.names if node.module}
+        elif isinstance(node, ast.FunctionDef):
+            functions.append((node.name, (node.end_lineno or 0) - node.lineno))
+        elif isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
+            calls.add(node.func.id)
+    imports = frozenset(name for name in names if name.startswith("armcal"))
+    return Source(len(text.splitlines()), imports, frozenset(packages), tuple(functions), frozenset(calls))
 
 
 def _height(module: str) -> int:
@@ -78,7 +105,7 @@ def test_a_room_imports_only_rooms_below_it(room: str) -> None:
         (_module(path), name)
         for path in FILES
         if _module(path).split(".")[1] == room
-        for name in _imports(path)
+        for name in _source(path).imports
         if name.startswith("armcal.") and _height(name) > _height(_module(path))
     }
     assert upward == set()
@@ -89,7 +116,7 @@ def test_no_file_stands_in_a_circle_of_imports() -> None:
     files = {_module(path): path for path in (*FILES, *PLUGINS.rglob("*.py"))}
     graph = {}
     for module, path in files.items():
-        named = _imports(path)
+        named = _source(path).imports
         above = {name.rpartition(".")[0] for name in named}
         graph[module] = ((named | above) & set(files)) - {module}
     tuple(graphlib.TopologicalSorter(graph).static_order())  # raises CycleError, which names the circle
@@ -98,20 +125,17 @@ def test_no_file_stands_in_a_circle_of_imports() -> None:
 def test_package_files_import_nothing_from_the_house() -> None:
     for path in FRAMEWORK.rglob("__init__.py"):
         if path.parent.name not in ("armcal", "report", "testing"):
-            assert not _imports(path), path
+            assert not _source(path).imports, path
 
 
 @pytest.mark.parametrize("plugin", sorted(p.name for p in PLUGINS.iterdir() if (p / "plugin.py").exists()))
 def test_plugins_import_armcal_and_never_each_other(plugin: str) -> None:
     others = {p.name for p in PLUGINS.iterdir()} - {plugin}
     for path in (PLUGINS / plugin).rglob("*.py"):
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            names = [a.name for a in node.names] if isinstance(node, ast.Import) else []
-            names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
-            assert not {name.split(".")[0] for name in names} & others, path
-            if plugin != "armcal" and path.name == "plugin.py":
-                heavy = [n for n in names if n.split(".")[0] not in ("armcal", "__future__", "")]
-                assert heavy == [], f"{path} is imported to list plugins and must stay light"
+        packages = _source(path).packages
+        assert not packages & others, path
+        if path.name == "plugin.py":
+            assert packages <= {"armcal", "__future__", ""}, f"{path} is imported to list plugins and must stay light"
 
 
 def test_applications_are_announced_by_their_commands_alone() -> None:
@@ -123,26 +147,22 @@ def test_applications_are_announced_by_their_commands_alone() -> None:
 def test_the_framework_names_no_plugin_package() -> None:
     packages = [p.name for p in PLUGINS.iterdir() if p.is_dir() and p.name.startswith("armcal_")]
     for path in FILES:
-        modules = _imports(path)
+        modules = _source(path).imports
         assert not [m for m in modules if m.split(".")[0] in packages], path
 
 
 @pytest.mark.parametrize("path", [*FILES, *sorted(PLUGINS.rglob("*.py"))], ids=lambda p: p.stem)
 def test_files_and_functions_stay_short(path: Path) -> None:
-    text = path.read_text(encoding="utf-8")
-    assert len(text.splitlines()) <= 400
-    for node in ast.walk(ast.parse(text)):
-        if isinstance(node, ast.FunctionDef):
-            assert (node.end_lineno or 0) - node.lineno < 45, f"{path}: {node.name}"
+    source = _source(path)
+    assert source.lines <= 400
+    for name, length in source.functions:
+        assert length < 45, f"{path}: {name}"
 
 
 def test_only_the_command_line_prints_or_exits() -> None:
     for path in FILES:
-        if "cli" in path.parts:
-            continue
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
-                assert node.func.id not in ("print", "exit", "quit"), path
+        if "cli" not in path.parts:
+            assert not _source(path).calls & {"print", "exit", "quit"}, path
 
 
 def test_the_public_interface_is_small_and_light() -> None:

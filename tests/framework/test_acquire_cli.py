@@ -24,7 +24,7 @@ from tests.bench_runs import CONFIG, BenchRun, free_port, positions, write_plan
 
 NEAR = (0, 50, 0, 100, 0, 0)
 """Bent down to the table."""
-ACQUIRE = (sys.executable, "-m", "armcal.cli", "acquire", str(CONFIG), "--set", "bench.acquisition.at_end=release")
+ARMCAL = (sys.executable, "-m", "armcal.cli")
 SETS = ("bench.acquisition.period_s=0.04",)
 
 
@@ -145,11 +145,8 @@ class TestRefusedBeforeAnythingMoves:
     def test_nobody_who_can_say_yes(self, run: BenchRun) -> None:
         with run.simulated() as clock:
             words = [word for text in (*run.sets, *there(run)) for word in ("--set", text)]
-            command = [*ACQUIRE, "--unchecked", "--plan", str(run.plan)]
-            done = subprocess.run(
-                [*command, "--out", str(run.out), *words], capture_output=True, text=True, stdin=subprocess.DEVNULL
-            )
-            assert done.returncode == 2 and "--yes" in done.stderr
+            done = armcal("acquire", CONFIG, "--unchecked", "--plan", run.plan, "--out", run.out, *words)
+            assert done.exit_code == 2 and "--yes" in done.stderr  # its input is at its end
             assert clock.ask({"state": True})["events"] == {}
 
     def test_another_board_than_the_servo_file_names(self, tmp_path: Path) -> None:
@@ -240,9 +237,10 @@ class TestRehearsal:
 
 def test_ctrl_c_parks_the_arm_and_resume_measures_the_rest(run: BenchRun) -> None:
     sets = [word for text in (*run.sets, *there(run)) for word in ("--set", text)]
-    command = [*ACQUIRE, "--unchecked", "--plan", str(run.plan), "--out", str(run.out)]
+    sets += ["--set", "bench.acquisition.at_end=release"]
+    command = ["acquire", str(CONFIG), "--unchecked", "--plan", str(run.plan), "--out", str(run.out), "--yes", *sets]
     with run.simulated() as clock:
-        process = subprocess.Popen([*command, "--yes", *sets], stdout=subprocess.PIPE, text=True)
+        process = subprocess.Popen([*ARMCAL, *command], stdout=subprocess.PIPE, text=True)
         until = time.monotonic() + 60
         while clock.ask({"state": True})["now"] < 6 and time.monotonic() < until:
             time.sleep(0.01)
@@ -253,15 +251,15 @@ def test_ctrl_c_parks_the_arm_and_resume_measures_the_rest(run: BenchRun) -> Non
         state = clock.ask({"state": True})
         assert all(pulse is None for pulse in state["pulses_s"].values()) and state["offences"] == {}
         before = len(run.progress().measured)
-        done = subprocess.run([*command, "--yes", "--resume", *sets], capture_output=True, text=True, timeout=120)
-        assert done.returncode == 0 and "4 of 4 poses measured" in done.stdout
+        done = armcal(*command, "--resume")
+        assert done.exit_code == 0 and "4 of 4 poses measured" in done.stdout
     assert 0 <= before < 4
     assert sorted(run.progress().measured) == ["p1", "p2", "p3", "p4"]
 
 
 def test_a_missing_library_is_named(tmp_path: Path, plan: Path) -> None:
     (tmp_path / "serial.py").write_text("raise ModuleNotFoundError(\"No module named 'serial'\", name='serial')\n")
-    command = [*ACQUIRE, "--plan", str(plan), "--out", str(tmp_path / "o")]
+    command = [*ARMCAL, "acquire", str(CONFIG), "--plan", str(plan), "--out", str(tmp_path / "o")]
     environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
     done = subprocess.run([*command, "--yes"], capture_output=True, text=True, env=environment)
     assert done.returncode in (1, 2) and "serial" in done.stderr and "Traceback" not in done.stderr

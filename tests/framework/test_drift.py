@@ -367,7 +367,7 @@ def test_intervals_that_know_of_a_drift_hold_the_truth_as_often_as_they_say(lrm)
     assert held[:, : len(PLANTED)].mean() < 0.65
 
 
-@pytest.mark.parametrize("seeds", [range(400, 420), pytest.param(range(400, 600), marks=pytest.mark.slow)], ids=len)
+@pytest.mark.parametrize("seeds", [range(400, 408), pytest.param(range(400, 600), marks=pytest.mark.slow)], ids=len)
 def test_a_drift_as_stated_is_no_error_of_the_model(lrm, seeds):
     """The test of the size of residuals warns at one of its two tails, 2.5 %, as often as chance allows (0.1 %)."""
     warned = 0

@@ -21,13 +21,14 @@ from planted_mistakes import DEMO, MISTAKES, Mistake, PlantedArm, outcome
 
 PRINTED = PlantedArm("printed", DEMO, "arm.mdh.base_*", 0.42)
 BY_NAME = {mistake.name: mistake for mistake in MISTAKES}
+QUICK = ("validation.folds=0", "evaluator=interpreted")
 SEEN = [mistake for mistake in MISTAKES if mistake.visible]
 
 
 def planted(name: str, folder: Path, arm: PlantedArm = PRINTED, seed: int = 1) -> planted_mistakes.Outcome:
     mistake: Mistake = BY_NAME[name]
     data = mistake.make(arm, arm.recording(seed), np.random.default_rng(7))
-    return outcome(arm, data, folder, ["validation.folds=0", *mistake.overrides(arm)])
+    return outcome(arm, data, folder, [*QUICK, *mistake.overrides(arm)])
 
 
 @pytest.mark.parametrize(
@@ -52,7 +53,8 @@ def test_a_bad_verdict_ends_with_3_and_its_calibration_is_loaded_by_nothing_unle
     mistake = BY_NAME["30 % off by 50 mm"]
     data = mistake.make(PRINTED, PRINTED.recording(1), np.random.default_rng(7))
     path = PRINTED.write(data, tmp_path / "data.csv")
-    run = ["run", str(DEMO), "--data", str(path), "--set", "validation.folds=0", "--out", str(tmp_path / "run")]
+    settings = [word for text in QUICK for word in ("--set", text)]
+    run = ["run", str(DEMO), "--data", str(path), *settings, "--out", str(tmp_path / "run")]
     ran = CliRunner().invoke(cli, [*run, "--json"])
     text = " ".join(ran.stderr.split())
     assert ran.exit_code == 3 and "no command loads" in text and "--accept" in text
@@ -93,7 +95,7 @@ def test_a_base_that_nothing_holds_and_that_is_far_off_is_a_warning(tmp_path: Pa
 
 
 def test_a_clean_recording_is_not_graded_bad(tmp_path: Path) -> None:
-    found = outcome(PRINTED, PRINTED.recording(5), tmp_path, ["validation.folds=0"])
+    found = outcome(PRINTED, PRINTED.recording(5), tmp_path, QUICK)
     assert found.grade in ("good", "warning") and found.true < 0.5
 
 
@@ -112,14 +114,14 @@ def test_records_of_one_pose_are_held_out_together_and_counted(tmp_path: Path) -
     """Else what was fitted to judges, and the error claimed is half of the true one."""
     few = PRINTED.recording(4).subset(np.arange(0, 200, 5))
     path = PRINTED.write(repeated(few, 0.0005), tmp_path / "twice.csv")
-    result = calibrate(Experiment.load(DEMO, ["validation.folds=4"], path))
+    result = calibrate(Experiment.load(DEMO, ["validation.folds=4", "evaluator=interpreted"], path))
     assert any("80 records at 40 poses" in text for text in result.warnings)
     poses = np.arange(80) % 40
     assert not set(poses[result.split.train]) & set(poses[result.split.holdout])
     for split in folds(80, 4, 0, poses):
         assert not set(poses[split.train]) & set(poses[split.holdout]) and len(split.holdout) == 20
     judged = result.table.calibrated["holdout"].mean
-    once = calibrate(Experiment.load(DEMO, ["validation.folds=0"], PRINTED.write(few, tmp_path / "once.csv")))
+    once = calibrate(Experiment.load(DEMO, QUICK, PRINTED.write(few, tmp_path / "once.csv")))
     fitted = result.table.calibrated["train"].mean
     assert judged is not None and fitted is not None and judged > 1.3 * fitted
     assert once.table.calibrated["holdout"].mean == pytest.approx(judged, rel=0.5)
@@ -137,11 +139,10 @@ def test_distinct_poses_are_split_as_before() -> None:
 def test_no_planted_mistake_is_graded_usable(tmp_path: Path) -> None:
     """Fifty mistakes on three arms; what data cannot show is stated instead."""
     for arm in planted_mistakes.arms(tmp_path):
-        quick = ["validation.folds=0", "evaluator=interpreted"]
-        usual = outcome(arm, arm.recording(2), tmp_path, quick)
+        usual = outcome(arm, arm.recording(2), tmp_path, QUICK)
         for mistake in MISTAKES:
             data = mistake.make(arm, arm.recording(1), np.random.default_rng(7))
-            found = outcome(arm, data, tmp_path, [*quick, *mistake.overrides(arm)])
+            found = outcome(arm, data, tmp_path, [*QUICK, *mistake.overrides(arm)])
             usable = found.grade in ("good", "warning")
             harmless = found.true < 5 * usual.true
             stated = "times a typical" in found.said or "its prior" in found.said or "times as large" in found.said
@@ -157,5 +158,5 @@ def test_no_clean_recording_is_graded_bad(tmp_path: Path) -> None:
     runs = [(printed, seed) for seed in range(100, 160)] + [(industrial, seed) for seed in range(100, 170)]
     runs += [(seven, seed) for seed in range(100, 170)]
     for arm, seed in runs:
-        found = outcome(arm, arm.recording(seed), tmp_path, ["validation.folds=0", "evaluator=interpreted"])
+        found = outcome(arm, arm.recording(seed), tmp_path, QUICK)
         assert found.grade in ("good", "warning"), f"{arm.name}, seed {seed}: {found.said}"

@@ -44,6 +44,8 @@ ROOT = Path(__file__).resolve().parents[2]
 CONFIGS = ROOT / "configs" / "lrm_arm"
 POSES = CONFIGS / "demo.csv"
 MEASURED = ROOT.parent / "shared" / "data" / "lrm_arm" / "poses.csv"
+RECORDED = 112
+"""Records of the recording that drifts; the last is at a knot of its process."""
 ONLY_BASE = "parameters.drift={arm.mdh.base_x: {sd: 2 mm, over: 8}}"
 
 
@@ -277,11 +279,11 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run on a planted drift of the base, by rejecting outliers so that weights are kept as well."""
     folder = tmp_path_factory.mktemp("drift")
     loaded = Experiment.load(DEMO, [FREE, ONLY_BASE, DRIFTING[1]])
-    commands = loaded.read().subset(np.arange(152))
-    commands = with_channels(commands, {"sequence": np.arange(1.0, 153.0)})
+    commands = loaded.read().subset(np.arange(RECORDED))
+    commands = with_channels(commands, {"sequence": np.arange(1.0, RECORDED + 1)})
     made = _planted(loaded, commands, np.random.default_rng(9))
     made.channels["tracker.x"][30] += 0.04
-    rows = list(csv.reader(POSES.open()))[:153]
+    rows = list(csv.reader(POSES.open()))[: RECORDED + 1]
     head = rows[0].index("x_mm")
     for i, row in enumerate(rows[1:]):
         row[rows[0].index("pose_id")] = str(i + 1)
@@ -328,7 +330,9 @@ def test_a_new_recording_is_predicted_at_rest_and_with_wider_intervals(recording
 def test_beyond_the_recording_the_drift_is_forgotten(recording: Path, tmp_path: Path) -> None:
     """The same pose, at more and more distant places after the last record."""
     rows = list(csv.reader((recording / "poses.csv").open()))
-    places = [152, 160, 168, 176, 184, 10_152]  # all at knots: between them the process is a little smaller
+    places = [
+        RECORDED + after for after in (0, 8, 16, 24, 32, 10_000)
+    ]  # all at knots: between them the process is a little smaller
     poses = tmp_path / "after.csv"
     with poses.open("w", newline="") as file:
         csv.writer(file).writerows([rows[0], *([str(place), *rows[-1][1:]] for place in places)])
@@ -373,7 +377,7 @@ def test_what_is_kept_predicts_as_the_fit_itself(extra: tuple[str, ...], tmp_pat
     poses = tmp_path / "numbered.csv"
     rows = list(csv.reader(POSES.open()))
     with poses.open("w", newline="") as file:
-        csv.writer(file).writerows([rows[0], *([str(i), *row[1:]] for i, row in enumerate(rows[1:], 1))])
+        csv.writer(file).writerows([rows[0], *([str(i), *row[1:]] for i, row in enumerate(rows[1:61], 1))])
     settings = [FREE, *extra, "evaluator=interpreted", "validation.folds=0"]
     folder = tmp_path / "run"
     run = ("run", DEMO, "--data", str(poses), "--out", str(folder), "--accept")
@@ -453,7 +457,7 @@ def test_a_run_tells_what_its_intervals_hold(recording: Path) -> None:
     message_of = json.loads((recording / "run" / "metrics.json").read_text())["prediction_intervals"]
     assert set(message_of) == {"same_recording", "new_recording"}
     same = message_of["same_recording"]
-    assert same["holdout"]["coordinates"] == 114 and same["cross_validated"]["records"] == 114
+    assert same["holdout"]["coordinates"] == same["cross_validated"]["records"] == 3 * RECORDED // 4
     assert same["radius_95_mm"] < 0.8 * message_of["new_recording"]["radius_95_mm"]
     page = (recording / "run" / "report.html").read_text()
     assert "What a +- is worth" in page and "Predicted and measured errors" in page

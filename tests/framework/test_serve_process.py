@@ -77,16 +77,40 @@ def taken(running: Running, text: str) -> dict[str, Any]:
     return running.until(lambda status: status["calibration"]["sha256"] == sha256(text))
 
 
+def test_a_calibration_is_replaced_under_load(path: Path, text: str, clients: list[Asking], tmp_path: Path) -> None:
+    texts = [text, variant(text, 1)]
+    with serving(path, "--workers", "1") as running:
+        asked_by(clients, running)
+        put(path, texts[1])
+        assert taken(running, texts[1])["calibration"]["sequence"] == 2
+        ended(clients)
+    check_answers(clients, texts, tmp_path)
+
+
+def asked_by(clients: list[Asking], running: Running) -> None:
+    """Four clients, all of whom have an answer."""
+    clients += [Asking(running, number) for number in range(4)]
+    for client in clients:
+        client.start()
+    while not all(client.told or client.fault for client in clients):
+        time.sleep(0.05)
+
+
+def ended(clients: list[Asking]) -> None:
+    for client in clients:
+        client.ends.set()
+    for client in clients:
+        client.join(LONG_S)
+    assert [client.fault for client in clients] == [None] * 4
+
+
+@pytest.mark.slow
 def test_calibrations_are_replaced_under_load_and_only_whole_ones(
     path: Path, text: str, clients: list[Asking], tmp_path: Path
 ) -> None:
     texts = [text, *(variant(text, i) for i in (1, 2))]
     with serving(path, "--workers", "1") as running:
-        clients += [Asking(running, number) for number in range(4)]
-        for client in clients:
-            client.start()
-        while not all(client.told or client.fault for client in clients):
-            time.sleep(0.05)
+        asked_by(clients, running)
         put(path, texts[1])
         assert taken(running, texts[1])["calibration"]["sequence"] == 2
 
@@ -102,11 +126,7 @@ def test_calibrations_are_replaced_under_load_and_only_whole_ones(
             assert running.status()["file"]["state"] in ("settling", "refused")
         put(path, texts[2])
         assert taken(running, texts[2])["calibration"]["sequence"] == 3
-        for client in clients:
-            client.ends.set()
-        for client in clients:
-            client.join(LONG_S)
-    assert [client.fault for client in clients] == [None] * 4
+        ended(clients)
     check_answers(clients, texts, tmp_path)
 
 

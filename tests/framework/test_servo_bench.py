@@ -3,29 +3,44 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
 import socket
 import subprocess
 import sys
 import time
+from contextlib import contextmanager
 
 import pytest
 import yaml
+from armcal.cli.main import cli
+from click.testing import CliRunner
 
+from tests.bench_runs import bench_served_by_the_command, free_port
 from tests.servo_fakes import config_in
 
 ARMCAL = [sys.executable, "-m", "armcal.cli"]
 JOINTS = ("q3", "q5")
 
 
-def free_port():
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp:
-        udp.bind(("127.0.0.1", 0))
-        return udp.getsockname()[1]
+def armcal(*words):
+    return CliRunner().invoke(cli, [*map(str, words)])
 
 
-def armcal(*words, **more):
-    return subprocess.run([*ARMCAL, *map(str, words)], capture_output=True, text=True, timeout=120, **more)
+@contextmanager
+def piped(text):
+    """A pipe with these lines, and their end, as descriptor 0."""
+    read, write = os.pipe()
+    os.write(write, text.encode())
+    os.close(write)
+    before = os.dup(0)
+    os.dup2(read, 0)
+    os.close(read)
+    try:
+        yield
+    finally:
+        os.dup2(before, 0)
+        os.close(before)
 
 
 @pytest.fixture(scope="module")
@@ -40,17 +55,10 @@ def bench(tmp_path_factory):
         "  link: {type: framed, port: run/board}\n"
         f"  tracker: {{port: {port}}}\n"
         f"  simulator: {{tracker: {{port: {port}}}}}\n"
-        f"  servo: {{joints: [{', '.join(JOINTS)}], step: 24 deg}}\n",
+        f"  servo: {{joints: [{', '.join(JOINTS)}], step: 46 deg, period_s: 0.04}}\n",
     )
-    serving = subprocess.Popen(
-        [*ARMCAL, "simulated-bench", str(config), "--dir", str(folder / "run")], stdout=subprocess.PIPE, text=True
-    )
-    try:
-        assert serving.stdout.readline()
+    with bench_served_by_the_command(config, folder / "run"):
         yield config
-    finally:
-        serving.terminate()
-        serving.wait(10)
 
 
 def ask(config, request):
@@ -62,34 +70,32 @@ def ask(config, request):
 
 @pytest.fixture(scope="module")
 def calibrated(bench):
-    """One calibration, interrupted once and finished; what it said, and what it wrote."""
+    """One calibration; what it said, and where it wrote."""
     out = bench.parent / "out"
-    first = subprocess.Popen(
-        [*ARMCAL, "servo", str(bench), "--out", str(out), "--yes"], stderr=subprocess.PIPE, text=True
-    )
-    record, until = out / "observations.jsonl", time.monotonic() + 60
+    return armcal("servo", bench, "--out", out, "--yes", "--json"), out
+
+
+@pytest.mark.slow
+def test_interrupted_it_holds_and_keeps_what_it_measured(bench, tmp_path):
+    words = ["servo", bench, "--out", tmp_path / "out", "--yes", "--keep"]
+    first = subprocess.Popen([*ARMCAL, *map(str, words)], stderr=subprocess.PIPE, text=True)
+    record, until = tmp_path / "out" / "observations.jsonl", time.monotonic() + 60
     while (not record.exists() or record.read_text().count("\n") < 8) and time.monotonic() < until:
         time.sleep(0.02)
     first.send_signal(signal.SIGINT)
     said = first.communicate(timeout=60)[1]
+    assert first.returncode == 4 and "The arm holds" in said
     kept = record.read_text()
-    done = armcal("servo", bench, "--out", out, "--yes", "--json")
-    return first.returncode, said, kept, done, out
-
-
-@pytest.mark.slow
-def test_interrupted_it_holds_and_keeps_what_it_measured(calibrated):
-    code, said, kept, done, out = calibrated
-    assert code == 4 and "The arm holds" in said
-    assert done.returncode == 0, done.stderr
-    assert (out / "observations.jsonl").read_text().startswith(kept)
-    rows = [json.loads(line) for line in (out / "observations.jsonl").read_text().splitlines()]
+    done = armcal(*words)
+    assert done.exit_code == 0, done.stderr
+    assert record.read_text().startswith(kept)
+    rows = [json.loads(line) for line in record.read_text().splitlines()]
     keys = [(r["joint"], r["counts"], r["came"]) for r in rows if r["kind"] == "pose"]
     assert len(keys) == len(set(keys)) and {k[0] for k in keys} == set(JOINTS)
 
 
 def test_it_finds_what_the_servos_truly_are(calibrated, bench):
-    found = json.loads(calibrated[3].stdout)
+    found = json.loads(calibrated[0].stdout)
     truth = yaml.safe_load((bench.parent / "bench_servos.yaml").read_text())
     longer = truth["boards"]["front"]["oscillator_hz"] / 25e6
     for joint in JOINTS:
@@ -107,8 +113,8 @@ def test_the_servo_file_is_written_and_the_one_before_is_kept(calibrated, bench)
     after = yaml.safe_load((bench.parent / "servos.yaml").read_text())
     assert after["servos"]["q1"] == before["servos"]["q1"]
     assert after["servos"]["q3"]["pulses_us"] != before["servos"]["q3"]["pulses_us"]
-    again = armcal("servo", bench, "--out", calibrated[4], "--yes", "--json")
-    assert again.returncode == 0, again.stderr
+    again = armcal("servo", bench, "--out", calibrated[1], "--yes", "--json")
+    assert again.exit_code == 0, again.stderr
     assert json.loads(again.stdout)["before"] is None
 
 
@@ -124,7 +130,7 @@ def test_an_unplugged_board_that_comes_back_is_gone_on_with(calibrated, bench, t
         assert "error" not in ask(bench, {"fault": {"kind": kind, "at": at}})
     words = ("--out", tmp_path / "out", "--yes", "--keep", "--set", "bench.servo.step=40 deg", "--json")
     done = armcal("servo", bench, *words)
-    assert done.returncode == 0, done.stderr
+    assert done.exit_code == 0, done.stderr
     assert ask(bench, {"advance": 0.0})["now"] > now + 23.0
     assert not json.loads(done.stdout)["not_told"]["servos"]
 
@@ -132,11 +138,11 @@ def test_an_unplugged_board_that_comes_back_is_gone_on_with(calibrated, bench, t
 def test_check_says_that_all_is_right(calibrated, bench):
     bent = "bench.servo.base={q2: 30 deg, q4: -40 deg}"
     done = armcal("servo", bench, "--check", "--yes", "--json", "--set", bent)
-    assert done.returncode == 0, done.stdout + done.stderr
+    assert done.exit_code == 0, done.stdout + done.stderr
     assert {v["kind"] for v in json.loads(done.stdout)["joints"]} == {"right"}
 
 
-def test_check_finds_a_planted_swap(calibrated, bench):
+def test_check_finds_a_planted_swap(calibrated, bench, monkeypatch):
     servos = yaml.safe_load((bench.parent / "servos.yaml").read_text())
     servos["servos"]["q2"]["channel"], servos["servos"]["q4"]["channel"] = 3, 1
     (bench.parent / "swapped.yaml").write_text(yaml.safe_dump(servos))
@@ -145,19 +151,20 @@ def test_check_finds_a_planted_swap(calibrated, bench):
         "bench.servo.joints=[q2, q4]",
         "bench.device.servos=swapped.yaml",
     )
-    done = armcal(
-        "servo", bench, "--check", "--yes", *(word for o in options for word in ("--set", o)), cwd=bench.parent
-    )
-    assert done.returncode == 1
+    monkeypatch.chdir(bench.parent)
+    done = armcal("servo", bench, "--check", "--yes", *(word for o in options for word in ("--set", o)))
+    assert done.exit_code == 1
     assert "q2 and q4 are swapped" in done.stdout
 
 
 def test_guided_by_lines_of_a_pipe(calibrated, bench, tmp_path):
     words = ("--set", "bench.servo.joints=[q6]", "--guided", "--yes", "--out", tmp_path / "out", "--keep", "--json")
-    done = armcal("servo", bench, *words, input="+10\nok\n-10\nok\nquit\n")
-    assert done.returncode == 4, done.stderr
-    done = armcal("servo", bench, *words, input="skip\nskip\nok\nok\n")
-    assert done.returncode == 0, done.stderr
+    with piped("+10\nok\n-10\nok\nquit\n"):
+        done = armcal("servo", bench, *words)
+    assert done.exit_code == 4, done.stderr
+    with piped("skip\nskip\nok\nok\n"):
+        done = armcal("servo", bench, *words)
+    assert done.exit_code == 0, done.stderr
     knots = json.loads(done.stdout)["servos"]["q6"]["knots"]
     assert knots[2]["change_us"] == pytest.approx(0.0, abs=6.0)
 
@@ -176,7 +183,7 @@ def test_guided_by_lines_of_a_pipe(calibrated, bench, tmp_path):
 def test_what_is_refused_says_where_and_moves_nothing(tmp_path, text, said):
     config = config_in(tmp_path, text)
     done = armcal("servo", config, "--out", tmp_path / "out", "--yes")
-    assert done.returncode == 2, done.stderr
+    assert done.exit_code == 2, done.stderr
     assert "Traceback" not in done.stderr
     for word in said:
         assert word in done.stderr, done.stderr
@@ -186,11 +193,11 @@ def test_without_a_folder_or_a_bench_it_says_what_to_give(tmp_path):
     config = config_in(tmp_path)
     assert "--out" in armcal("servo", config, "--yes").stderr
     done = armcal("servo", tmp_path / "option1.yaml", "--out", tmp_path / "out")
-    assert done.returncode == 2 and "found no bench" in done.stderr
+    assert done.exit_code == 2 and "found no bench" in done.stderr
 
 
 def test_nobody_is_there_to_be_asked(bench, tmp_path):
     done = armcal("servo", bench, "--park", "--release", "--yes")
-    assert done.returncode == 0, done.stderr
-    done = armcal("servo", bench, "--out", tmp_path / "out", stdin=subprocess.DEVNULL)
-    assert done.returncode == 2 and "--yes" in done.stderr and "nothing was moved" in done.stderr
+    assert done.exit_code == 0, done.stderr
+    done = armcal("servo", bench, "--out", tmp_path / "out")  # its input is at its end
+    assert done.exit_code == 2 and "--yes" in done.stderr and "nothing was moved" in done.stderr

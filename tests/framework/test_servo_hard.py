@@ -27,7 +27,7 @@ from tests.framework.test_acquire_faults import faults
 from tests.servo_fakes import CONFIGS, config_in, setup_on
 from tests.servo_runs import SETS, ServoRun
 
-QUICK, MANY = 2, 150
+QUICK, MANY = 1, 150
 SECONDS = 50.0
 """What a calibration takes when nothing goes wrong."""
 KINDS = ("drop", "duplicate", "reorder", "flip", "split", "unplug", "reset", "brown_out", "nack", "stuck")
