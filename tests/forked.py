@@ -31,7 +31,10 @@ def _server() -> ForkServerContext:
 
 
 def armcal(
-    *words: str, cwd: Path | None = None, path: Path | None = None, environment: Mapping[str, str] | None = None
+    *words: str,
+    cwd: Path | None = None,
+    path: Path | None = None,
+    environment: Mapping[str, str] | None = None,
 ) -> Ran:
     """One command of armcal.
 
@@ -41,7 +44,8 @@ def armcal(
         path: a directory whose modules and distributions it finds first, as PYTHONPATH gives it.
         environment: variables beside those of this process.
     """
-    return run_code("from armcal.cli.main import main\nmain()\n", *words, cwd=cwd, path=path, environment=environment)
+    code = "from armcal.cli.main import main\nmain()\n"
+    return run_code(code, *words, cwd=cwd, path=path, environment=environment)
 
 
 def run_code(
@@ -56,8 +60,8 @@ def run_code(
     variables = {**os.environ, **(environment or {}), "PYTHONPATH": str(path or "")}
     with tempfile.TemporaryDirectory(prefix="armcal-forked-") as place:
         streams = (os.devnull, f"{place}/out", f"{place}/err")
-        given = (code, list(words), str(cwd or Path.cwd()), str(path or ""), variables, streams, afresh)
-        process = _server().Process(target=_run, args=given)
+        what = (code, list(words), str(cwd or Path.cwd()), str(path or ""), variables, streams, afresh)
+        process = _server().Process(target=_run, args=what)
         process.start()
         process.join(LONGEST_S)
         if process.exitcode is None:

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import inspect
 import re
-import subprocess
-import sys
 from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import forked
 import pytest
 from armcal import hooks
 from armcal.cli.hook_reference import as_markdown, as_text, idle_words, missing, reference
@@ -26,8 +25,9 @@ def test_the_page_is_what_is_made_now() -> None:
 
 def test_the_command_prints_the_page_and_a_list_for_the_terminal() -> None:
     def said(*arguments: str) -> str:
-        command = [sys.executable, "-m", "armcal.cli", "plugins", "hooks", *arguments]
-        return subprocess.run(command, capture_output=True, text=True, check=True).stdout
+        ran = forked.armcal("plugins", "hooks", *arguments)
+        assert ran.returncode == 0, ran.stderr
+        return ran.stdout
 
     assert said("--markdown") == as_markdown(reference())
     told = said()

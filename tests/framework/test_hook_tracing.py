@@ -10,6 +10,7 @@ import sys
 from importlib.metadata import EntryPoint
 from pathlib import Path
 
+import forked
 import pytest
 import yaml
 from armcal.errors import ConfigError
@@ -126,9 +127,7 @@ def test_a_file_that_cannot_be_written_is_refused(monkeypatch: pytest.MonkeyPatc
 
 
 def armcal(*arguments: str, cwd: Path, trace: str) -> subprocess.CompletedProcess[str]:
-    environment = {**os.environ, VARIABLE: trace, "ARMCAL_CC": "none", "COLUMNS": "1000"}
-    command = [sys.executable, "-m", "armcal.cli", *arguments]
-    return subprocess.run(command, capture_output=True, text=True, cwd=cwd, env=environment, check=False)
+    return forked.armcal(*arguments, cwd=cwd, environment={VARIABLE: trace, "ARMCAL_CC": "none", "COLUMNS": "1000"})
 
 
 @pytest.fixture(scope="module")

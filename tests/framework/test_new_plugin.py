@@ -63,7 +63,8 @@ def test_a_new_package_installs_and_works(kind: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("package", [False, True])
-@pytest.mark.parametrize("name", ["a", "x" * LONGEST])
+@pytest.mark.parametrize("name", ["a", "x" * LONGEST], ids=["shortest", "longest"])
+@pytest.mark.quick("shortest-False", "longest-True")
 def test_it_is_clean_whatever_its_name(name: str, package: bool, tmp_path: Path) -> None:
     need("ruff")
     for kind in KINDS:

@@ -248,20 +248,14 @@ def test_an_out_that_cannot_be_written_is_refused_before_any_work(tmp_path: Path
         assert result.exit_code == 2 and str(place) in result.output.replace("\n", "")
 
 
-def test_a_plan_about_a_calibration_takes_its_values(tmp_path: Path) -> None:
-    folder = tmp_path / "run"
-    assert (
-        armcal(
-            "run", DEMO, "--out", str(folder), "-q", "--set", "evaluator=interpreted", "--set", "validation.folds=0"
-        ).exit_code
-        == 0
-    )
+def test_a_plan_about_a_calibration_takes_its_values(tmp_path: Path, demo_run: Path) -> None:
     nominal = planned(tmp_path / "n.csv", "--poses", "30")
-    about = planned(tmp_path / "c.csv", "--poses", "30", "--calibration", str(folder / "calibration.yaml"))
+    about = planned(tmp_path / "c.csv", "--poses", "30", "--calibration", str(demo_run / "calibration.yaml"))
     assert about["log_det"] != pytest.approx(nominal["log_det"], abs=0.01)
 
 
 @pytest.mark.parametrize("command", ["check", "identify", "plan", "run", "study"])
+@pytest.mark.quick("check", "plan", "run")
 def test_another_data_file_wins_over_an_absolute_path_that_leads_nowhere(command: str, tmp_path: Path) -> None:
     """The configured path is not even looked at."""
     away = f"data.path={tmp_path / 'away' / 'records.csv'}"

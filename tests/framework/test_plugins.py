@@ -103,7 +103,8 @@ def test_checking_all_names_the_one_that_is_broken(tmp_path: Path) -> None:
     code += (
         "p.discover = lambda: d([E('import', 'broken_import', 'armcal'), E('mdh', 'armcal_mdh.plugin', 'armcal')]); "
     )
-    ran = python("-c", f"{code}p.plugins(['check'])", path=tmp_path)
+    environment = {"COLUMNS": "1000", "ARMCAL_CC": "none"}
+    ran = forked.run_code(f"{code}p.plugins(['check'])", path=tmp_path, environment=environment)
     assert ran.returncode == 2
     assert ran.stderr.count("\n") == 1
     assert ran.stderr.startswith("armcal: import: ModuleNotFoundError")

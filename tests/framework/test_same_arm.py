@@ -163,6 +163,7 @@ def test_the_nominal_forms_stand_where_pinocchio_puts_them(arm, tmp_path):
 
 
 @pytest.mark.parametrize("arm", ["lrm", "frida"])
+@pytest.mark.quick("frida")
 def test_calibrated_on_the_same_points_all_forms_predict_the_same(arm, tmp_path):
     q = commands(arm, 10_000, 2)
     true, before = points(tool_poses(true_chain(arm), q)), points(tool_poses(nominal_chain(arm), q))
@@ -192,6 +193,7 @@ def test_a_calibrated_form_written_as_a_urdf_predicts_the_same_by_pinocchio(arm,
 
 
 @pytest.mark.parametrize("arm", ["lrm", "frida"])
+@pytest.mark.quick("lrm")
 def test_with_noise_the_forms_are_as_good_as_each_other(arm, tmp_path):
     """The same minimum but for priors: the same points left over, and the same rank, to the last thousandth."""
     data, random = recorded(arm), np.random.default_rng(9)

@@ -161,6 +161,7 @@ def test_many_outliers_or_many_in_a_row_are_not() -> None:
 
 
 @pytest.mark.parametrize("motion", ["moving", "still"])
+@pytest.mark.quick("moving")
 def test_deviations_are_those_of_the_mean(motion: str) -> None:
     bodies = BodySettings(tool="tool", base="base", base_motion=motion)
     found = [state(frames(lambda t: at(0.3), 1.1, seed), 1.1, bodies=bodies) for seed in range(150)]

@@ -100,7 +100,7 @@ def test_missed_records_are_listed_where_the_limit_says(tmp_path: Path) -> None:
         return points
 
     data = disturbed(tmp_path, spoil)
-    run = verdict(tmp_path / "run", "validation.holdout=0", "validation.folds=3", "validation.limit_mm=6", data=data)
+    run = verdict(tmp_path / "run", "validation.holdout=0", "validation.folds=2", "validation.limit_mm=6", data=data)
     missed = run["structure"]["large_errors"]
     assert {m["record_id"] for m in missed["explained"]} == {"8", "91"} and missed["beyond"] == 2
     assert missed["judged"] == 200 and missed["configured"]
@@ -147,7 +147,9 @@ def test_what_priors_alone_hold_is_a_note_where_the_tip_does_not_depend_on_it(tm
 
 
 def test_terminal_and_report_say_what_the_json_says(tmp_path: Path) -> None:
-    settings = ["--set", "evaluator=interpreted", "--set", "validation.holdout=0"]
+    settings = [
+        x for s in ("evaluator=interpreted", "validation.holdout=0", "validation.folds=2") for x in ("--set", s)
+    ]
     run = ["run", DEMO, "--out", str(tmp_path / "run"), *settings]
     shown = " ".join(CliRunner().invoke(cli, run).stdout.split())
     page = " ".join((tmp_path / "run" / "report.html").read_text().split())
@@ -198,6 +200,7 @@ def test_suggested_poses_tell_more_than_random_ones() -> None:
 
 
 @pytest.mark.parametrize("free", ["[]", "[arm.spring.k1]"])
+@pytest.mark.quick("[]")
 def test_a_run_with_nothing_or_little_free_still_ends_in_a_report(tmp_path: Path, free: str) -> None:
     run = verdict(tmp_path / "run", f"parameters.free={free}", "validation.folds=0")
     told = [each["text"] for each in run["verdict"]["findings"]]
