@@ -27,7 +27,7 @@ from armcal.io.plain_files import input_file
 from armcal.measure.checks import check_dataset, layout_of
 from armcal.measure.column_match import Column, Header, Plan, header_of, match_columns, renamed
 from armcal.measure.reader import ReadRequest
-from pydantic import Field
+from pydantic import Field, model_validator
 
 MAX_BYTES = 2 * 1024**3
 MAX_LINE_BYTES = 1024**2
@@ -40,12 +40,19 @@ class CsvSettings(Settings):
     """Which file, and what its columns are called.
 
     ``columns`` maps a name with its unit to the file's own: ``{q1_deg: joint_1_deg}``, or
-    ``{q1_deg: J1}`` for a column without its unit.
+    ``{q1_deg: J1}`` for a column without its unit. ``decimal`` is the sign before the fraction of every number.
     """
 
     path: InputPath
     columns: dict[str, str] = Field(default_factory=dict)
     delimiter: Literal[",", ";", "\t", "|"] = ","
+    decimal: Literal[".", ","] = "."
+
+    @model_validator(mode="after")
+    def _two_signs(self) -> CsvSettings:
+        if self.decimal == self.delimiter:
+            raise ValueError('found a comma as delimiter and as decimal, expected two signs: set delimiter: ";"')
+        return self
 
 
 class CsvReader:
@@ -74,7 +81,7 @@ class CsvReader:
                     _refuse_delimiter(header_of(cells, source, line), s.delimiter, rows)
                 header = renamed(header_of(cells, source, line), s.columns)
                 plan = match_columns(header, request.channels)
-                dataset = _load(rows, header, plan)
+                dataset = _load(rows, header, plan, s.decimal == ",")
         except OSError as fault:
             _refuse_file(path, f"it cannot be read ({fault.strerror or fault}).", "Check the path and its permissions.")
         dataset = replace(dataset, sha256=digest.hexdigest())
@@ -136,10 +143,10 @@ def _refuse_delimiter(header: Header, delimiter: str, rows: Iterator[tuple[int, 
     if comma is None:
         header.refuse(f"{text}.", f"{mend}.")
     text = f"{text}, and numbers with a decimal comma ({comma})."
-    header.refuse(text, f"{mend}, and write decimal points ({with_point(comma)}).")
+    header.refuse(text, f'{mend}, and decimal: ",".')
 
 
-def _load(rows: Iterator[tuple[int, list[str]]], header: Header, plan: Plan) -> Dataset:
+def _load(rows: Iterator[tuple[int, list[str]]], header: Header, plan: Plan, has_commas: bool) -> Dataset:
     """All rows, a block of them at a time; records without an id are set aside."""
     ids: list[str] = []
     places: list[int] = []
@@ -153,11 +160,10 @@ def _load(rows: Iterator[tuple[int, list[str]]], header: Header, plan: Plan) -> 
         table = list(zip(*(cells for _, cells in block), strict=True))
         for channel, (column, unit) in plan.channels.items():
             cells = table[column.index]
-            numbers = plain_numbers(cells)
+            numbers = None if has_commas else plain_numbers(cells)
             if numbers is None:
-                numbers = np.array(
-                    [_number(cell, line, column, header) for cell, line in zip(cells, lines, strict=True)]
-                )
+                read = partial(_number, column=column, header=header, has_commas=has_commas)
+                numbers = np.array([read(cell, line) for cell, line in zip(cells, lines, strict=True)])
             blocks[channel].append(from_unit(numbers, unit))
         for column in plan.extra:
             texts[column.known_as] += table[column.index]
@@ -183,10 +189,14 @@ def _refuse_ragged(line: int, cells: Sequence[str], header: Header) -> NoReturn:
     raise DataError(message, where=Location(header.source, line=line), hint=mend)
 
 
-def _number(cell: str, line: int, column: Column, header: Header) -> float:
+def _number(cell: str, line: int, column: Column, header: Header, has_commas: bool) -> float:
     """One cell; NaN if its value is missing."""
-    number = read_cell(cell)
+    number = read_cell(with_point(cell) if has_commas and "." not in cell else cell)
+    if has_commas and "." in cell and not isinstance(number, CellFault):
+        number = CellFault(f"found {cell!r}, expected a decimal comma.", 'Write 12,5, or leave decimal: "," out.')
     if isinstance(number, CellFault):
         where = Location(header.source, line=line, field=column.name)
-        raise DataError(number.text, where=where, hint=number.hint)
+        is_comma = not has_commas and DECIMAL_COMMA.fullmatch(cell)
+        other = ' Or set decimal: "," in the data section, if all numbers of the file have one.' if is_comma else ""
+        raise DataError(number.text, where=where, hint=number.hint + other)
     return number

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from armcal.base.domains import Array
 from armcal.base.settings import Settings
+from pydantic import Field, model_validator
 from scipy.spatial.transform import Rotation
 from typing_extensions import override
 
@@ -164,6 +165,42 @@ class AnglesColumns(Orientation):
         return {
             "R = Rx(roll) Ry(pitch) Rz(yaw)": Rotation.from_euler("XYZ", values, degrees=degrees),
             f"unit: {'rad' if degrees else 'deg'}": Rotation.from_euler("xyz", values, degrees=not degrees),
+        }
+
+
+class EulerColumns(AnglesColumns):
+    """The three columns of Euler angles, and their convention, as SciPy has it.
+
+    ``order`` names the axes in the order of the columns: small letters are turns about fixed axes (``xyz``: R = Rz Ry
+    Rx, as ``rpy``), capitals about the axes that turned before (``XYZ``: R = Rx Ry Rz).
+    """
+
+    kind = "triple of Euler angles"
+    order: Annotated[str, Field(pattern="^([xyz]{3}|[XYZ]{3})$")]
+
+    @model_validator(mode="after")
+    def _three_turns(self) -> EulerColumns:
+        if self.order[0] == self.order[1] or self.order[1] == self.order[2]:
+            raise ValueError(f"found the order {self.order!r}, expected neighbours to differ: XYZ, ZYX, ZYZ, xyz, ...")
+        return self
+
+    @property
+    @override
+    def declared(self) -> str:
+        return f"order: {self.order} in {self.unit}"
+
+    @override
+    def rotations(self, values: Array) -> Rotation:
+        return Rotation.from_euler(self.order, values, degrees=self.unit == "deg")
+
+    @override
+    def others(self, values: Array) -> dict[str, Rotation]:
+        """The other kind of axes, the other direction, and the other unit."""
+        degrees, other = self.unit == "deg", self.order.swapcase()
+        return {
+            f"order: {other}": Rotation.from_euler(other, values, degrees=degrees),
+            "it as that of body_T_base": self.rotations(values).inv(),
+            f"unit: {'rad' if degrees else 'deg'}": Rotation.from_euler(self.order, values, degrees=not degrees),
         }
 
 

@@ -24,6 +24,7 @@ from armcal_tracker.csv_reader import CsvReader, CsvSettings
 from armcal_tracker.orientation import (
     QUATERNION,
     AnglesColumns,
+    EulerColumns,
     Orientation,
     QuaternionColumns,
     RotationColumns,
@@ -34,9 +35,9 @@ from armcal_tracker.orientation import (
 TOLERANCE = 1e-3
 """How far a quaternion's length may be from one, or an entry of R^T R from the identity's."""
 MOST_FAULTY = 0.05
-WORSE = 3.0
-WORST_DEG = 5.0
-"""The declared meaning of the columns is refused if it fits the arm worse than this, and so much worse than another."""
+WORST = ((5.0, 3.0), (0.5, 10.0))
+"""The declared meaning of the columns is refused if it fits the arm worse than this (deg), and so many times worse than
+another; the second where the body hardly turned, as where a probe must face its tracker."""
 _ZERO = 1e-6
 FEWEST = 6
 _STRIDES = (1, 2, 3, 5, 7, 11, 17)
@@ -46,7 +47,9 @@ _LARGEST_TURN_RAD = 2.6
 
 
 class PoseCsvSettings(CsvSettings):
-    """As ``csv``, and base_T_body's orientation: one of ``quaternion``, ``rotation``, ``rpy`` and ``rotation_vector``.
+    """As ``csv``, and base_T_body's orientation.
+
+    One of ``quaternion``, ``rotation``, ``rpy``, ``euler`` and ``rotation_vector``.
 
     ``measurement`` names the measurement that reads orientations; by default the only one.
     """
@@ -54,6 +57,7 @@ class PoseCsvSettings(CsvSettings):
     quaternion: QuaternionColumns | None = None
     rotation: RotationColumns | None = None
     rpy: AnglesColumns | None = None
+    euler: EulerColumns | None = None
     rotation_vector: VectorColumns | None = None
     measurement: str | None = None
 
@@ -62,12 +66,13 @@ class PoseCsvSettings(CsvSettings):
         if sum(given is not None for given in self._given()) != 1:
             raise ValueError(
                 "expected one of quaternion: {columns: [...], order: xyzw}, rotation: {columns: [...]}, "
-                "rpy: {columns: [...], unit: deg} and rotation_vector: {columns: [...], unit: rad}"
+                "rpy: {columns: [...], unit: deg}, euler: {columns: [...], order: XYZ, unit: deg} "
+                "and rotation_vector: {columns: [...], unit: rad}"
             )
         return self
 
     def _given(self) -> tuple[Orientation | None, ...]:
-        return self.quaternion, self.rotation, self.rpy, self.rotation_vector
+        return self.quaternion, self.rotation, self.rpy, self.euler, self.rotation_vector
 
     @property
     def orientation(self) -> Orientation:
@@ -96,7 +101,8 @@ class PoseCsvReader:
         """
         s, instance = self._settings, self._instance(request)
         mapped = {f"{instance}.{name}": own for name, own in self._orientation.mapped().items()}
-        reader = CsvReader(CsvSettings(path=s.path, columns={**s.columns, **mapped}, delimiter=s.delimiter))
+        columns = {**s.columns, **mapped}
+        reader = CsvReader(CsvSettings(path=s.path, columns=columns, delimiter=s.delimiter, decimal=s.decimal))
         # the file's numbers in place of the quaternion; they cannot be absent
         quaternion = {f"{instance}.{name}" for name in QUATERNION}
         rest = [channel for channel in request.channels if channel.channel not in quaternion]
@@ -149,7 +155,7 @@ class PoseCsvReader:
         declared = np.degrees(misfit(self._orientation.rotations(values), nominal))
         others = {name: np.degrees(misfit(r, nominal)) for name, r in self._orientation.others(values).items()}
         best = min(others, key=lambda name: others[name])
-        if declared > WORST_DEG and declared > WORSE * others[best]:
+        if any(declared > worst and declared > times * others[best] for worst, times in WORST):
             self._refuse(
                 f"orientations turn unlike the nominal arm: with {self._orientation.declared} the turns between "
                 f"records are off by {declared:.2f} deg (median), with {best} by {others[best]:.2f} deg.",

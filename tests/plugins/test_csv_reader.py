@@ -22,6 +22,7 @@ from armcal_mdh.model import MdhModel, MdhSettings, Row
 from armcal_tracker import csv_reader
 from armcal_tracker.csv_reader import CsvReader, CsvSettings
 from armcal_tracker.position import TipPosition, TipPositionSettings
+from pydantic import ValidationError
 
 LRM_POSES = Path(__file__).parents[2].parent / "shared" / "data" / "lrm_arm" / "poses.csv"
 HEADER = "pose_id,q1_deg,q2_deg,approach1,approach2,x_mm,y_mm,z_mm"
@@ -236,7 +237,7 @@ REFUSED_BYTES = {
     "tabs": (table().encode().replace(b",", b"\t"), ["poses.csv:1:", 'Set delimiter: "\\t"']),
     "semicolons and decimal commas": (
         table().replace(",", ";").replace(".", ",").encode(),
-        ["poses.csv:1:", "decimal comma (10,0)", 'Set delimiter: ";"', "decimal points (10.0)"],
+        ["poses.csv:1:", "decimal comma (10,0)", 'Set delimiter: ";"', 'and decimal: ","'],
     ),
     "columns": (",".join(f"c{i}" for i in range(1001)).encode(), ["poses.csv:1:", "1001 columns"]),
 }
@@ -257,7 +258,24 @@ def test_the_byte_offset_is_that_in_the_file(tmp_path: Path) -> None:
 def test_decimal_commas_with_the_right_delimiter(tmp_path: Path) -> None:
     text = table().replace(",", ";").replace(".", ",")
     message = refusal(tmp_path, text, delimiter=";")
-    assert "poses.csv:2, q1_deg: found '10,0', a decimal comma. Write decimal points: 10.0." in message
+    assert "poses.csv:2, q1_deg: found '10,0', a decimal comma. Write decimal points: 10.0. Or set decimal" in message
+    with_points, with_commas = read(tmp_path, table()), read(tmp_path, text, delimiter=";", decimal=",")
+    assert with_commas.ids == with_points.ids
+    for name, column in with_points.channels.items():
+        np.testing.assert_array_equal(with_commas.column(name), column)
+
+
+def test_points_among_decimal_commas_are_refused(tmp_path: Path) -> None:
+    text = table().replace(",", ";").replace("10.0", "1.250,5", 1)
+    message = refusal(tmp_path, text, delimiter=";", decimal=",")
+    assert "poses.csv:2, q1_deg: found '1.250,5'" in message
+    message = refusal(tmp_path, table().replace(",", ";"), delimiter=";", decimal=",")
+    assert "expected a decimal comma" in message and 'leave decimal: "," out' in message
+
+
+def test_a_comma_cannot_be_both(tmp_path: Path) -> None:
+    with pytest.raises(ValidationError, match="a comma as delimiter and as decimal"):
+        read(tmp_path, table(), decimal=",")
 
 
 @pytest.mark.parametrize(

@@ -117,6 +117,61 @@ def test_angles_and_rotation_vectors_are_the_same_rotations(tmp_path, kind, unit
     assert f"unit: {unit}" in refusal(tmp_path, text, **{kind: {"columns": columns, "unit": other}})
 
 
+def about(axis, angle):
+    """Rotation matrices about a base axis, by hand."""
+    c, s, place = np.cos(angle), np.sin(angle), "xyz".index(axis.lower())
+    matrices = np.tile(np.eye(3), (len(angle), 1, 1))
+    i, j = (place + 1) % 3, (place + 2) % 3
+    matrices[:, i, i], matrices[:, i, j], matrices[:, j, i], matrices[:, j, j] = c, -s, s, c
+    return matrices
+
+
+@pytest.mark.parametrize("order", ["XYZ", "xyz", "ZYX", "zyz", "ZXZ"])
+def test_euler_angles_are_products_of_turns_in_their_order(tmp_path, order):
+    """Capitals multiply from the left to the right, small letters from the right to the left."""
+    angles = joints(40)
+    truth = seen(angles)
+    numbers = truth.as_euler(order, degrees=True)
+    turns = [about(axis, np.radians(column)) for axis, column in zip(order, numbers.T, strict=True)]
+    turns = turns if order.isupper() else turns[::-1]
+    np.testing.assert_allclose(turns[0] @ turns[1] @ turns[2], truth.as_matrix(), atol=1e-12)
+    text = table(angles, numbers, "abc")
+    euler = {"columns": list("abc"), "order": order, "unit": "deg"}
+    assert (rotations_of(read(tmp_path, text, euler=euler)).inv() * truth).magnitude().max() < 1e-12
+    told = refusal(tmp_path, text, euler={**euler, "order": order.swapcase()})
+    assert f"order: {order}" in told
+
+
+def test_the_wrong_order_is_refused_although_the_body_hardly_turns(tmp_path):
+    """A probe that must face its tracker: the declared order is off by under 5 degrees, the true one by far less."""
+    angles = 0.15 * joints(60)
+    truth = seen(angles, error_deg=0.02)
+    text = table(angles, truth.as_euler("XYZ", degrees=True), "abc")
+    euler = {"columns": list("abc"), "unit": "deg"}
+    assert len(read(tmp_path, text, euler={**euler, "order": "XYZ"})) == 60
+    told = refusal(tmp_path, text, euler={**euler, "order": "xyz"})
+    assert 0.5 < float(told.partition("are off by ")[2].split()[0]) < 5.0 and "order: XYZ by 0." in told
+
+
+@pytest.mark.parametrize("order", ["XXY", "Xyz", "XY", "xyzw", ""])
+def test_an_order_that_is_none_is_refused(tmp_path, order):
+    with pytest.raises(ValidationError, match="order"):
+        read(
+            tmp_path,
+            table(joints(3), np.zeros((3, 3)), "abc"),
+            euler={"columns": list("abc"), "order": order, "unit": "deg"},
+        )
+
+
+def test_decimal_commas(tmp_path):
+    angles = joints(40)
+    truth = seen(angles)
+    text = table(angles, truth.as_euler("XYZ", degrees=True), "abc").replace(",", ";").replace(".", ",")
+    euler = {"columns": list("abc"), "order": "XYZ", "unit": "deg"}
+    dataset = read(tmp_path, text, euler=euler, delimiter=";", decimal=",")
+    assert (rotations_of(dataset).inv() * truth).magnitude().max() < 1e-12
+
+
 def test_angles_of_the_other_order_and_inverse_vectors_are_refused(tmp_path):
     angles = joints(40)
     truth = seen(angles)
