@@ -94,10 +94,8 @@ def _tools(expression: ToolExpression, commands: Array, choice: EvaluatorChoice)
     """Where the tool is under the arm's own weight (N x 3; m)."""
     equilibrium, parts = Equilibrium(expression, choice), []
     for start in range(0, max(commands.shape[1], 1), AT_ONCE):
-        chunk = commands[:, start : start + AT_ONCE]
-        record = np.repeat(expression.defaults[:, None], chunk.shape[1], axis=1)
-        record[: len(commands)] = chunk
-        parts.append(equilibrium(record).base_T_tool[:, :3, 3])
+        records = expression.records(commands[:, start : start + AT_ONCE])
+        parts.append(equilibrium(records).base_T_tool[:, :3, 3])
     return np.concatenate(parts)
 
 

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import casadi as ca
 import numpy as np
 from armcal.arm.clearance import Mask
 from armcal.arm.loading import LOAD_CHANNELS
 from armcal.base.domains import Array
-from armcal.base.se3 import Expression
+from armcal.calibration.compensation.step import force_compliance, slopes, twists
 from armcal.calibration.tool_expression import Equilibrium, ToolExpression
 from armcal.functions.batch_function import BatchFunction, EvaluatorChoice
 
@@ -108,25 +108,10 @@ class MechanicsFunction:
 
 
 def _function(expression: ToolExpression) -> ca.Function:
-    """(record, state) -> pose, its slope by commands and by a force, efforts. [Griewank2008]"""
-    record, state, joints = expression.record, expression.state, len(expression.joints)
-    force = expression.channels.index(_FORCE)
-    pose = ca.densify(ca.vertcat(ca.vec(expression.base_T_tool.rotation), expression.base_T_tool.translation))
-    by_record, by_state = ca.jacobian(pose, record), ca.jacobian(pose, state)
-    answer = ca.jacobian(expression.next_state, record)
-    moved, given = expression.to_equilibrium(answer[:, :joints], answer[:, force : force + 3])
-    by_commands = by_record[:, :joints] + ca.mtimes(by_state, moved)
-    by_force = ca.mtimes(by_state[9:, :], given)
-    shown = [pose, ca.vec(ca.densify(_twists(pose, by_commands))), ca.vec(ca.densify(by_force)), expression.efforts]
-    return ca.Function("capability", [record, state], [ca.densify(output) for output in shown], {"cse": True})
-
-
-def _twists(pose: Expression, by_commands: Expression) -> Expression:
-    """Slopes of rotation and position (12 x n) as shift and turn (6 x n): half the sum of r_i x dr_i is the turn."""
-    turns = []
-    for joint in range(by_commands.size2()):
-        turned = [
-            ca.cross(pose[3 * i : 3 * i + 3], ca.densify(by_commands[3 * i : 3 * i + 3, joint])) for i in range(3)
-        ]
-        turns.append((turned[0] + turned[1] + turned[2]) / 2)
-    return ca.vertcat(by_commands[9:, :], ca.horzcat(*turns))
+    """(record, state) -> pose, its slope by commands and by a force, efforts."""
+    tool = expression.base_T_tool
+    pose = ca.vertcat(ca.vec(tool.rotation), tool.translation)
+    slope = replace(slopes(expression), corrected=pose)
+    shown = [pose, ca.vec(twists(slope)), ca.vec(force_compliance(expression)), expression.efforts]
+    outputs = [ca.densify(output) for output in shown]
+    return ca.Function("capability", [expression.record, expression.state], outputs, {"cse": True})

@@ -162,9 +162,7 @@ def _compare(loaded: LoadedModel, expected: Array, commands: Array) -> None:
 def _reach(request: ExportRequest, loaded: LoadedModel, commands: Array) -> float:
     """How far MuJoCo's tool at rest is from the calibrated arm's, at most over poses that settle in both (m)."""
     expression, largest = request.expression(), 0.0
-    records = np.tile(expression.defaults, (commands.shape[1], 1))
-    records[:, : len(commands)] = commands.T
-    tools, _, settled = in_equilibrium(expression, records)
+    tools, _, settled = in_equilibrium(expression, expression.records(commands).T)
     for command, tool in zip(commands.T[settled], tools[settled], strict=True):
         with suppress(NotConvergedError):
             largest = max(largest, float(np.linalg.norm(loaded.tool_at_rest(command)[:3, 3] - tool[:, 3])))

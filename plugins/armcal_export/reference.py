@@ -48,9 +48,7 @@ def reference_of(expression: ToolExpression, count: int) -> Reference:
     """
     random = np.random.default_rng(2)
     commands = random_commands(expression.arm, count)
-    records = np.tile(expression.defaults, (count, 1))
-    joints = len(expression.joints)
-    records[:, :joints] = commands.T
+    records, joints = expression.records(commands).T.copy(), len(expression.joints)
     records[:, joints : 2 * joints] = random.integers(-1, 2, (count, joints))
     place = expression.channels.index
     records[1::2, place("payload")] += random.uniform(0, _PAYLOAD_KG, count)[1::2]

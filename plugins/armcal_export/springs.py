@@ -27,7 +27,6 @@ class SpringNumbers:
         site: 0 for the mount, i for joint i (from 1).
         axes: unit vectors in the site's frame, columns (3 x n); of a spring on a joint's own axis that axis.
         along: whether it gives along a sliding joint's own axis and not about it.
-        own: whether it acts on the joint's own axis.
         compliance: of its coordinates under a small load at zero command (n x n; rad/(N m) or m/N).
         linear: whether that holds for every load and command.
     """
@@ -36,7 +35,6 @@ class SpringNumbers:
     site: int
     axes: Array
     along: bool
-    own: bool
     compliance: Array
     linear: bool
 
@@ -53,7 +51,6 @@ def spring_numbers(request: ExportRequest, chain: Chain) -> tuple[SpringNumbers,
 
 def _numbers(effect: str, spring: Spring, chain: Chain) -> SpringNumbers:
     joint = chain.joints[spring.site - 1] if spring.site else None
-    own = not spring.directions
     axes = np.array(spring.directions or ((joint.axis,) if joint else ()), dtype=float).T
     load, recorded = ca.SX.sym("load", spring.size), ca.SX.sym("recorded", 2)
     command = JointCommand(spring.site - 1, recorded[0], recorded[1]) if spring.site else MOUNT
@@ -61,9 +58,8 @@ def _numbers(effect: str, spring: Spring, chain: Chain) -> SpringNumbers:
     law = ca.Function("law", [load, recorded], [given, ca.densify(ca.jacobian(given, load))])
     compliance = np.asarray(law(np.zeros(spring.size), _COMMANDS[0])[1].full())
     linear = all(_follows(law, compliance, size, at) for size in _LOADS for at in _COMMANDS)
-    return SpringNumbers(
-        effect, spring.site, axes, own and joint is not None and not joint.is_revolute, own, compliance, linear
-    )
+    along = not spring.directions and joint is not None and not joint.is_revolute
+    return SpringNumbers(effect, spring.site, axes, along, compliance, linear)
 
 
 def _follows(law: ca.Function, compliance: Array, size: float, command: tuple[float, float]) -> bool:

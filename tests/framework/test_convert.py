@@ -12,8 +12,7 @@ import yaml
 from armcal.arm.model import forward
 from armcal.calibration.convert_check import Difference, difference, load_source, reload
 from armcal.calibration.convert_mdh import mdh_section
-from armcal.calibration.convert_poe import poe_section
-from armcal.calibration.convert_urdf import urdf_text
+from armcal.calibration.convert_poe_urdf import poe_section, urdf_text
 from armcal.calibration.rigid_chain import largest_difference, random_commands, rigid_chain, rpy_of, tool_poses
 from armcal.cli.main import cli
 from armcal.errors import ConfigError, ProblemError

@@ -15,8 +15,7 @@ from armcal.base.dataset import Dataset
 from armcal.base.domains import ScrewAxis
 from armcal.calibration.convert_check import load_source, nominal_values, reload
 from armcal.calibration.convert_mdh import mdh_section
-from armcal.calibration.convert_poe import poe_section
-from armcal.calibration.convert_urdf import urdf_text
+from armcal.calibration.convert_poe_urdf import poe_section, urdf_text
 from armcal.calibration.rigid_chain import numeric_chain, random_commands, rigid_chain, tool_poses
 from armcal.estimate.estimator import estimate
 from armcal.estimate.structure import identify

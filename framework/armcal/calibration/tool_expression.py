@@ -75,6 +75,12 @@ class ToolExpression(ElasticPass):
         start = self.channels.index(LOAD_CHANNELS[0])
         return self.record[start : start + len(LOAD_CHANNELS)]
 
+    def records(self, commands: Array) -> Array:
+        """Records (channels x N) of commands (n x N) where nothing else is said."""
+        record = np.repeat(self.defaults[:, None], commands.shape[1], axis=1)
+        record[: len(commands)] = commands
+        return record
+
     def uses(self, channels: Sequence[str]) -> bool:
         """Whether the tool or the elastic state depends on any of these channels."""
         chosen = ca.vertcat(*[self.record[self.channels.index(channel)] for channel in channels])
@@ -156,10 +162,8 @@ def _defaults(channels: Sequence[str], environment: Environment) -> Array:
 
 def sample_inputs(expression: ToolExpression) -> list[Array]:
     """A made-up record and state (8 columns each), to compare two forms of a function."""
-    record = np.repeat(expression.defaults[:, None], 8, axis=1)
-    count = len(expression.joints)
-    record[:count] = np.random.default_rng(0).uniform(-1, 1, (count, 8))
-    return [record, np.zeros((expression.state.numel(), 8))]
+    commands = np.random.default_rng(0).uniform(-1, 1, (len(expression.joints), 8))
+    return [expression.records(commands), np.zeros((expression.state.numel(), 8))]
 
 
 @dataclass(frozen=True)
@@ -197,7 +201,7 @@ class Equilibrium:
 
 def poses_of(tools: Array) -> Array:
     """Columns of 3x4 matrices (12 an arm x N) as homogeneous ones (arms x N x 4 x 4)."""
-    columns = tools.reshape(-1, 4, 3, tools.shape[1])
+    columns = tools.reshape(len(tools) // 12, 4, 3, tools.shape[1])
     poses = np.zeros((len(columns), tools.shape[1], 4, 4))
     poses[:, :, :3, :] = columns.transpose(0, 3, 2, 1)
     poses[:, :, 3, 3] = 1.0

@@ -11,8 +11,7 @@ import yaml
 
 from armcal.calibration.convert_check import ConvertSource, Difference, difference, load_source, reload
 from armcal.calibration.convert_mdh import Convention, mdh_section
-from armcal.calibration.convert_poe import poe_section
-from armcal.calibration.convert_urdf import urdf_text
+from armcal.calibration.convert_poe_urdf import poe_section, urdf_text
 from armcal.calibration.rigid_chain import rigid_chain
 from armcal.cli.common import FILE, Console, arm, speaking
 from armcal.errors import ArmcalError, InputError, Location, PluginError

@@ -280,7 +280,7 @@ class Compensator:
 
     def _record(self, targets: Targets) -> Array:
         joints, count = len(self.joints), len(targets)
-        record = np.repeat(self.expression.defaults[:, None], count, axis=1)
+        record = self.expression.records(np.zeros((joints, count)))
         record[joints : 2 * joints] = targets.approach
         record[2 * joints : 2 * joints + len(LOAD_CHANNELS)] = targets.acting
         conditions = self.expression.channels[2 * joints + len(LOAD_CHANNELS) :]

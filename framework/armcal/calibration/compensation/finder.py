@@ -251,9 +251,7 @@ class Seeds:
         tried = _tried(expression, limits)
         points = _spread_evenly(len(limits), count, seed)
         commands = tried[:, :1] + points * (tried[:, 1:] - tried[:, :1])
-        record = np.repeat(expression.defaults[:, None], count, axis=1)
-        record[: len(commands)] = commands
-        standing = equilibrium(record)
+        standing = equilibrium(expression.records(commands))
         kept = standing.settled
         self.commands, self.states = commands[:, kept], standing.states[:, kept]
         self._tools = standing.base_T_tool[kept]

@@ -14,7 +14,7 @@ from armcal.base.se3 import Expression
 from armcal.calibration.compensation.finder import Allowed
 from armcal.calibration.compensation.request import Redundancy
 from armcal.calibration.compensation.search import Goal, Solutions, Solver, with_commands
-from armcal.calibration.compensation.step import slopes, tool_error
+from armcal.calibration.compensation.step import force_compliance, slopes, tool_error
 from armcal.calibration.tool_expression import ToolExpression, sample_inputs
 from armcal.functions.batch_function import BatchFunction, EvaluatorChoice
 
@@ -38,9 +38,7 @@ def wanted_small(expression: ToolExpression, redundancy: Redundancy) -> Expressi
         return ca.SX.zeros(3)
     if redundancy == "least_sag":
         return pose - ca.substitute(pose, state, ca.SX.zeros(state.numel()))
-    places = [expression.channels.index(f"force_{axis}") for axis in "xyz"]
-    by_force = ca.jacobian(expression.next_state, expression.record)[:, places]
-    return ca.vec(ca.mtimes(ca.jacobian(pose, state), expression.to_equilibrium(by_force)[0]))
+    return ca.vec(force_compliance(expression))
 
 
 class Descent:

@@ -79,17 +79,33 @@ def rough_slopes(expression: ToolExpression) -> Slopes:
     return Slopes(expression.next_state - state, ca.SX(state.numel(), commands.numel()), by_commands, pose)
 
 
+def twists(own_slopes: Slopes) -> Expression:
+    """The tool's slope by the commands (6 x n): metres, then rad about the axes of the base frame.
+
+    Half the sum of r_i x dr_i over the columns of the rotation is the turn.
+    """
+    here, turns = ca.reshape(own_slopes.corrected[:9], 3, 3), []
+    for joint in range(own_slopes.tool.size2()):
+        moved = ca.reshape(own_slopes.tool[:9, joint], 3, 3)
+        turns.append(sum((ca.cross(here[:, i], moved[:, i]) for i in range(3)), ca.SX(3, 1)) / 2)
+    return ca.vertcat(own_slopes.tool[9:, :], ca.horzcat(*turns))
+
+
+def force_compliance(expression: ToolExpression) -> Expression:
+    """How the tool gives way to a force at it (3 x 3; m/N, base frame), in equilibrium."""
+    places = [expression.channels.index(f"force_{axis}") for axis in "xyz"]
+    by_force = ca.jacobian(expression.next_state, expression.record)[:, places]
+    by_state = ca.jacobian(expression.base_T_tool.translation, expression.state)
+    return ca.mtimes(by_state, expression.to_equilibrium(by_force)[0])
+
+
 def tool_error(own_slopes: Slopes, position: Expression, rotation: Expression | None) -> tuple[Expression, Expression]:
     """From where the tool is to a target: metres, then a rotation vector in the base frame; and its slope (m x n)."""
     away, slope = position - own_slopes.corrected[9:], own_slopes.tool[9:, :]
     if rotation is None:
         return away, slope
     here = ca.reshape(own_slopes.corrected[:9], 3, 3)
-    turns = []
-    for joint in range(slope.size2()):
-        moved = ca.reshape(own_slopes.tool[:9, joint], 3, 3)
-        turns.append(sum((ca.cross(here[:, i], moved[:, i]) for i in range(3)), ca.SX(3, 1)) / 2)
-    return ca.vertcat(away, _rotation_vector(here, rotation)), ca.vertcat(slope, ca.horzcat(*turns))
+    return ca.vertcat(away, _rotation_vector(here, rotation)), twists(own_slopes)
 
 
 def step_function(expression: ToolExpression, own_slopes: Slopes, turns: bool, length: float) -> ca.Function:

@@ -1,24 +1,60 @@
-"""A chain as a small URDF: one link a joint, no shapes, no masses."""
+"""A chain as a product of exponentials, the settings of the model ``poe`` [Brockett1984], and as a small URDF."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Any
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
 from armcal.base.domains import Array
+from armcal.base.pose_settings import quaternion_of
 from armcal.base.shown import shown
-from armcal.calibration.convert_poe import numbers
-from armcal.calibration.rigid_chain import RigidChain, RigidJoint, require_plain_axes, rpy_of
+from armcal.calibration.rigid_chain import RigidChain, RigidJoint, require_independent, require_plain_axes, rpy_of
 
+_DIGITS = 15
 BASE, TIP = "base_link", "tip_link"
 UNKNOWN = "0"
 """What a URDF has to state and nobody knows: effort, velocity, and the travel of a sliding joint."""
 
 
+def poe_section(chain: RigidChain) -> dict[str, Any]:
+    """Every axis by its direction and a point, and the tool at zero angles.
+
+    Raises:
+        ProblemError: a joint follows another, or has pitch or scale.
+    """
+    require_independent(chain, "poe")
+    require_plain_axes(chain, "poe")
+    joints = [
+        {
+            "name": joint.name,
+            "kind": "prismatic" if joint.slides else "revolute",
+            "axis": numbers(joint.direction),
+            "point_m": numbers(joint.point),
+        }
+        for joint in chain.joints
+    ]
+    section: dict[str, Any] = {"type": "poe", "joints": joints, "tool": _pose(chain.base_T_tool)}
+    if np.abs(chain.base_T_mount - np.eye(4)).max() > 0:
+        section["mount"] = _pose(chain.base_T_mount)
+    return section
+
+
+def numbers(values: Array) -> list[float]:
+    """Numbers without what rounding left of zeros."""
+    return [round(float(value), _DIGITS) + 0.0 for value in values]
+
+
+def _pose(pose: Array) -> dict[str, Any]:
+    return {"position_m": numbers(pose[:3, 3]), "quaternion": numbers(np.array(quaternion_of(pose[:3, :3])))}
+
+
 def urdf_text(chain: RigidChain, name: str) -> str:
-    """The text: links ``base_link``, ``link1``, ..., ``tip_link``; joints by their names. Lengths in m, angles in rad.
+    """A URDF without shapes and masses, one link a joint. Lengths in m, angles in rad.
+
+    Links are ``base_link``, ``link1``, ..., ``tip_link``; joints have their names.
 
     Raises:
         ProblemError: a joint has pitch or scale.
