@@ -9,7 +9,6 @@ from typing import Annotated, Literal
 import numpy as np
 from armcal.base.domains import Array
 from armcal.base.pose_settings import PoseSettings
-from armcal.base.quaternions import rotation_matrix
 from armcal.base.settings import Settings
 from armcal.devices.tracker import TrackerFrame
 from pydantic import Field, model_validator
@@ -82,7 +81,7 @@ def in_base(frames: Sequence[TrackerFrame], settings: BodySettings) -> Capture:
     reference = _reference(frames, settings)
     for i in np.flatnonzero(np.isnan(reference).any(axis=(1, 2))).tolist():
         faults[i] = faults[i] or base_fault(frames[i], settings)
-    base_T_reference, body_T_target = matrix_of(settings.base_T_reference), matrix_of(settings.tool_body_T_target)
+    base_T_reference, body_T_target = settings.base_T_reference.matrix, settings.tool_body_T_target.matrix
     seen_at = tool[:, :3, 3]
     if body_T_target[:3, 3].any():  # a target at the body's origin needs no rotation
         seen_at = seen_at + tool[:, :3, :3] @ body_T_target[:3, 3]
@@ -126,13 +125,6 @@ def repeats(frame: TrackerFrame, before: TrackerFrame | None, settings: BodySett
     pairs = [(frame.bodies.get(name), before.bodies.get(name)) for name in names]
     seen = [(a, b) for a, b in pairs if a is not None and b is not None]
     return len(seen) == len(pairs) and all(a.tobytes() == b.tobytes() for a, b in seen)
-
-
-def matrix_of(pose: PoseSettings) -> Array:
-    """The homogeneous matrix (4 x 4, m)."""
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = rotation_matrix(np.array(pose.unit_quaternion)), pose.position
-    return matrix
 
 
 def _unseen(frame: TrackerFrame, name: str, role: str) -> str:

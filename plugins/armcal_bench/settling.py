@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from armcal.base.domains import Array
@@ -40,6 +41,20 @@ class Settled:
     rejected: int
     begun: float
     ended: float
+
+    @property
+    def record(self) -> dict[str, Any]:
+        """Where it stands, to be written down; see ``pose_of``."""
+        rotation, position = self.base_T_target[:3, :3], self.base_T_target[:3, 3]
+        return {"position": position.tolist(), "rotation": None if np.isnan(rotation).any() else rotation.tolist()}
+
+
+def pose_of(record: Mapping[str, Any]) -> Array:
+    """What was written of a pose (4 x 4, m); NaN for a rotation that is not known."""
+    pose = np.eye(4)
+    pose[:3, 3] = record["position"]
+    pose[:3, :3] = np.nan if record["rotation"] is None else record["rotation"]
+    return pose
 
 
 @dataclass(frozen=True)

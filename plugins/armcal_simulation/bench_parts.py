@@ -5,13 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Annotated, Literal
 
-import numpy as np
 from armcal.arm.assembly import Arm
 from armcal.arm.joints import unknown_joint
 from armcal.arm.loading import holding_function
-from armcal.base.domains import Array
 from armcal.base.pose_settings import PoseSettings
-from armcal.base.quaternions import rotation_matrix
 from armcal.base.settings import Angle, InputPath, Settings
 from armcal.config.selection import with_values
 from armcal.config.servo_file import ServoFile, load_servo_file
@@ -153,11 +150,3 @@ def bounds(experiment: Experiment, file: ServoFile) -> Bounds:
         return Bounds({}, None, pulses)
     clearance = plan.clearance and clearance_check(plan.clearance, experiment.system.arms, experiment.source)
     return Bounds(plan.limits, clearance, pulses)
-
-
-def matrix_of(pose: PoseSettings) -> Array:
-    """A pose as a 4x4 matrix (m)."""
-    matrix = np.eye(4)
-    matrix[:3, :3] = rotation_matrix(np.array(pose.unit_quaternion))
-    matrix[:3, 3] = pose.position
-    return matrix

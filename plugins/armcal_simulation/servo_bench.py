@@ -82,7 +82,7 @@ class BenchWorld:
         self._joints = {(servo.board, servo.channel): joint for joint, servo in file.servos.items()}
         self._bus = I2cBus(self._clock, list(self._chips.values()))
         self._sender = DTrackSender(settings.tracker, settings.tracker.host, settings.tracker.port, settings.seed)
-        self._world_T_base = bench_parts.matrix_of(settings.world_T_base)
+        self._world_T_base = settings.world_T_base.matrix
         self._physics = bench_parts.physics(settings, tracked, file, self._track)
         limits = bench_parts.bounds(experiment, file)
         self._safety = Safety(settings.safety, limits, self._physics.servos, appended_to(folder / LOG))

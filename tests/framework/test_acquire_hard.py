@@ -22,6 +22,7 @@ from armcal.errors import ArmcalError, InputError
 from armcal.io.journal.journal import Journal, JournalFailedError, JournalFullError
 from armcal.run.experiment import Experiment
 from armcal_bench.acquisition.arrival import Arrival
+from armcal_bench.acquisition.drive import Drive
 from armcal_bench.acquisition.path_planner import PathPlanner
 from armcal_bench.acquisition.schedule import Rest
 from armcal_bench.acquisition.session import RunOptions, acquire
@@ -275,21 +276,19 @@ class TestBoard:
 
     @pytest.mark.parametrize("kind", [pytest.param("nack", marks=SLOW), "unplug", pytest.param("reset", marks=SLOW)])
     def test_joints_that_were_let_go_are_not_begun_again(self, run: BenchRun, kind: str, monkeypatch: Any) -> None:
-        from armcal_bench.acquisition.recovery import Recovery
-
-        release = Recovery.release
+        release = Drive.release
         with run.simulated() as clock:
 
-            def released(recovery: Recovery) -> None:
+            def released(drive: Drive) -> None:
                 now = clock.ask({"state": True})["now"]
                 if not planned:
                     planned.append(now)
                     clock.ask({"fault": {"kind": kind, "at": now + 0.6}})
                     clock.ask({"fault": {"kind": "replug", "at": now + 1.6}} if kind == "unplug" else {"advance": 0})
-                release(recovery)
+                release(drive)
 
             planned: list[float] = []
-            monkeypatch.setattr(Recovery, "release", released)
+            monkeypatch.setattr(Drive, "release", released)
             assert run.acquire().ending.how == "done"
             state = clock.ask({"state": True})
         assert is_let_go(state) and state["events"]["first_pulse"] == 6
@@ -327,15 +326,15 @@ class TestBoard:
     def test_pulses_that_are_not_those_that_were_told_are_not_measured(self) -> None:
         """Another program, or a chip that lost its supply and nothing else."""
         run = Run()
-        recovery = run.acquisition()._recovery
+        drive = run.acquisition()._drive
         run.device.running = {"q1": 0.0, "q2": 0.0}
-        assert recovery.standing() == {"q1": 0.0, "q2": 0.0}
+        assert drive.standing() == {"q1": 0.0, "q2": 0.0}
         run.device.running["q1"] = 5 * COUNT_RAD
         with pytest.raises(DeviceError, match=r"2\.66 deg for q1, expected 0\.00 deg"):
-            recovery.standing()
+            drive.standing()
         del run.device.running["q1"]
         with pytest.raises(DeviceError, match="no pulses for q1"):
-            recovery.standing()
+            drive.standing()
 
     def test_the_device_is_looked_at_while_the_arm_moves(self) -> None:
         """A chip that forgot its set-up must not be driven on to the end of the way."""
@@ -558,8 +557,8 @@ class TestHeat:
         drive = acquisition._drive
         drive.take_over({"q1": 0.0, "q2": 0.0})
         run.device.running = {"q1": 0.0, "q2": 0.0}
-        expected = drive._model.after(np.array([[0.90, 0.5], [0.0, 0.0]]), torques(drive.at), 20.0)
-        drive.thermal_state = np.array([[0.95, 0.5], [0.0, 0.0]])
+        expected = drive.thermal_state.model.after(np.array([[0.90, 0.5], [0.0, 0.0]]), torques(drive.at), 20.0)
+        drive.thermal_state.warmth = np.array([[0.95, 0.5], [0.0, 0.0]])
         acquisition._rest(Rest((drive.at,), 20.0, expected))
         assert 20 < run.clock.now() < 120
 

@@ -11,12 +11,11 @@ from armcal.devices.faults import DeviceError, DeviceLostError
 from armcal_bench.acquisition.acquisition_run import AcquisitionRun
 from armcal_bench.acquisition.drive import Drive
 from armcal_bench.acquisition.heat import HeatModel
-from armcal_bench.acquisition.motion_gate import MotionGate
 from armcal_bench.acquisition.path_planner import PathPlanner
-from armcal_bench.acquisition.recovery import Recovery
 from armcal_bench.acquisition.run_log import Progress
 from armcal_bench.acquisition.schedule import Scheduler
 from armcal_bench.acquisition.settings import AcquisitionSettings, ServoHeatSettings
+from armcal_bench.acquisition.tracker_monitor import MotionGate
 
 from tests.bench_fakes import COUNT_RAD, FakeClock, FakeDevice, FakeLog, FakeTrackerMonitor, KilledError
 
@@ -49,8 +48,8 @@ class Run:
         drive = Drive(device, clock, planner, settings, (self.model, torques), self.log)
         scheduler = Scheduler(self.poses, IDS, drive.park, planner, self.model, torques, RATE, 2.0, settings.order)
         gate = MotionGate(self.monitor, clock, settings.lost, lambda: self.asked)
-        recovery = Recovery(device, drive, gate, self.log, device.open(clock))
-        return AcquisitionRun(drive, recovery, scheduler, gate, self.log, self.progress, lambda progress: None)
+        identity = device.open(clock)
+        return AcquisitionRun(drive, identity, scheduler, gate, self.log, self.progress, lambda progress: None)
 
     def run(self) -> str:
         self.made = self.acquisition()

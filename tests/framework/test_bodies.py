@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from armcal.devices.tracker import TrackerFrame
-from armcal_bench.bodies import BodySettings, in_base, matrix_of, repeats
+from armcal_bench.bodies import BodySettings, in_base, repeats
 from armcal_bench.stillness import mean_rotation, turns_from
 from hypothesis import given
 from hypothesis import strategies as st
@@ -49,12 +49,12 @@ def test_the_chain_of_transforms() -> None:
     assert found.faults == ("",) * 5
     for i, got in enumerate(found.poses):
         reference_T_world = np.linalg.inv(pose(i))
-        expected = matrix_of(s.base_T_reference) @ reference_T_world @ pose(100 + i) @ matrix_of(s.tool_body_T_target)
+        expected = s.base_T_reference.matrix @ reference_T_world @ pose(100 + i) @ s.tool_body_T_target.matrix
         np.testing.assert_allclose(got, expected, atol=1e-12)
 
 
 def test_stated_sites_are_what_they_say() -> None:
-    found = matrix_of(settings().base_T_reference)
+    found = settings().base_T_reference.matrix
     np.testing.assert_allclose(found[:3, 3], [0.01, -0.02, 0.03])
     expected = Rotation.from_euler("xyz", [5, 10, 170], degrees=True).as_matrix()
     np.testing.assert_allclose(found[:3, :3], expected, atol=1e-12)
@@ -63,7 +63,7 @@ def test_stated_sites_are_what_they_say() -> None:
 def test_without_a_base_body_the_world_is_the_reference() -> None:
     found = in_base([frame(1, None, pose(7))], settings(base="none"))
     s = settings()
-    expected = matrix_of(s.base_T_reference) @ pose(7) @ matrix_of(s.tool_body_T_target)
+    expected = s.base_T_reference.matrix @ pose(7) @ s.tool_body_T_target.matrix
     np.testing.assert_allclose(found.poses[0], expected, atol=1e-12)
 
 

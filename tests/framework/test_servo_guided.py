@@ -12,8 +12,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from armcal.errors import DataError, InputError
+from armcal_bench.acquisition.tracker_monitor import StopRequested
 from armcal_bench.servo.keys import QUIT, Keys, Lines, wishes_from
-from armcal_bench.servo.mover import StoppedError
 from armcal_bench.servo.outputs import improved
 from armcal_bench.servo.record import NAME, Record
 from armcal_bench.servo.session import Conversation, evaluated, measure
@@ -106,7 +106,7 @@ def test_stopped_after_any_angle_and_given_again_it_finds_the_same(tmp_path, mon
     for cut in range(len(whole)):
         setup, device, _ = setup_on(monkeypatch, config)
         folder = tmp_path / f"cut{cut}"
-        with pytest.raises(StoppedError):
+        with pytest.raises(StopRequested):
             measure(setup, folder, talk(Person(device, quit_after=cut)), "guided")
         assert observed(folder) == whole[:cut]
         with (folder / NAME).open("ab") as file:
@@ -130,7 +130,7 @@ def test_a_line_that_is_no_observation_is_refused_with_its_place(tmp_path):
 def test_a_record_of_another_oscillator_is_refused(tmp_path, monkeypatch):
     config = config_in(tmp_path, SERVO)
     setup, device, _ = setup_on(monkeypatch, config)
-    with pytest.raises(StoppedError):
+    with pytest.raises(StopRequested):
         measure(setup, tmp_path / "out", talk(Person(device, quit_after=1)), "guided")
     servos = tmp_path / "servos.yaml"
     servos.write_text(servos.read_text().replace("oscillator_hz: 25000000.0", "oscillator_hz: 25500000.0"))

@@ -15,12 +15,14 @@ from armcal.config.servo_file import BoardSettings, ServoFile, load_servo_file
 from armcal.devices.device import DeviceIdentity
 from armcal.devices.faults import DeviceError
 from armcal.errors import ArmcalError, DataError, InputError
-from armcal_bench.acquisition.heat import HeatModel
-from armcal_bench.servo.mover import Mover, StoppedError
+from armcal_bench.acquisition.heat import HeatModel, ThermalState
+from armcal_bench.acquisition.recovery import DeviceLost
+from armcal_bench.acquisition.settings import LostSettings
+from armcal_bench.acquisition.tracker_monitor import MotionGate, StopRequested
+from armcal_bench.servo.mover import Mover
 from armcal_bench.servo.outputs import improved, write_servo_file
 from armcal_bench.servo.record import NAME, Record
 from armcal_bench.servo.session import Conversation, evaluated, measure
-from armcal_bench.servo.thermal_state import ThermalState
 
 from tests.bench_fakes import FakeClock
 from tests.framework.test_acquire_faults import faults
@@ -90,7 +92,7 @@ class Troubled:
         try:
             self.run.measure(asked)
             self.said.append("done")
-        except (StoppedError, DeviceError, ArmcalError) as end:
+        except (StopRequested, DeviceError, ArmcalError) as end:
             self.said.append(f"{type(end).__name__}: {end}")
 
     def _asked(self, clock: Any) -> Callable[[], bool]:
@@ -200,24 +202,18 @@ class TestRecovery:
 
         monkeypatch.setattr(device, "open", other)
         servos = {joint: setup.table_of(joint) for joint in setup.base}
-        mover = Mover(setup, device, FakeClock(), servos, lambda: False)
+        mover = Mover(setup, device, servos, MotionGate(None, FakeClock(), LostSettings(), lambda: False))
         mover.open()
-        calls = []
-        with pytest.raises(DeviceError, match="found another, expected fake"):
-            for joint, angle in setup.base.items():
-                mover.energise(joint, mover.counts_at(joint, angle))
-            try:
-                mover.go("q1", mover.counts["q1"] + 50)
-            except DeviceError as fault:
-                calls.append(device.calls)
-                mover.recover(fault)
-        assert device.calls == calls[0]
+        with pytest.raises(DeviceLost, match="found another, expected fake"):
+            mover.persist(lambda: [mover.energise(j, mover.counts_at(j, angle)) for j, angle in setup.base.items()])
+            mover.persist(lambda: mover.go("q1", mover.counts["q1"] + 50))
+        assert device.calls == 12
 
     @pytest.mark.slow
     def test_stopped_while_the_board_is_gone_it_does_not_say_that_the_arm_holds(self, run: ServoRun) -> None:
         with run.run.simulated() as clock:
             clock.ask({"fault": {"kind": "unplug", "at": 12}})
-            with pytest.raises(StoppedError) as stop:
+            with pytest.raises(StopRequested) as stop:
                 run.measure(lambda: clock.ask({"state": True})["now"] > 15)
             assert "unless the board" in stop.value.arm and "lost" in str(stop.value)
 
@@ -228,7 +224,7 @@ class TestTracker:
         """Where it may stay: nobody looks after the heat of an arm that was left alone."""
         with run.run.simulated() as clock:
             clock.ask({"fault": {"kind": "lost", "at": 15}})
-            with pytest.raises(StoppedError, match="told nothing") as stop:
+            with pytest.raises(StopRequested, match="nothing of use") as stop:
                 run.measure()
             state = clock.ask({"state": True})
             assert "base pose" in stop.value.arm and state["offences"] == {}
@@ -244,9 +240,9 @@ class TestTracker:
         rests: list[float] = []
         stand = Mover.stand
         with run.run.simulated() as clock, pytest.MonkeyPatch.context() as patch:
-            patch.setattr(Mover, "stand", lambda mover, s: (rests.append(s), stand(mover, s))[1])
+            patch.setattr(Mover, "stand", lambda mover, s, may: (rests.append(s), stand(mover, s, may))[1])
             clock.ask({"fault": {"kind": "lost", "at": 15}})
-            with pytest.raises(StoppedError, match="told nothing"):
+            with pytest.raises(StopRequested, match="nothing of use"):
                 run.measure(setup=setup)
             assert clock.ask({"state": True})["offences"] == {}
         assert rests
@@ -373,7 +369,7 @@ class TestTables:
         weak = "bench.simulator.joints.q2={stall_Nm: 1.2, backlash_deg: 0.1}"
         run = ServoRun(tmp_path, (*sets, "bench.servo.joints=[q2]", "bench.servo.step_deg=12", weak))
         with run.run.simulated() as clock:
-            with pytest.raises(StoppedError, match="q2 did not come to stand 3 times"):
+            with pytest.raises(StopRequested, match="q2 did not come to stand 3 times"):
                 run.measure()
             state = clock.ask({"state": True})
         assert state["offences"] == {} and drawn(state)["q2"] == pytest.approx(-50, abs=2.5)

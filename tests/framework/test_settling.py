@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from armcal.devices.tracker import REPEATED, TrackerFrame
 from armcal_bench.acquisition.settings import SettleSettings
+from armcal_bench.acquisition.tracker_monitor import TrackerHealth
 from armcal_bench.bodies import BodySettings
 from armcal_bench.settling import Settled, Settling, Unsettled
 from armcal_bench.stillness import deviations_of_mean, mean_pose
-from armcal_bench.tracker_health import TrackerHealth
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation

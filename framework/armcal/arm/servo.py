@@ -57,6 +57,12 @@ class PulseTable:
         order = slice(None) if self.pulses[0] < self.pulses[-1] else slice(None, None, -1)
         return piecewise_linear(pulse, self.pulses[order], self.angles[order])
 
+    @property
+    def least_slope(self) -> float:
+        """The least change of the pulse with the angle on any part (s/rad), be it upwards or downwards."""
+        parts = zip(pairwise(self.angles), pairwise(self.pulses), strict=True)
+        return min(abs((p1 - p0) / (a1 - a0)) for (a0, a1), (p0, p1) in parts)
+
 
 @dataclass(frozen=True)
 class PulseClock:

@@ -8,6 +8,7 @@ from pydantic import model_validator
 from armcal.base.domains import Array
 from armcal.base.parameters import ParameterBlock
 from armcal.base.pose_blocks import NO_TURN, pose_blocks
+from armcal.base.quaternions import rotation_matrix
 from armcal.base.settings import Angle3, Length3, Settings
 
 PRINTED = 2e-3
@@ -47,6 +48,13 @@ class PoseSettings(Settings):
         if self.rotation is not None:
             return quaternion_of(nearest_rotation(np.array(self.rotation)))
         return NO_TURN if self.rpy is None else quaternion_of(rpy_matrices(np.array(self.rpy)))
+
+    @property
+    def matrix(self) -> Array:
+        """The homogeneous matrix (4 x 4, m)."""
+        matrix = np.eye(4)
+        matrix[:3, :3], matrix[:3, 3] = rotation_matrix(np.array(self.unit_quaternion)), self.position
+        return matrix
 
     def blocks(self, name: str) -> tuple[ParameterBlock, ...]:
         """As parameters; see ``pose_blocks``."""

@@ -7,21 +7,21 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Literal, TypeVar
 
-import numpy as np
-from armcal.base.domains import Array
-from armcal.devices.faults import DeviceError
+from armcal.devices.device import DeviceIdentity
 
 from armcal_bench.acquisition import run_log as entry
 from armcal_bench.acquisition.arrival import Arrival
-from armcal_bench.acquisition.drive import Drive, ThermalLimit
-from armcal_bench.acquisition.motion_gate import MotionGate, ParkRequested, TrackerLost, unguarded
+from armcal_bench.acquisition.drive import Drive
+from armcal_bench.acquisition.heat import ThermalLimit
 from armcal_bench.acquisition.recovery import DeviceLost, Recovery
 from armcal_bench.acquisition.run_log import Progress, RunLog
 from armcal_bench.acquisition.schedule import LeaveOut, Measure, Rest, Scheduler
-from armcal_bench.settling import Settled
+from armcal_bench.acquisition.tracker_monitor import MotionGate, StopRequested, TrackerLost, unguarded
+from armcal_bench.settling import Settled, pose_of
 
 T = TypeVar("T")
 _TRIES = 2
+_AS_IT_IS = "its pulses go on as they are, unless the board parks the arm by itself"
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class AcquisitionRun:
 
     Args:
         drive: the arm.
-        recovery: brings the device back after a fault.
+        identity: of the device, with which the run began.
         scheduler: decides what comes next.
         gate: asked between two steps of the arm.
         log: the journal, in which every step is written as it is made.
@@ -52,7 +52,7 @@ class AcquisitionRun:
     def __init__(
         self,
         drive: Drive,
-        recovery: Recovery,
+        identity: DeviceIdentity,
         scheduler: Scheduler,
         gate: MotionGate,
         log: RunLog,
@@ -60,7 +60,8 @@ class AcquisitionRun:
         on_progress: Callable[[Progress], None],
         arrival: Arrival | None = None,
     ) -> None:
-        self._drive, self._recovery, self._scheduler, self._gate = drive, recovery, scheduler, gate
+        self._drive, self._scheduler, self._gate = drive, scheduler, gate
+        self._recovery = Recovery(drive.device, identity, gate, drive.settings.lost.park, self._notice)
         self._log, self.progress, self._on_progress, self._arrival = log, progress, on_progress, arrival
         self._ids, self._settings = scheduler.ids, drive.settings
         self._tries: dict[int, int] = {}
@@ -82,10 +83,10 @@ class AcquisitionRun:
                 left_out, total = len(self.progress.left_out), len(self._ids)
                 some = f"{total - left_out} of {total} poses are measured, {left_out} were left out"
                 return self._park_and_end("done", some if left_out else "all poses are measured")
-            except ParkRequested as request:
+            except StopRequested as request:
                 return self._park_and_end("parked", str(request))
             except DeviceLost as loss:
-                return self._end(Ending("held", str(loss)))
+                return self._end(Ending("held", f"{loss}; {_AS_IT_IS}"))
         except Exception as fault:
             # Nothing is known of what went wrong here, but an arm that is left standing heats up.
             with suppress(Exception):
@@ -93,20 +94,14 @@ class AcquisitionRun:
             raise
 
     def _energise(self) -> None:
-        self._recovery.energise(self.progress.angles)
+        self._drive.energise(self.progress.angles)
 
     def _persist(self, action: Callable[[], T], afterwards: Callable[[], None] | None = None) -> T:
         """Do it; when the device fails, hold until it is back and energised (or ``afterwards``), and do it again."""
-        while True:
-            try:
-                return action()
-            except DeviceError as fault:
-                self._notice("trouble", str(fault))
-                self._recovery.reopen(fault, afterwards or self._energise)
-                self._notice("back", "the device is back")
+        return self._recovery.persist(action, afterwards or self._energise)
 
     def _step(self) -> None:
-        step = self._scheduler.next(self._drive.at, self._drive.thermal_state, self._left)
+        step = self._scheduler.next(self._drive.at, self._drive.thermal_state.warmth, self._left)
         if isinstance(step, LeaveOut):
             self._leave_out(step.pose, step.why)
         elif isinstance(step, Rest):
@@ -116,60 +111,44 @@ class AcquisitionRun:
 
     def _rest(self, step: Rest) -> None:
         drive, waits, now = self._drive, self._gate.waits, self._gate.clock.now
-        until, why = now() + step.seconds, f"the servos rest where the arm parks: {drive.hottest}"
+        until, why = now() + step.seconds, f"the servos rest where the arm parks: {drive.thermal_state.hottest}"
         self._notice("rest", f"the servos rest for {step.seconds / 60:.1f} min")
         waits.goes_on("rest", why, step.seconds, now())
         drive.go(step.path, self._gate.resting)
         drive.note()
         while True:  # a second at least: whoever comes to rest here again and again must let time pass
             drive.stand(1.0, self._gate.resting)
-            if not drive.hotter_than(step.thermal_state):
+            if not drive.thermal_state.hotter_than(step.thermal_state, drive.angles):
                 waits.over("rest", now())
                 return
             waits.goes_on("rest", why, max(until - now(), 1.0), now())
 
     def _measure(self, step: Measure) -> None:
-        drive, gate, settled = self._drive, self._gate, None
+        drive, gate = self._drive, self._gate
         self._record(entry.GOING, {"pose": self._ids[step.pose], **self._here()})
         try:
             drive.go(step.path, gate.measuring)
             drive.preload_backlash(gate.measuring)
             drive.note()
-            settled = self._settled()
-            why = gate.monitor.why or "the arm did not come to stand"
+            settled = gate.settled(drive.tick, self._settings.settle.longest, drive.thermal_state.check)
         except ThermalLimit as limit:
-            why = str(limit)
+            settled = str(limit)
         except TrackerLost as loss:
             # If the tracker is well where the arm parks, it was the pose, or the path to it, that hid the body.
             if not self._persist(self._park) or not self._sees_again():
                 raise
-            why = str(loss)
-        if settled is None:
-            self._try_later(step.pose, why)
+            settled = str(loss)
+        if isinstance(settled, str):
+            self._try_later(step.pose, settled)
         else:
             self._accept(step.pose, settled)
-
-    def _settled(self) -> Settled | None:
-        """Where the target stands, once the arm does; None if it does not come to stand in time."""
-        monitor, now, longest = self._gate.monitor, self._gate.clock.now, self._settings.settle.longest
-        monitor.begin()
-        until, last = now() + longest, now() + longest + self._settings.lost.park
-        while now() < min(until, last):
-            is_seen = self._drive.tick(self._gate.measuring)
-            self._drive.check_heat()
-            if not is_seen:  # a tracker that comes and goes must not keep the arm here for ever: hence the last
-                until = now() + longest
-                monitor.begin()
-            elif (settled := monitor.settled()) is not None:
-                return settled
-        return None
 
     def _sees_again(self) -> bool:
         """Whether the tracker is well, or soon, while the arm rests."""
         until = self._gate.clock.now() + self._settings.settle.longest
         while self._gate.clock.now() < until:
             self._drive.tick(self._gate.resting)
-            if not self._gate.monitor.trouble()[0]:
+            if not self._gate.has_trouble:
                 return True
         return False
 
@@ -178,28 +157,27 @@ class AcquisitionRun:
 
         Raises:
             DeviceError: its pulses are not those that were commanded.
-            ParkRequested: it stood elsewhere several times in a row.
+            StopRequested: it stood elsewhere several times in a row.
         """
-        drive, base_T_target, measured = self._drive, settled.base_T_target, self.progress.measured
+        drive, measured = self._drive, self.progress.measured
         record = {
             "pose": self._ids[pose],
             **self._here(),
-            "position": base_T_target[:3, 3].tolist(),
-            "rotation": None if np.isnan(base_T_target[:3, :3]).any() else base_T_target[:3, :3].tolist(),
+            **settled.record,
             "deviation": settled.deviations[:3].tolist(),
             "frames": settled.frames,
             "rejected": settled.rejected,
             "temperature": self._settings.temperature,
-            "standing": self._recovery.standing(),
+            "standing": self._drive.standing(),
             "approach": dict(zip(drive.angles, drive.approach.tolist(), strict=True)),
         }
-        others = {i: _pose_of(measured[name]) for i, name in enumerate(self._ids) if name in measured}
-        doubt = self._arrival.doubt(pose, base_T_target, others) if self._arrival else ""
+        others = {i: pose_of(measured[name]) for i, name in enumerate(self._ids) if name in measured}
+        doubt = self._arrival.doubt(pose, settled.base_T_target, others) if self._arrival else ""
         if doubt:
             self._astray += 1
             self._try_later(pose, doubt)
             if self._astray >= self._settings.arrival.in_a_row:
-                raise ParkRequested(f"{doubt}, {self._astray} times in a row; look at servos, gears and bodies")
+                raise StopRequested(f"{doubt}, {self._astray} times in a row; look at servos, gears and bodies")
             return
         self._astray = 0
         self._record(entry.MEASURED, record)
@@ -208,7 +186,7 @@ class AcquisitionRun:
 
     def _here(self) -> dict[str, Any]:
         drive = self._drive
-        return {"angles": drive.angles, "warmth": drive.named_thermal_state(), "at": self._gate.clock.wall()}
+        return {"angles": drive.angles, "warmth": drive.thermal_state.by_joint, "at": self._gate.clock.wall()}
 
     def _try_later(self, pose: int, why: str) -> None:
         """At the end of what is left; after the last try it is left out."""
@@ -233,9 +211,9 @@ class AcquisitionRun:
             if not self._persist(self._park):
                 return self._end(Ending("held", f"{why}; no clear path to where it parks was found"))
             if self._settings.at_end == "release":  # a device that comes back must not energise what hangs by then
-                self._persist(self._recovery.release, lambda: None)
+                self._persist(self._drive.release, lambda: None)
         except DeviceLost as loss:
-            return self._end(Ending("held", f"{why}; then {loss}"))
+            return self._end(Ending("held", f"{why}; then {loss}; {_AS_IT_IS}"))
         return self._end(Ending(how, why))
 
     def _park(self) -> bool:
@@ -257,11 +235,3 @@ class AcquisitionRun:
     def _record(self, kind: str, content: Mapping[str, Any]) -> None:
         self._log.record(kind, content)
         self.progress = self.progress.after(kind, content)
-
-
-def _pose_of(record: Mapping[str, Any]) -> Array:
-    """What was written of a pose (4 x 4, m); NaN for a rotation that is not known."""
-    pose = np.eye(4)
-    pose[:3, 3] = record["position"]
-    pose[:3, :3] = np.nan if record["rotation"] is None else record["rotation"]
-    return pose

@@ -11,10 +11,15 @@ from armcal.arm.environment import Environment
 from armcal.arm.joints import unknown_joint
 from armcal.arm.loading import holding_function
 from armcal.base.domains import Array
+from armcal.devices.clock import Clock
 
 from armcal_bench.acquisition.settings import ServoHeatSettings
 
 NEVER = float("inf")
+_ENOUGH = 0.8
+"""Of the budget: one more point warms a servo by less than the rest of it."""
+_COOLED_TO = 0.5
+_SAME_HEAT = 1e-4
 _TIMES_OVER = 20.0
 _RESOLUTION_S = 0.01
 
@@ -113,3 +118,93 @@ def holding_torques(arm: Arm, environment: Environment) -> Torques:
         return np.asarray(function(pose).full()).ravel()
 
     return torques
+
+
+class ThermalLimit(Exception):  # noqa: N818 - no error: the servos are let rest
+    """A servo has come to its budget before its time."""
+
+
+class ThermalState:
+    """How warm the servos are, followed from cold on, or from where another run left it.
+
+    Args:
+        heat: the servos' model, and the torques that heat them.
+        joints: in the arm's order.
+        rest: where the servos rest (rad by joint; others at zero).
+        clock: the bench's.
+
+    Attributes:
+        warmth: of winding and case (joints x 2).
+    """
+
+    def __init__(
+        self, heat: tuple[HeatModel, Torques], joints: Sequence[str], rest: Mapping[str, float], clock: Clock
+    ) -> None:
+        (self.model, self.torques), self._joints, self._clock = heat, joints, clock
+        self.warmth, self._since = self.model.cold, clock.now()
+        self._at_rest = self.torques(self._pose(rest))
+
+    def go_on(self, before: Mapping[str, Sequence[float]], standing: Mapping[str, float], seconds: float) -> None:
+        """From another run's warmth (winding and case, by joint), after which joints stood at angles (rad) for so long.
+
+        Joints that are not among these angles hang free, and cool.
+        """
+        self.warmth = np.array([before.get(joint, (0.0, 0.0)) for joint in self._joints], dtype=float)
+        held = np.array([joint in standing for joint in self._joints])
+        self.warmth = self.model.after(self.warmth, self.torques(self._pose(standing)) * held, max(seconds, 0.0))
+
+    def pass_to_now(self, angles: Mapping[str, float]) -> None:
+        """The servos have stood at these angles (rad) since the last call."""
+        now = self._clock.now()
+        self.warmth = self.model.after(self.warmth, self.torques(self._pose(angles)), now - self._since)
+        self._since = now
+
+    @property
+    def by_joint(self) -> dict[str, list[float]]:
+        """Of winding and case, by joint."""
+        return dict(zip(self._joints, self.warmth.tolist(), strict=True))
+
+    def check(self) -> None:
+        """Whether the servos are within their budget.
+
+        Raises:
+            ThermalLimit: they are not.
+        """
+        if self.model.over(self.warmth):
+            raise ThermalLimit(f"the servo of {self._hottest[0]} has come to its budget")
+
+    @property
+    def must_rest(self) -> bool:
+        """Whether a servo is near its budget."""
+        return bool(np.any(self.model.heat(self.warmth) > _ENOUGH * self.model.budget))
+
+    @property
+    def rest_s(self) -> float:
+        """How long to rest; infinite where the servos would not cool."""
+        return self.model.cooled_in(self.warmth, self._at_rest, _COOLED_TO * self.model.budget)
+
+    @property
+    def too_heavy_at_rest(self) -> str:
+        """The joint that would not cool where the servos rest; empty if all do."""
+        hot = self.model.too_hot_for_ever(self._at_rest, _COOLED_TO)
+        return "" if hot is None else self._joints[hot]
+
+    def hotter_than(self, warmth: Array, angles: Mapping[str, float]) -> bool:
+        """Whether a servo is hotter than in a thermal state (joints x 2), and still cools at these angles (rad)."""
+        steady = np.repeat(self.model.steady(self.torques(self._pose(angles))), 2, axis=1)
+        least = np.maximum(self.model.heat(warmth), self.model.heat(steady))
+        return bool(np.any(self.model.heat(self.warmth) > least + _SAME_HEAT))
+
+    @property
+    def hottest(self) -> str:
+        """The servo that is nearest to its budget, in words."""
+        joint, share = self._hottest
+        return f"that of {joint} is at {100 * share:.0f} % of its budget"
+
+    @property
+    def _hottest(self) -> tuple[str, float]:
+        shares = self.model.heat(self.warmth) / self.model.budget
+        return self._joints[int(np.argmax(shares))], float(np.max(shares))
+
+    def _pose(self, angles: Mapping[str, float]) -> Array:
+        return np.array([angles.get(joint, 0.0) for joint in self._joints])

@@ -11,6 +11,7 @@ from armcal.arm.clearance import ClearanceCheck
 from armcal.arm.joints import joint_limits, unknown_joint
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
+from armcal.calibration.rigid_chain import tool_poses
 from armcal.devices.device import JointDevice
 from armcal.devices.faults import DeviceRefusedError
 from armcal.errors import ConfigError, DataError, Location
@@ -19,7 +20,7 @@ from armcal.run.plan_clearance import clearance_check
 from armcal.run.plan_poses import JointSpace, commands_of, read_poses
 from numpy.typing import NDArray
 
-from armcal_bench.acquisition.arrival import Arrival, tool_poses
+from armcal_bench.acquisition.arrival import Arrival
 from armcal_bench.acquisition.heat import HeatModel, Torques, holding_torques
 from armcal_bench.acquisition.path_planner import PathPlanner
 from armcal_bench.acquisition.schedule import Scheduler
@@ -97,8 +98,9 @@ def prepare(experiment: Experiment, plan: Path) -> Prepared:
         capture=settings.settle.wait + settings.settle.window + 0.5,
         order=settings.order,
     )
+    expected = tool_poses(arm.nominal_chain, np.stack(arm.joint_commands(list(poses.T)), axis=1))
     judge = HazardJudge(device.joint_names, device.joint_names, limits, torques, park)
-    return Prepared(bench, device, commands, scheduler, Arrival(tool_poses(arm, poses), settings.arrival), judge)
+    return Prepared(bench, device, commands, scheduler, Arrival(expected, settings.arrival), judge)
 
 
 def run_limits(experiment: Experiment, settings: AcquisitionSettings, arm: Arm) -> Array:

@@ -20,12 +20,10 @@ from armcal.errors import InputError, Location
 from armcal_bench.acquisition import run_log as entry
 from armcal_bench.acquisition.acquisition_run import AcquisitionRun, Ending
 from armcal_bench.acquisition.drive import Drive
-from armcal_bench.acquisition.motion_gate import MotionGate
 from armcal_bench.acquisition.outputs import OURS, in_order, measured_by, write_outputs
 from armcal_bench.acquisition.preparation import Prepared
-from armcal_bench.acquisition.recovery import Recovery
 from armcal_bench.acquisition.run_log import Progress, RunLog
-from armcal_bench.acquisition.tracker_monitor import TrackerMonitor
+from armcal_bench.acquisition.tracker_monitor import MotionGate, TrackerMonitor
 from armcal_bench.hazards import FirstMotion
 from armcal_bench.journal_folder import Start, opened_journal
 from armcal_bench.waiting import Waits
@@ -161,9 +159,7 @@ def _prepared_run(
     drive = Drive(device, clock, scheduler.planner, settings, (scheduler.model, scheduler.torques), log)
     scheduler.planner.meanwhile = drive.keep_alive  # the board would take a host that plans for one that died
     if progress.thermal_state:  # the warmth that an earlier part of the run has left
-        drive.take_over(progress.angles)
-        drive.thermal_state = np.array([progress.thermal_state.get(joint, (0.0, 0.0)) for joint in drive.angles])
-        drive.cool(max(clock.wall() - progress.at, 0.0))
+        drive.thermal_state.go_on(progress.thermal_state, progress.angles, clock.wall() - progress.at)
     angles = device.state().angles
     start = prepared.judge.first_motion(angles, progress.angles, releases=settings.at_end == "release")
     if angles:  # no signs of life reach the board while somebody thinks: joints that hold are to stay where they are
@@ -172,6 +168,5 @@ def _prepared_run(
     if not options.may_energise(start) or (options.asked_to_end() and not before):
         raise InputError("the arm may not be moved; nothing was moved.", hint="Say yes, or give --yes.")
     gate = MotionGate(monitor, clock, settings.lost, options.asked_to_end, options.waits)
-    recovery = Recovery(device, drive, gate, log, identity)
     progress = replace(progress, ended="")
-    return AcquisitionRun(drive, recovery, scheduler, gate, log, progress, options.on_progress, prepared.arrival)
+    return AcquisitionRun(drive, identity, scheduler, gate, log, progress, options.on_progress, prepared.arrival)

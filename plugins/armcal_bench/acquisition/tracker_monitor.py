@@ -1,17 +1,70 @@
-"""The bench's tracker while an arm is measured: whether it is well, and where the arm stands."""
+"""The bench's tracker while an arm is measured: whether it is well, where the arm stands, and whether it may go on."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
 
 from armcal.devices.clock import Clock
 from armcal.devices.faults import DeviceRefusedError
+from armcal.devices.tracker import REPEATED, TrackerFrame
 
+from armcal_bench.acquisition.settings import LostSettings
 from armcal_bench.bench import Bench
+from armcal_bench.bodies import BodySettings, base_fault, repeats, tool_fault
 from armcal_bench.settling import Settled, Settling
-from armcal_bench.tracker_health import TrackerHealth
+from armcal_bench.waiting import Waits
 
+_WELL_S = 0.1
+"""A tracker whose last frame was usable and came so lately is well."""
 _FIRST_FRAME_S = 3.0
+
+
+class TrackerHealth:
+    """Fed with all frames of a tracker from a moment on (s, by the bench's clock)."""
+
+    def __init__(self, bodies: BodySettings, begun: float) -> None:
+        self._bodies = bodies
+        self._usable_at = begun
+        self._last: TrackerFrame | None = None
+        self._base_seen = False
+        self._why = ""
+        self._refused: Mapping[str, int] = {}
+        self._refused_before: Mapping[str, int] = {}
+
+    def feed(self, frames: Iterable[TrackerFrame], refused: Mapping[str, int]) -> None:
+        """Take in the frames that came, and what the tracker has refused since it was opened (``Tracker.refused``)."""
+        self._refused = dict(refused)
+        for frame in frames:
+            unseen, base = tool_fault(frame, self._bodies), base_fault(frame, self._bodies)
+            self._base_seen = self._base_seen or not base
+            if not (self._bodies.base_motion == "still" and self._base_seen):
+                unseen = unseen or base
+            self._why = f"body lost: {unseen}" if unseen else ""
+            if not unseen and repeats(frame, self._last, self._bodies):
+                self._why = "frozen: each frame is like the one before"
+            self._last = frame
+            if not self._why:
+                self._usable_at = frame.arrived
+                self._refused_before = self._refused
+
+    def trouble(self, now: float) -> tuple[float, str]:
+        """Seconds since the last usable frame, and why there was none since; (0, "") if all is well."""
+        since = now - self._usable_at
+        if since < _WELL_S and not self._why and self._last is not None:
+            return 0.0, ""
+        return max(since, 0.0), self._why or self._silence()
+
+    def _silence(self) -> str:
+        """Why nothing came, by what was refused since the last usable frame."""
+        before = self._refused_before
+        risen = {reason: count - before.get(reason, 0) for reason, count in self._refused.items()}
+        worst = max(risen, key=lambda reason: risen[reason], default="")
+        if not worst or risen[worst] <= 0:
+            return "silent: no frame comes"
+        if worst == REPEATED:
+            return "frozen: the same frame comes again and again"
+        return f"silent: what comes cannot be read ({risen[worst]} times: {worst})"
 
 
 class TrackerMonitor:
@@ -81,3 +134,105 @@ class TrackerMonitor:
     def close(self) -> None:
         """Stop listening."""
         self._tracker.close()
+
+
+class StopRequested(Exception):  # noqa: N818 - no error: somebody or something wants the run to end
+    """The run is to end before everything is measured. The message says why.
+
+    Attributes:
+        arm: what the arm does then, in words.
+    """
+
+    def __init__(self, why: str, arm: str = "the arm holds") -> None:
+        super().__init__(why)
+        self.arm = arm
+
+
+class TrackerLost(StopRequested):
+    """The tracker has given nothing of use for long, be it for where the arm is or for good."""
+
+
+MayMove = Callable[[], bool]
+"""Whether to move now; an arm that may not, holds. It may raise ``StopRequested``."""
+
+
+def unguarded() -> bool:
+    """Always: for the path to where the arm rests, which needs no tracker."""
+    return True
+
+
+@dataclass(frozen=True)
+class MotionGate:
+    """Takes in the tracker's frames, and says whether the arm may go on.
+
+    Attributes:
+        monitor: of the tracker; None where none is used.
+        lost: for how long the tracker may give nothing of use.
+        asked_to_end: whether somebody wants the end.
+        waits: says what is waited for.
+    """
+
+    monitor: TrackerMonitor | None
+    clock: Clock
+    lost: LostSettings
+    asked_to_end: Callable[[], bool]
+    waits: Waits = field(default_factory=Waits)
+
+    def resting(self) -> bool:
+        """Always, for an arm that rests needs no tracker.
+
+        Raises:
+            StopRequested: somebody asked for the end.
+        """
+        if self.monitor is not None:
+            self.monitor.look()
+        if self.asked_to_end():
+            raise StopRequested("it was asked to stop")
+        return True
+
+    @property
+    def has_trouble(self) -> bool:
+        """Whether the tracker, if one is used, gives nothing of use now."""
+        return self.monitor is not None and self.monitor.trouble()[0] > 0
+
+    def measuring(self) -> bool:
+        """Whether the tracker is well.
+
+        Raises:
+            StopRequested: somebody asked for the end.
+            TrackerLost: the tracker stayed away for too long.
+        """
+        self.resting()
+        seconds, why = (0.0, "") if self.monitor is None else self.monitor.trouble()
+        if seconds >= self.lost.park:
+            self.waits.given_up("tracker")
+            raise TrackerLost(f"the tracker has given nothing of use for {seconds:.0f} s: {why}")
+        if seconds >= self.lost.hold:
+            self.waits.goes_on("tracker", f"the arm holds: {why}", self.lost.park - seconds, self.clock.now())
+            return False
+        if not seconds:
+            self.waits.over("tracker", self.clock.now())
+        return True
+
+    def settled(
+        self, tick: Callable[[MayMove], bool], longest_s: float, check_heat: Callable[[], None] = lambda: None
+    ) -> Settled | str:
+        """Where the target stands, once the arm does; why it is not known, if the arm does not come to stand in time.
+
+        Raises:
+            StopRequested: see ``measuring``.
+            ThermalLimit: by ``check_heat``.
+        """
+        now, monitor = self.clock.now, self.monitor
+        assert monitor is not None
+        monitor.begin()
+        until, last = now() + longest_s, now() + longest_s + self.lost.park
+        while now() < min(until, last):
+            is_seen = tick(self.measuring)
+            check_heat()
+            if not is_seen:  # a tracker that comes and goes must not keep the arm here for ever: hence the last
+                until = now() + longest_s
+                monitor.begin()
+            elif (settled := monitor.settled()) is not None:
+                return settled
+        return monitor.why or "the arm did not come to stand"

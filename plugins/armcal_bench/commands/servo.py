@@ -17,9 +17,9 @@ from armcal.errors import EXIT_FAULT, EXIT_INCOMPLETE, EXIT_STOPPED, InputError
 from armcal.io.signals import Signals
 from rich.table import Table
 
+from armcal_bench.acquisition.tracker_monitor import StopRequested
 from armcal_bench.commands.common import FILE, Question, energise_option, load, on_bench, waits, warned
 from armcal_bench.servo.keys import wishes_from
-from armcal_bench.servo.mover import StoppedError
 from armcal_bench.servo.outcome import Outcome
 from armcal_bench.servo.outputs import improved, results, write_results, write_servo_file
 from armcal_bench.servo.record import NAME
@@ -126,7 +126,7 @@ def _stoppable(console: Console, action: Callable[[], None]) -> None:
     """Do it; where it was stopped, say what that means."""
     try:
         action()
-    except StoppedError as stop:
+    except StopRequested as stop:
         arm = f"{stop.arm[:1].upper()}{stop.arm[1:]}"
         console.err.print(
             f"stopped: {stop}. {arm}, and what was measured is kept: give the same command again to go on.",

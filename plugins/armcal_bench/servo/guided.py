@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
+from armcal_bench.acquisition.tracker_monitor import StopRequested
 from armcal_bench.servo.keys import QUIT, Wishes
-from armcal_bench.servo.mover import Mover, StoppedError
+from armcal_bench.servo.mover import Mover
 from armcal_bench.servo.record import ANGLE, LEFT_OUT, Record
-from armcal_bench.servo.sweep import approach_counts, to_base
 
 _LOOK_S = 0.1
 
@@ -44,7 +44,7 @@ class Guided:
         """Ask for all that is left.
 
         Raises:
-            StoppedError: somebody stopped it; the arm holds.
+            StopRequested: somebody stopped it; the arm holds.
             DeviceError: the device fails.
         """
         targets = self.targets()
@@ -52,7 +52,7 @@ class Guided:
         place = next((i for i, target in enumerate(targets) if target.key not in done), len(targets))
         if place == len(targets):
             return
-        to_base(self.mover)
+        self.mover.to_base()
         while place < len(targets):
             if targets[place].key in done:
                 place += 1
@@ -85,7 +85,7 @@ class Guided:
         while True:
             counts = self._within(joint, round(pulse / mover.pulse(joint, 1)))
             if mover.came.get(joint) != target.came or target.came * (counts - mover.counts[joint]) < 0:
-                aside = counts - target.came * approach_counts(mover, joint)
+                aside = counts - target.came * mover.approach_counts(joint)
                 mover.go(joint, self._within(joint, aside))  # from the target's side, with the play taken up
             mover.go(joint, counts)
             set_us = 1e6 * mover.pulse(joint, mover.counts[joint])
@@ -129,12 +129,12 @@ def next_wish(wishes: Wishes, mover: Mover) -> str:
     """What somebody wishes next; the arm holds until then.
 
     Raises:
-        StoppedError: it is the end.
+        StopRequested: it is the end.
     """
     while True:
         wish = wishes.next(_LOOK_S)
-        if wish == QUIT or mover.asked_to_stop():
-            raise StoppedError("it was asked to stop")
+        if wish == QUIT or mover.gate.asked_to_end():
+            raise StopRequested("it was asked to stop")
         if wish is not None:
             return wish
         mover.device.keep_alive()

@@ -4,20 +4,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
-from typing import Protocol
+from itertools import pairwise, permutations
+from typing import Protocol, TypeVar
 
-import numpy as np
 from armcal.arm.servo import PulseClock, PulseTable
-from armcal.devices.clock import Clock
 from armcal.devices.device import DeviceIdentity, JointDevice, PulseDevice
 from armcal.devices.faults import DeviceError, DeviceRefusedError
 from armcal.errors import InputError
 
+from armcal_bench.acquisition.drive import Motion
+from armcal_bench.acquisition.heat import ThermalState
+from armcal_bench.acquisition.recovery import Recovery
+from armcal_bench.acquisition.tracker_monitor import MotionGate
 from armcal_bench.servo.setup import Setup
-from armcal_bench.waiting import LostDevice, Waits
 
-_ALIVE_EVERY_S = 0.1
+T = TypeVar("T")
 _BETWEEN_JOINTS_S = 0.5
 _LONGEST_LOSS_S = 30.0
 
@@ -26,44 +27,32 @@ class ServoDevice(JointDevice, PulseDevice, Protocol):
     """What a servo calibration needs: joints moved by pulses."""
 
 
-class StoppedError(Exception):
-    """The end before everything is measured: somebody asked for it, or the tracker stays away.
-
-    Attributes:
-        arm: what the arm does now, in words.
-    """
-
-    def __init__(self, why: str, arm: str = "the arm holds") -> None:
-        super().__init__(why)
-        self.arm = arm
-
-
-@dataclass
-class Mover:
+class Mover(Motion):
     """Moves servos; ``counts`` holds each one's as they were set, and ``came`` the sign of its last step.
 
     Args:
         setup: how fast and how far servos may be moved, and the tables by which the device reports its angles.
         device: opened by ``open``.
-        clock: for all waiting.
         servos: tables and their boards' clocks by joint: what angles are turned into pulses by.
-        asked_to_stop: looked at in every step.
-        waits: says what is waited for.
-        look: called after every pause, for who watches the arm meanwhile.
+        gate: asked in every step.
     """
 
-    setup: Setup
     device: ServoDevice
-    clock: Clock
-    servos: Mapping[str, tuple[PulseTable, PulseClock]]
-    asked_to_stop: Callable[[], bool]
-    waits: Waits = field(default_factory=Waits)
-    look: Callable[[], None] = field(default=lambda: None)
-    identity: DeviceIdentity | None = None
-    counts: dict[str, int] = field(default_factory=dict)
-    came: dict[str, int] = field(default_factory=dict)
-    _alive: float = -math.inf
-    _guarded: Mapping[str, float] = field(default_factory=dict)
+
+    def __init__(
+        self,
+        setup: Setup,
+        device: ServoDevice,
+        servos: Mapping[str, tuple[PulseTable, PulseClock]],
+        gate: MotionGate,
+    ) -> None:
+        thermal_state = ThermalState(setup.heat, tuple(setup.bench.arm.commanded), setup.base, gate.clock)
+        super().__init__(device, gate.clock, tuple(setup.base), setup.settings.period, thermal_state)
+        self.setup, self.servos, self.gate = setup, servos, gate
+        self.counts: dict[str, int] = {}
+        self.came: dict[str, int] = {}
+        self._guarded: Mapping[str, float] = {}
+        self._rate = math.radians(setup.settings.rate_deg_per_s)  # the fastest, by the stated tables (rad/s)
 
     def open(self) -> DeviceIdentity:
         """Open the device and learn which pulses it makes; nothing moves.
@@ -75,11 +64,18 @@ class Mover:
             raise DeviceRefusedError(
                 "this device cannot set pulses by their length.", hint="Calibrate servos with a device like pca9685."
             )
-        self.identity = self.device.open(self.clock)
-        # A way home of another run must not be gone now.
+        identity = self.device.open(self.clock)
+        self._recovery = Recovery(self.device, identity, self.gate, _LONGEST_LOSS_S)
+        # A path home of another run must not be gone now.
         self.device.guard([], self._rate, self.setup.settings.silence)
         self.counts |= self._running()
-        return self.identity
+        return identity
+
+    @property
+    def angles(self) -> dict[str, float]:
+        """The angles that the pulses ask for by the stated tables (rad, by joint)."""
+        angles = {j: float(self.servos[j][0].angle(self.pulse(j, counts))) for j, counts in self.counts.items()}
+        return {joint: angle for joint, angle in angles.items() if math.isfinite(angle)}
 
     def counts_at(self, joint: str, angle: float) -> int:
         """The counts that the stated table gives for an angle (rad)."""
@@ -89,35 +85,44 @@ class Mover:
         """The pulse of so many counts (s), by the stated oscillator."""
         return counts * self.servos[joint][1].tick
 
-    def counts_per_rad(self, joint: str) -> float:
+    def _counts_per_rad(self, joint: str) -> float:
         """By the stated table, where it is least."""
         table, clock = self.servos[joint]
-        slopes = np.abs(np.diff(table.pulses) / np.diff(table.angles))
-        return float(slopes.min() / clock.tick)
+        return table.least_slope / clock.tick
+
+    def approach_counts(self, joint: str) -> int:
+        """How many counts a joint comes from aside before it is measured; at most what a sweep leaves room for."""
+        return max(int(self.setup.settings.approach * self._counts_per_rad(joint)) - 1, 1)
 
     def energise(self, joint: str, counts: int) -> None:
         """A joint's first pulse; nothing if it gets pulses already."""
         if joint not in self.counts:
             self._set(joint, counts)
-            self.stand(_BETWEEN_JOINTS_S)
+            self.stand(_BETWEEN_JOINTS_S, self.gate.resting)
 
     def go(self, joint: str, counts: int) -> None:
         """Move a joint to a pulse, no faster than allowed.
 
         Raises:
             InputError: the pulse is outside the range that is allowed.
-            StoppedError: on the way; the joint holds.
+            StopRequested: on the way; the joint holds.
         """
         self.check(joint, counts)
-        at, period = float(self.counts[joint]), self.setup.settings.period
-        step = self._rate * self.counts_per_rad(joint) * period
+        at, step = float(self.counts[joint]), self._rate * self._counts_per_rad(joint) * self.period
         if counts != self.counts[joint]:
             self.came[joint] = 1 if counts > at else -1
         while self.counts[joint] != counts:
-            self._pause(period)
+            self.tick(self.gate.resting)
             at += math.copysign(min(step, abs(counts - at)), counts - at)
             if (near := math.floor(at + 0.5)) != self.counts[joint]:
                 self._set(joint, near)
+
+    def come_to(self, joint: str, counts: int, came: int) -> None:
+        """Move a joint to a pulse with rising pulses (1) or falling ones (-1), with its play taken up; see ``go``."""
+        aside = counts - came * self.approach_counts(joint)
+        if came * (aside - self.counts[joint]) < 0 or self.came.get(joint) != came:
+            self.go(joint, aside)
+        self.go(joint, counts)
 
     def check(self, joint: str, counts: int) -> None:
         """Whether a pulse is allowed.
@@ -133,19 +138,28 @@ class Mover:
                 hint="Narrow bench.servo.ranges; or widen bench.servo.pulses or its pulse_range if the servo bears it.",
             )
 
-    def stand(self, seconds: float) -> None:
-        """Wait, and say now and then that the host lives.
+    def to_base(self) -> None:
+        """Every servo to the base pose, one by one; those without pulses get their first.
 
         Raises:
-            StoppedError: it was asked for.
+            DeviceRefusedError: no order of the joints keeps clear on the way from where the arm stands.
         """
-        until = self.clock.now() + seconds
-        while (left := until - self.clock.now()) > 1e-9:
-            self._pause(min(left, _ALIVE_EVERY_S))
-
-    def tick(self) -> None:
-        """One period of standing still. See ``stand``."""
-        self._pause(self.setup.settings.period)
+        setup = self.setup
+        goals = {joint: self.counts_at(joint, angle) for joint, angle in setup.base.items()}
+        for joint, counts in goals.items():
+            self.energise(joint, counts)
+        start = self.angles
+        away = [joint for joint, counts in goals.items() if self.counts[joint] != counts]
+        for order in permutations(away):
+            arrived = [{**start, **{joint: setup.base[joint] for joint in order[:n]}} for n in range(len(order) + 1)]
+            if all(setup.clear_between(here, there) for here, there in pairwise(arrived)):
+                for joint in order:
+                    self.go(joint, goals[joint])
+                return
+        raise DeviceRefusedError(
+            "no way to the base pose is clear from where the arm stands.",
+            hint="Bring it nearer by armcal servo --guided, or release it and put it there by hand.",
+        )
 
     def guard(self, base: Mapping[str, float]) -> bool:
         """What the board is to do when the host falls silent: back to a pose (rad by joint), slowly."""
@@ -160,15 +174,13 @@ class Mover:
             return False
         return True
 
-    def recover(self, fault: DeviceError) -> None:
-        """After a fault of the device: open it again, and let every joint have the pulse that it had.
+    def persist(self, action: Callable[[], T]) -> T:
+        """Do it; when the device fails, open it again, let every joint have the pulse that it had, and do it again.
 
         Raises:
-            StoppedError: it was asked for.
-            DeviceError: it does not come back.
+            DeviceLost: it does not come back.
         """
-        lost = LostDevice(self.device, self.clock, self.identity, _LONGEST_LOSS_S, self.waits, self._stop_if_asked)
-        lost.reopened(fault, self._restore)
+        return self._recovery.persist(action, self._restore)
 
     def _restore(self) -> None:
         # No way home is known while joints hang free.
@@ -179,7 +191,7 @@ class Mover:
         for joint in before:
             if joint not in running:
                 self._set(joint, before[joint])
-                self.stand(_BETWEEN_JOINTS_S)
+                self.stand(_BETWEEN_JOINTS_S, self.gate.resting)
         if self._guarded:
             self.guard(self._guarded)
 
@@ -189,28 +201,10 @@ class Mover:
         moved = {joint: angle for joint, angle in angles.items() if joint in self.setup.base}
         return {joint: _counts(*self.setup.table_of(joint), angle) for joint, angle in moved.items()}
 
-    @property
-    def _rate(self) -> float:
-        """The fastest (rad/s, by the stated tables)."""
-        return math.radians(self.setup.settings.rate_deg_per_s)
-
     def _set(self, joint: str, counts: int) -> None:
         self.check(joint, counts)
         self.device.set_pulse(joint, self.pulse(joint, counts))
         self.counts[joint] = counts
-
-    def _pause(self, seconds: float) -> None:
-        self._stop_if_asked()
-        self.clock.sleep(seconds)
-        now = self.clock.now()
-        if now - self._alive >= _ALIVE_EVERY_S:
-            self._alive = now
-            self.device.keep_alive()
-        self.look()
-
-    def _stop_if_asked(self) -> None:
-        if self.asked_to_stop():
-            raise StoppedError("it was asked to stop")
 
 
 def _counts(table: PulseTable, clock: PulseClock, angle: float) -> int:

@@ -4,30 +4,29 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, cast
 
 from armcal.devices.clock import Clock
+from armcal.devices.device import DeviceIdentity
 from armcal.errors import InputError, Location
 
-from armcal_bench.acquisition.tracker_monitor import TrackerMonitor
+from armcal_bench.acquisition.recovery import DeviceLost
+from armcal_bench.acquisition.tracker_monitor import MotionGate, StopRequested, TrackerMonitor
 from armcal_bench.hazards import FirstMotion
-from armcal_bench.servo.automatic import Automatic, ReportProgress, capture
+from armcal_bench.servo.automatic import Automatic, ReportProgress
 from armcal_bench.servo.beginning import begin, check_same, stated_by
 from armcal_bench.servo.guided import Guided, next_wish
 from armcal_bench.servo.keys import Wishes
-from armcal_bench.servo.mover import Mover, ServoDevice, StoppedError
+from armcal_bench.servo.mover import Mover, ServoDevice
 from armcal_bench.servo.outcome import Outcome, outcome_of
 from armcal_bench.servo.record import BEGUN, Record
 from armcal_bench.servo.setup import Setup
-from armcal_bench.servo.sweep import commanded_angles, to_base
-from armcal_bench.servo.thermal_state import ThermalState
 from armcal_bench.servo.trial import Move, Verdict, answered, judged, wrapped
 from armcal_bench.waiting import Waits
 from armcal_bench.wiring import note_checked
 
-_LOOK_S = 0.1
 _AS_IT_IS = "its pulses go on as they are, unless the board brings the arm to its base pose"
 
 
@@ -58,21 +57,20 @@ def measure(setup: Setup, folder: Path, talk: Conversation, how: str) -> None:
 
     Raises:
         InputError: the folder, the board or the tracker is refused.
-        StoppedError: it was stopped before its end; the arm holds, and what was measured is kept.
+        StopRequested: it was stopped before its end; the arm holds, and what was measured is kept.
         DeviceError: the device is gone; what was measured is kept.
     """
     record = Record(folder)
-    with setup.bench.clock() as clock, _opened(setup, clock, talk, record) as mover:
+    with setup.bench.clock() as clock, _opened(setup, clock, talk, record) as (mover, identity):
         if how == "guided":
-            begin(setup, record, mover.identity, talk.say)
+            begin(setup, record, identity, talk.say)
             with talk.wishes() as wishes:
                 Guided(mover, wishes, record, talk.say).run()
             return
-        with _monitor(mover) as monitor:
-            run = Automatic(mover, monitor, record, talk.report, _thermal_state(mover, record))
-            begin(setup, record, mover.identity, talk.say)
-            mover.look = run.look
-            run.run()
+        with _monitored(mover):
+            _go_on_warm(mover, record)
+            begin(setup, record, identity, talk.say)
+            Automatic(mover, record, talk.report).run()
 
 
 def evaluated(setup: Setup, folder: Path) -> Outcome:
@@ -107,17 +105,16 @@ def tried(setup: Setup, talk: Conversation, seen: str) -> list[Verdict]:
     if away:  # by such a table no joint can be moved
         _note(setup, away, {})
         return away
-    with setup.bench.clock() as clock, _opened(setup, clock, talk, None) as mover:
+    with setup.bench.clock() as clock, _opened(setup, clock, talk, None) as (mover, identity):
         if seen == "tracker":
-            with _monitor(mover) as monitor:
-                to_base(mover)
-                verdicts = _tracked(mover, monitor)
+            with _monitored(mover):
+                mover.to_base()
+                verdicts = _tracked(mover)
         else:
-            to_base(mover)
+            mover.to_base()
             with talk.wishes() as wishes:
                 verdicts = [_by_eye(mover, joint, talk, wishes) for joint in setup.joints]
-        adapter = mover.identity.adapter if mover.identity else ""
-        _note(setup, verdicts, {"adapter": adapter, "by": seen, "at": clock.wall()})
+        _note(setup, verdicts, {"adapter": identity.adapter, "by": seen, "at": clock.wall()})
         return verdicts
 
 
@@ -138,81 +135,83 @@ def park(setup: Setup, talk: Conversation, how: str) -> None:
 
     Raises: as ``measure``.
     """
-    with setup.bench.clock() as clock, _opened(setup, clock, talk, None, releases=how == "release") as mover:
-        to_base(mover)
+    with setup.bench.clock() as clock, _opened(setup, clock, talk, None, releases=how == "release") as (mover, _):
+        mover.to_base()
         mover.guard({})
-        for joint in reversed(tuple(setup.base)) if how == "release" else ():
-            mover.device.release(joint)
-            mover.clock.sleep(_LOOK_S)
+        if how == "release":
+            mover.release()
 
 
 @contextmanager
 def _opened(
     setup: Setup, clock: Clock, talk: Conversation, record: Record | None, *, releases: bool = False
-) -> Iterator[Mover]:
+) -> Iterator[tuple[Mover, DeviceIdentity]]:
     device = cast(ServoDevice, setup.bench.device())
     servos = {joint: setup.table_of(joint) for joint in setup.base}
     if record is not None and record.is_measured:
         stated, _ = stated_by(setup, record.of_kind(BEGUN)[0], tuple(setup.base))
         servos = {servo.joint: (servo.table, servos[servo.joint][1]) for servo in stated}
-    mover = Mover(setup, device, clock, servos, talk.asked_to_stop, talk.waits)
+    lost = setup.bench.settings.acquisition.lost
+    mover = Mover(setup, device, servos, MotionGate(None, clock, lost, talk.asked_to_stop, talk.waits))
     try:
         identity = mover.open()
         if record is not None and record.is_measured:
             check_same(setup, record, identity)
-        start = setup.judge.first_motion(commanded_angles(mover), {}, releases=releases)
+        start = setup.judge.first_motion(mover.angles, {}, releases=releases)
         if (start.free or start.hazards) and not talk.may_energise(start):
             raise InputError("the arm may not be moved; nothing was moved.", hint="Say yes, or give --yes.")
-        yield mover
-    except StoppedError as stop:
+        yield mover, identity
+    except StopRequested as stop:
         if not mover.hold():
-            raise StoppedError(f"{stop}, while the board was lost", _AS_IT_IS) from stop
+            raise StopRequested(f"{stop}, while the board was lost", _AS_IT_IS) from stop
         raise
+    except DeviceLost as loss:
+        if loss.fault is None:
+            raise StopRequested(str(loss), _AS_IT_IS) from loss
+        raise loss.fault from loss
     finally:
         device.close()
 
 
 @contextmanager
-def _monitor(mover: Mover) -> Iterator[TrackerMonitor]:
-    """The tracker, once it gives frames that can be used."""
-    monitor = TrackerMonitor(mover.setup.bench, mover.clock)
+def _monitored(mover: Mover) -> Iterator[None]:
+    """With the tracker, once it gives frames that can be used."""
+    gate, monitor = mover.gate, TrackerMonitor(mover.setup.bench, mover.clock)
     try:
         monitor.open()
-        mover.look = monitor.look
+        mover.gate = replace(gate, monitor=monitor)
         hint = "Start it, check its address and the names of its bodies; or calibrate with --guided."
-        monitor.await_first_frame(mover.tick, hint)
-        yield monitor
+        monitor.await_first_frame(lambda: mover.tick(mover.gate.resting), hint)
+        yield
     finally:
-        mover.look = lambda: None
+        mover.gate = gate
         monitor.close()
 
 
-def _thermal_state(mover: Mover, record: Record) -> ThermalState:
-    """From where the record's last line left it, where the servos may have to rest; else from cold servos on.
+def _go_on_warm(mover: Mover, record: Record) -> None:
+    """From where the record's last line left the servos' warmth, where they may have to rest; else from cold on.
 
     Raises:
         InputError: one would not cool where it is to rest.
     """
-    setup = mover.setup
-    thermal_state = ThermalState(setup.heat, tuple(setup.bench.arm.commanded), setup.base, mover.clock)
-    if joint := thermal_state.base_is_too_heavy:
+    if joint := mover.thermal_state.too_heavy_at_rest:
         raise InputError(
             f"the servo of {joint} would not cool in the base pose, by bench.acquisition.heat; nothing was moved.",
             hint="Give bench.servo.base a pose in which it carries less.",
         )
     last = next((entry for entry in reversed(record.entries) if "warmth" in entry), None)
     if last is not None:
-        thermal_state.go_on(last["warmth"], commanded_angles(mover), mover.clock.wall() - float(last["at"]))
-    return thermal_state
+        mover.thermal_state.go_on(last["warmth"], mover.angles, mover.clock.wall() - float(last["at"]))
 
 
-def _tracked(mover: Mover, monitor: TrackerMonitor) -> list[Verdict]:
-    setup, base, moves, unseen = mover.setup, commanded_angles(mover), [], []
+def _tracked(mover: Mover) -> list[Verdict]:
+    setup, base, moves, unseen = mover.setup, mover.angles, [], []
+    longest = setup.bench.settings.acquisition.settle.longest
     for joint in setup.joints:
         turn, at = _small_turn(setup, joint), mover.counts[joint]
-        before = capture(mover, monitor)
+        before = mover.gate.settled(mover.tick, longest)
         mover.go(joint, mover.counts_at(joint, setup.base[joint] + turn))
-        after = capture(mover, monitor)
+        after = mover.gate.settled(mover.tick, longest)
         mover.go(joint, at)
         if isinstance(before, str) or isinstance(after, str):
             why = before if isinstance(before, str) else after

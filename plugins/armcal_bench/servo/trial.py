@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from armcal_bench.servo.nominal import NominalArm
 from armcal_bench.servo.record import BEGUN, POSE
 from armcal_bench.servo.turning import twist_angles
+from armcal_bench.settling import pose_of
 
 _LEVER_M = 0.1
 _STILL = math.radians(1.5)
@@ -140,7 +141,7 @@ def permuted(entries: Sequence[Mapping[str, Any]], joints: Sequence[str], nomina
         turned = [turn for turn in turned if abs(turn[0]) >= _USUAL_TURN / 2]
         if turned:  # more than the usual turn shows more of what springs give
             commanded, before, after = min(turned, key=lambda turn: abs(abs(turn[0]) - _USUAL_TURN))
-            moves.append(Move(joint, commanded, _pose(before), _pose(after)))
+            moves.append(Move(joint, commanded, pose_of(before), pose_of(after)))
     begun = next((entry for entry in entries if entry["kind"] == BEGUN), None)
     if begun is None or not moves:
         return {}
@@ -159,13 +160,6 @@ def permuted(entries: Sequence[Mapping[str, Any]], joints: Sequence[str], nomina
         for joint, other in moved.items()
         if other != joint
     }
-
-
-def _pose(line: Mapping[str, Any]) -> Array:
-    pose = np.eye(4)
-    pose[:3, :3] = np.nan if line["rotation"] is None else np.array(line["rotation"])
-    pose[:3, 3] = line["position"]
-    return pose
 
 
 def _score(wiring: _Wiring, seen: Sequence[Move], base: Mapping[str, float], nominal: NominalArm) -> float:
