@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
+from armcal.estimate.identifiability import InverseInformation
 from armcal.estimate.nuisance import started
 from armcal.estimate.polish import descended
 from armcal.measure.measurement import Measurement
@@ -57,7 +58,7 @@ class Fitted:
     """Values, how sure their coordinates are, and the noise found in units of the declared one.
 
     Attributes:
-        half: a root of the covariance by coordinates (n x n).
+        half: a root of the covariance by coordinates (n x k).
         freedom: how many numbers the noise was estimated from.
         used: which postures were fitted (N).
     """
@@ -116,15 +117,13 @@ class QuickFitter:
         records = self._weak.weighted(self.records, [used.astype(float)] * len(self.records))
         posed = PosedProblem(self._weak, records)
         self._x = descended(posed, self._x, _MOST_STEPS, _DAMPING, _AT_REST)
-        values, scales = posed.values(self._x), parameters.scales()
-        data = self._weak.normal_equations(values, records).chained(parameters.entries_jacobian(values) * scales)
-        prior = parameters.prior_information() * scales**2
-        identified_by_data = float(np.trace(np.linalg.solve(data.hessian + np.diag(prior), data.hessian)))
-        freedom = max(self._weak.equations(records) - identified_by_data, 0.0) + _DECLARED_COUNTS
-        scale = max(float(np.sqrt((2 * data.cost + _DECLARED_COUNTS) / freedom)), _LEAST_SCALE)
-        known, directions = np.linalg.eigh(data.hessian / scale**2 + np.diag(prior))
-        half = scales[:, None] * directions / np.sqrt(np.maximum(known, prior.min(initial=1.0)))
-        return Fitted(values, half, scale, freedom, used)
+        values = posed.values(self._x)
+        triangle = self._weak.triangular_factor(values, records)
+        spent = InverseInformation.of(triangle, parameters).spent
+        freedom = max(self._weak.equations(records) - spent, 0.0) + _DECLARED_COUNTS
+        squares = 2 * self._weak.cost(values, records)
+        scale = max(float(np.sqrt((squares + _DECLARED_COUNTS) / freedom)), _LEAST_SCALE)
+        return Fitted(values, InverseInformation.of(triangle / scale, parameters).root, scale, freedom, used)
 
     def predicted(self, fitted: Fitted, one: int) -> PredictedResidual:
         """Of a posture that was not fitted."""
