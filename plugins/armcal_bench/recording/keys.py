@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import os
-import select
 from collections.abc import Callable
 from typing import Protocol
 
 from armcal.io.line_cutter import LineCutter
 from typing_extensions import override
 
-from armcal_bench.terminal import keep_single_keys
+from armcal_bench.terminal import Typed
 
 END = "q"
 _END_OF_INPUT, _ERASE, _ESCAPE = "\x04", "\x7f\b", "\x1b"
@@ -37,20 +35,22 @@ class NoKeys(Keys):
         return []
 
 
-class LineKeys(Keys):
+class LineKeys(Typed, Keys):
     """A command a line, from a pipe."""
 
     def __init__(self, descriptor: int) -> None:
-        self._descriptor, self._cutter = descriptor, LineCutter(_LONGEST)
-        self.ended = False
+        super().__init__(descriptor)
+        self._cutter = LineCutter(_LONGEST)
 
     @override
     def commands(self) -> list[str]:
-        data, self.ended = _typed(self._descriptor, self.ended)
-        return [line.decode("utf-8", "replace") for line in self._cutter.feed(data) if line is not None]
+        lines: list[bytes | None] = []
+        while data := self.read():
+            lines += self._cutter.feed(data)
+        return [line.decode("utf-8", "replace") for line in lines if line is not None]
 
 
-class TerminalKeys(Keys):
+class TerminalKeys(Typed, Keys):
     """Single keys of a terminal; see ``terminal.single_keys`` for the mode that it must be in.
 
     Args:
@@ -59,16 +59,18 @@ class TerminalKeys(Keys):
     """
 
     def __init__(self, descriptor: int, echo: Callable[[str], None]) -> None:
-        self._descriptor, self._echo = descriptor, echo
+        super().__init__(descriptor)
+        self._echo = echo
         self._name: str | None = None
         """What was typed of a name; None while none is typed."""
-        self.ended = False
 
     @override
     def commands(self) -> list[str]:
-        keep_single_keys(self._descriptor)
-        data, self.ended = _typed(self._descriptor, self.ended)
-        pressed = [self._pressed(key) for key in data.decode("utf-8", "replace")]
+        self.keep_single_keys()
+        typed = b""
+        while data := self.read():
+            typed += data
+        pressed = [self._pressed(key) for key in typed.decode("utf-8", "replace")]
         return [command for command in pressed if command is not None]
 
     def _pressed(self, key: str) -> str | None:
@@ -98,16 +100,3 @@ class TerminalKeys(Keys):
             self._name = name + key
             self._echo(key)
         return None
-
-
-def _typed(descriptor: int, ended: bool) -> tuple[bytes, bool]:
-    """All that can be read without waiting, and whether the input has ended."""
-    data = b""
-    while not ended and select.select([descriptor], [], [], 0)[0]:
-        try:
-            read = os.read(descriptor, _LONGEST)
-        except OSError:
-            read = b""
-        ended = not read
-        data += read
-    return data, ended

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import os
 import re
-import select
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Protocol
 
 from typing_extensions import override
 
-from armcal_bench.terminal import keep_single_keys, single_keys
+from armcal_bench.terminal import Typed, single_keys
 
 QUIT = "quit"
 _KEYS = {
@@ -48,15 +47,14 @@ class Wishes(Protocol):
         """
 
 
-class Keys(Wishes):
+class Keys(Typed, Wishes):
     """Single keys of a terminal; see ``terminal.single_keys`` for the mode that it must be in."""
 
-    def __init__(self, descriptor: int) -> None:
-        self._descriptor, self._read = descriptor, b""
+    _read = b""
 
     @override
     def next(self, seconds: float) -> str | None:
-        keep_single_keys(self._descriptor)
+        self.keep_single_keys()
         while True:
             while self._read:
                 if key := _KEY.match(self._read):
@@ -65,38 +63,28 @@ class Keys(Wishes):
                 if any(key.startswith(self._read) for key in _KEYS):
                     break
                 self._read = self._read[1:]  # what is no key is passed over
-            if not select.select([self._descriptor], [], [], seconds)[0]:
-                # An escape with nothing after it is no key.
-                self._read = b""
-                return None
-            try:
-                more = os.read(self._descriptor, 64)
-            except OSError:  # the terminal is gone
-                more = b""
+            more = self.read(seconds)
             if not more:
-                return QUIT
+                self._read = b""  # an escape with nothing after it is no key
+                return QUIT if self.ended else None
             self._read += more
 
 
-class Lines(Wishes):
+class Lines(Typed, Wishes):
     """A wish a line, for scripts."""
 
-    def __init__(self, descriptor: int) -> None:
-        self._descriptor, self._read, self._ended = descriptor, b"", False
+    _read = b""
 
     @override
     def next(self, seconds: float) -> str | None:
-        while b"\n" not in self._read:
-            if self._ended:
-                last, self._read = self._read, b""
-                return _said(last) or QUIT
-            if not select.select([self._descriptor], [], [], seconds)[0]:
+        while b"\n" not in self._read and not self.ended:
+            more = self.read(seconds)
+            if not more and not self.ended:
                 return None
-            more = os.read(self._descriptor, 4096)
-            self._ended = not more
             self._read += more
-        line, _, self._read = self._read.partition(b"\n")
-        return _said(line) or self.next(seconds)
+        line, end, self._read = self._read.partition(b"\n")
+        said = line.decode("utf-8", "replace").strip().lower()
+        return said or (self.next(seconds) if end else QUIT)
 
 
 @contextmanager
@@ -107,7 +95,3 @@ def wishes_from(descriptor: int) -> Iterator[Wishes]:
         return
     with single_keys(descriptor):
         yield Keys(descriptor)
-
-
-def _said(line: bytes) -> str:
-    return line.decode("utf-8", "replace").strip().lower()
