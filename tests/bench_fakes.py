@@ -101,7 +101,6 @@ class FakeTrackerMonitor:
     blind_since: float | None = None
     restless: set[tuple[float, ...]] = field(default_factory=set)
     begun: float = 0.0
-    why: str = ""
 
     def look(self) -> None:
         pass
@@ -112,14 +111,12 @@ class FakeTrackerMonitor:
     def begin(self) -> None:
         self.begun = self.clock.now()
 
-    def settled(self) -> Settled | None:
+    def settled(self) -> Settled | str:
         if self.clock.now() - self.begun < 1.0 or self.blind_since is not None:
-            self.why = "too early"
-            return None
+            return "too early"
         angles = tuple(round(a, 6) for a in self.device.running.values())
         if angles in self.restless:
-            self.why = "still moving by 3 mm"
-            return None
+            return "still moving by 3 mm"
         pose = np.eye(4)
         pose[:2, 3] = list(self.device.running.values())
         return Settled(pose, np.full(6, 1e-5), 60, 0, self.begun, self.clock.now())

@@ -22,7 +22,7 @@ from pydantic import Field
 
 from armcal_bench.acquisition.settings import AcquisitionSettings
 from armcal_bench.bodies import BodySettings
-from armcal_bench.recording.settings import RecordingSettings
+from armcal_bench.recording.window import RecordingSettings
 
 SECTION = "bench"
 

@@ -57,13 +57,6 @@ def pose_of(record: Mapping[str, Any]) -> Array:
     return pose
 
 
-@dataclass(frozen=True)
-class Unsettled:
-    """Why the arm is not known to stand: a sentence."""
-
-    why: str
-
-
 class Settling:
     """Judges by frames whether the arm stands. See ``stillness.judged`` for what that means."""
 
@@ -89,23 +82,23 @@ class Settling:
         while self._frames and self._frames[0][0].arrived <= self._frames[-1][0].arrived - self._settings.window:
             self._frames.popleft()
 
-    def state(self, now: float) -> Settled | Unsettled:
-        """Whether it stands now (s, by the bench's clock)."""
+    def state(self, now: float) -> Settled | str:
+        """Where it stands now (s, by the bench's clock), or why it is not known to stand: a sentence."""
         start = now - self._settings.window
         left = self._begun + self._settings.wait - start
         if left > _SLACK_S:
-            return Unsettled(f"too early: {left:.2f} s to wait")
+            return f"too early: {left:.2f} s to wait"
         recent = [(frame, again) for frame, again in self._frames if start < frame.arrived <= now]
         frames = [frame for frame, _ in recent]
         capture = in_base(frames, self._bodies)
         faults = [fault or (FROZEN if again else "") for fault, (_, again) in zip(capture.faults, recent, strict=True)]
         usable = [frame for frame, fault in zip(frames, faults, strict=True) if not fault]
         if why := self._too_few([frame.arrived for frame in usable], faults, start, now):
-            return Unsettled(why)
+            return why
         poses = capture.poses[[not fault for fault in faults]]
         stillness = judged(poses, self._settings.spread)
         if stillness.why_not:
-            return Unsettled(stillness.why_not)
+            return stillness.why_not
         kept = [frame for frame, keep in zip(usable, stillness.kept, strict=True) if keep]
         poses = poses[stillness.kept]
         mean = mean_pose(poses)

@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar
 
-from armcal.arm.servo import COUNTS
+from armcal.arm.servo import COUNTS, PulseClock, PulseTable, quantised
 from armcal.base.settings import InputPath, Settings
-from armcal.config.servo_file import ServoFile, digest, load_servo_file
+from armcal.config.servo_file import CalibratedServo, ServoFile, digest, load_servo_file
 from armcal.devices.clock import Clock
 from armcal.devices.device import DeviceIdentity, DeviceState, JointDevice, PulseDevice
 from armcal.devices.faults import DeviceLostError, DeviceRefusedError
@@ -18,9 +19,55 @@ from armcal.devices.link import GuardedLink, Link
 from armcal.errors import Location
 from typing_extensions import override
 
-from armcal_pca9685.chip import Chip, ForeignPulses
-from armcal_pca9685.registers import no_pulse, pulse_on
-from armcal_pca9685.servo import Servo
+from armcal_pca9685.chip import Chip, ForeignPulses, no_pulse, pulse_on
+
+_ANGLE_SLACK = 1e-9
+_COUNT_SLACK = 1e-6
+
+
+@dataclass(frozen=True)
+class Servo:
+    """A servo as the servo file has it; tables and clocks are looked up once, for every step needs them."""
+
+    calibrated: CalibratedServo
+    pulse_range: tuple[float, float]
+
+    @cached_property
+    def place(self) -> tuple[int, int]:
+        """The board's address, and the channel."""
+        return self.calibrated.address, self.calibrated.channel
+
+    @cached_property
+    def clock(self) -> PulseClock:
+        """What its pulses are counted by."""
+        return self.calibrated.clock
+
+    @cached_property
+    def span(self) -> tuple[float, float]:
+        """The smallest and the largest angle that its table has (rad); an end may be rounded over."""
+        ends = self.table.angles[0], self.table.angles[-1]
+        rounded = [float(quantised(end, self.table, self.clock)) for end in ends]
+        return min(ends[0], rounded[0]) - _ANGLE_SLACK, max(ends[1], rounded[1]) + _ANGLE_SLACK
+
+    @cached_property
+    def borne(self) -> tuple[int, int]:
+        """The fewest and the most counts that lie within the pulses that it bears."""
+        low, high = (pulse / self.clock.tick for pulse in self.pulse_range)
+        return math.ceil(low - _COUNT_SLACK), math.floor(high + _COUNT_SLACK)
+
+    def counts(self, angle: float) -> int:
+        """Nearest to an angle (rad), of those that it bears."""
+        fewest, most = self.borne
+        return min(max(int(self.clock.counts(self.table.pulse(angle))), fewest), most)
+
+    def angle(self, counts: int) -> float:
+        """The angle (rad) that so many counts ask for."""
+        return float(self.table.angle(counts * self.clock.tick))
+
+    @cached_property
+    def table(self) -> PulseTable:
+        """Angles and pulses."""
+        return self.calibrated.table
 
 
 class Pca9685Settings(Settings):
@@ -57,7 +104,8 @@ class _Guard:
         for waypoint in self.waypoints:
             at = {joint: waypoint.get(joint, counts) for joint, counts in at.items()}
             ways.append({places[joint]: counts for joint, counts in at.items()})
-        rates = {places[joint]: servos[joint].counts_per_s(self.rate) for joint in joints}
+        # no joint turns faster than the rate on any part of its table
+        rates = {servos[j].place: self.rate * servos[j].table.least_slope / servos[j].clock.tick for j in joints}
         link.guard(ways if joints else [], rates, self.after_s)
 
 
@@ -194,9 +242,11 @@ class Pca9685Device(JointDevice, PulseDevice):
 
     def _counts_of(self, joint: str, angle: float) -> int:
         servo = self._known(joint)
-        if not servo.has(angle):
+        low, high = servo.span
+        if not low <= angle <= high:  # no table has an angle that is not finite
+            ends = " to ".join(f"{math.degrees(end):g}" for end in (servo.table.angles[0], servo.table.angles[-1]))
             raise DeviceRefusedError(
-                f"found {math.degrees(angle):.3f} deg for {joint}, expected {servo.span_text}, its pulse table.",
+                f"found {math.degrees(angle):.3f} deg for {joint}, expected {ends} deg, its pulse table.",
                 where=Location(str(self._settings.servos), field=f"servos.{joint}"),
                 hint="Keep the plan within the table, or measure the servo further: armcal servo.",
             )

@@ -48,8 +48,6 @@ class BenchPhysics:
 
     Args:
         servos: by joint, in the arm's order.
-        torques: see there.
-        pose: see there.
         frame_s: between the tracker's frames.
         seen: takes them.
     """

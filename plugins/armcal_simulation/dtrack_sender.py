@@ -72,11 +72,7 @@ class TrackerFaults:
 
 
 class DTrackSender:
-    """Sends to a host and port. The same seed, times and bodies give the same bytes.
-
-    Attributes:
-        faults: see there.
-    """
+    """Sends to a host and port. The same seed, times and bodies give the same bytes."""
 
     def __init__(self, settings: DTrackSenderSettings, host: str, port: int, seed: int) -> None:
         self.faults = TrackerFaults()

@@ -59,7 +59,6 @@ class FramedBoard:
         clock: seconds.
         bus: what it is wired to.
         send: bytes to the host.
-        identity: see there.
         boots: how often it has started before.
     """
 

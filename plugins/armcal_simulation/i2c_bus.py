@@ -17,15 +17,7 @@ class BusStuckError(Exception):
 
 
 class I2cBus:
-    """Chips on two wires.
-
-    Attributes:
-        chips: all of them.
-
-    Args:
-        clock: seconds.
-        chips: see above.
-    """
+    """Chips on two wires; the clock gives seconds."""
 
     def __init__(self, clock: Callable[[], float], chips: Sequence[Pca9685Model]) -> None:
         self.chips = tuple(chips)

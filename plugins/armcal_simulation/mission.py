@@ -19,8 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from armcal_simulation.mission_changes import MovingTruth, moving_truth, scheduled
 from armcal_simulation.mission_settings import LossSettings, MissionSettings, RecordSettings, TiltSettings, began_at
-from armcal_simulation.moving_arm import measured_while_moving
-from armcal_simulation.readings import approach_of, at_truth, disturbed, with_outliers
+from armcal_simulation.readings import approach_of, at_truth, disturbed, measured_while_moving, with_outliers
 
 _STREAMS = ("times", "losses", "tilt", "poses", "creep", "noise", "outliers")
 _HOUR_S = 3600.0

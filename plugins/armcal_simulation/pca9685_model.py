@@ -55,8 +55,6 @@ class Pca9685Model:
 
     Args:
         clock: seconds, for the rules about time.
-        oscillator_hz: see above.
-        address: see above.
         external_hz: the clock at the EXTCLK pin; None where nothing is connected.
     """
 

@@ -7,13 +7,16 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
+import casadi as ca
 import numpy as np
+from armcal.arm.evaluator import Evaluator
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.base.settings import Length, Settings
 from armcal.config.selection import with_values
 from armcal.config.yaml_source import load_config
 from armcal.estimate.simulation import SimulationRequest, measured_with_noise
+from armcal.problem.problem import Problem
 from numpy.typing import NDArray
 from pydantic import Field
 
@@ -84,3 +87,36 @@ def approach_of(commands: Array) -> Array:
         still = moves[:, column] == 0
         moves[still, column] = moves[still, column - 1]
     return np.asarray(moves)
+
+
+def measured_while_moving(request: SimulationRequest, commands: Dataset, values: Array) -> dict[str, Array]:
+    """What every instrument would read without noise (SI), by channel (N each).
+
+    The parameters that differ from record to record stay symbols, and each record is evaluated with its own row: the
+    exact reading, at the cost of one with parameters that never change.
+
+    Args:
+        request: arms and measurements.
+        commands: joint angles, approaches, load and gravity.
+        values: each record's value vector (N x entries).
+
+    Raises:
+        NotConvergedError: a record has no elastic equilibrium.
+    """
+    still = request.parameters.with_nominal(values[0] if len(values) else request.parameters.nominal())
+    differing = np.flatnonzero(np.any(values != values[:1], axis=0))
+    names = (block.name for block in still.blocks for _ in range(block.size))
+    moving = {name for i, name in enumerate(names) if i in differing}
+    parameters = still.with_free(moving)
+    problem = Problem.build(
+        request.arms, request.measurements, parameters, request.environment, commands, "interpreted"
+    )
+    own = values[:, list(parameters.free_entries)].T
+    shown: dict[str, Array] = {}
+    for kernel, records in zip(problem.kernels, problem.records(commands), strict=True):
+        factor, record = kernel.factor, records.record[:, : records.count]
+        row_by_row = replace(factor, record=ca.vertcat(factor.record, factor.values), values=ca.SX(0, 1))
+        start = np.zeros((factor.state.numel(), records.count))
+        read = Evaluator(row_by_row, factor.outputs)(np.zeros(0), np.concatenate([record, own]), start)
+        shown |= dict(zip(factor.output_channels, read, strict=True))
+    return shown

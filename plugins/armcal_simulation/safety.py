@@ -59,7 +59,6 @@ class Safety:
 
     Args:
         settings: what is unsafe.
-        bounds: see there.
         servos: by joint.
         log: a line of JSON for the first offence of each kind and joint, and for every event.
     """

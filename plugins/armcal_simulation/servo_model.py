@@ -65,7 +65,6 @@ class ServoModel:
         failed: it has burnt out, and holds nothing.
 
     Args:
-        settings: see above.
         table: the angle that it takes at each pulse length, in truth.
         angle: where it stands.
     """

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from armcal.arm.servo import PulseClock, PulseTable
 from armcal_bench.servo.fit import fit_servos
-from armcal_bench.servo.known import KnownBoard, KnownServo, MeasuredPulse, Observation
-from armcal_bench.servo.problem import FitTask
+from armcal_bench.servo.problem import FitTask, KnownBoard, KnownServo, MeasuredPulse, Observation
 
 US = 1e-6
 KNOTS = tuple(math.radians(a) for a in (-100, 0, 100))

@@ -5,9 +5,7 @@ from __future__ import annotations
 from typing import Annotated, Literal
 
 from armcal.base.settings import Angle, Duration, Length, Settings, Temperature, Torque
-from pydantic import Field, model_validator
-
-Positive = Annotated[float, Field(gt=0)]
+from pydantic import Field
 
 
 class ServoHeatSettings(Settings):
@@ -17,18 +15,11 @@ class ServoHeatSettings(Settings):
     as much of its limit as ``budget``: 0.5 is safe where each of these numbers is wrong by 30 %.
     """
 
-    continuous: Torque
-    winding_time: Duration = 60.0
-    case_time: Duration = 900.0
+    continuous: Annotated[Torque, Field(gt=0)]
+    winding_time: Annotated[Duration, Field(gt=0)] = 60.0
+    case_time: Annotated[Duration, Field(gt=0)] = 900.0
     winding_share: Annotated[float, Field(ge=0, le=1)] = 0.3
     budget: Annotated[float, Field(gt=0, le=1)] = 0.5
-
-    @model_validator(mode="after")
-    def _physical(self) -> ServoHeatSettings:
-        for name in ("continuous", "winding_time", "case_time"):
-            if getattr(self, name) <= 0:
-                raise ValueError(f"found a {name} that is not above zero")
-        return self
 
 
 class SettleSettings(Settings):
@@ -52,16 +43,9 @@ class ArrivalSettings(Settings):
     and the run ends.
     """
 
-    astray: Length = 0.1
-    astray_turned: Angle = 0.45
+    astray: Annotated[Length, Field(gt=0)] = 0.1
+    astray_turned: Annotated[Angle, Field(gt=0)] = 0.45
     in_a_row: Annotated[int, Field(ge=1)] = 3
-
-    @model_validator(mode="after")
-    def _positive(self) -> ArrivalSettings:
-        for name in ("astray", "astray_turned"):
-            if getattr(self, name) <= 0:
-                raise ValueError(f"found {name} that is not above zero")
-        return self
 
 
 class LostSettings(Settings):

@@ -53,26 +53,18 @@ class TrackerHealth:
         since = now - self._usable_at
         if since < _WELL_S and not self._why and self._last is not None:
             return 0.0, ""
-        return max(since, 0.0), self._why or self._silence()
-
-    def _silence(self) -> str:
-        """Why nothing came, by what was refused since the last usable frame."""
-        before = self._refused_before
-        risen = {reason: count - before.get(reason, 0) for reason, count in self._refused.items()}
+        risen = {reason: count - self._refused_before.get(reason, 0) for reason, count in self._refused.items()}
         worst = max(risen, key=lambda reason: risen[reason], default="")
-        if not worst or risen[worst] <= 0:
-            return "silent: no frame comes"
-        if worst == REPEATED:
-            return "frozen: the same frame comes again and again"
-        return f"silent: what comes cannot be read ({risen[worst]} times: {worst})"
+        silent = "silent: no frame comes"
+        if worst and risen[worst] > 0:
+            silent = f"silent: what comes cannot be read ({risen[worst]} times: {worst})"
+            if worst == REPEATED:
+                silent = "frozen: the same frame comes again and again"
+        return max(since, 0.0), self._why or silent
 
 
 class TrackerMonitor:
-    """Feeds every frame to what judges whether the arm stands, and to what judges the tracker.
-
-    Attributes:
-        why: why the arm is not known to stand, a sentence.
-    """
+    """Feeds every frame to what judges whether the arm stands, and to what judges the tracker."""
 
     def __init__(self, bench: Bench, clock: Clock) -> None:
         self._clock = clock
@@ -82,7 +74,6 @@ class TrackerMonitor:
         self._health = TrackerHealth(bodies, clock.now())
         self._with_base = TrackerHealth(bodies.model_copy(update={"base_motion": "moving"}), clock.now())
         self._longest = bench.settings.acquisition.lost.park
-        self.why = ""
 
     def open(self) -> None:
         """Begin to listen; see ``Tracker.open`` for what it raises."""
@@ -123,13 +114,9 @@ class TrackerMonitor:
         self.look()
         self._settling.begin(self._clock.now())
 
-    def settled(self) -> Settled | None:
-        """The mean, once the arm stands; else None, and ``why`` says why."""
-        state = self._settling.state(self._clock.now())
-        if isinstance(state, Settled):
-            return state
-        self.why = state.why
-        return None
+    def settled(self) -> Settled | str:
+        """The mean, once the arm stands; else why it is not known to stand."""
+        return self._settling.state(self._clock.now())
 
     def close(self) -> None:
         """Stop listening."""
@@ -227,12 +214,13 @@ class MotionGate:
         assert monitor is not None
         monitor.begin()
         until, last = now() + longest_s, now() + longest_s + self.lost.park
+        settled: Settled | str = "the arm did not come to stand"
         while now() < min(until, last):
             is_seen = tick(self.measuring)
             check_heat()
             if not is_seen:  # a tracker that comes and goes must not keep the arm here for ever: hence the last
                 until = now() + longest_s
                 monitor.begin()
-            elif (settled := monitor.settled()) is not None:
+            elif not isinstance(settled := monitor.settled(), str):
                 return settled
-        return monitor.why or "the arm did not come to stand"
+        return settled

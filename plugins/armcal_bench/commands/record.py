@@ -6,7 +6,7 @@ import json
 import os
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -25,8 +25,7 @@ from armcal_bench.bench import SECTION, Bench
 from armcal_bench.commands.common import FILE, load, on_bench
 from armcal_bench.journal_folder import Start
 from armcal_bench.recording.keys import Keys, LineKeys, NoKeys, TerminalKeys
-from armcal_bench.recording.messages import Message
-from armcal_bench.recording.recorder import KEYS
+from armcal_bench.recording.recorder import KEYS, Message
 from armcal_bench.recording.recording_log import DATASET
 from armcal_bench.recording.session import RecordingOptions, record
 from armcal_bench.terminal import single_keys
@@ -104,7 +103,12 @@ def _keys(bench: Bench, capture: str) -> Iterator[tuple[Keys, bool]]:
     if not is_taken and not sys.stdin.isatty():
         yield LineKeys(sys.stdin.fileno()), False
         return
-    descriptor = os.dup(sys.stdin.fileno()) if not is_taken else _terminal()
+    descriptor = None
+    if not is_taken:
+        descriptor = os.dup(sys.stdin.fileno())
+    elif sys.stderr.isatty():  # somebody looks at it
+        with suppress(OSError):
+            descriptor = os.open(_TERMINAL, os.O_RDWR | os.O_CLOEXEC)
     if descriptor is None:
         if capture == "keys":
             raise InputError(
@@ -118,13 +122,3 @@ def _keys(bench: Bench, capture: str) -> Iterator[tuple[Keys, bool]]:
             yield TerminalKeys(descriptor, lambda text: click.echo(text, err=True, nl=False)), True
     finally:
         os.close(descriptor)
-
-
-def _terminal() -> int | None:
-    """The terminal that the command was started from, where standard error shows that somebody looks at it."""
-    if not sys.stderr.isatty():
-        return None
-    try:
-        return os.open(_TERMINAL, os.O_RDWR | os.O_CLOEXEC)
-    except OSError:
-        return None

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -55,7 +55,15 @@ def servo(
     """Find which pulse makes which angle of each servo on the bench of CONFIG, and write the servo file."""
     setup = Setup.of(load(console, config, overrides))
     how = "guided" if guided else "automatic"
-    with _conversation(console, may_energise) as talk:
+    with Signals() as signals, console.progress() as show:
+        talk = Conversation(
+            asked_to_stop=lambda: signals.finish,
+            may_energise=warned(console, may_energise),
+            report=lambda joint, done, planned: show(f"measuring {joint}", done / max(planned, 1)),
+            say=partial(say, err=console.json),
+            wishes=lambda: wishes_from(0),
+            waits=waits(console),
+        )
         if check:
             _check(console, setup, talk, "somebody" if guided else "tracker")
         elif not parks and not (release and out is None):
@@ -66,22 +74,6 @@ def servo(
             _evaluate(console, setup, out, keep)
         if parks or release:
             _stoppable(console, lambda: park(setup, talk, "release" if release else "hold"))
-
-
-@contextmanager
-def _conversation(console: Console, may_energise: Question) -> Iterator[Conversation]:
-    def say_line(text: str) -> None:
-        say(text, err=console.json)
-
-    with Signals() as signals, console.progress() as show:
-
-        def on_progress(joint: str, done: int, planned: int) -> None:
-            show(f"measuring {joint}", done / max(planned, 1))
-
-        question = warned(console, may_energise)
-        yield Conversation(
-            lambda: signals.finish, question, on_progress, say_line, lambda: wishes_from(0), waits(console)
-        )
 
 
 def _evaluate(console: Console, setup: Setup, out: Path, keep: bool) -> None:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from armcal.devices.clock import Clock
@@ -14,16 +15,65 @@ from armcal.devices.line_source import refused_lines_text
 from armcal.measure.limits import warn_beyond_limits
 
 from armcal_bench.bench import Bench
-from armcal_bench.recording import messages as messages_of
-from armcal_bench.recording.assessor import Assessment, Assessor
+from armcal_bench.recording.agreement import Assessment, Assessor
 from armcal_bench.recording.labels import Labels
-from armcal_bench.recording.messages import Message
 from armcal_bench.recording.recording_log import Posture, RecordingLog, dataset_of, write_dataset
 from armcal_bench.recording.window import JointKinds, Mean, SampleWindow
 
 Capture = Literal["keys", "still", "rests"]
 """When postures are captured: at a command, when the arm has stood for a while, or at each rest of the stream."""
 KEYS = "c or Enter captures, u takes the last one back, g NAME or a digit names what is touched, s tells more, q ends"
+
+
+@dataclass(frozen=True)
+class Message:
+    """One event of a recording.
+
+    Attributes:
+        kind: ``captured``, ``refused``, ``undone``, ``named``, ``disagrees``, ``agrees_again``, ``known``, ``status``,
+            ``warning``, ``silent``, ``heard``, ``finished``.
+        sentence: for people.
+        content: for programs; JSON.
+    """
+
+    kind: str
+    sentence: str
+    content: Mapping[str, Any] = field(default_factory=dict)
+
+
+def _captured(posture: Posture, assessment: Assessment) -> Message:
+    """A posture is safe, and agrees or has nothing to be compared with."""
+    where = f" in {posture.place}" if posture.place else ""
+    offset, doubt = assessment.newest, assessment.doubts.get(posture.name)
+    content: dict[str, Any] = {"posture": posture.as_dict(), "doubtful": doubt is not None}
+    if offset is not None:
+        content["offset"] = offset.__dict__
+    if doubt is not None:
+        sentence = f"posture {posture.name}{where} is kept, and in doubt."
+    elif assessment.why_not:
+        sentence = f"posture {posture.name}{where} is kept; it could not be judged: {assessment.why_not}"
+    elif offset is None:
+        sentence = f"posture {posture.name}{where} is kept; there is none yet to compare it with."
+    else:
+        sentence = f"posture {posture.name}{where} is kept and agrees: off by {offset}."
+    return Message("captured", sentence, content)
+
+
+def _doubts_changed(before: Assessment, after: Assessment, postures: Sequence[Posture]) -> list[Message]:
+    """Postures that disagree now and did not before, and the other way round."""
+    messages, standing = [], {posture.name: posture for posture in postures}
+    for name, offset in after.doubts.items():
+        if name not in before.doubts:
+            place = standing[name].place
+            text = f"did it sit right in {place}, and is that its name?" if place else "was it held as the others were?"
+            sentence = f"posture {name} disagrees by {offset}: {text}"
+            if name == postures[-1].name:
+                sentence += " u takes it back."
+            messages.append(Message("disagrees", sentence, {"posture": name, "offset": offset.__dict__}))
+    for name in before.doubts:
+        if name in standing and name not in after.doubts and not after.why_not:
+            messages.append(Message("agrees_again", f"posture {name} agrees after all.", {"posture": name}))
+    return messages
 
 
 class Recorder:
@@ -99,7 +149,7 @@ class Recorder:
             if self._fault or self._silence() > self._settings.stale:
                 return [_refused(self._silent())]
             mean = self._window.mean()
-            return [_refused(mean.why_not)] if mean.why_not else self._kept(mean)
+            return [_refused(mean)] if isinstance(mean, str) else self._kept(mean)
         if word == "u":
             return self._undone()
         if word == "s":
@@ -122,7 +172,7 @@ class Recorder:
     def _kept_if_elsewhere(self) -> list[Message]:
         """Capture an arm that has come to rest somewhere else; what hinders that is said once."""
         mean, last = self._window.mean(), self._log.last
-        if mean.why_not:
+        if isinstance(mean, str):
             self._complaint = ""
             return []
         if last is not None and self._apart(mean.angles, last.angles) < self._settings.moved:
@@ -143,8 +193,8 @@ class Recorder:
         self._assessment = self._assessor.with_newest(postures)
         if set(before.doubts) != set(self._assessment.doubts):
             self._write()
-        messages = [messages_of.captured(posture, self._assessment)]
-        messages += messages_of.doubts_changed(before, self._assessment, postures)
+        messages = [_captured(posture, self._assessment)]
+        messages += _doubts_changed(before, self._assessment, postures)
         return messages + self._warnings(posture) + self._known()
 
     def _undone(self) -> list[Message]:
@@ -155,7 +205,7 @@ class Recorder:
         self._assessment = self._assessor.anew(self._log.postures)
         self._write()
         messages = [Message("undone", f"posture {posture.name} is taken back.", {"posture": posture.name})]
-        return messages + messages_of.doubts_changed(before, self._assessment, self._log.postures) + self._known()
+        return messages + _doubts_changed(before, self._assessment, self._log.postures) + self._known()
 
     def _status(self) -> list[Message]:
         postures, doubts = self._log.postures, self._assessment.doubts
@@ -189,7 +239,21 @@ class Recorder:
         return float(np.max([abs(one[channel] - other[channel]) for channel in self.kinds.channels]))
 
     def _known(self) -> list[Message]:
-        return [messages_of.known(self._assessment.known)] if self._assessment.known else []
+        """How much is determined, and what would help."""
+        known = self._assessment.known
+        if known is None:
+            return []
+        sentence = f"{known.rank} of {known.free} free numbers are determined"
+        if known.missing:
+            more = len(known.missing) - 1
+            sentence += f". Missing: {known.missing[0]}" + (f"; and {more} more, which s lists" if more else "")
+        elif known.rank < known.free:
+            sentence += f"; {known.free - known.rank} combinations are missing, which s lists"
+        if known.vary:
+            *others, last = known.vary
+            joints = f"{', '.join(others)} and {last}" if others else last
+            sentence += f". {joints} would add most: vary {'them' if others else 'it'} more"
+        return [Message("known", f"{sentence}.", known.__dict__)]
 
     def _silence(self) -> float:
         return self._clock.now() - self._heard

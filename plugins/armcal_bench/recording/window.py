@@ -6,11 +6,14 @@ import math
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from armcal.arm.assembly import Arm
+from armcal.base.settings import Angle, Duration, Length, Settings
 from armcal.base.units import display_unit, to_unit
 from armcal.devices.joint_stream import JointSample
+from pydantic import Field, model_validator
 
 _FULL_TURN = 2 * math.pi * (1 + 1e-9)
 _LONG_ENOUGH = 0.8
@@ -61,7 +64,7 @@ class JointKinds:
 
 @dataclass(frozen=True)
 class Mean:
-    """The readings of a window, or why they make no posture (a sentence).
+    """The readings of a window.
 
     Attributes:
         angles: means by channel.
@@ -73,7 +76,6 @@ class Mean:
     readings: int
     labels: Mapping[str, str]
     stamp: float | None
-    why_not: str = ""
 
 
 class SampleWindow:
@@ -108,14 +110,14 @@ class SampleWindow:
         """Forget all."""
         self._samples.clear()
 
-    def mean(self) -> Mean:
-        """The posture, or why there is none."""
+    def mean(self) -> Mean | str:
+        """The posture, or why there is none: a sentence."""
         count = len(self._samples)
         if not count:
-            return _none("no joint readings came.")
+            return "no joint readings came."
         lasts = self._samples[-1][0] - self._samples[0][0]
         if count < self._least or lasts < _LONG_ENOUGH * self._length:
-            return _none(
+            return (
                 f"only {count} readings over {lasts:.2f} s are there, expected {self._least} over "
                 f"{self._length:g} s: wait, or let the source send more often."
             )
@@ -127,7 +129,7 @@ class SampleWindow:
             channel = self._kinds.channels[worst]
             unit = display_unit(self._kinds.dimensions[channel]).name
             moved, allowed = (f"{to_unit(amount[worst], unit):.3g} {unit}" for amount in (spreads, self._limits))
-            return _none(
+            return (
                 f"the arm does not stand still: {channel} moved by {moved} within {self._length:g} s "
                 f"(allowed: {allowed})."
             )
@@ -140,5 +142,34 @@ class SampleWindow:
         )
 
 
-def _none(why: str) -> Mean:
-    return Mean({}, 0.0, 0, {}, None, why)
+class RecordingSettings(Settings):
+    """How postures are captured.
+
+    Attributes:
+        window: a posture is the mean of the readings of so long.
+        samples: it has at least so many.
+        spread: no turning joint moves by more within the window; ``sliding_spread``: no sliding one.
+        stale: a stream that is silent for longer does not show where the arm stands now.
+        rest: with ``--capture still``, how long the arm must stand before it is captured by itself.
+        moved: and how far a joint must have gone since the posture before.
+        alike: postures of one group whose joints all differ by less are reported as nearly the same.
+        groups: names that the digits stand for, ``[front/hole_0, front/hole_1]``; an asterisk keeps what was named
+            before. Without any, those that the measurements' settings speak of.
+    """
+
+    window: Duration = 0.5
+    samples: Annotated[int, Field(ge=2)] = 5
+    spread: Angle = math.radians(0.2)
+    sliding_spread: Length = 0.0002
+    stale: Duration = 1.0
+    rest: Duration = 1.0
+    moved: Angle = math.radians(5.0)
+    alike: Angle = math.radians(2.0)
+    groups: tuple[str, ...] = ()
+
+    @model_validator(mode="after")
+    def _above_zero(self) -> RecordingSettings:
+        for name in ("window", "spread", "sliding_spread", "stale", "rest", "moved", "alike"):
+            if getattr(self, name) <= 0:
+                raise ValueError(f"{name} is not above zero")
+        return self

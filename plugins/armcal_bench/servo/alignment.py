@@ -45,15 +45,15 @@ class Alignment:
     base: Array = field(default_factory=lambda: np.eye(3))
     seat: Array | None = None
 
+    @classmethod
+    def of(cls, nominal: NominalArm) -> Alignment:
+        """The model as it is."""
+        return cls(np.zeros(len(_sds(nominal))), np.zeros(len(nominal.compliances)))
 
-def begin(nominal: NominalArm) -> Alignment:
-    """The model as it is."""
-    return Alignment(np.zeros(len(_sds(nominal))), np.zeros(len(nominal.compliances)))
-
-
-def seat_of(alignment: Alignment) -> Array:
-    """``tool_R_body``."""
-    return np.eye(3) if alignment.seat is None else alignment.seat
+    @property
+    def tool_R_body(self) -> Array:  # noqa: N802
+        """The seat, as far as it is known."""
+        return np.eye(3) if self.seat is None else self.seat
 
 
 def shifted(nominal: NominalArm, alignment: Alignment) -> NominalArm:
@@ -100,7 +100,7 @@ def aligned(
         alignment.numbers + step[:count],
         alignment.compliances + changes,
         Rotation.from_rotvec(step[count - 6 : count - 3]).as_matrix() @ alignment.base,
-        seat_of(alignment) @ Rotation.from_rotvec(step[count - 3 : count]).as_matrix(),
+        alignment.tool_R_body @ Rotation.from_rotvec(step[count - 3 : count]).as_matrix(),
     )
     # The rows with everything but the compliances taken out, as few as there are compliances.
     free = np.linalg.qr(others, mode="complete")[0][:, others.shape[1] :].T
@@ -133,7 +133,7 @@ def _rows(alignment: Alignment, joint: str, sweeps: Sweeps, springs: Springs) ->
     """
     tool, by_angles, by_joints, by_springs = springs.about.turns(springs.poses(sweeps.lines, joint))
     seen = sweeps.rotations
-    predicted = alignment.base @ tool @ seat_of(alignment)
+    predicted = alignment.base @ tool @ alignment.tool_R_body
     off = Rotation.from_matrix(seen @ np.swapaxes(predicted, 1, 2)).as_rotvec()
     axes = by_joints[:, :, springs.about.joints.index(joint)] @ alignment.base.T
     across = np.linalg.svd(axes[:, None])[2][:, 1:] / sweeps.sds[:, None, None]

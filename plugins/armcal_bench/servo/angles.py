@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from armcal.base.domains import Array
 
-from armcal_bench.servo.known import Observation
 from armcal_bench.servo.nominal import By, NominalArm
+from armcal_bench.servo.problem import Observation
 from armcal_bench.servo.record import ANGLE, POSE
 from armcal_bench.servo.settings import ServoCalibrationSettings
 from armcal_bench.servo.turning import NoTurnError, Turning, mean_angle, turning_of_positions, turning_of_rotations

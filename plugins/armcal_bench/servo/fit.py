@@ -15,8 +15,7 @@ from armcal.arm.servo import PulseClock
 from armcal.base.domains import Array
 from scipy.optimize import OptimizeResult, least_squares
 
-from armcal_bench.servo.known import KnownServo, Observation
-from armcal_bench.servo.problem import WEAK_PULSE_SD, FitTask, Residuals, Unknowns
+from armcal_bench.servo.problem import WEAK_PULSE_SD, FitTask, KnownServo, Observation, Residuals, Unknowns
 
 _FAR_OFF = 5.0
 _LOSSES: tuple[Literal["linear", "soft_l1"], ...] = ("soft_l1", "linear", "linear")
@@ -99,9 +98,17 @@ def fit_servos(task: FitTask) -> ServoFit:
         scales[joint] = float(np.sqrt(off_servo @ off_servo / free)) if free > 0 else 1.0
     enlarged = {joint: max(1.0, scale) for joint, scale in scales.items()}
     solution = _solved(Residuals(unknowns, kept, enlarged, x), x, "linear", 1e-13)
-    slopes = np.asarray(solution.jac)
-    covariance = np.linalg.pinv(slopes.T @ slopes, hermitian=True)
-    return _servo_fit(unknowns, solution.x, np.sqrt(np.diag(covariance)), kept, scales)
+    x, slopes, at = solution.x, np.asarray(solution.jac), unknowns.place
+    sds = np.sqrt(np.diag(np.linalg.pinv(slopes.T @ slopes, hermitian=True)))
+    off = Residuals(unknowns, kept, {}, x).observed(x)
+    servos = {s.joint: _fitted_servo(unknowns, s, x, sds, kept, scales, off) for s in task.servos if task.of(s.joint)}
+    stated = {name: board.clock.oscillator_hz for name, board in task.boards.items()}
+    oscillators = {name: float(sds[at[name, "clock"]]) * hz for name, hz in stated.items() if (name, "clock") in at}
+    springs = {name: at[name, "compliance"] for name in unknowns.compliances}
+    changes = {name: (float(x[i]), float(sds[i])) for name, i in springs.items()}
+    determined = {name: change for name, change in changes.items() if change[1] < _DETERMINED * task.compliance_sd}
+    clocks = {name: unknowns.clock(x, name) for name in task.boards}
+    return ServoFit(servos, clocks, oscillators, determined, tuple(name for name in changes if name not in determined))
 
 
 def _solved(residuals: Residuals, x: Array, loss: Literal["linear", "soft_l1"], tolerance: float) -> OptimizeResult:
@@ -115,19 +122,6 @@ def _solved(residuals: Residuals, x: Array, loss: Literal["linear", "soft_l1"], 
         ftol=tolerance,
         gtol=tolerance,
     )
-
-
-def _servo_fit(unknowns: Unknowns, x: Array, sds: Array, kept: Sequence[bool], scales: Mapping[str, float]) -> ServoFit:
-    task, at = unknowns.task, unknowns.place
-    off = Residuals(unknowns, kept, {}, x).observed(x)
-    servos = {s.joint: _fitted_servo(unknowns, s, x, sds, kept, scales, off) for s in task.servos if task.of(s.joint)}
-    clocks = {name: unknowns.clock(x, name) for name in task.boards}
-    stated = {name: board.clock.oscillator_hz for name, board in task.boards.items()}
-    oscillators = {name: float(sds[at[name, "clock"]]) * hz for name, hz in stated.items() if (name, "clock") in at}
-    springs = {name: at[name, "compliance"] for name in unknowns.compliances}
-    changes = {name: (float(x[i]), float(sds[i])) for name, i in springs.items()}
-    determined = {name: change for name, change in changes.items() if change[1] < _DETERMINED * task.compliance_sd}
-    return ServoFit(servos, clocks, oscillators, determined, tuple(name for name in changes if name not in determined))
 
 
 def _fitted_servo(

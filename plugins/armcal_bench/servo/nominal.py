@@ -21,7 +21,7 @@ from armcal.problem.kernel import AS_IT_STANDS, Interpreter, Kernel
 from scipy.spatial.transform import Rotation
 from typing_extensions import override
 
-from armcal_bench.servo.turning import twist_angles
+from armcal_bench.servo.turning import turn_of_point, twist_angles
 
 By = Literal["rotation", "position"]
 """What shows a turn about an axis."""
@@ -140,8 +140,7 @@ class NominalArm:
         """The same by where the tool is (3, m)."""
         at_zero = {**pose, joint: 0.0}
         axis, origin = self.axis(joint, at_zero)
-        seen, model = (_across(p - origin, axis) for p in (position, self.tool(at_zero)[:3, 3]))
-        return float(np.arctan2(axis @ np.cross(model, seen), model @ seen))
+        return turn_of_point(self.tool(at_zero)[:3, 3] - origin, position - origin, axis)
 
     def tools(self, poses: Sequence[Pose], springs: Literal["giving", "stiff"] = "giving") -> Array:
         """``base_T_tool`` (N x 4 x 4) in elastic equilibrium, or with springs that do not give.
@@ -248,11 +247,7 @@ class NominalArm:
         return ca.Function("rigid", [commands], [ca.densify(x) for x in out], {"cse": True})
 
 
-def _across(vector: Array, axis: Array) -> Array:
-    return np.asarray(vector - (vector @ axis) * axis)
-
-
 def _lever(vector: Array, axis: Array) -> Array:
     """By which a shift of a point at ``vector`` from the axis becomes a turn about the axis (3, rad/m)."""
-    arm = _across(vector, axis)
+    arm = vector - (vector @ axis) * axis
     return np.asarray(np.cross(axis, arm) / max(float(arm @ arm), 1e-12))

@@ -10,12 +10,11 @@ from typing import Literal
 import numpy as np
 from armcal.arm.servo import PulseTable
 
-from armcal_bench.servo.alignment import Alignment, aligned, begin, seat_of, shifted
+from armcal_bench.servo.alignment import Alignment, aligned, shifted
 from armcal_bench.servo.angles import Entry, Springs, Sweeps, observations_of, sweeps_of
 from armcal_bench.servo.fit import FittedServo, ServoFit, fit_servos
-from armcal_bench.servo.known import KnownBoard, KnownServo, Zero, piecewise
 from armcal_bench.servo.nominal import NominalArm
-from armcal_bench.servo.problem import FitTask
+from armcal_bench.servo.problem import FitTask, KnownBoard, KnownServo, Zero, piecewise
 from armcal_bench.servo.settings import ServoCalibrationSettings
 from armcal_bench.servo.trial import permuted
 
@@ -80,7 +79,7 @@ def _fitted(
     seen = tuple(servo for servo in servos if servo.joint in sweeps)
     zero: Zero = "kept" if settings.zero == "kept" and all(s.by is not None for s in sweeps.values()) else "measured"
     task = FitTask(seen, dict(boards), settings.knots, (), zero, settings.sag_sd)
-    now = _Round(sweeps, task, fit_servos(task), begin(nominal), {})
+    now = _Round(sweeps, task, fit_servos(task), Alignment.of(nominal), {})
     has_springs = settings.sag != "none" and bool(nominal.compliances)
     for _ in range(_ROUNDS if has_springs else 1):
         before = now
@@ -129,7 +128,7 @@ def _better(
         sd = settings.sag_sd if settings.sag == "fitted" else 0.0
         alignment, rows = aligned(alignment, nominal, now.sweeps, stood, sd)
         about = shifted(nominal, alignment)
-        springs = {joint: Springs(about, bent.angles, seat_of(alignment)) for joint, bent in stood.items()}
+        springs = {joint: Springs(about, bent.angles, alignment.tool_R_body) for joint, bent in stood.items()}
     sweeps = {**now.sweeps, **_swept(entries, task.servos, nominal, settings, springs)[0]}
     observations = [
         observation

@@ -6,15 +6,21 @@ Lines are checked when they are read: one that was damaged must not become a tab
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from armcal.arm.servo import COUNTS, PulseClock, PulseTable
+from armcal.devices.device import DeviceIdentity
 from armcal.errors import DataError, InputError, Location
 from armcal.io.journal.files import REAL_FILES, opened
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
+
+from armcal_bench.servo.problem import KnownBoard, KnownServo
+from armcal_bench.servo.setup import Setup
 
 NAME = "observations.jsonl"
 BEGUN, POSE, ANGLE, LEFT_OUT = "begun", "pose", "angle", "left_out"
@@ -25,6 +31,7 @@ _ROTATION_OFF = 1e-6
 
 Counts = Annotated[int, Field(gt=0, lt=COUNTS)]
 Row = tuple[float, float, float]
+_SAME = 1e-6
 
 
 class _Line(BaseModel):
@@ -197,3 +204,91 @@ def _unwritable(path: Path, fault: OSError) -> InputError:
     return InputError(
         f"it cannot be written ({fault.strerror}).", where=Location(str(path)), hint="Give --out a writable folder."
     )
+
+
+def begin(setup: Setup, record: Record, device: DeviceIdentity | None, say: Callable[[str], None]) -> None:
+    """The first line of a record: by which tables and in which base pose it is measured.
+
+    It is written when nothing is left that could refuse the run. One that stands there without a measurement after it
+    is of a run that measured nothing, and must not be taken for this run's.
+    """
+    if record.is_measured:
+        return
+    servos = {joint: _as_stated(setup, joint) for joint in setup.base}
+    board = {} if device is None else {"device": device.name, "adapter": device.adapter}
+    content = {"servos": servos, **board, "base": dict(setup.base)}
+    begun = record.of_kind(BEGUN)
+    if begun and {**begun[0], **content} == begun[0]:
+        return
+    if begun:
+        kept = record.set_aside()
+        say(
+            f"{record.path}: it was begun with another base pose, servo file or board, and holds no measurement; it is "
+            f"kept as {kept.name}, and this run begins anew."
+        )
+    record.append(BEGUN, content)
+
+
+def check_same(setup: Setup, record: Record, device: DeviceIdentity) -> None:
+    """A record that holds measurements goes on only with the board, the wiring and the base pose that it began with.
+
+    Raises:
+        InputError: it would be another one.
+    """
+    begun = record.of_kind(BEGUN)[0]
+    where = Location(str(record.path))
+    adapter = str(begun.get("adapter", ""))
+    if adapter and device.adapter and adapter != device.adapter:
+        raise InputError(
+            f"it was begun with the adapter {adapter!r}, found {device.adapter!r}.",
+            where=where,
+            hint="Connect the one that it was begun with, or give a new --out.",
+        )
+    moved = [joint for joint, angle in setup.base.items() if abs(begun["base"].get(joint, angle) - angle) > _SAME]
+    if moved:
+        raise InputError(
+            f"it was begun with another base pose: {moved[0]} stood at {_deg(begun['base'][moved[0]])}, not at "
+            f"{_deg(setup.base[moved[0]])}.",
+            where=where,
+            hint="Give the base pose that it was begun with, or a new --out.",
+        )
+    for joint in setup.base:
+        stated, before = _as_stated(setup, joint), begun["servos"].get(joint, {})
+        if any(stated[key] != before.get(key) for key in ("board", "channel", "oscillator_hz", "prescale")):
+            raise InputError(
+                f"it was begun with another board, channel or oscillator of {joint}.",
+                where=where,
+                hint="Give a new --out.",
+            )
+
+
+def _deg(angle: float) -> str:
+    return f"{math.degrees(angle):.1f} deg"
+
+
+def _as_stated(setup: Setup, joint: str) -> dict[str, Any]:
+    servo = setup.file.servos[joint]
+    clock = setup.file.boards[servo.board].clock
+    return {
+        "board": str(servo.board),
+        "channel": servo.channel,
+        "oscillator_hz": clock.oscillator_hz,
+        "prescale": clock.prescale,
+        "angles": list(servo.angles),
+        "pulses": list(servo.pulses),
+    }
+
+
+def stated_by(setup: Setup, begun: Any, joints: tuple[str, ...]) -> tuple[list[KnownServo], dict[str, KnownBoard]]:
+    """Servos and boards as they were when the record was begun."""
+    servos, boards = [], setup.boards()
+    for joint in joints:
+        stated = begun["servos"].get(joint)
+        if stated is None:
+            servos.append(setup.known(joint))
+            continue
+        table = PulseTable(tuple(stated["angles"]), tuple(stated["pulses"]))
+        servos.append(replace(setup.known(joint), table=table))
+        clock = PulseClock(stated["oscillator_hz"], stated["prescale"])
+        boards[stated["board"]] = KnownBoard(clock, boards[stated["board"]].measured)
+    return servos, boards

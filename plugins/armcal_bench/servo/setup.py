@@ -22,8 +22,8 @@ from armcal_bench.acquisition.path_planner import PathPlanner
 from armcal_bench.acquisition.preparation import clearance_of, heat_of, run_limits
 from armcal_bench.bench import SECTION, Bench
 from armcal_bench.hazards import HazardJudge
-from armcal_bench.servo.known import KnownBoard, KnownServo, MeasuredPulse
 from armcal_bench.servo.nominal import NominalArm
+from armcal_bench.servo.problem import KnownBoard, KnownServo, MeasuredPulse
 from armcal_bench.servo.settings import ServoCalibrationSettings
 from armcal_bench.wiring import servo_file_of
 

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from armcal_bench.servo.nominal import NominalArm
 from armcal_bench.servo.record import BEGUN, POSE
-from armcal_bench.servo.turning import twist_angles
+from armcal_bench.servo.turning import turn_of_point, twist_angles
 from armcal_bench.settling import pose_of
 
 _LEVER_M = 0.1
@@ -227,8 +227,7 @@ def _explained(move: Move, axis: Array, origin: Array) -> tuple[float, float]:
     """The turn about an axis (rad) that is nearest to what was seen, and how far from it that is (m)."""
     p, q = move.before[:3, 3] - origin, move.after[:3, 3] - origin
     if not move.has_rotations:
-        flat_p, flat_q = p - (p @ axis) * axis, q - (q @ axis) * axis
-        turned = math.atan2(float(axis @ np.cross(flat_p, flat_q)), float(flat_p @ flat_q))
+        turned = turn_of_point(p, q, axis)
         return turned, float(np.linalg.norm(Rotation.from_rotvec(turned * axis).apply(p) - q))
     seen = Rotation.from_matrix((move.after[:3, :3] @ move.before[:3, :3].T)[None])
     turned = float(twist_angles(seen, axis)[0])

@@ -115,6 +115,12 @@ def twist_angles(rotations: Rotation, axis: Array) -> Array:
     return np.asarray((angles + math.pi) % (2 * math.pi) - math.pi)
 
 
+def turn_of_point(before: Array, after: Array, axis: Array) -> float:
+    """The turn (rad) about an axis (unit) through the origin that brings a point nearest to where it is after."""
+    flat, turned = (point - (point @ axis) * axis for point in (before, after))
+    return math.atan2(float(axis @ np.cross(flat, turned)), float(flat @ turned))
+
+
 def mean_angle(angles: Array) -> float:
     """Of angles that may differ by whole turns (rad)."""
     return float(np.angle(np.mean(np.exp(1j * angles))))
