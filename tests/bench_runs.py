@@ -21,10 +21,9 @@ from armcal.devices.simulated import CLOCK, BenchRequest
 from armcal.errors import ArmcalError, InputError
 from armcal.io.journal.journal import Journal
 from armcal.run.experiment import Experiment
-from armcal_bench.acquisition.outputs import dataset_of
 from armcal_bench.acquisition.preparation import Prepared, prepare
 from armcal_bench.acquisition.rehearsal import overrides_for
-from armcal_bench.acquisition.run_log import Progress, progress_of
+from armcal_bench.acquisition.run_log import Progress, dataset_of, progress_of
 from armcal_bench.acquisition.session import Outcome, RunOptions, acquire
 from armcal_bench.bench import Bench
 

@@ -24,6 +24,6 @@ def armcal_register_commands(register: Register) -> None:
     )
     register(
         "simulated-bench",
-        "armcal_bench.commands.simulated_bench:simulated_bench",
+        "armcal_bench.commands.rehearse:simulated_bench_command",
         "Stand in for a servo board, arm and tracker.",
     )

@@ -20,9 +20,8 @@ from armcal.errors import InputError, Location
 from armcal_bench.acquisition import run_log as entry
 from armcal_bench.acquisition.acquisition_run import AcquisitionRun, Ending
 from armcal_bench.acquisition.drive import Drive
-from armcal_bench.acquisition.outputs import OURS, in_order, measured_by, write_outputs
 from armcal_bench.acquisition.preparation import Prepared
-from armcal_bench.acquisition.run_log import Progress, RunLog
+from armcal_bench.acquisition.run_log import OURS, Progress, RunLog, in_order, measured_by, write_outputs
 from armcal_bench.acquisition.tracker_monitor import MotionGate, TrackerMonitor
 from armcal_bench.hazards import FirstMotion
 from armcal_bench.journal_folder import Start, opened_journal

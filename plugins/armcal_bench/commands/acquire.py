@@ -11,9 +11,8 @@ from armcal.cli.common import Console
 from armcal.errors import EXIT_DONE, EXIT_INCOMPLETE, EXIT_STOPPED, InputError
 from armcal.io.signals import Signals
 
-from armcal_bench.acquisition.outputs import DATASET
 from armcal_bench.acquisition.preparation import Prepared, prepare
-from armcal_bench.acquisition.run_log import Progress
+from armcal_bench.acquisition.run_log import DATASET, Progress
 from armcal_bench.acquisition.schedule import LeaveOut, Rest, ScheduleForecast, forecast_schedule
 from armcal_bench.acquisition.session import Outcome, RunOptions, acquire
 from armcal_bench.commands.common import (

@@ -1,4 +1,4 @@
-"""``armcal rehearse``."""
+"""``armcal rehearse``, and ``armcal simulated-bench``, against which it is done."""
 
 from __future__ import annotations
 
@@ -9,13 +9,21 @@ from typing import Any
 
 import click
 from armcal.cli.common import Console
+from armcal.devices.simulated import BOARD, CLOCK, BenchRequest
 from armcal.errors import EXIT_DONE, EXIT_INCOMPLETE
 from armcal.io.folder import check_folder
 from armcal.run.experiment import Experiment
 
-from armcal_bench.acquisition.outputs import BENCH, OURS
 from armcal_bench.acquisition.preparation import prepare
-from armcal_bench.acquisition.rehearsal import overrides_for, port_instead_of_adapter, simulated_bench, truth
+from armcal_bench.acquisition.rehearsal import (
+    make_bench_folder,
+    overrides_for,
+    port_instead_of_adapter,
+    simulated_bench,
+    truth,
+)
+from armcal_bench.acquisition.run_log import BENCH, OURS
+from armcal_bench.bench import Bench
 from armcal_bench.commands.acquire import driven, exit_code_of, schedule_forecast, show_forecast, show_outcome
 from armcal_bench.commands.common import FILE, always, load, on_bench, plan_option
 
@@ -76,3 +84,19 @@ def _amount(kind: str, entry: dict[str, Any]) -> str:
     """The joint, and how much it was, with its unit."""
     factor, unit = _UNITS.get(kind, (1.0, ""))
     return f"{entry['joint'] or 'the arm'} {factor * entry['value']:.1f} {unit}".rstrip()
+
+
+@click.command(name="simulated-bench")
+@click.option("--dir", "folder", required=True, type=FILE, help="Where its port and clock are.")
+@on_bench
+def simulated_bench_command(console: Console, config: Path, folder: Path, overrides: tuple[str, ...]) -> None:
+    """Stand in for the bench of CONFIG: a servo board at DIR/board, a clock at DIR/clock, a tracker.
+
+    It serves until SIGTERM or Ctrl-C. Its time passes only while a client lets it pass.
+    """
+    experiment = load(console, config, overrides)
+    bench = Bench.of(experiment).simulator()
+    make_bench_folder(folder)
+    console.result({"board": str(folder / BOARD), "clock": str(folder / CLOCK)})
+    console.out.print(f"simulated bench: {folder / BOARD}, {folder / CLOCK}", markup=False, soft_wrap=True)
+    bench.serve(BenchRequest(experiment, folder))
