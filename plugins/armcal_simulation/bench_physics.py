@@ -53,12 +53,7 @@ class BenchPhysics:
     """
 
     def __init__(
-        self,
-        servos: Mapping[str, ServoModel],
-        torques: Torques,
-        pose: ElasticPose,
-        frame_s: float,
-        seen: Seen,
+        self, servos: Mapping[str, ServoModel], torques: Torques, pose: ElasticPose, frame_s: float, seen: Seen
     ) -> None:
         self.servos = dict(servos)
         self.heat = {joint: ServoHeat(servo.settings) for joint, servo in servos.items()}

@@ -54,12 +54,7 @@ class Stands:
 
     @classmethod
     def drawn(
-        cls,
-        days: float,
-        tilt: TiltSettings,
-        hours: tuple[float, float],
-        gravity: Array,
-        random: np.random.Generator,
+        cls, days: float, tilt: TiltSettings, hours: tuple[float, float], gravity: Array, random: np.random.Generator
     ) -> Stands:
         """Tilts about random level axes, uniform up to the most; a new one after each drive in working hours."""
         drives = random.poisson(tilt.drives_per_day * days) if tilt.drives_per_day else 0

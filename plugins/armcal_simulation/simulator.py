@@ -18,14 +18,7 @@ from armcal.estimate.simulation import SimulationRequest, measured_without_noise
 from armcal.testing import EXAMPLE_TRUTH
 from pydantic import Field
 
-from armcal_simulation.readings import (
-    OutlierSettings,
-    approach_of,
-    at_truth,
-    disturbed,
-    is_orientation,
-    with_outliers,
-)
+from armcal_simulation.readings import OutlierSettings, approach_of, at_truth, disturbed, is_orientation, with_outliers
 
 
 class PoseSettings(Settings):
@@ -63,8 +56,7 @@ class PoseSettings(Settings):
         total = int(np.prod(shape))
         if self.count > total:
             raise ConfigError(
-                f"simulation.poses.count: found {self.count}, the grid has {total} poses.",
-                hint="Give more levels.",
+                f"simulation.poses.count: found {self.count}, the grid has {total} poses.", hint="Give more levels."
             )
         indices = np.unravel_index(np.sort(random.choice(total, self.count, replace=False)), shape)
         return np.array([level[index] for level, index in zip(levels, indices, strict=True)])

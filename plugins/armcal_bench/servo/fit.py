@@ -113,14 +113,7 @@ def fit_servos(task: FitTask) -> ServoFit:
 
 def _solved(residuals: Residuals, x: Array, loss: Literal["linear", "soft_l1"], tolerance: float) -> OptimizeResult:
     return least_squares(
-        residuals,
-        x,
-        jac=residuals.jacobian,
-        x_scale="jac",
-        loss=loss,
-        xtol=tolerance,
-        ftol=tolerance,
-        gtol=tolerance,
+        residuals, x, jac=residuals.jacobian, x_scale="jac", loss=loss, xtol=tolerance, ftol=tolerance, gtol=tolerance
     )
 
 

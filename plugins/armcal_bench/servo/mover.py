@@ -40,11 +40,7 @@ class Mover(Motion):
     device: ServoDevice
 
     def __init__(
-        self,
-        setup: Setup,
-        device: ServoDevice,
-        servos: Mapping[str, tuple[PulseTable, PulseClock]],
-        gate: MotionGate,
+        self, setup: Setup, device: ServoDevice, servos: Mapping[str, tuple[PulseTable, PulseClock]], gate: MotionGate
     ) -> None:
         thermal_state = ThermalState(setup.heat, tuple(setup.bench.arm.commanded), setup.base, gate.clock)
         super().__init__(device, gate.clock, tuple(setup.base), setup.settings.period, thermal_state)
