@@ -348,7 +348,7 @@ class TestBoard:
         made = run.acquisition()
         made._drive._planner.find = lambda start, goal: None  # type: ignore[method-assign]
         made._drive.take_over({"q1": 0.4, "q2": 0.2})
-        made._drive.guard_here()
+        made._drive._guard(made._drive.at)
         assert run.device.guards[-1] == [{"q1": 0.4, "q2": 0.2}]
 
     @pytest.mark.slow

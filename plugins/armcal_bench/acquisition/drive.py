@@ -25,7 +25,6 @@ _ALIVE_EVERY_S = 0.1
 _NOTED_EVERY_S = 1.0
 _HEATED_EVERY_S = 0.25
 _RELEASED_EVERY_S = 0.25
-_STILL_RAD = 1e-9
 _SAME_RAD = 1e-9
 _MOST_WAYPOINTS = 6
 """So many are given to a board whose memory the whole path does not fit."""
@@ -148,7 +147,7 @@ class Drive(Motion):
                 self.device.energise(joint, angle)
                 self.approach[i] = 0.0  # it may have jumped from either side
                 self.stand(self.settings.between_joints, unguarded)
-        self.guard_here()
+        self._guard(self.at)
 
     def standing(self) -> dict[str, float]:
         """The angles that its pulses ask for (rad), read back.
@@ -178,7 +177,7 @@ class Drive(Motion):
             difference, gone, before = goal - start, 0.0, self.clock.now()
             length = float(np.max(np.abs(difference)))
             commanded = self.device.standing(self.angles)
-            self.approach = np.where(np.abs(difference) > _STILL_RAD, np.sign(difference), self.approach)
+            self.approach = np.where(np.abs(difference) > _SAME_RAD, np.sign(difference), self.approach)
             while gone < length:
                 moves = self.tick(may_move)
                 now = self.clock.now()
@@ -194,10 +193,6 @@ class Drive(Motion):
                     self.device.command(standing)
                     commanded = standing
         self._guard(path[-1])
-
-    def guard_here(self) -> None:
-        """Should the host fall silent from now on: home from where the arm stands; see ``go``."""
-        self._guard(self.at)
 
     def preload_backlash(self, may_move: MayMove) -> None:
         """Give joints a direction of approach that have none since they were energised: a little away, and back.

@@ -14,7 +14,7 @@ import numpy as np
 from armcal.base.config_text import plain
 from armcal.calibration.calibration_file import identity_of
 from armcal.devices.clock import Clock
-from armcal.devices.device import DeviceIdentity, JointDevice
+from armcal.devices.device import DeviceIdentity
 from armcal.errors import InputError, Location
 
 from armcal_bench.acquisition import run_log as entry
@@ -82,9 +82,9 @@ def acquire(prepared: Prepared, plan: Path, options: RunOptions) -> Outcome:
         if identity is not None and is_done and progress.ended in ("done", "parked"):  # nothing needs to be there
             ending = Ending("done", "it was done before")
         else:
-            with _opened(prepared, options, clock, log) as (device, monitor, identity):
+            with _opened(prepared, options, clock, log) as (gate, identity):
                 log.record(entry.STARTED, {"at": clock.wall(), "device": identity.digest, "name": identity.name})
-                run = _prepared_run(prepared, options, clock, log, (device, monitor, identity))
+                run = _prepared_run(prepared, options, log, gate, identity)
                 ending, progress = run.run(), run.progress
         summary = {
             "how": ending.how,
@@ -115,8 +115,8 @@ def _header(prepared: Prepared, plan: Path) -> dict[str, Any]:
 @contextmanager
 def _opened(
     prepared: Prepared, options: RunOptions, clock: Clock, log: RunLog
-) -> Iterator[tuple[JointDevice, TrackerMonitor, DeviceIdentity]]:
-    """Device and tracker, both alive; nothing moves."""
+) -> Iterator[tuple[MotionGate, DeviceIdentity]]:
+    """With device and tracker, both alive; nothing moves."""
     device, monitor = prepared.device, TrackerMonitor(prepared.bench, clock)
 
     def pause() -> None:
@@ -135,18 +135,14 @@ def _opened(
         monitor.open()
         hint = "Start it, check its address and the names of its bodies, and let it see them."
         monitor.await_first_frame(pause, hint)
-        yield device, monitor, identity
+        yield MotionGate(monitor, clock, prepared.settings.lost, options.asked_to_end, options.waits), identity
     finally:
         monitor.close()
         device.close()
 
 
 def _prepared_run(
-    prepared: Prepared,
-    options: RunOptions,
-    clock: Clock,
-    log: RunLog,
-    opened: tuple[JointDevice, TrackerMonitor, DeviceIdentity],
+    prepared: Prepared, options: RunOptions, log: RunLog, gate: MotionGate, identity: DeviceIdentity
 ) -> AcquisitionRun:
     """A run that may energise the arm.
 
@@ -154,7 +150,7 @@ def _prepared_run(
         InputError: it may not.
     """
     settings, scheduler, progress = prepared.settings, prepared.scheduler, log.progress
-    device, monitor, identity = opened
+    device, clock = prepared.device, gate.clock
     drive = Drive(device, clock, scheduler.planner, settings, (scheduler.model, scheduler.torques), log)
     scheduler.planner.meanwhile = drive.keep_alive  # the board would take a host that plans for one that died
     if progress.thermal_state:  # the warmth that an earlier part of the run has left
@@ -166,6 +162,5 @@ def _prepared_run(
     before = options.asked_to_end()
     if not options.may_energise(start) or (options.asked_to_end() and not before):
         raise InputError("the arm may not be moved; nothing was moved.", hint="Say yes, or give --yes.")
-    gate = MotionGate(monitor, clock, settings.lost, options.asked_to_end, options.waits)
     progress = replace(progress, ended="")
     return AcquisitionRun(drive, identity, scheduler, gate, log, progress, options.on_progress, prepared.arrival)
