@@ -9,9 +9,7 @@ SYSEX, END, VERSION = 0xF0, 0xF7, 0xF9
 STRING, I2C_REQUEST, I2C_REPLY, I2C_CONFIG, FIRMWARE = 0x71, 0x76, 0x77, 0x78, 0x79
 WRITE, READ_ONCE = 0x00, 0x08
 
-MAX_SYSEX = 1024
-"""Bytes between the first and the last; boards send far fewer."""
-
+# up to 1024 bytes between the first and the last of a sysex: boards send far fewer
 _MESSAGE = re.compile(rb"\xf0([\x00-\x7f]{1,1024})\xf7|\xf9([\x00-\x7f]{2})|[\x80-\xef][\x00-\x7f]{2}", re.DOTALL)
 _UNFINISHED = re.compile(rb"(?:\xf0[\x00-\x7f]{0,1024}|[\x80-\xef\xf9][\x00-\x7f]?)\Z", re.DOTALL)
 
