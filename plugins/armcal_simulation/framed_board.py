@@ -74,15 +74,6 @@ class FramedBoard:
     ) -> None:
         self.boots = boots
         self._clock, self._bus, self._send, self._identity = clock, bus, send, identity
-        self._handlers = {
-            Kind.HELLO: self._hello,
-            Kind.TAKE: self._take_over,
-            Kind.WRITE: self._write,
-            Kind.READ: self._read,
-            Kind.SET: self._set,
-            Kind.BEAT: self._beat,
-            Kind.GUARD: self._guard,
-        }
         self._forget()
 
     def boot(self) -> None:
@@ -121,9 +112,7 @@ class FramedBoard:
         self._last = frame.sequence
         kind = int(Kind.REFUSED)
         try:
-            if frame.kind not in self._handlers:
-                raise _RefusedError(Code.UNKNOWN_TYPE)
-            content = self._handlers[Kind(frame.kind)](frame.payload)
+            content = self._done(frame.kind, frame.payload)
             kind = frame.kind | Kind.REPLY
         except _RefusedError as refused:
             content = Refusal(frame.kind, refused.code, refused.detail).pack()
@@ -137,49 +126,47 @@ class FramedBoard:
         self._reply = encoded(Frame(kind, frame.sequence, packed_head(Head(self.boots, flags)) + content))
         self._send(self._reply)
 
-    def _hello(self, payload: bytes) -> bytes:
-        Hello.read(payload)
-        who = self._identity
-        return HelloReply(VERSION, who.oscillator_hz, who.board_id, who.firmware).pack()
+    def _done(self, kind: int, payload: bytes) -> bytes:
+        """What a reply holds, after what was asked for is done.
 
-    def _take_over(self, payload: bytes) -> bytes:
-        if Take.read(payload).boots != self.boots:
-            raise _RefusedError(Code.WRONG_BOOTS)
-        self.guard.take()
-        return b""
-
-    def _write(self, payload: bytes) -> bytes:
-        request = Write.read(payload)
-        self._require_host()
-        self._transaction(request.address, request.data)
-        return b""
-
-    def _read(self, payload: bytes) -> bytes:
-        request = Read.read(payload)
-        if request.count > MAX_PAYLOAD - _HEAD_SIZE:
-            raise ValueError("more than a reply holds")
-        data = self._bus.read(request.address, request.register, request.count)
-        if data is None:
-            raise _RefusedError(Code.NO_ADDRESS)
-        return data
-
-    def _set(self, payload: bytes) -> bytes:
-        targets = Set.read(payload).targets
-        if any(target.channel > 15 for target in targets):
-            raise ValueError("no such channel")
-        self._require_host()
-        for index, target in enumerate(targets):
-            register = LED0 + 4 * target.channel
-            self._transaction(target.address, struct.pack("<BHH", register, target.on, target.off), index)
-        return b""
-
-    def _beat(self, payload: bytes) -> bytes:
-        if payload:
-            raise ValueError("found a payload in a beat, expected none")
-        return b""
-
-    def _guard(self, payload: bytes) -> bytes:
-        self.guard.set(Guard.read(payload))
+        Raises:
+            _RefusedError, ValueError, BusStuckError: it cannot be done.
+        """
+        match kind:
+            case Kind.HELLO:
+                Hello.read(payload)
+                who = self._identity
+                return HelloReply(VERSION, who.oscillator_hz, who.board_id, who.firmware).pack()
+            case Kind.TAKE:
+                if Take.read(payload).boots != self.boots:
+                    raise _RefusedError(Code.WRONG_BOOTS)
+                self.guard.take()
+            case Kind.WRITE:
+                write = Write.read(payload)
+                self._require_host()
+                self._transaction(write.address, write.data)
+            case Kind.READ:
+                read = Read.read(payload)
+                if read.count > MAX_PAYLOAD - _HEAD_SIZE:
+                    raise ValueError("more than a reply holds")
+                if (data := self._bus.read(read.address, read.register, read.count)) is None:
+                    raise _RefusedError(Code.NO_ADDRESS)
+                return data
+            case Kind.SET:
+                targets = Set.read(payload).targets
+                if any(target.channel > 15 for target in targets):
+                    raise ValueError("no such channel")
+                self._require_host()
+                for index, target in enumerate(targets):
+                    written = struct.pack("<BHH", LED0 + 4 * target.channel, target.on, target.off)
+                    self._transaction(target.address, written, index)
+            case Kind.BEAT:
+                if payload:
+                    raise ValueError("found a payload in a beat, expected none")
+            case Kind.GUARD:
+                self.guard.set(Guard.read(payload))
+            case _:
+                raise _RefusedError(Code.UNKNOWN_TYPE)
         return b""
 
     def _require_host(self) -> None:

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -48,7 +47,8 @@ class Guided:
             DeviceError: the device fails.
         """
         targets = self.targets()
-        done = {key_of(entry) for entry in self.record.entries if "target" in entry}
+        lines = [entry for entry in self.record.entries if "target" in entry]
+        done = {Target(line["joint"], line["target"], line["came"]).key for line in lines}
         place = next((i for i, target in enumerate(targets) if target.key not in done), len(targets))
         if place == len(targets):
             return
@@ -138,8 +138,3 @@ def next_wish(wishes: Wishes, mover: Mover) -> str:
         if wish is not None:
             return wish
         mover.device.keep_alive()
-
-
-def key_of(entry: Mapping[str, Any]) -> tuple[str, int, int]:
-    """Which target a line of the record is about."""
-    return Target(str(entry["joint"]), float(entry["target"]), int(entry["came"])).key
