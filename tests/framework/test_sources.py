@@ -9,6 +9,7 @@ import random
 import socket
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -46,6 +47,31 @@ def everything(source: Source, patience_s: float = 0.3) -> list[Incoming]:
 
 def ids(found: list[Incoming]) -> list[str]:
     return [incoming.record_id for incoming in found]
+
+
+class SimulatedTime:
+    """Time that passes where it is slept through, and nowhere else."""
+
+    def __init__(self) -> None:
+        self.began, self.slept = time.time(), 0.0
+
+    def monotonic(self) -> float:
+        return self.slept
+
+    def time(self) -> float:
+        return self.began + self.slept
+
+    def sleep(self, seconds: float) -> None:
+        self.slept += seconds
+
+
+@pytest.fixture
+def simulated(monkeypatch: pytest.MonkeyPatch) -> SimulatedTime:
+    """What sources wait by."""
+    passes = SimulatedTime()
+    for module in ("csv_file", "folder", "source"):
+        monkeypatch.setattr(f"armcal_online.sources.{module}.time", passes)
+    return passes
 
 
 def table(count: int, first: int = 1) -> str:
@@ -179,10 +205,10 @@ def test_bytes_at_random_never_raise(tmp_path: Path) -> None:
                 json.dumps(found.as_dict(), allow_nan=False).encode()
 
 
-def test_a_growing_file_is_followed_and_half_a_line_waited_for(tmp_path: Path) -> None:
+def test_a_growing_file_is_followed_and_half_a_line_waited_for(tmp_path: Path, simulated: SimulatedTime) -> None:
     path = tmp_path / "poses.csv"
     path.write_text(HEADER[:10])
-    source = CsvFile(path, rows(), "wait")
+    source = CsvFile(path, rows(), "wait", simulated.time)
     assert everything(source, 0.06) == []
     with path.open("a") as file:
         file.write(f"{HEADER[10:]}\n{row(1)}\n{row(2)[:-1]}")
@@ -194,10 +220,12 @@ def test_a_growing_file_is_followed_and_half_a_line_waited_for(tmp_path: Path) -
     assert second.record_id == "p2" and second.channels["tracker.z"] == 0.03 and not source.ended
 
 
-def test_a_file_that_takes_the_place_of_another_is_read_from_its_beginning(tmp_path: Path) -> None:
+def test_a_file_that_takes_the_place_of_another_is_read_from_its_beginning(
+    tmp_path: Path, simulated: SimulatedTime
+) -> None:
     path = tmp_path / "poses.csv"
     path.write_text(table(5))
-    source = CsvFile(path, rows(), "wait")
+    source = CsvFile(path, rows(), "wait", simulated.time)
     first = everything(source, 0.06)
     (tmp_path / "new").write_text(table(3, first=10))
     os.replace(tmp_path / "new", path)
@@ -206,7 +234,7 @@ def test_a_file_that_takes_the_place_of_another_is_read_from_its_beginning(tmp_p
     third = everything(source, 0.12)
     assert ids(first + second + third) == ["p1", "p2", "p3", "p4", "p5", "p10", "p11", "p12", "p20", "p21"]
     assert len({r.source_key for r in first + second + third}) == 3
-    again = CsvFile(path, rows(), "wait")
+    again = CsvFile(path, rows(), "wait", simulated.time)
     again.resume({first[0].source_key: 6})  # of another file of that name
     assert ids(everything(again, 0.06)) == ["p20", "p21"]
 
@@ -240,18 +268,20 @@ def test_a_file_that_cannot_be_used_is_refused_at_once(tmp_path: Path) -> None:
     assert isinstance(open_source(str(tmp_path), rows()), Folder)
 
 
-def folder(path: Path) -> Folder:
-    return Folder(path, rows(), settled_s=0.15)
+def folder(path: Path, clock: Callable[[], float] = time.time) -> Folder:
+    return Folder(path, rows(), clock, settled_s=0.15)
 
 
-def test_files_of_a_folder_come_in_the_order_of_their_names_and_new_ones_at_any_time(tmp_path: Path) -> None:
+def test_files_of_a_folder_come_in_the_order_of_their_names_and_new_ones_at_any_time(
+    tmp_path: Path, simulated: SimulatedTime
+) -> None:
     (tmp_path / "b.csv").write_text(table(2, first=3))
     (tmp_path / "a.csv").write_text(table(2))
     (tmp_path / "c.jsonl").write_text(f"{json.dumps({**WHOLE, 'id': 'p5'})}\n\nnonsense\n")
     (tmp_path / ".d.csv.part").write_text(table(2))
     (tmp_path / "notes.txt").write_text("nothing")
     (tmp_path / "d.csv").mkdir()
-    source = folder(tmp_path)
+    source = folder(tmp_path, simulated.time)
     assert ids(everything(source, 0.5)) == ["p1", "p2", "p3", "p4", "p5", "3"]
     (tmp_path / "new").write_text(json.dumps([{**WHOLE, "id": "p6"}, 7, {**WHOLE, "id": "p7"}]))
     os.replace(tmp_path / "new", tmp_path / "aa.json")
@@ -262,8 +292,8 @@ def test_files_of_a_folder_come_in_the_order_of_their_names_and_new_ones_at_any_
     assert ids(everything(source, 0.5)) == ["p8"]
 
 
-def test_a_file_that_is_being_written_holds_up_those_after_it(tmp_path: Path) -> None:
-    source = folder(tmp_path)
+def test_a_file_that_is_being_written_holds_up_those_after_it(tmp_path: Path, simulated: SimulatedTime) -> None:
+    source = folder(tmp_path, simulated.time)
     with (tmp_path / "a.csv").open("w") as file:
         (tmp_path / "b.csv").write_text(table(1, first=50))
         for piece in (HEADER, f"\n{row(1)}\n{row(2)[:5]}", f"{row(2)[5:]}\n"):
@@ -273,31 +303,33 @@ def test_a_file_that_is_being_written_holds_up_those_after_it(tmp_path: Path) ->
     assert ids(everything(source, 0.4)) == ["p1", "p2", "p50"]
 
 
-def test_a_json_file_that_is_cut_short_is_read_when_it_is_whole(tmp_path: Path) -> None:
+def test_a_json_file_that_is_cut_short_is_read_when_it_is_whole(tmp_path: Path, simulated: SimulatedTime) -> None:
     path, text = tmp_path / "a.json", json.dumps([WHOLE, WHOLE])
     path.write_text(text[:-20])
-    source = folder(tmp_path)
+    source = folder(tmp_path, simulated.time)
     assert everything(source, 0.4) == []
     path.write_text(text)
     assert len(everything(source, 0.5)) == 2
 
 
-def test_a_folder_is_gone_on_with_and_a_bad_header_costs_its_file_one_fault(tmp_path: Path) -> None:
+def test_a_folder_is_gone_on_with_and_a_bad_header_costs_its_file_one_fault(
+    tmp_path: Path, simulated: SimulatedTime
+) -> None:
     (tmp_path / "a.csv").write_text(table(3))
     (tmp_path / "b.csv").write_text("no,header\n1,2\n3,4\n")
     (tmp_path / "c.csv").write_text(table(3, first=4))
-    progress, first = Progress(), folder(tmp_path)
+    progress, first = Progress(), folder(tmp_path, simulated.time)
     taken = [first.incoming(0.5) for _ in range(5)]
     for sequence, incoming in enumerate(taken):
         assert incoming is not None
         progress.take(incoming, sequence)
-    second = folder(tmp_path)
+    second = folder(tmp_path, simulated.time)
     second.resume(progress.positions)
     assert ids([r for r in taken if r]) == ["p1", "p2", "p3", "1", "p4"]
     assert ids(everything(second, 0.5)) == ["p5", "p6"]
 
 
-def test_what_is_remembered_of_files_does_not_grow(tmp_path: Path) -> None:
+def test_what_is_remembered_of_files_does_not_grow(tmp_path: Path, simulated: SimulatedTime) -> None:
     progress = Progress()
     for i in range(3 * MAX_FILES):
         progress.take(Incoming("p", {}, {}, 0.0, f"{i:06d}.csv", 5), i)
@@ -305,7 +337,7 @@ def test_what_is_remembered_of_files_does_not_grow(tmp_path: Path) -> None:
     assert len(positions) == MAX_FILES + 1
     for i in (0, 2 * MAX_FILES - 1, 2 * MAX_FILES, 3 * MAX_FILES - 1, 3 * MAX_FILES):
         (tmp_path / f"{i:06d}.csv").write_text("\n" + table(5, first=i))
-    source = folder(tmp_path)
+    source = folder(tmp_path, simulated.time)
     source.resume(positions)
     last = 3 * MAX_FILES
     assert ids(everything(source, 0.5)) == [f"p{n}" for i in (last - MAX_FILES, last - 1) for n in (i + 3, i + 4)] + [
@@ -313,10 +345,10 @@ def test_what_is_remembered_of_files_does_not_grow(tmp_path: Path) -> None:
     ]
 
 
-def test_a_file_that_becomes_shorter_is_told_once(tmp_path: Path) -> None:
+def test_a_file_that_becomes_shorter_is_told_once(tmp_path: Path, simulated: SimulatedTime) -> None:
     path = tmp_path / "a.csv"
     path.write_text(table(5))
-    source = folder(tmp_path)
+    source = folder(tmp_path, simulated.time)
     assert len(everything(source, 0.4)) == 5
     path.write_text(table(1))
     (fault,) = everything(source, 0.4)
