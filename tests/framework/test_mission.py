@@ -36,7 +36,7 @@ BUMP = {"kind": "bump", "day": 2.5, "shift_mm": [3, -2, 1], "turn_deg": [0.2, 0.
 EVENTS = yaml.safe_dump([SLIP, SWAP, BUMP], default_flow_style=True, width=10_000).strip()
 SHORT = (
     "simulation.days=3",
-    "simulation.records.every_min=12",
+    "simulation.records.every_min=20",
     f"simulation.events={EVENTS}",
     "simulation.power_cuts=[0.7, 1.55]",
     "mission.poses=20",

@@ -142,10 +142,11 @@ def test_the_recalibrator_notices(lie: str) -> None:
     print(f"\n{lie}: first decision after {', '.join(f'{n} ({kind})' for n, kind in after)}")
 
 
-def test_the_recalibrator_stays_calm_where_all_is_as_stated() -> None:
+@pytest.mark.parametrize("runs", [1, pytest.param(3, marks=pytest.mark.slow)])
+def test_the_recalibrator_stays_calm_where_all_is_as_stated(runs: int) -> None:
     recalibrator = begun()
     fresh = recalibrator.snapshot()
-    for seed in range(3):
+    for seed in range(runs):
         recalibrator.restore(fresh)
         arm = World.drawn(seed)
         for sequence in range(1, UPDATES + 1):

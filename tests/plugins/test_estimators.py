@@ -304,6 +304,7 @@ def test_an_undetermined_problem_ends_in_a_verdict_not_in_an_exception(lrm, name
 
 
 @both
+@pytest.mark.quick("ipopt")  # the other agrees with it, see above
 def test_the_noise_declared_moves_no_answer_without_priors(lrm, name):
     q, measured = simulated(oracle.published(), 60, 15)
     answers = []
@@ -323,6 +324,7 @@ def test_the_noise_declared_moves_no_answer_without_priors(lrm, name):
 
 
 @both
+@pytest.mark.quick("ipopt")  # the other agrees with it, see above
 def test_the_order_of_records_changes_no_answer(lrm, name):
     q, measured = simulated(oracle.published(), 83, 16, noise=0.002)
     order = np.random.default_rng(16).permutation(83)
@@ -334,6 +336,7 @@ def test_the_order_of_records_changes_no_answer(lrm, name):
 
 
 @both
+@pytest.mark.quick("ipopt")  # the other agrees with it, see above
 def test_the_unit_of_length_changes_no_answer(lrm, name):
     """Everything a thousand times as long, compliances a thousandth: the same arm, told in millimetres."""
     q, measured = simulated(oracle.published(), 60, 17, noise=0.002)
