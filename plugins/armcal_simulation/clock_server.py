@@ -6,7 +6,6 @@ import contextlib
 import json
 import select
 import socket
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -21,7 +20,6 @@ _LONGEST_LINE = 1 << 20
 _LOOK_UP_S = 0.25
 _PATIENCE_S = 5.0
 """A client that does not read its answers for so long is let go."""
-_AWAKE_S = 0.0003
 
 
 class ClockServer:
@@ -72,7 +70,7 @@ class ClockServer:
                 if watched is not None:
                     # Edges only: a port that nobody has open is at its end all the time.
                     self._poll.register(watched[0], select.EPOLLIN | select.EPOLLHUP | select.EPOLLET)
-            for number, _ in self._events():
+            for number, _ in self._poll.poll(_LOOK_UP_S):
                 if number == self._listener.fileno():
                     client, _ = self._listener.accept()
                     client.settimeout(_PATIENCE_S)
@@ -91,14 +89,6 @@ class ClockServer:
         self._listener.close()
         if self._bound:
             self._path.unlink(missing_ok=True)
-
-    def _events(self) -> list[tuple[int, int]]:
-        """What happens next. A client at work sends its next request at once: falling asleep would cost more."""
-        until = time.perf_counter() + _AWAKE_S
-        while self._clients and time.perf_counter() < until:
-            if events := self._poll.poll(0):
-                return events
-        return self._poll.poll(_LOOK_UP_S)
 
     def _read(self, number: int) -> None:
         client, buffer = self._clients[number]
