@@ -98,6 +98,7 @@ def test_the_source_distribution_makes_the_same_wheel(release: Release, tmp_path
     assert again.read_bytes() == release.wheel.read_bytes()
 
 
+@pytest.mark.slow
 def test_two_builds_are_the_same_bytes_whatever_the_files_times(tree: Path, release: Release, tmp_path: Path) -> None:
     os.utime(tree / "framework" / "armcal" / "errors.py", (1, 1))
     place = build(tree, tmp_path)

@@ -24,6 +24,7 @@ measurements: {tracker: {type: tip_position, noise_mm: 0.05}}
 data: {type: csv, path: records.csv}
 parameters: {free: [arm.wood.swelling, "arm.mdh.theta[23]"]}
 validation: {holdout: 0.25, seed: 1, folds: 0}
+evaluator: interpreted
 """
 
 

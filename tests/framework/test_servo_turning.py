@@ -143,6 +143,7 @@ def test_an_arm_that_does_as_told_is_right(arm):
 
 
 @pytest.mark.parametrize("joint", ["q1", "q3", "q6"])
+@pytest.mark.quick("q3")
 def test_a_reversed_joint_is_found(arm, joint):
     found = judged(moves_of(arm, signs={joint: -1}), BASE, arm)
     assert [v.joint for v in found if v.kind == "reversed"] == [joint]
@@ -150,6 +151,7 @@ def test_a_reversed_joint_is_found(arm, joint):
 
 
 @pytest.mark.parametrize("pair", [("q2", "q4"), ("q1", "q2"), ("q5", "q6")])
+@pytest.mark.quick("pair0")
 def test_swapped_channels_are_found(arm, pair):
     a, b = pair
     found = judged(moves_of(arm, moves={a: b, b: a}), BASE, arm)

@@ -40,6 +40,8 @@ study:
     springs: {extends: angles, add: {parameters.free: ["arm.spring.k[0-2]"]}}
     lengths: {extends: springs, add: {parameters.free: [arm.mdh.after2_z, arm.mdh.base_z]}}
 """
+TWO = SMALL.partition("    springs:")[0]
+"""The first two of its variants."""
 
 
 @pytest.fixture
@@ -312,7 +314,7 @@ def _problem(experiment: Experiment, system, dataset):
 def test_variants_must_be_judged_on_the_same_records(place: Path) -> None:
     lines = (place / "demo.csv").read_text().splitlines()
     (place / "other.csv").write_text("\n".join(lines[:-1]) + "\n")
-    path = _write(place, SMALL.replace("none: {}", "none: {set: {data.path: other.csv}}"))
+    path = _write(place, TWO.replace("none: {}", "none: {set: {data.path: other.csv}}"))
     with pytest.raises(ProblemError, match=r"not judged on the same records: 199 and 200"):
         _run(path)
 
@@ -397,7 +399,7 @@ def test_an_earlier_study_is_kept_and_a_run_is_not_written_into_one(place: Path)
 
 
 def test_names_of_variants_are_shown_as_text(place: Path) -> None:
-    path = _write(place, SMALL.replace("none: {}", "'<b>[bold]': {}"))
+    path = _write(place, TWO.replace("none: {}", "'<b>[bold]': {}"))
     done = armcal("study", str(path), "--out", str(place / "out"), "--set", FAST[0])
     assert done.exit_code == 0, done.output
     assert "<b>" in done.output

@@ -36,7 +36,7 @@ def calibration(demo_calibration: Path) -> Path:
 def poses(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("poses") / "poses.csv"
     header, *rows = POSES.read_text().splitlines()
-    path.write_text("\n".join([header, *rows[::5]]) + "\n")
+    path.write_text("\n".join([header, *rows[::10]]) + "\n")
     return path
 
 

@@ -364,12 +364,13 @@ def fuzzed(text: bytes, random_: random.Random) -> bytes:
     return bytes(data)
 
 
-def test_mutated_files_never_give_anything_else(tmp_path: Path) -> None:
+@pytest.mark.parametrize("trials", [400, pytest.param(1000, marks=pytest.mark.slow)])
+def test_mutated_files_never_give_anything_else(tmp_path: Path, trials: int) -> None:
     random_ = random.Random(20240)
     base = table(count=20, header=HEADER).encode()
     timed = "\n".join(f"{line},{i if i else 'time_s'}" for i, line in enumerate(table(count=20).split("\n")[:-1]))
     outcomes = {"read": 0, "refused": 0}
-    for trial in range(1000):
+    for trial in range(trials):
         content = fuzzed(base if trial % 2 else timed.encode(), random_)
         try:
             dataset = read(tmp_path, content)
@@ -379,19 +380,20 @@ def test_mutated_files_never_give_anything_else(tmp_path: Path) -> None:
         else:
             assert len(dataset) and all(np.isfinite(values).all() for values in dataset.channels.values())
             outcomes["read"] += 1
-    assert min(outcomes.values()) > 50, outcomes
+    assert min(outcomes.values()) > trials // 20, outcomes
 
 
-def test_a_long_file_is_read_whole(tmp_path: Path) -> None:
+@pytest.mark.parametrize("count", [20_000, pytest.param(100_000, marks=pytest.mark.slow)])
+def test_a_long_file_is_read_whole(tmp_path: Path, count: int) -> None:
     random_ = np.random.default_rng(0)
-    numbers = random_.uniform(-100, 100, (100_000, 9)).round(4).tolist()
+    numbers = random_.uniform(-100, 100, (count, 9)).round(4).tolist()
     header = ",".join(["pose_id", *(f"q{i}_deg" for i in range(1, 7)), *(f"approach{i}" for i in range(1, 7)), "x_mm"])
     lines = [f"{i},{','.join(map(str, n[:6]))},1,0,-1,1,0,-1,{n[6]},{n[7]},{n[8]}" for i, n in enumerate(numbers)]
     text = "\n".join([f"{header},y_mm,z_mm", *lines])
     (tmp_path / "poses.csv").write_text(text)
     reader = CsvReader(CsvSettings(path=tmp_path / "poses.csv"))
     dataset = reader.read(ReadRequest({}, {}, wanted(6)))
-    assert len(dataset) == 100_000
+    assert len(dataset) == count
 
 
 def test_settings_from_a_config(tmp_path: Path) -> None:

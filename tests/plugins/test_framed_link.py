@@ -134,7 +134,7 @@ def test_unplugged_and_plugged_in_under_another_name(board, tmp_path):
 
 
 def test_a_silent_board_is_lost(board):
-    link = link_to(board)
+    link = FramedLink(FramedLink.Settings(port=board.path, start_s=0.05))
     link.open(board.clock)
     board.deaf = True
     with pytest.raises(DeviceLostError, match="does not answer"):

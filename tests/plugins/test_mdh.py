@@ -94,11 +94,12 @@ def lrm_rows(*changes):
     return rows
 
 
+@pytest.mark.parametrize("arms", [12, pytest.param(50, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("convention", ["standard", "craig"])
-def test_random_arms_and_poses_agree_with_the_matrix_product_of_the_convention(convention):
-    """1,000 poses: 50 random arms with revolute and prismatic joints and extra transforms, 20 poses each."""
+def test_random_arms_and_poses_agree_with_the_matrix_product_of_the_convention(convention, arms):
+    """Random arms with revolute and prismatic joints and extra transforms, 20 poses each."""
     random = np.random.default_rng(1)
-    for _ in range(50):
+    for _ in range(arms):
         config = random_settings(random, convention)
         frames = armcal_frames(MdhModel(MdhSettings.si(**config)))
         for q in random.uniform(-3, 3, (20, 6)):
@@ -108,12 +109,13 @@ def test_random_arms_and_poses_agree_with_the_matrix_product_of_the_convention(c
             np.testing.assert_allclose(found["row4"], rows[3], rtol=0, atol=EXACT_M * 10)
 
 
+@pytest.mark.parametrize("arms", [12, pytest.param(50, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("convention", ["standard", "craig"])
-def test_random_arms_and_poses_agree_with_pinocchio(convention):
-    """1,000 poses; pinocchio's joints are put together from placements, one joint after the other."""
+def test_random_arms_and_poses_agree_with_pinocchio(convention, arms):
+    """20 poses of each arm; pinocchio's joints are put together from placements, one joint after the other."""
     pin = pytest.importorskip("pinocchio")
     random = np.random.default_rng(2)
-    for _ in range(50):
+    for _ in range(arms):
         config = random_settings(random, convention)
         model, tool = pinocchio_arm(pin, config)
         data, frames = model.createData(), armcal_frames(MdhModel(MdhSettings.si(**config)))

@@ -564,9 +564,8 @@ class TestCommand:
             client = Client(folder / "clock")
             assert client.ask(advance=1.0)["now"] == 1.0
             assert client.ask(state=True)["violations"] == 0
-            second = self.start(folder, ear.getsockname()[1])
-            _, told = second.communicate(timeout=60)
-            assert second.returncode == 2 and "another simulated bench is running here" in told
+            second = CliRunner().invoke(cli, ["simulated-bench", str(LRM / "bench.yaml"), "--dir", str(folder)])
+            assert second.exit_code == 2 and "another simulated bench is running here" in second.stderr
             process.send_signal(signal.SIGTERM)
             said, told = process.communicate(timeout=60)
         assert process.returncode == 0 and told == ""
