@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import combinations, permutations
 from typing import Any
 
@@ -69,13 +70,17 @@ class Move:
         apart = float(np.linalg.norm(self.after[:3, 3] - self.before[:3, 3]))
         if not self.has_rotations:
             return apart < _STILL_M
-        turned = Rotation.from_matrix(self.after[:3, :3] @ self.before[:3, :3].T).magnitude()
-        return apart < _STILL_M and float(turned) < _STILL
+        return apart < _STILL_M and float(np.max(self.turn.magnitude())) < _STILL
 
     @property
     def has_rotations(self) -> bool:
         """Whether the tracker sees them."""
         return not (np.isnan(self.before[0, 0]) or np.isnan(self.after[0, 0]))
+
+    @cached_property
+    def turn(self) -> Rotation:
+        """What takes the rotation before to the one after (one rotation); every wiring is compared with it."""
+        return Rotation.from_matrix((self.after[:3, :3] @ self.before[:3, :3].T)[None])
 
 
 @dataclass(frozen=True)
@@ -229,10 +234,9 @@ def _explained(move: Move, axis: Array, origin: Array) -> tuple[float, float]:
     if not move.has_rotations:
         turned = turn_of_point(p, q, axis)
         return turned, float(np.linalg.norm(Rotation.from_rotvec(turned * axis).apply(p) - q))
-    seen = Rotation.from_matrix((move.after[:3, :3] @ move.before[:3, :3].T)[None])
-    turned = float(twist_angles(seen, axis)[0])
+    turned = float(twist_angles(move.turn, axis)[0])
     by_joint = Rotation.from_rotvec(turned * axis)
-    left = float(np.max((seen * by_joint.inv()).magnitude()))
+    left = float(np.max((move.turn * by_joint.inv()).magnitude()))
     return turned, float(np.linalg.norm(by_joint.apply(p) - q)) + _LEVER_M * left
 
 
