@@ -9,6 +9,7 @@ from armcal.calibration.calibration import Calibration
 from armcal.cli.main import cli
 from armcal.errors import ConfigError
 from armcal_online.tracking.updated import calibration_text
+from armcal_serve import loaded as loaded_module
 from armcal_serve.loaded import Order, loaded
 from click.testing import CliRunner, Result
 from online_arm import CONFIG, begun, calibration, settings
@@ -76,8 +77,11 @@ def test_its_headline_is_not_that_of_the_run_any_more(texts: dict[str, str], los
     assert found.level == "suspect" and found.verdict == calibration().record.verdict
 
 
-def test_a_server_answers_with_the_level_and_with_an_error_once_it_is_lost(texts: dict[str, str]) -> None:
+def test_a_server_answers_with_the_level_and_with_an_error_once_it_is_lost(
+    texts: dict[str, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """That the file before is no longer used either: its arm is the one that moved."""
+    monkeypatch.setattr(loaded_module, "_warm_up", lambda *given: None)
     request = {"do": "forward", "joint_angles_deg": [0, 0, 0, 0, 0, 0]}
     orders = {
         level: [Order("c.yaml", n, sha256(text), evaluator="interpreted") for n in (1, 2)]

@@ -133,7 +133,7 @@ names = st.one_of(
     st.floats(23e6, 27e6),
     st.floats(50, 51),
 )
-@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=50, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_written_and_read_to_the_last_bit(tmp_path, tables, board, identity, oscillator_hz, rate_hz):
     servos = {
         joint: ServoSettings.si(

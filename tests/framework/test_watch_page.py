@@ -47,6 +47,7 @@ def test_the_page_needs_nothing_from_elsewhere_and_its_policy_lets_nothing_in() 
     assert "/* style */" not in html and "/* script */" not in html
 
 
+@pytest.mark.slow
 def test_the_wheel_holds_the_page(tmp_path: Path) -> None:
     pytest.importorskip("hatchling")
     import zipfile

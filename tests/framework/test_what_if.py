@@ -57,10 +57,11 @@ def slopes(loaded: Calibration, names: tuple[str, ...], poses: Path) -> np.ndarr
         return np.stack([channels[f"tracker.{axis}"] for axis in "xyz"], axis=1)
 
     nominal, columns = loaded.parameters.nominal(), []
+    here = tips(nominal)
     for entry in entries:
         moved = nominal.copy()
         moved[entry] += STEP
-        columns.append((tips(moved) - tips(nominal)) / STEP)
+        columns.append((tips(moved) - here) / STEP)
     return np.stack(columns, axis=2)
 
 

@@ -329,10 +329,11 @@ def mutate(rng: random.Random, text: bytes) -> bytes:
     return bytes(raw)
 
 
-def test_two_thousand_mutated_configs_give_a_result_or_a_refusal_that_names_the_file(tmp_path: Path) -> None:
+@pytest.mark.parametrize("count", [500, pytest.param(2000, marks=pytest.mark.slow)])
+def test_mutated_configs_give_a_result_or_a_refusal_that_names_the_file(tmp_path: Path, count: int) -> None:
     write(tmp_path, BASE, "base.yaml")
     rng, outcomes, slowest = random.Random(20240607), {"read": 0, "refused": 0}, 0.0
-    for _ in range(2000):
+    for _ in range(count):
         path = write(tmp_path, mutate(rng, SAMPLE.encode()))
         began = time.perf_counter()
         try:
@@ -345,4 +346,4 @@ def test_two_thousand_mutated_configs_give_a_result_or_a_refusal_that_names_the_
             assert fault.hint
         slowest = max(slowest, time.perf_counter() - began)
     assert slowest < 2.0
-    assert min(outcomes.values()) > 200, outcomes
+    assert min(outcomes.values()) > count // 10, outcomes

@@ -193,6 +193,7 @@ def expected(pin, arm, data, commands):
 
 
 @pytest.mark.parametrize("seed", range(4))
+@pytest.mark.quick("0")
 def test_mutants_are_refused_or_read_as_pinocchio_reads_them(folder, registry, seed):
     pin = pytest.importorskip("pinocchio")
     random, refused, compared = np.random.default_rng(seed), 0, 0
@@ -217,10 +218,11 @@ def test_mutants_are_refused_or_read_as_pinocchio_reads_them(folder, registry, s
     assert compared > 10
 
 
-def test_a_sample_of_mutants_on_the_command_line(folder):
+@pytest.mark.parametrize("count", [12, pytest.param(40, marks=pytest.mark.slow)])
+def test_a_sample_of_mutants_on_the_command_line(folder, count):
     """Exit code 0 or 2, one message and no traceback."""
     random, codes = np.random.default_rng(9), []
-    for _ in range(40):
+    for _ in range(count):
         (folder / "arm.urdf").write_bytes(mutant(random))
         ran = CliRunner().invoke(cli, ["check", str(folder / "a.yaml")])
         assert ran.exit_code in (EXIT_DONE, EXIT_BAD_INPUT), ran.output
