@@ -12,7 +12,7 @@ from armcal.cli.main import cli
 from click.testing import CliRunner, Result
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs" / "lrm_arm"
-QUICK = ("--set", "capability.samples=150", "--set", "capability.voxel_mm=120")
+QUICK = ("--set", "capability.samples=80", "--set", "capability.voxel_mm=120")
 
 
 def armcal(*arguments: object) -> Result:

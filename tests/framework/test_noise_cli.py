@@ -59,7 +59,7 @@ def robust_run(repository, spoilt, tmp_path_factory):
     def by(loss):
         if loss not in done:
             out = tmp_path_factory.mktemp(loss) / "out"
-            done[loss] = (out, *run(repository, spoilt[0], out, f"noise.loss={loss}", "validation.folds=3"))
+            done[loss] = (out, *run(repository, spoilt[0], out, f"noise.loss={loss}", "validation.folds=2"))
         return done[loss]
 
     return by

@@ -302,6 +302,7 @@ def test_an_effect_alone_moves_the_tip_as_its_description_says(lrm, tmp_path, na
 
 
 @pytest.mark.parametrize("seed", range(3))
+@pytest.mark.quick("0")
 def test_all_effects_together_move_the_tip_as_all_descriptions_say(lrm, tmp_path, seed):
     experiment, drawn = configured(tmp_path, TOGETHER, np.random.default_rng(seed))
     dataset = visited(lrm, 10 + seed)
