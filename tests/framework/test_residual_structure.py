@@ -12,6 +12,7 @@ import pytest
 from armcal.arm.loading import LOAD_CHANNELS, holding_efforts, site_loads
 from armcal.base.dataset import Dataset
 from armcal.diagnose.evidence import priors_alone, unseen_poses
+from armcal.diagnose.evidence_findings import determined_finding
 from armcal.diagnose.large_errors import Judged, large_errors
 from armcal.diagnose.residual_structure import LEVEL, MOST_RECORDS, structure
 from armcal.diagnose.score_tests import DRAWS, family_test, linear_fit, own_basis
@@ -349,12 +350,40 @@ def test_whether_the_tip_depends_on_what_priors_hold(lrm, poses_seen):
     problem = lrm.problem(experiment, dataset, "interpreted", replace(freed, blocks=held))
     found = fit(problem, problem.records(dataset), IPOPT, problem.parameters.nominal()).estimate
     assert found.identifiability.undetermined
-    alone = priors_alone(problem, found, unseen_poses(dataset, [f"arm.q{i}" for i in range(1, 7)]))
-    assert (alone.worst_mm > 1) if poses_seen == "two" else (alone.worst_mm < 1e-9)
-    assert priors_alone(problem, found, dataset).worst_mm < 1e-6
+    joints = [f"arm.q{i}" for i in range(1, 7)]
+    alone = priors_alone(problem, found, *(unseen_poses(dataset, joints, between) for between in (False, True)))
+    for worst in (alone.worst_mm, alone.between_mm):
+        assert (worst > 1) if poses_seen == "two" else (worst < 1e-9)
+    assert priors_alone(problem, found, dataset, dataset).between_mm < 1e-6
+
+
+def test_what_positions_at_their_ends_leave_open_shows_between_them(lrm):
+    """A joint's gain, play and zero trade where each end is approached from one side; in between nothing holds them."""
+    random = np.random.default_rng(5)
+    q = poses(80, 12)[0]
+    q[:, 1] = random.choice([-0.8, 0.8], 80)
+    came = np.sign(random.normal(size=(80, 6)))
+    came[:, 1] = np.sign(q[:, 1])
+    free = ["arm.mdh.theta2", "arm.map.gain2", "arm.play.lag2"]
+    effects = ("map={type: servo_map, joints: [q2], gains: one}", "play={type: approach_backlash, joints: [q2]}")
+    experiment = lrm.experiment("option1", *(f"arms.arm.effects.{effect}" for effect in effects))
+    approach = {f"arm.approach.q{i + 1}": came[:, i] for i in range(6)}
+    noise = NOISE_M * random.normal(size=(80, 3))
+    dataset = lrm.dataset(q, oracle.tip(oracle.nominal(), q) + noise, **approach)
+    freed = experiment.parameters.with_free(free)
+    held = tuple(replace(block, prior_sd=block.scale) if block.free else block for block in freed.blocks)
+    problem = lrm.problem(experiment, dataset, "interpreted", replace(freed, blocks=held))
+    found = fit(problem, problem.records(dataset), IPOPT, problem.parameters.nominal()).estimate
+    assert len(found.identifiability.undetermined) == 1
+    joints = [f"arm.q{i}" for i in range(1, 7)]
+    alone = priors_alone(problem, found, *(unseen_poses(dataset, joints, between) for between in (False, True)))
+    assert alone.worst_mm < 1e-6 and alone.between_mm > 0.5
+    finding = determined_finding(found, alone, 0.5)
+    assert finding.grade == "warning" and "between its recorded positions" in finding.text
+    assert "from both sides" in finding.action
 
 
 def test_without_priors_nothing_is_said_to_be_held_by_them(lrm):
     problem, records, start, dataset = recording(lrm, 60, 1)
     found = fit(problem, records, IPOPT, start).estimate
-    assert priors_alone(problem, found, dataset) is None
+    assert priors_alone(problem, found, dataset, dataset) is None

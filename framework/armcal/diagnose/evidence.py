@@ -29,11 +29,13 @@ class PriorsAlone:
 
     Attributes:
         worst_mm: the largest standard deviation of the tip that they leave, over the poses looked at.
-        poses: how many unseen poses were looked at.
+        between_mm: the same where joints stand between recorded positions too, approached from either recorded side.
+        poses: how many unseen poses of each kind were looked at.
         up_to: motions that were left out, because nothing that was measured sees them; empty where none were.
     """
 
     worst_mm: float
+    between_mm: float
     poses: int
     up_to: str = ""
 
@@ -54,12 +56,17 @@ class Evidence:
         return {
             "residual_structure": None if self.structure is None else self.structure.as_dict(),
             "large_errors": None if self.large_errors is None else self.large_errors.as_dict(),
-            "priors_alone": None if alone is None else {"worst_mm": alone.worst_mm, "poses": alone.poses},
+            "priors_alone": None
+            if alone is None
+            else {"worst_mm": alone.worst_mm, "between_mm": alone.between_mm, "poses": alone.poses},
         }
 
 
-def unseen_poses(dataset: Dataset, channels: Sequence[str]) -> Dataset:
-    """Poses that combine what single joints did in the records: a joint's command and approach are of one of them."""
+def unseen_poses(dataset: Dataset, channels: Sequence[str], between: bool = False) -> Dataset:
+    """Poses that combine what single joints did in the records: a joint's command and approach are of one of them.
+
+    ``between``: a joint stands anywhere between its recorded ends instead, approached as in any of its records.
+    """
     random = np.random.default_rng(0)
     together = random.integers(0, len(dataset), UNSEEN)
     values = {name: column[together] for name, column in dataset.channels.items()}
@@ -69,11 +76,14 @@ def unseen_poses(dataset: Dataset, channels: Sequence[str]) -> Dataset:
         for own in (channel, f"{arm}.approach.{joint}"):
             if dataset.has(own):
                 values[own] = dataset.column(own)[drawn]
+        if between:
+            recorded = dataset.column(channel)
+            values[channel] = random.uniform(recorded.min(), recorded.max(), UNSEEN)
     return Dataset(tuple(str(i) for i in range(UNSEEN)), values)
 
 
-def priors_alone(problem: Problem, estimate: Estimate, poses: Dataset) -> PriorsAlone | None:
-    """How far the tip at these poses depends on combinations that the data does not determine.
+def priors_alone(problem: Problem, estimate: Estimate, poses: Dataset, between: Dataset) -> PriorsAlone | None:
+    """How far the tip at both kinds of ``unseen_poses`` depends on combinations that the data does not determine.
 
     Their covariance is what the priors give them, V (V'PV)^-1 V' over the undetermined directions V.
 
@@ -85,18 +95,24 @@ def priors_alone(problem: Problem, estimate: Estimate, poses: Dataset) -> Priors
     information = null * (scales**2 * estimate.parameters.prior_information()) @ null.T
     if not len(null) or not len(poses) or np.linalg.cond(information) > 1 / np.finfo(float).eps:
         return None
-    values, up_to, rows = estimate.values, "", _position_rows(problem)
-    if rows:
-        noise = np.concatenate([kernel.factor.noise for kernel in problem.kernels])
-        moved = (whitened_rows(problem, values, poses)[rows] * noise[rows, None, None] @ null.T)[None]
-    else:  # nothing reads a position in the base frame: of the tools themselves, up to what no contact could see
-        records, up_to = problem.records(poses), UP_TO_FRAMES
-        at, axes = tools(problem, values, records)
-        moves = np.array([along(problem, values, records, direction).ravel() for direction in null]).T
-        moved = apart_from(np.array(unseen_motions(at, axes)).T, moves).reshape(len(at), 3, -1, moves.shape[1])
     covariance: Array = np.asarray(np.linalg.inv(information), dtype=float)
-    variance = np.einsum("trnk,kl,trnl->tn", moved, covariance, moved)
-    return PriorsAlone(float(np.sqrt(np.max(np.maximum(variance, 0.0)))) * _MM, len(poses), up_to)
+    worst = []
+    for kind in (poses, between):
+        moved = _tip_motions(problem, estimate.values, kind, null)
+        variance = np.einsum("trnk,kl,trnl->tn", moved, covariance, moved)
+        worst.append(float(np.sqrt(np.max(np.maximum(variance, 0.0)))) * _MM)
+    return PriorsAlone(worst[0], max(worst), len(poses), "" if _position_rows(problem) else UP_TO_FRAMES)
+
+
+def _tip_motions(problem: Problem, values: Array, poses: Dataset, null: Array) -> Array:
+    """How the tips (T, or the one position that is read) move along the directions (T x 3 x N x K; m)."""
+    if rows := _position_rows(problem):
+        noise = np.concatenate([kernel.factor.noise for kernel in problem.kernels])
+        return np.asarray((whitened_rows(problem, values, poses)[rows] * noise[rows, None, None] @ null.T)[None])
+    records = problem.records(poses)  # nothing reads a position: of the tools, up to what no contact could see
+    at, axes = tools(problem, values, records)
+    moves = np.array([along(problem, values, records, direction).ravel() for direction in null]).T
+    return apart_from(np.array(unseen_motions(at, axes)).T, moves).reshape(len(at), 3, -1, moves.shape[1])
 
 
 def _position_rows(problem: Problem) -> list[int]:

@@ -44,13 +44,19 @@ def determined_finding(estimate: Estimate, alone: PriorsAlone | None, typical_mm
         return Finding("bad", text, test, "Free fewer parameters, or measure what armcal identify asks for.")
     held = f"{_plural(count, 'combination is', 'combinations are')} held by priors alone"
     held += f" ({listed})" if count <= FEW_NAMED else ""
-    test = f"{test}; the tip at {alone.poses} unseen poses, joints approached as in the records"
+    test = f"{test}; the tip at {alone.poses} poses of recorded joint positions, and at as many between them"
     test += f"; positions, not orientations, up to {alone.up_to}, which nothing measured shows" if alone.up_to else ""
-    if typical_mm is None or alone.worst_mm <= NEGLIGIBLE_SHARE * typical_mm:
-        most = f"{alone.worst_mm:.2g}" if alone.worst_mm >= 0.001 else "0.001"
+    negligible = np.inf if typical_mm is None else NEGLIGIBLE_SHARE * typical_mm
+    if alone.between_mm <= negligible:
+        most = f"{alone.between_mm:.2g}" if alone.between_mm >= 0.001 else "0.001"
         text = f"{held}; the tip at unseen poses does not depend on them (at most {most} {_MM}, 1 sd)."
         return Finding("note", text, test, "Nothing for the tip; armcal identify names them.")
-    text = f"{held}, and the tip at unseen poses depends on them, by up to {alone.worst_mm:.2g} {_MM} (1 sd)."
+    if alone.worst_mm <= negligible:
+        text = f"{held}. The tip depends on them by up to {alone.between_mm:.2g} {_MM} (1 sd) where a joint stands "
+        text += "between its recorded positions, or is approached from another side there; elsewhere it does not."
+        advice = "Measure each joint between its recorded positions too, from both sides; armcal identify names them."
+        return Finding("warning", text, test, advice)
+    text = f"{held}, and the tip at unseen poses depends on them, by up to {alone.between_mm:.2g} {_MM} (1 sd)."
     return Finding(
         "warning", text, test, "armcal identify names them, and armcal plan finds the poses that determine them."
     )

@@ -98,7 +98,8 @@ def gather(run: FittedRecords, judged_mm: Array, system: System, limit: float | 
     training, train = dataset.subset(run.split.train), run.split.train
     alone = None
     if len(estimate.identifiability.null):
-        alone = priors_alone(problem, estimate, unseen_poses(training, motion.channels))
+        poses = (unseen_poses(training, motion.channels, between) for between in (False, True))
+        alone = priors_alone(problem, estimate, *poses)
     acting = problem.weighted(run.fitted.records, run.fitted.weights)
     own = (training, motion.subset(train), position[train])
     left = structure(problem, acting, estimate, *own, modelled=effect_types(system))
