@@ -106,7 +106,7 @@ def show_forecast(console: Console, prepared: Prepared, forecast: ScheduleForeca
         lines.append(f"hottest, of what each servo bears: {', '.join(hot)}.")
     lines += [f"left out: {step.why}." for step in forecast.steps if isinstance(step, LeaveOut)]
     for line in lines:
-        console.out.print(line, markup=False, soft_wrap=True)
+        console.line(line)
     for skipped in prepared.plan.set_aside:
         console.warn(
             f"row {skipped.row} of the plan, pose {skipped.record_id}, is set aside and not driven: {skipped.reason}"
@@ -118,11 +118,11 @@ def show_outcome(console: Console, outcome: Outcome, config: Path, out: Path) ->
     console.result(outcome.summary)
     summary, ending = outcome.summary, outcome.ending
     text = f"{ending.how}: {ending.sentence}. {summary['measured']} of {summary['poses']} poses measured."
-    console.out.print(text, markup=False, soft_wrap=True)
+    console.line(text)
     for name, why in summary["left_out"].items():
         console.warn(f"pose {name} was left out: {why}.")
     if ending.how != "done":
-        console.out.print("Go on with --resume.", markup=False)
+        console.line("Go on with --resume.")
         return
     if summary["left_out"]:
         console.warn(
@@ -130,7 +130,7 @@ def show_outcome(console: Console, outcome: Outcome, config: Path, out: Path) ->
             "measure them with another --out."
         )
     if summary["measured"]:
-        console.out.print(f"next: armcal run {config} --data {out / DATASET} --out DIR", markup=False, soft_wrap=True)
+        console.line(f"next: armcal run {config} --data {out / DATASET} --out DIR")
 
 
 def _show_dry_run(console: Console, prepared: Prepared, forecast: ScheduleForecast) -> None:

@@ -77,7 +77,7 @@ def warned(console: Console, question: Question) -> Question:
 
 def waits(console: Console) -> Waits:
     """Lines about what is waited for, on standard error: a progress bar alone does not say that."""
-    return Waits(lambda text: console.err.print(text, markup=False, soft_wrap=True))
+    return Waits(lambda text: console.err.print(text, soft_wrap=True))
 
 
 def show_hazards(console: Console, hazards: Iterable[Hazard]) -> None:

@@ -72,12 +72,10 @@ def _show_account(console: Console, account: dict[str, Any]) -> None:
             limit = f"{factor * worst[kind]['limit']:.1f} {unit}" if kind in worst else ""
             worst_text = f" (worst: {_amount(kind, worst[kind])}, where {limit} is the limit)" if limit else ""
             counted.append(f"{kind} {count} times{worst_text}")
-    console.out.print(
-        f"on the simulated arm's side, unsafe was: {'; '.join(counted) or 'nothing'}.", markup=False, soft_wrap=True
-    )
+    console.line(f"on the simulated arm's side, unsafe was: {'; '.join(counted) or 'nothing'}.")
     for kind, what in (("first_pulse", "the largest jump at a first pulse"), ("drop", "the deepest fall when let go")):
         if kind in worst:
-            console.out.print(f"{what}: {_amount(kind, worst[kind])}.", markup=False, soft_wrap=True)
+            console.line(f"{what}: {_amount(kind, worst[kind])}.")
 
 
 def _amount(kind: str, entry: dict[str, Any]) -> str:
@@ -98,5 +96,5 @@ def simulated_bench_command(console: Console, config: Path, folder: Path, overri
     bench = Bench.of(experiment).simulator()
     make_bench_folder(folder)
     console.result({"board": str(folder / BOARD), "clock": str(folder / CLOCK)})
-    console.out.print(f"simulated bench: {folder / BOARD}, {folder / CLOCK}", markup=False, soft_wrap=True)
+    console.line(f"simulated bench: {folder / BOARD}, {folder / CLOCK}")
     bench.serve(BenchRequest(experiment, folder))

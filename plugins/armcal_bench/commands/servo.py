@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -25,7 +26,7 @@ from armcal_bench.servo.outputs import improved, results, write_results, write_s
 from armcal_bench.servo.record import NAME
 from armcal_bench.servo.session import Conversation, adapter_of, evaluated, measure, park, tried
 from armcal_bench.servo.setup import Setup
-from armcal_bench.servo.trial import Verdict, swapped
+from armcal_bench.servo.trial import swapped
 from armcal_bench.wiring import carry_over
 
 
@@ -54,7 +55,6 @@ def servo(
 ) -> None:
     """Find which pulse makes which angle of each servo on the bench of CONFIG, and write the servo file."""
     setup = Setup.of(load(console, config, overrides))
-    how = "guided" if guided else "automatic"
     with Signals() as signals, console.progress() as show:
         talk = Conversation(
             asked_to_stop=lambda: signals.finish,
@@ -70,10 +70,12 @@ def servo(
             if out is None:
                 raise InputError("found no --out.", hint="Say where what is measured is to be kept, or give --check.")
             if not evaluate:
-                _stoppable(console, lambda: measure(setup, out, talk, how))
+                with _stoppable(console):
+                    measure(setup, out, talk, "guided" if guided else "automatic")
             _evaluate(console, setup, out, keep)
         if parks or release:
-            _stoppable(console, lambda: park(setup, talk, "release" if release else "hold"))
+            with _stoppable(console):
+                park(setup, talk, "release" if release else "hold")
 
 
 def _evaluate(console: Console, setup: Setup, out: Path, keep: bool) -> None:
@@ -88,7 +90,7 @@ def _evaluate(console: Console, setup: Setup, out: Path, keep: bool) -> None:
     console.result({**content, "servo_file": str(setup.path), "before": None if earlier is None else str(earlier)})
     _show(console, outcome, content)
     if earlier is not None:
-        console.out.print(f"{setup.path}: written; the one before is {earlier.name}", markup=False, soft_wrap=True)
+        console.line(f"{setup.path}: written; the one before is {earlier.name}")
     left = [joint for joint in setup.joints if not content["servos"].get(joint, {"written": False})["written"]]
     if left:
         count = len(setup.joints) - len(left)
@@ -100,31 +102,29 @@ def _evaluate(console: Console, setup: Setup, out: Path, keep: bool) -> None:
 
 
 def _check(console: Console, setup: Setup, talk: Conversation, seen: str) -> None:
-    verdicts: list[Verdict] = []
-    _stoppable(console, lambda: verdicts.extend(tried(setup, talk, seen)))
+    with _stoppable(console):
+        verdicts = tried(setup, talk, seen)
     pairs = swapped(verdicts)
     shown = [{**asdict(v), "turned": v.turned if v.turned == v.turned else None} for v in verdicts]
     console.result({"joints": shown, "swapped": pairs})
     for verdict in verdicts:
         style = "green" if verdict.kind == "right" else "red"
-        console.out.print(f"{verdict.sentence} {verdict.mend}".rstrip(), style=style, markup=False, soft_wrap=True)
+        console.line(f"{verdict.sentence} {verdict.mend}".rstrip(), style)
     for sentence in pairs:
-        console.out.print(sentence, style="red", markup=False, soft_wrap=True)
+        console.line(sentence, "red")
     if any(verdict.kind != "right" for verdict in verdicts):
         sys.exit(EXIT_FAULT)
 
 
-def _stoppable(console: Console, action: Callable[[], None]) -> None:
-    """Do it; where it was stopped, say what that means."""
+@contextmanager
+def _stoppable(console: Console) -> Iterator[None]:
+    """Where it is stopped, say what that means."""
     try:
-        action()
+        yield
     except StopRequested as stop:
         arm = f"{stop.arm[:1].upper()}{stop.arm[1:]}"
-        console.err.print(
-            f"stopped: {stop}. {arm}, and what was measured is kept: give the same command again to go on.",
-            markup=False,
-            soft_wrap=True,
-        )
+        what = f"stopped: {stop}. {arm}, and what was measured is kept: give the same command again to go on."
+        console.err.print(what, soft_wrap=True)
         sys.exit(EXIT_STOPPED)
     except DeviceError as fault:
         hint = f"{fault.hint} What was measured is kept: give the same command again to go on.".strip()
@@ -153,7 +153,7 @@ def _show(console: Console, outcome: Outcome, content: Mapping[str, Any]) -> Non
     for name, board in content["boards"].items():
         if board["oscillator_sd_hz"] is not None:
             text = f"{name}: oscillator {board['oscillator_hz'] / 1e6:.4f} +- {board['oscillator_sd_hz'] / 1e6:.4f} MHz"
-            console.out.print(text, markup=False)
+            console.line(text)
     for sentence in content["findings"]:
-        console.out.print(sentence, markup=False, soft_wrap=True)
+        console.line(sentence)
     console.detail(f"{len(outcome.task.observations)} angles, in {NAME}.")
