@@ -135,13 +135,18 @@ def halving() -> ca.Function:
 @pytest.mark.parametrize("choice", ["interpreted", pytest.param("compiled", marks=needs_a_compiler)])
 @pytest.mark.parametrize("count", [0, 1, 7, 8, 9, 100])
 def test_each_record_is_iterated_until_it_ends(choice: batch_function.EvaluatorChoice, count: int) -> None:
-    """However long its neighbours take; bounds are broadcast, backwards or turned round."""
+    """However long its neighbours take; bounds are shared, broadcast, backwards or turned round."""
     batch = BatchFunction(halving(), [np.ones((1, 8)), np.full((3, 8), 3.0)], choice, iterated=True)
     assert batch.compiled == (choice == "compiled")
     begun = np.random.default_rng(4).uniform(1, 1e4, count)
-    for bound in (np.broadcast_to(0.5, (1, count)), np.linspace(0.1, 9, count)[None, ::-1], np.full((count, 1), 2).T):
+    for bound in (
+        np.array([0.5]),
+        np.broadcast_to(0.5, (1, count)),
+        np.linspace(0.1, 9, count)[None, ::-1],
+        np.full((count, 1), 2).T,
+    ):
         for progress in (np.zeros((3, count)), np.zeros((count, 3)).T):
             progress[0] = begun
             batch.iterate(progress, bound)
-            steps = np.maximum(np.ceil(np.log2(begun / bound[0])), 1)
+            steps = np.maximum(np.ceil(np.log2(begun / np.atleast_2d(bound)[0])), 1)
             assert progress.tolist() == [(begun / 2**steps).tolist(), steps.tolist(), [1.0] * count]

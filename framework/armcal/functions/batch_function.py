@@ -84,15 +84,18 @@ class BatchFunction:
     def iterate(self, progress: Array, *inputs: Array) -> None:
         """Put the output in the place of ``progress`` (entries x N) until its last entry is not zero, record by record.
 
-        ``inputs`` (entries x N each) come before it among the function's inputs. C would read beyond other shapes.
+        ``inputs`` (entries x N each; entries alone where all records share them) come before it among the function's
+        inputs. C would read beyond other shapes.
         """
         if self._library is not None:
             given = [*(np.asarray(array, dtype=float) for array in inputs), progress]
             pointers = (ctypes.c_void_p * len(given))(*(array.ctypes.data for array in given))
-            strides = (ctypes.c_long * (2 * len(given)))(*(stride // 8 for array in given for stride in array.strides))
+            steps = [step // 8 for array in given for step in (*array.strides, 0)[:2]]
+            strides = (ctypes.c_long * len(steps))(*steps)
             self._library.armcal_iterate(ctypes.c_long(progress.shape[1]), pointers, strides)
             return
-        active, now, rest = np.arange(progress.shape[1]), progress, list(inputs)
+        active, now = np.arange(progress.shape[1]), progress
+        rest = [np.repeat(array[:, None], len(active), axis=1) if array.ndim == 1 else array for array in inputs]
         while active.size:
             (now,) = self(*rest, now)
             ended = now[-1] != 0

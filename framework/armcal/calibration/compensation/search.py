@@ -179,13 +179,12 @@ class Search:
         stated = (manner.damping, manner.patience, manner.steps, near.metres, near.radians, near.rest)
         settings = np.concatenate([stated, [goal.towards is not None], *self._limits.T, held])
         progress = np.zeros((places["end"].stop, count))
-        begun = np.clip(goal.record[:joints], self._limits[:, :1], self._limits[:, 1:])
+        begun = np.minimum(np.maximum(goal.record[:joints], self._limits[:, :1]), self._limits[:, 1:])
         progress[places["commands"]] = progress[places["best_commands"]] = begun
         progress[places["state"]] = progress[places["best_state"]] = goal.state
         progress[places["free"]], progress[places["damping"]] = 1 - held[:, None], FIRST_DAMPING
         progress[places["distance"].start : places["milestone"].stop] = np.inf
-        shared = np.broadcast_to(settings[:, None], (len(settings), count))
-        self._iteration.iterate(progress, shared, goal.record, goal.target, towards)
+        self._iteration.iterate(progress, settings, goal.record, goal.target, towards)
         best, (distances, turns) = progress[places["best_commands"]], progress[places["distance"].start :][:2]
         there, forbidden = progress[-1] == REACHED, np.zeros(count, dtype=bool)
         return Solutions(best, progress[places["best_state"]], distances, turns, there, forbidden)
