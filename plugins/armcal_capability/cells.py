@@ -134,10 +134,11 @@ class AreaSearch:
         nearest = cKDTree(where).query(targets, k=min(most, len(where)))[1].reshape(-1)
         starts = np.asarray(self.sampled.commands[:, nearest])
         cell = np.repeat(np.arange(len(centres)), starts.shape[1] // len(centres))
-        arrivals = reach_for(self.function, centres[cell].T, starts, self.limits, self.weights.length, pointing)
-        good = np.flatnonzero(arrivals.arrived)
-        good = good[self.allowed(arrivals.commands[:, good])] if len(good) else good
-        postures = postures_at(self.function, arrivals.commands[:, good], self.weights)
+        length = self.weights.length
+        commands, arrived = reach_for(self.function, centres[cell].T, starts, self.limits, length, pointing)
+        good = np.flatnonzero(arrived)
+        good = good[self.allowed(commands[:, good])] if len(good) else good
+        postures = postures_at(self.function, commands[:, good], self.weights)
         counts = np.bincount(cell[good], minlength=len(centres)).astype(np.int64)
         values = grouped(postures.values, cell[good], len(centres))
         held = None

@@ -47,14 +47,6 @@ class Pointing:
         return np.asarray(np.arctan2(across, axis.T @ self.along))
 
 
-@dataclass(frozen=True)
-class Arrivals:
-    """Commands (joints x N), and which of them bring the tool there (N)."""
-
-    commands: Array
-    arrived: Mask
-
-
 def reach_for(
     function: MechanicsFunction,
     targets: Array,
@@ -62,10 +54,10 @@ def reach_for(
     limits: Array,
     length: float,
     pointing: Pointing | None = None,
-) -> Arrivals:
-    """Bring the tool to targets (3 x N; m) from commands (joints x N), inside limits (joints x 2).
+) -> tuple[Array, Mask]:
+    """Commands that bring the tool to targets (3 x N; m) from others (joints x N), and which of them arrive (N).
 
-    ``length`` is how many metres a rad counts for.
+    Limits are joints x 2; ``length`` is how many metres a rad counts for.
     """
     commands, arrived = starts.copy(), np.zeros(starts.shape[1], dtype=bool)
     left, states = np.arange(starts.shape[1]), None
@@ -85,7 +77,7 @@ def reach_for(
         if not len(left):
             break
         commands[:, left] = _moved(commands[:, left], error, slope, limits)
-    return Arrivals(commands, arrived)
+    return commands, arrived
 
 
 def _equations(

@@ -8,12 +8,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from armcal.base.domains import Array
 from armcal.calibration.tool_expression import ToolExpression
 from armcal.errors import ProblemError
 from armcal.functions.compiler import find_compiler
 
-from armcal_export.c_text import c_number, filled
+from armcal_export.c_text import c_number, c_row, filled
 from armcal_export.reference import Reference
 
 FLAGS = ("-std=c99", "-O1", "-Wall", "-Wextra", "-Werror", "-pedantic")
@@ -70,7 +69,7 @@ def test_source(e: ToolExpression, reference: Reference, prefix: str, places: Ma
     """The program with armcal's own answers in it."""
     cases = zip(reference.records, reference.base_T_tool, reference.efforts, strict=True)
     rows = [
-        f"  {{{input_row(e, list(record))},\n   {_listed(pose.ravel())},\n   {_listed(efforts)}}}"
+        f"  {{{input_row(e, list(record))},\n   {c_row(pose.ravel())},\n   {c_row(efforts)}}}"
         for record, pose, efforts in cases
     ]
     filling = {"cases": str(len(rows)), "case_rows": ",\n".join(rows), "tolerance": repr(TOLERANCE)}
@@ -80,15 +79,11 @@ def test_source(e: ToolExpression, reference: Reference, prefix: str, places: Ma
 def input_row(e: ToolExpression, record: list[float]) -> str:
     """A record as the initial value of an arm_input."""
     n, sizes = len(e.joints), (3, 1, 3, 3, 3)
-    rows, start = [_listed(record[:n]), _listed(record[n : 2 * n])], 2 * n
+    rows, start = [c_row(record[:n]), c_row(record[n : 2 * n])], 2 * n
     for size in sizes:
         part = record[start : start + size]
-        rows.append(_listed(part) if size > 1 else c_number(part[0]))
+        rows.append(c_row(part) if size > 1 else c_number(part[0]))
         start += size
     if len(record) > start:
-        rows.append(_listed(record[start:]))
+        rows.append(c_row(record[start:]))
     return "{" + ", ".join(rows) + "}"
-
-
-def _listed(numbers: Array | list[float]) -> str:
-    return "{" + ", ".join(c_number(number) for number in numbers) + "}"

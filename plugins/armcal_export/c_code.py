@@ -18,7 +18,7 @@ from pydantic import field_validator
 from armcal_export.c_check import FileNames, compiled_and_run, input_row, test_source
 from armcal_export.c_expressions import arm_functions
 from armcal_export.c_servos import servo_parts
-from armcal_export.c_text import c_number, filled, in_comment, quoted
+from armcal_export.c_text import c_row, filled, in_comment, quoted
 from armcal_export.reference import reference_of
 
 CASES = 24
@@ -127,15 +127,11 @@ def _places(request: ExportRequest, e: ToolExpression, files: FileNames, prefix:
         "first_passes": str(functions.first_passes),
         "expressions": functions.source,
         "defaults": input_row(e, list(e.defaults)),
-        "lower": _row([low for low, _ in limits]),
-        "upper": _row([high for _, high in limits]),
+        "lower": c_row([low for low, _ in limits]),
+        "upper": c_row([high for _, high in limits]),
         "names": "{" + ", ".join(quoted(name) for name in e.joints) + "}",
         "identity": request.digest,
     }
-
-
-def _row(numbers: list[float]) -> str:
-    return "{" + ", ".join(c_number(number) for number in numbers) + "}"
 
 
 def _unit(e: ToolExpression, joint: str) -> str:

@@ -6,7 +6,7 @@ import casadi as ca
 import numpy as np
 from armcal.calibration.tool_expression import ToolExpression
 
-from armcal_export.c_text import c_number, filled, with_prefix
+from armcal_export.c_text import c_number, c_row, filled, with_prefix
 
 _DECLARATIONS = """
 /* The counts that a servo board is told for a command of a joint (from 0), the nearest; -1 of a joint that has no pulse
@@ -41,8 +41,7 @@ def servo_parts(e: ToolExpression, prefix: str) -> dict[str, str]:
     for name, (table, clock) in e.servos.items():
         joint = e.joints.index(name)
         for kind, numbers in (("angles", table.angles), ("pulses", table.pulses)):
-            listed = ", ".join(c_number(number) for number in numbers)
-            tables.append(f"static const double {kind}_{joint}[] = {{{listed}}};")
+            tables.append(f"static const double {kind}_{joint}[] = {c_row(numbers)};")
         points, tick = len(table.angles), c_number(clock.tick)
         rows.append(f"  {{{joint}, {points}, {tick}, angles_{joint}, pulses_{joint}}}")
         for angle in np.linspace(min(table.angles), max(table.angles), _TOLD):

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from importlib import resources
 
 import casadi as ca
@@ -37,6 +37,11 @@ def c_number(value: float) -> str:
     if math.isinf(value):
         return "INFINITY" if value > 0 else "-INFINITY"
     return repr(float(value))
+
+
+def c_row(numbers: Iterable[float]) -> str:
+    """Numbers as the initial value of an array."""
+    return "{" + ", ".join(c_number(number) for number in numbers) + "}"
 
 
 def c_function(function: ca.Function, name: str, inputs: Sequence[str], outputs: Sequence[str]) -> str:

@@ -23,7 +23,7 @@ from armcal.io.standard_output import StandardOutput
 from armcal_serve.protocol import Notify
 from armcal_serve.server import Opening, Server
 from armcal_serve.transports.datagrams import Datagrams
-from armcal_serve.transports.standard import StandardStreams
+from armcal_serve.transports.stream import StandardStreams
 from armcal_serve.transports.unix import UnixSocket
 
 _ALWAYS = ("refused", "worker_lost", "missing", "status", "notice")

@@ -328,12 +328,12 @@ def test_found_postures_are_where_and_how_they_should_be(lrm: Task) -> None:
     pointing = Pointing(2, np.array([0.0, 0.0, -1.0]), 0.6)
     starts = spread(subject.limits, 600, 0)
     which = np.arange(600) % 3
-    found = reach_for(function, targets[:, which], starts, subject.limits, 0.1, pointing)
-    assert not found.arrived[which == 2].any() and found.arrived[which < 2].mean() > 0.2
-    there = function(found.commands[:, found.arrived])
-    assert np.allclose(there.positions, targets[:, which[found.arrived]], atol=1.1e-5)
+    commands, arrived = reach_for(function, targets[:, which], starts, subject.limits, 0.1, pointing)
+    assert not arrived[which == 2].any() and arrived[which < 2].mean() > 0.2
+    there = function(commands[:, arrived])
+    assert np.allclose(there.positions, targets[:, which[arrived]], atol=1.1e-5)
     assert pointing.angles(there.rotations).max() <= 0.6
-    assert (found.commands >= subject.limits[:, :1]).all() and (found.commands <= subject.limits[:, 1:]).all()
+    assert (commands >= subject.limits[:, :1]).all() and (commands <= subject.limits[:, 1:]).all()
 
 
 def test_clearance_takes_postures_away() -> None:

@@ -20,7 +20,7 @@ from armcal_serve.dispatcher import Dispatcher
 from armcal_serve.poller import Poller
 from armcal_serve.protocol import MAX_LINE_BYTES
 from armcal_serve.transports.datagrams import Datagrams
-from armcal_serve.transports.standard import StandardStreams
+from armcal_serve.transports.stream import StandardStreams
 from armcal_serve.transports.unix import MOST_CLIENTS, UnixSocket
 from armcal_serve.worker import Message, Unpacker
 

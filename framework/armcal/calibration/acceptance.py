@@ -45,8 +45,12 @@ def accept(path: Path, day: str, registry: PluginRegistry) -> Accepted:
     how = "made with other versions" if is_whole else "edited by hand"
     noted = replace(loaded, record=loaded.record.model_copy(update={"accepted": f"{how} and accepted on {day}"}))
     try:
-        moved = _moved(loaded)
-        remade = noted.checked(loaded.record.checks.commands if loaded.record.checks else None, registry)
+        moved, kept = None, loaded.record.checks
+        if kept is not None:
+            tools = predict(loaded.system, loaded.parameters, kept.commands)[1]
+            before = np.array([kept.tools[arm] for arm in loaded.system.arms]).reshape(*tools.shape[:2], 3, 4)
+            moved = float(np.linalg.norm(tools[:, :, :3, 3] - before[..., 3], axis=-1).max())
+        remade = noted.checked(kept.commands if kept else None, registry)
     except (NotConvergedError, ArithmeticError, LookupError, TypeError, ValueError) as fault:
         text = f"the arm cannot be predicted with it ({type(fault).__name__}: {fault})."
         raise ConfigError(text, where=where, hint="Undo the last edits, or run the calibration again.") from fault
@@ -75,12 +79,3 @@ def _check_values(record: CalibrationFile, source: ConfigSource) -> None:
                 where=where,
                 hint="Write the same number for nominal and value.",
             )
-
-
-def _moved(loaded: Calibration) -> float | None:
-    kept = loaded.record.checks
-    if kept is None:
-        return None
-    tools = predict(loaded.system, loaded.parameters, kept.commands)[1]
-    before = np.array([kept.tools[arm] for arm in loaded.system.arms]).reshape(*tools.shape[:2], 3, 4)
-    return float(np.linalg.norm(tools[:, :, :3, 3] - before[..., 3], axis=-1).max())

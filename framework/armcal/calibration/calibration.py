@@ -88,33 +88,21 @@ class Calibration:
             ConfigError: its parts do not fit one another.
             PluginError: it needs a plugin that is not there.
         """
-        record = validate(CalibrationFile, source)
+        where, record = Location(str(path)), validate(CalibrationFile, source)
         if not record.converged:
-            raise ConfigError(
-                "the solver did not converge: these values are no calibration.",
-                where=Location(str(path)),
-                hint="Run the calibration again with better start values or more data.",
-            )
+            hint = "Run the calibration again with better start values or more data."
+            raise ConfigError("the solver did not converge: these values are no calibration.", where=where, hint=hint)
         if not (record.verdict.get("usable", True) or record.verdict.get("accepted", False)):
-            raise ConfigError(
-                f"its verdict is bad: {record.verdict['findings'][0]}",
-                where=Location(str(path)),
-                hint="Correct the data or the configuration; or, if you know better, run again with --accept.",
-            )
-        rows = record.information.square_root
-        if [len(row) for row in rows] != [len(record.information.increments)] * len(record.information.increments):
-            raise ConfigError(
-                "its information does not fit its parameters: the file was cut or damaged.",
-                where=Location(str(path)),
-                hint="Take a whole copy, or run the calibration again.",
-            )
+            hint = "Correct the data or the configuration; or, if you know better, run again with --accept."
+            raise ConfigError(f"its verdict is bad: {record.verdict['findings'][0]}", where=where, hint=hint)
+        rows, count = record.information.square_root, len(record.information.increments)
+        if [len(row) for row in rows] != [count] * count:
+            text = "its information does not fit its parameters: the file was cut or damaged."
+            raise ConfigError(text, where=where, hint="Take a whole copy, or run the calibration again.")
         description = {key: plain(source.data[key]) for key in ("arms", "measurements", "statics")}
         if identity_of(description) != record.identity.get("arm"):
-            raise ConfigError(
-                "the description of the arm does not match its identity: the file was edited or damaged.",
-                where=Location(str(path)),
-                hint="Change the experiment's configuration and run it again.",
-            )
+            text = "the description of the arm does not match its identity: the file was edited or damaged."
+            raise ConfigError(text, where=where, hint="Change the experiment's configuration and run it again.")
         missing = absent(record.components, registry)
         if missing is not None:
             raise _absent(missing, path)
@@ -231,7 +219,12 @@ class Calibration:
             )
         fitted = self.parameters.with_nominal(np.array([entry.nominal for entry in entries])).with_free(free)
         try:
-            components = tuple(_component(component) for component in noise.get("components", ()))
+            nan = float("nan")  # where null is kept
+            stated: list[dict[str, Any]] = [
+                {key: nan if value is None else value for key, value in component.items()}
+                for component in noise.get("components", ())
+            ]
+            components = tuple(Component(**component) for component in stated)
             measure = (float(noise["scale"]), float(noise["degrees_of_freedom"]))
         except (KeyError, TypeError, ValueError) as fault:
             text = f"the noise in the calibration cannot be read ({type(fault).__name__}: {fault})."
@@ -361,12 +354,6 @@ def arm_named(calibration: Calibration, arm: str | None) -> str:
     if name not in arms:
         raise ConfigError(f"no arm is called {name!r}.", hint=f"The arms are {', '.join(arms)}.")
     return name
-
-
-def _component(kept: Mapping[str, Any]) -> Component:
-    """One estimated variance; not a number where null is kept."""
-    known: dict[str, Any] = {key: float("nan") if value is None else value for key, value in kept.items()}
-    return Component(**known)
 
 
 def _absent(missing: ComponentRecord, path: str | Path) -> PluginError:

@@ -115,7 +115,8 @@ def require_independent(chain: RigidChain, target: str) -> None:
 def random_commands(chain: RigidChain, count: int, seed: int) -> Array:
     """Commands (count x joints): within limits where they are known, else half a turn or 0.5 m either way."""
     random = np.random.default_rng(seed)
-    ends = [joint.limits or _free(joint) for joint in chain.joints]
+    free = {True: (-FREE_TRAVEL, FREE_TRAVEL), False: (-FREE_ANGLE, FREE_ANGLE)}
+    ends = [joint.limits or free[joint.slides] for joint in chain.joints]
     lower, upper = np.clip(np.array(ends, dtype=float), -_WIDEST, _WIDEST).T
     return np.asarray(random.uniform(lower, upper, (count, len(chain.joints))))
 
@@ -158,11 +159,6 @@ def rpy_of(rotation: Array) -> tuple[float, float, float]:
     cosine, sine = math.cos(yaw), math.sin(yaw)
     left = np.array([[cosine, sine, 0.0], [-sine, cosine, 0.0], [0.0, 0.0, 1.0]]) @ rotation
     return math.atan2(-left[1, 2], left[1, 1]), math.atan2(-left[2, 0], left[0, 0]), yaw
-
-
-def _free(joint: RigidJoint) -> tuple[float, float]:
-    reach = FREE_TRAVEL if joint.slides else FREE_ANGLE
-    return -reach, reach
 
 
 def _rigid(joint: Joint, placed: Array) -> RigidJoint:

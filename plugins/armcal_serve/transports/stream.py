@@ -1,19 +1,24 @@
-"""A client at a stream of bytes: lines in, lines out, with bounded memory for both."""
+"""A client at a stream of bytes: lines in, lines out, with bounded memory for both; and standard input and output."""
 
 from __future__ import annotations
 
+import os
 import time
 from collections import deque
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from armcal.errors import ArmcalError, DataError
 from armcal.io.line_cutter import LineCutter
+from armcal.io.standard_output import write_ready
+from typing_extensions import override
 
 from armcal_serve.conversation import MOST_WAITING, Conversation
 from armcal_serve.dispatcher import Dispatcher
 from armcal_serve.poller import Poller
 from armcal_serve.protocol import MAX_LINE_BYTES
+from armcal_serve.transports.transport import Transport
 
 CHUNK = 64 * 1024
 MOST_UNREAD_BYTES = 1024**2
@@ -153,3 +158,52 @@ class StreamClient:
             self.end()
             return
         self.arrange()
+
+
+class StandardStreams(Transport):
+    """Requests from one descriptor, answers to another, which stay the caller's; no waiting in either.
+
+    They are shared with other programs (a terminal with its shell), so neither is made non-blocking.
+    """
+
+    name = "standard input"
+
+    def __init__(self, incoming: int, outgoing: int, poller: Poller, dispatcher: Dispatcher) -> None:
+        self._incoming, self._outgoing = incoming, outgoing
+        self._poller, self._dispatcher = poller, dispatcher
+        self._client: StreamClient | None = None
+
+    @property
+    @override
+    def clients(self) -> int:
+        return int(not self.ended)
+
+    @property
+    @override
+    def ended(self) -> bool:
+        client = self._client
+        return client is not None and (client.ended or (client.input_ended and client.finished))
+
+    @property
+    @override
+    def finished(self) -> bool:
+        return self._client is None or self._client.ended or self._client.finished
+
+    @override
+    def open(self) -> None:
+        receive, send = partial(os.read, self._incoming, CHUNK), partial(write_ready, self._outgoing)
+        self._client = StreamClient(self._incoming, self._outgoing, receive, send, self._poller, self._dispatcher)
+
+    @override
+    def poll(self) -> None:
+        """Nothing: a slow reader delays no other client here."""
+
+    @override
+    def stop_reading(self) -> None:
+        if self._client is not None:
+            self._client.stop_reading()
+
+    @override
+    def close(self) -> None:
+        if self._client is not None and not self._client.ended:
+            self._client.end()

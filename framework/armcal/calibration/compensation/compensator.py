@@ -11,7 +11,7 @@ import numpy as np
 from armcal.arm.loading import LOAD_CHANNELS
 from armcal.base.domains import Array
 from armcal.base.parameters import Parameters
-from armcal.calibration.compensation.counts import Counts, Rounding, ServoCounts
+from armcal.calibration.compensation.counts import Rounding, ServoCounts
 from armcal.calibration.compensation.finder import Allowed, Finder, Seeds
 from armcal.calibration.compensation.path import PathFinder, with_sides
 from armcal.calibration.compensation.reach import Reach, check_held, command_limits, held_joints, reach_of, why_not
@@ -249,17 +249,12 @@ class Compensator:
                 barred = solutions.there & ~self._allowed(record[:joints])
                 solutions.there[barred], solutions.forbidden[barred] = False, True
         standing = self._equilibrium(record, None if counts is not None else solutions.states)
-        return self._answer(record, targets, solutions, standing, counts)
-
-    def _answer(
-        self, record: Array, targets: Targets, solutions: Solutions, standing: Standing, counts: Counts | None
-    ) -> Commands:
         tools, had = standing.base_T_tool, solutions.there & standing.settled
         bounds = self.reach.bounds(targets.positions)
         turns = np.zeros(len(tools))
         if targets.rotations is not None:
             turns = np.linalg.norm(turn_between(tools[:, :3, :3], targets.rotations), axis=1)
-        commands = record[: len(self.joints)]
+        commands = record[:joints]
 
         def position_can_be_had(rows: Rows) -> Mask:
             return self._positions.finder(record[:, rows], targets.positions[rows].T, commands[:, rows]).there
@@ -275,7 +270,7 @@ class Compensator:
             reached=had,
             reasons=reasons,
             bounds=np.where(had, 0.0, bounds),
-            approach=record[len(self.joints) : 2 * len(self.joints)].T.copy(),
+            approach=record[joints : 2 * joints].T.copy(),
         )
 
     def _record(self, targets: Targets) -> Array:

@@ -20,6 +20,7 @@ from armcal.calibration.compensation.search import (
     chosen_of,
     with_commands,
 )
+from armcal.calibration.rigid_chain import FREE_ANGLE, FREE_TRAVEL
 from armcal.calibration.tool_expression import Equilibrium, ToolExpression
 
 Allowed = Callable[[Array], Mask]
@@ -37,8 +38,6 @@ _POSTURES, _MOVED = 24, 0.2
 """Starts from which the nearest of all commands is sought; what their distance from where the arm is counts beside
 that of their tool from the target."""
 _NEAREST_STARTS = 4
-FREE_ANGLE, FREE_TRAVEL = np.pi, 0.5
-"""How far joints without limits are tried (rad, m)."""
 _WIDEST = 2 * np.pi
 """To either side; a joint that goes farther is tried about where it is nearest to zero."""
 
