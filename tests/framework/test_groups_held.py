@@ -38,6 +38,7 @@ def data():
 
 
 @pytest.mark.parametrize("counts", [(1, 0), (2, 0), (3, 0), (4, 3)])
+@pytest.mark.quick("counts0", "counts3")
 def test_where_sockets_start_does_not_depend_on_the_order_of_records(counts):
     data, made = touches(8, counts, scatter=0.05), bench()
     if not counts[1]:

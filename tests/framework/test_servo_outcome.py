@@ -106,6 +106,12 @@ def whole(truth, nominal):
     return evaluated(record_of(truth), nominal)
 
 
+@pytest.fixture(scope="module")
+def part(truth, nominal):
+    """The same of one joint alone."""
+    return evaluated(record_of(truth, joints=("q3",)), nominal, ("q3",))
+
+
 @pytest.mark.slow
 def test_tables_come_back_though_nobody_knew_springs_or_axes(whole):
     assert worst_us(whole) < 3.0
@@ -142,10 +148,10 @@ def test_a_joint_that_positions_do_not_show_is_left_as_it_was(nominal):
     assert any("left as it was" in sentence for sentence in results(found, changed)["findings"])
 
 
-def test_writing_keeps_every_file_before_and_the_numbers_that_were_found(whole, tmp_path):
+def test_writing_keeps_every_file_before_and_the_numbers_that_were_found(part, tmp_path):
     path = tmp_path / "servos.yaml"
     path.write_bytes((CONFIGS / "servos.yaml").read_bytes())
-    changed = improved(STATED, whole)
+    changed = improved(STATED, part)
     assert write_servo_file(path, changed) == tmp_path / "servos.yaml.before-1"
     assert load_servo_file(path) == changed
     assert write_servo_file(path, changed) is None
@@ -180,8 +186,8 @@ def test_a_servo_that_lets_go_is_left_out_and_spoils_no_other(truth, nominal):
     assert both.fit.servos["q3"].pulses == alone.fit.servos["q3"].pulses
 
 
-def test_a_board_without_an_id_gets_the_one_it_was_measured_on_and_others_keep_theirs(whole):
+def test_a_board_without_an_id_gets_the_one_it_was_measured_on_and_others_keep_theirs(part):
     board = STATED.boards["front"]
     nameless = replace(STATED, boards={"front": type(board).si(**{**board.model_dump(), "id": ""})})
-    assert improved(nameless, whole, "A5069RR4").boards["front"].id == "A5069RR4"
-    assert improved(STATED, whole, "A5069RR4").boards["front"].id == "LRM-1"
+    assert improved(nameless, part, "A5069RR4").boards["front"].id == "A5069RR4"
+    assert improved(STATED, part, "A5069RR4").boards["front"].id == "LRM-1"
