@@ -27,10 +27,9 @@ from armcal_export.description import (
     Parameter,
     Pose,
     Servo,
-    SpringEntry,
     Statics,
 )
-from armcal_export.springs import spring_numbers
+from armcal_export.springs import spring_entries
 
 TOLERANCE = 1e-12
 """m, and entries of rotation matrices, for each metre and radian that a pose is made of."""
@@ -64,17 +63,7 @@ def describe(request: ExportRequest) -> ArmDescription:
         base_T_mount=_pose(rigid.base_T_mount),
         base_T_tool=_pose(rigid.base_T_tool),
         effects=_effects(request),
-        springs=[
-            SpringEntry(
-                effect=spring.effect,
-                site=spring.site,
-                axes=spring.axes.T.tolist(),
-                along=spring.along,
-                compliance=spring.compliance.tolist(),
-                linear=spring.linear,
-            )
-            for spring in spring_numbers(request, chain)
-        ],
+        springs=spring_entries(request, chain),
         masses=_masses(request, chain),
         statics=_statics(request),
         servos=[

@@ -19,11 +19,10 @@ from armcal.errors import InputError, NotConvergedError, ProblemError
 from pydantic import Field
 
 from armcal_export.describe import REPORT, chain_of, describe
-from armcal_export.description import ArmDescription
+from armcal_export.description import ArmDescription, SpringEntry
 from armcal_export.mjcf import Drive, Hinge, mjcf
 from armcal_export.mujoco_rest import LoadedModel
 from armcal_export.reference import in_equilibrium
-from armcal_export.springs import SpringNumbers, spring_numbers
 
 TOLERANCE = 1e-9
 """m, and entries of rotation matrices, of the rigid arm."""
@@ -65,14 +64,13 @@ class MujocoExporter:
         chain = chain_of(request)
         rigid, arm_description = rigid_chain(chain), describe(request)
         require_plain_axes(rigid, "mujoco")
-        springs = spring_numbers(request, chain)
         drive = Drive(self._settings.gain, self._settings.damping, self._settings.armature)
-        content = mjcf(arm_description, rigid, _hinges(springs), drive)
+        content = mjcf(arm_description, rigid, _hinges(arm_description.springs), drive)
         loaded = _loaded(content, rigid)
         commands = random_commands(request.arm, POSES)
         _compare(loaded, rigid_tools(request.arm, request.values, commands), commands)
         reach = _reach(request, loaded, commands)
-        left_out = _left_out(request, springs, arm_description)
+        left_out = _left_out(request, arm_description)
         left_out = left_out or (("turns of second order in its springs",) if reach > TOLERANCE else ())
         return Exported(content, changed_numbers(request), left_out, reach=reach)
 
@@ -88,7 +86,7 @@ def _loaded(content: bytes, rigid: RigidChain) -> LoadedModel:
         raise ProblemError(f"MuJoCo does not take the model: {str(fault)[:300]}.", hint=REPORT) from fault
 
 
-def _hinges(springs: Sequence[SpringNumbers]) -> Mapping[int, Sequence[Hinge]]:
+def _hinges(springs: Sequence[SpringEntry]) -> Mapping[int, Sequence[Hinge]]:
     """Linear springs as hinges along principal axes, by site."""
     turning: dict[int, Array] = defaultdict(lambda: np.zeros((3, 3)))
     sliding: dict[int, float] = defaultdict(float)
@@ -97,10 +95,11 @@ def _hinges(springs: Sequence[SpringNumbers]) -> Mapping[int, Sequence[Hinge]]:
         if not spring.linear:
             continue
         if spring.along:
-            sliding[spring.site] += float(spring.compliance[0, 0])
-            axes[spring.site] = spring.axes[:, 0]
+            sliding[spring.site] += spring.compliance[0][0]
+            axes[spring.site] = np.array(spring.axes[0])
         else:
-            turning[spring.site] += spring.axes @ spring.compliance @ spring.axes.T
+            about = np.array(spring.axes)
+            turning[spring.site] += about.T @ np.array(spring.compliance) @ about
     hinges: dict[int, list[Hinge]] = defaultdict(list)
     for site, compliance in sliding.items():
         hinges[site] += _kept([(axes[site], compliance)], slides=True)
@@ -122,11 +121,9 @@ def _snapped(axis: Array) -> Array:
     return near if np.allclose(axis, near, rtol=0, atol=1e-12) else axis
 
 
-def _left_out(
-    request: ExportRequest, springs: Sequence[SpringNumbers], arm_description: ArmDescription
-) -> tuple[str, ...]:
+def _left_out(request: ExportRequest, arm_description: ArmDescription) -> tuple[str, ...]:
     """What no passive hinge and no mass does."""
-    bent = {spring.effect for spring in springs if not spring.linear}
+    bent = {spring.effect for spring in arm_description.springs if not spring.linear}
     effects = [name for name in request.arm.effects if name in bent or _displaces(request, name)]
     masses = [mass.name for mass in arm_description.masses if mass.loads_up_to != mass.moved_by and mass.mass_kg > 0]
     counted = [f"what {', '.join(masses)} load beyond the joints that carry them"] if masses else []
