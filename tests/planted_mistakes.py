@@ -135,19 +135,22 @@ def true_error(arm: PlantedArm, experiment: Experiment, parameters) -> float:
 
 def arms(folder: Path) -> tuple[PlantedArm, ...]:
     """A printed arm on its bench, an industrial one, and one of seven joints; the last two as armcal makes them new."""
+    seven = _new(folder, "seven", "--urdf", str(ROOT / "configs" / "ball" / "arm7.urdf"))
+    printed = PlantedArm("printed", DEMO, "arm.mdh.base_*", 0.42)
+    return printed, industrial_arm(folder), PlantedArm("seven", seven, "arm.placement_*", 1.2)
+
+
+def industrial_arm(folder: Path) -> PlantedArm:
+    """Begun from its table of lengths and angles."""
     (folder / "industrial.csv").write_text(INDUSTRIAL)
-    seven = str(ROOT / "configs" / "ball" / "arm7.urdf")
-    for name, flags in (
-        ("industrial", ["--convention", "standard", "--dh", str(folder / "industrial.csv")]),
-        ("seven", ["--urdf", seven]),
-    ):
-        made = CliRunner().invoke(cli, ["new", "robot", name, *flags, "--out", str(folder / name)])
-        assert made.exit_code == 0, made.output
-    return (
-        PlantedArm("printed", DEMO, "arm.mdh.base_*", 0.42),
-        PlantedArm("industrial", folder / "industrial" / "simulated.yaml", "arm.mdh.base_*", 1.4),
-        PlantedArm("seven", folder / "seven" / "simulated.yaml", "arm.placement_*", 1.2),
-    )
+    config = _new(folder, "industrial", "--convention", "standard", "--dh", str(folder / "industrial.csv"))
+    return PlantedArm("industrial", config, "arm.mdh.base_*", 1.4)
+
+
+def _new(folder: Path, name: str, *flags: str) -> Path:
+    made = CliRunner().invoke(cli, ["new", "robot", name, *flags, "--out", str(folder / name)])
+    assert made.exit_code == 0, made.output
+    return folder / name / "simulated.yaml"
 
 
 # ---------------------------------------------------------------- mistakes

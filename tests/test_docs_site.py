@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 import re
@@ -126,16 +127,24 @@ def test_folders_give_their_pages() -> None:
 # The site
 
 
-@pytest.fixture(scope="module")
-def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Built strictly: a link or an anchor that leads nowhere ends the build."""
+@pytest.fixture(scope="session")
+def site(of_this_run: Path) -> Path:
+    """Built strictly, by the worker that is first: a link or an anchor that leads nowhere ends the build."""
     pytest.importorskip("material", reason="mkdocs-material is not installed here: pip install 'armcal[docs]'")
-    place = tmp_path_factory.mktemp("site")
+    place = of_this_run / "site"
+    with (of_this_run / "site.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not place.exists():
+            build(of_this_run / "site.new")
+            (of_this_run / "site.new").rename(place)
+    return place
+
+
+def build(place: Path) -> None:
     environment = {**os.environ, "NO_MKDOCS_2_WARNING": "1"}
     command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "-d", str(place)]
     done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
-    return place
 
 
 class Fetched(HTMLParser):

@@ -155,6 +155,7 @@ def compared(lrm, problem, records, dense, v):
                                hessian / np.outer(size, size), rtol=0, atol=1e-6)  # fmt: skip
 
 
+@pytest.mark.quick("3-64", "1_0-31", "1_1-31")
 @pytest.mark.parametrize("count", [31, 64])
 @pytest.mark.parametrize("drifts", [DRIFTS, {"theta1": (2e-3, 3.0)}, {"base_y": (1e-3, 200.0)}], ids=len)
 def test_cost_and_derivatives_are_those_of_the_dense_covariance(lrm, count, drifts):

@@ -83,8 +83,7 @@ def test_what_data_cannot_show_is_stated(tmp_path: Path) -> None:
 
 def test_an_arm_that_shows_a_tenth_too_large_is_not_usable(tmp_path: Path) -> None:
     """An instrument's scale 10 % off, where priors pull the arm a little back towards its nominal size."""
-    industrial = planted_mistakes.arms(tmp_path)[1]
-    found = planted("a tracker's scale off by 10 %", tmp_path, industrial)
+    found = planted("a tracker's scale off by 10 %", tmp_path, planted_mistakes.industrial_arm(tmp_path))
     assert found.grade == "bad" and "1.1 times as large" in found.said
 
 
