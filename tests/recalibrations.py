@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from armcal.io.journal.files import RealFiles
+from armcal.io.journal.files import FileLayer
 from armcal.io.journal.reader import read_entries, read_until
 from armcal_online.running.session import Open, opened
 from armcal_online.running.state_replayer import StateReplayer
@@ -103,7 +103,7 @@ def steps(going: Open, count: int) -> None:
         going.recalibration.step(0.0)
 
 
-class FullFiles(RealFiles):
+class FullFiles(FileLayer):
     """Files on a disk that fills up."""
 
     def __init__(self) -> None:

@@ -13,7 +13,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar, Literal, NoReturn
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from armcal.base.dataset import Dataset
@@ -21,7 +21,7 @@ from armcal.base.domains import Array
 from armcal.base.settings import InputPath, Settings
 from armcal.errors import DataError, Location
 from armcal.io.cells import is_missing, is_number
-from armcal.io.plain_files import input_bytes, text_of
+from armcal.io.plain_files import input_bytes, refuse, text_of
 from armcal.measure.checks import check_dataset, layout_of
 from armcal.measure.contact import named_arm
 from armcal.measure.measurement import GroupedMeasurement, noise_channels
@@ -114,9 +114,9 @@ def found_files(folder: Path) -> tuple[tuple[SocketFile, ...], tuple[str, ...]]:
         DataError: there is no such folder, no position in it, or a file cannot be read or is a copy of another.
     """
     if not folder.exists():
-        _refuse(folder, "there is no such folder.", "Check the path.")
+        refuse(folder, "there is no such folder.", "Check the path.")
     if not folder.is_dir():
-        _refuse(folder, "it is a file, expected a folder.", _LAYOUT)
+        refuse(folder, "it is a file, expected a folder.", _LAYOUT)
     files: list[SocketFile] = []
     try:
         warnings = [_ignored(path) for path in sorted(folder.iterdir()) if not path.is_dir() and _is_table(path)]
@@ -132,15 +132,15 @@ def found_files(folder: Path) -> tuple[tuple[SocketFile, ...], tuple[str, ...]]:
         own = any(_SOCKET_FILE.fullmatch(path.name) for path in folder.iterdir())
     except OSError as fault:
         path = Path(str(fault.filename)) if fault.filename else folder
-        _refuse(path, f"it cannot be read ({fault.strerror or fault}).", "Check the path and its permissions.")
+        refuse(path, f"it cannot be read ({fault.strerror or fault}).", "Check the path and its permissions.")
     if not files:
         where = " (its files lie in the folder itself: is it one position?)" if own else ""
-        _refuse(folder, f"found no position in it, expected folders with hole_0.csv and hole_1.csv{where}.", _LAYOUT)
+        refuse(folder, f"found no position in it, expected folders with hole_0.csv and hole_1.csv{where}.", _LAYOUT)
     first: dict[bytes, SocketFile] = {}
     for file in files:  # no ball sits in two sockets in the same postures
         other = first.setdefault(file.raw, file)
         if other is not file and file.text.strip():
-            _refuse(file.path, f"it is a copy of {other.path}.", "Give each socket its own recording.")
+            refuse(file.path, f"it is a copy of {other.path}.", "Give each socket its own recording.")
     return tuple(files), tuple(warnings)
 
 
@@ -151,7 +151,7 @@ def hash_of(files: Sequence[SocketFile]) -> str:
 
 def _file(path: Path, folder: Path) -> SocketFile:
     if not path.resolve().is_relative_to(folder.resolve()):
-        _refuse(path, "it is a link that leads out of the folder.", "Put the recording itself there.")
+        refuse(path, "it is a link that leads out of the folder.", "Put the recording itself there.")
     raw = input_bytes(path, MAX_BYTES, "a CSV file")
     text = text_of(raw, path, "Save it as CSV text.")
     return SocketFile(path, path.parent.name, path.stem, text.replace("\r\n", "\n").replace("\r", "\n"), raw)
@@ -175,17 +175,17 @@ def _rows(file: SocketFile, requested_channels: Sequence[RequestedChannel]) -> t
         first = first or len(cells)
         if len(cells) != first:
             mend = "Complete the row, or remove it."
-            _refuse(path, f"found {len(cells)} numbers, expected {first} as in the first row.", mend, line)
+            refuse(path, f"found {len(cells)} numbers, expected {first} as in the first row.", mend, line)
         if len(cells) != len(requested_channels):
             arm = requested_channels[0].channel.partition(".")[0] if requested_channels else "arm"
             message = (
                 f"found {len(cells)} columns, expected {len(requested_channels)}: a joint angle of the arm {arm} each."
             )
-            _refuse(path, message, "Give this arm's recordings, comma separated.", line)
+            refuse(path, message, "Give this arm's recordings, comma separated.", line)
         lines.append(line)
         numbers.append([_number(path, line, i, cell, requested_channels) for i, cell in enumerate(cells)])
     if not lines:
-        _refuse(path, "it is empty.", "Give a row a posture, or remove the file.")
+        refuse(path, "it is empty.", "Give a row a posture, or remove the file.")
     return lines, np.array(numbers)
 
 
@@ -198,16 +198,12 @@ def _number(path: Path, line: int, index: int, cell: str, requested_channels: Se
     if not is_number(text):
         header = " These files have no header." if line == 1 else ""
         mend = f"Correct it, or leave the cell empty to set the record aside.{header}"
-        _refuse(path, f"found {text[:40]!r}, expected a number.", mend, line, column)
+        refuse(path, f"found {text[:40]!r}, expected a number.", mend, line, column)
     value = float(text)
     if joint.dimension == "angle" and not joint.is_endless and _FULL_TURN * (1 + 1e-9) < abs(value) < math.inf:
         message = f"found {value:.10g} rad, more than one turn (2 pi rad): are these degrees?"
-        _refuse(path, message, "Write the angles in rad.", line, column)
+        refuse(path, message, "Write the angles in rad.", line, column)
     return value
-
-
-def _refuse(path: Path, message: str, hint: str, line: int | None = None, column: str | None = None) -> NoReturn:
-    raise DataError(message, where=Location(str(path), line=line, field=column), hint=hint)
 
 
 def _weighed(dataset: Dataset, request: ReadRequest) -> Dataset:

@@ -9,13 +9,11 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import chain, islice
 from pathlib import Path
-from typing import NoReturn
 
 import numpy as np
 from armcal.base.domains import Array
-from armcal.errors import DataError, Location
 from armcal.io.cells import is_missing, is_number, plain_numbers
-from armcal.io.plain_files import input_bytes
+from armcal.io.plain_files import input_bytes, refuse
 
 MAX_BYTES = 2 * 1024**3
 _ROWS_AT_ONCE = 256
@@ -55,11 +53,11 @@ def read_table(path: Path, delimiter: str, numbers: Sequence[Column], texts: Seq
     try:
         raw = input_bytes(path, MAX_BYTES, "a log")
     except OSError as fault:
-        _refuse(path, f"it cannot be read ({fault.strerror or fault}).", "Check the path and its permissions.")
+        refuse(path, f"it cannot be read ({fault.strerror or fault}).", "Check the path and its permissions.")
     rows = _rows(path, raw, delimiter)
     first = next(rows, None)
     if first is None:
-        _refuse(path, "it is empty.", "Give a row a moment.")
+        refuse(path, "it is empty.", "Give a row a moment.")
     line, cells = first
     header = cells if is_header(cells, numbers, texts) else []
     places = [place_of(path, line, header, len(cells), column) for column in (*numbers, *texts)]
@@ -67,7 +65,7 @@ def read_table(path: Path, delimiter: str, numbers: Sequence[Column], texts: Seq
     names = [header[place] if header else f"column {place + 1}" for place in places]
     lines, columns, words = _load(path, body, len(cells), places[: len(numbers)], places[len(numbers) :], names)
     if not lines:
-        _refuse(path, "found a header and no rows.", "Give a row a moment.", line)
+        refuse(path, "found a header and no rows.", "Give a row a moment.", line)
     return LogTable(lines, columns, words, tuple(names[: len(numbers)]), hashlib.sha256(raw).hexdigest())
 
 
@@ -90,9 +88,9 @@ def text_of(path: Path, line: int | None, data: bytes) -> str:
     try:
         text = data.decode("utf-8" if line and line > 1 else "utf-8-sig")
     except UnicodeDecodeError:
-        _refuse(path, "found bytes that are not UTF-8 text.", _SAVE_AS_TEXT, line)
+        refuse(path, "found bytes that are not UTF-8 text.", _SAVE_AS_TEXT, line)
     if "\0" in text:
-        _refuse(path, "found a NUL byte, expected text.", _SAVE_AS_TEXT, line)
+        refuse(path, "found a NUL byte, expected text.", _SAVE_AS_TEXT, line)
     return text
 
 
@@ -123,16 +121,16 @@ def place_of(path: Path, line: int | None, header: Sequence[str], count: int, co
     """
     if isinstance(column, int):
         if not 1 <= column <= count:
-            _refuse(path, f"found {count} columns, expected a column {column}.", "Columns count from 1.", line)
+            refuse(path, f"found {count} columns, expected a column {column}.", "Columns count from 1.", line)
         return column - 1
     if not header:
         text = f"found no header, expected one with the column {column}."
-        _refuse(path, text, "Add it, or give the columns' numbers, from 1.", line)
+        refuse(path, text, "Add it, or give the columns' numbers, from 1.", line)
     if header.count(column) != 1:
         near = difflib.get_close_matches(column, header, n=2)
         text = f"found the column {column} {header.count(column)} times" if column in header else f"no column {column}"
         hint = f"The nearest is {' or '.join(near)}." if near else f"The columns are {', '.join(header[:20])[:200]}."
-        _refuse(path, f"{text}, expected it once.", hint, line, column)
+        refuse(path, f"{text}, expected it once.", hint, line, column)
     return header.index(column)
 
 
@@ -151,7 +149,7 @@ def _load(
         ragged = next(((line, cells) for line, cells in block if len(cells) != count), None)
         if ragged:
             mend = "Complete the row, or give the delimiter; numbers have a decimal point."
-            _refuse(path, f"found {len(ragged[1])} cells, expected {count} as in the first row.", mend, ragged[0])
+            refuse(path, f"found {len(ragged[1])} cells, expected {count} as in the first row.", mend, ragged[0])
         block_lines = [line for line, _ in block]
         table = list(zip(*(cells for _, cells in block), strict=True))
         columns = []
@@ -178,8 +176,4 @@ def number_of(path: Path, line: int | None, cell: str, name: str) -> float:
         return float(cell)
     if is_missing(cell):
         return math.nan
-    _refuse(path, f"found {cell[:40]!r}, expected a number.", "Correct it, or leave the cell empty.", line, name)
-
-
-def _refuse(path: Path, message: str, hint: str, line: int | None = None, column: str | None = None) -> NoReturn:
-    raise DataError(message, where=Location(str(path), line=line, field=column), hint=hint)
+    refuse(path, f"found {cell[:40]!r}, expected a number.", "Correct it, or leave the cell empty.", line, name)

@@ -12,6 +12,8 @@ from armcal.base.parameters import ParameterBlock, scalar
 from armcal.base.settings import Torque
 from pydantic import Field
 
+from armcal_joints.springs import SiteSprings
+
 PLAY_SCALE_RAD = 0.01
 
 
@@ -37,12 +39,13 @@ class TorqueBacklashSettings(EffectSettings):
     transition: Annotated[Torque, Field(gt=0)] = 0.05
 
 
-class TorqueBacklash(JointEffect):
+class TorqueBacklash(SiteSprings):
     """The effect ``torque_backlash``: ``play1`` to ``playn`` (rad), half the play that the sign of the torque decides.
 
     play * torque / sqrt(torque^2 + transition^2): a smooth sign, so that the elastic equilibrium has a derivative.
     """
 
+    letter = "play"
     Settings = TorqueBacklashSettings
 
     def parameters(self) -> tuple[ParameterBlock, ...]:
@@ -50,13 +53,10 @@ class TorqueBacklash(JointEffect):
         physical = Interval(lower=0.0)
         return tuple(scalar(f"play{joint}", "rad", 0.0, PLAY_SCALE_RAD, physical) for joint in self.joints)
 
-    def springs(self, values: Mapping[str, Any]) -> tuple[Spring, ...]:
-        """One coordinate a joint."""
-        return tuple(self._spring(joint, values[f"play{joint}"]) for joint in self.joints)
-
-    def _spring(self, site: int, play: Any) -> Spring:
+    def spring(self, site: int, value: Any) -> Spring:
+        """One coordinate."""
         floor = self.settings.transition**2
-        return Spring(site, (), lambda torque, command: play * torque / ca.sqrt(torque * torque + floor))
+        return Spring(site, (), lambda torque, command: value * torque / ca.sqrt(torque * torque + floor))
 
 
 class BearingPlaySettings(TorqueBacklashSettings):
@@ -65,29 +65,22 @@ class BearingPlaySettings(TorqueBacklashSettings):
     base: bool = True
 
 
-class BearingPlay(JointEffect):
+class BearingPlay(SiteSprings):
     """The effect ``bearing_play``: ``tilt0`` (base) and ``tilt1`` to ``tiltn`` (rad), half a bearing's angular play.
 
     The part of the arm beyond a bearing tilts with the moment that it carries, whatever its direction, as far as the
     play lets it: tilt * moment / sqrt(|moment|^2 + transition^2).
     """
 
+    letter = "tilt"
     Settings = BearingPlaySettings
-
-    @property
-    def sites(self) -> tuple[int, ...]:
-        """Where there is play: 0 for the base, i for joint i."""
-        return (0, *self.joints) if self.settings.base else self.joints
 
     def parameters(self) -> tuple[ParameterBlock, ...]:
         """One half-width a site."""
         physical = Interval(lower=0.0)
         return tuple(scalar(f"tilt{site}", "rad", 0.0, PLAY_SCALE_RAD, physical) for site in self.sites)
 
-    def springs(self, values: Mapping[str, Any]) -> tuple[Spring, ...]:
-        """Three coordinates a site."""
-        return tuple(self._spring(site, values[f"tilt{site}"]) for site in self.sites)
-
-    def _spring(self, site: int, tilt: Any) -> Spring:
+    def spring(self, site: int, value: Any) -> Spring:
+        """Three coordinates."""
         floor = self.settings.transition**2
-        return Spring(site, XYZ, lambda moment, command: tilt * moment / ca.sqrt(ca.dot(moment, moment) + floor))
+        return Spring(site, XYZ, lambda moment, command: value * moment / ca.sqrt(ca.dot(moment, moment) + floor))

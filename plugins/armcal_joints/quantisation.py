@@ -8,14 +8,10 @@ from typing import Annotated, Any, ClassVar
 from armcal.arm.effects import JointCommand, chosen
 from armcal.arm.servo import PulseClock, PulseTable, SteppedEffect, quantised, without_slope
 from armcal.base.config_text import resolve_path
-from armcal.base.quantities import UnitOf
 from armcal.base.settings import Settings
-from armcal.config.servo_file import CalibratedServo, load_servo_file
+from armcal.config.servo_file import Angles, CalibratedServo, Oscillator, Pulses, check_longest, load_servo_file
 from armcal.errors import ConfigError
 from pydantic import BeforeValidator, Field, model_validator
-
-Angles = Annotated[tuple[float, ...], UnitOf("angle")]
-Pulses = Annotated[tuple[float, ...], UnitOf("time")]
 
 
 class PulseTableSettings(Settings):
@@ -52,7 +48,7 @@ class QuantisationSettings(Settings):
 
     servos: Servos = Field(default_factory=dict)
     tables: dict[str, PulseTableSettings] = Field(default_factory=dict)
-    oscillator_hz: Annotated[float, Field(ge=20e6, le=30e6)] = 25e6
+    oscillator_hz: Oscillator = 25e6
     rate_hz: Annotated[float, Field(ge=24, le=1526)] = 50.0
     prescale: Annotated[int, Field(ge=3, le=255)] | None = None
 
@@ -98,11 +94,7 @@ class Quantisation(SteppedEffect):
         clocked = settings.clocked()
         self._servos = {joint_names.index(joint): clocked[joint] for joint in clocked if joint in joint_names}
         for table, clock in self._servos.values():
-            longest, limit = max(table.pulses), clock.longest_pulse
-            if longest > limit:
-                raise ValueError(
-                    f"a pulse of {1e6 * longest:g} us is longer than the board's longest, {1e6 * limit:.0f} us"
-                )
+            check_longest(table, clock)
 
     def servos(self) -> Mapping[int, tuple[PulseTable, PulseClock]]:
         """Pulse table and clock by the joint's index; a joint without a table is not stepped."""

@@ -17,6 +17,29 @@ CUBIC_SCALE_RAD_PER_NM3 = 0.05
 _AXES = dict(zip("xyz", XYZ, strict=True))
 
 
+class SiteSprings(JointEffect):
+    """Springs of one law: at joints, and at the base where the settings say so.
+
+    Attributes:
+        letter: of the sites' parameters, before the number: 0 for the base, i for joint i.
+    """
+
+    letter: ClassVar[str]
+
+    @property
+    def sites(self) -> tuple[int, ...]:
+        """Where a spring is."""
+        return (0, *self.joints) if getattr(self.settings, "base", False) else self.joints
+
+    def springs(self, values: Mapping[str, Any]) -> tuple[Spring, ...]:
+        """One a site."""
+        return tuple(self.spring(site, values[f"{self.letter}{site}"]) for site in self.sites)
+
+    def spring(self, site: int, value: Any) -> Spring:
+        """That of a site, by its parameter."""
+        raise NotImplementedError
+
+
 class TorsionalSpringSettings(EffectSettings):
     """Which joints have a spring about their axis, and whether the base has one."""
 
@@ -31,13 +54,14 @@ class TorsionalSpringSettings(EffectSettings):
         return value
 
 
-class TorsionalSprings(JointEffect):
+class TorsionalSprings(SiteSprings):
     """The effect ``torsional_spring``: ``k1`` to ``kn`` about the joints' axes, ``k0`` at the base (rad/(N m)).
 
     The base's spring turns about an axis of the frame that carries joint 1, under the moment of everything
     about that frame's origin. The physical bound k >= 0 is part of the parameters' domain.
     """
 
+    letter = "k"
     Settings = TorsionalSpringSettings
     EXAMPLE: ClassVar[Mapping[str, Any]] = {"base_axis": "y", "compliance_rad_per_Nm": 0.01}
 
@@ -54,31 +78,27 @@ class TorsionalSprings(JointEffect):
             scalar(f"k{site}", "rad_per_Nm", nominal, COMPLIANCE_SCALE_RAD_PER_NM, physical) for site in self.sites
         )
 
-    def springs(self, values: Mapping[str, Any]) -> tuple[Spring, ...]:
-        """One coordinate a site."""
-        return tuple(self._spring(site, values[f"k{site}"]) for site in self.sites)
-
-    def _spring(self, site: int, compliance: Any) -> Spring:
+    def spring(self, site: int, value: Any) -> Spring:
+        """One coordinate."""
         directions = () if site else (_AXES[self.settings.base_axis],)
-        return Spring(site, directions, lambda load, command: compliance * load)
+        return Spring(site, directions, lambda load, command: value * load)
 
 
-class CubicSprings(JointEffect):
+class CubicSprings(SiteSprings):
     """The effect ``cubic_spring``: ``c1`` to ``cn`` (rad/(N m)^3) times the third power of the torque about the axis.
 
     It stands beside a linear spring. A negative value is a spring that stiffens; alone it would push back.
     """
 
+    letter = "c"
+
     def parameters(self) -> tuple[ParameterBlock, ...]:
         """One number a joint, zero at first."""
         return tuple(scalar(f"c{joint}", "rad_per_Nm3", 0.0, CUBIC_SCALE_RAD_PER_NM3) for joint in self.joints)
 
-    def springs(self, values: Mapping[str, Any]) -> tuple[Spring, ...]:
-        """One coordinate a joint."""
-        return tuple(self._spring(joint, values[f"c{joint}"]) for joint in self.joints)
-
-    def _spring(self, site: int, cubic: Any) -> Spring:
-        return Spring(site, (), lambda load, command: cubic * load * load * load)
+    def spring(self, site: int, value: Any) -> Spring:
+        """One coordinate."""
+        return Spring(site, (), lambda load, command: value * load * load * load)
 
 
 class ComplianceSettings(EffectSettings):
@@ -91,7 +111,7 @@ class ComplianceSettings(EffectSettings):
     compliance: Annotated[Compliance, Field(gt=0)] = 0.01
 
 
-class Compliances(JointEffect):
+class Compliances(SiteSprings):
     """The effect ``compliance``: symmetric positive semidefinite matrices ``C0`` (base) and ``C1`` to ``Cn`` (rad/(N m)).
 
     The rotation vector of a site is its matrix times the moment of everything beyond about the site's origin, both
@@ -99,13 +119,9 @@ class Compliances(JointEffect):
     with the mount's, and only the sum of their matrices would be determined.)
     """  # noqa: E501
 
+    letter = "C"
     Settings = ComplianceSettings
     EXAMPLE: ClassVar[Mapping[str, Any]] = {"compliance_rad_per_Nm": 0.02}
-
-    @property
-    def sites(self) -> tuple[int, ...]:
-        """Where a matrix is: 0 for the base, i for joint i."""
-        return (0, *self.joints) if self.settings.base else self.joints
 
     def parameters(self) -> tuple[ParameterBlock, ...]:
         """One matrix a site."""
@@ -113,11 +129,8 @@ class Compliances(JointEffect):
         nominal, scale = (c, 0.0, 0.0, c, 0.0, c), COMPLIANCE_SCALE_RAD_PER_NM
         return tuple(ParameterBlock(f"C{site}", "rad_per_Nm", nominal, Semidefinite(), scale) for site in self.sites)
 
-    def springs(self, values: Mapping[str, Any]) -> tuple[Spring, ...]:
-        """Three coordinates a site."""
-        return tuple(self._spring(site, values[f"C{site}"]) for site in self.sites)
-
-    def _spring(self, site: int, entries: Any) -> Spring:
-        xx, xy, xz, yy, yz, zz = (entries[i] for i in range(6))
+    def spring(self, site: int, value: Any) -> Spring:
+        """Three coordinates."""
+        xx, xy, xz, yy, yz, zz = (value[i] for i in range(6))
         matrix = ca.vertcat(ca.horzcat(xx, xy, xz), ca.horzcat(xy, yy, yz), ca.horzcat(xz, yz, zz))
         return Spring(site, XYZ, lambda moment, command: ca.mtimes(matrix, moment))

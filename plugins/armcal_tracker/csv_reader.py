@@ -23,7 +23,7 @@ from armcal.base.settings import InputPath, Settings
 from armcal.base.units import from_unit
 from armcal.errors import DataError, Location
 from armcal.io.cells import DECIMAL_COMMA, CellFault, plain_numbers, read_cell, with_point
-from armcal.io.plain_files import input_file
+from armcal.io.plain_files import input_file, refuse
 from armcal.measure.checks import check_dataset, layout_of
 from armcal.measure.column_match import Column, Header, Plan, header_of, match_columns, renamed
 from armcal.measure.reader import ReadRequest
@@ -74,7 +74,7 @@ class CsvReader:
         try:
             with input_file(path, MAX_BYTES, "a CSV file") as file:
                 if not os.fstat(file.fileno()).st_size:
-                    _refuse_file(path, "it is empty.", "Give a header and one line a record.")
+                    refuse(path, "it is empty.", "Give a header and one line a record.")
                 rows = _rows(_text_lines(file, path, digest), path, s.delimiter)
                 line, cells = next(rows, (1, []))
                 if len(cells) == 1:
@@ -83,15 +83,11 @@ class CsvReader:
                 plan = match_columns(header, request.channels)
                 dataset = _load(rows, header, plan, s.decimal == ",")
         except OSError as fault:
-            _refuse_file(path, f"it cannot be read ({fault.strerror or fault}).", "Check the path and its permissions.")
+            refuse(path, f"it cannot be read ({fault.strerror or fault}).", "Check the path and its permissions.")
         dataset = replace(dataset, sha256=digest.hexdigest())
         names = {channel: column.name for channel, (column, _) in plan.channels.items()}
         units = {channel: unit for channel, (_, unit) in plan.channels.items()}
         return check_dataset(dataset, layout_of(request.channels, dataset, names, units, by_line=True))
-
-
-def _refuse_file(path: Path, message: str, hint: str, line: int | None = None) -> NoReturn:
-    raise DataError(message, where=Location(str(path), line=line), hint=hint)
 
 
 def _text_lines(file: BinaryIO, path: Path, digest: Any) -> Iterator[str]:
@@ -101,15 +97,15 @@ def _text_lines(file: BinaryIO, path: Path, digest: Any) -> Iterator[str]:
         digest.update(raw)
         if b"\0" in raw:
             at = offset + raw.index(b"\0")
-            _refuse_file(path, f"found a NUL byte at offset {at}, expected text.", _SAVE_AS_TEXT, number)
+            refuse(path, f"found a NUL byte at offset {at}, expected text.", _SAVE_AS_TEXT, number)
         if len(raw) > MAX_LINE_BYTES:
-            _refuse_file(path, "found a line of more than 1 MiB, expected a record.", _SAVE_AS_TEXT, number)
+            refuse(path, "found a line of more than 1 MiB, expected a record.", _SAVE_AS_TEXT, number)
         try:
             text = raw.decode("utf-8")
         except UnicodeDecodeError as fault:
             at = offset + fault.start
             message = f"found the byte 0x{raw[fault.start]:02x} at offset {at}, which is not UTF-8 text."
-            _refuse_file(path, message, _SAVE_AS_TEXT, number)
+            refuse(path, message, _SAVE_AS_TEXT, number)
         yield text.removeprefix("\ufeff") if number == 1 else text
         offset += len(raw)
 
@@ -125,7 +121,7 @@ def _rows(lines: Iterator[str], path: Path, delimiter: str) -> Iterator[tuple[in
             line = reader.line_num + 1
     except csv.Error as fault:
         hint = "Close every quote, end lines with LF or CRLF, and put no bare quote inside a quoted cell."
-        _refuse_file(path, f"found a row that is not CSV ({fault}).", hint, line)
+        refuse(path, f"found a row that is not CSV ({fault}).", hint, line)
 
 
 def _refuse_delimiter(header: Header, delimiter: str, rows: Iterator[tuple[int, list[str]]]) -> None:

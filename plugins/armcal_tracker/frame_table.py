@@ -6,12 +6,11 @@ import csv
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import NoReturn
 
 from armcal.base.domains import Array
 from armcal.base.units import from_unit, split_suffix
-from armcal.errors import DataError, Location
 from armcal.io.cells import DELIMITERS, read_cell, split
+from armcal.io.plain_files import refuse
 
 from armcal_tracker.frames import Frame, UnreadableError, body_pose
 
@@ -53,13 +52,15 @@ def frame_table(line: str, source: str) -> FrameTable:
     try:
         cells = split(line, delimiter)
     except csv.Error as fault:
-        _refuse(source, f"the header is not CSV ({fault}).", "Close every quote.")
+        refuse(source, f"the header is not CSV ({fault}).", "Close every quote.", 1)
     places = {name: i for i, name in enumerate(cells)}
     if len(places) != len(cells):
-        _refuse(source, "found two columns of one name.", "Rename or remove one of them.")
+        refuse(source, "found two columns of one name.", "Rename or remove one of them.", 1)
     frame = next((places[name] for name in _FRAMES if name in places), None)
     if frame is None:
-        _refuse(source, f"found no column frame among {_shown(cells)}.", "Give each frame its number, one higher each.")
+        refuse(
+            source, f"found no column frame among {_shown(cells)}.", "Give each frame its number, one higher each.", 1
+        )
     time = next(((places[name], unit) for name, unit in _TIMES.items() if name in places), None)
     positions: dict[str, dict[str, str]] = {}
     for cell in cells:
@@ -70,7 +71,7 @@ def frame_table(line: str, source: str) -> FrameTable:
     bodies = {name: _body(name, columns, places, source) for name, columns in positions.items()}
     if not bodies:
         hint = "Name them after the body, with their unit: tool_x_mm, tool_y_mm, tool_z_mm."
-        _refuse(source, f"found no column of positions among {_shown(cells)}.", hint)
+        refuse(source, f"found no column of positions among {_shown(cells)}.", hint, 1)
     return FrameTable(tuple(cells), delimiter, frame, time, bodies)
 
 
@@ -104,16 +105,15 @@ def row_of(table: FrameTable, line: bytes) -> Frame | None:
 def _body(name: str, columns: Mapping[str, str], places: Mapping[str, int], source: str) -> BodyColumns:
     lacking = [axis for axis in "xyz" if axis not in columns]
     if lacking:
-        _refuse(
-            source, f"found no {lacking[0]} of the body {name}.", f"Give all of {name}_x_mm, {name}_y_mm, {name}_z_mm."
-        )
+        hint = f"Give all of {name}_x_mm, {name}_y_mm, {name}_z_mm."
+        refuse(source, f"found no {lacking[0]} of the body {name}.", hint, 1)
     units = [split_suffix(columns[axis]) for axis in "xyz"]
     position = tuple((places[columns[axis]], u[1].name) for axis, u in zip("xyz", units, strict=True) if u is not None)
     stem = columns["x"].rpartition("x_")[0]
     quaternion = tuple(places[stem + part] for part in _QUATERNION if stem + part in places)
     if len(quaternion) not in (0, 4):
         hint = f"Give {stem}qw, {stem}qx, {stem}qy and {stem}qz, or none."
-        _refuse(source, f"found {len(quaternion)} columns of the quaternion of {name}.", hint)
+        refuse(source, f"found {len(quaternion)} columns of the quaternion of {name}.", hint, 1)
     return BodyColumns(position, quaternion)
 
 
@@ -127,7 +127,3 @@ def _number(cell: str) -> float:
 
 def _shown(cells: Sequence[str]) -> str:
     return ", ".join(cell[:40] for cell in cells[:8])
-
-
-def _refuse(source: str, message: str, hint: str) -> NoReturn:
-    raise DataError(message, where=Location(source, line=1), hint=hint)

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 from armcal.errors import DataError, InputError
-from armcal.io.journal.files import RealFiles, write_whole
+from armcal.io.journal.files import FileLayer, write_whole
 from armcal.io.journal.journal import Journal, JournalLimits
 from armcal.io.journal.reader import read_entries, read_newest, read_segments, read_until, verify
 from armcal.io.journal.room import BALLAST, BALLAST_BYTES
@@ -296,7 +296,7 @@ def test_short_writes_are_gone_on_with(tmp_path: Path, monkeypatch: pytest.Monke
 
 
 def test_a_file_is_put_in_place_whole_or_not_at_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    files, path = RealFiles(), tmp_path / "calibration.yaml"
+    files, path = FileLayer(), tmp_path / "calibration.yaml"
     write_whole(files, path, b"first")
     (tmp_path / "calibration.yaml.new").write_bytes(b"left by a kill")
     write_whole(files, path, b"2nd")

@@ -120,7 +120,7 @@ class CalibratedServo(Settings):
     @model_validator(mode="after")
     def _usable(self) -> CalibratedServo:
         usable_address(self.address)
-        _check_longest(self.table, self.clock)
+        check_longest(self.table, self.clock)
         return self
 
     @property
@@ -179,7 +179,7 @@ class ServoFile:
                 raise ServoFileError(text, ("servos", joint, "channel"))
             try:
                 _check_borne(servo, self.boards[servo.board].clock)
-                _check_longest(servo.table, self.boards[servo.board].clock)
+                check_longest(servo.table, self.boards[servo.board].clock)
             except ValueError as fault:
                 raise ServoFileError(str(fault), ("servos", joint, "pulses")) from fault
 
@@ -262,7 +262,8 @@ def _check_borne(servo: ServoSettings, clock: PulseClock) -> None:
         )
 
 
-def _check_longest(table: PulseTable, clock: PulseClock) -> None:
+def check_longest(table: PulseTable, clock: PulseClock) -> None:
+    """Raise ValueError if a table has a pulse that its board cannot make."""
     longest, limit = max(table.pulses), clock.longest_pulse
     if longest > limit:
         raise ValueError(f"a pulse of {1e6 * longest:g} us is longer than the board's longest, {1e6 * limit:.0f} us")

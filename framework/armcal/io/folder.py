@@ -22,6 +22,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from armcal.errors import InputError, Location
+from armcal.io.journal.files import REAL_FILES
 
 EARLIER = "earlier"
 _LONGEST_NAME = 200
@@ -184,7 +185,7 @@ def _staged(contents: Mapping[str, str | bytes], beside: Path, prefix: str) -> P
                 file.write(text.encode() if isinstance(text, str) else text)
                 file.flush()
                 os.fsync(file.fileno())
-        _sync(staging)
+        REAL_FILES.sync_folder(staging)
     except BaseException:
         shutil.rmtree(staging, ignore_errors=True)
         raise
@@ -209,8 +210,8 @@ def _settle(folder: Path, before: Path) -> None:
             before.rename(_next(folder))
         else:
             before.rmdir()
-        _sync(folder)
-        _sync(folder.parent)
+        REAL_FILES.sync_folder(folder)
+        REAL_FILES.sync_folder(folder.parent)
 
 
 def _recover(folder: Path) -> None:
@@ -251,7 +252,7 @@ def _one_by_one(staging: Path, folder: Path, present: list[str], names: list[str
         raise
     shutil.rmtree(staging, ignore_errors=True)
     with suppress(OSError):
-        _sync(folder)
+        REAL_FILES.sync_folder(folder)
 
 
 def _next(folder: Path) -> Path:
@@ -262,14 +263,6 @@ def _next(folder: Path) -> Path:
     while (earlier / str(number)).exists():
         number += 1
     return earlier / str(number)
-
-
-def _sync(folder: Path) -> None:
-    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
 
 
 def change_places(one: Path, two: Path) -> bool:

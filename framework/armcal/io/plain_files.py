@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 from stat import S_ISDIR, S_ISLNK, S_ISREG
-from typing import BinaryIO
+from typing import BinaryIO, NoReturn
 
 from armcal.errors import DataError, InputError, Location
 
@@ -59,6 +59,11 @@ def input_bytes(path: Path, most: int, expected: str, refusal: type[InputError] 
         return stream.read(most)
 
 
+def refuse(path: Path | str, message: str, hint: str, line: int | None = None, column: str | None = None) -> NoReturn:
+    """Raise a DataError about a file, or about a line or a column of it."""
+    raise DataError(message, where=Location(str(path), line=line, field=column), hint=hint)
+
+
 def text_of(content: bytes, path: Path, hint: str) -> str:
     """Text in UTF-8, without a byte order mark.
 
@@ -71,8 +76,7 @@ def text_of(content: bytes, path: Path, hint: str) -> str:
         text, at = "", undecodable.start
         fault = f"the byte 0x{content[at]:02x}, which is not UTF-8 text"
     if at >= 0:
-        line = content.count(b"\n", 0, at) + 1
-        raise DataError(f"found {fault}.", where=Location(str(path), line=line), hint=hint)
+        refuse(path, f"found {fault}.", hint, content.count(b"\n", 0, at) + 1)
     return text
 
 

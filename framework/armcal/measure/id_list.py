@@ -5,10 +5,10 @@ from __future__ import annotations
 import csv
 from pathlib import Path
 
-from armcal.errors import DataError, Location
-from armcal.io.plain_files import input_bytes, text_of
+from armcal.io.plain_files import input_bytes, refuse, text_of
 
 MAX_BYTES = 1 << 26
+_HEADER = "Give a header pose_id and an id a line."
 
 
 def read_ids(path: Path) -> tuple[str, ...]:
@@ -17,21 +17,18 @@ def read_ids(path: Path) -> tuple[str, ...]:
     Raises:
         DataError: no such file, no text, no ids, or an id stands twice.
     """
-    where = Location(str(path))
     text = text_of(input_bytes(path, MAX_BYTES, "a list of ids"), path, "Save it as CSV text in UTF-8.")
     rows = [row for row in csv.reader(text.splitlines()) if any(cell.strip() for cell in row)]
     if not rows:
-        raise DataError("it is empty.", where=where, hint="Give a header pose_id and an id a line.")
+        refuse(path, "it is empty.", _HEADER)
     header = [cell.strip().lower() for cell in rows[0]]
     column = next((header.index(name) for name in ("pose_id", "id") if name in header), None)
     if column is None:
-        raise DataError(
-            f"found the columns {', '.join(rows[0])}.", where=where, hint="Give a header pose_id and an id a line."
-        )
+        refuse(path, f"found the columns {', '.join(rows[0])}.", _HEADER)
     ids = [row[column].strip() for row in rows[1:] if len(row) > column]
     if not ids:
-        raise DataError("it lists no ids.", where=where, hint="Give an id a line below the header.")
+        refuse(path, "it lists no ids.", "Give an id a line below the header.")
     twice = sorted({record for record in ids if ids.count(record) > 1}) if len(set(ids)) < len(ids) else []
     if twice:
-        raise DataError(f"the id {twice[0]} stands twice.", where=where, hint="List each record once.")
+        refuse(path, f"the id {twice[0]} stands twice.", "List each record once.")
     return tuple(ids)

@@ -128,7 +128,7 @@ def requested_channels(
     for instance, measurement in measurements.items():
         for channel in measurement.channels():
             own = f"{instance}.{channel.name}"
-            names = (own, channel.name) if local.count(channel.name) == 1 else (own,)
+            names = _names(own, (channel.name,), local.count(channel.name) == 1)
             requested.append(RequestedChannel(own, names, channel.dimension, measured, parts=(instance,)))
     return (*requested, *_deviations(measurements)) if measured else tuple(requested)
 
@@ -143,7 +143,7 @@ def _deviations(measurements: Mapping[str, Measurement]) -> Iterator[RequestedCh
     for instance, channels in by_instance.items():
         for channel in channels.values():
             own = f"{instance}.{channel.name}"
-            names = (own, channel.name) if local.count(channel.name) == 1 else (own,)
+            names = _names(own, (channel.name,), local.count(channel.name) == 1)
             yield RequestedChannel(own, names, channel.dimension, False, is_deviation=True, parts=(instance,))
 
 

@@ -12,7 +12,7 @@ from typing import NoReturn
 from armcal.base.units import Unit, display_unit, from_unit, split_suffix, units_of
 from armcal.errors import DataError, Location
 from armcal.io.cells import CellFault, read_cell
-from armcal.io.plain_files import input_bytes, text_of
+from armcal.io.plain_files import input_bytes, refuse, text_of
 from armcal.scaffold.naming import check_joint_names
 from armcal.scaffold.robot import (
     ASSUMED_TRAVEL,
@@ -50,8 +50,7 @@ class _Line:
 
     def refuse(self, key: Key | None, message: str, hint: str) -> NoReturn:
         """Raise a DataError here."""
-        column = self.columns[key][0] if key else None
-        raise DataError(message, where=Location(self.source, line=self.line, field=column), hint=hint)
+        refuse(self.source, message, hint, self.line, self.columns[key][0] if key else None)
 
     def number(self, stem: str, dimension: str) -> float | None:
         """A number in SI; None for an empty cell or no such column."""
@@ -113,17 +112,13 @@ def _lines(path: Path, text: str) -> list[_Line]:
                 columns = _header(path, line, [cell.strip() for cell in cells])
                 continue
             if len(cells) != len(columns):
-                raise DataError(
-                    f"found {len(cells)} cells, expected {len(columns)} as in the header.",
-                    where=Location(str(path), line=line),
-                    hint="Leave a cell empty if its value is not known, and write decimal points (12.5), no commas.",
-                )
+                hint = "Leave a cell empty if its value is not known, and write decimal points (12.5), no commas."
+                refuse(path, f"found {len(cells)} cells, expected {len(columns)} as in the header.", hint, line)
             lines.append(_Line(str(path), line, dict(zip(columns, cells, strict=True)), columns))
     except csv.Error as fault:
-        where = Location(str(path), line=max(1, reader.line_num))
-        raise DataError(f"found a line that is not CSV ({fault}).", where=where, hint="Close every quote.") from fault
+        refuse(path, f"found a line that is not CSV ({fault}).", "Close every quote.", max(1, reader.line_num))
     if not columns:
-        raise DataError("it is empty.", where=Location(str(path)), hint=f"Begin with the header {_SHOWN}.")
+        refuse(path, "it is empty.", f"Begin with the header {_SHOWN}.")
     return lines
 
 
@@ -131,8 +126,7 @@ def _header(path: Path, line: int, names: list[str]) -> dict[Key, tuple[str, Uni
     columns: dict[Key, tuple[str, Unit | None]] = {}
     other = next((character for character in ";\t|" if len(names) == 1 and character in names[0]), None)
     if other:
-        where = Location(str(path), line=line)
-        raise DataError(f"found {other!r} between the columns, expected ','.", where=where, hint="Write commas.")
+        refuse(path, f"found {other!r} between the columns, expected ','.", "Write commas.", line)
     for name in names:
         where = Location(str(path), line=line, field=name[:60] or None)
         key, unit = _column(name, where)
@@ -141,11 +135,8 @@ def _header(path: Path, line: int, names: list[str]) -> dict[Key, tuple[str, Uni
         columns[key] = (name, unit)
     for stem, dimension in _NUMBERS.items():
         if (stem, dimension) not in columns:
-            raise DataError(
-                f"found no column for {stem}, expected {_spellings(stem, dimension)}.",
-                where=Location(str(path), line=line),
-                hint=f"Begin with a header such as {_SHOWN}.",
-            )
+            hint = f"Begin with a header such as {_SHOWN}."
+            refuse(path, f"found no column for {stem}, expected {_spellings(stem, dimension)}.", hint, line)
     return columns
 
 

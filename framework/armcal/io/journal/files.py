@@ -7,83 +7,42 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Protocol
-
-from typing_extensions import override
 
 
-class FileLayer(Protocol):
-    """Files and folders. Every method raises OSError where the system does."""
+class FileLayer:
+    """The operating system's files and folders; every method raises OSError where the system does.
+
+    Python itself repeats a call that a signal interrupted (PEP 475).
+    """
 
     def make_folder(self, folder: Path) -> None:
         """The folder and those above it, durable; nothing if it is there."""
-
-    def names(self, folder: Path) -> tuple[str, ...]:
-        """What a folder holds, sorted; empty if there is no folder."""
-
-    def read(self, path: Path) -> bytes:
-        """The whole of a file."""
-
-    def size(self, path: Path) -> int:
-        """Bytes in a file."""
-
-    def open_append(self, path: Path) -> int:
-        """A descriptor that writes at the end; the file is made if it is not there."""
-
-    def write(self, descriptor: int, data: bytes) -> None:
-        """All of the data, or OSError after any part of it."""
-
-    def truncate(self, descriptor: int, size: int) -> None:
-        """Cut a file to ``size`` bytes."""
-
-    def sync(self, descriptor: int) -> None:
-        """Return when the file's bytes would outlast a power loss."""
-
-    def close(self, descriptor: int) -> None:
-        """Give a descriptor back."""
-
-    def sync_folder(self, folder: Path) -> None:
-        """Return when names made, removed or changed in the folder would outlast a power loss."""
-
-    def rename(self, old: Path, new: Path) -> None:
-        """Give a file another name, in place of what had it."""
-
-    def remove(self, path: Path) -> None:
-        """Take a file away."""
-
-
-class RealFiles(FileLayer):
-    """The operating system's files. Python itself repeats a call that a signal interrupted (PEP 475)."""
-
-    @override
-    def make_folder(self, folder: Path) -> None:
         missing = [place for place in (folder, *folder.parents) if not place.is_dir()]
         folder.mkdir(parents=True, exist_ok=True)
         for place in reversed(missing):
             self.sync_folder(place.parent)
 
-    @override
     def names(self, folder: Path) -> tuple[str, ...]:
+        """What a folder holds, sorted; empty if there is no folder."""
         try:
             return tuple(sorted(entry.name for entry in folder.iterdir()))
         except FileNotFoundError:
             return ()
 
-    @override
     def read(self, path: Path) -> bytes:
+        """The whole of a file."""
         return path.read_bytes()
 
-    @override
     def size(self, path: Path) -> int:
+        """Bytes in a file."""
         return path.stat().st_size
 
-    @override
     def open_append(self, path: Path) -> int:
+        """A descriptor that writes at the end; the file is made if it is not there."""
         return os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o644)
 
-    @override
     def write(self, descriptor: int, data: bytes) -> None:
-        """One call of the system; more only where it wrote a part."""
+        """All of the data, or OSError after any part of it; one call of the system, more only where it wrote a part."""
         left = memoryview(data)
         while left:
             written = os.write(descriptor, left)
@@ -91,36 +50,36 @@ class RealFiles(FileLayer):
                 raise OSError(errno.EIO, "the system wrote nothing and gave no reason")
             left = left[written:]
 
-    @override
     def truncate(self, descriptor: int, size: int) -> None:
+        """Cut a file to ``size`` bytes."""
         os.ftruncate(descriptor, size)
 
-    @override
     def sync(self, descriptor: int) -> None:
+        """Return when the file's bytes would outlast a power loss."""
         os.fsync(descriptor)
 
-    @override
     def close(self, descriptor: int) -> None:
+        """Give a descriptor back."""
         os.close(descriptor)
 
-    @override
     def sync_folder(self, folder: Path) -> None:
+        """Return when names made, removed or changed in the folder would outlast a power loss."""
         descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
         try:
             os.fsync(descriptor)
         finally:
             os.close(descriptor)
 
-    @override
     def rename(self, old: Path, new: Path) -> None:
+        """Give a file another name, in place of what had it."""
         old.rename(new)
 
-    @override
     def remove(self, path: Path) -> None:
+        """Take a file away."""
         path.unlink()
 
 
-REAL_FILES = RealFiles()
+REAL_FILES = FileLayer()
 
 
 def is_full(fault: OSError) -> bool:
