@@ -14,8 +14,7 @@ import casadi as ca
 import numpy as np
 from armcal.arm.model import Attachment, Chain, Joint, Vector3
 from armcal.base import se3
-from armcal.base.directions import Direction
-from armcal.base.domains import Array, ScrewAxis
+from armcal.base.domains import Array, Direction, ScrewAxis
 from armcal.base.parameters import ParameterBlock, scalar
 from armcal.base.pose_blocks import pose_transform
 from armcal.base.quaternions import rotation_matrix

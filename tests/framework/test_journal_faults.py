@@ -10,7 +10,8 @@ import pytest
 from armcal.errors import ArmcalError
 from armcal.io.journal import room as journal_room
 from armcal.io.journal.journal import Journal, JournalFailedError, JournalFullError, JournalLimits
-from armcal.io.journal.reader import JournalDamagedError, read_entries, verify
+from armcal.io.journal.reader import read_entries, verify
+from armcal.io.journal.segment import JournalDamagedError
 from file_layers import FOLDER, MemoryFiles, PowerLossError, no_lock
 
 LIMITS = JournalLimits(segment_bytes=3000, total_bytes=12_000)

@@ -14,7 +14,7 @@ from armcal.arm.effects import JointEffect, Spring
 from armcal.arm.model import Joint, forward
 from armcal.arm.statics import Load, Mass, effort, wrenches
 from armcal.base import se3
-from armcal.base.directions import Direction
+from armcal.base.domains import Direction
 from armcal.base.parameters import Parameters
 from armcal_poe.model import PoeModel
 from armcal_poe.settings import PoeSettings

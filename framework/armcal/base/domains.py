@@ -12,8 +12,9 @@ increment is no fair measure of the value (a factor of a semidefinite matrix).
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Protocol
+from typing import ClassVar
 
 import numpy as np
 
@@ -26,106 +27,76 @@ from armcal.base.quaternions import (
     rotation_matrix,
 )
 
-__all__ = ["Array", "Domain", "Interval", "Pose", "Rotation", "ScrewAxis", "Semidefinite", "symmetric"]
+__all__ = ["Array", "Direction", "Domain", "Interval", "Pose", "Rotation", "ScrewAxis", "Semidefinite", "symmetric"]
 
 _SYMMETRIC = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 
-class Domain(Protocol):
-    """What a parameter block needs to know of its own shape."""
+class Domain(ABC):
+    """What a parameter block needs to know of its own shape; coordinates are increments where a domain says no other.
 
-    @property
-    def entries(self) -> tuple[str, ...]:
-        """Suffix of each canonical number; one empty suffix for a scalar."""
+    Attributes:
+        entries: suffix of each canonical number; one empty suffix for a scalar.
+        increments: a short name for each number of an increment.
+    """
+
+    entries: ClassVar[tuple[str, ...]]
+    increments: ClassVar[tuple[str, ...]]
 
     @property
     def dof(self) -> int:
         """How many numbers an increment has."""
+        return len(self.increments)
 
-    @property
-    def increments(self) -> tuple[str, ...]:
-        """A short name for each number of an increment."""
-
+    @abstractmethod
     def check(self, value: Array) -> str:
         """What is wrong with a canonical value; empty when nothing is."""
 
+    @abstractmethod
     def retract(self, base: Array, delta: Array) -> Array:
         """The canonical value that ``delta`` (dof) leads to from ``base``."""
 
+    @abstractmethod
     def local(self, base: Array, value: Array) -> Array:
         """The increment that leads from ``base`` to ``value``; the inverse of ``retract``."""
 
+    @abstractmethod
     def retract_jacobian(self, base: Array, delta: Array) -> Array:
         """d retract / d delta at ``delta`` (entries x dof)."""
 
     def increment_scale(self, scale: float) -> float:
         """The typical scale of an increment, from that of a coordinate."""
-
-    def coordinates(self, base: Array, delta: Array) -> Array:
-        """Where ``delta`` leads, in the coordinates of priors and covariances (dof)."""
-
-    def from_coordinates(self, base: Array, coordinates: Array) -> Array:
-        """The increment (dof) that leads there, or to the nearest value of the domain."""
-
-    def coordinates_jacobian(self, base: Array, delta: Array) -> Array:
-        """d coordinates / d delta (dof x dof)."""
-
-    def entries_jacobian(self, base: Array, delta: Array) -> Array:
-        """d canonical entries / d coordinates (entries x dof)."""
-
-    def curvature(self, gradient: Array) -> Array | None:
-        """The convex part of sum over entries of gradient * d2 entry / d delta2 (dof x dof); None to neglect it."""
-
-
-class ByIncrement:
-    """A domain whose coordinates are its increments."""
-
-    @property
-    def increments(self: Domain) -> tuple[str, ...]:
-        """Numbers, where a domain gives no names."""
-        return tuple(str(i) for i in range(self.dof))
-
-    def increment_scale(self, scale: float) -> float:
-        """The same."""
         return scale
 
     def coordinates(self, base: Array, delta: Array) -> Array:
-        """The increment."""
+        """Where ``delta`` leads, in the coordinates of priors and covariances (dof)."""
         return delta
 
     def from_coordinates(self, base: Array, coordinates: Array) -> Array:
-        """The increment."""
+        """The increment (dof) that leads there, or to the nearest value of the domain."""
         return coordinates
 
     def coordinates_jacobian(self, base: Array, delta: Array) -> Array:
-        """One."""
+        """d coordinates / d delta (dof x dof)."""
         return np.eye(len(delta))
 
-    def entries_jacobian(self: Domain, base: Array, delta: Array) -> Array:
-        """That of the retraction."""
+    def entries_jacobian(self, base: Array, delta: Array) -> Array:
+        """d canonical entries / d coordinates (entries x dof)."""
         return self.retract_jacobian(base, delta)
 
     def curvature(self, gradient: Array) -> Array | None:
-        """Neglected: small against that of the residuals, and zero for a number."""
+        """The convex part of sum over entries of gradient * d2 entry / d delta2 (dof x dof); None to neglect it."""
         return None
 
 
 @dataclass(frozen=True)
-class Interval(ByIncrement):
+class Interval(Domain):
     """A number between two bounds, both allowed."""
 
+    entries: ClassVar[tuple[str, ...]] = ("",)
+    increments: ClassVar[tuple[str, ...]] = ("0",)
     lower: float = -math.inf
     upper: float = math.inf
-
-    @property
-    def entries(self) -> tuple[str, ...]:
-        """One entry, without a suffix."""
-        return ("",)
-
-    @property
-    def dof(self) -> int:
-        """One."""
-        return 1
 
     def check(self, value: Array) -> str:
         """Within the bounds."""
@@ -148,23 +119,11 @@ class Interval(ByIncrement):
 
 
 @dataclass(frozen=True)
-class Rotation(ByIncrement):
+class Rotation(Domain):
     """A rotation: unit quaternion (w, x, y, z); increments are rotation vectors (rad) in the moved frame."""
 
-    @property
-    def entries(self) -> tuple[str, ...]:
-        """The four numbers of the quaternion."""
-        return ("w", "x", "y", "z")
-
-    @property
-    def dof(self) -> int:
-        """Three."""
-        return 3
-
-    @property
-    def increments(self) -> tuple[str, ...]:
-        """About which axis of the moved frame."""
-        return ("rx", "ry", "rz")
+    entries: ClassVar[tuple[str, ...]] = ("w", "x", "y", "z")
+    increments: ClassVar[tuple[str, ...]] = ("rx", "ry", "rz")  # about the axes of the moved frame
 
     def check(self, value: Array) -> str:
         """Unit norm."""
@@ -186,23 +145,11 @@ class Rotation(ByIncrement):
 
 
 @dataclass(frozen=True)
-class Pose(ByIncrement):
+class Pose(Domain):
     """A rigid motion: quaternion then translation (m); increments: rotation vector (rad), translation, both in the moved frame."""  # noqa: E501
 
-    @property
-    def entries(self) -> tuple[str, ...]:
-        """Quaternion and translation."""
-        return ("qw", "qx", "qy", "qz", "x", "y", "z")
-
-    @property
-    def dof(self) -> int:
-        """Six."""
-        return 6
-
-    @property
-    def increments(self) -> tuple[str, ...]:
-        """About and along which axis of the moved frame."""
-        return ("rx", "ry", "rz", "x", "y", "z")
+    entries: ClassVar[tuple[str, ...]] = ("qw", "qx", "qy", "qz", "x", "y", "z")
+    increments: ClassVar[tuple[str, ...]] = ("rx", "ry", "rz", "x", "y", "z")  # in the axes of the moved frame
 
     def check(self, value: Array) -> str:
         """Unit quaternion, finite translation."""
@@ -227,27 +174,15 @@ class Pose(ByIncrement):
 
 
 @dataclass(frozen=True)
-class ScrewAxis(ByIncrement):
+class ScrewAxis(Domain):
     """The axis of a revolute joint as a twist (w, v = -w x q), |w| = 1, w.v = 0; four degrees of freedom.
 
     An increment is two turns (rad) and two shifts (m), about and along two directions across the axis at
     its point nearest the origin. [Murray1994]
     """
 
-    @property
-    def entries(self) -> tuple[str, ...]:
-        """Direction and moment."""
-        return ("wx", "wy", "wz", "vx", "vy", "vz")
-
-    @property
-    def dof(self) -> int:
-        """Four."""
-        return 4
-
-    @property
-    def increments(self) -> tuple[str, ...]:
-        """Turns and shifts, across the axis."""
-        return ("turn1", "turn2", "shift1", "shift2")
+    entries: ClassVar[tuple[str, ...]] = ("wx", "wy", "wz", "vx", "vy", "vz")
+    increments: ClassVar[tuple[str, ...]] = ("turn1", "turn2", "shift1", "shift2")  # across the axis
 
     def check(self, value: Array) -> str:
         """Unit direction, moment across it."""
@@ -291,7 +226,37 @@ class ScrewAxis(ByIncrement):
 
 
 @dataclass(frozen=True)
-class Semidefinite:
+class Direction(Domain):
+    """A unit vector; an increment is two turns (rad) about two directions across it. [Murray1994]"""
+
+    entries: ClassVar[tuple[str, ...]] = ("x", "y", "z")
+    increments: ClassVar[tuple[str, ...]] = ("turn1", "turn2")  # about two directions across it
+
+    def check(self, value: Array) -> str:
+        """Unit length."""
+        norm = float(np.linalg.norm(value))
+        return "" if abs(norm - 1) < 1e-6 else f"the direction has length {norm:g}, not 1"
+
+    def retract(self, base: Array, delta: Array) -> Array:
+        """Turn it."""
+        turned = rotation_matrix(quaternion_exp(two_across(base) @ delta)) @ base
+        return np.asarray(turned / np.linalg.norm(turned))
+
+    def local(self, base: Array, value: Array) -> Array:
+        """The smallest turn from one to the other."""
+        turn_axis = np.cross(base, value)
+        sine, cosine = float(np.linalg.norm(turn_axis)), float(base @ value)
+        return np.asarray(two_across(base).T @ turn_axis * (math.atan2(sine, cosine) / sine if sine > 1e-12 else 1.0))
+
+    def retract_jacobian(self, base: Array, delta: Array) -> Array:
+        """3 x 2."""
+        across = two_across(base)
+        turning = left_jacobian(across @ delta) @ across
+        return np.asarray(np.cross(turning.T, self.retract(base, delta)).T)
+
+
+@dataclass(frozen=True)
+class Semidefinite(Domain):
     """A symmetric positive semidefinite 3x3 matrix: xx, xy, xz, yy, yz, zz; increments move its symmetric root.
 
     C = S S, so every increment gives a semidefinite matrix. (A triangular factor would do so too, but is not unique
@@ -299,20 +264,8 @@ class Semidefinite:
     vanishes: a start must be definite. Coordinates are differences of the canonical entries.
     """
 
-    @property
-    def entries(self) -> tuple[str, ...]:
-        """The upper triangle, row by row."""
-        return ("xx", "xy", "xz", "yy", "yz", "zz")
-
-    @property
-    def dof(self) -> int:
-        """Six."""
-        return 6
-
-    @property
-    def increments(self) -> tuple[str, ...]:
-        """As the entries."""
-        return self.entries
+    entries: ClassVar[tuple[str, ...]] = ("xx", "xy", "xz", "yy", "yz", "zz")
+    increments: ClassVar[tuple[str, ...]] = entries
 
     def check(self, value: Array) -> str:
         """No negative eigenvalue."""

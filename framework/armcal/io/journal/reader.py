@@ -11,22 +11,6 @@ from armcal.errors import DataError, InputError, Location
 from armcal.io.journal.files import REAL_FILES, FileLayer
 from armcal.io.journal.segment import Cut, Entry, JournalDamagedError, Link, Segment, Stub, read_segment
 
-__all__ = [
-    "Cut",
-    "Entry",
-    "JournalDamagedError",
-    "Newest",
-    "Segment",
-    "Verified",
-    "read_entries",
-    "read_newest",
-    "read_segments",
-    "read_until",
-    "segment_numbers",
-    "segment_path",
-    "verify",
-]
-
 _NAME = re.compile(r"journal-(\d{8}|[1-9]\d{8,})\.log", re.ASCII)
 
 
