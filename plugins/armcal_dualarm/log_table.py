@@ -50,10 +50,7 @@ def read_table(path: Path, delimiter: str, numbers: Sequence[Column], texts: Seq
     Raises:
         DataError: with file, line and column.
     """
-    try:
-        raw = input_bytes(path, MAX_BYTES, "a log")
-    except OSError as fault:
-        refuse(path, f"it cannot be read ({fault.strerror or fault}).", "Check the path and its permissions.")
+    raw = input_bytes(path, MAX_BYTES, "a log")
     rows = _rows(path, raw, delimiter)
     first = next(rows, None)
     if first is None:

@@ -176,7 +176,7 @@ def test_a_missing_or_broken_library_is_told_before_the_survey(
 
 def test_bad_files_are_refused_in_words(tmp_path: Path) -> None:
     refused(tmp_path, tmp_path / "none.yaml", says=("there is no such file",))
-    refused(tmp_path, tmp_path, says=("this is a directory",))
+    refused(tmp_path, tmp_path, says=("it is a directory",))
     (tmp_path / "empty.yaml").write_text("", encoding="utf-8")
     refused(tmp_path, tmp_path / "empty.yaml", says=("the file is empty",))
     (tmp_path / "latin.yaml").write_bytes("name: Gerät\n".encode("latin-1"))

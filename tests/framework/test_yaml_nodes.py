@@ -168,7 +168,7 @@ def test_a_file_over_sixteen_mebibytes_is_refused_and_one_at_the_limit_is_read(t
     body = b"a: 1\n#"
     assert load(tmp_path, body + b"x" * ((16 << 20) - len(body))).data == {"a": 1}
     message = refusal(tmp_path, body + b"x" * ((16 << 20) - len(body) + 1))
-    assert "larger than 16 MiB" in message and "CSV" in message
+    assert "larger than 16 MiB, expected a YAML file. Check the path" in message
 
 
 def test_fifty_levels_are_read_and_values_up_to_the_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -154,9 +154,9 @@ def test_a_file_that_is_not_one_is_refused(tmp_path: Path) -> None:
     for path, says in (
         (tmp_path / "cc.yaml", f"there is no such file. Did you mean {tmp_path / 'c.yaml'}?"),
         (tmp_path / "no" / "such" / "q.yaml", "there is no such file. Check the spelling and the directory."),
-        (tmp_path, "this is a directory, expected a YAML file. Name the file in it."),
-        (tmp_path / "pipe.yaml", "this is a device or pipe"),
-        (Path("a\0b"), "there is no such file"),
+        (tmp_path, "it is a directory, expected a YAML file. Give the path of the file itself."),
+        (tmp_path / "pipe.yaml", "it is a device or pipe"),
+        (Path("a\0b"), "it cannot be read (embedded null byte)"),
     ):
         with pytest.raises(ConfigError) as caught:
             load_config(path)

@@ -15,7 +15,7 @@ from armcal.base.units import split_suffix
 from armcal.config.yaml_nodes import Node, Origin, Step, dotted, read_nodes
 from armcal.config.yaml_tree import entries_of, merge, override
 from armcal.errors import ConfigError, Location
-from armcal.io.plain_files import size_text
+from armcal.io.plain_files import input_bytes
 
 __all__ = ["ConfigSource", "ConfigText", "find_key", "load_config", "resolve_path"]
 
@@ -125,20 +125,12 @@ def _refuse_file(path: Path, message: str, hint: str) -> NoReturn:
 
 def _read_text(path: Path) -> str:
     try:
-        if path.is_dir():
-            _refuse_file(path, "this is a directory, expected a YAML file.", "Name the file in it.")
-        if not path.exists():
-            near = difflib.get_close_matches(path.name, sorted(p.name for p in path.parent.glob("*.y*ml")), n=1)
-            hint = f"Did you mean {path.parent / near[0]}?" if near else "Check the spelling and the directory."
-            _refuse_file(path, "there is no such file.", hint)
-        if not path.is_file():
-            _refuse_file(path, "this is a device or pipe, expected a YAML file.", "Save it to a file.")
-        with path.open("rb") as stream:
-            raw = stream.read(MAX_BYTES + 1)
-    except (OSError, ValueError) as fault:
-        _refuse_file(path, f"the file cannot be read ({fault}).", "Check the path and its permissions.")
-    if len(raw) > MAX_BYTES:
-        _refuse_file(path, f"the file is larger than {size_text(MAX_BYTES)}.", "Keep measured data in a CSV file.")
+        raw = input_bytes(path, MAX_BYTES, "a YAML file", ConfigError)
+    except ConfigError as fault:
+        near = difflib.get_close_matches(path.name, sorted(p.name for p in path.parent.glob("*.y*ml")), n=1)
+        if near and isinstance(fault.__cause__, FileNotFoundError):
+            _refuse_file(path, fault.message, f"Did you mean {path.parent / near[0]}?")
+        raise
     try:
         return raw.decode("utf-8").removeprefix("\ufeff")
     except UnicodeDecodeError as fault:

@@ -46,7 +46,7 @@ def input_file(
     elif not S_ISREG(status.st_mode):
         message, hint = f"it is a device or pipe, expected {expected}.", "Save what it gives to a file, and give that."
     elif status.st_size > most:
-        message, hint = f"it is larger than {size_text(most)}, expected {expected}.", "Check the path, or split it."
+        message, hint = f"it is larger than {_size_text(most)}, expected {expected}.", "Check the path, or split it."
     if message:
         os.close(descriptor)
         raise refusal(message, where=where, hint=hint)
@@ -54,9 +54,15 @@ def input_file(
 
 
 def input_bytes(path: Path, most: int, expected: str, refusal: type[InputError] = DataError) -> bytes:
-    """The whole content of a file, as ``input_file`` opens it."""
+    """The whole content of a file, as ``input_file`` opens it; one that fails while it is read is refused as well."""
     with input_file(path, most, expected, refusal) as stream:
-        return stream.read(most)
+        try:
+            return stream.read(most)
+        except OSError as fault:
+            hint = "Check the disk it is on."
+            raise refusal(
+                f"it cannot be read ({fault.strerror or fault}).", where=Location(str(path)), hint=hint
+            ) from fault
 
 
 def refuse(path: Path | str, message: str, hint: str, line: int | None = None, column: str | None = None) -> NoReturn:
@@ -102,7 +108,7 @@ def check_output(path: Path, refusal: type[InputError] = DataError) -> None:
     )
 
 
-def size_text(count: int) -> str:
+def _size_text(count: int) -> str:
     """A number of bytes as people read it."""
     unit, name = next(((unit, name) for unit, name in _UNITS if count >= unit), (1, "bytes"))
     return f"{count / unit:.3g} {name}"
