@@ -307,18 +307,18 @@ class _TargetKind:
         """Of one search."""
         arm, options = self._arm, self._arm.options
         tolerance, length = (options.reach_m, options.reach_rad), arm._seeds.spread / 2
-        return Solver(arm.expression, arm.limits, self._turns, length, tolerance, arm._choice)
+        return Solver(arm.expression, arm.limits, self._turns, length, tolerance, arm._held, arm._choice)
 
     @cached_property
     def finder(self) -> Finder:
         """Of many."""
-        return Finder(self.solver, self._arm._seeds, self._arm._allowed, self._arm._held)
+        return Finder(self.solver, self._arm._seeds, self._arm._allowed)
 
     @cached_property
     def descent(self) -> Descent:
         """To better commands for the same target."""
         arm = self._arm
-        return Descent(arm.expression, arm.options.redundancy, self.solver, arm._held, arm._choice)
+        return Descent(arm.expression, arm.options.redundancy, self.solver, arm._choice)
 
     @cached_property
     def rounding(self) -> Rounding | None:
@@ -326,7 +326,7 @@ class _TargetKind:
         arm = self._arm
         if arm._counts is None:
             return None
-        return Rounding(arm.expression, arm._counts, arm._equilibrium, self.solver, arm._held, arm._choice)
+        return Rounding(arm.expression, arm._counts, arm._equilibrium, self.solver, arm._choice)
 
 
 def _goal(targets: Targets) -> Array:

@@ -149,11 +149,9 @@ class Rounding:
         counts: ServoCounts,
         equilibrium: Equilibrium,
         solver: Solver,
-        held: tuple[int, ...] = (),
         choice: EvaluatorChoice = "auto",
     ) -> None:
-        """For the targets of a solver; ``held`` joints are only rounded."""
-        self._held = held
+        """For the targets of a solver; joints that it holds are only rounded."""
         self._counts, self._equilibrium, self._solver = counts, equilibrium, solver
         self._slope = BatchFunction(slope_function(expression, solver.turns), sample_inputs(expression), choice)
         self._weights = np.array([1.0] * 3 + [solver.length] * (3 if solver.turns else 0))
@@ -176,7 +174,7 @@ class Rounding:
         slopes = self._slope(record, solutions.states[:, part])[0].reshape(joints, len(self._weights), count)
         weighted = slopes.transpose(2, 1, 0) * self._weights[None, :, None]
         left = self._left(self._equilibrium(record, solutions.states[:, part]).base_T_tool, targets, part)
-        near = self._counts.near(exact, self._solver.limits, self._held)
+        near = self._counts.near(exact, self._solver.limits, self._solver.held)
         counts, commands = self._counts.best(near, exact, weighted, left * self._weights[:, None])
         tried = np.repeat(record, TRIED, axis=1)
         tried[:joints] = commands.reshape(joints, -1)

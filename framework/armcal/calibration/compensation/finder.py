@@ -45,9 +45,9 @@ _WIDEST = 2 * np.pi
 class Finder:
     """Searches of one solver from many starts."""
 
-    def __init__(self, solver: Solver, seeds: Seeds, allowed: Allowed | None, held: tuple[int, ...] = ()) -> None:
-        """``held`` joints stay where searches start; every search then needs a start."""
-        self._solver, self._seeds, self._allowed, self._held = solver, seeds, allowed, held
+    def __init__(self, solver: Solver, seeds: Seeds, allowed: Allowed | None) -> None:
+        """Where the solver holds joints, every search needs a start."""
+        self._solver, self._seeds, self._allowed, self._held = solver, seeds, allowed, solver.held
 
     def __call__(
         self, record: Array, target: Array, start: Array | None = None, score: Score | None = None

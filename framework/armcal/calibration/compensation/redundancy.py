@@ -45,14 +45,8 @@ class Descent:
     """From commands that reach a target to better ones that reach it too."""
 
     def __init__(
-        self,
-        expression: ToolExpression,
-        redundancy: Redundancy,
-        solver: Solver,
-        still: tuple[int, ...] = (),
-        choice: EvaluatorChoice = "auto",
+        self, expression: ToolExpression, redundancy: Redundancy, solver: Solver, choice: EvaluatorChoice = "auto"
     ) -> None:
-        """``still`` joints do not move."""
         small = ca.densify(wanted_small(expression, redundancy))
         own_slopes, count = slopes(expression), len(expression.joints)
         by_commands = ca.jacobian(small, expression.record)[:, :count]
@@ -62,7 +56,7 @@ class Descent:
         outputs = [small, ca.vec(ca.densify(slope)), ca.vec(ca.densify(held))]
         function = ca.Function("redundancy", [expression.record, expression.state], outputs, {"cse": True})
         self._function = BatchFunction(function, sample_inputs(expression), choice)
-        self._solver, self._still = solver, still
+        self._solver = solver
 
     def score(self, record: Array, commands: Array, states: Array) -> Array:
         """Half of the squares of what is to be small (N), for commands (n x N) in equilibrium."""
@@ -80,7 +74,9 @@ class Descent:
             if not (trust > _LEAST).any():
                 break
             step = self._step(record, commands, states, trust)
-            attempt = self._solver(Goal(with_commands(record, commands + step), states, target, None, self._still))
+            attempt = self._solver(
+                Goal(with_commands(record, commands + step), states, target, None, self._solver.held)
+            )
             new = self.score(record, attempt.commands, attempt.states)
             good = attempt.there & (new < value * (1 - 1e-9))
             if allowed is not None:
@@ -102,7 +98,7 @@ class Descent:
         at = commands.T
         stuck = ((at <= low) & (pull < 0)) | ((at >= high) & (pull > 0))
         free = np.where(stuck, 0.0, 1.0)
-        free[:, list(self._still)] = 0.0
+        free[:, list(self._solver.held)] = 0.0
         n, k = held.shape[2], held.shape[1]
         square = np.einsum("nki,nkj->nij", slope, slope) * free[:, :, None] * free[:, None, :]
         size = np.maximum(np.trace(square, axis1=1, axis2=2), 1e-300)[:, None, None]

@@ -22,8 +22,6 @@ from armcal.calibration.tool_expression import ToolExpression, sample_inputs
 from armcal.functions.batch_function import BatchFunction, EvaluatorChoice
 
 Rows = NDArray[np.intp]
-Chosen = Mask | Rows
-"""Some columns: whether, or which."""
 
 
 @dataclass(frozen=True)
@@ -44,10 +42,10 @@ class Goal:
     towards: Array | None = None
     held: tuple[int, ...] = ()
 
-    def subset(self, chosen: Chosen) -> Goal:
+    def subset(self, rows: Rows) -> Goal:
         """Some of them."""
-        towards = None if self.towards is None else chosen_of(self.towards, chosen)
-        record, state, target = (chosen_of(array, chosen) for array in (self.record, self.state, self.target))
+        towards = None if self.towards is None else chosen_of(self.towards, rows)
+        record, state, target = (chosen_of(array, rows) for array in (self.record, self.state, self.target))
         return Goal(record, state, target, towards, self.held)
 
 
@@ -83,7 +81,7 @@ class Solutions:
         self.commands[:, at], self.states[:, at] = attempt.commands[:, chosen], attempt.states[:, chosen]
         self.distances[at], self.turns[at] = attempt.distances[chosen], attempt.turns[chosen]
 
-    def subset(self, chosen: Chosen) -> Solutions:
+    def subset(self, chosen: Mask | Rows) -> Solutions:
         """Some of them."""
         return Solutions(*(getattr(self, part.name)[..., chosen] for part in fields(self)))
 
@@ -197,6 +195,7 @@ class Solver:
         limits: n x 2 (rad or m).
         turns: whether rotations count.
         length: how many metres a radian counts for.
+        held: joints that stay where searches start, by index.
     """
 
     def __init__(
@@ -206,10 +205,11 @@ class Solver:
         turns: bool,
         length: float,
         tolerance: tuple[float, float],
+        held: tuple[int, ...],
         choice: EvaluatorChoice = "auto",
     ) -> None:
         """Targets are reached within tolerances in m and rad."""
-        self.length, self.turns, self.limits = length, turns, limits
+        self.length, self.turns, self.limits, self.held = length, turns, limits, held
         self._near = Near(*tolerance, _REST)
         self._exact = Search(expression, slopes(expression), limits, turns, length, choice)
         rough = rough_slopes(expression) if expression.state.numel() else None
@@ -235,7 +235,6 @@ def with_commands(record: Array, commands: Array) -> Array:
     return moved
 
 
-def chosen_of(array: Array, chosen: Chosen) -> Array:
+def chosen_of(array: Array, rows: Rows) -> Array:
     """Some columns, channel by channel in one piece: plain indexing would turn the storage round."""
-    places = np.flatnonzero(chosen) if chosen.dtype == bool else chosen
-    return np.asarray(np.take(array, places, axis=1))
+    return np.asarray(np.take(array, rows, axis=1))
