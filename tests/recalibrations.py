@@ -13,7 +13,7 @@ from armcal.io.journal.files import FileLayer
 from armcal.io.journal.reader import read_entries, read_until
 from armcal_online.running.session import Open, opened
 from armcal_online.running.state_replayer import StateReplayer
-from armcal_online.sources.incoming import Incoming
+from armcal_online.sources.source import Incoming
 from fake_recalibrator import HEADER, FakeRecalibrator, row, setup
 
 

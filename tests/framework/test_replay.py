@@ -29,7 +29,7 @@ from armcal_online.replaying.replay import replay
 from armcal_online.replaying.replay_verifier import BOUND, Comparer, DiffersError, ReplayVerifier, distance
 from armcal_online.running.loop import Pace
 from armcal_online.running.session import Open, opened
-from armcal_online.sources.incoming import Incoming
+from armcal_online.sources.source import Incoming
 from armcal_online.tracking.recalibrator import Recalibrator
 from armcal_online.tracking.settings import RecalibrateSettings
 from armcal_online.tracking.state import State

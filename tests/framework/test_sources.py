@@ -20,10 +20,9 @@ from armcal.io.line_cutter import LineCutter
 from armcal_online.running.progress import MAX_FILES, Progress
 from armcal_online.sources.csv_file import CsvFile
 from armcal_online.sources.folder import Folder
-from armcal_online.sources.incoming import Incoming, Place
 from armcal_online.sources.opening import open_source
 from armcal_online.sources.row_parser import RowParser
-from armcal_online.sources.source import Source
+from armcal_online.sources.source import Incoming, Place, Source
 from armcal_online.sources.streams import Lines, Udp
 from armcal_tracker.csv_reader import CsvReader, CsvSettings
 from fake_recalibrator import HEADER, request, row

@@ -51,13 +51,6 @@ def mission(console: Console, config: Path, out: Path, overrides: tuple[str, ...
     content = {**figures(plan.experiment.name, result.mission, result.log, result.judgement), "seconds": watch.seconds}
     write_files(out, plan, result, content)
     console.result({**content, "folder": str(out)})
-    _show(console, content)
-    for stage, seconds in watch.seconds.items():
-        console.detail(f"{stage}: {seconds:.1f} s")
-    console.out.print(f"figure: {out / 'mission.png'}  ({watch.total():.1f} s)", markup=False, soft_wrap=True)
-
-
-def _show(console: Console, content: dict[str, Any]) -> None:
     errors, counts = content["error_mm"], content["records"]
     table = Table(title=f"Mean tip error over {content['days']:g} days, mm", title_justify="left")
     table.add_column("calibration")
@@ -82,6 +75,9 @@ def _show(console: Console, content: dict[str, Any]) -> None:
         f"({counts['good_rejected_apart']} good ones apart from events), {counts['ignored']} ignored; "
         f"{counts['outliers_accepted']} of {counts['outliers']} outliers accepted",
     )
+    for stage, seconds in watch.seconds.items():
+        console.detail(f"{stage}: {seconds:.1f} s")
+    console.out.print(f"figure: {out / 'mission.png'}  ({watch.total():.1f} s)", markup=False, soft_wrap=True)
 
 
 def _line(console: Console, text: str) -> None:

@@ -8,8 +8,7 @@ from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from typing_extensions import override
 
-from armcal_online.sources.incoming import Incoming
-from armcal_online.sources.source import Source
+from armcal_online.sources.source import Incoming, Source
 
 SOURCE_KEY = "mission"
 

@@ -104,7 +104,25 @@ class JournalReplayer:
             self._verifier.unnoted_events(self._pending_after, self._pending)
         self._pending = []
         if entry.kind == ROLLBACK:
-            self._roll_back(entry.sequence, content)
+            sequence = entry.sequence
+            with parsing(sequence):
+                to = int(content["to"])
+            sentence = f"The estimate was set back to what it was after entry {to}."
+            rollback = {"event": "decision", "sequence": sequence, "kind": "rollback", "to": to, "sentence": sentence}
+            self.decisions.append(rollback)
+            if to in self._held:
+                self._state_replayer.apply(sequence, ROLLBACK, {"to": to})
+            elif self._verifier.resumes:
+                # The state that it went back to is no longer kept; the checkpoint that follows a rollback has it.
+                self._is_lost = True
+            else:
+                raise DataError(
+                    f"entry {sequence} goes back to entry {to}, which the journal no longer holds: what other settings "
+                    "would have made of it cannot be found.",
+                    hint=f"Replay up to there only: --until {sequence - 1}.",
+                )
+            if content.get("digest") and not self._is_lost:
+                self._verifier.compare_digest(sequence, content["digest"], self.session)
         elif not self._is_lost:
             undigested = {key: value for key, value in content.items() if key != "digest"}
             events = self._state_replayer.apply(entry.sequence, entry.kind, undigested)
@@ -118,26 +136,6 @@ class JournalReplayer:
                         residual = event.get("residual_mm")
                         size = math.hypot(*residual) / 1000 if residual else math.nan
                         self.judged.append(Judged(entry.sequence, event["verdict"], size))
-
-    def _roll_back(self, sequence: int, content: Mapping[str, Any]) -> None:
-        with parsing(sequence):
-            to = int(content["to"])
-        sentence = f"The estimate was set back to what it was after entry {to}."
-        event = {"event": "decision", "sequence": sequence, "kind": "rollback", "to": to, "sentence": sentence}
-        self.decisions.append(event)
-        if to in self._held:
-            self._state_replayer.apply(sequence, ROLLBACK, {"to": to})
-        elif self._verifier.resumes:
-            # The state that it went back to is no longer kept; the checkpoint that follows a rollback has it.
-            self._is_lost = True
-        else:
-            raise DataError(
-                f"entry {sequence} goes back to entry {to}, which the journal no longer holds: what other settings "
-                "would have made of it cannot be found.",
-                hint=f"Replay up to there only: --until {sequence - 1}.",
-            )
-        if content.get("digest") and not self._is_lost:
-            self._verifier.compare_digest(sequence, content["digest"], self.session)
 
     def _compare_note(self, sequence: int, content: Mapping[str, Any]) -> None:
         if self._is_lost:

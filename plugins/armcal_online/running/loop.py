@@ -13,8 +13,7 @@ from armcal.io.signals import Signals
 
 from armcal_online.running.outputs import Outputs
 from armcal_online.running.state_replayer import DECISION, NOTED, PAUSE, RECORD, RESUME, ROLLBACK, StateReplayer
-from armcal_online.sources.incoming import Incoming
-from armcal_online.sources.source import Source
+from armcal_online.sources.source import Incoming, Source
 from armcal_online.tracking.recalibrator import Recalibrator
 
 WAIT_S = 0.1

@@ -7,8 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 from zlib import crc32
 
-from armcal_online.sources.incoming import Incoming
-from armcal_online.sources.source import THROUGH
+from armcal_online.sources.source import THROUGH, Incoming
 
 MAX_FILES = 2000
 """So many files are remembered one by one; of the others, that all up to a name were taken."""

@@ -101,7 +101,15 @@ def opened(setup: Setup, session: Recalibrator, source_of: SourceOf) -> Iterator
         source.resume(state_replayer.progress.positions)
         outputs = Outputs(setup.folder, setup.stream, EventFile(setup.folder), setup.files)
         stack.callback(outputs.close)
-        _report_start(journal, outputs, session, header, resumed)
+        sequence = journal.record(STARTED, {"at": time.time(), "resumed": resumed, "evaluator": header["evaluator"]})
+        content = {"sequence": sequence, "at": time.time(), "resumed": resumed, "calibration": header["path"]}
+        outputs.event({**session.started_event(resumed), **content})
+        cut = journal.recovered.cut
+        if cut is not None:
+            outputs.alarm(cut.sentence)
+        before = journal.recovered.header.get("evaluator", header["evaluator"])
+        if before != header["evaluator"]:
+            outputs.alarm("Another evaluator than before is used: a replay has to go over from one to the other here.")
         try:
             verify(folder, setup.files)
         except DataError as fault:
@@ -153,17 +161,3 @@ def _recover(setup: Setup, journal: Journal, state_replayer: StateReplayer, head
     if not same_evaluator:
         journal.checkpoint(state_replayer.checkpoint())
     return True
-
-
-def _report_start(
-    journal: Journal, outputs: Outputs, session: Recalibrator, header: Mapping[str, Any], resumed: bool
-) -> None:
-    sequence = journal.record(STARTED, {"at": time.time(), "resumed": resumed, "evaluator": header["evaluator"]})
-    content = {"sequence": sequence, "at": time.time(), "resumed": resumed, "calibration": header["path"]}
-    outputs.event({**session.started_event(resumed), **content})
-    cut = journal.recovered.cut
-    if cut is not None:
-        outputs.alarm(cut.sentence)
-    before = journal.recovered.header.get("evaluator", header["evaluator"])
-    if before != header["evaluator"]:
-        outputs.alarm("Another evaluator than before is used: a replay has to go over from one to the other here.")

@@ -13,7 +13,7 @@ from armcal.errors import ArmcalError, DataError, Location
 from armcal.io.journal.segment import Entry
 
 from armcal_online.running.progress import Progress
-from armcal_online.sources.incoming import Incoming
+from armcal_online.sources.source import Incoming
 from armcal_online.tracking.recalibrator import Recalibrator
 
 RECORD = "record"

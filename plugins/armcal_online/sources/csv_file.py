@@ -9,6 +9,7 @@ import time
 from collections.abc import Mapping
 from pathlib import Path
 from stat import S_ISREG
+from typing import BinaryIO
 from zlib import crc32
 
 from armcal.errors import DataError, InputError, Location
@@ -16,10 +17,9 @@ from armcal.io.line_cutter import MAX_LINE_BYTES
 from armcal.io.plain_files import input_file
 from typing_extensions import override
 
-from armcal_online.sources.incoming import Incoming
 from armcal_online.sources.reading import LineReading
 from armcal_online.sources.row_parser import KINDS, Kind, LineParser, RowParser
-from armcal_online.sources.source import AtEnd, Clock, Source, key_of, wait_until
+from armcal_online.sources.source import AtEnd, Clock, Incoming, Source, key_of, wait_until
 
 _IDENTIFYING: Mapping[Kind, int] = {"csv": 2, "json": 1}
 """So many lines that are not blank identify a file: a header alone does not."""
@@ -35,15 +35,14 @@ class CsvFile(Source):
         DataError: its header cannot be used.
     """
 
-    keeps_records = True
+    keeps_records, ended = True, False
 
     def __init__(self, path: Path, rows: RowParser, at_end: AtEnd, clock: Clock = time.time) -> None:
         self._path, self._kind = path, KINDS.get(path.suffix, "csv")
         self._rows, self._at_end, self._clock = rows, at_end, clock
         self._positions: Mapping[str, int] = {}
         self._reading: LineReading | None = None
-        self._node = (0, 0)
-        self._ended = False
+        self._file: BinaryIO | None = None
         where = Location(str(path))
         with contextlib.suppress(OSError):  # of a path that leads nowhere, input_file says what is wrong
             if not S_ISREG(path.stat().st_mode):
@@ -59,11 +58,6 @@ class CsvFile(Source):
         if line and self._kind == "csv":
             rows.table(line.decode("utf-8", "replace").removeprefix("\ufeff").strip("\r"), str(path), number)
 
-    @property
-    @override
-    def ended(self) -> bool:
-        return self._ended
-
     @override
     def resume(self, positions: Mapping[str, int]) -> None:
         self._positions = positions
@@ -71,49 +65,50 @@ class CsvFile(Source):
     @override
     def incoming(self, wait_s: float) -> Incoming | None:
         deadline = time.monotonic() + wait_s
-        while not self._ended:
+        while not self.ended:
             if self._reading is None:
-                self._reading = self._opened()
-            if self._reading is not None:
+                self._open()
+            if self._reading is not None and self._file is not None:
                 incoming = self._reading.next()
                 if incoming is not None:
                     return incoming
                 if self._at_end == "stop":
-                    self._ended = True
+                    self.ended = True
                     return self._reading.last()
                 with contextlib.suppress(OSError):
-                    status = self._path.stat()
-                    if (status.st_dev, status.st_ino) != self._node or status.st_size < self._reading.offset:
-                        self._reading.close()
-                        self._reading = None  # another file, or the same from its start
+                    there, known = self._path.stat(), os.fstat(self._file.fileno())
+                    if not os.path.samestat(there, known) or there.st_size < self._reading.offset:
+                        self._release()  # another file, or the same from its start
             if not wait_until(deadline):
                 return None
         return None
 
     @override
     def close(self) -> None:
-        if self._reading is not None:
-            self._reading.close()
-        self._reading = None
-        self._ended = True
+        self._release()
+        self.ended = True
 
-    def _opened(self) -> LineReading | None:
-        """The file, once the first lines that identify it are there."""
+    def _release(self) -> None:
+        if self._file is not None:
+            self._file.close()
+        self._file = self._reading = None
+
+    def _open(self) -> None:
+        """Begin with the file, once the first lines that identify it are there."""
         try:
             file = input_file(self._path, sys.maxsize, "a file of records", buffering=0)
         except InputError:  # it is away, or a pipe or device stands in its place: those are not waited for
-            return None
+            return
         head = file.read(2 * MAX_LINE_BYTES) or b""
         count = _IDENTIFYING[self._kind]
         whole = head[: head.rfind(b"\n") + 1] if self._at_end == "wait" else head
         lines = [line.strip() for line in whole.split(b"\n") if line.strip()][:count]
         if self._at_end == "wait" and len(lines) < count and len(head) < 2 * MAX_LINE_BYTES:
             file.close()
-            return None
+            return
         file.seek(0)
-        status = os.fstat(file.fileno())
-        self._node = (status.st_dev, status.st_ino)
         checksum = crc32(b"\n".join(lines))
         key = f"{key_of(self._path.name)}#{checksum:08x}"
         parser = LineParser(self._rows, self._kind, str(self._path))
-        return LineReading(file, parser, key, self._positions.get(key, 0), self._clock)
+        self._file = file
+        self._reading = LineReading(file.read, parser, self._clock, key, self._positions.get(key, 0))

@@ -8,15 +8,15 @@ import sys
 import time
 from collections.abc import Mapping
 from pathlib import Path
+from typing import BinaryIO
 
 from armcal.errors import InputError
 from armcal.io.plain_files import input_file
 from typing_extensions import override
 
-from armcal_online.sources.incoming import Incoming, Place
-from armcal_online.sources.reading import LineReading, Reading, WholeReading
+from armcal_online.sources.reading import LineReading, WholeReading
 from armcal_online.sources.row_parser import KINDS, LineParser, RowParser, faulty
-from armcal_online.sources.source import THROUGH, Clock, Source, key_of, wait_until
+from armcal_online.sources.source import THROUGH, Clock, Incoming, Place, Source, key_of, wait_until
 
 SETTLED_S = 1.0
 """A file whose size has not changed for so long is read; one that never stops growing after ``IMPATIENT_S``."""
@@ -35,11 +35,10 @@ class _Watched:
     """One file: its size when last looked at, and since when."""
 
     def __init__(self, size: int, at: float) -> None:
-        self.size = size
-        self.modified = math.inf
-        self.seen = at
-        self.changed = at
-        self.reading: Reading | None = None
+        self.size, self.modified = size, math.inf
+        self.seen = self.changed = at
+        self.reading: LineReading | WholeReading | None = None
+        self.file: BinaryIO | None = None
         self.shorter = False
 
     def look(self, path: Path) -> None:
@@ -61,25 +60,16 @@ class Folder(Source):
     under such a name, and rename. A file whose name comes before all that are remembered was taken already.
     """
 
-    keeps_records = True
+    keeps_records, ended = True, False
 
     def __init__(self, path: Path, rows: RowParser, clock: Clock = time.time, settled_s: float = SETTLED_S) -> None:
-        self._path = path
-        self._rows = rows
-        self._clock = clock
-        self._settled_s = settled_s
+        self._path, self._rows, self._clock, self._settled_s = path, rows, clock, settled_s
         self._positions: dict[str, int] = {}
         self._through = ""
         self._pending: list[str] = []
         self._known: set[str] = set()
         self._watched: dict[str, _Watched] = {}
         self._stamp = (0, 0.0)
-        self._open = True
-
-    @property
-    @override
-    def ended(self) -> bool:
-        return not self._open
 
     @override
     def resume(self, positions: Mapping[str, int]) -> None:
@@ -89,7 +79,7 @@ class Folder(Source):
     @override
     def incoming(self, wait_s: float) -> Incoming | None:
         deadline = time.monotonic() + wait_s
-        while self._open:
+        while not self.ended:
             self._scan()
             incoming = self._next()
             if incoming is not None or not wait_until(deadline):
@@ -98,7 +88,7 @@ class Folder(Source):
 
     @override
     def close(self) -> None:
-        self._open = False
+        self.ended = True
         for name in [*self._watched]:
             self._forget(name)
 
@@ -165,10 +155,10 @@ class Folder(Source):
             return faulty(Place(self._clock(), key, 0), f"{key} cannot be read ({fault.__cause__.strerror}).")
         try:
             if path.suffix == _WHOLE:
-                watched.reading = WholeReading(file, self._rows, key, through, self._clock)
+                watched.reading = WholeReading(file, self._rows, self._clock, key, through)
             else:
                 parser = LineParser(self._rows, KINDS[path.suffix], str(path))
-                watched.reading = LineReading(file, parser, key, through, self._clock)
+                watched.reading, watched.file = LineReading(file.read, parser, self._clock, key, through), file
         except OSError as fault:
             return faulty(Place(self._clock(), key, 0), f"{key} cannot be read ({fault.strerror}).")
         return None
@@ -192,6 +182,6 @@ class Folder(Source):
         return watched.reading.last() if watched.reading.begun and quiet else None
 
     def _forget(self, name: str) -> None:
-        reading = self._watched.pop(name).reading
-        if reading is not None:
-            reading.close()
+        file = self._watched.pop(name).file
+        if file is not None:
+            file.close()

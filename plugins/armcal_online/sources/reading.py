@@ -1,93 +1,75 @@
-"""One file that is read to its end, and read on when it grows."""
+"""Lines as they come, and files read whole, become records."""
 
 from __future__ import annotations
 
 import json
 import os
 from collections import deque
-from typing import Any, BinaryIO, Protocol
+from collections.abc import Callable
+from typing import Any, BinaryIO
 
 from armcal.io.line_cutter import LineCutter
-from typing_extensions import override
 
-from armcal_online.sources.incoming import Incoming, Place
 from armcal_online.sources.row_parser import LineParser, RowParser, faulty
-from armcal_online.sources.source import Clock
+from armcal_online.sources.source import Clock, Incoming, Place
 
 MAX_JSON_BYTES = 4 * 1024**2
 
 _CHUNK = 64 * 1024
 
 
-class Reading(Protocol):
-    """One file, being read."""
+class LineReading:
+    """Lines of a file, which may still grow, or of a stream; rows are line numbers.
 
-    @property
-    def offset(self) -> int:
-        """How many bytes of it were read."""
+    Args:
+        read: at most so many bytes; none if there are none now.
+        parser: of lines.
+        clock: for the arrival of records.
+        key: of the file in its source.
+        through: the last row that was taken before.
 
-    @property
-    def begun(self) -> bool:
-        """Whether its last line has no end yet."""
+    Attributes:
+        offset: how many bytes were read.
+    """
 
-    def next(self) -> Incoming | None:
-        """The next record; None if the file has no other whole line now."""
-
-    def last(self) -> Incoming | None:
-        """The record in a last line without an end, now that no end is to come."""
-
-    def close(self) -> None:
-        """Close the file, where it is still open."""
-        return
-
-
-class LineReading(Reading):
-    """A file of lines; rows are line numbers."""
-
-    def __init__(self, file: BinaryIO, parser: LineParser, key: str, through: int, clock: Clock) -> None:
-        self._file = file
-        self._parser = parser
-        self._key = key
-        self._through = through
-        self._clock = clock
+    def __init__(
+        self, read: Callable[[int], bytes | None], parser: LineParser, clock: Clock, key: str = "", through: int = 0
+    ) -> None:
+        self._read, self._parser, self._clock = read, parser, clock
+        self._key, self._through = key, through
         self._cutter = LineCutter()
         self._lines: deque[bytes | None] = deque()
-        self._row = 0
-        self._offset = 0
+        self._row = self.offset = 0
 
     @property
-    @override
-    def offset(self) -> int:
-        return self._offset
-
-    @property
-    @override
     def begun(self) -> bool:
+        """Whether the last line has no end yet."""
         return self._cutter.begun
 
-    @override
     def next(self) -> Incoming | None:
+        """The next record; None if there is no other whole line now."""
         while True:
             while self._lines:
                 record = self._record(self._lines.popleft())
                 if record is not None:
                     return record
             try:
-                data = self._file.read(_CHUNK)
+                data = self._read(_CHUNK)
             except OSError as fault:
                 return faulty(self._place(), f"The file cannot be read ({fault.strerror}).")
             if not data:
                 return None
-            self._offset += len(data)
+            self.offset += len(data)
             self._lines.extend(self._cutter.feed(data))
 
-    @override
     def last(self) -> Incoming | None:
-        return self._record(self._cutter.rest()) if self._cutter.begun else None
+        """The record in a last line without an end, now that no end is to come."""
+        return self._record(self._cutter.rest()) if self.begun else None
 
-    @override
-    def close(self) -> None:
-        self._file.close()
+    def cut_short(self) -> Incoming | None:
+        """A fault in place of a last line without an end, where that is not trusted."""
+        self._row += 1
+        return faulty(self._place(), "The last line has no end: it may have been cut short.") if self.begun else None
 
     def _record(self, line: bytes | None) -> Incoming | None:
         self._row += 1
@@ -100,18 +82,21 @@ class LineReading(Reading):
         return Place(self._clock(), self._key, self._row)
 
 
-class WholeReading(Reading):
-    """A file that is one JSON object, or an array of them; rows count these."""
+class WholeReading:
+    """A file that is one JSON object, or an array of them; rows count these.
 
-    def __init__(self, file: BinaryIO, rows: RowParser, key: str, through: int, clock: Clock) -> None:
-        self._rows = rows
-        self._key = key
-        self._clock = clock
-        self._row = 0
+    Attributes:
+        offset: its size when it was read.
+        row: how many objects were taken.
+    """
+
+    def __init__(self, file: BinaryIO, rows: RowParser, clock: Clock, key: str, through: int) -> None:
+        self._rows, self._clock, self._key = rows, clock, key
         self._objects: deque[Any] = deque()
         self._fault = ""
+        self.row = 0
         with file:
-            self._offset = os.fstat(file.fileno()).st_size
+            self.offset = os.fstat(file.fileno()).st_size
             data = file.read(MAX_JSON_BYTES + 1)
         try:
             if len(data) > MAX_JSON_BYTES:
@@ -121,33 +106,23 @@ class WholeReading(Reading):
             self._fault = f"The file is not JSON ({fault})."
             return
         self._objects.extend(objects if isinstance(objects, list) else [objects])
-        while self._objects and self._row < through:
+        while self._objects and self.row < through:
             self._objects.popleft()
-            self._row += 1
-
-    @property
-    def row(self) -> int:
-        """How many objects were taken."""
-        return self._row
-
-    @property
-    def offset(self) -> int:
-        """Its size when it was read."""
-        return self._offset
+            self.row += 1
 
     @property
     def begun(self) -> bool:
         """Whether it may yet become what it is not: it was cut short."""
         return bool(self._fault)
 
-    @override
     def next(self) -> Incoming | None:
+        """The next record; None if there is no other."""
         if not self._objects:
             return None
-        self._row += 1
-        return self._rows.object(self._objects.popleft(), Place(self._clock(), self._key, self._row))
+        self.row += 1
+        return self._rows.object(self._objects.popleft(), Place(self._clock(), self._key, self.row))
 
-    @override
     def last(self) -> Incoming | None:
+        """Why it cannot be read, now that it does not change any more."""
         fault, self._fault = self._fault, ""
         return faulty(Place(self._clock(), self._key, 0), fault) if fault else None

@@ -18,7 +18,7 @@ from armcal.io.cells import DELIMITERS, CellFault, is_missing, read_cell, split
 from armcal.measure.column_match import Header, Plan, header_of, match_columns, refuse_missing, renamed
 from armcal.measure.reader import ReadRequest, RequestedChannel
 
-from armcal_online.sources.incoming import Incoming, Place
+from armcal_online.sources.source import Incoming, Place
 
 MAX_LABELS = 50
 MAX_LABEL = 500

@@ -8,19 +8,17 @@ import os
 import select
 import socket
 import time
-from collections import OrderedDict, deque
+from collections import OrderedDict
 from collections.abc import Sequence
 from typing import Any
 
-from armcal.io.line_cutter import LineCutter
 from armcal.io.udp import MAX_DATAGRAM_BYTES, listening
 from typing_extensions import override
 
-from armcal_online.sources.incoming import Incoming, Place
+from armcal_online.sources.reading import LineReading
 from armcal_online.sources.row_parser import LineParser, RowParser, faulty
-from armcal_online.sources.source import Clock, Source
+from armcal_online.sources.source import Clock, Incoming, Place, Source
 
-_CHUNK = 64 * 1024
 _WAITING = 64
 """So many senders are remembered until their records are acknowledged; there is one unless a disk is full."""
 
@@ -28,51 +26,40 @@ _WAITING = 64
 class Lines(Source):
     """JSON or CSV lines from a descriptor, which stays the caller's. A last line without an end is not trusted."""
 
-    keeps_records = False
+    keeps_records, ended = False, False
 
     def __init__(self, descriptor: int, rows: RowParser, clock: Clock = time.time) -> None:
         self._descriptor = descriptor
-        self._parser = LineParser(rows, "either", "standard input")
-        self._clock = clock
-        self._cutter = LineCutter()
-        self._lines: deque[bytes | None] = deque()
-        self._row = 0
-        self._open = True
-
-    @property
-    @override
-    def ended(self) -> bool:
-        return not self._open and not self._lines
+        self._reading = LineReading(self._read, LineParser(rows, "either", "standard input"), clock)
+        self._is_at_end = False
 
     @override
     def incoming(self, wait_s: float) -> Incoming | None:
         deadline = time.monotonic() + wait_s
-        while True:
-            while self._lines:
-                incoming = self._parser.record(self._lines.popleft(), self._next_place())
-                if incoming is not None:
-                    return incoming
-            left = max(deadline - time.monotonic(), 0.0)
-            if not self._open or not select.select([self._descriptor], [], [], left)[0]:
+        while not self.ended:
+            incoming = self._reading.next()
+            if incoming is not None:
+                return incoming
+            if self._is_at_end:
+                self.ended = True
+                return self._reading.cut_short()
+            if not select.select([self._descriptor], [], [], max(deadline - time.monotonic(), 0.0))[0]:
                 return None
-            try:
-                data = os.read(self._descriptor, _CHUNK)
-            except OSError:
-                data = b""
-            self._lines.extend(self._cutter.feed(data))
-            if not data:
-                self._open = False
-                if self._cutter.begun:
-                    return faulty(self._next_place(), "The last line has no end: it may have been cut short.")
+        return None
 
     @override
     def close(self) -> None:
-        self._open = False
-        self._lines.clear()
+        self.ended = True
 
-    def _next_place(self) -> Place:
-        self._row += 1
-        return Place(self._clock(), "", self._row)
+    def _read(self, count: int) -> bytes | None:
+        if not select.select([self._descriptor], [], [], 0.0)[0]:
+            return None
+        try:
+            data = os.read(self._descriptor, count)
+        except OSError:
+            data = b""
+        self._is_at_end = not data
+        return data
 
 
 class Udp(Source):
@@ -86,17 +73,15 @@ class Udp(Source):
         InputError: the port cannot be opened, or other machines reach it and no sender is named.
     """
 
-    keeps_records = False
+    keeps_records, ended = False, False
 
     def __init__(
         self, host: str, port: int, rows: RowParser, clock: Clock = time.time, senders: Sequence[str] = ()
     ) -> None:
-        self._rows = rows
-        self._clock = clock
-        self._row = 0
+        self._rows, self._clock, self._row = rows, clock, 0
         self._senders: OrderedDict[int, Any] = OrderedDict()
         self._socket, self._is_ours = listening(host, port, senders)
-        self._stranger_reported, self._open = False, True
+        self._stranger_reported = False
 
     @property
     def address(self) -> tuple[str, int]:
@@ -104,14 +89,9 @@ class Udp(Source):
         host, port, *_ = self._socket.getsockname()
         return str(host), int(port)
 
-    @property
-    @override
-    def ended(self) -> bool:
-        return not self._open
-
     @override
     def incoming(self, wait_s: float) -> Incoming | None:
-        if not self._open or not select.select([self._socket], [], [], max(wait_s, 0.0))[0]:
+        if self.ended or not select.select([self._socket], [], [], max(wait_s, 0.0))[0]:
             return None
         try:
             data, _, flags, sender = self._socket.recvmsg(MAX_DATAGRAM_BYTES + 1)
@@ -139,7 +119,7 @@ class Udp(Source):
     @override
     def acknowledge(self, incoming: Incoming, sequence: int) -> None:
         sender = self._senders.pop(incoming.source_row, None)
-        if sender is None or not self._open:
+        if sender is None or self.ended:
             return
         reply = {"acknowledged": sequence, "id": incoming.record_id}
         if incoming.fault:
@@ -149,5 +129,5 @@ class Udp(Source):
 
     @override
     def close(self) -> None:
-        self._open = False
+        self.ended = True
         self._socket.close()

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from armcal.estimate.online import Linearised
 
-from armcal_online.sources.incoming import Incoming
+from armcal_online.sources.source import Incoming
 from armcal_online.tracking.directions import Steps
 from armcal_online.tracking.health import Health
 from armcal_online.tracking.hypotheses import Recent

@@ -16,13 +16,13 @@ from typing import Any
 from armcal.base.domains import Array
 from armcal.calibration.calibration import Calibration
 from armcal.errors import ArmcalError, ConfigError, DataError, Location
-from armcal.estimate.online import Linearised, OnlineEstimator, normalised_innovation_squared
+from armcal.estimate.online import OnlineEstimator, normalised_innovation_squared
 from armcal.estimate.validation import error_unit
 from armcal.measure.reader import ReadRequest
 from armcal.plugins import PluginRegistry, discover
 from pydantic import ValidationError
 
-from armcal_online.sources.incoming import Incoming
+from armcal_online.sources.source import Incoming
 from armcal_online.tracking import events
 from armcal_online.tracking.advance import advanced
 from armcal_online.tracking.belief import most_likely
@@ -168,7 +168,7 @@ class Recalibrator:
     def _judged(
         self, incoming: Incoming, state: State, readings: tuple[Reading, ...], passed: Mapping[str, float]
     ) -> tuple[dict[str, Any], ...]:
-        """Gate a record, and take it in if it is accepted."""
+        """Gate a record, take it in if it is accepted, and judge what the last records mean now."""
         process_noise, observer, space = self.setup.process_noise, self.setup.observer, self.setup.space
         before = process_noise.faded(state.belief, passed)
         anchor = process_noise.faded(state.anchor, passed) if state.held else before
@@ -185,24 +185,17 @@ class Recalibrator:
             after = state if rejected else advanced(state, recent, self.setup, self._estimator, nis_window)
         except ArmcalError as fault:
             return self._ignored(incoming, state, fault.message)
-        after = _counted(after, "rejected" if rejected else "accepted")
-        return self._concluded(incoming, after, recent, first, limit)
-
-    def _concluded(
-        self, incoming: Incoming, state: State, recent: Recent, first: Linearised, limit: float
-    ) -> tuple[dict[str, Any], ...]:
-        """What the last records mean now, with events of it."""
-        before = self.state.health.level
-        gated = replace(state, recent=(*state.recent, recent)[-self._settings.gate.window :])
+        counted = _counted(after, "rejected" if rejected else "accepted")
+        gated = replace(counted, recent=(*counted.recent, recent)[-self._settings.gate.window :])
         state, decisions = self._judge.after(gated) if self._settings.gating == "on" else (gated, ())
-        health = self._judge.health(gated, decisions, first)
+        health, level = self._judge.health(gated, decisions, first), self.state.health.level
         record_events = [events.judged(incoming, state, recent, first, limit, self.setup)]
         for decision in decisions:
             # These two stand until something else is decided: they are news once.
-            if decision.kind not in ("unexplained", "model_no_longer_fits") or before != decision.level:
+            if decision.kind not in ("unexplained", "model_no_longer_fits") or decision.level != level:
                 record_events.append(events.decided(state, decision))
-        if health.level != before:
-            record_events.append(events.level_changed(state, before, health))
+        if health.level != level:
+            record_events.append(events.level_changed(state, level, health))
         self.state = replace(state, health=health)
         every = self._settings.output.estimate_every_records
         if decisions or (state.counts["accepted"] % every == 0 and not recent.rejected):

@@ -52,7 +52,22 @@ class History:
         if kind == "record":
             return self._record(event)
         if kind == "started":
-            return self._started(event)
+            message = message_of(event)
+            messages: list[Message] = []
+            if event.get("resumed") is not True and (self.last or self._listed):
+                self._begin()
+                messages.append({"event": "reset"})
+            self.calibration = text(event.get("calibration")) or self.calibration
+            gate = event.get("gate")
+            self.gate = number(gate.get("probability")) if isinstance(gate, Mapping) else self.gate
+            first = whole(event.get("sequence"))
+            self._sequence = self._sequence if first is None else first - 1
+            row = self.estimates.start(event)
+            self._set_level(text(event.get("level")), None)
+            if message:
+                self._listed.append(message)
+                messages.append(message)
+            return [*messages, *([row] if row else [])]
         if kind == "estimate":
             row = self.estimates.take(event)
             return [row] if row else []
@@ -103,24 +118,6 @@ class History:
         self._set_level(record.get("level"), None)
         standing = {"standing": self.level, "standing_sentence": self.level_sentence}
         return [{**record, "counts": dict(self._counts), **standing}]
-
-    def _started(self, event: Mapping[str, Any]) -> list[Message]:
-        message = message_of(event)
-        messages: list[Message] = []
-        if event.get("resumed") is not True and (self.last or self._listed):
-            self._begin()
-            messages.append({"event": "reset"})
-        self.calibration = text(event.get("calibration")) or self.calibration
-        gate = event.get("gate")
-        self.gate = number(gate.get("probability")) if isinstance(gate, Mapping) else self.gate
-        first = whole(event.get("sequence"))
-        self._sequence = self._sequence if first is None else first - 1
-        row = self.estimates.start(event)
-        self._set_level(text(event.get("level")), None)
-        if message:
-            self._listed.append(message)
-            messages.append(message)
-        return [*messages, *([row] if row else [])]
 
     def _set_level(self, level: Any, sentence: str | None) -> None:
         if level not in LEVELS:
