@@ -10,9 +10,9 @@ from pathlib import Path
 from armcal.errors import DataError
 from armcal.io.standard_output import StandardOutput
 from armcal.measure.reader import ReadRequest, RequestedChannel
+from armcal_online.commands.recalibrate import open_source
 from armcal_online.running.loop import Pace
 from armcal_online.running.session import Setup, opened
-from armcal_online.sources.opening import open_source
 
 HEADER = "pose_id,q1_deg,q2_deg,x_mm,y_mm,z_mm"
 CALIBRATION = "armcal_calibration: 0\n"

@@ -14,8 +14,7 @@ from typing import Any
 import pytest
 from armcal.cli.main import cli
 from armcal.errors import InputError
-from armcal_online.running.control import SOCKET, ControlServer, ask
-from armcal_online.running.requests import joint_values
+from armcal_online.running.control import SOCKET, ControlServer, ask, joint_values
 from click.testing import CliRunner
 from fake_recalibrator import request
 

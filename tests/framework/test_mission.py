@@ -21,11 +21,16 @@ from armcal.estimate.simulation import DAY_S, Mission, SimulationRequest, measur
 from armcal_online.mission.errors import error_curve, random_poses
 from armcal_online.mission.figure import mission_figure
 from armcal_online.mission.files import curve_text, figures, schedule, truth_text, write_files
-from armcal_online.mission.judge import Judgement, judge
-from armcal_online.mission.mission import MissionResult, before_launch, recalibrated, simulated
-from armcal_online.mission.mission_log import MissionLog
+from armcal_online.mission.judge import Judgement, MissionLog, judge
+from armcal_online.mission.mission import (
+    MissionResult,
+    MissionSource,
+    PowerCutError,
+    before_launch,
+    recalibrated,
+    simulated,
+)
 from armcal_online.mission.settings import MissionPlan
-from armcal_online.mission.source import MissionSource, PowerCutError
 from armcal_online.tracking.settings import RecalibrateSettings
 from click.testing import CliRunner, Result
 

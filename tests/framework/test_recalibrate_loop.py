@@ -12,10 +12,10 @@ import pytest
 from armcal.errors import InputError
 from armcal.io.journal.journal import JournalFullError
 from armcal.io.journal.reader import read_entries
+from armcal_online.commands.recalibrate import open_source
 from armcal_online.running.loop import Pace, Recalibration
 from armcal_online.running.session import opened
 from armcal_online.running.state_replayer import ReplayDiffersError
-from armcal_online.sources.opening import open_source
 from armcal_online.sources.source import Incoming
 from fake_recalibrator import FakeRecalibrator, setup
 from recalibrations import (

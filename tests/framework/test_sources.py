@@ -17,10 +17,10 @@ import pytest
 from armcal.base.dataset import Dataset
 from armcal.errors import DataError, InputError
 from armcal.io.line_cutter import LineCutter
-from armcal_online.running.progress import MAX_FILES, Progress
+from armcal_online.commands.recalibrate import open_source
+from armcal_online.running.state_replayer import MAX_FILES, Progress
 from armcal_online.sources.csv_file import CsvFile
 from armcal_online.sources.folder import Folder
-from armcal_online.sources.opening import open_source
 from armcal_online.sources.row_parser import RowParser
 from armcal_online.sources.source import Incoming, Place, Source
 from armcal_online.sources.streams import Lines, Udp

@@ -22,13 +22,12 @@ from armcal.calibration.calibration import Calibration
 from armcal.cli.main import cli
 from armcal.io.event_file import EventFile, EventTail
 from armcal.io.line_cutter import MAX_LINE_BYTES
-from armcal_online.watch.events import message_of, record_of
+from armcal_online.watch.estimates import Thinned
+from armcal_online.watch.events import LONGEST_TEXT, message_of, number, parsed, record_of, text
 from armcal_online.watch.feed import Feed
 from armcal_online.watch.history import OLDER_ACCEPTED, OLDER_OTHERS, RECENT_RECORDS, History
-from armcal_online.watch.lenient import LONGEST_TEXT, number, parsed, text
 from armcal_online.watch.shape import Shape, drawing_of
 from armcal_online.watch.terminal import line, picture
-from armcal_online.watch.thinned import Thinned
 from click.testing import CliRunner
 from rich.console import Console
 from watching import SLIP, append, made_up, made_up_folder, written

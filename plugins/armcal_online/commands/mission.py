@@ -19,9 +19,17 @@ from rich.table import Table
 
 from armcal_online.commands.recalibrate import setup_of
 from armcal_online.mission.files import figures, write_files
-from armcal_online.mission.mission import BENCH, CALIBRATION, RECALIBRATION, RECORDS, Session, run_mission
+from armcal_online.mission.mission import (
+    BENCH,
+    CALIBRATION,
+    RECALIBRATION,
+    RECORDS,
+    MissionSource,
+    PowerCutError,
+    Session,
+    run_mission,
+)
 from armcal_online.mission.settings import MissionPlan
-from armcal_online.mission.source import MissionSource, PowerCutError
 from armcal_online.running.session import opened
 from armcal_online.tracking.recalibrator import Recalibrator
 from armcal_online.tracking.settings import RecalibrateSettings

@@ -16,7 +16,6 @@ from armcal.errors import EXIT_BAD_INPUT, EXIT_FAULT, InputError, Location
 from armcal.io.journal.files import REAL_FILES, write_whole
 from rich.table import Table
 
-from armcal_online.replaying.comparison import WARM_UP, Comparison, compared, side_by_side
 from armcal_online.replaying.kept_journal import (
     KeptJournal,
     journal_folder,
@@ -24,7 +23,15 @@ from armcal_online.replaying.kept_journal import (
     kept_journal,
     kept_settings,
 )
-from armcal_online.replaying.replay import JournalReplayer, Replayed, replay
+from armcal_online.replaying.replay import (
+    WARM_UP,
+    Comparison,
+    JournalReplayer,
+    Replayed,
+    compared,
+    replay,
+    side_by_side,
+)
 from armcal_online.replaying.replay_verifier import Comparer, ReplayVerifier
 from armcal_online.running.session import OURS
 from armcal_online.tracking.recalibrator import Recalibrator

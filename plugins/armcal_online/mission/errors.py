@@ -21,8 +21,7 @@ from armcal.measure.measurement import Measurement
 from armcal.problem.factor_records import FactorRecords
 from armcal.problem.problem import Problem
 
-from armcal_online.mission.judge import ErrorCurve
-from armcal_online.mission.mission_log import MissionLog
+from armcal_online.mission.judge import ErrorCurve, MissionLog
 from armcal_online.mission.settings import MissionRunSettings
 
 _HOUR_S = 3600.0

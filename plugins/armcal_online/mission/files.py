@@ -20,9 +20,8 @@ from armcal.estimate.simulation import DAY_S, Mission
 from armcal.io.plain_files import check_output
 
 from armcal_online.mission.figure import mission_figure
-from armcal_online.mission.judge import ErrorCurve, Judgement
+from armcal_online.mission.judge import Decision, ErrorCurve, Judgement, MissionLog
 from armcal_online.mission.mission import MissionResult
-from armcal_online.mission.mission_log import Decision, MissionLog
 from armcal_online.mission.settings import MissionPlan
 
 _MM = 1000.0

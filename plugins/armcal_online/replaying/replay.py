@@ -1,4 +1,4 @@
-"""A journal replayed: every entry does to a session what it did when it was written."""
+"""A journal replayed: every entry does to a session what it did when it was written; two replays compared."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 from armcal.base.config_text import finite
 from armcal.errors import DataError
 from armcal.io.journal.segment import CHECKPOINT, Entry, JournalDamagedError, Segment
@@ -17,6 +18,9 @@ from armcal_online.running.state_replayer import DECISION, NOTED, RECORD, ROLLBA
 from armcal_online.tracking.recalibrator import Recalibrator
 
 Progress = Callable[[str, float], None]
+
+WARM_UP = 50
+"""So many records at the beginning are left out of the mean innovation."""
 
 
 @dataclass(frozen=True)
@@ -189,3 +193,52 @@ def replay(
     except DiffersError as difference:
         return Replayed(replayer, difference)
     return Replayed(replayer, None)
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Two replays side by side.
+
+    Attributes:
+        innovation_m: the mean distance of measured and predicted tips in each, over the records that both
+            accepted after the first ``WARM_UP``; NaN without such a record.
+        records: how many these are.
+        apart_sd: the largest difference of a parameter that is free in both, in the standard deviation of the first.
+        parameter: which one that is.
+    """
+
+    innovation_m: tuple[float, float]
+    records: int
+    apart_sd: float
+    parameter: str
+
+
+def compared(one: JournalReplayer, other: JournalReplayer) -> Comparison:
+    """Two replays of one journal."""
+    theirs = {judged.sequence: judged for judged in other.judged}
+    pairs = [(judged, theirs[judged.sequence]) for judged in one.judged[WARM_UP:] if judged.sequence in theirs]
+    sizes = [(a.residual_m, b.residual_m) for a, b in pairs if a.verdict == b.verdict == "accepted"]
+    known = np.array([size for size in sizes if np.isfinite(size).all()]).reshape(-1, 2)
+    means = known.mean(axis=0).tolist() if len(known) else [np.nan, np.nan]
+    second = other.session.estimate
+    apart = {
+        name: abs(second[name][0] - value) / sd
+        for name, (value, sd) in one.session.estimate.items()
+        if name in second and sd > 0
+    }
+    farthest = max(apart, key=lambda name: apart[name], default="")
+    return Comparison((means[0], means[1]), len(known), apart.get(farthest, 0.0), farthest)
+
+
+def side_by_side(one: JournalReplayer, other: JournalReplayer) -> list[tuple[int, str, str]]:
+    """Decisions by entry: the sequence number, and the sentences of each replay there."""
+    first, second = _sentences(one.decisions), _sentences(other.decisions)
+    return [(n, first.get(n, ""), second.get(n, "")) for n in sorted({*first, *second})]
+
+
+def _sentences(events: list[Event]) -> Mapping[int, str]:
+    sentences: dict[int, str] = {}
+    for event in events:
+        if event["event"] == "decision":
+            sentences[event["sequence"]] = f"{sentences.get(event['sequence'], '')} {event['sentence']}".strip()
+    return sentences

@@ -19,10 +19,9 @@ from armcal.io.journal.journal import Journal, JournalLimits
 from armcal.io.journal.reader import read_until, verify
 from armcal.io.standard_output import StandardOutput
 
-from armcal_online.running.control import SOCKET, ControlServer
+from armcal_online.running.control import SOCKET, ControlServer, Requests
 from armcal_online.running.loop import Pace, Recalibration
 from armcal_online.running.outputs import CALIBRATION, RESERVE, STATUS, Outputs
-from armcal_online.running.requests import Requests
 from armcal_online.running.state_replayer import STARTED, ReplayDiffersError, StateReplayer
 from armcal_online.sources.row_parser import RowParser
 from armcal_online.sources.source import Source

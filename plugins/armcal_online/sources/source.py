@@ -8,6 +8,15 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol
 
+Clock = Callable[[], float]
+"""Unix seconds."""
+AtEnd = Literal["stop", "wait"]
+"""What a file's end means: there is no more, or more may come."""
+POLL_S = 0.05
+"""How often a file is looked at again."""
+THROUGH = "/"
+"""Before a name among positions: all files up to that name were taken. No file's name begins so."""
+
 
 @dataclass(frozen=True)
 class Place:
@@ -69,16 +78,6 @@ class Incoming:
             source_row=int(content["row"]),
             fault=str(content["fault"]),
         )
-
-
-Clock = Callable[[], float]
-"""Unix seconds."""
-AtEnd = Literal["stop", "wait"]
-"""What a file's end means: there is no more, or more may come."""
-POLL_S = 0.05
-"""How often a file is looked at again."""
-THROUGH = "/"
-"""Before a name among positions: all files up to that name were taken. No file's name begins so."""
 
 
 class Source(Protocol):

@@ -1,4 +1,4 @@
-"""Everything that a recalibration knows between two records, and the same as JSON that keeps every bit."""
+"""Everything that a recalibration knows between two records, also as JSON that keeps every bit; how a record moves it."""
 
 from __future__ import annotations
 
@@ -6,22 +6,26 @@ import base64
 import hashlib
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from armcal.base.domains import Array
 from armcal.errors import DataError
-from armcal.estimate.online import Gaussian
+from armcal.estimate.online import Gaussian, OnlineEstimator, kalman_update
 
-from armcal_online.tracking.belief import Belief
+from armcal_online.tracking.belief import Belief, most_likely
 from armcal_online.tracking.clock import Clock
 from armcal_online.tracking.health import Health
 from armcal_online.tracking.hypotheses import Candidate, Recent
 from armcal_online.tracking.observer import Reading
+from armcal_online.tracking.start import FilterSetup
 
 REMEMBERED = 64
 """So many ids are remembered, to know a record that comes twice."""
+
+_REFRESHED = 25
+"""After so many accepted records the origin is put where it is most likely within the bounds."""
 
 
 @dataclass(frozen=True)
@@ -196,3 +200,41 @@ def _recent_of(content: Mapping[str, Any]) -> Recent:
         nis=float(content["nis"]),
         dof=int(content["dof"]),
     )
+
+
+def advanced(state: State, recent: Recent, setup: FilterSetup, estimator: OnlineEstimator, nis_window: int) -> State:
+    """The state with a record taken in by an estimator.
+
+    Args:
+        state: before it, with belief and anchor at its time.
+        recent: the record.
+        setup: of the recalibration.
+        estimator: a filter, or one that holds the last records back.
+        nis_window: how many NIS the state keeps.
+
+    Raises:
+        NotConvergedError: the arm has no elastic equilibrium near the belief.
+        ProblemError: the numbers of the belief are no longer sound.
+    """
+    space, observer, before = setup.space, setup.observer, state.belief
+    if estimator.window == 1:
+        observation = observer.observation(before, recent.readings, recent.joint_noise)
+        belief = before.updated(space, estimator.update(before.gaussian, [observation]).posterior)
+        anchor, held = belief, state.held
+    else:
+        # A record that leaves the window is taken for good, linearised where the records after it lead.
+        held = (*state.held, recent)
+        prior = state.anchor.about(space, before.origin).gaussian
+        observations = [observer.observation(before, record.readings, record.joint_noise) for record in held]
+        update = estimator.update(prior, observations, before.gaussian.mean)
+        belief = before.updated(space, update.posterior)
+        if len(held) >= estimator.window:
+            point = update.posterior.mean
+            prior, held = kalman_update(prior, observations[0].at(point), point), held[1:]
+        anchor = Belief(before.origin, prior)
+    if state.counts["accepted"] % _REFRESHED == _REFRESHED - 1:
+        # Where bounds hold, steps of the mean lead the origin astray slowly.
+        belief = belief.about(space, most_likely(space, belief))
+        anchor = anchor if held else belief
+    nis = (*state.nis_window, (recent.nis, recent.dof))[-nis_window:]
+    return replace(state, belief=belief, anchor=anchor, held=held, nis_window=nis)

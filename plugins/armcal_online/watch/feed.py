@@ -15,9 +15,8 @@ from typing import Any
 from armcal.errors import ArmcalError
 from armcal.io.event_file import EVENTS, EventTail
 
-from armcal_online.watch.events import VERDICTS, Message
+from armcal_online.watch.events import VERDICTS, Message, numbers, parsed, scalar, text
 from armcal_online.watch.history import History
-from armcal_online.watch.lenient import numbers, parsed, scalar, text
 from armcal_online.watch.shape import Shape
 
 STATUS, CALIBRATION = "status.json", "calibration.yaml"

@@ -6,10 +6,8 @@ from collections import deque
 from collections.abc import Mapping
 from typing import Any
 
-from armcal_online.watch.estimates import Estimates
-from armcal_online.watch.events import LEVELS, VERDICTS, Message, message_of, record_of, shortened
-from armcal_online.watch.lenient import number, text, whole
-from armcal_online.watch.thinned import Thinned
+from armcal_online.watch.estimates import Estimates, Thinned
+from armcal_online.watch.events import LEVELS, VERDICTS, Message, message_of, number, record_of, shortened, text, whole
 
 RECENT_RECORDS = 2000
 """The newest records, kept whole."""
