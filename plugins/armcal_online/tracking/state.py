@@ -1,4 +1,4 @@
-"""Everything that a recalibration knows between two records, also as JSON that keeps every bit; how a record moves it."""
+"""Everything that a recalibration knows between two records, also as JSON to the last bit; how a record moves it."""
 
 from __future__ import annotations
 
