@@ -46,7 +46,26 @@ def check(console: Console, config: Path, data: Path | None, overrides: tuple[st
     if refused:
         content["error"] = {"message": str(refused), "exit_code": refused.exit_code}
     console.result(content)
-    _show(console, experiment, content)
+    out, records, parameters = console.out, content["records"], content["parameters"]
+    out.print(
+        f"{experiment.name}: {records['used']} records ({records['train']} train, {records['holdout']} held out, "
+        f"{len(records['set_aside'])} set aside), {content['equations']} equations for "
+        f"{len(parameters['free'])} free of {len(parameters['all'])} parameters."
+    )
+    table = Table(title="Excitation of the joints", title_justify="left")
+    for column in ("joint", "from", "to", "levels"):
+        table.add_column(column, justify="left" if column == "joint" else "right")
+    for joint, seen in content["excitation_rad_or_m"].items():
+        table.add_row(joint, f"{seen['min']:.3f}", f"{seen['max']:.3f}", str(seen["levels"]))
+    out.print(table)
+    condition = parameters["scaled_condition"]
+    shown = "infinite" if condition is None else f"{condition:.3g}"
+    out.print(f"rank {parameters['rank']} of {len(parameters['free'])}, scaled condition {shown}.")
+    if parameters["weakest"]:
+        out.print(f"least determined: {parameters['weakest']}.")
+    if console.verbose:
+        for name in parameters["all"]:
+            out.print(f"  {'free ' if name in parameters['free'] else 'fixed'} {name}")
     if refused:
         say(f"armcal: {refused}", err=True)
         sys.exit(refused.exit_code)
@@ -80,28 +99,3 @@ def _content(experiment: Experiment, ready: Prepared, known: Identifiability) ->
         },
         "warnings": list(ready.warnings),
     }
-
-
-def _show(console: Console, experiment: Experiment, content: dict[str, Any]) -> None:
-    out, records, parameters = console.out, content["records"], content["parameters"]
-    out.print(
-        f"{experiment.name}: {records['used']} records ({records['train']} train, {records['holdout']} held out, "
-        f"{len(records['set_aside'])} set aside), {content['equations']} equations for "
-        f"{len(parameters['free'])} free of {len(parameters['all'])} parameters."
-    )
-    table = Table(title="Excitation of the joints", title_justify="left")
-    for column in ("joint", "from", "to", "levels"):
-        table.add_column(column, justify="left" if column == "joint" else "right")
-    for joint, seen in content["excitation_rad_or_m"].items():
-        table.add_row(joint, f"{seen['min']:.3f}", f"{seen['max']:.3f}", str(seen["levels"]))
-    out.print(table)
-    condition = parameters["scaled_condition"]
-    out.print(
-        f"rank {parameters['rank']} of {len(parameters['free'])}, scaled condition "
-        + (f"{condition:.3g}." if condition is not None else "infinite.")
-    )
-    if parameters["weakest"]:
-        out.print(f"least determined: {parameters['weakest']}.")
-    if console.verbose:
-        for name in parameters["all"]:
-            out.print(f"  {'free ' if name in parameters['free'] else 'fixed'} {name}")

@@ -44,16 +44,16 @@ def convert(
     compared with the original over 10,000 random poses.
     """
     registry = console.registry()
-    convert_source = load_source(source, arm, registry)
-    text, section = _sections(convert_source, target, convention)
-    off = _verified(convert_source, section, target, registry)
-    _warn_of_what_is_left(console, convert_source, target, off)
+    original = load_source(source, arm, registry)
+    text, section = _sections(original, target, convention)
+    off = _verified(original, section, target, registry)
+    _warn_of_what_is_left(console, original, target, off)
     said = (
         f"largest difference over {off.poses} poses: "
         f"{off.position_m:.1e} m in position, {off.angle_rad:.1e} rad in angle"
     )
     content = {
-        "arm": convert_source.arm,
+        "arm": original.arm,
         "to": target,
         "poses": off.poses,
         "largest_position_m": off.position_m,
@@ -74,15 +74,15 @@ def convert(
         reason = f"the file cannot be written ({fault.strerror})."
         raise InputError(reason, where=Location(str(out)), hint="Give another --out.") from fault
     console.result({**content, "out": str(out)})
-    console.line(f"{convert_source.arm} as {target} written: {out}")
+    console.line(f"{original.arm} as {target} written: {out}")
     console.line(said)
 
 
-def _sections(convert_source: ConvertSource, target: str, convention: Convention) -> tuple[str, str]:
+def _sections(original: ConvertSource, target: str, convention: Convention) -> tuple[str, str]:
     """What to write, and the section ``model:`` that reads it."""
-    chain = rigid_chain(convert_source.chain)
+    chain = rigid_chain(original.chain)
     if target == "urdf":
-        text = urdf_text(chain, convert_source.arm)
+        text = urdf_text(chain, original.arm)
         return text, _yaml({"type": "urdf", "text": text})
     section = _yaml(poe_section(chain) if target == "poe" else mdh_section(chain, convention))
     return section, section
@@ -93,9 +93,9 @@ def _yaml(section: Mapping[str, Any]) -> str:
     return yaml.safe_dump({"model": section}, sort_keys=False, allow_unicode=True, width=110, default_flow_style=None)
 
 
-def _verified(convert_source: ConvertSource, section: str, target: str, registry: PluginRegistry) -> Difference:
+def _verified(original: ConvertSource, section: str, target: str, registry: PluginRegistry) -> Difference:
     try:
-        off = difference(convert_source.chain, reload(section, registry))
+        off = difference(original.chain, reload(section, registry))
     except PluginError as fault:
         hint = f"Install the plugin that offers the model {target}."
         raise PluginError(f"what would be written cannot be checked: {fault.message}", hint=hint) from fault
@@ -108,15 +108,15 @@ def _verified(convert_source: ConvertSource, section: str, target: str, registry
     return off
 
 
-def _warn_of_what_is_left(console: Console, convert_source: ConvertSource, target: str, off: Difference) -> None:
-    left = list(convert_source.left)
-    known = [joint.name for joint in convert_source.chain.joints if joint.limits]
+def _warn_of_what_is_left(console: Console, original: ConvertSource, target: str, off: Difference) -> None:
+    left = list(original.left)
+    known = [joint.name for joint in original.chain.joints if joint.limits]
     if known and target != "urdf":
         left.append(f"limits ({', '.join(known)})")
     if left and not off.same_mount:
         left.append("the mount, about which springs at the base deflect")
     if left:
         console.err.print(f"not converted: {'; '.join(left)}", soft_wrap=True)
-    unknown = [joint.name for joint in convert_source.chain.joints if not joint.is_revolute and not joint.limits]
+    unknown = [joint.name for joint in original.chain.joints if not joint.is_revolute and not joint.limits]
     if target == "urdf" and unknown:
         console.warn(f"the travel of {', '.join(unknown)} is not known; the URDF states none.")

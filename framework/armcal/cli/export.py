@@ -13,7 +13,6 @@ from armcal.config.options import settings_from
 from armcal.errors import InputError, Location, PluginError
 from armcal.io.file_set import require_new, write_new, write_over
 from armcal.io.plain_files import check_output
-from armcal.plugins import PluginRegistry
 
 _NOTHING_MM = 1e-6
 
@@ -42,21 +41,6 @@ def export(
     Some formats write further files beside --out. What a format cannot hold is told.
     """
     registry = console.registry()
-    exporter = _exporter(registry, kind, options)
-    _check_place(out, calibration, force)
-    loaded = Calibration.load(calibration, registry, accept)
-    request = request_of(loaded, arm, out.name)
-    exported = exporter.export(request)
-    moved_m: float | None = 0.0  # by what is left out; None where the arm does not settle
-    if exported.left_out:
-        moved_m = effects_reach(loaded, request) if exported.reach is None else exported.reach
-    files = _files(out, exported, calibration)
-    new = {file: content for file, content in files.items() if not _holds(file, content)}
-    (write_over if force else write_new)(new)
-    _show(console, request, exported, moved_m, list(files), kind)
-
-
-def _exporter(registry: PluginRegistry, kind: str, options: tuple[str, ...]) -> Exporter:
     try:
         made = registry.find("exporter", kind).load()
     except PluginError as fault:
@@ -65,10 +49,6 @@ def _exporter(registry: PluginRegistry, kind: str, options: tuple[str, ...]) -> 
             raise PluginError(fault.message, hint=f"{fault.hint} The formats are {known}.") from fault
         raise
     exporter: Exporter = made(settings_from(made.Settings, options, "--option"))
-    return exporter
-
-
-def _check_place(out: Path, calibration: Path, force: bool) -> None:
     where = Location(str(out))
     try:
         if out.is_dir() or not out.name:
@@ -80,6 +60,16 @@ def _check_place(out: Path, calibration: Path, force: bool) -> None:
     except OSError as fault:
         hint = "Give --out a place that can be written."
         raise InputError(f"it cannot be written ({fault.strerror}).", where=where, hint=hint) from fault
+    loaded = Calibration.load(calibration, registry, accept)
+    request = request_of(loaded, arm, out.name)
+    exported = exporter.export(request)
+    moved_m: float | None = 0.0  # by what is left out; None where the arm does not settle
+    if exported.left_out:
+        moved_m = effects_reach(loaded, request) if exported.reach is None else exported.reach
+    files = _files(out, exported, calibration)
+    new = {file: content for file, content in files.items() if not _holds(file, content)}
+    (write_over if force else write_new)(new)
+    _show(console, request, exported, moved_m, list(files), kind)
 
 
 def _not_the_calibration(out: Path, calibration: Path) -> None:
@@ -130,13 +120,10 @@ def _show(
     for remark in exported.remarks:
         console.warn(f"{remark}.")
     if exported.left_out:
-        words = "the calibrated arm does not settle in all poses" if apart is None else _up_to(apart)
+        words = "the calibrated arm does not settle in all poses"
+        if apart is not None:  # less than a thousandth of a micrometre is rounding
+            words = f"up to {apart:.3g} mm" if apart >= _NOTHING_MM else "which does not move the tool"
         console.warn(
             f"left out, a {kind} file cannot hold it: {', '.join(exported.left_out)} "
             f"({words}, in {POSES} random poses)."
         )
-
-
-def _up_to(apart_mm: float) -> str:
-    """In significant digits; less than a thousandth of a micrometre is rounding."""
-    return f"up to {apart_mm:.3g} mm" if apart_mm >= _NOTHING_MM else "which does not move the tool"

@@ -10,7 +10,7 @@ import numpy as np
 
 from armcal.base.domains import Array
 from armcal.cli.common import FILE, Console, data, overrides, speaking
-from armcal.diagnose.minimal import Dropped, MinimalSet, minimal_set
+from armcal.diagnose.minimal import Dropped, minimal_set
 from armcal.errors import ConfigError, Location
 from armcal.estimate.combination import Combination
 from armcal.estimate.identifiability import CORRELATED, Identifiability, correlated_pairs, expected_covariance
@@ -63,7 +63,12 @@ def identify(
     content = _content(experiment, ready, triangle, known)
     if minimal or prefer or most is not None or max_sd is not None:
         minimal_parameters = minimal_set(triangle, parameters, preferred, most, np.inf if max_sd is None else max_sd)
-        content["minimal"] = _minimal_content(minimal_parameters)
+        content["minimal"] = {
+            "kept": list(minimal_parameters.kept),
+            "redundant": [_dropped(dropped) for dropped in minimal_parameters.redundant],
+            "left_out": [_dropped(dropped) for dropped in minimal_parameters.left_out],
+            "sd_ordinary_sizes": {name: _finite(sd) for name, sd in minimal_parameters.deviations.items()},
+        }
     for text in ready.warnings:
         console.warn(text)
     console.result(content)
@@ -120,15 +125,6 @@ def _finite(number: float) -> float | None:
     return number if np.isfinite(number) else None
 
 
-def _minimal_content(minimal: MinimalSet) -> dict[str, Any]:
-    return {
-        "kept": list(minimal.kept),
-        "redundant": [_dropped(dropped) for dropped in minimal.redundant],
-        "left_out": [_dropped(dropped) for dropped in minimal.left_out],
-        "sd_ordinary_sizes": {name: _finite(sd) for name, sd in minimal.deviations.items()},
-    }
-
-
 def _dropped(dropped: Dropped) -> dict[str, Any]:
     return {"name": dropped.name, "effect_left": dropped.left, **_terms(dropped.absorbed_by)}
 
@@ -146,21 +142,6 @@ def _show(console: Console, content: dict[str, Any]) -> None:
     if content["observability_of_the_determined"]:
         shown = ", ".join(f"{n.upper()} {v:.3g}" for n, v in content["observability_of_the_determined"].items())
         console.line(f"observability of {'them' if rank == free else f'the {rank} determined combinations'}: {shown}.")
-    _show_undetermined(console, content)
-    hardly = [
-        f"{pair['text']}: sd {pair['sd_ordinary_sizes'] or np.inf:.3g} typical scales"
-        for pair in content["hardly_determined"]
-    ]
-    _section(console, "Hardly determined (worse than a typical scale of correction, by the declared noise):", hardly)
-    pairs = [f"{pair['one']} and {pair['other']} ({pair['correlation']:+.3f})" for pair in content["correlated"]]
-    _section(console, f"Correlated above {CORRELATED:g}:", pairs)
-    if console.verbose:
-        deviations = content["expected_sd"].items()
-        shown_sd = [f"{name}: {'undetermined' if sd is None else f'{sd:.3g}'}" for name, sd in deviations]
-        _section(console, "Expected standard deviations by the declared noise and the priors (SI):", shown_sd)
-
-
-def _show_undetermined(console: Console, content: dict[str, Any]) -> None:
     for cause, words in CAUSES.items():
         determined = [
             combination["text"]
@@ -180,6 +161,17 @@ def _show_undetermined(console: Console, content: dict[str, Any]) -> None:
             f"Undetermined without a prior: armcal run refuses these ({len(free)}):",
             [combination["text"] for combination in free],
         )
+    hardly = [
+        f"{pair['text']}: sd {pair['sd_ordinary_sizes'] or np.inf:.3g} typical scales"
+        for pair in content["hardly_determined"]
+    ]
+    _section(console, "Hardly determined (worse than a typical scale of correction, by the declared noise):", hardly)
+    pairs = [f"{pair['one']} and {pair['other']} ({pair['correlation']:+.3f})" for pair in content["correlated"]]
+    _section(console, f"Correlated above {CORRELATED:g}:", pairs)
+    if console.verbose:
+        deviations = content["expected_sd"].items()
+        shown_sd = [f"{name}: {'undetermined' if sd is None else f'{sd:.3g}'}" for name, sd in deviations]
+        _section(console, "Expected standard deviations by the declared noise and the priors (SI):", shown_sd)
 
 
 def _show_minimal(console: Console, content: dict[str, Any]) -> None:

@@ -14,8 +14,8 @@ from armcal.plugins import PluginRegistry
 from armcal.scaffold.dh_table import read_rows
 from armcal.scaffold.naming import robot_name
 from armcal.scaffold.robot import Convention, Robot, robot_of_rows
-from armcal.scaffold.robot_files import RobotFolder, write_robot
-from armcal.scaffold.trial import Trial, try_out
+from armcal.scaffold.robot_files import write_robot
+from armcal.scaffold.trial import try_out
 from armcal.scaffold.urdf_source import robot_of_urdf
 
 CONVENTIONS: dict[str, Convention] = {"standard": "standard", "modified": "craig"}
@@ -46,33 +46,6 @@ def begin(console: Console, name: str, source: Source, folder: Path) -> None:
     made = write_robot(robot, folder, registry)
     with console.progress() as progress:
         trial = try_out(made, registry, command_line(), progress)
-    _show(console, robot, made, trial)
-    if trial.fault:
-        say(f"armcal: {made.folder}: the calibration of simulated records failed: {trial.fault}.", err=True)
-        sys.exit(EXIT_FAULT if trial.result.estimate.verdict.converged else EXIT_NOT_CONVERGED)
-
-
-def _robot(name: str, source: Source, registry: PluginRegistry) -> Robot:
-    if source.dh and source.urdf:
-        raise ConfigError("found both --dh and --urdf, expected one of them.", hint="Leave one out.")
-    if source.tip and not source.urdf:
-        raise ConfigError("found --tip without --urdf.", hint="Give --urdf FILE, or leave it out.")
-    if source.convention and not source.dh:
-        raise ConfigError("found --convention without --dh.", hint="Give --dh FILE, or leave it out.")
-    if source.urdf:
-        return robot_of_urdf(name, source.urdf, source.tip, registry)
-    if not source.dh:
-        return robot_of_rows(name, *ask_rows(CONVENTIONS))
-    if source.convention is None:
-        raise ConfigError(
-            "found --dh without --convention: two go by the same name.",
-            hint="Give --convention standard, Rot_z(theta) Trans_z(d) Trans_x(a) Rot_x(alpha), or modified, "
-            "Rot_x(alpha) Trans_x(a) Rot_z(theta) Trans_z(d).",
-        )
-    return robot_of_rows(name, CONVENTIONS[source.convention], read_rows(source.dh))
-
-
-def _show(console: Console, robot: Robot, made: RobotFolder, trial: Trial) -> None:
     content = {
         "robot": robot.name,
         "out": str(made.folder),
@@ -100,3 +73,26 @@ def _show(console: Console, robot: Robot, made: RobotFolder, trial: Trial) -> No
         console.line(f"{finding.grade}: {finding.text}")
     console.line(trial.result.verdict.headline)
     console.line(f"report: {trial.results / 'report.html'}; next: {made.folder / 'README.md'}")
+    if trial.fault:
+        say(f"armcal: {made.folder}: the calibration of simulated records failed: {trial.fault}.", err=True)
+        sys.exit(EXIT_FAULT if trial.result.estimate.verdict.converged else EXIT_NOT_CONVERGED)
+
+
+def _robot(name: str, source: Source, registry: PluginRegistry) -> Robot:
+    if source.dh and source.urdf:
+        raise ConfigError("found both --dh and --urdf, expected one of them.", hint="Leave one out.")
+    if source.tip and not source.urdf:
+        raise ConfigError("found --tip without --urdf.", hint="Give --urdf FILE, or leave it out.")
+    if source.convention and not source.dh:
+        raise ConfigError("found --convention without --dh.", hint="Give --dh FILE, or leave it out.")
+    if source.urdf:
+        return robot_of_urdf(name, source.urdf, source.tip, registry)
+    if not source.dh:
+        return robot_of_rows(name, *ask_rows(CONVENTIONS))
+    if source.convention is None:
+        raise ConfigError(
+            "found --dh without --convention: two go by the same name.",
+            hint="Give --convention standard, Rot_z(theta) Trans_z(d) Trans_x(a) Rot_x(alpha), or modified, "
+            "Rot_x(alpha) Trans_x(a) Rot_z(theta) Trans_z(d).",
+        )
+    return robot_of_rows(name, CONVENTIONS[source.convention], read_rows(source.dh))

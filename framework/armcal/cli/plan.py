@@ -64,6 +64,10 @@ def _content(experiment: Experiment, result: PlanResult) -> dict[str, Any]:
         "efficiency": bound.efficiency,
         "by": bound.how,
     }
+    blocks = experiment.parameters.free
+    units = [block.unit for block in blocks for _ in range(block.domain.dof)]
+    scales = experiment.parameters.scales()
+    before, after = result.deviations
     return {
         "experiment": experiment.name,
         "goal": settings.goal,
@@ -82,27 +86,19 @@ def _content(experiment: Experiment, result: PlanResult) -> dict[str, Any]:
         "bound": certificate,
         "observability": result.observability.as_dict(),
         "equations": result.equations,
-        "parameters": _parameters(experiment, result),
+        "parameters": [
+            {
+                "name": name,
+                "unit": unit,
+                "sd_before": float(before[i]) if math.isfinite(before[i]) else None,
+                "sd_after": float(after[i]),
+                "sd_in_ordinary_sizes": float(after[i] / scales[i]),
+            }
+            for i, (name, unit) in enumerate(zip(result.names, units, strict=True))
+        ],
         "weakest": str(result.identifiability.weakest),
         "visit": {"order": settings.order, "travel_s": result.travel_s, "peak_squared_torque": result.peak},
     }
-
-
-def _parameters(experiment: Experiment, result: PlanResult) -> list[dict[str, Any]]:
-    blocks = experiment.parameters.free
-    units = [block.unit for block in blocks for _ in range(block.domain.dof)]
-    scales = experiment.parameters.scales()
-    before, after = result.deviations
-    return [
-        {
-            "name": name,
-            "unit": unit,
-            "sd_before": float(before[i]) if math.isfinite(before[i]) else None,
-            "sd_after": float(after[i]),
-            "sd_in_ordinary_sizes": float(after[i] / scales[i]),
-        }
-        for i, (name, unit) in enumerate(zip(result.names, units, strict=True))
-    ]
 
 
 def _show(console: Console, content: dict[str, Any]) -> None:
@@ -121,7 +117,17 @@ def _show(console: Console, content: dict[str, Any]) -> None:
     console.line(_bound_text(content))
     indices = "  ".join(f"{name.upper()} {value:.4g}" for name, value in content["observability"].items())
     console.line(f"observability: {indices}")
-    out.print(_table(content["parameters"]))
+    parameters = content["parameters"]
+    table = Table(title="Predicted standard deviations, the largest first", title_justify="left")
+    for column in ("parameter", "before", "after", "unit"):
+        table.add_column(column, justify="left" if column in ("parameter", "unit") else "right")
+    worst = np.argsort([-p["sd_in_ordinary_sizes"] for p in parameters], kind="stable")[:_SHOWN]
+    for p in (parameters[i] for i in worst):
+        dimension = DIMENSION_OF_UNIT.get(p["unit"])
+        unit = display_unit(dimension).name if dimension else p["unit"]
+        texts = ["-" if p[k] is None else f"{to_unit(p[k], unit):.3g}" for k in ("sd_before", "sd_after")]
+        table.add_row(p["name"], *texts, unit)
+    out.print(table)
     console.line(f"least determined: {content['weakest']}.")
     visit = content["visit"]
     hot = visit["peak_squared_torque"]
@@ -140,17 +146,3 @@ def _bound_text(content: dict[str, Any]) -> str:
         f"{100 * bound['efficiency']:.2f} % (certified; {bound['by']})"
         + (whole if content["candidates"]["kind"] == "continuous" else "")
     )
-
-
-def _table(parameters: list[dict[str, Any]]) -> Table:
-    """The least determined parameters, in their typical scales."""
-    table = Table(title="Predicted standard deviations, the largest first", title_justify="left")
-    for column in ("parameter", "before", "after", "unit"):
-        table.add_column(column, justify="left" if column in ("parameter", "unit") else "right")
-    worst = np.argsort([-p["sd_in_ordinary_sizes"] for p in parameters], kind="stable")[:_SHOWN]
-    for p in (parameters[i] for i in worst):
-        dimension = DIMENSION_OF_UNIT.get(p["unit"])
-        unit = display_unit(dimension).name if dimension else p["unit"]
-        texts = ["-" if p[k] is None else f"{to_unit(p[k], unit):.3g}" for k in ("sd_before", "sd_after")]
-        table.add_row(p["name"], *texts, unit)
-    return table

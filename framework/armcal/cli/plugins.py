@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from armcal.errors import EXIT_BAD_INPUT, PluginError
-from armcal.plugins import PluginInfo, PluginRegistry, discover
+from armcal.plugins import PluginInfo, discover
 
 if TYPE_CHECKING:
     from armcal.testing.results import CheckResult
@@ -30,23 +29,7 @@ def list_plugins(as_json: bool, quiet: bool, verbose: bool) -> None:
     """List every plugin and what it provides, without importing any of it."""
     registry = discover()
     if as_json:
-        click.echo(json.dumps(_content(registry), indent=2))
-    else:
-        for plugin in registry.plugins:
-            if quiet:
-                click.echo(plugin.name)
-                continue
-            click.echo(f"{plugin.name}  ({plugin.distribution} {plugin.version}, {plugin.module})")
-            if plugin.fault:
-                click.echo(f"  does not load: {plugin.fault}")
-            for component in registry.announced_by(plugin):
-                place = f"  [{component.target}]" if verbose else ""
-                click.echo(f"  {component.kind:<12} {component.name:<18} {component.summary}{place}")
-
-
-def _content(registry: PluginRegistry) -> dict[str, Any]:
-    return {
-        "plugins": [
+        content = [
             {
                 "name": plugin.name,
                 "module": plugin.module,
@@ -59,8 +42,19 @@ def _content(registry: PluginRegistry) -> dict[str, Any]:
                 ],
             }
             for plugin in registry.plugins
-        ],
-    }
+        ]
+        click.echo(json.dumps({"plugins": content}, indent=2))
+    else:
+        for plugin in registry.plugins:
+            if quiet:
+                click.echo(plugin.name)
+                continue
+            click.echo(f"{plugin.name}  ({plugin.distribution} {plugin.version}, {plugin.module})")
+            if plugin.fault:
+                click.echo(f"  does not load: {plugin.fault}")
+            for component in registry.announced_by(plugin):
+                place = f"  [{component.target}]" if verbose else ""
+                click.echo(f"  {component.kind:<12} {component.name:<18} {component.summary}{place}")
 
 
 @dataclass(frozen=True)
@@ -118,7 +112,18 @@ class _Report:
 @click.option("-v", "--verbose", is_flag=True, help="Name every check, and why one did not run.")
 def check_plugin(name: str | None, as_json: bool, quiet: bool, verbose: bool) -> None:
     """Check the plugin NAME, or all: imports, hooks, and the contract of each component."""
-    reports = _reports(discover(), name)
+    from armcal.testing.contract import check_plugin as checks_of
+
+    registry = discover()
+    names = list(dict.fromkeys(plugin.name for plugin in registry.plugins if name in (None, plugin.name)))
+    if not names:
+        known = ", ".join(p.name for p in registry.plugins)
+        raise PluginError(f"no plugin is called {name!r}.", hint=f"Installed: {known}.")
+    reports = []
+    for text in names:
+        chosen = tuple(plugin for plugin in registry.plugins if plugin.name == text)
+        results = [result for plugin in chosen for result in checks_of(plugin, registry)]
+        reports.append(_Report(text, chosen, tuple(results)))
     if as_json:
         content = [report.content() for report in reports]
         click.echo(json.dumps({"plugins": content} if name is None else content[0], indent=2))
@@ -130,21 +135,6 @@ def check_plugin(name: str | None, as_json: bool, quiet: bool, verbose: bool) ->
         click.echo(f"armcal: {report.name}: {report.broken or 'it breaks the plugin contract'}", err=True)
     if failed:
         sys.exit(EXIT_BAD_INPUT)
-
-
-def _reports(registry: PluginRegistry, name: str | None) -> Sequence[_Report]:
-    from armcal.testing.contract import check_plugin as checks_of
-
-    names = list(dict.fromkeys(plugin.name for plugin in registry.plugins if name in (None, plugin.name)))
-    if not names:
-        known = ", ".join(p.name for p in registry.plugins)
-        raise PluginError(f"no plugin is called {name!r}.", hint=f"Installed: {known}.")
-    reports = []
-    for text in names:
-        chosen = tuple(plugin for plugin in registry.plugins if plugin.name == text)
-        results = [result for plugin in chosen for result in checks_of(plugin, registry)]
-        reports.append(_Report(text, chosen, tuple(results)))
-    return reports
 
 
 @plugins.command("hooks")

@@ -56,7 +56,11 @@ def predict(
     channels, placed = loaded.predict(commands)
     plus_minus = None
     if not loaded.readable:
-        channels = _tools(placed, tuple(system.arms))
+        channels = {}
+        for arm, tools in zip(system.arms, placed, strict=True):
+            turns = np.array([quaternion_of(tool[:3, :3]) for tool in tools]).reshape(-1, 4)
+            channels |= {f"{arm}.tool_{axis}": tools[:, i, 3] for i, axis in enumerate("xyz")}
+            channels |= {f"{arm}.tool_q{axis}": turns[:, i] for i, axis in enumerate("wxyz")}
     elif loaded.record.prediction is None:
         console.warn("the calibration keeps nothing about the errors of predictions: run it again to have them.")
     else:
@@ -110,16 +114,6 @@ def _show(
         console.out.print(f"+- {text}, in the median pose", soft_wrap=not typical)
 
 
-def _tools(placed: Array, arms: Sequence[str]) -> dict[str, Array]:
-    """Where tools are, as channels: position (m) and unit quaternion (arms x N x 4 x 4)."""
-    channels: dict[str, Array] = {}
-    for arm, poses in zip(arms, placed, strict=True):
-        turns = np.array([quaternion_of(pose[:3, :3]) for pose in poses]).reshape(-1, 4)
-        channels |= {f"{arm}.tool_{axis}": poses[:, i, 3] for i, axis in enumerate("xyz")}
-        channels |= {f"{arm}.tool_q{axis}": turns[:, i] for i, axis in enumerate("wxyz")}
-    return channels
-
-
 def _tool_channels(arms: Sequence[str]) -> Iterator[RequestedChannel]:
     for arm in arms:
         names = [(f"tool_{axis}", "length") for axis in "xyz"] + [(f"tool_q{axis}", DIMENSIONLESS) for axis in "wxyz"]
@@ -133,7 +127,16 @@ def read_commands(registry: PluginRegistry, loaded: Calibration, poses: Path, co
     arms = loaded.system.arms
     requested = requested_channels(arms, {}, measured=False)
     reader_class = registry.find("reader", "csv").load()
-    named = {**_known_columns(loaded, poses, requested), **_named_columns(columns)}
+    named = _known_columns(loaded, poses, requested)
+    for text in columns:
+        name, _, own = (part.strip() for part in text.partition("="))
+        if not (name and own):
+            raise InputError(
+                f"found {text!r}, expected NAME=COLUMN.",
+                where=Location("--columns"),
+                hint="For example --columns sequence=pose_id.",
+            )
+        named[name] = own
     reader = reader_class(reader_class.Settings(path=ConfigText(str(poses)), columns=named))
     return noticed(reader.read(ReadRequest(arms, {}, requested)))
 
@@ -154,18 +157,6 @@ def _known_columns(loaded: Calibration, poses: Path, requested: Sequence[Request
         for name, own in columns.items()
         if own in header and name not in header and (name in used or (split_suffix(name) or (name,))[0] in used)
     }
-
-
-def _named_columns(columns: Sequence[str]) -> dict[str, str]:
-    for text in columns:
-        name, equals, own = text.partition("=")
-        if not (name.strip() and equals and own.strip()):
-            raise InputError(
-                f"found {text!r}, expected NAME=COLUMN.",
-                where=Location("--columns"),
-                hint="For example --columns sequence=pose_id.",
-            )
-    return {text.partition("=")[0].strip(): text.partition("=")[2].strip() for text in columns}
 
 
 def _warn_of_missing(console: Console, loaded: Calibration, commands: Dataset, recording: str) -> None:

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from armcal.base.domains import Array
 from armcal.estimate.prediction import LEVELS
 from armcal.estimate.profile import Profile
 from armcal.report import svg
@@ -84,7 +83,12 @@ def predicted_against_found(result: RunResult) -> Figure | None:
     caption = "Below the line the error is inside its 95 % radius. Spread along the line: the +- follows the pose."
 
     def draw(width: float) -> tuple[float, list[str]]:
-        start, parts = svg.legend(52, 12, width - 60, _legend(known & ~holdout, known & holdout))
+        entries = []
+        if (known & ~holdout).any():
+            entries.append(('<path class="dot train" d="M11 0h0"/>', "cross-validated"))
+        if (known & holdout).any():
+            entries.append((f'<path class="diamond" d="M11 0{DIAMOND}"/>', "held out"))
+        start, parts = svg.legend(52, 12, width - 60, entries)
         box = Box(52, start + 2, width - 16, start + (270 if width > svg.NARROW else 220))
         low, high = float(np.nanmin(radius[known])), float(np.nanmax(radius[known]))
         margin = max(0.05 * (high - low), 0.02 * high)
@@ -99,15 +103,6 @@ def predicted_against_found(result: RunResult) -> Figure | None:
         return box.bottom + 44, parts
 
     return svg.both("radii", ("Predicted and measured errors", said, caption), draw)
-
-
-def _legend(crossed: Array, held: Array) -> list[tuple[str, str]]:
-    entries = []
-    if crossed.any():
-        entries.append(('<path class="dot train" d="M11 0h0"/>', "cross-validated"))
-    if held.any():
-        entries.append((f'<path class="diamond" d="M11 0{DIAMOND}"/>', "held out"))
-    return entries
 
 
 def profile_rows(result: RunResult) -> tuple[ProfileRow, ...]:

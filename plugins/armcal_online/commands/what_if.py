@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -59,11 +59,17 @@ def what_if(console: Console, calibration: Path, poses: Path, out: Path | None, 
     if out is not None:
         check_output(out)
         with out.open("w", newline="", encoding="utf-8") as file:
-            table = csv.DictWriter(file, ["rank", "id", "row", "bits", f"prediction_sd_{unit}", "tells_most"])
-            table.writeheader()
-            table.writerows({**row, "tells_most": _reductions(row["tells_most"])} for row in rows)
+            writer = csv.DictWriter(file, ["rank", "id", "row", "bits", f"prediction_sd_{unit}", "tells_most"])
+            writer.writeheader()
+            writer.writerows({**row, "tells_most": _reductions(row["tells_most"])} for row in rows)
     console.result({"poses": rows, "no_equilibrium": [commands.ids[place] for place in lost]})
-    console.out.print(_table(rows, unit))
+    table = Table(title=f"what one more record would add: the best {min(_SHOWN, len(rows))} of {len(rows)} poses")
+    for heading in ("pose", "bits", "prediction known to", "standard deviations that shrink most"):
+        table.add_column(heading)
+    for row in rows[:_SHOWN]:
+        known = f"{row[f'prediction_sd_{unit}']:.3g} {unit}"
+        table.add_row(str(row["id"]), f"{row['bits']:.2f}", known, _reductions(row["tells_most"]))
+    console.out.print(table)
     if out is not None:
         console.out.print(f"{len(rows)} poses, best first: {out}", markup=False, soft_wrap=True)
 
@@ -71,14 +77,3 @@ def what_if(console: Console, calibration: Path, poses: Path, out: Path | None, 
 def _reductions(remaining: Mapping[str, float]) -> str:
     """Of standard deviations, from the part of each that remains."""
     return ", ".join(f"{name} -{100 * (1 - part):.1f} %" for name, part in remaining.items())
-
-
-def _table(rows: Sequence[Mapping[str, Any]], unit: str) -> Table:
-    """The best poses."""
-    table = Table(title=f"what one more record would add: the best {min(_SHOWN, len(rows))} of {len(rows)} poses")
-    for heading in ("pose", "bits", "prediction known to", "standard deviations that shrink most"):
-        table.add_column(heading)
-    for row in rows[:_SHOWN]:
-        known = f"{row[f'prediction_sd_{unit}']:.3g} {unit}"
-        table.add_row(str(row["id"]), f"{row['bits']:.2f}", known, _reductions(row["tells_most"]))
-    return table
