@@ -17,7 +17,7 @@ from armcal.functions.batch_function import EvaluatorChoice
 from armcal.problem.kernel import NEAR_REST_RAD
 from armcal.problem.problem import Problem
 from armcal.run.experiment import Experiment
-from armcal_kalman.extended import ExtendedFilter, ExtendedSettings
+from armcal_kalman.filters import ExtendedFilter, ExtendedSettings
 from armcal_online.tracking.belief import Belief
 from armcal_online.tracking.observer import Observer, Reading
 from armcal_online.tracking.process_noise import GaussMarkovStates

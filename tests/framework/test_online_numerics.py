@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from armcal.base.parameters import Parameters
 from armcal.estimate.online import Gaussian
-from armcal_kalman.extended import ExtendedFilter, ExtendedSettings
+from armcal_kalman.filters import ExtendedFilter, ExtendedSettings
 from armcal_online.sources.source import Incoming
 from armcal_online.tracking.belief import Belief
 from armcal_online.tracking.observer import Observer

@@ -14,8 +14,7 @@ from armcal.cli.common import Console
 from armcal.estimate.bootstrap import Bootstrap
 from armcal.estimate.validation import ErrorSummary
 from armcal.report.numbers import MINUS, NONE, decimals_for, shown_unit, significant
-from armcal.report.record_tables import part_of
-from armcal.report.tables import parameter_rows
+from armcal.report.tables import parameter_rows, part_of
 from armcal.run.result import RunResult
 
 _SETS = {"train": "training", "holdout": "held out", "cross_validated": "cross-validated"}

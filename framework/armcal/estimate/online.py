@@ -74,6 +74,7 @@ class OnlineEstimator(Protocol):
     @property
     def window(self) -> int:
         """How many of the last records each update needs; 1 for a filter."""
+        return 1
 
     def update(self, prior: Gaussian, observations: Sequence[Observation], start: Array | None = None) -> Update:
         """The belief after the last observation; ``prior`` is the one before the first of them.

@@ -12,15 +12,16 @@ from armcal.estimate.estimator import Estimate
 from armcal.estimate.identifiability import CORRELATED, POOR_CONDITION, bound_together, correlated_pairs, correlations
 from armcal.report import error_figures, interval_figures, parameter_figures, workspace
 from armcal.report.numbers import NONE, common_decimals, count, duration, fixed, plural, ratio, significant, unbroken
-from armcal.report.record_tables import group_rows, missed_records, scatter_rows, suspicious_rows
 from armcal.report.sections import PluginSection
 from armcal.report.tables import (
     Fact,
     error_rows,
     fixed_rows,
+    group_rows,
     judged,
     parameter_rows,
     provenance_facts,
+    scatter_rows,
     worst_records,
     worst_rows,
 )
@@ -52,7 +53,7 @@ def render(result: RunResult, sections: Sequence[PluginSection] = ()) -> str:
         "workspace": workspace.views(result),
         "order": error_figures.in_order(result, worst),
         "worst": worst_rows(result, worst),
-        "missed": missed_records(result.evidence.large_errors),
+        "missed": result.evidence.large_errors,
         "crossed": bool(np.isfinite(result.errors.cross_validated_mm).any()),
         "shares": interval_figures.share_rows(result.intervals),
         "levels": interval_figures.level_names(),
@@ -65,9 +66,9 @@ def render(result: RunResult, sections: Sequence[PluginSection] = ()) -> str:
         "springs": springs,
         **_correlations(result.estimate),
         **_determined(result.estimate),
-        "suspicious": suspicious_rows(result.noise, MOST_LISTED),
+        "suspicious": result.noise.suspicious[:MOST_LISTED],
         "more_suspicious": max(len(result.noise.suspicious) - MOST_LISTED, 0),
-        "scatter": scatter_rows(result.noise),
+        "scatter": scatter_rows(result.noise.components),
         "sections": sections,
         "aside": aside[:MOST_LISTED],
         "more_aside": max(len(aside) - MOST_LISTED, 0),
@@ -84,7 +85,8 @@ def rendered(template: str, content: Mapping[str, Any], *folders: Path) -> str:
     loader = FileSystemLoader([*folders, Path(__file__).parent])
     environment = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True)
     environment.lstrip_blocks = True
-    environment.filters.update(count=count, plural=plural, unbroken=unbroken, signed=lambda x: fixed(x, 3, signed=True))
+    environment.filters.update(count=count, fixed=fixed, plural=plural, unbroken=unbroken)
+    environment.filters["signed"] = lambda x: fixed(x, 3, signed=True)
     return environment.get_template(template).render(content)
 
 
@@ -98,7 +100,7 @@ def _accuracy(result: RunResult) -> dict[str, Any]:
         decimals = common_decimals([v for _, b, a in pairs for v in (b, a)], most=3)
         tiles = [(name, fixed(b, decimals), fixed(a, decimals), ratio(b, a)) for name, b, a in pairs]
     rows = group_rows(result.groups.errors)
-    distances = bool(rows) and len(rows[0].numbers) > 2
+    distances = bool(rows) and len(rows[0][-1]) > 2
     shown = {"group_rows": rows, "group_distances": distances}
     return {"judged": from_set, "tiles": tiles, "error_rows": error_rows(result), **shown}
 

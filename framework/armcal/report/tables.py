@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from armcal.estimate.estimator import Estimate, Interval95
+from armcal.estimate.estimator import Estimate
 from armcal.estimate.validation import ErrorSummary
+from armcal.estimate.variance import VarianceComponents
 from armcal.report.numbers import (
     MINUS,
     NONE,
@@ -22,12 +23,15 @@ from armcal.report.numbers import (
     ratio,
     shown_unit,
 )
+from armcal.run.groups import GroupError
 from armcal.run.result import RunResult
 
 _SETS = (("train", "Train"), ("holdout", "Holdout"), ("cross_validated", "Cross-validated"))
 _STATISTICS = ("mean", "rms", "p95", "max")
 _EMPTY = ErrorSummary(None, None, None, None, 0)
 _FIGURE_SPACE, _POINT_SPACE = "\u2007", "\u2008"
+
+_MM = 1000.0
 
 
 @dataclass(frozen=True)
@@ -117,7 +121,7 @@ class ParameterRow:
     at_bound: bool
     determined: bool
     raw: RawParameter
-    held: bool = False
+    held: bool
 
 
 def parameter_rows(estimate: Estimate) -> tuple[ParameterRow, ...]:
@@ -137,17 +141,10 @@ def parameter_rows(estimate: Estimate) -> tuple[ParameterRow, ...]:
         size = own.sd if known else max(abs(own.value), abs(own.nominal)) / 1000
         decimals.append(decimals_for(size) if size else 3)
     widest = max(decimals, default=0)
-    bounds = set(estimate.at_bound)
-    rows = (
-        _row(names[i], units[i], raw[i], estimate.intervals[i], decimals[i], widest, names[i] in bounds)
-        for i in range(len(names))
-    )
-    return tuple(replace(row, held=not seen) for row, seen in zip(rows, estimate.identified_by_data, strict=True))
+    return tuple(_row(estimate, i, units[i], raw[i], decimals[i], widest) for i in range(len(names)))
 
 
-def _row(
-    name: str, si_unit: str, raw: RawParameter, interval: Interval95, decimals: int, widest: int, at_bound: bool
-) -> ParameterRow:
+def _row(estimate: Estimate, i: int, si_unit: str, raw: RawParameter, decimals: int, widest: int) -> ParameterRow:
     def aligned(value: float, signed: bool = False) -> str:
         padding = _FIGURE_SPACE * (widest - decimals) + (_POINT_SPACE if decimals == 0 < widest else "")
         written = fixed(value, decimals, signed)
@@ -156,11 +153,11 @@ def _row(
     determined = math.isfinite(raw.sd)
     lower, upper = fixed(raw.lower, decimals), fixed(raw.upper, decimals)
     written = f"{lower} to {upper}" if determined else NONE
-    if determined and interval.one_sided:
+    if determined and estimate.intervals[i].one_sided:
         nearer_lower = abs(raw.value - raw.lower) <= abs(raw.upper - raw.value)
         written = f"≤ {upper}" if nearer_lower else f"≥ {lower}"
     return ParameterRow(
-        name=name,
+        name=estimate.names[i],
         unit=shown_unit(si_unit)[1],
         si_unit=si_unit,
         nominal=aligned(raw.nominal),
@@ -168,23 +165,15 @@ def _row(
         correction=aligned(raw.value - raw.nominal, signed=True),
         sd=aligned(raw.sd),
         interval=written,
-        at_bound=at_bound,
+        at_bound=estimate.names[i] in estimate.at_bound,
         determined=determined,
         raw=raw,
+        held=not estimate.identified_by_data[i],
     )
 
 
-@dataclass(frozen=True)
-class FixedRow:
-    """A parameter that the run left alone."""
-
-    name: str
-    value: str
-    unit: str
-
-
-def fixed_rows(estimate: Estimate) -> tuple[FixedRow, ...]:
-    """One row a fixed canonical entry."""
+def fixed_rows(estimate: Estimate) -> list[tuple[str, str, str]]:
+    """Name, value and unit of each fixed canonical entry."""
     rows = []
     for block in estimate.parameters.blocks:
         if block.free:
@@ -192,21 +181,8 @@ def fixed_rows(estimate: Estimate) -> tuple[FixedRow, ...]:
         values = estimate.values[estimate.parameters.entries_of(block.name)]
         for name, suffix, value in zip(block.entry_names, block.domain.entries, values, strict=True):
             factor, unit = shown_unit(entry_unit(block, suffix))
-            shown = float(value) * factor
-            rows.append(FixedRow(name, f"{shown:.7g}".replace("-", MINUS), unit))
-    return tuple(rows)
-
-
-@dataclass(frozen=True)
-class WorstRow:
-    """One of the records with the largest errors."""
-
-    record_id: str
-    row: str
-    role: str
-    before: str
-    after: str
-    crossed: str
+            rows.append((name, f"{float(value) * factor:.7g}".replace("-", MINUS), unit))
+    return rows
 
 
 def worst_records(result: RunResult, number: int = 10) -> NDArray[np.intp]:
@@ -216,23 +192,18 @@ def worst_records(result: RunResult, number: int = 10) -> NDArray[np.intp]:
     return np.argsort(-ranked, kind="stable")[:number].astype(np.intp)
 
 
-def worst_rows(result: RunResult, worst: NDArray[np.intp]) -> tuple[WorstRow, ...]:
-    """Id, source row, role and errors of these records."""
+def worst_rows(result: RunResult, worst: NDArray[np.intp]) -> list[tuple[str, ...]]:
+    """Id, source row, role, and errors of these records: nominal, calibrated, cross-validated."""
     errors, data = result.errors, result.dataset
     train, holdout = set(result.split.train.tolist()), set(result.split.holdout.tolist())
-    columns = (errors.nominal_mm[worst], errors.calibrated_mm[worst], errors.cross_validated_mm[worst])
-    decimals = common_decimals(np.concatenate(columns).tolist())
-    return tuple(
-        WorstRow(
-            record_id=data.ids[i],
-            row=str(data.rows[i]) if data.rows else NONE,
-            role="train" if i in train else "holdout" if i in holdout else "not used",
-            before=fixed(float(errors.nominal_mm[i]), decimals),
-            after=fixed(float(errors.calibrated_mm[i]), decimals),
-            crossed=fixed(float(errors.cross_validated_mm[i]), decimals),
-        )
-        for i in worst.tolist()
-    )
+    columns = np.array([errors.nominal_mm[worst], errors.calibrated_mm[worst], errors.cross_validated_mm[worst]])
+    decimals = common_decimals(columns.ravel().tolist())
+    rows = []
+    for i, numbers in zip(worst.tolist(), columns.T.tolist(), strict=True):
+        role = "train" if i in train else "holdout" if i in holdout else "not used"
+        row = str(data.rows[i]) if data.rows else NONE
+        rows.append((data.ids[i], row, role, *(fixed(number, decimals) for number in numbers)))
+    return rows
 
 
 @dataclass(frozen=True)
@@ -260,3 +231,34 @@ def provenance_facts(provenance: Mapping[str, Any], prefix: str = "") -> tuple[F
         else:
             facts.append(Fact(name, NONE if value is None or value == "" else str(value)))
     return tuple(facts)
+
+
+def group_rows(groups: Sequence[GroupError]) -> list[tuple[str, str, int, list[str]]]:
+    """Name, whether it trained or judged, records, errors before and after; then distances, where any is known."""
+    with_distances = any(group.distance_error_mm is not None for group in groups)
+    columns: list[list[float | None]] = []
+    for group in groups:
+        distances = [group.nominal_distance_error_mm, group.distance_error_mm] if with_distances else []
+        columns.append([group.nominal_error_mm, group.error_mm, *distances])
+    decimals = common_decimals(x for row in columns for x in row if x is not None)
+    return [
+        (group.name, part_of(group), group.records, [fixed(x, decimals) for x in row])
+        for group, row in zip(groups, columns, strict=True)
+    ]
+
+
+def part_of(group: GroupError) -> str:
+    """Which part its records took."""
+    if not group.trained:
+        return "judged"
+    return "trained" if group.trained == group.records else "both"
+
+
+def scatter_rows(components: VarianceComponents | None) -> list[tuple[str, ...]]:
+    """Variance components in a customary unit, the largest share first: name, share, sd, unit, interval, effect."""
+    rows: list[tuple[str, ...]] = []
+    for c in sorted(components.components if components else (), key=lambda c: -c.share):
+        factor, unit = {"rad": (180 / np.pi, "deg"), "m": (_MM, "mm")}.get(c.unit, (1.0, "\u00d7 declared noise"))
+        sd, lower, upper = (fixed(factor * x, 3) for x in (c.sd, c.lower, c.upper))
+        rows.append((c.name, f"{100 * c.share:.1f} %", sd, unit, f"{lower} to {upper}", fixed(_MM * c.rms, 3)))
+    return rows

@@ -15,11 +15,6 @@ class Clock:
     late: int = 0
     behind: float = 0.0
 
-    @classmethod
-    def of(cls, now: float | None, late: int, behind: float) -> Clock:
-        """As a state keeps it."""
-        return cls(None if now is None else float(now), int(late), float(behind))
-
 
 @dataclass(frozen=True)
 class Tick:

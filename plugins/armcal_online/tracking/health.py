@@ -23,12 +23,6 @@ class Health:
     calm: int = 0
     sentence: str = "The records agree with the calibration."
 
-    @classmethod
-    def of(cls, level: str, calm: int, sentence: str) -> Health:
-        """As a state keeps it; IndexError for a level that there is not."""
-        matching = [known for known in LEVELS if known == level]
-        return cls(matching[0], int(calm), str(sentence))
-
     def troubled(self, level: Level, sentence: str) -> Health:
         """After trouble: at least that bad, counting anew."""
         if LEVELS.index(level) > LEVELS.index(self.level):

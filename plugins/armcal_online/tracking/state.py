@@ -6,8 +6,9 @@ import base64
 import hashlib
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, replace
-from typing import Any
+from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
+from types import UnionType
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import numpy as np
 from armcal.base.domains import Array
@@ -18,7 +19,6 @@ from armcal_online.tracking.belief import Belief, most_likely
 from armcal_online.tracking.clock import Clock
 from armcal_online.tracking.health import Health
 from armcal_online.tracking.hypotheses import Candidate, Recent
-from armcal_online.tracking.observer import Reading
 from armcal_online.tracking.start import FilterSetup
 
 REMEMBERED = 64
@@ -74,29 +74,9 @@ class State:
 
     def as_dict(self) -> dict[str, Any]:
         """As JSON, to the last bit."""
-        return {
-            "belief": _belief_dict(self.belief),
-            "anchor": _belief_dict(self.anchor) if self.held else None,
-            "held": [_recent_dict(recent) for recent in self.held],
-            "recent": [_recent_dict(recent) for recent in self.recent],
-            "clock": asdict(self.clock),
-            "place": self.place,
-            "health": asdict(self.health),
-            "nis": [list(pair) for pair in self.nis_window],
-            "counts": dict(self.counts),
-            "ids": [list(pair) for pair in self.ids],
-            "wary": self.wary,
-            "suspects": [
-                {"place": s.place, "log_evidence": s.log_evidence, "belief": _belief_dict(s.belief)}
-                for s in self.suspects
-            ],
-            "suspected": self.suspected,
-            "before_change": None if self.before_change is None else _belief_dict(self.before_change),
-            "drifted": self.drifted,
-            "changes": list(self.changes),
-            "sequence": self.sequence,
-            "at": self.at,
-        }
+        content = _encoded(self)
+        content["nis"] = content.pop("nis_window")
+        return {**content, "anchor": content["anchor"] if self.held else None}
 
     @classmethod
     def from_dict(cls, content: Mapping[str, Any]) -> State:
@@ -106,30 +86,11 @@ class State:
             DataError: an array is not whole.
             KeyError, TypeError, ValueError, AttributeError, IndexError: it is no state.
         """
-        belief, before_change = _belief_of(content["belief"]), content["before_change"]
-        return cls(
-            belief=belief,
-            anchor=belief if content["anchor"] is None else _belief_of(content["anchor"]),
-            held=tuple(_recent_of(recent) for recent in content["held"]),
-            recent=tuple(_recent_of(recent) for recent in content["recent"]),
-            clock=Clock.of(**content["clock"]),
-            place=None if content["place"] is None else float(content["place"]),
-            health=Health.of(**content["health"]),
-            nis_window=tuple((float(nis), int(dof)) for nis, dof in content["nis"]),
-            counts={what: int(content["counts"][what]) for what in ("accepted", "rejected", "ignored")},
-            ids=tuple((str(name), str(content_hash)) for name, content_hash in content["ids"]),
-            wary=bool(content["wary"]),
-            suspects=tuple(
-                Candidate(int(s["place"]), float(s["log_evidence"]), _belief_of(s["belief"]))
-                for s in content["suspects"]
-            ),
-            suspected=int(content["suspected"]),
-            before_change=None if before_change is None else _belief_of(before_change),
-            drifted=int(content["drifted"]),
-            changes=tuple(int(sequence) for sequence in content["changes"]),
-            sequence=int(content["sequence"]),
-            at=float(content["at"]),
-        )
+        anchor = content["belief"] if content["anchor"] is None else content["anchor"]
+        state: State = _decoded(cls, {**content, "anchor": anchor, "nis_window": content["nis"]})
+        if set(state.counts) != {"accepted", "rejected", "ignored"}:
+            raise ValueError(f"counts of {', '.join(state.counts)}")
+        return state
 
     def digest(self) -> str:
         """A hash of the belief and how it is judged, to the last bit."""
@@ -142,64 +103,49 @@ class State:
         return hashed.hexdigest()[:16]
 
 
-def _encoded(array: Array) -> dict[str, Any]:
-    """An array of numbers: shape, and its bytes in base64 (little-endian doubles)."""
-    raw = np.ascontiguousarray(array, dtype="<f8").tobytes()
-    return {"shape": list(array.shape), "float64": base64.b64encode(raw).decode("ascii")}
+def _encoded(value: Any) -> Any:
+    """As JSON; of an array its shape, and its bytes in base64 (little-endian doubles)."""
+    if isinstance(value, np.ndarray):
+        raw = np.ascontiguousarray(value, dtype="<f8").tobytes()
+        return {"shape": list(value.shape), "float64": base64.b64encode(raw).decode("ascii")}
+    if isinstance(value, Belief):  # of its covariance, which is symmetric, the lower triangle
+        mean, covariance = value.gaussian.mean, value.gaussian.covariance
+        triangle = covariance[np.tril_indices(len(covariance))]
+        return _encoded({"origin": value.origin, "mean": mean, "covariance": triangle})
+    if is_dataclass(value):
+        return {field.name: _encoded(getattr(value, field.name)) for field in fields(value)}
+    if isinstance(value, Mapping):
+        return {key: _encoded(item) for key, item in value.items()}
+    return [_encoded(item) for item in value] if isinstance(value, tuple) else value
 
 
-def _decoded(content: Mapping[str, Any]) -> Array:
-    raw = np.frombuffer(base64.b64decode(content["float64"]), dtype="<f8")
-    if raw.size != int(np.prod(content["shape"])):
-        raise DataError("an array in the journal is not whole.", hint="Start again from the last calibration.yaml.")
-    return np.array(raw.reshape(content["shape"]), dtype=float)
-
-
-def _belief_dict(belief: Belief) -> dict[str, Any]:
-    """A belief; of its covariance, which is symmetric, the lower triangle."""
-    mean, covariance = belief.gaussian.mean, belief.gaussian.covariance
-    triangle = covariance[np.tril_indices(len(covariance))]
-    return {"origin": _encoded(belief.origin), "mean": _encoded(mean), "covariance": _encoded(triangle)}
-
-
-def _belief_of(content: Mapping[str, Any]) -> Belief:
-    mean = _decoded(content["mean"])
-    covariance = np.zeros((len(mean), len(mean)))
-    rows, columns = np.tril_indices(len(mean))
-    covariance[rows, columns] = covariance[columns, rows] = _decoded(content["covariance"])
-    return Belief(_decoded(content["origin"]), Gaussian(mean, covariance))
-
-
-def _recent_dict(recent: Recent) -> dict[str, Any]:
-    return {
-        "sequence": recent.sequence,
-        "readings": [
-            {"factor": r.factor, "group": r.group, "record": _encoded(r.record), "noise": _encoded(r.noise)}
-            for r in recent.readings
-        ],
-        "joint_noise": [None if noise is None else _encoded(noise) for noise in recent.joint_noise],
-        "passed": dict(recent.passed),
-        "before": _belief_dict(recent.before),
-        "rejected": recent.rejected,
-        "nis": recent.nis,
-        "dof": recent.dof,
-    }
-
-
-def _recent_of(content: Mapping[str, Any]) -> Recent:
-    return Recent(
-        sequence=int(content["sequence"]),
-        readings=tuple(
-            Reading(int(r["factor"]), _decoded(r["record"]), int(r["group"]), _decoded(r["noise"]))
-            for r in content["readings"]
-        ),
-        joint_noise=tuple(None if noise is None else _decoded(noise) for noise in content["joint_noise"]),
-        passed={str(channel): float(distance) for channel, distance in content["passed"].items()},
-        before=_belief_of(content["before"]),
-        rejected=bool(content["rejected"]),
-        nis=float(content["nis"]),
-        dof=int(content["dof"]),
-    )
+def _decoded(kind: Any, content: Any) -> Any:
+    """The value of a type that ``_encoded`` made ``content`` of."""
+    origin, parts = get_origin(kind), get_args(kind)
+    if origin is np.ndarray:
+        raw = np.frombuffer(base64.b64decode(content["float64"]), dtype="<f8")
+        if raw.size != int(np.prod(content["shape"])):
+            raise DataError("an array in the journal is not whole.", hint="Start again from the last calibration.yaml.")
+        return np.array(raw.reshape(content["shape"]), dtype=float)
+    if kind is Belief:
+        place, mean, triangle = (_decoded(Array, content[name]) for name in ("origin", "mean", "covariance"))
+        covariance = np.zeros((len(mean), len(mean)))
+        rows, columns = np.tril_indices(len(mean))
+        covariance[rows, columns] = covariance[columns, rows] = triangle
+        return Belief(place, Gaussian(mean, covariance))
+    if isinstance(kind, type) and is_dataclass(kind):
+        kinds = get_type_hints(kind)
+        return kind(**{field.name: _decoded(kinds[field.name], content[field.name]) for field in fields(kind)})
+    if origin is UnionType:
+        return None if content is None else _decoded(parts[0], content)
+    if origin is tuple:
+        kinds_of = parts[:1] * len(content) if parts[-1] is Ellipsis else parts
+        return tuple(_decoded(one, item) for one, item in zip(kinds_of, content, strict=True))
+    if origin is Mapping:
+        return {str(key): _decoded(parts[1], item) for key, item in content.items()}
+    if origin is Literal and content not in parts:
+        raise ValueError(f"{content!r} is none of {', '.join(parts)}")
+    return content if origin is Literal else kind(content)
 
 
 def advanced(state: State, recent: Recent, setup: FilterSetup, estimator: OnlineEstimator, nis_window: int) -> State:
