@@ -188,9 +188,9 @@ def test_events_are_named_right_and_nothing_is_missed(knowing: tuple[MissionLog,
         row = int(np.searchsorted(made.times, report.event.time)) + DECIDED_AFTER
         assert report.decision is not None and report.decision.time == made.times[row]
     counts = judgement.records
-    assert counts.rejected == counts.outliers == made.outliers.sum() and counts.good_rejected == 0
-    assert counts.accepted + counts.rejected + counts.ignored == counts.arrived == len(made.records)
-    assert counts.made == counts.arrived + made.lost
+    assert counts["rejected"] == counts["outliers"] == made.outliers.sum() and counts["good_rejected"] == 0
+    assert counts["accepted"] + counts["rejected"] + counts["ignored"] == counts["arrived"] == len(made.records)
+    assert counts["made"] == counts["arrived"] + made.lost
     assert log.verdicts[made.records.ids[0]] in ("accepted", "rejected")
 
 

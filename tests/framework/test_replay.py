@@ -206,7 +206,7 @@ def test_a_state_or_a_decision_that_differs_is_told(whole: Path, calibration: Pa
     moved = replace(belief, gaussian=replace(belief.gaussian, mean=mean))
     nudged.state = State(moved, moved)
     done = replay(journal, nudged, Comparer(header["evaluator"]), None, no_progress)
-    assert done.difference is not None and done.replayer.entries < 10
+    assert done.difference is not None and done.entries < 10
     with pytest.raises(DiffersError, match="noted was"):
         Comparer({}).compare_events(
             7, [{"event": "decision", "kind": "drift", "sequence": 7, "sentence": "A drift."}], []
@@ -279,7 +279,7 @@ def test_a_rollback_to_what_is_no_longer_kept_goes_on_at_the_checkpoint_after_it
         path.unlink()
     done, fake = replayed(folder)
     assert done.difference is None and fake.digest() == end
-    assert [event["to"] for event in done.replayer.decisions if event["event"] == "decision" and "to" in event] == [
+    assert [event["to"] for event in done.decisions if event["event"] == "decision" and "to" in event] == [
         sequence_of_first(done)
     ]
     with pytest.raises(DataError, match="no longer holds"):
@@ -288,7 +288,7 @@ def test_a_rollback_to_what_is_no_longer_kept_goes_on_at_the_checkpoint_after_it
 
 def sequence_of_first(done: Any) -> int:
     """Where the rollback went."""
-    return int(next(event["to"] for event in done.replayer.decisions if "to" in event))
+    return int(next(event["to"] for event in done.decisions if "to" in event))
 
 
 def test_a_journal_without_its_calibration_is_refused(whole: Path) -> None:

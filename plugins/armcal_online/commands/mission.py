@@ -70,26 +70,20 @@ def mission(console: Console, config: Path, out: Path, overrides: tuple[str, ...
     for event in content["events"]:
         records = event["recovered_after_records"]
         back = "not recovered" if records is None else f"recovered after {records} records"
-        _line(console, f"day {event['day']:.2f}: {event['label']}: {_NAMED[event['named']]}, {back}")
-    _line(
-        console,
+        console.line(f"day {event['day']:.2f}: {event['label']}: {_NAMED[event['named']]}, {back}")
+    console.line(
         f"available {content['availability']:.1%} of the time (frozen: within {content['limit_mm']:g} mm "
         f"{content['frozen_within_limit']:.1%}); {len(content['false_alarms'])} false alarms, "
         f"{content['missed']} events missed",
     )
-    _line(
-        console,
+    console.line(
         f"{counts['arrived']} records: {counts['accepted']} accepted, {counts['rejected']} rejected "
         f"({counts['good_rejected_apart']} good ones apart from events), {counts['ignored']} ignored; "
         f"{counts['outliers_accepted']} of {counts['outliers']} outliers accepted",
     )
     for stage, seconds in watch.seconds.items():
         console.detail(f"{stage}: {seconds:.1f} s")
-    console.out.print(f"figure: {out / 'mission.png'}  ({watch.total():.1f} s)", markup=False, soft_wrap=True)
-
-
-def _line(console: Console, text: str) -> None:
-    console.out.print(text, markup=False, soft_wrap=True)
+    console.line(f"figure: {out / 'mission.png'}  ({watch.total():.1f} s)")
 
 
 def loop_session(registry: PluginRegistry) -> Session:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, cast
 
@@ -27,7 +26,6 @@ from armcal_online.replaying.replay import (
     WARM_UP,
     Comparison,
     JournalReplayer,
-    Replayed,
     compared,
     replay,
     side_by_side,
@@ -39,14 +37,6 @@ from armcal_online.tracking.settings import RecalibrateSettings, load_settings
 
 _Evaluator = Literal["auto", "compiled", "interpreted"]
 _EVALUATORS = ("auto", "compiled", "interpreted")
-
-
-@dataclass(frozen=True)
-class _Other:
-    """The course that other settings would have taken."""
-
-    replayer: JournalReplayer
-    comparison: Comparison
 
 
 @click.command("replay")
@@ -89,16 +79,15 @@ def replay_command(
         other = None
         if other_settings is not None:
             others = Recalibrator.begin(begun_from, _evaluated(other_settings, evaluator), registry)
-            replayer = replay(held, others, ReplayVerifier(), until, progress, "with other settings").replayer
-            other = _Other(replayer, compared(done.replayer, replayer))
-    chosen = other.replayer if other else done.replayer
+            other = compared(done, replay(held, others, ReplayVerifier(), until, progress, "with other settings"))
+    chosen = other.replayer if other else done
     written = calibration if calibration and not done.difference else None
     if written:
         write_whole(REAL_FILES, written, chosen.session.calibration_text().encode())
     console.result(_as_json(held, done, comparer, other, written))
     _show(console, held, done, comparer, other)
     if written:
-        console.out.print(f"the calibration after entry {chosen.last}: {written}", markup=False, soft_wrap=True)
+        console.line(f"the calibration after entry {chosen.last}: {written}")
     _leave(held, done)
 
 
@@ -119,7 +108,7 @@ def _check_out(out: Path | None, folder: Path) -> None:
         raise InputError("no file can be written there.", where=Location(str(out)), hint="Give a file in a folder.")
 
 
-def _leave(held: KeptJournal, done: Replayed) -> None:
+def _leave(held: KeptJournal, done: JournalReplayer) -> None:
     """End with what the replay found."""
     context = click.get_current_context()
     if held.damage is not None:
@@ -129,91 +118,88 @@ def _leave(held: KeptJournal, done: Replayed) -> None:
         context.exit(EXIT_FAULT)
 
 
-def _show(console: Console, held: KeptJournal, done: Replayed, comparer: Comparer, other: _Other | None) -> None:
-    def say(text: str) -> None:
-        console.out.print(text, markup=False, soft_wrap=True)
-
-    header, replayer = held.first.header, done.replayer
-    say(f"{held.folder}: begun from {header['path']}, replayed from entry {replayer.first} to {replayer.last}")
+def _show(
+    console: Console, held: KeptJournal, done: JournalReplayer, comparer: Comparer, other: Comparison | None
+) -> None:
+    header = held.first.header
+    console.line(f"{held.folder}: begun from {header['path']}, replayed from entry {done.first} to {done.last}")
     same = "as the journal was written" if not comparer.others else f"another than the journal's: {comparer.others[0]}"
-    say(f"evaluator: {replayer.session.evaluator['backend']}, {same}")
+    console.line(f"evaluator: {done.session.evaluator['backend']}, {same}")
     for text in comparer.others[1:]:
         console.detail(f"  {text}")
-    counts = f"{replayer.entries} entries, {comparer.states} states compared"
+    counts = f"{done.entries} entries, {comparer.states} states compared"
     if done.difference is not None:
-        say(f"{counts}; after entry {done.difference.sequence} they differ. {done.difference.sentence}")
+        console.line(f"{counts}; after entry {done.difference.sequence} they differ. {done.difference.sentence}")
     elif comparer.equal == comparer.states:
-        say(f"{counts}, all the same to the last bit")
+        console.line(f"{counts}, all the same to the last bit")
     else:
         counts = f"{counts}, {comparer.equal} the same to the last bit"
         if comparer.measured:
             widest = f"{comparer.widest.values:.1e} sd ({comparer.widest.covariance:.1e} in the covariance)"
             counts += f"; {comparer.measured} of the others were noted in full and differ by at most {widest}"
-        say(f"{counts}; all {comparer.decisions} decisions and levels are the same")
+        console.line(f"{counts}; all {comparer.decisions} decisions and levels are the same")
     if other is not None:
-        console.out.print(_table(replayer, other))
+        console.out.print(_table(done, other))
     else:
-        state = replayer.session.state
+        state = done.session.state
         counts = ", ".join(f"{count} {verdict}" for verdict, count in state.counts.items())
-        say(f"{replayer.records} records, of these in the estimate: {counts}; level {state.health.level}")
+        console.line(f"{done.records} records, of these in the estimate: {counts}; level {state.health.level}")
     if held.cut is not None:
         console.warn(held.cut.sentence)
 
 
-def _table(replayer: JournalReplayer, other: _Other) -> Table:
+def _table(done: JournalReplayer, other: Comparison) -> Table:
     """Both courses."""
-    comparison = other.comparison
     table = Table(title="what was done, and what other settings would have done")
     for heading in ("", "done", "with other settings"):
         table.add_column(heading)
-    for number, one, two in side_by_side(replayer, other.replayer):
+    for number, one, two in side_by_side(done, other.replayer):
         table.add_row(f"entry {number}", one or "-", two or "-")
     table.add_section()
-    states = replayer.session.state, other.replayer.session.state
+    states = done.session.state, other.replayer.session.state
     for what in states[0].counts:
         table.add_row(what, *(str(state.counts[what]) for state in states))
     table.add_row("level at the end", *(state.health.level for state in states))
-    name = f"mean innovation of {comparison.records} records after the first {WARM_UP} that both accept"
-    table.add_row(name, *("-" if math.isnan(size) else f"{1000 * size:.3f} mm" for size in comparison.innovation_m))
-    table.add_row("largest difference of a parameter", "", f"{comparison.apart_sd:.3g} sd, {comparison.parameter}")
+    name = f"mean innovation of {other.records} records after the first {WARM_UP} that both accept"
+    table.add_row(name, *("-" if math.isnan(size) else f"{1000 * size:.3f} mm" for size in other.innovation_m))
+    table.add_row("largest difference of a parameter", "", f"{other.apart_sd:.3g} sd, {other.parameter}")
     return table
 
 
 def _as_json(
-    held: KeptJournal, done: Replayed, comparer: Comparer, other: _Other | None, written: Path | None
+    held: KeptJournal, done: JournalReplayer, comparer: Comparer, other: Comparison | None, written: Path | None
 ) -> Mapping[str, Any]:
-    difference, replayer = done.difference, done.replayer
+    difference = done.difference
     content: dict[str, Any] = {
         "journal": str(held.folder),
-        "entries": replayer.entries,
-        "first": replayer.first,
-        "last": replayer.last,
+        "entries": done.entries,
+        "first": done.first,
+        "last": done.last,
         "states": {"compared": comparer.states, "same_to_the_last_bit": comparer.equal, "measured": comparer.measured},
         "largest_difference_sd": {"values": comparer.widest.values, "covariance": comparer.widest.covariance},
-        "evaluator": replayer.session.evaluator,
+        "evaluator": done.session.evaluator,
         "other_evaluator": list(comparer.others),
         "difference": {"after": difference.sequence, "sentence": difference.sentence} if difference else None,
         "damage": str(held.damage) if held.damage else None,
         "cut": held.cut.sentence if held.cut else None,
         "calibration": str(written) if written else None,
-        **_state_replayer(replayer),
+        **_outcome(done),
     }
     if other is not None:
-        comparison = other.comparison
         content["other_settings"] = {
-            **_state_replayer(other.replayer),
-            "mean_innovation_mm": [1000 * size for size in comparison.innovation_m],
-            "innovations_compared": comparison.records,
-            "largest_difference": {"parameter": comparison.parameter, "sd": comparison.apart_sd},
+            **_outcome(other.replayer),
+            "mean_innovation_mm": [1000 * size for size in other.innovation_m],
+            "innovations_compared": other.records,
+            "largest_difference": {"parameter": other.parameter, "sd": other.apart_sd},
         }
     return cast(Mapping[str, Any], finite(content))
 
 
-def _state_replayer(replayer: JournalReplayer) -> dict[str, Any]:
-    state = replayer.session.state
+def _outcome(done: JournalReplayer) -> dict[str, Any]:
+    state = done.session.state
     return {
-        "records": replayer.records,
+        "records": done.records,
         "counts": dict(state.counts),
         "level": state.health.level,
-        "decisions": [event for event in replayer.decisions if event["event"] == "decision"],
+        "decisions": [event for event in done.decisions if event["event"] == "decision"],
     }

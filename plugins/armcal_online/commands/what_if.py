@@ -41,20 +41,20 @@ def what_if(console: Console, calibration: Path, poses: Path, out: Path | None, 
     if out is not None and (out.resolve() in (poses.resolve(), calibration.resolve()) or not out.parent.is_dir()):
         raise InputError("it cannot be written there.", where=Location(str(out)), hint="Give another --out.")
     setup = filter_setup(loaded, RecalibrateSettings(evaluator="auto"), shares=False)
-    pose_worths, lost = ranked(setup, commands)
+    worths, lost = ranked(setup, commands)
     if lost:
         console.warn(f"{len(lost)} poses have no elastic equilibrium, the first is {commands.ids[lost[0]]}.")
     unit = error_unit(setup.problem)
     rows: list[dict[str, Any]] = [
         {
             "rank": rank,
-            "id": commands.ids[pose_worth.place],
-            "row": commands.rows[pose_worth.place] if commands.rows else pose_worth.place + 1,
-            "bits": pose_worth.worth.bits,
-            f"prediction_sd_{unit}": 1000 * pose_worth.worth.deviation,
-            "tells_most": dict(pose_worth.worth.tells_most),
+            "id": commands.ids[place],
+            "row": commands.rows[place] if commands.rows else place + 1,
+            "bits": worth.bits,
+            f"prediction_sd_{unit}": 1000 * worth.deviation,
+            "tells_most": dict(worth.tells_most),
         }
-        for rank, pose_worth in enumerate(pose_worths, 1)
+        for rank, (place, worth) in enumerate(worths, 1)
     ]
     if out is not None:
         check_output(out)
@@ -71,7 +71,7 @@ def what_if(console: Console, calibration: Path, poses: Path, out: Path | None, 
         table.add_row(str(row["id"]), f"{row['bits']:.2f}", known, _reductions(row["tells_most"]))
     console.out.print(table)
     if out is not None:
-        console.out.print(f"{len(rows)} poses, best first: {out}", markup=False, soft_wrap=True)
+        console.line(f"{len(rows)} poses, best first: {out}")
 
 
 def _reductions(remaining: Mapping[str, float]) -> str:

@@ -101,7 +101,7 @@ def curve_text(curve: ErrorCurve, temperature: Array) -> str:
 
 def figures(name: str, mission: Mission, log: MissionLog, judged: Judgement) -> dict[str, Any]:
     """The whole judgement for other programs."""
-    curve, counts = judged.curve, judged.records
+    curve = judged.curve
     levels = [level for level, hour in zip(curve.levels, curve.is_hour, strict=True) if hour]
     return {
         "mission": name,
@@ -130,7 +130,7 @@ def figures(name: str, mission: Mission, log: MissionLog, judged: Judgement) -> 
         ],
         "missed": judged.missed,
         "false_alarms": [_decision(false_alarm) for false_alarm in judged.false_alarms],
-        "records": {key: getattr(counts, key) for key in counts.__dataclass_fields__},
+        "records": dict(judged.records),
         "power_cuts": [time / DAY_S for time in mission.power_cuts],
         "resumed": log.resumed,
         "hours_at_level": Counter(levels),

@@ -140,22 +140,6 @@ class EventReport:
 
 
 @dataclass(frozen=True)
-class RecordCount:
-    """What became of the records; good ones are those that were not made outliers."""
-
-    made: int
-    lost: int
-    arrived: int
-    outliers: int
-    accepted: int
-    rejected: int
-    ignored: int
-    good_rejected: int
-    good_rejected_apart: int
-    outliers_accepted: int
-
-
-@dataclass(frozen=True)
 class Judgement:
     """A mission's figures.
 
@@ -166,7 +150,7 @@ class Judgement:
     curve: ErrorCurve
     events: tuple[EventReport, ...]
     false_alarms: tuple[Decision, ...]
-    records: RecordCount
+    records: Mapping[str, int]
     availability: float
     frozen_within: float
     limit: float
@@ -235,19 +219,20 @@ def _event_report(event: MissionEvent, end: float, log: MissionLog, curve: Error
     )
 
 
-def _record_count(mission: Mission, log: MissionLog, windows: Sequence[tuple[float, float]]) -> RecordCount:
+def _record_count(mission: Mission, log: MissionLog, windows: Sequence[tuple[float, float]]) -> dict[str, int]:
+    """What became of the records; good ones are those that were not made outliers."""
     verdicts = np.array([log.verdicts.get(text, "ignored") for text in mission.records.ids])
     apart = np.array([not _within(time, windows) for time in mission.times.tolist()], dtype=bool)
     good, rejected, accepted = ~mission.outliers, verdicts == "rejected", verdicts == "accepted"
-    return RecordCount(
-        made=len(verdicts) + mission.lost,
-        lost=mission.lost,
-        arrived=len(verdicts),
-        outliers=int(mission.outliers.sum()),
-        accepted=int(accepted.sum()),
-        rejected=int(rejected.sum()),
-        ignored=int((verdicts == "ignored").sum()),
-        good_rejected=int((good & rejected).sum()),
-        good_rejected_apart=int((good & rejected & apart).sum()),
-        outliers_accepted=int((mission.outliers & accepted).sum()),
-    )
+    return {
+        "made": len(verdicts) + mission.lost,
+        "lost": mission.lost,
+        "arrived": len(verdicts),
+        "outliers": int(mission.outliers.sum()),
+        "accepted": int(accepted.sum()),
+        "rejected": int(rejected.sum()),
+        "ignored": int((verdicts == "ignored").sum()),
+        "good_rejected": int((good & rejected).sum()),
+        "good_rejected_apart": int((good & rejected & apart).sum()),
+        "outliers_accepted": int((mission.outliers & accepted).sum()),
+    }

@@ -40,6 +40,7 @@ class JournalReplayer:
         first, last: sequence numbers of the first checkpoint and of the last entry.
         judged: each record.
         decisions: events of the kinds that a journal notes, and rollbacks.
+        difference: the first one from the journal; None where there is none.
     """
 
     def __init__(
@@ -55,6 +56,7 @@ class JournalReplayer:
         self.entries = self.records = self.first = self.last = 0
         self.judged: list[Judged] = []
         self.decisions: list[Event] = []
+        self.difference: DiffersError | None = None
 
     @property
     def is_done(self) -> bool:
@@ -152,14 +154,6 @@ class JournalReplayer:
         self._verifier.compare_digest(sequence, digest, self.session)
 
 
-@dataclass(frozen=True)
-class Replayed:
-    """A replay to its end, or to its first difference from the journal."""
-
-    replayer: JournalReplayer
-    difference: DiffersError | None
-
-
 def replay(
     journal: KeptJournal,
     session: Recalibrator,
@@ -167,8 +161,8 @@ def replay(
     until: int | None,
     progress: Progress,
     what: str = "replay",
-) -> Replayed:
-    """Take a session through a journal, from the oldest checkpoint that it keeps.
+) -> JournalReplayer:
+    """Take a session through a journal, from the oldest checkpoint that it keeps, to its end or the first difference.
 
     Args:
         journal: see ``kept_journal``.
@@ -191,15 +185,16 @@ def replay(
     except JournalDamagedError:
         pass  # ``journal.damage`` has it
     except DiffersError as difference:
-        return Replayed(replayer, difference)
-    return Replayed(replayer, None)
+        replayer.difference = difference
+    return replayer
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """Two replays side by side.
+    """A replay beside what was done.
 
     Attributes:
+        replayer: of the other settings.
         innovation_m: the mean distance of measured and predicted tips in each, over the records that both
             accepted after the first ``WARM_UP``; NaN without such a record.
         records: how many these are.
@@ -207,6 +202,7 @@ class Comparison:
         parameter: which one that is.
     """
 
+    replayer: JournalReplayer
     innovation_m: tuple[float, float]
     records: int
     apart_sd: float
@@ -227,7 +223,7 @@ def compared(one: JournalReplayer, other: JournalReplayer) -> Comparison:
         if name in second and sd > 0
     }
     farthest = max(apart, key=lambda name: apart[name], default="")
-    return Comparison((means[0], means[1]), len(known), apart.get(farthest, 0.0), farthest)
+    return Comparison(other, (means[0], means[1]), len(known), apart.get(farthest, 0.0), farthest)
 
 
 def side_by_side(one: JournalReplayer, other: JournalReplayer) -> list[tuple[int, str, str]]:

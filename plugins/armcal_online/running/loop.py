@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import os
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 from armcal.base.config_text import finite
 from armcal.io.journal.journal import Journal, JournalFullError
@@ -20,13 +21,6 @@ WAIT_S = 0.1
 """How long a source is waited for before control and signals are looked at again."""
 FULL_WAIT_S = 1.0
 """How long a record waits for room in the journal before it is tried again."""
-
-
-class Served(Protocol):
-    """A control socket as the loop uses it."""
-
-    def serve(self) -> None:
-        """Answer the requests that have come; returns at once."""
 
 
 @dataclass(frozen=True)
@@ -84,8 +78,8 @@ class Recalibration:
         """Whether records are passed over, or left where they are."""
         return self._state_replayer.progress.paused
 
-    def run(self, control: Served) -> None:
-        """Until the source ends, a signal comes, or a request to finish.
+    def run(self, serve: Callable[[], None]) -> None:
+        """Until the source ends, a signal comes, or a request to finish; ``serve`` answers requests that have come.
 
         Raises:
             JournalFailedError: the disk fails; what was acknowledged is safe.
@@ -93,7 +87,7 @@ class Recalibration:
         with Signals() as signals:
             self.write_calibration()
             while not self.finishing:
-                control.serve()
+                serve()
                 if signals.finish:
                     self.finishing = "It was asked to finish by a signal."
                 if signals.rotate:
@@ -113,7 +107,7 @@ class Recalibration:
             event = {"event": "finished", "sequence": self.sequence, "at": time.time(), "sentence": sentence}
             self._outputs.event(event)
             self._outputs.status({**self.status(), "finished": True})
-            control.serve()
+            serve()
 
     def step(self, wait_s: float) -> None:
         """Take one record, if there is one within the wait, and write what is due."""

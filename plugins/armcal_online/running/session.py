@@ -68,7 +68,7 @@ class Open:
 
     def run(self) -> None:
         """Until it ends; see ``Recalibration.run``."""
-        self.recalibration.run(self.control)
+        self.recalibration.run(self.control.serve)
 
 
 SourceOf = Callable[[RowParser], Source]

@@ -35,16 +35,8 @@ class Worth:
     tells_most: tuple[tuple[str, float], ...]
 
 
-@dataclass(frozen=True)
-class PoseWorth:
-    """A pose (its index among the commands) and the worth of a record there."""
-
-    place: int
-    worth: Worth
-
-
-def ranked(setup: FilterSetup, commands: Dataset) -> tuple[tuple[PoseWorth, ...], tuple[int, ...]]:
-    """All poses, the one whose record is worth most first, and those at which the arm has no equilibrium.
+def ranked(setup: FilterSetup, commands: Dataset) -> tuple[list[tuple[int, Worth]], list[int]]:
+    """Places of all poses, the one whose record is worth most first, and of those without an elastic equilibrium.
 
     Each is taken by itself: a second record at the best pose is worth less. The error that the calibration's residuals
     had counts as noise.
@@ -52,15 +44,15 @@ def ranked(setup: FilterSetup, commands: Dataset) -> tuple[tuple[PoseWorth, ...]
     Raises:
         DataError: no measurement reads a single pose.
     """
-    pose_worths, lost = [], []
+    worths, lost = [], []
     for place in range(len(commands)):
         channels = {name: float(values[place]) for name, values in commands.channels.items()}
         known = {name: value for name, value in channels.items() if np.isfinite(value)}
         try:
-            pose_worths.append(PoseWorth(place, worth_of_record(setup.observer, setup.belief, known)))
+            worths.append((place, worth_of_record(setup.observer, setup.belief, known)))
         except NotConvergedError:
             lost.append(place)
-    return tuple(sorted(pose_worths, key=lambda pose_worth: -pose_worth.worth.bits)), tuple(lost)
+    return sorted(worths, key=lambda placed: -placed[1].bits), lost
 
 
 def worth_of_record(observer: Observer, belief: Belief, channels: Mapping[str, float]) -> Worth:
