@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from armcal.base.dataset import Dataset
 from armcal.diagnose.evidence_findings import worse_than_nominal
-from armcal.diagnose.moved import FEWEST, moved_findings, moved_groups
+from armcal.diagnose.majority import FEWEST, moved_findings, moved_groups
 from armcal.estimate.nuisance import settled, started, untrained
 from armcal_contact.ball import BallInSocket, BallInSocketSettings
 

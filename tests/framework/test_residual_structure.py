@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import lru_cache
 
 import numpy as np
@@ -188,7 +188,7 @@ def test_records_of_no_weight_tell_nothing(lrm):
     one = looked_at(problem, problem.records(dataset, weights), start, dataset)
     other = looked_at(problem, problem.records(spoilt, weights), start, spoilt)
     assert one.records == other.records == 148
-    assert json.dumps(one.as_dict()) == json.dumps(other.as_dict())
+    assert json.dumps(asdict(one)) == json.dumps(asdict(other))
 
 
 def test_what_the_model_has_is_told_to_be_loosened_not_added(lrm):

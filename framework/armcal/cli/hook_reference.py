@@ -121,35 +121,6 @@ def reference(specifications: Any = hooks) -> Reference:
     return Reference(register, kinds, observers)
 
 
-def missing(reference: Reference) -> list[str]:
-    """What a reader would not find explained: hooks and methods without a docstring, arguments without a word."""
-    gaps = []
-    entries = [("", hook) for hook in (reference.register, *(k.hook for k in reference.kinds), *reference.observers)]
-    for protocol in _protocols(reference):
-        gaps += [f"{protocol.name}: a docstring"] if not protocol.text else []
-        entries += [(f"{protocol.name}.", method) for method in protocol.methods]
-    for before, entry in entries:
-        gaps += [f"{before}{entry.name}: a docstring"] if not entry.text else []
-        gaps += [f"{before}{entry.name}: the argument {a.name}" for a in entry.arguments if not a.explained]
-    return gaps
-
-
-def idle_words(reference: Reference) -> list[str]:
-    """Words of the table above that explain no argument."""
-    used = {
-        argument.name
-        for protocol in _protocols(reference)
-        for method in protocol.methods
-        for argument in method.arguments
-        if argument.explained == WORDS.get(argument.name)
-    }
-    return [word for word in WORDS if word not in used]
-
-
-def _protocols(reference: Reference) -> list[ProtocolEntry]:
-    return [protocol for kind in reference.kinds for protocol in (kind.protocol, *kind.beside)]
-
-
 def _protocol(target: str) -> ProtocolEntry:
     module, _, name = target.partition(":")
     made = getattr(import_module(module), name)

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -35,10 +34,6 @@ class Change:
     helped: float
     most_helped: tuple[tuple[str, float], ...]
     most_hurt: tuple[tuple[str, float], ...]
-
-    def as_dict(self) -> dict[str, Any]:
-        """For JSON."""
-        return asdict(self)
 
 
 def change(errors: Array, others: Array, against: str, ids: Sequence[str], block: BlockLength = "auto") -> Change:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -54,11 +54,10 @@ class Evidence:
         """For metrics.json."""
         alone = self.priors_alone
         return {
-            "residual_structure": None if self.structure is None else self.structure.as_dict(),
-            "large_errors": None if self.large_errors is None else self.large_errors.as_dict(),
-            "priors_alone": None
-            if alone is None
-            else {"worst_mm": alone.worst_mm, "between_mm": alone.between_mm, "poses": alone.poses},
+            "residual_structure": self.structure and asdict(self.structure),
+            "large_errors": self.large_errors and asdict(self.large_errors),
+            "priors_alone": alone
+            and {"worst_mm": alone.worst_mm, "between_mm": alone.between_mm, "poses": alone.poses},
         }
 
 

@@ -9,7 +9,7 @@ from armcal.base.domains import Array, Semidefinite, symmetric
 from armcal.base.parameters import ParameterBlock
 from armcal.diagnose.evidence import PriorsAlone
 from armcal.diagnose.large_errors import MEDIANS, LargeErrors
-from armcal.diagnose.noise_findings import Finding
+from armcal.diagnose.noise_findings import Finding, first_few
 from armcal.diagnose.odds import UNLISTED
 from armcal.diagnose.residual_structure import ResidualStructure, Structure
 from armcal.diagnose.smooth import CLEAR, IMITATED
@@ -72,10 +72,9 @@ def shift_findings(estimate: Estimate) -> list[Finding]:
     if not seen:
         return []
     worst = sorted(seen, key=lambda i: -abs(moved[i]))
-    listed = ", ".join(f"{estimate.names[i]} ({moved[i]:+.1f} sd)" for i in worst[:MOST_TOLD])
-    more = f" and {len(worst) - MOST_TOLD} more" if len(worst) > MOST_TOLD else ""
+    listed = first_few([f"{estimate.names[i]} ({moved[i]:+.1f} sd)" for i in worst], MOST_TOLD)
     held = ", ".join(sorted(blocks)[:MOST_TOLD]) + (" and others" if len(blocks) > MOST_TOLD else "")
-    text = f"Bounds that hold {held} shift other estimates: {listed}{more}. Their intervals do not count this shift."
+    text = f"Bounds that hold {held} shift other estimates: {listed}. Their intervals do not count this shift."
     return [Finding("note", text, f"step without bounds, more than {NOTICEABLE_SD:g} sd")]
 
 

@@ -76,10 +76,6 @@ class FitRows:
         below = np.zeros((len(self.residual) - len(self.record_of), parts[0].shape[1]))
         return np.vstack([*parts, below])
 
-    def stance(self, count: int) -> Array:
-        """How the arm stands in each record, by how its parameters move the residual (records x features)."""
-        return np.asarray(self.slopes[self.by_record][:, :, :count].reshape(len(self.by_record), -1))
-
     def mean_error(self, residual: Array) -> float:
         """Mean length of the raw residuals that rows stand for (m); root mean square over several factors."""
         return float(np.mean(self.errors(residual)))

@@ -9,7 +9,7 @@ import numpy as np
 from armcal.base.domains import Array
 from armcal.diagnose.gross import BEYOND, FAR_BEYOND, Displaced, Figure
 from armcal.diagnose.majority import Minority
-from armcal.diagnose.noise_findings import Finding
+from armcal.diagnose.noise_findings import Finding, first_few
 from armcal.diagnose.residual_structure import ResidualStructure
 from armcal.estimate.estimator import CHECK_THE_DATA, Estimate
 
@@ -112,13 +112,14 @@ def displacement_findings(figure: Figure) -> list[Finding]:
 
 
 def _listed(group: Sequence[Displaced]) -> str:
-    more = f" and {len(group) - MOST_NAMED} more" if len(group) > MOST_NAMED else ""
-    return f"{', '.join(map(_displacement, group[:MOST_NAMED]))}{more}"
-
-
-def _displacement(displaced: Displaced) -> str:
-    measure = "its prior" if displaced.by_prior else "a typical correction"
-    return f"{displaced.name} by {displaced.amount:.3g} {displaced.unit} ({displaced.times:.0f} times {measure})"
+    measures = ["its prior" if displaced.by_prior else "a typical correction" for displaced in group]
+    return first_few(
+        [
+            f"{d.name} by {d.amount:.3g} {d.unit} ({d.times:.0f} times {m})"
+            for d, m in zip(group, measures, strict=True)
+        ],
+        MOST_NAMED,
+    )
 
 
 def limit_findings(figure: Figure, scale_sd: float | None) -> list[Finding]:

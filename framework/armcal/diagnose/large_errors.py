@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,10 +61,6 @@ class LargeErrors:
     judged: int
     beyond: int
     explained: tuple[Miss, ...]
-
-    def as_dict(self) -> dict[str, Any]:
-        """For metrics.json."""
-        return asdict(self)
 
 
 @dataclass(frozen=True)

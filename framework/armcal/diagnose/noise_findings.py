@@ -31,6 +31,11 @@ class Finding:
         return self.text + (f" [{self.test}]" if self.test else "") + (f" {self.action}" if self.action else "")
 
 
+def first_few(texts: Sequence[str], most: int = 5) -> str:
+    """The first ones, and how many more there are."""
+    return ", ".join(texts[:most]) + (f" and {len(texts) - most} more" if len(texts) > most else "")
+
+
 def suspect_findings(fitted: WeighedFit, ids: Sequence[str]) -> list[Finding]:
     """Which training records lie beyond what noise does, at 1 % over all of them; ``ids`` are theirs."""
     if not fitted.suspects:
@@ -41,13 +46,12 @@ def suspect_findings(fitted: WeighedFit, ids: Sequence[str]) -> list[Finding]:
     for fate, group in (("Set aside", fitted.set_aside), (left, kept)):
         if not group:
             continue
-        weights = [f", weight {s.weight:.2g}" if 0 < s.weight < 1 else "" for s in group[:MOST_LISTED]]
-        listed = (f"{ids[s.record]} ({s.distance:.1f} sd{w})" for s, w in zip(group, weights, strict=False))
-        more = f" and {len(group) - MOST_LISTED} more" if len(group) > MOST_LISTED else ""
+        weights = [f", weight {s.weight:.2g}" if 0 < s.weight < 1 else "" for s in group]
+        listed = [f"{ids[s.record]} ({s.distance:.1f} sd{w})" for s, w in zip(group, weights, strict=True)]
         text = (
             f"{fate}, and farther from the fit than noise allows ({group[0].limit:.1f} sd, 1 % over all records): "
-            f"{len(group)} records: {', '.join(listed)}{more}. Their errors are counted all the same; residuals.csv "
-            "has them."
+            f"{len(group)} records: {first_few(listed, MOST_LISTED)}. Their errors are counted all the same; "
+            "residuals.csv has them."
         )
         findings.append(Finding("warning", text))
     return findings

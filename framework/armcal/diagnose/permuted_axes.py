@@ -7,9 +7,9 @@ adapted to first order. A right reading leaves little, a wrong one cannot be men
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import permutations, product
+from itertools import combinations, permutations, product
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -17,12 +17,17 @@ from scipy.spatial.transform import Rotation
 from armcal.arm.assembly import Arm
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
-from armcal.diagnose.permuted_columns import Wires, axes_words, several_joints, single_joints
+from armcal.diagnose.gross import thinned
 from armcal.errors import NotConvergedError
 from armcal.measure.partners import OTHER
 from armcal.problem.factor_records import subset
 from armcal.problem.problem import FactorRecords, Problem
 from armcal.problem.tool_motion import rigid_fit, spread_of
+
+Wires = Mapping[str, tuple[str, float]]
+"""Channels, each read as another one times a factor."""
+_DEGREES = 180 / np.pi
+_MOST_SIGNS = 8
 
 MUCH_BETTER = 3.0
 """A permutation leaves so many times less than the data as they stand."""
@@ -41,6 +46,58 @@ _LENGTHS = (10.0, 0.1)
 _AXIS_LENGTHS = (*_LENGTHS, 1000.0, 0.001)
 _SEVERAL_RECORDS, _MOST_NAMED = 100, 3
 _MM = 1000.0
+
+
+def single_joints(arm: Arm) -> list[tuple[str, Wires]]:
+    """Each joint's sign, each two joints of a kind exchanged, and all angles in another unit."""
+    joints = tuple(arm.commanded)
+    angles = {joint: joint for joint, dimension in arm.commanded.items() if dimension == "angle"}
+    readings: list[tuple[str, Wires]] = [
+        (f"the sign of {joint} reversed", _wires(arm, {joint: joint}, -1.0)) for joint in joints
+    ]
+    for one, other in combinations(joints, 2):
+        if arm.commanded[one] == arm.commanded[other]:
+            readings.append((f"{one} and {other} exchanged", _wires(arm, {one: other, other: one}, 1.0)))
+    for factor in (_DEGREES, 1 / _DEGREES):
+        readings.append((f"joint angles {factor:.3g} times as large", _wires(arm, angles, factor)))
+    return readings
+
+
+def several_joints(arm: Arm) -> Iterator[tuple[str, Wires]]:
+    """The signs of several joints, and joints in reverse order or shifted."""
+    joints = tuple(arm.commanded)
+    for size in range(2, len(joints) + 1) if len(joints) <= _MOST_SIGNS else ():
+        for chosen in combinations(joints, size):
+            words = f"the signs of {', '.join(chosen[:-1])} and {chosen[-1]} reversed"
+            yield words, _wires(arm, {joint: joint for joint in chosen}, -1.0)
+    if len(set(arm.commanded.values())) == 1:
+        orders = [joints[::-1], *(joints[step:] + joints[:step] for step in range(1, len(joints)))]
+        for order in orders if len(joints) > 2 else ():
+            yield (
+                f"({', '.join(order)}) taken for ({', '.join(joints)})",
+                _wires(arm, dict(zip(joints, order, strict=True)), 1.0),
+            )
+
+
+def axes_words(order: Sequence[int], signs: Sequence[float]) -> str:
+    """Axes in this order, with these signs."""
+    moved = [i for i in range(3) if order[i] != i]
+    negative = [_AXES[order[i]] for i in range(3) if signs[i] < 0]
+    if len(moved) == 2 and not negative:
+        return f"{_AXES[moved[0]]} and {_AXES[moved[1]]} exchanged"
+    if not moved:
+        return f"the sign{'s' * (len(negative) > 1)} of {' and '.join(negative)} reversed"
+    taken = (f"{'-' if sign < 0 else ''}{_AXES[axis]}" for axis, sign in zip(order, signs, strict=True))
+    return f"({', '.join(taken)}) taken for (x, y, z)"
+
+
+def _wires(arm: Arm, joints: Mapping[str, str], factor: float) -> dict[str, tuple[str, float]]:
+    """Commands and approaches of some joints read as those of others, times a factor; of approaches, times its sign."""
+    return {
+        f"{arm.name}.{part}{joint}": (f"{arm.name}.{part}{other}", scale)
+        for joint, other in joints.items()
+        for part, scale in (("", factor), ("approach.", float(np.sign(factor))))
+    }
 
 
 @dataclass(frozen=True)
@@ -81,7 +138,7 @@ class _Seen:
 
     def thinned(self, most: int) -> _Seen:
         """At most so many of the records, evenly."""
-        chosen = np.arange(0, self.records.count, max(1, -(-self.records.count // most)))
+        chosen = thinned(np.arange(self.records.count), most)
         return _Seen(self.kernel, subset([self.records], chosen)[0], self.measured[:, chosen])
 
 
@@ -148,8 +205,7 @@ def _seen(problem: Problem, records: Sequence[FactorRecords], dataset: Dataset, 
         return None
     if any(OTHER in name for name in factor.channels):
         return None
-    chosen = np.flatnonzero(records[number].measured)
-    chosen = chosen[:: max(1, -(-len(chosen) // _MOST_RECORDS))]
+    chosen = thinned(np.flatnonzero(records[number].measured), _MOST_RECORDS)
     if 3 * len(chosen) < _EQUATIONS * max(problem.increments, 6):
         return None
     own = replace(problem.subset(records, chosen)[number], whitening=None, correlation=None)

@@ -10,8 +10,7 @@ what is not among them: it is named alone only where it is clearly the likeliest
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -111,10 +110,6 @@ class ResidualStructure:
     def worthwhile(self) -> tuple[Structure, ...]:
         """Those that would lower the mean error by a hundredth of it."""
         return tuple(s for s in self.structures if s.falls_mm >= WORTHWHILE * self.mean_mm)
-
-    def as_dict(self) -> dict[str, Any]:
-        """For metrics.json."""
-        return asdict(self)
 
 
 def structure(

@@ -20,7 +20,7 @@ from armcal.diagnose.evidence_findings import (
     structure_findings,
     what_neighbours_cost,
 )
-from armcal.diagnose.noise_findings import Finding, component_findings, suspect_findings
+from armcal.diagnose.noise_findings import Finding, component_findings, first_few, suspect_findings
 from armcal.estimate.estimator import CHECK_THE_DATA, Estimate
 from armcal.estimate.identifiability import POOR_CONDITION, bound_together, correlated_pairs
 from armcal.estimate.prediction import NewRecording
@@ -148,7 +148,9 @@ def _in_short(
         ids = ", ".join(miss.record_id for miss in missed.explained[:MOST_TOLD])
         more = f" and {missed.beyond - MOST_TOLD} more" if missed.beyond > MOST_TOLD else ""
         sentences.append(f"Missed by more than {missed.limit_mm:.2f} {seen.unit}: {ids}{more}.")
-    sentences.append(f"Suspicious records: {_few(suspicious)}." if suspicious else "No training record is suspicious.")
+    sentences.append(
+        f"Suspicious records: {first_few(suspicious)}." if suspicious else "No training record is suspicious."
+    )
     if seen.structure is not None and seen.structure.worthwhile:
         listed = "; ".join(
             f"{s.words}{', or on another cause' if s.alternatives else ''} ({s.falls_mm:.2f} {seen.unit})"
@@ -198,17 +200,12 @@ def _bounds(estimate: Estimate) -> list[Finding]:
         (pushing if beyond > ndtri(1 - LEVEL) else agreeing).append(f"{name} ({beyond:.1f} sd beyond)")
     findings, test = [], "step without bounds, one-sided, 5 %"
     if pushing:
-        text = f"The data pushes against a bound: {_few(pushing)}. Something else in the model is missing."
+        text = f"The data pushes against a bound: {first_few(pushing)}. Something else in the model is missing."
         findings.append(Finding("warning", text, test, "Check loads, masses and signs; look for a missing effect."))
     if agreeing:
-        text = f"At a bound, and the data agrees: {_few(agreeing)}. The data limits it to one side only."
+        text = f"At a bound, and the data agrees: {first_few(agreeing)}. The data limits it to one side only."
         findings.append(Finding("note", text, test))
     return findings
-
-
-def _few(listed: Sequence[str], separator: str = ", ") -> str:
-    more = f" and {len(listed) - MOST_TOLD} more" if len(listed) > MOST_TOLD else ""
-    return separator.join(listed[:MOST_TOLD]) + more
 
 
 def _size(estimate: Estimate, seen: Evidence) -> Finding:
@@ -249,7 +246,7 @@ def _correlated(estimate: Estimate) -> list[Finding]:
     pairs = correlated_pairs(estimate.covariance, estimate.names, bound=bound_together(estimate.parameters))
     if not pairs:
         return []
-    listed = _few([f"{a} with {b} ({value:+.3f})" for a, b, value in pairs])
+    listed = first_few([f"{a} with {b} ({value:+.3f})" for a, b, value in pairs])
     return [Finding("note", f"Hard to tell apart: {listed}.", "correlation of estimates above 0.95")]
 
 

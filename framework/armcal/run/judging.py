@@ -22,8 +22,7 @@ from armcal.diagnose.gross_findings import (
     size_findings,
 )
 from armcal.diagnose.large_errors import Judged, large_errors
-from armcal.diagnose.majority import minority
-from armcal.diagnose.moved import moved_findings, moved_groups
+from armcal.diagnose.majority import minority, moved_findings, moved_groups
 from armcal.diagnose.noise_findings import Finding
 from armcal.diagnose.outside import predicted_positions
 from armcal.diagnose.residual_structure import structure

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 from armcal.base.config_text import as_json
@@ -61,7 +61,7 @@ class VariantResult:
                 "cross_validated": self.crossed.as_dict(),
                 "cross_validated_at_rest": self.at_rest.as_dict(),
             },
-            "change_mm": self.change.as_dict() if self.change else None,
+            "change_mm": self.change and asdict(self.change),
             "converged": self.converged,
             "failed_folds": self.failed_folds,
             "seconds": {"fit": self.fit_seconds, "all_fits": self.seconds},
