@@ -18,7 +18,6 @@ from armcal.base.dataset import Dataset
 from armcal.base.parameters import Parameters
 from armcal.estimate.estimator import Estimate, estimate
 from armcal.estimate.nuisance import started
-from armcal.estimate.simulation import SimulationRequest
 from armcal.problem.problem import Problem
 from armcal.problem.readings import with_joint_noise
 from armcal.run.experiment import Experiment
@@ -69,7 +68,7 @@ def recording(seed: int) -> Dataset:
     """Of the arms and the bracket as they are."""
     experiment = Experiment.load(CONFIGS / "wrong_clamp.yaml", [f"simulation.seed={seed}"])
     system = experiment.system
-    request = SimulationRequest(system.arms, system.measurements, experiment.parameters, system.environment)
+    request = experiment.simulation_request
     return experiment.simulator().simulate(request)
 
 

@@ -7,7 +7,6 @@ from pathlib import Path
 import click
 
 from armcal.cli.common import FILE, Console, overrides, speaking
-from armcal.estimate.simulation import SimulationRequest
 from armcal.measure.csv_writer import write_csv
 from armcal.run.experiment import Experiment
 
@@ -21,9 +20,7 @@ def simulate(console: Console, config: Path, out: Path, overrides: tuple[str, ..
     """Simulate measurements as the simulation section of CONFIG says."""
     registry = console.registry()
     experiment = Experiment.load(config, overrides, registry=registry)
-    system = experiment.system
-    request = SimulationRequest(system.arms, system.measurements, experiment.parameters, system.environment)
-    dataset = experiment.simulator().simulate(request)
+    dataset = experiment.simulator().simulate(experiment.simulation_request)
     write_csv(out, dataset, experiment.request(measured=True).channels)
     console.result({"records": len(dataset), "out": str(out)})
     console.out.print(f"{len(dataset)} records written: {out}")

@@ -23,7 +23,7 @@ from armcal.config.validate import validate
 from armcal.config.yaml_source import ConfigSource, load_config
 from armcal.errors import ConfigError
 from armcal.estimate.estimator import Estimator
-from armcal.estimate.simulation import Simulator
+from armcal.estimate.simulation import SimulationRequest, Simulator
 from armcal.estimate.weighing import weighed
 from armcal.measure.environment import noticed, require_conditions
 from armcal.measure.groups import grouped_instances, groups_of, unmatched
@@ -192,6 +192,12 @@ class Experiment:
         built: Simulator
         built, _ = build_component(self.source, self.registry, "simulator", ("simulation",))
         return built
+
+    @property
+    def simulation_request(self) -> SimulationRequest:
+        """What a simulator makes records of."""
+        system = self.system
+        return SimulationRequest(system.arms, system.measurements, self.parameters, system.environment)
 
 
 def with_data(source: ConfigSource, data: str | Path) -> ConfigSource:

@@ -15,7 +15,7 @@ from armcal.base.dataset import Dataset
 from armcal.base.units import display_unit, to_unit
 from armcal.diagnose.minimal import minimal_set
 from armcal.errors import InputError
-from armcal.estimate.simulation import SimulationRequest, measured_without_noise
+from armcal.estimate.simulation import measured_without_noise
 from armcal.measure.csv_writer import write_csv
 from armcal.plugins import PluginRegistry
 from armcal.problem.projection import factor_at_zero
@@ -84,9 +84,7 @@ def _fill(place: Path, robot: Robot, registry: PluginRegistry) -> FreeChoice:
     true = truth.made_up(parameters, weight_N * _reach(experiment, robot))
     _write(place, robot, nothing, truth.as_text(parameters, true))
     experiment = Experiment.load(place / SIMULATED, registry=registry)
-    system = experiment.system
-    request = SimulationRequest(system.arms, system.measurements, experiment.parameters, system.environment)
-    dataset = experiment.simulator().simulate(request)
+    dataset = experiment.simulator().simulate(experiment.simulation_request)
     write_csv(place / RECORDS, dataset, experiment.request(measured=True).channels)
     freed = f"parameters.free={json.dumps(truth.candidates(parameters))}"
     chosen = _choose_free(Experiment.load(place / SIMULATED, [freed], registry=registry), robot)
@@ -148,9 +146,7 @@ def _reach(experiment: Experiment, robot: Robot) -> float:
     random = np.random.default_rng(truth.SEED)
     commands = {f"arm.{j.name}": random.uniform(*j.limits, _TRIED_POSES) for j in robot.joints}
     poses = Dataset(tuple(str(i) for i in range(_TRIED_POSES)), commands)
-    system = experiment.system
-    request = SimulationRequest(system.arms, system.measurements, experiment.parameters, system.environment)
-    exact = measured_without_noise(request, poses)
+    exact = measured_without_noise(experiment.simulation_request, poses)
     reach = truth.reach(np.array([exact[f"tracker.{axis}"] for axis in "xyz"]))
     if not reach > _SMALLEST_REACH_M:
         raise InputError(

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from armcal.base.dataset import Dataset
@@ -14,7 +14,7 @@ from armcal.calibration.calibration import Calibration
 from armcal.calibration.calibration_file import sealed
 from armcal.errors import ConfigError, InputError, NotConvergedError
 from armcal.estimate.estimator import Progress, no_progress
-from armcal.estimate.simulation import Mission, SimulationRequest
+from armcal.estimate.simulation import Mission
 from armcal.io.plain_files import check_output
 from armcal.measure.csv_writer import write_csv
 from armcal.plugins import PluginRegistry
@@ -65,8 +65,7 @@ class MissionSource(Source):
     keeps_records = True
 
     def __init__(self, records: Sequence[Incoming], cut: int | None = None) -> None:
-        self._records = records
-        self._cut = cut
+        self._records, self._cut = records, cut
         self._next = 0
 
     @property
@@ -91,13 +90,9 @@ class MissionSource(Source):
         return self._records[self._next - 1]
 
 
-class Session(Protocol):
-    """Recalibrates from a source until it ends; resumes what is in the folder."""
-
-    def __call__(
-        self, calibration: Path, settings: RecalibrateSettings, source: MissionSource, folder: Path
-    ) -> Sequence[Mapping[str, Any]]:
-        """The events that it wrote; those up to a power cut, which it does not raise."""
+Session = Callable[[Path, RecalibrateSettings, MissionSource, Path], Sequence[Mapping[str, Any]]]
+"""Recalibrates a calibration from a source until that ends, resuming what is in the folder; the events that it wrote,
+those up to a power cut, which it does not raise."""
 
 
 @dataclass(frozen=True)
@@ -116,15 +111,11 @@ def simulated(plan: MissionPlan) -> Mission:
     Raises:
         ConfigError: the simulation does not fit the arm.
     """
-    experiment = plan.experiment
-    system = experiment.system
-    mission = plan.simulator.mission(
-        SimulationRequest(system.arms, system.measurements, experiment.parameters, system.environment)
-    )
+    mission = plan.simulator.mission(plan.experiment.simulation_request)
     if not len(mission.records):
         raise ConfigError(
             "no record arrives in this mission.",
-            where=experiment.source.where(("simulation",)),
+            where=plan.experiment.source.where(("simulation",)),
             hint="Make it longer, or lose fewer records.",
         )
     return mission
@@ -141,10 +132,7 @@ def before_launch(plan: MissionPlan, folder: Path, progress: Progress = no_progr
     if settings.calibration is not None:
         return settings.calibration
     bench = Experiment.load(settings.experiment or "", registry=plan.experiment.registry)
-    system = bench.system
-    made = bench.simulator().simulate(
-        SimulationRequest(system.arms, system.measurements, bench.parameters, system.environment)
-    )
+    made = bench.simulator().simulate(bench.simulation_request)
     write_csv(folder / BENCH, made, bench.request(measured=True).channels)
     again = Experiment.load(settings.experiment or "", data=folder / BENCH, registry=bench.registry)
     result = calibrate(again, progress=progress)

@@ -166,35 +166,28 @@ def _refusal(sentence: str) -> dict[str, Any]:
     return {"ok": False, "error": sentence}
 
 
-class Requests:
-    """Answers requests; commands act at once."""
+def answer(recalibration: Recalibration, session: Recalibrator, request: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The reply to one of the known commands, which act at once.
 
-    def __init__(self, recalibration: Recalibration, session: Recalibrator) -> None:
-        self._recalibration = recalibration
-        self._session = session
-
-    def answer(self, request: Mapping[str, Any]) -> Mapping[str, Any]:
-        """The reply to one of the known commands.
-
-        Raises:
-            ArmcalError: the request cannot be met.
-        """
-        match request["command"]:
-            case "pause":
-                self._recalibration.pause()
-            case "resume":
-                self._recalibration.resume()
-            case "finish":
-                self._recalibration.finishing = "It was asked to finish."
-            case "rollback":
-                to = request.get("to")
-                if isinstance(to, bool) or not isinstance(to, int) or to < 0:
-                    hint = "Give the sequence number of a record; every event has it."
-                    raise InputError(f"found {to!r}, expected a sequence number.", where=Location("to"), hint=hint)
-                self._recalibration.roll_back(to)
-            case "what_if":
-                return self._session.what_if(joint_values(request.get("joints"), self._session.request))
-        return self._recalibration.status()
+    Raises:
+        ArmcalError: the request cannot be met.
+    """
+    match request["command"]:
+        case "pause":
+            recalibration.pause()
+        case "resume":
+            recalibration.resume()
+        case "finish":
+            recalibration.finishing = "It was asked to finish."
+        case "rollback":
+            to = request.get("to")
+            if isinstance(to, bool) or not isinstance(to, int) or to < 0:
+                hint = "Give the sequence number of a record; every event has it."
+                raise InputError(f"found {to!r}, expected a sequence number.", where=Location("to"), hint=hint)
+            recalibration.roll_back(to)
+        case "what_if":
+            return session.what_if(joint_values(request.get("joints"), session.request))
+    return recalibration.status()
 
 
 def joint_values(joints: Any, request: ReadRequest) -> dict[str, float]:

@@ -57,12 +57,8 @@ class Recalibration:
         pace: Pace,
         since_checkpoint: int = 0,
     ) -> None:
-        self._source = source
-        self._journal = journal
-        self._session = session
-        self._state_replayer = state_replayer
-        self._outputs = outputs
-        self._pace = pace
+        self._source, self._journal, self._session = source, journal, session
+        self._state_replayer, self._outputs, self._pace = state_replayer, outputs, pace
         self._held: Incoming | None = None
         self._held_until = 0.0
         self._is_full = False

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,15 @@ RESERVE = "calibration.reserve"
 """As much room as a calibration needs: the journal would take all that is left of a disk."""
 RETRY_S = 10.0
 """What could not be written is tried again after so long."""
+_SENTENCES = {
+    "events": ("The events are not written to a file ({}).", "The events are written to a file again."),
+    "status": ("The status is not written ({}).", "The status is written again."),
+    "calibration": (
+        "The calibration is not written ({}); the one before stands. It is tried again.",
+        "The calibration is written again.",
+    ),
+}
+"""Of what is written: that it cannot be, and that it can again."""
 
 
 class Outputs:
@@ -29,10 +38,7 @@ class Outputs:
     """
 
     def __init__(self, folder: Path, stream: StandardOutput, events: EventFile, files: FileLayer = REAL_FILES) -> None:
-        self._folder = folder
-        self._stream = stream
-        self._events = events
-        self._files = files
+        self._folder, self._stream, self._events, self._files = folder, stream, events, files
         self._silent_until: dict[str, float] = {}
         self._troubled: set[str] = set()
 
@@ -45,53 +51,35 @@ class Outputs:
         """One event, everywhere."""
         line = as_line(event)
         self._stream_line(line)
-        if self._may("events"):
-            try:
-                self._events.write(line)
-            except OSError as fault:
-                self._failed("events", f"The events are not written to a file ({fault.strerror}).")
-            else:
-                self._mended("events", "The events are written to a file again.")
+        self._attempt("events", lambda: self._events.write(line))
 
     def status(self, status: Mapping[str, Any]) -> None:
         """The newest status, in place of the one before."""
-        if not self._may("status"):
-            return
-        try:
-            write_whole(self._files, self._folder / STATUS, as_line(status).encode() + b"\n")
-        except OSError as fault:
-            self._failed("status", f"The status is not written ({fault.strerror}).")
-        else:
-            self._mended("status", "The status is written again.")
+        data = as_line(status).encode() + b"\n"
+        self._attempt("status", lambda: write_whole(self._files, self._folder / STATUS, data))
 
     def calibration(self, text: str) -> bool:
         """The updated calibration, in place of the one before; whether that went well."""
-        if not self._may("calibration"):
-            return False
-        data, reserve = text.encode(), self._folder / RESERVE
+        return self._attempt("calibration", lambda: self._replace_calibration(text.encode()))
+
+    def _replace_calibration(self, data: bytes) -> None:
+        reserve = self._folder / RESERVE
         try:
-            try:
-                write_whole(self._files, self.calibration_path, data)
-            except OSError as fault:
-                if not is_full(fault):
-                    raise
-                # Events and reserve make room.
-                with contextlib.suppress(OSError):
-                    self._events.give_up()
-                self._failed("events", "The events of the past were dropped: the disk is full.")
-                with contextlib.suppress(OSError):
-                    self._files.remove(reserve)
-                write_whole(self._files, self.calibration_path, data)
-            with contextlib.suppress(OSError):
-                # Somewhat larger than the calibration: the next one can be written in its place.
-                if not reserve.exists() or self._files.size(reserve) < len(data):
-                    write_whole(self._files, reserve, b"\0" * (len(data) + len(data) // 4 + 4096))
+            write_whole(self._files, self.calibration_path, data)
         except OSError as fault:
-            sentence = f"The calibration is not written ({fault.strerror}); the one before stands. It is tried again."
-            self._failed("calibration", sentence)
-            return False
-        self._mended("calibration", "The calibration is written again.")
-        return True
+            if not is_full(fault):
+                raise
+            # Events and reserve make room.
+            with contextlib.suppress(OSError):
+                self._events.give_up()
+            self._failed("events", "The events of the past were dropped: the disk is full.")
+            with contextlib.suppress(OSError):
+                self._files.remove(reserve)
+            write_whole(self._files, self.calibration_path, data)
+        with contextlib.suppress(OSError):
+            # Somewhat larger than the calibration: the next one can be written in its place.
+            if not reserve.exists() or self._files.size(reserve) < len(data):
+                write_whole(self._files, reserve, b"\0" * (len(data) + len(data) // 4 + 4096))
 
     def rotate(self) -> None:
         """Begin a new file of events."""
@@ -118,20 +106,26 @@ class Outputs:
             sentence = f"{lost} events were left out here: nobody read them in time."
             self._stream.write(as_line({"event": "alarm", "at": time.time(), "sentence": sentence}))
 
-    def _may(self, what: str) -> bool:
-        """Whether it is time to try."""
-        return time.monotonic() >= self._silent_until.get(what, -math.inf)
+    def _attempt(self, what: str, write: Callable[[], None]) -> bool:
+        """Write, if it is time to; whether that went well."""
+        if time.monotonic() < self._silent_until.get(what, -math.inf):
+            return False
+        broken, mended = _SENTENCES[what]
+        try:
+            write()
+        except OSError as fault:
+            self._failed(what, broken.format(fault.strerror))
+            return False
+        self._silent_until.pop(what, None)
+        if what in self._troubled:
+            self._troubled.discard(what)
+            self._report(what, mended)
+        return True
 
     def _failed(self, what: str, sentence: str) -> None:
         self._silent_until[what] = time.monotonic() + RETRY_S
         if what not in self._troubled:
             self._troubled.add(what)
-            self._report(what, sentence)
-
-    def _mended(self, what: str, sentence: str) -> None:
-        self._silent_until.pop(what, None)
-        if what in self._troubled:
-            self._troubled.discard(what)
             self._report(what, sentence)
 
     def _report(self, what: str, sentence: str) -> None:

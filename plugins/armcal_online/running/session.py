@@ -19,7 +19,7 @@ from armcal.io.journal.journal import Journal, JournalLimits
 from armcal.io.journal.reader import read_until, verify
 from armcal.io.standard_output import StandardOutput
 
-from armcal_online.running.control import SOCKET, ControlServer, Requests
+from armcal_online.running.control import SOCKET, ControlServer, answer
 from armcal_online.running.loop import Pace, Recalibration
 from armcal_online.running.outputs import CALIBRATION, RESERVE, STATUS, Outputs
 from armcal_online.running.state_replayer import STARTED, ReplayDiffersError, StateReplayer
@@ -117,7 +117,7 @@ def opened(setup: Setup, session: Recalibrator, source_of: SourceOf) -> Iterator
             outputs.alarm(f"{fault.message} {text}")
         left = len(journal.recovered.entries) if resumed else 0
         recalibration = Recalibration(source, journal, session, state_replayer, outputs, setup.pace, left)
-        control = ControlServer(setup.folder, Requests(recalibration, session).answer)
+        control = ControlServer(setup.folder, partial(answer, recalibration, session))
         stack.callback(control.close)
         yield Open(recalibration, control)
 

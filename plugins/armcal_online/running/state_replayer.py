@@ -128,9 +128,7 @@ class StateReplayer:
     """A session and how far its source was taken, moved on by journal entries."""
 
     def __init__(self, session: Recalibrator, reach: Reach, journal_name: str = "") -> None:
-        self._session = session
-        self._reach = reach
-        self._name = journal_name
+        self._session, self._reach, self._name = session, reach, journal_name
         self._initial = session.snapshot()
         self.progress = Progress()
 

@@ -163,9 +163,7 @@ class LineParser:
     """
 
     def __init__(self, rows: RowParser, kind: Kind, source: str) -> None:
-        self._rows = rows
-        self._kind = kind
-        self._source = source
+        self._rows, self._kind, self._source = rows, kind, source
         self._table: Table | None = None
         self.refused = ""
 

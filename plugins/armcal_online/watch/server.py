@@ -81,23 +81,15 @@ class Access:
         return named is not None and (named["ipv6"] or named["name"]) in (*_OWN_NAMES, self.host)
 
 
-@dataclass(frozen=True)
-class Page:
-    """A page as it is sent, and its Content-Security-Policy."""
-
-    html: bytes
-    policy: str
-
-
-def page() -> Page:
-    """Put together from the files of this package."""
+def page() -> tuple[bytes, str]:
+    """The page as it is sent, put together from the files of this package, and its Content-Security-Policy."""
     style, script = _file("page.css"), "\n".join(_file(name) for name in SCRIPTS)
     html = _file("page.html").replace("/* style */", style).replace("/* script */", script)
     policy = (
         f"default-src 'none'; script-src {_hash(script)}; style-src {_hash(style)}; connect-src 'self'; "
         "img-src data:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
     )
-    return Page(html.encode(), policy)
+    return html.encode(), policy
 
 
 def _file(name: str) -> str:
@@ -136,7 +128,7 @@ class WatchServer(ThreadingHTTPServer):
     ) -> None:
         self.feed, self.heartbeat, self.patience = feed, heartbeat, patience
         self.access = Access.of(host)
-        self.page = page()
+        self.page, self.policy = page()
         self.streams = threading.BoundedSemaphore(MOST_STREAMS)
         self.ending = threading.Event()
         self._connections = threading.BoundedSemaphore(_MOST_CONNECTIONS)
@@ -199,7 +191,7 @@ class _Handler(BaseHTTPRequestHandler):
         if not self.server.access.allows(self.headers.get("Host"), query.get("token")):
             self._answer(HTTPStatus.FORBIDDEN, b"Forbidden: wrong name or token in the address.\n")
         elif address.path == "/":
-            self._answer(HTTPStatus.OK, self.server.page.html, "text/html")
+            self._answer(HTTPStatus.OK, self.server.page, "text/html")
         elif address.path == "/state":
             state = json.dumps(self.server.feed.state(), allow_nan=False, separators=(",", ":"))
             self._answer(HTTPStatus.OK, state.encode(), "application/json")
@@ -223,7 +215,7 @@ class _Handler(BaseHTTPRequestHandler):
     def _head(self, status: HTTPStatus, kind: str) -> None:
         self.send_response(status)
         self.send_header("Content-Type", kind)
-        self.send_header("Content-Security-Policy", self.server.page.policy)
+        self.send_header("Content-Security-Policy", self.server.policy)
         for name, value in _ALWAYS.items():
             self.send_header(name, value)
 
