@@ -67,9 +67,7 @@ class JointPath:
 def recording(seed: int) -> Dataset:
     """Of the arms and the bracket as they are."""
     experiment = Experiment.load(CONFIGS / "wrong_clamp.yaml", [f"simulation.seed={seed}"])
-    system = experiment.system
-    request = experiment.simulation_request
-    return experiment.simulator().simulate(request)
+    return experiment.simulator().simulate(experiment.simulation_request)
 
 
 def clamp_study(seeds: Iterable[int]) -> dict[str, ClampErrors]:

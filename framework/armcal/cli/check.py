@@ -9,9 +9,9 @@ from typing import Any
 
 import click
 import numpy as np
-from rich.table import Table
 
 from armcal.cli.common import FILE, Console, data, overrides, speaking
+from armcal.cli.console import columned
 from armcal.cli.outlet import say
 from armcal.errors import ProblemError
 from armcal.estimate.identifiability import Identifiability
@@ -52,9 +52,7 @@ def check(console: Console, config: Path, data: Path | None, overrides: tuple[st
         f"{len(records['set_aside'])} set aside), {content['equations']} equations for "
         f"{len(parameters['free'])} free of {len(parameters['all'])} parameters."
     )
-    table = Table(title="Excitation of the joints", title_justify="left")
-    for column in ("joint", "from", "to", "levels"):
-        table.add_column(column, justify="left" if column == "joint" else "right")
+    table = columned("Excitation of the joints", ("joint", "from", "to", "levels"))
     for joint, seen in content["excitation_rad_or_m"].items():
         table.add_row(joint, f"{seen['min']:.3f}", f"{seen['max']:.3f}", str(seen["levels"]))
     out.print(table)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 from rich.console import Console, ConsoleOptions, Group, RenderableType
@@ -39,6 +39,14 @@ class Screen(Console):
     def on_broken_pipe(self) -> None:
         """Nobody reads any longer: said to nobody, as ``Outlet`` has it."""
         self.quiet = True
+
+
+def columned(title: str, columns: Iterable[str], left: Sequence[str] = ()) -> Table:
+    """A table of numbers, which stand to the right; the first column and those of ``left`` hold words."""
+    table = Table(title=title, title_justify="left")
+    for place, column in enumerate(columns):
+        table.add_column(column, justify="left" if not place or column in left else "right")
+    return table
 
 
 def as_list(table: Table) -> Group:

@@ -9,10 +9,10 @@ from typing import Any
 
 import click
 import numpy as np
-from rich.table import Table
 
 from armcal.base.units import display_unit, to_unit
 from armcal.cli.common import FILE, Console, overrides, speaking
+from armcal.cli.console import columned
 from armcal.config.selection import DIMENSION_OF_UNIT
 from armcal.errors import ConfigError
 from armcal.measure.csv_writer import write_csv
@@ -118,9 +118,8 @@ def _show(console: Console, content: dict[str, Any]) -> None:
     indices = "  ".join(f"{name.upper()} {value:.4g}" for name, value in content["observability"].items())
     console.line(f"observability: {indices}")
     parameters = content["parameters"]
-    table = Table(title="Predicted standard deviations, the largest first", title_justify="left")
-    for column in ("parameter", "before", "after", "unit"):
-        table.add_column(column, justify="left" if column in ("parameter", "unit") else "right")
+    columns = ("parameter", "before", "after", "unit")
+    table = columned("Predicted standard deviations, the largest first", columns, left=("unit",))
     worst = np.argsort([-p["sd_in_ordinary_sizes"] for p in parameters], kind="stable")[:_SHOWN]
     for p in (parameters[i] for i in worst):
         dimension = DIMENSION_OF_UNIT.get(p["unit"])

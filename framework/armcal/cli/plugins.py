@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -57,52 +57,26 @@ def list_plugins(as_json: bool, quiet: bool, verbose: bool) -> None:
                 click.echo(f"  {component.kind:<12} {component.name:<18} {component.summary}{place}")
 
 
-@dataclass(frozen=True)
-class _Report:
+def _report(name: str, plugins: Sequence[PluginInfo], results: Sequence[CheckResult]) -> dict[str, Any]:
     """What the checks found on the plugins of one name."""
+    rows = [
+        {"component": r.component, "check": r.check, "fault": r.fault or None, "not_run": r.not_run or None}
+        for r in results
+    ]
+    failed, left = (sum(row[key] is not None for row in rows) for key in ("fault", "not_run"))
+    counts = {"ran": len(rows) - left, "failed": failed, "not_run": left}
+    broken = "; ".join(plugin.fault for plugin in plugins if plugin.fault)
+    return {"plugin": name, "fault": broken or None, **counts, "checks": rows}
 
-    name: str
-    plugins: tuple[PluginInfo, ...]
-    results: tuple[CheckResult, ...]
 
-    @property
-    def broken(self) -> str:
-        """Why it does not load; empty if it does."""
-        return "; ".join(plugin.fault for plugin in self.plugins if plugin.fault)
-
-    @property
-    def failed(self) -> tuple[CheckResult, ...]:
-        """Checks that found a fault."""
-        return tuple(result for result in self.results if result.fault)
-
-    @property
-    def left(self) -> tuple[CheckResult, ...]:
-        """Checks that did not run."""
-        return tuple(result for result in self.results if result.not_run)
-
-    @property
-    def ran(self) -> int:
-        """How many checks ran."""
-        return len(self.results) - len(self.left)
-
-    def content(self) -> dict[str, Any]:
-        """For JSON."""
-        rows = [
-            {"component": r.component, "check": r.check, "fault": r.fault or None, "not_run": r.not_run or None}
-            for r in self.results
-        ]
-        counts = {"ran": self.ran, "failed": len(self.failed), "not_run": len(self.left)}
-        return {"plugin": self.name, "fault": self.broken or None, **counts, "checks": rows}
-
-    def show(self, verbose: bool) -> None:
-        """For people."""
-        for result in self.results:
-            if verbose or result.fault:
-                mark, fault = ("FAIL", f": {result.fault}") if result.fault else ("ok  ", "")
-                click.echo(f"{'--  ' if result.not_run else mark} {result.component}: {result.check}{fault}")
-        left = f", {len(self.left)} not run" if self.left else ""
-        why = f"{left} (-v says why)" if left and not verbose else left
-        click.echo(f"{self.name}: {self.ran - len(self.failed)} of {self.ran} checks passed{why}.")
+def _show(report: Mapping[str, Any], verbose: bool) -> None:
+    for row in report["checks"]:
+        if verbose or row["fault"]:
+            mark, fault = ("FAIL", f": {row['fault']}") if row["fault"] else ("ok  ", "")
+            click.echo(f"{'--  ' if row['not_run'] else mark} {row['component']}: {row['check']}{fault}")
+    left = f", {report['not_run']} not run" if report["not_run"] else ""
+    why = f"{left} (-v says why)" if left and not verbose else left
+    click.echo(f"{report['plugin']}: {report['ran'] - report['failed']} of {report['ran']} checks passed{why}.")
 
 
 @plugins.command("check")
@@ -123,16 +97,15 @@ def check_plugin(name: str | None, as_json: bool, quiet: bool, verbose: bool) ->
     for text in names:
         chosen = tuple(plugin for plugin in registry.plugins if plugin.name == text)
         results = [result for plugin in chosen for result in checks_of(plugin, registry)]
-        reports.append(_Report(text, chosen, tuple(results)))
+        reports.append(_report(text, chosen, results))
     if as_json:
-        content = [report.content() for report in reports]
-        click.echo(json.dumps({"plugins": content} if name is None else content[0], indent=2))
+        click.echo(json.dumps({"plugins": reports} if name is None else reports[0], indent=2))
     elif not quiet:
         for report in reports:
-            report.show(verbose)
-    failed = [report for report in reports if report.failed]
+            _show(report, verbose)
+    failed = [report for report in reports if report["failed"]]
     for report in failed:
-        click.echo(f"armcal: {report.name}: {report.broken or 'it breaks the plugin contract'}", err=True)
+        click.echo(f"armcal: {report['plugin']}: {report['fault'] or 'it breaks the plugin contract'}", err=True)
     if failed:
         sys.exit(EXIT_BAD_INPUT)
 

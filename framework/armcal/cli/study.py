@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import click
-from rich.table import Table
 
 from armcal.cli.common import FILE, Console, command_line, data, overrides, parallel, speaking
+from armcal.cli.console import columned
 from armcal.io.folder import reserved
 from armcal.io.parallel import Executor
 from armcal.report.study_page import conclusions, render_study, render_transfer, transfer_conclusions, transfer_table
@@ -60,8 +59,8 @@ def study(
 def _show_study(console: Console, result: StudyResult) -> None:
     records = f"{len(result.dataset)} records, {result.folds} folds"
     records += f" drawn {result.repeats} times" if result.repeats > 1 else ""
-    columns = ("free", "train", "cv", "cv 95 %", "change", "± se", "helps")
-    table = _table(f"{result.name}: mean error, {result.unit}; cross-validated (cv): {records}", ("variant",), columns)
+    title = f"{result.name}: mean error, {result.unit}; cross-validated (cv): {records}"
+    table = columned(title, ("variant", "free", "train", "cv", "cv 95 %", "change", "± se", "helps"))
     for v in result.variants:
         moved = ["", "", ""]
         if v.change:
@@ -78,19 +77,10 @@ def _show_study(console: Console, result: StudyResult) -> None:
 
 def _show_transfer(console: Console, result: TransferResult) -> None:
     shown = transfer_table(result)
-    words = [[name for name, number in shown.headings if number is is_number] for is_number in (False, True)]
-    table = _table(f"{result.name}: {shown.caption}", words[0], words[1])
+    words = [name for name, is_number in shown.headings if not is_number]
+    table = columned(f"{result.name}: {shown.caption}", [name for name, _ in shown.headings], left=words)
     for row in shown.rows:
         table.add_row(*row)
     console.out.print(table)
     for text in transfer_conclusions(result):
         console.line(text)
-
-
-def _table(title: str, words: Sequence[str], numbers: Sequence[str]) -> Table:
-    table = Table(title=title, title_justify="left")
-    for column in words:
-        table.add_column(column)
-    for column in numbers:
-        table.add_column(column, justify="right")
-    return table

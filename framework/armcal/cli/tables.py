@@ -11,6 +11,7 @@ from rich.text import Text
 
 from armcal.base.domains import Semidefinite, symmetric
 from armcal.cli.common import Console
+from armcal.cli.console import columned
 from armcal.estimate.bootstrap import Bootstrap
 from armcal.estimate.validation import ErrorSummary
 from armcal.report.numbers import MINUS, NONE, decimals_for, shown_unit, significant
@@ -55,9 +56,8 @@ def _findings(result: RunResult) -> Table:
 
 def _errors(result: RunResult) -> Table:
     unit = result.errors.unit
-    table = Table(title=f"{'Tip' if unit == 'mm' else 'Angle'} error, {unit}: {result.name}", title_justify="left")
-    for column in ("records", "count", "", "mean", "rms", "95 %", "max"):
-        table.add_column(column, justify="left" if column in ("records", "") else "right")
+    title = f"{'Tip' if unit == 'mm' else 'Angle'} error, {unit}: {result.name}"
+    table = columned(title, ("records", "count", "", "mean", "rms", "95 %", "max"), left=("",))
     for key, words in _SETS.items():
         before, after = result.table.nominal[key], result.table.calibrated[key]
         if not after.count:
@@ -72,10 +72,9 @@ def _errors(result: RunResult) -> Table:
 
 def _groups(result: RunResult) -> Table:
     """A row a group: what its records miss each other by, and what its known distances miss."""
-    table = Table(title=f"By group, mean, {result.errors.unit}: before and after", title_justify="left")
     distances = any(group.distance_error_mm is not None for group in result.groups.errors)
-    for column in ("group", "records", "", "error", "", *(("distance error", "") if distances else ())):
-        table.add_column(column, justify="left" if column in ("group", "") else "right")
+    columns = ("group", "records", "", "error", "", *(("distance error", "") if distances else ()))
+    table = columned(f"By group, mean, {result.errors.unit}: before and after", columns, left=("",))
     for group in result.groups.errors:
         numbers = [f"{group.nominal_error_mm:.3f}", f"-> {group.error_mm:.3f}"]
         if distances:
@@ -91,9 +90,8 @@ def _numbers(summary: ErrorSummary) -> list[str]:
 
 def _compliances(result: RunResult) -> Table:
     estimate = result.estimate
-    table = Table(title=f"Compliance, {shown_unit('rad_per_Nm')[1]}", title_justify="left")
-    for column in ("parameter", "value", "sd", "95 % interval", ""):
-        table.add_column(column, justify="left" if column in ("parameter", "") else "right")
+    title = f"Compliance, {shown_unit('rad_per_Nm')[1]}"
+    table = columned(title, ("parameter", "value", "sd", "95 % interval", ""), left=("",))
     for i, row in enumerate(parameter_rows(estimate)):
         if row.si_unit != "rad_per_Nm" or estimate.parameters[row.name.partition("[")[0]].size > 1:
             continue
@@ -117,9 +115,7 @@ def _matrices(result: RunResult) -> Table:
     """Compliance matrices by their principal values, the softest direction last."""
     estimate = result.estimate
     factor, unit = shown_unit("rad_per_Nm")
-    table = Table(title=f"Principal compliances, {unit}", title_justify="left")
-    for column in ("parameter", "stiffest", "", "softest"):
-        table.add_column(column, justify="left" if column == "parameter" else "right")
+    table = columned(f"Principal compliances, {unit}", ("parameter", "stiffest", "", "softest"))
     for block in estimate.parameters.free:
         if isinstance(block.domain, Semidefinite):
             sizes = np.linalg.eigvalsh(symmetric(estimate.values[estimate.parameters.entries_of(block.name)]))
@@ -131,9 +127,8 @@ def _bootstrap(result: RunResult, bootstrap: Bootstrap) -> Table:
     """How sure each parameter is, in SI, by curvature and by refits."""
     how = f"blocks of {bootstrap.block}" if bootstrap.method == "blocks" else "parametric"
     failed = f", {bootstrap.failed} more did not converge" if bootstrap.failed else ""
-    table = Table(title=f"Bootstrap, {len(bootstrap.values)} refits{failed}; {how}", title_justify="left")
-    for column in ("parameter", "value", "sd", "bootstrap sd", "bootstrap 95 % interval"):
-        table.add_column(column, justify="left" if column == "parameter" else "right")
+    title = f"Bootstrap, {len(bootstrap.values)} refits{failed}; {how}"
+    table = columned(title, ("parameter", "value", "sd", "bootstrap sd", "bootstrap 95 % interval"))
     estimate = result.estimate
     for i, name in enumerate(bootstrap.names):
         sd, low, high = (float(x) for x in (bootstrap.deviations[i], *bootstrap.intervals[i]))

@@ -11,11 +11,11 @@ from typing import Any
 import click
 from armcal.calibration.calibration import Calibration
 from armcal.cli.common import Console, overrides, speaking
+from armcal.cli.console import columned
 from armcal.io.folder import reserved
 from armcal.io.standard_output import StandardOutput
 from armcal.plugins import PluginRegistry
 from armcal.run.pipeline import Stopwatch
-from rich.table import Table
 
 from armcal_online.commands.recalibrate import setup_of
 from armcal_online.mission.files import figures, write_files
@@ -60,12 +60,10 @@ def mission(console: Console, config: Path, out: Path, overrides: tuple[str, ...
     write_files(out, plan, result, content)
     console.result({**content, "folder": str(out)})
     errors, counts = content["error_mm"], content["records"]
-    table = Table(title=f"Mean tip error over {content['days']:g} days, mm", title_justify="left")
-    table.add_column("calibration")
-    for column in ("mean", "median", "p95", "max", "last"):
-        table.add_column(column, justify="right")
+    columns = ("mean", "median", "p95", "max", "last")
+    table = columned(f"Mean tip error over {content['days']:g} days, mm", ("calibration", *columns))
     for name, summary in errors.items():
-        table.add_row(name, *(f"{summary[column]:.3f}" for column in ("mean", "median", "p95", "max", "last")))
+        table.add_row(name, *(f"{summary[column]:.3f}" for column in columns))
     console.out.print(table)
     for event in content["events"]:
         records = event["recovered_after_records"]
