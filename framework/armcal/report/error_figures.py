@@ -32,7 +32,16 @@ def roles(result: RunResult) -> tuple[Mask, Mask]:
 
 def distribution(result: RunResult) -> Figure | None:
     """Share of records below each error, nominal and calibrated, on one axis; None without records."""
-    curves = _curves(result)
+    train, holdout = roles(result)
+    errors = result.errors
+    curves = [
+        ("before", "nominal", errors.nominal_mm),
+        ("train", "calibrated, train", errors.calibrated_mm[train]),
+        ("holdout", "calibrated, holdout", errors.calibrated_mm[holdout]),
+        ("crossed", "calibrated, cross-validated", errors.cross_validated_mm),
+    ]
+    finite = [(css, name, values[np.isfinite(values)]) for css, name, values in curves]
+    curves = [(css, f"{name} ({count(len(values))})", values) for css, name, values in finite if len(values)]
     if not curves:
         return None
     values = np.concatenate([errors for _, _, errors in curves])
@@ -61,20 +70,6 @@ def distribution(result: RunResult) -> Figure | None:
     return svg.both("distribution", ("Errors before and after", said, caption), draw)
 
 
-def _curves(result: RunResult) -> list[tuple[str, str, Array]]:
-    """Class, name and finite errors of each curve that has any."""
-    train, holdout = roles(result)
-    errors = result.errors
-    curves = [
-        ("before", "nominal", errors.nominal_mm),
-        ("train", "calibrated, train", errors.calibrated_mm[train]),
-        ("holdout", "calibrated, holdout", errors.calibrated_mm[holdout]),
-        ("crossed", "calibrated, cross-validated", errors.cross_validated_mm),
-    ]
-    finite = [(css, name, values[np.isfinite(values)]) for css, name, values in curves]
-    return [(css, f"{name} ({count(len(values))})", values) for css, name, values in finite if len(values)]
-
-
 def _ecdf(errors: Array, x: Axis, y: Axis, css: str) -> str:
     ordered = np.sort(errors)
     if len(ordered) > _CURVE_POINTS:
@@ -94,7 +89,13 @@ def in_order(result: RunResult, worst: NDArray[np.intp]) -> Figure | None:
     clipped = len(finite) > 20 and largest > _OUTLIER * ninety_five > 0
     top = 2 * ninety_five if clipped else max(largest * 1.06, 1e-9)
     thinned = len(errors) > PLAIN_POINTS
-    words = _order_words(len(errors), thinned, int(np.sum(finite > top)) if clipped else 0)
+    beyond = int(np.sum(finite > top)) if clipped else 0
+    words = "The dashed line marks 95 % of all records; rings mark the ten worst. "
+    if thinned:
+        words += f"{plural(len(errors), 'record')} are too many to draw one by one: drawn as bands. "
+    else:
+        words += "The dark line is the running median: where it wanders, the setup changed on the way. "
+    words += f"Triangles: {plural(beyond, 'record')} beyond the axis." if beyond else ""
     few = len(finite) < FEWEST_FOR_P95
     most = f"all lie below {significant(largest)}" if few else f"95 % lie below {significant(ninety_five)}"
     said = f"{plural(len(errors), 'record')}; {most} {result.errors.unit}."
@@ -113,15 +114,6 @@ def in_order(result: RunResult, worst: NDArray[np.intp]) -> Figure | None:
         return box.bottom + 44, parts
 
     return svg.both("order", ("Error of each record in recorded order", said, words), draw)
-
-
-def _order_words(number: int, thinned: bool, beyond: int) -> str:
-    words = "The dashed line marks 95 % of all records; rings mark the ten worst. "
-    if thinned:
-        words += f"{plural(number, 'record')} are too many to draw one by one: drawn as bands. "
-    else:
-        words += "The dark line is the running median: where it wanders, the setup changed on the way. "
-    return words + (f"Triangles: {plural(beyond, 'record')} beyond the axis." if beyond else "")
 
 
 def _order_legend(result: RunResult, thinned: bool) -> list[tuple[str, str]]:

@@ -29,9 +29,23 @@ def compliances(rows: Sequence[ParameterRow]) -> Figure | None:
     ranked = sorted(range(len(rows)), key=lambda i: (not rows[i].at_bound, -abs(rows[i].raw.value)))
     shown = [rows[i] for i in sorted(ranked[:MOST_WHISKERS])]
     unit = shown[0].unit
-    caption = _whisker_words(shown, len(rows))
+    words = "Dot: value; whisker: 95 % interval; dark line at 0: the physical bound"
+    words += "; hollow dot: ended at its bound" if any(r.at_bound for r in shown) else ""
+    words += "; dashed: not determined" if not all(r.determined for r in shown) else ""
+    words += "; small bar: nominal, where it is not 0" if any(r.raw.nominal for r in shown) else ""
+    caption = (
+        f"{words}. {len(shown)} of {len(rows)}: at a bound, or the largest." if len(shown) < len(rows) else f"{words}."
+    )
     said = "; ".join(f"{r.name} {r.value} {unit}, {r.interval}" for r in shown[:12])
-    low, high = _range(shown)
+    ends = [0.0]
+    for row in shown:
+        raw = row.raw
+        ends += [raw.value, raw.nominal]
+        ends += [raw.lower, raw.upper] if math.isfinite(raw.sd) else []
+    finite = [e for e in ends if math.isfinite(e)]
+    low, high = min(finite), max(finite)
+    room = (high - low) * 0.04 or 1e-3
+    low, high = low - room, high + room
 
     def draw(width: float) -> tuple[float, list[str]]:
         most = 14 if width == svg.NARROW else 26
@@ -57,26 +71,6 @@ def _beside(row: ParameterRow) -> str:
     return f"{row.value.strip()}   ({row.interval if row.determined else 'not determined'})"
 
 
-def _whisker_words(shown: Sequence[ParameterRow], total: int) -> str:
-    words = "Dot: value; whisker: 95 % interval; dark line at 0: the physical bound"
-    words += "; hollow dot: ended at its bound" if any(r.at_bound for r in shown) else ""
-    words += "; dashed: not determined" if not all(r.determined for r in shown) else ""
-    words += "; small bar: nominal, where it is not 0" if any(r.raw.nominal for r in shown) else ""
-    return f"{words}. {len(shown)} of {total}: at a bound, or the largest." if len(shown) < total else f"{words}."
-
-
-def _range(rows: Sequence[ParameterRow]) -> tuple[float, float]:
-    ends = [0.0]
-    for row in rows:
-        raw = row.raw
-        ends += [raw.value, raw.nominal]
-        ends += [raw.lower, raw.upper] if math.isfinite(raw.sd) else []
-    finite = [e for e in ends if math.isfinite(e)]
-    low, high = min(finite), max(finite)
-    room = (high - low) * 0.04 or 1e-3
-    return low - room, high + room
-
-
 def _whisker(row: ParameterRow, x: Axis, y: float) -> list[str]:
     raw = row.raw
     known = math.isfinite(raw.sd)
@@ -99,7 +93,16 @@ def correlation_map(correlation: Array, names: tuple[str, ...], known: Sequence[
     cell = min(26.0, max(14.0, 560.0 / number))
     margin = MONO * max(len(name) for name in short) + 14
     side = cell * number
-    parts = _cells(correlation, names, known, margin, cell)
+    parts = []
+    for i in range(len(names)):
+        for j in range(i + 1):
+            colour, title = _DIAGONAL, ""
+            if i != j:
+                both_known = known[i] and known[j]
+                colour = _colour(float(correlation[i, j])) if both_known else _UNKNOWN
+                shown = f"{correlation[i, j]:+.2f}" if both_known else "not known"
+                title = f"{names[i]}, {names[j]}: {shown}"
+            parts.append(svg.rect(margin + j * cell, 6 + i * cell, cell - 1, cell - 1, colour, title))
     for i, name in enumerate(short):
         at = (i + 0.5) * cell
         parts.append(svg.text(margin - 7, 6 + at + 4, name, "mono", "end"))
@@ -116,20 +119,6 @@ def correlation_map(correlation: Array, names: tuple[str, ...], known: Sequence[
     caption = "Dark cells: the data hardly separates the two."
     caption += "" if all(known) else " Grey: not determined, so no correlation is known."
     return Figure(title, caption, drawn)
-
-
-def _cells(correlation: Array, names: tuple[str, ...], known: Sequence[bool], margin: float, cell: float) -> list[str]:
-    parts = []
-    for i in range(len(names)):
-        for j in range(i + 1):
-            colour, title = _DIAGONAL, ""
-            if i != j:
-                both_known = known[i] and known[j]
-                colour = _colour(float(correlation[i, j])) if both_known else _UNKNOWN
-                value = f"{correlation[i, j]:+.2f}" if both_known else "not known"
-                title = f"{names[i]}, {names[j]}: {value}"
-            parts.append(svg.rect(margin + j * cell, 6 + i * cell, cell - 1, cell - 1, colour, title))
-    return parts
 
 
 def _colour(value: float) -> str:

@@ -30,9 +30,7 @@ def started(
     """At the beginning."""
     blocks = {name: block.entry_unit for block in setup.space.parameters.free for name in block.entry_names}
     return {
-        "event": "started",
-        "sequence": state.sequence,
-        "at": state.at,
+        **_event("started", state),
         "level": state.health.level,
         "gate": {"probability": settings.gate.probability},
         "parameters": [{"name": n, "unit": blocks[n], "value": v, "sd": sd} for n, (v, sd) in parameters.items()],
@@ -79,14 +77,7 @@ def judged(
 
 def decided(state: State, decision: Decision) -> dict[str, Any]:
     """Something that was decided."""
-    event = {
-        "event": "decision",
-        "sequence": state.sequence,
-        "at": state.at,
-        "kind": decision.kind,
-        "since": decision.since,
-        "sentence": decision.sentence,
-    }
+    event = _event("decision", state, kind=decision.kind, since=decision.since, sentence=decision.sentence)
     if decision.subject:
         event["joint" if decision.kind.startswith("joint") else "measurement"] = decision.subject
     if len(decision.candidates) > 1:
@@ -99,25 +90,21 @@ def decided(state: State, decision: Decision) -> dict[str, Any]:
 
 def noted(state: State, kind: str, text: str) -> dict[str, Any]:
     """Something odd that did no harm."""
-    sentence = f"{text[:1].upper()}{text[1:]}."
-    return {"event": "decision", "sequence": state.sequence, "at": state.at, "kind": kind, "sentence": sentence}
+    return _event("decision", state, kind=kind, sentence=f"{text[:1].upper()}{text[1:]}.")
 
 
 def level_changed(state: State, before: str, health: Health) -> dict[str, Any]:
     """Health got better or worse."""
-    return {
-        "event": "level",
-        "sequence": state.sequence,
-        "at": state.at,
-        "from": before,
-        "to": health.level,
-        "sentence": health.sentence,
-    }
+    return {**_event("level", state), "from": before, "to": health.level, "sentence": health.sentence}
 
 
 def estimated(state: State, parameters: Mapping[str, list[float]]) -> dict[str, Any]:
     """What is believed: value and standard deviation by entry (SI)."""
-    return {"event": "estimate", "sequence": state.sequence, "at": state.at, "parameters": dict(parameters)}
+    return _event("estimate", state, parameters=dict(parameters))
+
+
+def _event(kind: str, state: State, /, **content: Any) -> dict[str, Any]:
+    return {"event": kind, "sequence": state.sequence, "at": state.at, **content}
 
 
 def _record(incoming: Incoming, state: State, verdict: str) -> dict[str, Any]:
