@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -20,29 +19,11 @@ _RECORDINGS = {"same": "calibrated recording", "new": "new recording"}
 _ENDS = {"crossed": "", "bound": "at its bound", "open": "does not end as far as was looked"}
 
 
-@dataclass(frozen=True)
-class ShareRow:
-    """Shares held by the intervals of one set of records, as stated and as computed; one text a level, radii last."""
+def share_rows(interval_result: IntervalResult) -> list[tuple[str, str, tuple[str, ...], tuple[str, ...]]]:
+    """Shares held by the intervals of cross-validated and held-out records, in the calibrated and in a new recording.
 
-    name: str
-    records: str
-    stated: tuple[str, ...]
-    raw: tuple[str, ...]
-
-
-@dataclass(frozen=True)
-class ProfileRow:
-    """One interval by profile likelihood, in a customary unit."""
-
-    name: str
-    value: str
-    interval: str
-    unit: str
-    remark: str
-
-
-def share_rows(interval_result: IntervalResult) -> tuple[ShareRow, ...]:
-    """Cross-validated and held-out records, each in the calibrated and in a new recording."""
+    Name, records, shares as stated and as computed; of these one text a level, radii last.
+    """
     sets = (("Cross-validated", interval_result.crossed), ("Held out", interval_result.holdout))
     rows = []
     for words, shares in sets:
@@ -50,8 +31,8 @@ def share_rows(interval_result: IntervalResult) -> tuple[ShareRow, ...]:
             label = f"{words}, {_RECORDINGS[name]}" if len(shares) > 1 else words
             radius = share.stretched_radius if share.stretched else share.raw_radius
             percents = _percent([*share.stated, radius]), _percent([*share.raw, share.raw_radius])
-            rows.append(ShareRow(label, count(share.records), *percents))
-    return tuple(rows)
+            rows.append((label, count(share.records), *percents))
+    return rows
 
 
 def _percent(shares: Sequence[float | None]) -> tuple[str, ...]:
@@ -105,9 +86,9 @@ def predicted_against_found(result: RunResult) -> Figure | None:
     return svg.both("radii", ("Predicted and measured errors", said, caption), draw)
 
 
-def profile_rows(result: RunResult) -> tuple[ProfileRow, ...]:
-    """Of the numbers asked for."""
-    rows = []
+def profile_rows(result: RunResult) -> list[tuple[str, ...]]:
+    """Name, value, interval by profile likelihood, customary unit and remark of each number asked for."""
+    rows: list[tuple[str, ...]] = []
     for profile in result.profiles:
         factor, unit = _shown(result, profile)
         width = max(factor * max(profile.upper - profile.lower, 1e-12), 1e-12)
@@ -117,8 +98,8 @@ def profile_rows(result: RunResult) -> tuple[ProfileRow, ...]:
         remarks = [f"{side} end {_ENDS[end]}" for side, end in sides if _ENDS[end]]
         if profile.better:
             remarks.append("a better fit was found on the way: try more starts")
-        rows.append(ProfileRow(profile.name, fixed(factor * profile.value, digits), ends, unit, "; ".join(remarks)))
-    return tuple(rows)
+        rows.append((profile.name, fixed(factor * profile.value, digits), ends, unit, "; ".join(remarks)))
+    return rows
 
 
 def profile_figures(result: RunResult) -> tuple[Figure, ...]:
