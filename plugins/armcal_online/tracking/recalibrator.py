@@ -25,7 +25,6 @@ from pydantic import ValidationError
 from armcal_online.sources.source import Incoming
 from armcal_online.tracking import events
 from armcal_online.tracking.belief import most_likely
-from armcal_online.tracking.clock import Tick, ticked
 from armcal_online.tracking.directions import Steps, find_steps
 from armcal_online.tracking.evaluator import identity
 from armcal_online.tracking.health import nis_limit
@@ -34,7 +33,7 @@ from armcal_online.tracking.judge import Judge
 from armcal_online.tracking.observer import Reading
 from armcal_online.tracking.settings import RecalibrateSettings
 from armcal_online.tracking.start import FilterSetup, filter_setup
-from armcal_online.tracking.state import REMEMBERED, State, advanced
+from armcal_online.tracking.state import REMEMBERED, State, Tick, advanced, ticked
 from armcal_online.tracking.updated import calibration_text, deviations
 from armcal_online.tracking.what_if import worth_of_record
 
