@@ -38,11 +38,11 @@ def served(tmp_path: Path) -> Iterator[Served]:
 
 
 def test_the_page_needs_nothing_from_elsewhere_and_its_policy_lets_nothing_in() -> None:
-    made = page()
-    html = made.html.decode()
+    sent, policy = page()
+    html = sent.decode()
     assert set(re.findall(r"https?://[^\s\"'`)]+", html)) == {"http://www.w3.org/2000/svg"}  # a name, not fetched
     assert not re.search(r"\son\w+=|innerHTML|insertAdjacent|document\.write|\beval\b|style=\"|url\(", html)
-    assert made.policy.startswith("default-src 'none'") and "unsafe" not in made.policy
+    assert policy.startswith("default-src 'none'") and "unsafe" not in policy
     assert html.count("<script>") == html.count("</script>") == 1
     assert "/* style */" not in html and "/* script */" not in html
 
