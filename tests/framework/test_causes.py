@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -10,13 +11,16 @@ import numpy as np
 import oracle
 import pytest
 from armcal.cli.main import cli
+from armcal.diagnose.evidence import Evidence
 from armcal.diagnose.evidence_findings import neighbour_findings, structure_findings
 from armcal.diagnose.fit_rows import FitRows
 from armcal.diagnose.gross import scale_deviation
+from armcal.diagnose.noise_findings import Finding
 from armcal.diagnose.odds import UNLISTED
 from armcal.diagnose.outside import predicted_positions
 from armcal.diagnose.residual_structure import LEVEL, structure
 from armcal.diagnose.smooth import CLEAR
+from armcal.diagnose.verdict import _in_short
 from armcal.estimate.weighing import fit
 from armcal.problem.motion import Motion, recorded_position
 from armcal_ipopt.estimator import IpoptEstimator
@@ -129,6 +133,18 @@ def test_what_is_not_among_the_causes_is_not_given_the_name_of_one(lrm):
     found = found_in(lrm, "smooth", 4)
     assert graded(found, "smooth") != "wrong" and found.unlisted > CLEAR
     assert "none of the" in said(found) or UNLISTED in said(found)
+
+
+def test_in_short_nothing_is_left_only_where_no_function_of_the_pose_is(lrm):
+    found = found_in(lrm, "smooth", 4)
+    sure = SimpleNamespace(verdict=SimpleNamespace(converged=True), identifiability=SimpleNamespace(undetermined=()))
+
+    def short(unlisted):
+        left = replace(found, structures=(), lag_after_p=1.0, unlisted=unlisted)
+        return " ".join(_in_short("", sure, Finding("good", ""), Evidence(left), (), ()))
+
+    assert "follow the pose in a way that no cause" in short(found.unlisted)
+    assert "Nothing that was looked for is left" in short(0.0)
 
 
 def test_what_is_significant_but_less_likely_than_chance_is_no_finding(lrm):

@@ -21,6 +21,7 @@ from armcal.diagnose.evidence_findings import (
     what_neighbours_cost,
 )
 from armcal.diagnose.noise_findings import Finding, component_findings, first_few, suspect_findings
+from armcal.diagnose.smooth import CLEAR
 from armcal.estimate.estimator import CHECK_THE_DATA, Estimate
 from armcal.estimate.identifiability import POOR_CONDITION, bound_together, correlated_pairs
 from armcal.estimate.prediction import NewRecording
@@ -157,6 +158,8 @@ def _in_short(
             for s in seen.structure.worthwhile
         )
         sentences.append(f"Residuals still depend on {listed}.")
+    elif seen.structure is not None and seen.structure.unlisted > CLEAR:
+        sentences.append("Residuals follow the pose in a way that no cause that was looked for explains.")
     elif seen.structure is not None and seen.structure.lag_after_p <= seen.structure.level:
         after = f"{seen.structure.lag_after:.2f}"
         sentences.append(f"No cause that was looked for is left in the residuals, yet neighbours correlate by {after}.")
