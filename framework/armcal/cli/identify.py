@@ -62,12 +62,12 @@ def identify(
     known = identify_from(triangle, parameters)
     content = _content(experiment, ready, triangle, known)
     if minimal or prefer or most is not None or max_sd is not None:
-        minimal_parameters = minimal_set(triangle, parameters, preferred, most, np.inf if max_sd is None else max_sd)
+        smallest = minimal_set(triangle, parameters, preferred, most, np.inf if max_sd is None else max_sd)
         content["minimal"] = {
-            "kept": list(minimal_parameters.kept),
-            "redundant": [_dropped(dropped) for dropped in minimal_parameters.redundant],
-            "left_out": [_dropped(dropped) for dropped in minimal_parameters.left_out],
-            "sd_ordinary_sizes": {name: _finite(sd) for name, sd in minimal_parameters.deviations.items()},
+            "kept": list(smallest.kept),
+            "redundant": [_dropped(dropped) for dropped in smallest.redundant],
+            "left_out": [_dropped(dropped) for dropped in smallest.left_out],
+            "sd_ordinary_sizes": {name: _finite(sd) for name, sd in smallest.deviations.items()},
         }
     for text in ready.warnings:
         console.warn(text)
@@ -150,17 +150,14 @@ def _show(console: Console, content: dict[str, Any]) -> None:
             if combination["cause"] == cause
         ]
         _section(console, f"Undetermined, {words} ({len(determined)}):", determined)
-    free = content["held_by_nothing"]
+    unheld = content["held_by_nothing"]
     if not content["undetermined"]:
         console.line("No combination is undetermined.", "green")
-    elif not free:
+    elif not unheld:
         console.line("Priors hold every undetermined combination: what they say of it is all that will be known.")
     else:
-        _section(
-            console,
-            f"Undetermined without a prior: armcal run refuses these ({len(free)}):",
-            [combination["text"] for combination in free],
-        )
+        title = f"Undetermined without a prior: armcal run refuses these ({len(unheld)}):"
+        _section(console, title, [combination["text"] for combination in unheld])
     hardly = [
         f"{pair['text']}: sd {pair['sd_ordinary_sizes'] or np.inf:.3g} typical scales"
         for pair in content["hardly_determined"]

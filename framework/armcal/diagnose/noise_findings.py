@@ -57,10 +57,10 @@ def suspect_findings(fitted: WeighedFit, ids: Sequence[str]) -> list[Finding]:
     return findings
 
 
-def component_findings(variance_components: VarianceComponents) -> list[Finding]:
+def component_findings(components: VarianceComponents) -> list[Finding]:
     """Is it the tracker or the model?"""
-    joints = variance_components.share("joint")
-    parts = sorted(variance_components.components, key=lambda c: -c.share)
+    joints = components.share("joint")
+    parts = sorted(components.components, key=lambda c: -c.share)
     texts = []
     for c in parts:
         factor, unit = _SHOWN.get(c.unit, (1.0, " times the declared noise"))
@@ -75,11 +75,9 @@ def component_findings(variance_components: VarianceComponents) -> list[Finding]
     )
     text = f"The scatter is mostly {whose} ({100 * share:.0f} % of the variance): {listed}."
     findings = [Finding("note", text + (meaning if joints > 0.5 else ""))]
-    if variance_components.inseparable:
-        pairs = ", ".join(f"{a} and {b} ({r:+.2f})" for a, b, r in variance_components.inseparable)
+    if components.inseparable:
+        pairs = ", ".join(f"{a} and {b} ({r:+.2f})" for a, b, r in components.inseparable)
         findings.append(Finding("warning", f"In these poses some variances can hardly be told apart: {pairs}."))
-    if variance_components.unseen:
-        findings.append(
-            Finding("note", f"No residual shows what these joints do: {', '.join(variance_components.unseen)}.")
-        )
+    if components.unseen:
+        findings.append(Finding("note", f"No residual shows what these joints do: {', '.join(components.unseen)}."))
     return findings

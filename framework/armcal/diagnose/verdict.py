@@ -171,13 +171,13 @@ def _in_short(
 
 
 def _convergence(estimate: Estimate) -> Finding:
-    solver_verdict = estimate.verdict
-    if not solver_verdict.converged:
-        text = f"{solver_verdict.name} did not converge ({solver_verdict.status}): these values are no calibration."
+    solver = estimate.verdict
+    if not solver.converged:
+        text = f"{solver.name} did not converge ({solver.status}): these values are no calibration."
         return Finding("bad", text, "the solver's own", CHECK_THE_DATA)
-    text = f"{solver_verdict.name} converged in {solver_verdict.iterations} iterations"
-    if solver_verdict.starts > 1:
-        text += f"; {solver_verdict.agreeing_starts} of {solver_verdict.starts} starts came to the same answer"
+    text = f"{solver.name} converged in {solver.iterations} iterations"
+    if solver.starts > 1:
+        text += f"; {solver.agreeing_starts} of {solver.starts} starts came to the same answer"
     return Finding("good", text + ".", "the solver's own")
 
 
@@ -216,11 +216,10 @@ def _size(estimate: Estimate, seen: Evidence) -> Finding:
     freedom, ratio = max(1, estimate.degrees_of_freedom), estimate.noise_scale
     total, test = ratio**2 * freedom, "chi-square, 5 %"
     if total > chdtri(freedom, LEVEL / 2):
-        residual_structure = seen.structure
         why = "the model's error or the instrument's, which this test cannot tell apart"
-        if residual_structure is not None:
+        if seen.structure is not None:
             known = "some of it is the model's: what residuals depend on is named below"
-            why += f"; {known if residual_structure.structures else 'no cause that was looked for is in it'}"
+            why += f"; {known if seen.structure.structures else 'no cause that was looked for is in it'}"
         text = f"Residuals are {ratio:.1f} times the declared noise: {why}. Intervals are widened to the residuals."
         action = "Repeat some poses, each from elsewhere: what scatters there is noise, the rest the model's error."
         return Finding("warning", text, test, action)

@@ -144,19 +144,15 @@ def _determined(estimate: Estimate) -> dict[str, Any]:
 
 
 def _origin(result: RunResult) -> dict[str, Any]:
-    solver_verdict, data = result.estimate.verdict, result.dataset
-    answer = "converged" if solver_verdict.converged else "did not converge"
-    effort = f"{plural(solver_verdict.iterations, 'iteration')}, {duration(solver_verdict.seconds)}"
-    starts = (
-        f"{solver_verdict.agreeing_starts} of {solver_verdict.starts} came to the same answer"
-        if solver_verdict.starts > 1
-        else "one"
-    )
+    solver, data = result.estimate.verdict, result.dataset
+    answer = "converged" if solver.converged else "did not converge"
+    effort = f"{plural(solver.iterations, 'iteration')}, {duration(solver.seconds)}"
+    starts = f"{solver.agreeing_starts} of {solver.starts} came to the same answer" if solver.starts > 1 else "one"
     facts = [
         Fact("data", data.source or NONE),
         Fact("data sha256", data.sha256 or NONE),
         Fact("records", f"{len(result.split.train)} train, {len(result.split.holdout)} holdout"),
-        Fact("solver", f"{solver_verdict.name}: {solver_verdict.status} ({answer}; {effort})"),
+        Fact("solver", f"{solver.name}: {solver.status} ({answer}; {effort})"),
         Fact("starts", starts),
         Fact("backend", result.backend or NONE),
         Fact("noise scale", f"{significant(result.estimate.noise_scale)} times the declared noise"),
