@@ -34,20 +34,11 @@ _FIGURE_SPACE, _POINT_SPACE = "\u2007", "\u2008"
 _MM = 1000.0
 
 
-@dataclass(frozen=True)
-class ErrorRows:
-    """Before, after and ratio over one set of records; after if nothing is known of a drift, where something drifts."""
+def error_rows(result: RunResult) -> list[dict[str, Any]]:
+    """Of each set that has records, errors before and after calibration, and their ratios.
 
-    name: str
-    count: int
-    nominal: tuple[str, ...]
-    calibrated: tuple[str, ...]
-    ratios: tuple[str, ...]
-    at_rest: tuple[str, ...] = ()
-
-
-def error_rows(result: RunResult) -> tuple[ErrorRows, ...]:
-    """One entry for each set that has records."""
+    And after if nothing is known of a drift (``at_rest``), where something drifts.
+    """
     nominal, calibrated = result.table.nominal, result.table.calibrated
     sets = [(k, w, nominal.get(k, _EMPTY), calibrated.get(k, _EMPTY)) for k, w in _SETS]
     extra = [k for k in {**nominal, **calibrated} if k not in {key for key, _ in _SETS}]
@@ -59,16 +50,16 @@ def error_rows(result: RunResult) -> tuple[ErrorRows, ...]:
         at_rest = result.table.at_rest.get(key)
         pairs = list(zip(_statistics(before), _statistics(after), strict=True))
         rows.append(
-            ErrorRows(
-                words,
-                after.count or before.count,
-                tuple(fixed(b, decimals) for b, _ in pairs),
-                tuple(fixed(a, decimals) for _, a in pairs),
-                tuple(ratio(b, a) for b, a in pairs),
-                tuple(fixed(v, decimals) for v in _statistics(at_rest)) if at_rest else (),
-            )
+            {
+                "name": words,
+                "count": after.count or before.count,
+                "nominal": [fixed(b, decimals) for b, _ in pairs],
+                "calibrated": [fixed(a, decimals) for _, a in pairs],
+                "ratios": [ratio(b, a) for b, a in pairs],
+                "at_rest": [fixed(v, decimals) for v in _statistics(at_rest)] if at_rest else [],
+            }
         )
-    return tuple(rows)
+    return rows
 
 
 def _statistics(summary: ErrorSummary) -> tuple[float | None, ...]:
