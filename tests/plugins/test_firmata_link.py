@@ -72,11 +72,12 @@ def test_a_board_that_starts_when_its_port_is_opened_is_waited_for(board):
 
 @pytest.mark.parametrize("fault", ["drop", "duplicate", "split"])
 @pytest.mark.parametrize("direction", ["to_board", "to_host"])
-def test_messages_that_are_lost_or_doubled_are_not_seen(board, tmp_path, fault, direction):
+@pytest.mark.parametrize("turns", [3, pytest.param(8, marks=pytest.mark.slow)])
+def test_messages_that_are_lost_or_doubled_are_not_seen(board, tmp_path, fault, direction, turns):
     device = device_on(board, tmp_path)
     device.open(board.clock)
     device.energise("q1", 0.0)
-    for turn in range(3):
+    for turn in range(turns):
         with board.paused():
             getattr(board.line, direction).plan(fault, 1, after=turn % 3)
         angle = {"q1": 0.05 * turn}

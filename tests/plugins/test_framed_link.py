@@ -60,12 +60,13 @@ def test_the_driver_works_over_it(board, tmp_path):
 
 @pytest.mark.parametrize("fault", ["drop", "duplicate", "reorder", "flip", "split"])
 @pytest.mark.parametrize("direction", ["to_board", "to_host"])
-def test_no_fault_of_the_line_is_seen(board, tmp_path, fault, direction):
+@pytest.mark.parametrize("turns", [3, pytest.param(12, marks=pytest.mark.slow)])
+def test_no_fault_of_the_line_is_seen(board, tmp_path, fault, direction, turns):
     """Whatever the line does to two messages in a row, every command arrives, once or again."""
     device = device_on(board, tmp_path)
     device.open(board.clock)
     device.energise("q1", 0.0)
-    for turn in range(3):
+    for turn in range(turns):
         with board.paused():
             getattr(board.line, direction).plan(fault, 2, after=turn % 3)
         angle = {"q1": 0.05 * turn}
