@@ -74,7 +74,7 @@ def predict(
     if not loaded.readable:
         requested = (*requested, *_tool_channels(tuple(system.arms)))
     shown = [channel for channel in requested if channel.channel in channels]
-    extra, medians = (_columns(plus_minus, shown), _medians(plus_minus, shown)) if plus_minus else ({}, {})
+    extra, medians = _half_widths(plus_minus, shown) if plus_minus else ({}, {})
     write_csv(out, replace(commands, channels=channels, extra=extra), shown)
     _show(console, commands, out, recording, plus_minus, medians)
 
@@ -180,24 +180,20 @@ def _warn_of_missing(console: Console, loaded: Calibration, commands: Dataset, r
         console.warn(f"{text}; if they belong to it, say --recording calibrated.")
 
 
-def _columns(plus_minus: PlusMinus, shown: Sequence[RequestedChannel]) -> dict[str, tuple[str, ...]]:
-    """Half widths of 90 % intervals beside each channel, and 95 % radii in mm."""
-    columns = {}
+def _half_widths(
+    plus_minus: PlusMinus, shown: Sequence[RequestedChannel]
+) -> tuple[dict[str, tuple[str, ...]], dict[str, float]]:
+    """Columns of half widths of 90 % intervals and of 95 % radii in mm; and medians of the former over the poses."""
+    columns, medians = {}, {}
     for channel, (column, unit) in column_names(shown).items():
         if channel in plus_minus.half_widths:
-            columns[f"plus_minus_{column}"] = _texts(to_unit(plus_minus.half_widths[channel], unit))
+            widths = to_unit(plus_minus.half_widths[channel], unit)
+            columns[f"plus_minus_{column}"] = _texts(widths)
+            if np.isfinite(widths).any():
+                medians[column] = float(np.nanmedian(widths))
     for name, radius in plus_minus.radii.items():
         columns["radius95_mm" if len(plus_minus.radii) == 1 else f"{name}.radius95_mm"] = _texts(to_unit(radius, "mm"))
-    return columns
-
-
-def _medians(plus_minus: PlusMinus, shown: Sequence[RequestedChannel]) -> dict[str, float]:
-    """Half widths of 90 % intervals by column, in its unit: medians over the poses."""
-    columns = column_names(shown).items()
-    half = {
-        column: to_unit(plus_minus.half_widths[c], unit) for c, (column, unit) in columns if c in plus_minus.half_widths
-    }
-    return {column: float(np.nanmedian(widths)) for column, widths in half.items() if np.isfinite(widths).any()}
+    return columns, medians
 
 
 def _texts(values: Array) -> tuple[str, ...]:
