@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from typing import Any
 from zlib import crc32
 
@@ -35,65 +36,63 @@ Reach = Callable[[int], tuple[Entry, tuple[Entry, ...]]]
 """The last checkpoint at or before a sequence number, and the entries after it up to that number."""
 
 
+@dataclass
 class Progress:
     """Rows taken by file, the records taken last, and whether records are passed over.
 
     Attributes:
         records: how many records were journalled, from the beginning.
         paused: whether records are passed over.
+        rows: the last one taken, by file.
+        through: all files up to this name were taken.
+        recent: sequence numbers of the last records of streams.
     """
 
-    def __init__(self) -> None:
-        self.records = 0
-        self.paused = False
-        self._positions: dict[str, int] = {}
-        self._through = ""
-        self._recent: dict[str, int] = {}
+    records: int = 0
+    paused: bool = False
+    rows: dict[str, int] = field(default_factory=dict)
+    through: str = ""
+    recent: dict[str, int] = field(default_factory=dict)
 
     @property
     def positions(self) -> dict[str, int]:
         """The last row taken, by file; a key that begins with a slash says that all files up to a name were."""
-        return {**self._positions, **({THROUGH + self._through: 0} if self._through else {})}
+        return {**self.rows, **({THROUGH + self.through: 0} if self.through else {})}
 
     def take(self, incoming: Incoming, sequence: int) -> None:
         """A record was journalled."""
         self.records += 1
         if incoming.source_key:
             key = incoming.source_key
-            self._positions[key] = max(self._positions.get(key, 0), incoming.source_row)
-            if len(self._positions) > MAX_FILES:
-                first = min(self._positions)
-                del self._positions[first]
-                self._through = max(self._through, first)
+            self.rows[key] = max(self.rows.get(key, 0), incoming.source_row)
+            if len(self.rows) > MAX_FILES:
+                first = min(self.rows)
+                del self.rows[first]
+                self.through = max(self.through, first)
         elif not incoming.fault:
-            self._recent[_mark(incoming)] = sequence
-            if len(self._recent) > RECENT:
-                del self._recent[next(iter(self._recent))]
+            self.recent[_mark(incoming)] = sequence
+            if len(self.recent) > RECENT:
+                del self.recent[next(iter(self.recent))]
 
     def repeated(self, incoming: Incoming) -> int | None:
         """Under which sequence number the same record of a stream was taken not long ago."""
-        return None if incoming.source_key or incoming.fault else self._recent.get(_mark(incoming))
+        return None if incoming.source_key or incoming.fault else self.recent.get(_mark(incoming))
 
     def as_dict(self) -> dict[str, Any]:
         """As JSON."""
         return {
             "records": self.records,
             "paused": self.paused,
-            "positions": dict(self._positions),
-            "through": self._through,
-            "recent": dict(self._recent),
+            "positions": dict(self.rows),
+            "through": self.through,
+            "recent": dict(self.recent),
         }
 
     @classmethod
     def from_dict(cls, content: Mapping[str, Any]) -> Progress:
         """What ``as_dict`` wrote."""
-        progress = cls()
-        progress.records = int(content["records"])
-        progress.paused = bool(content["paused"])
-        progress._positions = dict(content["positions"])
-        progress._through = str(content["through"])
-        progress._recent = dict(content["recent"])
-        return progress
+        rows, recent = dict(content["positions"]), dict(content["recent"])
+        return cls(int(content["records"]), bool(content["paused"]), rows, str(content["through"]), recent)
 
 
 def _mark(incoming: Incoming) -> str:
