@@ -83,12 +83,12 @@ class Axis:
         return [(v, fixed(v, decimals)) for v in values]
 
 
-def nice_step(rough: float) -> float:
-    """1, 2 or 5 times a power of ten, at least ``rough``."""
+def nice_step(rough: float, steps: Sequence[float] = (1, 2, 5, 10, 20)) -> float:
+    """One of some numbers (1, 2 or 5) times a power of ten, at least ``rough``."""
     if not math.isfinite(rough) or rough <= 0:
         return 1.0
     power = 10.0 ** math.floor(math.log10(rough))
-    return next(step * power for step in (1, 2, 5, 10, 20) if step * power >= rough * (1 - 1e-9))
+    return next(step * power for step in steps if step * power >= rough * (1 - 1e-9))
 
 
 def document(ident: str, size: tuple[float, float], title: str, desc: str, parts: Iterable[str]) -> Markup:

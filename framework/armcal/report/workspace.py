@@ -63,9 +63,13 @@ def _view(
 ) -> Figure:
     shown = position[list(axes)][:, chosen]
     across, up = (_NAMES[i] for i in axes)
-    step = _colour_step(float(np.percentile(errors[chosen], 98)) / len(_COLOURS))
+    step = svg.nice_step(float(np.percentile(errors[chosen], 98)) / len(_COLOURS), _STEPS)
     enlarged = _enlargement(shown, vectors)
-    caption = _caption(len(chosen), total, enlarged)
+    caption = "Predicted tip positions; the darker, the larger the calibrated error."
+    if enlarged:
+        caption += f" Lines: residuals, {significant(enlarged, 1)} times enlarged."
+    if len(chosen) < total:
+        caption += f" {count(len(chosen))} of {count(total)} drawn, evenly chosen, the 50 worst among them."
     worst = chosen[-1]
     said = (
         f"{plural(len(chosen), 'tip position')} seen along {({'xy': 'z', 'xz': 'y'})[across + up]}; the largest error, "
@@ -89,15 +93,6 @@ def _view(
 
     title = "Workspace from above (x, y)" if up == "y" else "Workspace from the side (x, z)"
     return svg.both(f"workspace-{across}{up}", (title, said, caption), draw, svg.HALF)
-
-
-def _caption(drawn: int, total: int, enlarged: float) -> str:
-    words = "Predicted tip positions; the darker, the larger the calibrated error."
-    if enlarged:
-        words += f" Lines: residuals, {significant(enlarged, 1)} times enlarged."
-    if drawn < total:
-        words += f" {count(drawn)} of {count(total)} drawn, evenly chosen, the 50 worst among them."
-    return words
 
 
 def _enlargement(shown: Array, vectors: Array | None) -> float:
@@ -132,11 +127,3 @@ def _colour_key(box: Box, step: float, unit: str) -> list[str]:
         parts.append(svg.text(left + i * width, y + 24, fixed(i * step, decimals), "tick", "middle"))
     words = f"calibrated error, {unit}; the darkest: and more"
     return [*parts, svg.text((box.left + box.right) / 2, y + 44, words, "tick", "middle")]
-
-
-def _colour_step(rough: float) -> float:
-    """A round step with finer choices than an axis needs, so that all colours are used."""
-    if not np.isfinite(rough) or rough <= 0:
-        return 1.0
-    power = float(10.0 ** np.floor(np.log10(rough)))
-    return next(step * power for step in _STEPS if step * power >= rough * (1 - 1e-9))
