@@ -209,9 +209,9 @@ def upgraded(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[], None]]:
 
 def softer(monkeypatch: pytest.MonkeyPatch, factor: float) -> None:
     """Springs that give more under the same torque: what a plugin's next version might have."""
-    before = TorsionalSprings._spring
+    before = TorsionalSprings.spring
     monkeypatch.setattr(
-        TorsionalSprings, "_spring", lambda self, site, compliance: before(self, site, factor * compliance)
+        TorsionalSprings, "spring", lambda self, site, compliance: before(self, site, factor * compliance)
     )
 
 

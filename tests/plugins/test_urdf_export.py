@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import re
 from dataclasses import replace
+from pathlib import Path
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -320,9 +322,19 @@ def test_a_placement_stays_out_of_the_urdf_and_is_said(tmp_path):
     assert b'<origin xyz="0 0 0.3"/>' in content
 
 
-def test_what_is_left_out_is_said_in_significant_digits():
-    from armcal.cli.export import _up_to
+@pytest.mark.parametrize(
+    ("moved_m", "words"),
+    [
+        (0.0384794, "(up to 38.5 mm, in"),
+        (1.23e-7, "(up to 0.000123 mm, in"),
+        (1e-16, "(which does not move the tool, in"),
+        (None, "does not settle"),
+    ],
+)
+def test_what_is_left_out_is_said_in_significant_digits(moved_m, words):
+    from armcal.cli.export import _show
 
-    assert _up_to(38.4794) == "up to 38.5 mm"
-    assert _up_to(0.000123) == "up to 0.000123 mm"
-    assert _up_to(1e-13) == "which does not move the tool"
+    console, exported = MagicMock(), MagicMock(changed=2, left_out=("springs",), remarks=())
+    _show(console, MagicMock(), exported, moved_m, [Path("out.urdf")], "urdf")
+    (said,) = console.warn.call_args.args
+    assert words in said and "cannot hold it: springs" in said
