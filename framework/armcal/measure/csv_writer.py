@@ -89,20 +89,14 @@ def column_names(
     columns = {}
     for w in requested_channels:
         own = [name for name in w.columns if taken.count(name) == 1] or [w.columns[0]]
-        unit = _unit(w.dimension, units)
-        name = min(own, key=len)
+        unit, name = "1", min(own, key=len)
+        if w.dimension not in ("1", DIMENSIONLESS):
+            unit = units.get(w.dimension) or display_unit(w.dimension).name
+            known = [u.name for u in units_of(w.dimension)]
+            if unit not in known:
+                raise ValueError(f"{unit!r} is not a unit of {w.dimension}; expected one of {', '.join(known)}.")
         columns[w.channel] = (name if unit == "1" else f"{name}_{unit}", unit)
     return columns
-
-
-def _unit(dimension: str, units: Mapping[str, str]) -> str:
-    if dimension in ("1", DIMENSIONLESS):
-        return "1"
-    unit = units.get(dimension) or display_unit(dimension).name
-    known = [u.name for u in units_of(dimension)]
-    if unit not in known:
-        raise ValueError(f"{unit!r} is not a unit of {dimension}; expected one of {', '.join(known)}.")
-    return unit
 
 
 def _texts(values: Array, unit: str) -> list[str]:

@@ -8,9 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from armcal.arm.assembly import Arm
-from armcal.arm.model import Joint
 from armcal.base.dataset import Dataset
-from armcal.base.domains import Array
 from armcal.base.units import display_unit, to_unit
 
 TOLERANCE = {"angle": 1e-3, "length": 1e-4}
@@ -33,19 +31,15 @@ def _beyond(dataset: Dataset, name: str, arm: Arm, alone: bool) -> list[str]:
     commands = arm.joint_commands([dataset.column(channel) for channel in channels])
     texts = []
     for joint, dimension, angles in zip(arm.nominal_chain.joints, arm.joint_dimensions, commands, strict=True):
-        over = np.nan_to_num(_over(joint, np.asarray(angles)), nan=-np.inf, neginf=-np.inf)
+        if joint.limits is None:
+            continue
+        over = np.maximum(joint.limits[0] - angles, angles - joint.limits[1])  # below zero inside
+        over = np.nan_to_num(over, nan=-np.inf, neginf=-np.inf)
         count = int(np.sum(over > TOLERANCE[dimension]))
-        if count and joint.limits:
+        if count:
             unit = display_unit(dimension).name
             low, high, worst = (to_unit(x, unit) for x in (*joint.limits, float(angles[int(np.argmax(over))])))
             shown = joint.name if alone else f"{name}.{joint.name}"
             limits = f"limits {low:.4g} to {high:.4g} {unit}"
             texts.append(f"{shown} is beyond its {limits} in {count} of {len(dataset)} records, at worst {worst:.4g}")
     return texts
-
-
-def _over(joint: Joint, angles: Array) -> Array:
-    """How far each command is beyond the limits; below zero inside."""
-    if joint.limits is None:
-        return np.full(angles.shape, -np.inf)
-    return np.maximum(joint.limits[0] - angles, angles - joint.limits[1])

@@ -25,7 +25,10 @@ def set_aside_not_finite(dataset: Dataset, layout: Layout) -> Dataset:
     """
     if all(np.isfinite(values).all() for values in dataset.channels.values()):
         return dataset
-    complete = _complete(dataset, layout)
+    complete: dict[str, Mask] = {}  # of each measurement whether a record has all it needs (N)
+    for channel, parts in layout.parts.items():
+        known = np.isfinite(dataset.column(channel))
+        complete |= {part: complete.get(part, True) & known for part in parts}
     lost = np.zeros(len(dataset), dtype=bool)
     if complete:
         lost |= ~np.any(list(complete.values()), axis=0)
@@ -34,16 +37,6 @@ def set_aside_not_finite(dataset: Dataset, layout: Layout) -> Dataset:
     faulty = {int(index): _reason(dataset, layout, int(index)) for index in np.flatnonzero(lost)}
     kept = set_aside(dataset, layout, faulty, "a value is missing or not finite", "Measure these again.")
     return _without_incomplete(kept, layout, {part: mask[~lost] for part, mask in complete.items()})
-
-
-def _complete(dataset: Dataset, layout: Layout) -> dict[str, Mask]:
-    """Of each measurement whether a record has all it needs (N)."""
-    masks: dict[str, Mask] = {}
-    for channel, parts in layout.parts.items():
-        known = np.isfinite(dataset.column(channel))
-        for part in parts:
-            masks[part] = masks[part] & known if part in masks else known
-    return masks
 
 
 def _reason(dataset: Dataset, layout: Layout, index: int) -> str:

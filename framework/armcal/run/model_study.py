@@ -23,7 +23,6 @@ from armcal.estimate.validation import (
     summarise,
 )
 from armcal.io.parallel import Executor
-from armcal.run.experiment import Experiment
 from armcal.run.pipeline import Prepared, Stopwatch, prepare
 from armcal.run.study import PREVIOUS, ModelStudySettings, Study, interpreted_first, judged_fits, naming
 from armcal.run.study_result import NestedResult, StudyResult, VariantResult
@@ -46,7 +45,8 @@ def compare(
     """
     watch, settings = watch or Stopwatch(), study.settings_as(ModelStudySettings)
     with watch.stage("prepare"):
-        ready = {name: naming(name, partial(_prepared, e)) for name, e in study.experiments.items()}
+        by_variant = {n: replace(e, settings=interpreted_first(e)) for n, e in study.experiments.items()}
+        ready = {name: naming(name, partial(prepare, e, Stopwatch())) for name, e in by_variant.items()}
         _require_same_records(ready)
     dataset, first = next(iter(ready.values())).dataset, next(iter(study.experiments.values()))
     every, poses = np.arange(len(dataset), dtype=np.intp), first.poses(dataset)
@@ -72,10 +72,6 @@ def compare(
         provenance=first.provenance(dataset),
         unit=error_unit(next(iter(ready.values())).problem),
     )
-
-
-def _prepared(experiment: Experiment) -> Prepared:
-    return prepare(replace(experiment, settings=interpreted_first(experiment)), Stopwatch())
 
 
 def _inside(outer: Split, settings: ModelStudySettings, poses: Indices) -> tuple[Split, ...]:
