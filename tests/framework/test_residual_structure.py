@@ -152,7 +152,7 @@ def test_the_family_wise_level_holds(lrm):
 
 @pytest.mark.slow
 def test_errors_that_resemble_their_neighbours_do_not_pass_for_dependence_on_the_pose(lrm):
-    """Long-lived errors: neighbours are found to correlate, with time, and poses are not blamed more often than 5 %."""
+    """Long-lived errors: neighbours are found to correlate, with time (a drift or a jump), and poses are not blamed."""
     blamed = 0
     for seed in range(6):
         rng = np.random.default_rng(seed)
@@ -160,9 +160,9 @@ def test_errors_that_resemble_their_neighbours_do_not_pass_for_dependence_on_the
         for i in range(1, 150):
             slow[i] = 0.9 * slow[i - 1] + 0.0005 * rng.normal(size=3)
         found = looked_at(*recording(lrm, 150, seed, moved=lambda q, came, slow=slow: slow))
-        blamed += any(s.kind != "order" for s in found.structures)
+        blamed += any(s.kind not in ("order", "step") for s in found.structures)
         assert found.lag_p <= LEVEL and found.lag_one > 0.3 and found.block > 3
-    assert blamed <= 2
+    assert blamed <= 1
 
 
 @pytest.mark.slow
