@@ -91,7 +91,7 @@ class HookTrace:
         if not self.active:
             return
         given = ", ".join(f"{name}={_short(value)}" for name, value in arguments.items())
-        line = f"armcal hook {hook}({given}): {'; '.join(map(str, answers)) or 'nobody listens'}"
+        line = f"armcal hook {hook}({given}): {'; '.join(map(str, answers)) or 'no listener'}"
         line = f"{line}; all {_told(seconds)}\n" if len(answers) > 1 else f"{line}\n"
         try:
             self._append(line)

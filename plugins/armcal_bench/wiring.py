@@ -85,10 +85,10 @@ def check_wiring(bench: Bench, joints: Iterable[str], adapter: str = "") -> None
     alike = {reason: ", ".join(joint for joint in why if why[joint] == reason) for reason in why.values()}
     named = "; ".join(f"{joints_of}: {reason}" for reason, joints_of in alike.items())
     raise InputError(
-        f"found servos of which nobody has seen that they move their joint ({named}); nothing was moved.",
+        f"found servos that were not checked to move their joint ({named}); nothing was moved.",
         where=Location(str(servos)),
-        hint="With exchanged plugs a joint goes where nobody looked: check them with armcal servo CONFIG --check, or "
-        "give --unchecked to drive them all the same.",
+        hint="With exchanged plugs the wrong joint moves: check them with armcal servo CONFIG --check, or "
+        "give --unchecked to drive them without a check.",
     )
 
 

@@ -74,7 +74,7 @@ class FramedLink(GuardedLink, Link):
                 hello = self._greet()
                 if hello is None:
                     if clock.now() >= until:
-                        text = "nobody answers in the framed protocol."
+                        text = "no board answers in the framed protocol."
                         hint = "Check port and baud, and that the board runs the framed firmware."
                         raise DeviceLostError(text, where=self._where, hint=hint)
                     clock.sleep(_REPLY_S)

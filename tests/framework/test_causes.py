@@ -126,7 +126,7 @@ def test_a_planted_cause_is_named_or_said_to_be_open(lrm, name):
     found = found_in(lrm, name, 3)
     assert graded(found, name) in (("open",) if name == "heavy payload" else ("right", "open"))
     assert NAMED[name][2] in said(found)
-    assert (graded(found, name) == "open") == ("cannot tell which" in said(found))
+    assert (graded(found, name) == "open") == ("do not identify which" in said(found))
 
 
 def test_what_is_not_among_the_causes_is_not_given_the_name_of_one(lrm):
@@ -171,7 +171,7 @@ def test_noise_that_grows_is_noise_that_depends_on_the_order(lrm):
     found = found_in(lrm, "growing noise", 5)
     assert found.noise is not None and found.noise.words == "the recorded order"
     assert found.noise.low < 1.3 < 1.8 < found.noise.high
-    assert "The scatter of the residuals depends on the recorded order" in said(found)
+    assert "The spread of the residuals depends on the recorded order" in said(found)
     assert graded(found, "growing noise") == "nothing"
 
 
@@ -183,7 +183,7 @@ def test_larger_noise_is_not_said_to_be_the_models_error(tmp_path):
     findings = json.loads(result.stdout)["verdict"]["findings"]
     told = next(f for f in findings if "times the declared noise" in f["text"])
     assert told["text"].startswith("Residuals are 2.0 times the declared noise")
-    assert "which this test cannot tell apart" in told["text"] and "not the tracker's" not in told["text"]
+    assert "which this test cannot separate" in told["text"] and "not the tracker's" not in told["text"]
     assert "Repeat some poses" in told["action"]
 
 

@@ -70,7 +70,7 @@ def test_in_random_order_they_do_not_and_nobody_says_so() -> None:
     assert wide.widened is not None
     assert np.median(wide.widened or (1.0,)) < 1.15
     if not wide.widened:
-        assert "hold all the same" in what_neighbours_cost(wide)
+        assert "need no widening" in what_neighbours_cost(wide)
 
 
 @pytest.mark.slow

@@ -119,7 +119,7 @@ def test_a_run_tells_what_is_determined_and_names_the_rest(name, tmp_path):
     held, determined = set(parameters["held_by_priors"]), {n for n, p in kept.items() if p["determined"]}
     assert held | determined == set(kept) and not held & determined
     assert parameters["free"] - parameters["determined"] == len(parameters["undetermined"]) <= len(held)
-    alone = [f["text"] for f in told["verdict"]["findings"] if "held by priors alone" in f["text"]]
+    alone = [f["text"] for f in told["verdict"]["findings"] if "determined by priors alone" in f["text"]]
     assert all(text.startswith(f"{len(parameters['undetermined'])} combination") for text in alone)
     if name not in CASES:
         assert offsets("arm", 1, 3) <= held and "arm.poe.twist2_wx" in held

@@ -17,7 +17,7 @@ from armcal.errors import ConfigError
 from armcal.hook_trace import VARIABLE
 from armcal.plugins import PluginRegistry, discover
 
-LINE = re.compile(r"armcal hook (\w+)\((.*)\): (nobody listens|.* [0-9.]+ ms(, raised \w+)?(; all [0-9.]+ ms)?)")
+LINE = re.compile(r"armcal hook (\w+)\((.*)\): (no listener|.* [0-9.]+ ms(, raised \w+)?(; all [0-9.]+ ms)?)")
 OBSERVER = """
 from armcal.hooks import hookimpl
 
@@ -82,7 +82,7 @@ def test_a_file_is_appended_to_and_standard_error_stays_empty(
     assert LINE.fullmatch(ended)
     assert "..." in ended, "a long argument is told in short"
     assert len(ended) < 250
-    assert rejected == "armcal hook armcal_record_rejected(row=1, record_id='r', reason='torn'): nobody listens"
+    assert rejected == "armcal hook armcal_record_rejected(row=1, record_id='r', reason='torn'): no listener"
     assert capsys.readouterr().err == ""
 
 
@@ -95,7 +95,7 @@ def test_a_large_argument_is_told_by_its_type(
 
     registry = observers(monkeypatch, tmp_path, "1", one="pass")
     registry.notify("armcal_estimate_changed", estimate=Large())
-    assert "armcal_estimate_changed(estimate=<Large>): nobody listens" in capsys.readouterr().err
+    assert "armcal_estimate_changed(estimate=<Large>): no listener" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("asked", ["", "0", None])

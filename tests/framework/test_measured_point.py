@@ -89,7 +89,10 @@ def test_where_nobody_says_which_point_arrives_the_miss_is_named(tmp_path: Path)
         reached = [row["reached"] == "yes" for row in csv.DictReader(stream)]
     assert any(reached)
     assert np.linalg.norm(away[reached], axis=1) == pytest.approx(1000 * known.distance, abs=1e-4)
-    assert f"misses them by {1000 * known.distance:.3g} mm. To bring that one there, give --point target" in ran.stderr
+    assert (
+        f"arrives {1000 * known.distance:.3g} mm away from them. To bring that one there, give --point target"
+        in ran.stderr
+    )
     content = json.loads(ran.stdout)
     assert content["point"] == "tool" and np.linalg.norm(content["target_mm"]) == pytest.approx(1000 * known.distance)
     _, quiet = missed(tmp_path, found, "--point", "tool")

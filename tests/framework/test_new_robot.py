@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import re
 import shlex
 import subprocess
 import sys
@@ -326,7 +327,16 @@ def test_a_frame_that_is_tilted_is_stated_or_the_assumption_is_a_finding(here: P
     told = [text for text in run(**fixed) if "gravity" in text]
     assert told and "assumed to be (0, 0, -9.80665) m/s^2" in told[0]
     asked = CliRunner().invoke(cli, ["check", str(here / "arm" / "simulated.yaml")])
-    assert "Nobody stated which way gravity points" in asked.output
+    assert "The direction of gravity is not stated" in asked.output
+
+    columns = re.findall(r"gravity_[xyz]_\w+", asked.output)
+    records = here / "arm" / "simulated.csv"
+    head, *lines = records.read_text(encoding="utf-8").splitlines()
+    rows_with_gravity = [",".join([head, *columns]), *(f"{line},0,-9.81,0" for line in lines)]
+    records.write_text("\n".join(rows_with_gravity) + "\n", encoding="utf-8")
+    asked = CliRunner().invoke(cli, ["check", str(here / "arm" / "simulated.yaml")])
+    assert asked.exit_code == 0 and len(columns) == 3, asked.output
+    assert "The direction of gravity is not stated" not in asked.output
 
 
 def test_an_arm_without_springs_needs_no_statics(here: Path) -> None:

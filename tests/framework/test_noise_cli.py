@@ -154,8 +154,8 @@ def test_components_reach_every_output(repository, tmp_path):
     assert set(found) == {"tracker", *(f"arm.q{i}" for i in range(1, 7))}
     assert found["tracker"]["sd"] == pytest.approx(1, abs=0.15), "the simulated noise is the declared one"
     assert sum(c["share"] for c in found.values()) == pytest.approx(1)
-    assert "The scatter is mostly the instruments'" in " ".join(shown.split())
-    assert "Whose the scatter is" in (tmp_path / "out" / "report.html").read_text()
+    assert "Most of the residual variance comes from the instruments" in " ".join(shown.split())
+    assert "<h3>Variance components</h3>" in (tmp_path / "out" / "report.html").read_text()
     assert yaml.safe_load((tmp_path / "out" / "calibration.yaml").read_text())["noise"] == told["noise"]
     Calibration.load(tmp_path / "out" / "calibration.yaml")
 

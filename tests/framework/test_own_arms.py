@@ -273,7 +273,7 @@ class TestFirstAndLastMotion:
         clock.ask({"fault": {"kind": "seen"}})
         pulses = clock.ask({"state": True})["pulses_s"]
         unasked = arm.armcal(*run, "--resume", sets=sets)
-        assert unasked.exit_code == 2 and "have pulses, and nobody can be asked" in said_by(unasked)
+        assert unasked.exit_code == 2 and "have pulses, and there is no terminal to ask" in said_by(unasked)
         assert clock.ask({"state": True})["pulses_s"] == pulses and all(pulses.values())
         narrow = ("plan.limits.b=[-20 deg, 20 deg]", "bench.acquisition.park={}", *sets)
         other = ("acquire", "--plan", arm.plan((0, 10, 0)), "--out", arm.folder / "other")

@@ -34,7 +34,7 @@ def planted(name: str, folder: Path, arm: PlantedArm = PRINTED, seed: int = 1) -
 @pytest.mark.parametrize(
     ("name", "grade", "words"),
     [
-        ("rows of positions shuffled", "bad", "given up"),
+        ("rows of positions shuffled", "bad", "stopped early"),
         ("two signs", "refused", "the signs of q2 and q4 reversed"),
         ("x and y exchanged, one sign", "refused", "the sign of q4 reversed and x and y exchanged"),
         ("z in centimetres for millimetres", "refused", "with z 10 times as large"),
@@ -90,7 +90,7 @@ def test_an_arm_that_shows_a_tenth_too_large_is_not_usable(tmp_path: Path) -> No
 def test_a_base_that_nothing_holds_and_that_is_far_off_is_a_warning(tmp_path: Path) -> None:
     found = planted("a base off by 1 m", tmp_path)
     assert found.grade == "warning" and "base_x by 999 mm (100 times a typical correction)" in found.said
-    assert "cannot tell whether it is there" in found.said
+    assert "do not determine whether it is there" in found.said
 
 
 def test_a_clean_recording_is_not_graded_bad(tmp_path: Path) -> None:

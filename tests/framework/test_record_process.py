@@ -234,7 +234,7 @@ class GuidedStep:
         (("--from", "udp:0", "--set", "bench.joints={type: json_lines, joints: {j9: x}}"), "no joint is called 'j9'"),
         (("--from", "udp:0", "--set", "bench.recording.window_s=0"), "window is not above zero"),
         (("--from", "udp:0", "--resume"), "holds no recording to resume"),
-        (("--from", "-"), "nobody can say when to capture"),
+        (("--from", "-"), "no key can start a capture"),
     ],
 )
 def test_bad_requests_are_refused_before_anything_is_written(

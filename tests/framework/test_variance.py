@@ -199,7 +199,7 @@ def test_is_it_the_tracker_or_the_joints(lrm):
         assert found.share(kind) > 0.75
         assert sum(c.share for c in found.components) == pytest.approx(1)
         told = component_findings(found)[0].text
-        assert told.startswith(f"The scatter is mostly the {kind}s'")
+        assert told.startswith(f"Most of the residual variance comes from the {kind}s")
 
 
 def test_axes_apart_find_the_noisy_axis(lrm):
@@ -238,7 +238,7 @@ def test_one_pose_again_and_again_tells_no_joint_from_another(lrm):
     problem, records, start = posed(lrm, q, points, ("base_x", "base_z"))
     found = estimate_components(problem, start, records)
     assert found.inseparable
-    assert any("hardly be told apart" in finding.text for finding in component_findings(found))
+    assert any("hardly separate some variances" in finding.text for finding in component_findings(found))
 
 
 def test_joints_through_the_tip_are_unseen(lrm):

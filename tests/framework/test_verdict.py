@@ -105,10 +105,10 @@ def test_missed_records_are_listed_where_the_limit_says(tmp_path: Path) -> None:
     assert {m["record_id"] for m in missed["explained"]} == {"8", "91"} and missed["beyond"] == 2
     assert missed["judged"] == 200 and missed["configured"]
     assert all(m["error_mm"] > 15 and m["advice"] for m in missed["explained"])
-    finding = next(f for f in run["verdict"]["findings"] if "missed by more than 6.00 mm" in f["text"])
+    finding = next(f for f in run["verdict"]["findings"] if "an error above 6.00 mm" in f["text"])
     assert finding["grade"] == "warning" and "validation.limit_mm" in finding["test"]
-    assert "Missed by more than 6.00 mm" in run["verdict"]["paragraph"]
-    assert "missed by more than 6.00 mm by fits that did not see them" in (tmp_path / "run" / "report.html").read_text()
+    assert "Error above 6.00 mm" in run["verdict"]["paragraph"]
+    assert "an error above 6.00 mm by fits that did not see them" in (tmp_path / "run" / "report.html").read_text()
     relaxed = verdict(
         tmp_path / "relaxed", "validation.holdout=0", "validation.folds=2", "validation.limit_mm=60", data=data
     )
@@ -139,7 +139,7 @@ def test_what_priors_alone_hold_is_a_note_where_the_tip_does_not_depend_on_it(tm
     freed = "parameters.free=[arm.mdh.alpha6, arm.mdh.tool_rx, arm.mdh.tool_z, arm.mdh.theta2, arm.mdh.base_z]"
     priors = 'parameters.priors={"*.alpha6": 2 deg, "*.tool_rx": 2 deg}'
     run = verdict(tmp_path / "run", freed, priors, "validation.folds=0")
-    found = next(f for f in run["verdict"]["findings"] if "held by priors alone" in f["text"])
+    found = next(f for f in run["verdict"]["findings"] if "determined by priors alone" in f["text"])
     assert found["grade"] == "note" and "does not depend on them" in found["text"]
     assert len(found["text"]) < 200 and "armcal identify" in found["action"]
     assert run["structure"]["priors_alone"]["worst_mm"] < 1e-6

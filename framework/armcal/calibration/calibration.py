@@ -251,7 +251,7 @@ class Calibration:
         """
         if recording == "same" and self.record.recalibrated is not None:
             raise ConfigError(
-                "the calibration was kept true since its recording, which no longer tells of its drift.",
+                "the calibration was updated after its recording, so the drift of that recording is not known.",
                 hint="Predict for a new recording.",
             )
         return self.uncertainty.plus_minus(commands, recording)

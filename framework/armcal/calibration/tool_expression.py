@@ -161,7 +161,7 @@ def _defaults(channels: Sequence[str], environment: Environment) -> Array:
 
 
 def sample_inputs(expression: ToolExpression) -> list[Array]:
-    """A made-up record and state (8 columns each), to compare two forms of a function."""
+    """A random record and state (8 columns each), to compare two forms of a function."""
     commands = np.random.default_rng(0).uniform(-1, 1, (len(expression.joints), 8))
     return [expression.records(commands), np.zeros((expression.state.numel(), 8))]
 

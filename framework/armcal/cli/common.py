@@ -163,13 +163,14 @@ def spare_inputs(out: Path, *given: Path | None) -> None:
 
 
 def warn_of_target(console: Console, subject: str, target: MeasuredPoint | None) -> None:
-    """Nobody said which point shall arrive, and it matters."""
+    """Warn that no point to arrive was stated, where it matters."""
     if target is not None and target.distance > _SAME_POINT_M:
         x, y, z = 1000 * target.tool_T_target[:3, 3]
         console.warn(
             f"{subject} the tool frame's origin to the targets. The target that "
-            f"{target.measurement} measured sits at ({x:.3f}, {y:.3f}, {z:.3f}) mm on the tool and misses them by "
-            f"{1000 * target.distance:.3g} mm. To bring that one there, give --point target; otherwise --point tool."
+            f"{target.measurement} measured sits at ({x:.3f}, {y:.3f}, {z:.3f}) mm on the tool and arrives "
+            f"{1000 * target.distance:.3g} mm away from them. "
+            "To bring that one there, give --point target; otherwise --point tool."
         )
 
 

@@ -34,7 +34,7 @@ def correction_table(
     point: Point | None,
     accept: bool,
 ) -> None:
-    """Make a table of what to tell a controller that takes the arm in CALIBRATION for the nominal one."""
+    """Make a table of what to send to a controller that takes the arm in CALIBRATION for the nominal one."""
     spare_inputs(out, calibration, grid, within)
     registry = console.registry()
     settings = read_table_settings(grid)

@@ -38,7 +38,7 @@ def export(
 ) -> None:
     """Write the arm in CALIBRATION in the format of another program.
 
-    Some formats write further files beside --out. What a format cannot hold is told.
+    Some formats write further files beside --out. What a format cannot hold is reported.
     """
     registry = console.registry()
     try:

@@ -38,7 +38,7 @@ WORDS: Mapping[str, str] = MappingProxyType(
         "joint": "a joint's name.",
         "measured": "what the record says, by the local names of the channels (SI).",
         "observations": "records, the newest last, each ready to be looked at from anywhere.",
-        "progress": "to be told what is being done, and which fraction of it is.",
+        "progress": "receives what is being done, and which fraction of it is done.",
         "pulse": "its length (s).",
         "records": "those of each measurement, with their weights.",
         "register": "the number of the first register.",
@@ -52,7 +52,7 @@ WORDS: Mapping[str, str] = MappingProxyType(
 
 @dataclass(frozen=True)
 class Argument:
-    """An argument, and what it is; empty if nobody says."""
+    """An argument, and what it is; empty if not stated."""
 
     name: str
     explained: str
@@ -219,7 +219,7 @@ def as_markdown(reference: Reference) -> str:
     ]
     lines += ["the base, `arm_names` all arms' instance names, `link` the link of the bench.", ""]
     lines += ["## Announcing a component", "", *_markdown(reference.register)]
-    lines += ["## Observers", "", "They are told what happens; what they return is ignored.", ""]
+    lines += ["## Observers", "", "They are notified of what happens; what they return is ignored.", ""]
     for hook in reference.observers:
         lines += [f"### `{hook.name}`", "", *_markdown(hook)]
     for kind in reference.kinds:

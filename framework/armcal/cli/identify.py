@@ -44,7 +44,7 @@ def identify(
     max_sd: float | None,
     overrides: tuple[str, ...],
 ) -> None:
-    """Tell which combinations of CONFIG's free parameters its poses determine. Refuses no rank, solves nothing."""
+    """Report which combinations of CONFIG's free parameters its poses determine. Refuses no rank, solves nothing."""
     registry = console.registry()
     experiment = Experiment.load(config, overrides, data, registry)
     ready = assemble(experiment, Stopwatch())

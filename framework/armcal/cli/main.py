@@ -27,7 +27,7 @@ COMMANDS = {
     "compensate": ("armcal.cli.compensate:compensate", "What to command so that the real arm arrives at targets."),
     "correction-table": (
         "armcal.cli.correction_table:correction_table",
-        "What to tell a controller that only knows the nominal arm.",
+        "What to send to a controller that only knows the nominal arm.",
     ),
     "export": ("armcal.cli.export:export", "Write a calibrated arm in another program's format, such as URDF."),
     "calibration": ("armcal.cli.calibration:calibration", "Accept a calibration that was edited by hand."),

@@ -39,7 +39,7 @@ _RECORDINGS: Mapping[str, Literal["same", "new"]] = {"calibrated": "same", "new"
     type=click.Choice(list(_RECORDINGS)),
     default="new",
     show_default=True,
-    help="Whether the poses belong to the calibration's recording, which tells how parameters drifted.",
+    help="Whether the poses belong to the calibration's recording, in which the drift of parameters is known.",
 )
 @click.option("--columns", multiple=True, metavar="NAME=COLUMN", help="What the CSV calls a column: sequence=pose_id.")
 @accept

@@ -154,7 +154,7 @@ class SerialPort:
         raise DeviceRefusedError(
             f"found {len(devices)} adapters with this serial number, expected one.",
             where=Location(self._settings.meant),
-            hint=f"Plugged in are: {seen or 'none that tell a serial number'}.",
+            hint=f"Plugged in are: {seen or 'none with a serial number'}.",
         )
 
     def _refuse(self, path: str, fault: Exception) -> NoReturn:

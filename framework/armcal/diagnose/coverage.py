@@ -1,4 +1,4 @@
-"""Whether prediction intervals hold what they claim, and by how much to widen them where they do not.
+"""Whether prediction intervals cover what they claim, and by how much to widen them where they do not.
 
 Residuals of records that took no part in a fit are put in units of what was predicted for them. If the model's own
 error is not Gaussian, or larger in some poses than in others, the shares held differ from the levels claimed. The
@@ -264,20 +264,20 @@ def coverage(scores: Scores, stretches: Sequence[Stretch | None] | None = None) 
 
 
 def coverage_finding(shares: Coverage, of: str, recording: Recording = "same") -> Finding:
-    """Do intervals hold their share? Two-sided, at 5 %, against so many independent numbers as they are worth."""
+    """Do intervals cover their share? Two-sided, at 5 %, against so many independent numbers as they are worth."""
     share, raw = shares.stated[LEVELS.index(STATED)], shares.raw[LEVELS.index(STATED)]
     error = np.sqrt(STATED * (1 - STATED) / shares.independent)
     off = abs(share - STATED) > ndtri(1 - LEVEL / 2) * error
     before = f"; {100 * raw:.1f} % before they were stretched" if shares.stretched else ""
     text = (
-        f"90 % prediction intervals{_MEANT[recording]} hold {100 * share:.1f} % of {shares.coordinates} coordinates "
+        f"90 % prediction intervals{_MEANT[recording]} cover {100 * share:.1f} % of {shares.coordinates} coordinates "
         f"of {of}{before}"
     )
     test = f"two-sided, 5 %, as of {shares.independent:.0f} independent numbers"
     if not off:
         return Finding("good", f"{text}.", test)
     if share > STATED:
-        return Finding("note", f"{text}: wider than need be.", test)
+        return Finding("note", f"{text}: wider than necessary.", test)
     return Finding("warning", f"{text}: too narrow.", test, "Take the measured shares for what a +- is worth.")
 
 

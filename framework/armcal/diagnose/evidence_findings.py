@@ -40,9 +40,9 @@ def determined_finding(estimate: Estimate, alone: PriorsAlone | None, typical_mm
     listed = "; ".join(str(combination) for combination in known.undetermined[:MOST_TOLD])
     more = f"; and {count - MOST_TOLD} more" if count > MOST_TOLD else ""
     if alone is None:
-        text = f"Not determined by the data, held by priors alone: {listed}{more}."
+        text = f"Not determined by the data, only by priors: {listed}{more}."
         return Finding("bad", text, test, "Free fewer parameters, or measure what armcal identify asks for.")
-    held = f"{_plural(count, 'combination is', 'combinations are')} held by priors alone"
+    held = f"{_plural(count, 'combination is', 'combinations are')} determined by priors alone"
     held += f" ({listed})" if count <= FEW_NAMED else ""
     test = f"{test}; the tip at {alone.poses} poses of recorded joint positions, and at as many between them"
     test += f"; positions, not orientations, up to {alone.up_to}, which nothing measured shows" if alone.up_to else ""
@@ -143,7 +143,7 @@ def _structure_finding(s: Structure, structure: ResidualStructure, unit: str, te
     more = len(named) - MOST_TOLD
     text = f"Residuals still depend on {'; or on '.join(named[:MOST_TOLD])}"
     text += f"; or on {more} more (metrics.json). " if more > 0 else ". "
-    text += f"These data cannot tell which. Modelled as {s.words}, which has {_share(s.odds)} of the odds, {falls}."
+    text += f"These data do not identify which. Modelled as {s.words}, which has {_share(s.odds)} of the odds, {falls}."
     model = f" Then model it: {s.effect}." if s.effect else ""
     return Finding("warning", text, test, f"To find out: {s.measure}.{model}")
 
@@ -157,12 +157,13 @@ def _scatter(structure: ResidualStructure) -> list[Finding]:
     noise = structure.noise
     if noise is None:
         return []
-    text = f"The scatter of the residuals depends on {'; or on '.join([noise.words, *noise.alternatives[:MOST_TOLD]])}:"
+    text = f"The spread of the residuals depends on {'; or on '.join([noise.words, *noise.alternatives[:MOST_TOLD]])}:"
     text += f" from {noise.low:.1f} to {noise.high:.1f} times the declared noise, in the thirds of the records with the"
     text += " least and the most of it. Either the noise varies, or the model errs more there."
     test = f"regression of squared residuals, p {_p(noise.p_value)} over everything looked at"
     action = (
-        "Repeat a pose at both ends of it: where repeats scatter alike, it is the model; else state noise by record."
+        "Repeat a pose at both ends of it: if repeats spread equally, the model is the cause; else state noise by "
+        "record."
     )
     return [Finding("warning", text, test, action)]
 
@@ -183,8 +184,8 @@ def neighbour_findings(structure: ResidualStructure | None, estimate: Estimate, 
     if alike is None:
         return [Finding("warning", text, test, _TELL_APART["open"])]
     text += (
-        f" {_WHY[alike.cause]}predicted from the others, a record misses a smooth function of time by "
-        f"{alike.time_mm:.2f} {unit} and one of the pose by {alike.pose_mm:.2f} {unit} (log odds against noise "
+        f" {_WHY[alike.cause]}predicted from the other records, a smooth function of time has an error of "
+        f"{alike.time_mm:.2f} {unit} and one of the pose {alike.pose_mm:.2f} {unit} (log odds against noise "
         f"{alike.time:.0f} and {alike.pose:.0f})"
     )
     if max(alike.time_imitated, alike.pose_imitated) > IMITATED:
@@ -197,7 +198,7 @@ def what_neighbours_cost(estimate: Estimate) -> str:
     """What correlated neighbours do to the intervals of the parameters."""
     factors = estimate.widened
     if not factors:
-        return "Intervals of the parameters hold all the same, in the order in which these poses were measured."
+        return "The intervals of the parameters need no widening, in the order in which these poses were measured."
     widest = int(np.argmax(factors))
     return (
         "By independent errors the intervals of the parameters would be too narrow; they are wider by a factor of "
@@ -224,14 +225,14 @@ def large_error_findings(large_errors: LargeErrors | None, unit: str = _MM) -> l
     limit = "validation.limit_mm" if large_errors.configured else f"{MEDIANS:g} times the median"
     test = f"errors of {large_errors.judged} records by fits that did not see them, limit {limit}"
     if not large_errors.beyond:
-        return [Finding("good", f"No judged record is missed by more than {large_errors.limit_mm:.2f} {unit}.", test)]
+        return [Finding("good", f"No judged record has an error above {large_errors.limit_mm:.2f} {unit}.", test)]
     listed = "; ".join(
         f"{miss.record_id} ({miss.error_mm:.2f} {unit}: {', '.join(miss.reasons)})"
         for miss in large_errors.explained[:MOST_TOLD]
     )
     more = f"; and {large_errors.beyond - MOST_TOLD} more, in the report" if large_errors.beyond > MOST_TOLD else ""
-    records = _plural(large_errors.beyond, "record is", "records are")
-    text = f"{records} missed by more than {large_errors.limit_mm:.2f} {unit}: "
+    records = _plural(large_errors.beyond, "record has", "records have")
+    text = f"{records} an error above {large_errors.limit_mm:.2f} {unit}: "
     advice = "; or ".join(dict.fromkeys(miss.advice for miss in large_errors.explained[:MOST_TOLD]))
     return [Finding("warning", f"{text}{listed}{more}.", test, f"{advice.capitalize()}.")]
 

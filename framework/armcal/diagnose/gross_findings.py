@@ -40,7 +40,7 @@ def gross_error(
     mean, scale = float(np.mean(seen)), estimate.noise_scale
     whole, name = (figure.reach_mm, "the arm's reach") if unit == "mm" else (1000.0, "a radian")
     share = mean / whole
-    error = f"Records that did not train are missed by {mean:.3g} {unit} on average, {100 * share:.2g} % of {name}"
+    error = f"The mean error of records that did not train is {mean:.3g} {unit}, {100 * share:.2g} % of {name}"
     if share > OF_REACH:
         test = f"mean, limit {100 * OF_REACH:g} % of {whole:.0f} {unit}"
         return [Finding("bad", f"{error}: the values do not describe this arm.", test, CHECK_THE_DATA)]
@@ -104,7 +104,8 @@ def displacement_findings(figure: Figure) -> list[Finding]:
     if elsewhere:
         text = (
             f"The base or the tool's point is far from where the configuration has it: {_listed(elsewhere)}. These "
-            "data cannot tell whether it is there, or the instrument's frame or target is elsewhere: no prior holds it."
+            "data do not determine whether it is there, or the instrument's frame or target is elsewhere: it has "
+            "no prior."
         )
         action = "If the configuration's frame is meant, look for an offset or a unit; else correct the nominal values."
         findings.append(Finding("warning", text, test, action))

@@ -189,4 +189,4 @@ def _along(record: int, problem: Problem, motion: Motion, judged: Judged) -> str
     unit = display_unit(arm.commanded[joint])
     off = abs(float(own @ slopes[:, best] / (slopes[:, best] @ slopes[:, best])))
     shown = joint if len(problem.blueprint.arms) == 1 else motion.channels[best]
-    return f"it misses along {shown}'s own motion, as if {to_unit(off, unit.name):.1f} {unit.name} off"
+    return f"its error lies along {shown}'s own motion, as if {to_unit(off, unit.name):.1f} {unit.name} off"

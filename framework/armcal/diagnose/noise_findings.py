@@ -67,17 +67,17 @@ def component_findings(components: VarianceComponents) -> list[Finding]:
         sd = f"{factor * c.sd:.2g}{unit}, 95 % {factor * c.lower:.2g} to {factor * c.upper:.2g}"
         texts.append(f"{c.name} {100 * c.share:.0f} % ({sd})")
     listed = "; ".join(texts)
-    whose = "the joints'" if joints > 0.5 else "the instruments'"
+    whose = "the joints" if joints > 0.5 else "the instruments"
     share = joints if joints > 0.5 else 1 - joints
     meaning = (
         " A joint's part is what acts like an angle that is off, repeatable or not: an effect that the model lacks "
         "looks the same. Poses measured twice would separate the two."
     )
-    text = f"The scatter is mostly {whose} ({100 * share:.0f} % of the variance): {listed}."
+    text = f"Most of the residual variance comes from {whose} ({100 * share:.0f} %): {listed}."
     findings = [Finding("note", text + (meaning if joints > 0.5 else ""))]
     if components.inseparable:
         pairs = ", ".join(f"{a} and {b} ({r:+.2f})" for a, b, r in components.inseparable)
-        findings.append(Finding("warning", f"In these poses some variances can hardly be told apart: {pairs}."))
+        findings.append(Finding("warning", f"These poses hardly separate some variances: {pairs}."))
     if components.unseen:
         findings.append(Finding("note", f"No residual shows what these joints do: {', '.join(components.unseen)}."))
     return findings

@@ -76,7 +76,7 @@ def judge(
         ids: of all records (N).
         suggestions: poses that would add most information.
         fitted: how the training records weighed; None for plain least squares.
-        predicted: whether prediction intervals hold their share.
+        predicted: whether prediction intervals cover their share.
         evidence: what residuals still depend on, which records are missed, what priors alone hold.
     """
     seen = evidence or Evidence()
@@ -148,7 +148,7 @@ def _in_short(
     if missed is not None and missed.beyond:
         ids = ", ".join(miss.record_id for miss in missed.explained[:MOST_TOLD])
         more = f" and {missed.beyond - MOST_TOLD} more" if missed.beyond > MOST_TOLD else ""
-        sentences.append(f"Missed by more than {missed.limit_mm:.2f} {seen.unit}: {ids}{more}.")
+        sentences.append(f"Error above {missed.limit_mm:.2f} {seen.unit}: {ids}{more}.")
     sentences.append(
         f"Suspicious records: {first_few(suspicious)}." if suspicious else "No training record is suspicious."
     )
@@ -216,12 +216,14 @@ def _size(estimate: Estimate, seen: Evidence) -> Finding:
     freedom, ratio = max(1, estimate.degrees_of_freedom), estimate.noise_scale
     total, test = ratio**2 * freedom, "chi-square, 5 %"
     if total > chdtri(freedom, LEVEL / 2):
-        why = "the model's error or the instrument's, which this test cannot tell apart"
+        why = "the model's error or the instrument's, which this test cannot separate"
         if seen.structure is not None:
             known = "some of it is the model's: what residuals depend on is named below"
             why += f"; {known if seen.structure.structures else 'no cause that was looked for is in it'}"
         text = f"Residuals are {ratio:.1f} times the declared noise: {why}. Intervals are widened to the residuals."
-        action = "Repeat some poses, each from elsewhere: what scatters there is noise, the rest the model's error."
+        action = (
+            "Repeat some poses, each from elsewhere: the spread of the repeats is noise, the rest the model's error."
+        )
         return Finding("warning", text, test, action)
     if ratio < 0.5:
         text = f"Residuals are only {ratio:.2f} times the declared noise: was it stated too large?"
@@ -249,7 +251,7 @@ def _correlated(estimate: Estimate) -> list[Finding]:
     if not pairs:
         return []
     listed = first_few([f"{a} with {b} ({value:+.3f})" for a, b, value in pairs])
-    return [Finding("note", f"Hard to tell apart: {listed}.", "correlation of estimates above 0.95")]
+    return [Finding("note", f"Strongly correlated: {listed}.", "correlation of estimates above 0.95")]
 
 
 def _suspicious(errors_mm: Array, ids: Sequence[str], fitted: WeighedFit | None) -> list[str]:

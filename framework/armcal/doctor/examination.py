@@ -1,4 +1,4 @@
-"""All checks, in the order in which they are told; a check that fails is a finding, and stops none of the others."""
+"""All checks, in the order of the report; a check that fails is a finding, and stops none of the others."""
 
 from __future__ import annotations
 

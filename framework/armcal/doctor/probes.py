@@ -127,7 +127,7 @@ def kalman() -> dict[str, Any]:
 
 
 def calibration() -> dict[str, Any]:
-    """Calibrate a made-up arm of two links as ``armcal run`` does, and compare with what made it up.
+    """Calibrate a simulated arm of two links as ``armcal run`` does, and compare with its truth.
 
     The measured positions come from the cosine rule written here, not from armcal's kinematics.
     """

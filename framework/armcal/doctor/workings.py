@@ -108,10 +108,10 @@ def compiler(ask: Ask) -> Finding:
 
 
 def main_job(ask: Ask) -> Finding:
-    """Calibrate a small made-up arm, report and all."""
+    """Calibrate a small simulated arm, report and all."""
     content = ask("calibration")
     if "fault" in content:
-        text = f"a made-up arm cannot be calibrated: {content['fault']}"
+        text = f"a simulated arm cannot be calibrated: {content['fault']}"
         return Finding("main job", "calibrate", "fault", text, "Mend what is marked above first.", content)
-    text = f"a made-up arm of two links came out right to {content['off_mm']:.3f} mm, with report and calibration file"
+    text = f"a simulated arm was calibrated to {content['off_mm']:.3f} mm, with report and calibration file"
     return Finding("main job", "calibrate", "ok", text, detail=content)

@@ -137,7 +137,7 @@ def hopeless(problem: Problem, records: Sequence[FactorRecords], dataset: Datase
         return None
     if off <= HOPELESS:
         return None
-    status = f"given up: positions stay off by {100 * off:.0f} % of how far they spread, whatever the free parameters"
+    status = f"stopped early: position errors stay at {100 * off:.0f} % of the spread of the positions"
     seconds = time.perf_counter() - began
     return Solution(start, SolverVerdict("the first search", status, False, _SEARCH_STEPS, seconds))
 

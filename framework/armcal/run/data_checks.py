@@ -79,7 +79,7 @@ def check_permuted_axes(problem: Problem, records: Sequence[FactorRecords], data
 
 
 def gravity_findings(system: System, dataset: Dataset) -> list[Finding]:
-    """A warning where springs bend under weights and nothing states which way gravity points.
+    """A warning where springs bend under weights and the direction of gravity is not stated.
 
     A tracker's frame may stand in any way: gravity that is turned with it makes wrong compliances, and fits as well.
     """
@@ -91,9 +91,12 @@ def gravity_findings(system: System, dataset: Dataset) -> list[Finding]:
         return []
     x, y, z = system.environment.gravity
     text = (
-        f"Nobody stated which way gravity points: for the springs of {', '.join(bent)} it was assumed to be "
+        f"The direction of gravity is not stated: for the springs of {', '.join(bent)} it was assumed to be "
         f"({x:g}, {y:g}, {z:g}) m/s^2 in the frame of the measurements, z up. If that frame is tilted, compliances are "
         "wrong."
     )
-    action = "State statics.gravity_m_s2 in that frame, or record it: columns gravity_x_m_per_s2, _y, _z."
+    action = (
+        "State statics.gravity_m_s2 in that frame, or add the columns gravity_x_m_s2, gravity_y_m_s2 and gravity_z_m_s2 "
+        "to the records."
+    )
     return [Finding("warning", text, action=action)]

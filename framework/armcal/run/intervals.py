@@ -61,7 +61,7 @@ class IntervalResult:
         return (self.holdout, "held-out records") if self.holdout else (self.crossed, "cross-validated records")
 
     def findings(self) -> list[Finding]:
-        """Whether intervals hold their share."""
+        """Whether intervals cover their share."""
         coverages, words = self.judged
         typical = [Finding("note", self._typical())] if self.half_width_mm else []
         return [*typical, *(coverage_finding(own, words, name) for name, own in coverages.items())]

@@ -48,7 +48,7 @@ def verdict_of(
     Args:
         run: the fit and its records.
         errors: of every record.
-        intervals: whether prediction intervals hold their share.
+        intervals: whether prediction intervals cover their share.
         system: the arms.
         limit: above which the error of a judged record is explained (m); None for the default.
     """

@@ -1,4 +1,4 @@
-"""The files of a new robot: its arm, what to calibrate, a plan, a made-up truth and records of it."""
+"""The files of a new robot: its arm, what to calibrate, a plan, a simulated truth and records of it."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class FreeChoice:
 
 @dataclass(frozen=True)
 class RobotFolder:
-    """What was written: where, the parameters chosen, and the noise that the made-up records have (mm)."""
+    """What was written: where, the parameters chosen, and the noise that the simulated records have (mm)."""
 
     folder: Path
     choice: FreeChoice

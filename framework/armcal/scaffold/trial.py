@@ -1,4 +1,4 @@
-"""The end of a new robot's files: a calibration on made-up records, whose truth is known."""
+"""The end of a new robot's files: a calibration on simulated records, whose truth is known."""
 
 from __future__ import annotations
 
@@ -44,14 +44,14 @@ class Trial:
             return bad[0]
         if not self.calibrated_mm <= MOST_ERROR * self.noise_mm:
             return (
-                f"held-out tips are missed by {self.calibrated_mm:.3f} mm, and the noise alone makes "
+                f"the error at held-out tips is {self.calibrated_mm:.3f} mm, and the noise alone makes "
                 f"{self.noise_mm:.3f} mm"
             )
         return ""
 
 
 def try_out(made: RobotFolder, registry: PluginRegistry, command: str = "", progress: Progress = no_progress) -> Trial:
-    """Calibrate on the made-up records, as ``armcal run`` does.
+    """Calibrate on the simulated records, as ``armcal run`` does.
 
     Raises:
         InputError: the data or the configuration is refused.

@@ -47,13 +47,13 @@ def ask(motion: FirstMotion) -> bool:
     """Whether somebody at the terminal says that the arm may be moved.
 
     Raises:
-        InputError: there is nobody.
+        InputError: there is no terminal to ask at.
     """
     named = ", ".join(motion.free or motion.powered)
     pulses = "get no pulses yet" if motion.free else "have pulses"
     if not sys.stdin.isatty():
         raise InputError(
-            f"{named} {pulses}, and nobody can be asked whether the arm may be moved; nothing was moved.",
+            f"{named} {pulses}, and there is no terminal to ask whether the arm may be moved; nothing was moved.",
             hint="Stand clear of the arm and give --yes.",
         )
     jumps = (

@@ -97,7 +97,7 @@ def _keys(bench: Bench, capture: str) -> Iterator[tuple[Keys, bool]]:
     """What a person types, and whether that is a terminal; never what the joint readings come from.
 
     Raises:
-        InputError: nobody could say when to capture.
+        InputError: no key could start a capture.
     """
     is_taken = (bench.settings.joints or {}).get("source") == STANDARD_INPUT
     if not is_taken and not sys.stdin.isatty():
@@ -112,7 +112,7 @@ def _keys(bench: Bench, capture: str) -> Iterator[tuple[Keys, bool]]:
     if descriptor is None:
         if capture == "keys":
             raise InputError(
-                "standard input gives the joint readings and there is no terminal, so nobody can say when to capture.",
+                "standard input gives the joint readings and there is no terminal, so no key can start a capture.",
                 hint="Give --capture still, or let the readings come from udp:PORT or a file.",
             )
         yield NoKeys(), False

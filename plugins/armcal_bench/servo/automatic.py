@@ -131,7 +131,7 @@ class Automatic:
             self.record.append(LEFT_OUT, {**line, "why": settled})
             self.restless += 1
             if self.restless >= _MOST_RESTLESS:
-                text = f"{point.joint} did not come to stand {self.restless} times in a row ({settled})"
+                text = f"{point.joint} did not stop moving {self.restless} times in a row ({settled})"
                 raise Restless(f"{text}: does a servo stall, or let go?")
             return
         deviations = [float(d) if np.isfinite(d) else None for d in settled.deviations]

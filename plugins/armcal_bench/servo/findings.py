@@ -67,7 +67,8 @@ def _of_servo(servo: FittedServo, outcome: Outcome) -> Iterator[str]:
             yield f"{joint}: no measurement determines the pulse at {math.degrees(angle):g} deg; it is the stated one."
         elif beyond > math.radians(15):
             yield (
-                f"{joint}: the pulse at {math.degrees(angle):g} deg goes on straight from what was measured, "
+                f"{joint}: the pulse at {math.degrees(angle):g} deg is extrapolated linearly from "
+                "the measured range, "
                 f"{math.degrees(servo.reach[0]):.0f} to {math.degrees(servo.reach[1]):.0f} deg."
             )
     if before == after and _gain_change(servo) > _FAR_CHANGE:
@@ -82,8 +83,8 @@ def _of_servo(servo: FittedServo, outcome: Outcome) -> Iterator[str]:
         yield f"{joint}: it overshoots by {over:.2f} deg rather than lags: does it stand before it is measured?"
     if servo.scale > 3:
         yield (
-            f"{joint}: the angles scatter by {math.degrees(servo.scatter):.2f} deg, {servo.scale:.0f} times more than "
-            "stated; the deviations are enlarged by that."
+            f"{joint}: the spread of the angles is {math.degrees(servo.scatter):.2f} deg, {servo.scale:.0f} times the "
+            "stated one; the deviations are enlarged by that."
         )
     for outlier in servo.outliers:
         angle = math.degrees(outlier.angle)
@@ -102,7 +103,7 @@ def _of_springs(outcome: Outcome) -> list[str]:
         return []
     if not any(outcome.sag_span.values()):
         return [
-            "springs: what the arm gives under its weight is not reckoned with; it is in the tables. Give the springs "
+            "springs: the model has no deflection of the arm under its weight; the tables contain it. Give the springs "
             "their compliances, or bench.servo.sag: fitted."
         ]
     worst = max(outcome.sag_span, key=lambda joint: outcome.sag_span[joint])
