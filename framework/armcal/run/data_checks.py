@@ -96,7 +96,7 @@ def gravity_findings(system: System, dataset: Dataset) -> list[Finding]:
         "wrong."
     )
     action = (
-        "State statics.gravity_m_s2 in that frame, or add the columns gravity_x_m_s2, gravity_y_m_s2 and gravity_z_m_s2 "
-        "to the records."
+        "State statics.gravity_m_s2 in that frame, or add the columns gravity_x_m_s2, gravity_y_m_s2 and gravity_z_m_s2"
+        " to the records."
     )
     return [Finding("warning", text, action=action)]

@@ -64,7 +64,8 @@ def outcome_of(
         if worst is None or worst.scatter <= _MOST_SCATTER:
             return replace(fitted, silent={**fitted.silent, **left_out})
         left_out[worst.known.joint] = (
-            f"the spread of its angles is {math.degrees(worst.scatter):.1f} deg, as if it slipped, or was too hot and let go"
+            f"the spread of its angles is {math.degrees(worst.scatter):.1f} deg, as if it slipped, or "
+            "was too hot and let go"
         )
 
 
