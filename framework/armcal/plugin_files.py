@@ -1,4 +1,4 @@
-"""Plugins that nobody packaged: Python files, each a component and its registration.
+"""Plugins without a package: Python files, each a component and its registration.
 
 Which ones are loaded stands in environment variables, so that every process that is started knows them too. A file
 ``gear.py`` is the module ``armcal.plugin_files.gear``, by which other processes find its components again.

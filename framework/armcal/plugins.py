@@ -45,7 +45,7 @@ class Component:
         module, _, attribute = self.target.partition(":")
         try:
             return getattr(import_module(module), attribute)
-        except (Exception, SystemExit) as fault:  # a plugin may fail in any way; the user is told which and how
+        except (Exception, SystemExit) as fault:  # a plugin may fail in any way; the error names it and the reason
             raise PluginError(
                 f"the {self.kind} {self.name!r} of the plugin {self.plugin!r} does not load: {said(fault)}.",
                 hint="Repair or update that plugin.",
@@ -69,7 +69,7 @@ class PluginInfo:
 
     @property
     def is_file(self) -> bool:
-        """Whether nobody packaged it."""
+        """Whether it is a single file without a package."""
         return self.module.startswith(f"{plugin_files.__name__}.")
 
 

@@ -75,7 +75,7 @@ def describe(request: ExportRequest) -> ArmDescription:
 
 
 def rebuilt_tools(arm_description: ArmDescription, commands: Array) -> Array:
-    """base_T_tool (N x 4 x 4) of the rigid arm that a description tells of, at commands (commanded joints x N).
+    """base_T_tool (N x 4 x 4) of the rigid arm that a description specifies, at commands (commanded joints x N).
 
     The product of exponentials of the joints' screws [Murray1994], from the description alone.
     """

@@ -188,7 +188,7 @@ def _word(name: str) -> str:
 
 
 def _left_out(request: ExportRequest, arm_description: ArmDescription) -> tuple[str, ...]:
-    """Settings that ROS 2 has no type for; pulse tables are told joint by joint."""
+    """Settings that ROS 2 has no type for; pulse tables are set joint by joint."""
     return tuple(
         f"{setting} of {effect.name}"
         for effect in arm_description.effects
@@ -213,7 +213,7 @@ def _compare(
 
 
 def rebuilt_tools(parameters: Mapping[str, Any], commands: Array) -> Array:
-    """base_T_tool (N x 4 x 4) of the rigid arm that the parameters tell of, at commands (commanded joints x N)."""
+    """base_T_tool (N x 4 x 4) of the rigid arm that the parameters specify, at commands (commanded joints x N)."""
     given = dict(zip(parameters["commanded_joint_names"], commands, strict=True))
     tools = np.tile(np.eye(4), (commands.shape[1], 1, 1))
     for name in parameters["joint_names"]:

@@ -19,7 +19,7 @@ _MOTION_TERMS = 12
 _HALVINGS = 3
 _ARCSINE_TERMS = 11
 _NO_AXIS = 1e-30
-"""Put on an axis so that half a turn exactly, whose axis this way does not tell, is still half a turn."""
+"""Put on an axis so that half a turn exactly, whose axis this way does not determine, is still half a turn."""
 
 
 @dataclass(frozen=True)

@@ -69,7 +69,7 @@ class Calibration:
 
         Raises:
             ConfigError: not a calibration, of another schema, damaged, changed since it was written, lost, of a bad
-                verdict that nobody accepted, or made with other physics than that of the plugins that are there now.
+                verdict that was not accepted, or made with other physics than that of the plugins that are there now.
             PluginError: it needs a plugin that is not there.
         """
         registry = registry or discover()
@@ -241,7 +241,7 @@ class Calibration:
     def plus_minus(self, commands: Dataset, recording: Recording = "new") -> PlusMinus:
         """How far measurements at these commands may lie from ``predict``.
 
-        In the ``same`` recording as the calibration's, with the drift that it tells of, which ``shift`` adds to the
+        In the ``same`` recording as the calibration's, with the drift that it determines, which ``shift`` adds to the
         predicted channels.
 
         Raises:

@@ -36,7 +36,7 @@ from armcal.version import __version__
 SHARE = 0.05
 """Of a stated half width or radius: predictions that moved by more are not those of the calibration."""
 UNSTATED_M = 1e-5
-"""The same where no accuracy of the tool is stated: below what any tracker can tell."""
+"""The same where no accuracy of the tool is stated: below what any tracker can resolve."""
 CHECK_POSES = 8
 
 

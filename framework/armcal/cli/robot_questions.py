@@ -44,7 +44,7 @@ def ask_rows(conventions: Mapping[str, Convention]) -> tuple[Convention, tuple[R
 
 
 def ask_up() -> str:
-    """Which way is up, as ``direction`` takes it; empty if nobody knows."""
+    """Which way is up, as ``direction`` takes it; empty if not known."""
     words = "up in the tracker's base frame (x, y, z, -x, -y, -z, three numbers, or unknown)"
     answer = click.prompt(
         words, default=_UNKNOWN, value_proc=lambda text: text if text == _UNKNOWN else _checked(direction, text)

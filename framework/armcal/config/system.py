@@ -89,7 +89,7 @@ class SystemSettings(Settings):
 
 
 ASSUMED_GRAVITY = (0.0, 0.0, -9.80665)
-"""m/s^2, on the earth with z up, where nobody states it. [Williams2024]"""
+"""m/s^2, on the earth with z up, where it is not stated. [Williams2024]"""
 
 
 @dataclass(frozen=True)
@@ -179,7 +179,7 @@ def build_component(
         built = _refusable(source, at, lambda: component(settings, *context))
     except ArmcalError:
         raise
-    except Exception as fault:  # a plugin may fail in any way; the user is told which and how
+    except Exception as fault:  # a plugin may fail in any way; the error names it and the reason
         raise _broken(registered, f"building it raised {type(fault).__name__}: {fault}") from fault
     base = _BASES.get(kind, object)
     if not isinstance(built, base):

@@ -55,7 +55,7 @@ class Structure:
         falls_mm: by how much the mean error would fall if it were modelled, judged on records left out.
         size: how large it is, in words; empty if its coefficients have no unit.
         odds: its share of the odds of everything that was tried, and of what was not.
-        alternatives: what it does not beat 20 to 1, the most likely first; only a measurement can tell.
+        alternatives: what it does not beat 20 to 1, the most likely first; only a measurement can decide.
     """
 
     kind: str

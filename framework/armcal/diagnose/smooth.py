@@ -3,7 +3,7 @@
 Residuals of a fit, freed of what the fit and some causes take up, are noise plus a process over the records with a
 kernel of a few length scales, each entry of a record's residual for itself [Rasmussen2006]. Two explanations are
 compared by their marginal likelihoods, by how well other records predict each record, and by whether one can imitate
-the other: where poses were visited in order, a function of time is a function of the pose, and nothing can tell.
+the other: where poses were visited in order, a function of time is a function of the pose, and no test separates them.
 """
 
 from __future__ import annotations

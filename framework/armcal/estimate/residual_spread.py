@@ -3,7 +3,7 @@
 A model that is wrong errs by more than its instrument, and alike in poses that follow one another. Whoever goes on from
 the calibration needs both: the covariance as the noise to expect, and its shared part as no new evidence each time.
 The shared part is a process whose correlation falls by e over a distance, beside an independent part: the first two
-serial correlations tell share and distance [Box2015].
+serial correlations determine share and distance [Box2015].
 
 A few residuals do not determine a covariance of many rows: it is taken together with the declared noise, scaled to the
 residuals, as the mean of an inverse Wishart distribution whose weight is the likeliest for these residuals [Chen1979].

@@ -1,4 +1,4 @@
-"""Whether a factor's compiled library gives the interpreter's numbers: on a made-up block of records."""
+"""Whether a factor's compiled library gives the interpreter's numbers: on a random block of records."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Linearise(Protocol):
 
 @dataclass(frozen=True)
 class _Sample:
-    """A made-up block of records, and its residuals and Jacobians."""
+    """A random block of records, and its residuals and Jacobians."""
 
     values: Array
     record: Array

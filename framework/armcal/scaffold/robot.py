@@ -67,7 +67,7 @@ class Robot:
         urdf: the file's content.
         urdf_file: its name.
         tip: the link that is the tool.
-        up: which way is up in the tracker's base frame (unit vector); None if nobody said.
+        up: which way is up in the tracker's base frame (unit vector); None if not stated.
         target: where the tracker's target sits in the tool's frame (m), roughly.
     """
 
@@ -86,7 +86,7 @@ class Robot:
 
 
 def with_tilts(convention: Convention, rows: tuple[Row, ...]) -> tuple[Row, ...]:
-    """The rows, those between parallel axes marked: there rows alone cannot tell every small tilt. [Hayati1983]
+    """The rows, those between parallel axes marked: there rows alone cannot express every small tilt. [Hayati1983]
 
     ``alpha`` lies between a joint and the next one, in Craig's convention between it and the one before.
     """
