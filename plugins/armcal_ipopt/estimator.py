@@ -1,7 +1,8 @@
 """IPOPT over the increments of a problem. [Waechter2006]
 
 IPOPT sees sums over all records (cost, gradient, Hessian) through callbacks, so its own work does not grow
-with the data. Bounds are kept exactly: its bound relaxation is off.
+with the data. Bounds are kept exactly: its bound relaxation is off. It also ends, converged, where the best step left
+would lower the cost by no more than its rounding errors.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from armcal.base.parameters import Parameters
 from armcal.base.settings import Settings
 from armcal.errors import NotConvergedError
 from armcal.estimate.estimator import Progress, Solution, SolverVerdict, no_progress
-from armcal.estimate.polish import polish
+from armcal.estimate.polish import bounded_step, polish
 from armcal.io.parallel import Executor, Sequential
 from armcal.problem.posed import PosedProblem
 from armcal.problem.problem import FactorRecords, NormalEquations, Problem
@@ -36,6 +37,10 @@ _LEAST_START = 2e-2
 _MOST_REFUSED = 110
 """Trial points in a row without an equilibrium, which is two whole line searches down to a step of rounding errors: the
 fit stands where no way leads on, and IPOPT would search again in each iteration."""
+_ROUNDING = 1e-15
+"""Of the cost: a decrease below it is lost in its rounding errors, and a line search for it only shortens its steps."""
+_LEAST_CURVATURE = 1e-300
+_FLAT = "nothing left to gain beyond rounding errors of the cost"
 _STUCK = "stuck where springs no longer hold the arm"
 
 
@@ -99,13 +104,14 @@ def _solve_once(settings: IpoptSettings, problem: Problem, records: tuple[Factor
     answer = solver(x0=start, lbx=lower, ubx=upper)
     stats = solver.stats()
     stopped = stats["return_status"] == "User_Requested_Stop"
-    if objective.interrupted or (stopped and not objective.stuck):
+    if objective.interrupted or (stopped and not (objective.stuck or watch.settled)):
         raise KeyboardInterrupt  # CasADi keeps it to itself, and the next start would go on
     # IPOPT stays inside its bounds by a rounding error; the model's domain wants it exactly.
     x = np.clip(np.asarray(answer["x"]).ravel(), lower, upper)
-    converged = bool(stats["success"]) and bool(np.isfinite(x).all())
+    converged = (bool(stats["success"]) or watch.settled) and bool(np.isfinite(x).all())
     cost = float(answer["f"]) * objective.unit
-    return _Run(x, cost, converged, _STUCK if stopped else str(stats["return_status"]), int(stats["iter_count"]))
+    status = _FLAT if watch.settled else _STUCK if stopped else str(stats["return_status"])
+    return _Run(x, cost, converged, status, int(stats["iter_count"]))
 
 
 def _solver(settings: IpoptSettings, callbacks: list[_Callback], watch: _Watch, size: int) -> Any:
@@ -196,6 +202,22 @@ class _Objective:
         """Whether no step, however short, leads on."""
         return self._refused >= _MOST_REFUSED
 
+    def settled(self, x: Array) -> bool:
+        """Whether the best step within the bounds would lower the cost by no more than its rounding error."""
+        model, (lower, upper) = self._evaluate(x), self._posed.bounds()
+        if not (np.isfinite(model.cost) and np.isfinite(model.hessian).all()):
+            return False
+        # Most often one number alone can still lower it, which is told without the search for the best step of all.
+        curvature = np.maximum(np.diag(model.hessian), _LEAST_CURVATURE)
+        alone = np.clip(-model.gradient / curvature, lower - x, upper - x)
+        if np.max(-(model.gradient + curvature * alone / 2) * alone) > _ROUNDING * model.cost:
+            return False
+        step = bounded_step(model, lower - x, upper - x)
+        if step is None:
+            return False
+        gain = -float(model.gradient @ step + step @ model.hessian @ step / 2)
+        return abs(gain) <= _ROUNDING * model.cost
+
     def gradient(self, x: Array) -> Array:
         """By scaled increments."""
         return self._evaluate(x).gradient / self.unit
@@ -247,11 +269,11 @@ class _Callback(ca.Callback):  # type: ignore[misc]
 
 
 class _Watch(ca.Callback):  # type: ignore[misc]
-    """Ends the solve between two iterations once the objective is stuck."""
+    """Ends the solve between two iterations once the objective is stuck, or settled."""
 
     def __init__(self, objective: _Objective) -> None:
         super().__init__()
-        self._objective = objective
+        self._objective, self.settled = objective, False
         self.construct("watch", {})
 
     @override
@@ -265,4 +287,6 @@ class _Watch(ca.Callback):  # type: ignore[misc]
 
     @override
     def eval(self, arguments: list[ca.DM]) -> list[int]:
-        return [int(self._objective.stuck)]  # not zero to end
+        x = np.asarray(arguments[ca.nlpsol_out().index("x")]).ravel()
+        self.settled = not self._objective.stuck and self._objective.settled(x)
+        return [int(self._objective.stuck or self.settled)]  # not zero to end

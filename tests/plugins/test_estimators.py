@@ -12,6 +12,7 @@ from armcal.errors import ProblemError
 from armcal.estimate.estimator import estimate
 from armcal.estimate.identifiability import analyse
 from armcal.estimate.structure import require_solvable
+from armcal.problem.posed import PosedProblem
 from armcal.problem.problem import Problem
 from armcal_cvxpy.estimator import CvxpyEstimator
 from armcal_ipopt.estimator import IpoptEstimator
@@ -270,6 +271,20 @@ def test_the_number_of_starts_and_of_those_that_agree_is_told(lrm):
     again = estimator("ipopt", starts=5, seed=3).solve(problem, records, start)
     assert again.verdict.agreeing_starts == several.verdict.agreeing_starts
     np.testing.assert_allclose(again.values, several.values, rtol=0, atol=1e-9)
+
+
+def test_a_start_beside_the_optimum_takes_no_search_among_rounding_errors(lrm, monkeypatch):
+    """What the fits of a robust loss start from: there the cost's rounding errors exceed what is left to gain."""
+    q, measured = simulated(oracle.published(), 60, 10)
+    problem, records, start = posed(lrm, oracle.OPTION_1, q, measured)
+    first = estimator("ipopt").solve(problem, records, start)
+    taken, cost = [], PosedProblem.cost
+    monkeypatch.setattr(PosedProblem, "cost", lambda self, x: taken.append(1) or cost(self, x))
+    again = [estimator("ipopt").solve(problem, records, first.values + k * 1e-6 * start) for k in range(10)]
+    assert len(taken) <= 6 * sum(1 + solution.verdict.iterations for solution in again)
+    sd = deviations(problem, records, first)
+    for solution in again:
+        assert (np.abs(fitted(problem, solution) - fitted(problem, first)) / sd).max() < 1e-8
 
 
 @both
