@@ -18,10 +18,10 @@ demo: $(READY)
 	$(BIN)/armcal run configs/lrm_arm/demo.yaml --out runs/demo
 
 test: $(READY)
-	$(BIN)/python -m pytest -n 2 -m "not slow" tests
+	$(BIN)/python -m pytest -n 3 --dist worksteal -m "not slow" tests
 
 test-all: $(READY)
-	$(BIN)/python -m pytest -n 2 tests
+	$(BIN)/python -m pytest -n 3 --dist worksteal tests
 
 # The peers are not needed: without one its row says so.
 bench: $(READY)

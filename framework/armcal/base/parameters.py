@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from armcal.base.domains import Array, Domain, Interval, Rotation
 from armcal.errors import ConfigError
@@ -192,6 +193,12 @@ class Parameters:
             names += block.entry_names if by_entry else [f"{block.name}<{i}>" for i in block.domain.increments]
         return tuple(names)
 
+    @cached_property
+    def _added(self) -> NDArray[np.intp] | None:
+        """Where increments are added, if every free block is a number: most problems' case, and done all at once."""
+        are_numbers = all(isinstance(block.domain, Interval) for block in self.free)
+        return np.array(self.free_entries, dtype=np.intp) if are_numbers else None
+
     def _per_increment(self, of: Mapping[str, float]) -> Array:
         return np.array([of[block.name] for block in self.free for _ in range(block.domain.dof)])
 
@@ -220,6 +227,9 @@ class Parameters:
     def retract(self, delta: Array) -> Array:
         """The value vector that an increment of the free blocks leads to from the nominal values."""
         moved, start = self.nominal(), 0
+        if self._added is not None:
+            moved[self._added] += delta
+            return moved
         for block in self.free:
             place, dof = self.entries_of(block.name), block.domain.dof
             moved[place] = block.domain.retract(moved[place], delta[start : start + dof])
@@ -228,6 +238,8 @@ class Parameters:
 
     def local(self, values: Array) -> Array:
         """The increment of the free blocks that leads from the nominal values to ``values``."""
+        if self._added is not None:
+            return np.asarray(values[self._added] - self.nominal()[self._added])
         parts = [b.domain.local(np.array(b.nominal), values[self.entries_of(b.name)]) for b in self.free]
         return np.concatenate(parts) if parts else np.zeros(0)
 
@@ -237,11 +249,15 @@ class Parameters:
 
     def coordinates(self, delta: Array) -> Array:
         """Where an increment leads, in the coordinates of priors and covariances."""
+        if self._added is not None:
+            return delta.copy()
         parts = [b.domain.coordinates(np.array(b.nominal), part) for b, part in self._parts(delta)]
         return np.concatenate(parts) if parts else np.zeros(0)
 
     def from_coordinates(self, coordinates: Array) -> Array:
         """The increment that leads there, or to the nearest value of each domain."""
+        if self._added is not None:
+            return coordinates.copy()
         parts = [b.domain.from_coordinates(np.array(b.nominal), part) for b, part in self._parts(coordinates)]
         return np.concatenate(parts) if parts else np.zeros(0)
 
@@ -273,6 +289,8 @@ class Parameters:
             start += block.domain.dof
 
     def _diagonal(self, delta: Array, of: Callable[[ParameterBlock, Array, Array], Array]) -> Array:
+        if self._added is not None:
+            return np.eye(len(delta))
         parts = [of(block, np.array(block.nominal), part) for block, part in self._parts(delta)]
         whole = np.zeros((sum(part.shape[0] for part in parts), sum(part.shape[1] for part in parts)))
         row = column = 0
