@@ -187,8 +187,10 @@ def _refuse_ragged(line: int, cells: Sequence[str], header: Header) -> NoReturn:
 
 def _number(cell: str, line: int, column: Column, header: Header, has_commas: bool) -> float:
     """One cell; NaN if its value is missing."""
-    number = read_cell(with_point(cell) if has_commas and "." not in cell else cell)
-    if has_commas and "." in cell and not isinstance(number, CellFault):
+    number = read_cell(cell)
+    if has_commas and DECIMAL_COMMA.fullmatch(cell):
+        number = read_cell(with_point(cell))
+    elif has_commas and "." in cell and not isinstance(number, CellFault):
         number = CellFault(f"found {cell!r}, expected a decimal comma.", 'Write 12,5, or leave decimal: "," out.')
     if isinstance(number, CellFault):
         where = Location(header.source, line=line, field=column.name)

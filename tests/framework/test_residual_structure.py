@@ -383,6 +383,19 @@ def test_what_positions_at_their_ends_leave_open_shows_between_them(lrm):
     assert "from both sides" in finding.action
 
 
+def test_unseen_poses_are_of_what_was_recorded_although_an_arm_is_not_in_all_records(lrm):
+    q = poses(30, 3)[0]
+    q[::2, 1] = np.nan
+    dataset = lrm.dataset(q, np.zeros((30, 3)))
+    joints = [f"arm.q{i}" for i in range(1, 7)]
+    for between in (False, True):
+        unseen = unseen_poses(dataset, joints, between)
+        for number, joint in enumerate(joints):
+            column, recorded = unseen.column(joint), q[np.isfinite(q[:, number]), number]
+            assert np.isfinite(column).all() and recorded.min() <= column.min() < column.max() <= recorded.max()
+            assert between or set(column) <= set(recorded)
+
+
 def test_without_priors_nothing_is_said_to_be_held_by_them(lrm):
     problem, records, start, dataset = recording(lrm, 60, 1)
     found = fit(problem, records, IPOPT, start).estimate

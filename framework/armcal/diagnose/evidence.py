@@ -29,7 +29,8 @@ class PriorsAlone:
 
     Attributes:
         worst_mm: the largest standard deviation of the tip that they leave, over the poses looked at.
-        between_mm: the same where joints stand between recorded positions too, approached from either recorded side.
+        between_mm: the same at any pose: where joints stand between recorded positions too, approached from either
+            recorded side.
         poses: how many unseen poses of each kind were looked at.
         up_to: motions that were left out, because nothing that was measured sees them; empty where none were.
     """
@@ -71,12 +72,15 @@ def unseen_poses(dataset: Dataset, channels: Sequence[str], between: bool = Fals
     values = {name: column[together] for name, column in dataset.channels.items()}
     for channel in channels:
         arm, _, joint = channel.partition(".")
-        drawn = random.integers(0, len(dataset), UNSEEN)
+        known = np.flatnonzero(np.isfinite(dataset.column(channel)))  # of two arms one may not be recorded
+        if not len(known):
+            continue
+        drawn = known[random.integers(0, len(known), UNSEEN)]
         for own in (channel, f"{arm}.approach.{joint}"):
             if dataset.has(own):
                 values[own] = dataset.column(own)[drawn]
         if between:
-            recorded = dataset.column(channel)
+            recorded = dataset.column(channel)[known]
             values[channel] = random.uniform(recorded.min(), recorded.max(), UNSEEN)
     return Dataset(tuple(str(i) for i in range(UNSEEN)), values)
 
