@@ -193,7 +193,7 @@ def test_nothing_free_is_an_increment_of_no_numbers():
 
 
 def test_numbers_are_added_at_once_as_one_by_one():
-    """Blocks of numbers alone take a shorter way, which gives the same bits; fixed ones stay."""
+    """Blocks of numbers give the same bits whether others are free beside them or not; fixed ones stay."""
     random = np.random.default_rng(3)
     numbers = [scalar(f"p{i}", "m", float(random.normal()), 1.0) for i in range(9)]
     alone = Parameters(tuple(numbers)).with_free([f"p{i}" for i in (1, 2, 5, 8)])

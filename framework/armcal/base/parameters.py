@@ -6,7 +6,7 @@ import difflib
 import fnmatch
 import math
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -79,6 +79,24 @@ class ParameterBlock:
 def scalar(name: str, unit: str, nominal: float, scale: float, domain: Interval | None = None) -> ParameterBlock:
     """A block of one number."""
     return ParameterBlock(name, unit, (float(nominal),), domain or Interval(), scale)
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """Where the numbers of free blocks stand.
+
+    Attributes:
+        places, entries, increments: of blocks that are numbers: in a value vector, among the free entries, and among
+            the increments.
+        others: each other free block, with the same three.
+        shape: how many free entries and increments there are.
+    """
+
+    places: NDArray[np.intp]
+    entries: NDArray[np.intp]
+    increments: NDArray[np.intp]
+    others: tuple[tuple[ParameterBlock, slice, slice, slice], ...]
+    shape: tuple[int, int]
 
 
 @dataclass(frozen=True)
@@ -194,10 +212,20 @@ class Parameters:
         return tuple(names)
 
     @cached_property
-    def _added(self) -> NDArray[np.intp] | None:
-        """Where increments are added, if every free block is a number: most problems' case, and done all at once."""
-        are_numbers = all(isinstance(block.domain, Interval) for block in self.free)
-        return np.array(self.free_entries, dtype=np.intp) if are_numbers else None
+    def _layout(self) -> _Layout:
+        """Numbers, whose increments are added, all at once; the other free blocks one by one."""
+        numbers: list[tuple[int, int, int]] = []
+        others: list[tuple[ParameterBlock, slice, slice, slice]] = []
+        entry = increment = 0
+        for block in self.free:
+            place, ends = self.entries_of(block.name), (entry + block.size, increment + block.domain.dof)
+            if isinstance(block.domain, Interval):
+                numbers.append((place.start, entry, increment))
+            else:
+                others.append((block, place, slice(entry, ends[0]), slice(increment, ends[1])))
+            entry, increment = ends
+        places, entries, increments = np.array(numbers, dtype=np.intp).reshape(-1, 3).T
+        return _Layout(places, entries, increments, tuple(others), (entry, increment))
 
     def _per_increment(self, of: Mapping[str, float]) -> Array:
         return np.array([of[block.name] for block in self.free for _ in range(block.domain.dof)])
@@ -226,77 +254,67 @@ class Parameters:
 
     def retract(self, delta: Array) -> Array:
         """The value vector that an increment of the free blocks leads to from the nominal values."""
-        moved, start = self.nominal(), 0
-        if self._added is not None:
-            moved[self._added] += delta
-            return moved
-        for block in self.free:
-            place, dof = self.entries_of(block.name), block.domain.dof
-            moved[place] = block.domain.retract(moved[place], delta[start : start + dof])
-            start += dof
+        moved, layout = self.nominal(), self._layout
+        moved[layout.places] += delta[layout.increments]
+        for block, place, _, own in layout.others:
+            moved[place] = block.domain.retract(moved[place], delta[own])
         return moved
 
     def local(self, values: Array) -> Array:
         """The increment of the free blocks that leads from the nominal values to ``values``."""
-        if self._added is not None:
-            return np.asarray(values[self._added] - self.nominal()[self._added])
-        parts = [b.domain.local(np.array(b.nominal), values[self.entries_of(b.name)]) for b in self.free]
-        return np.concatenate(parts) if parts else np.zeros(0)
+        layout, nominal = self._layout, self.nominal()
+        delta = np.zeros(layout.shape[1])
+        delta[layout.increments] = values[layout.places] - nominal[layout.places]
+        for block, place, _, own in layout.others:
+            delta[own] = block.domain.local(nominal[place], values[place])
+        return delta
 
     def retract_jacobian(self, delta: Array) -> Array:
         """d free canonical entries / d increment, at an increment from the nominal values."""
-        return self._diagonal(delta, lambda block, base, part: block.domain.retract_jacobian(base, part))
+        return self._diagonal(delta, lambda domain, base, part: domain.retract_jacobian(base, part))
 
     def coordinates(self, delta: Array) -> Array:
         """Where an increment leads, in the coordinates of priors and covariances."""
-        if self._added is not None:
-            return delta.copy()
-        parts = [b.domain.coordinates(np.array(b.nominal), part) for b, part in self._parts(delta)]
-        return np.concatenate(parts) if parts else np.zeros(0)
+        coordinates = np.array(delta, dtype=float)
+        for block, _, _, own in self._layout.others:
+            coordinates[own] = block.domain.coordinates(np.array(block.nominal), delta[own])
+        return coordinates
 
     def from_coordinates(self, coordinates: Array) -> Array:
         """The increment that leads there, or to the nearest value of each domain."""
-        if self._added is not None:
-            return coordinates.copy()
-        parts = [b.domain.from_coordinates(np.array(b.nominal), part) for b, part in self._parts(coordinates)]
-        return np.concatenate(parts) if parts else np.zeros(0)
+        delta = np.array(coordinates, dtype=float)
+        for block, _, _, own in self._layout.others:
+            delta[own] = block.domain.from_coordinates(np.array(block.nominal), coordinates[own])
+        return delta
 
     def coordinates_jacobian(self, delta: Array) -> Array:
         """d coordinates / d increment."""
-        return self._diagonal(delta, lambda block, base, part: block.domain.coordinates_jacobian(base, part))
+        return self._diagonal(delta, lambda domain, base, part: domain.coordinates_jacobian(base, part), True)
 
     def entries_jacobian(self, values: Array) -> Array:
         """d free canonical entries / d coordinates, at a value vector."""
         delta = self.local(values)
-        return self._diagonal(delta, lambda block, base, part: block.domain.entries_jacobian(base, part))
+        return self._diagonal(delta, lambda domain, base, part: domain.entries_jacobian(base, part))
 
     def curvature(self, gradient: Array) -> Array:
         """What the retraction's curvature adds to a Hessian by increments; ``gradient`` is by free entries."""
-        size = sum(block.domain.dof for block in self.free)
-        total, row, column = np.zeros((size, size)), 0, 0
-        for block in self.free:
-            end = column + block.domain.dof
-            part = block.domain.curvature(gradient[row : row + block.size])
+        layout = self._layout
+        total = np.zeros((layout.shape[1], layout.shape[1]))
+        for block, _, entries, own in layout.others:
+            part = block.domain.curvature(gradient[entries])
             if part is not None:
-                total[column:end, column:end] = part
-            row, column = row + block.size, end
+                total[own, own] = part
         return total
 
-    def _parts(self, delta: Array) -> Iterator[tuple[ParameterBlock, Array]]:
-        start = 0
-        for block in self.free:
-            yield block, delta[start : start + block.domain.dof]
-            start += block.domain.dof
-
-    def _diagonal(self, delta: Array, of: Callable[[ParameterBlock, Array, Array], Array]) -> Array:
-        if self._added is not None:
-            return np.eye(len(delta))
-        parts = [of(block, np.array(block.nominal), part) for block, part in self._parts(delta)]
-        whole = np.zeros((sum(part.shape[0] for part in parts), sum(part.shape[1] for part in parts)))
-        row = column = 0
-        for part in parts:
-            whole[row : row + part.shape[0], column : column + part.shape[1]] = part
-            row, column = row + part.shape[0], column + part.shape[1]
+    def _diagonal(
+        self, delta: Array, of: Callable[[Domain, Array, Array], Array], by_coordinates: bool = False
+    ) -> Array:
+        """A matrix of each free block's own (rows by entries or ``by_coordinates``, columns by increments)."""
+        layout = self._layout
+        whole = np.zeros((layout.shape[int(by_coordinates)], layout.shape[1]))
+        whole[layout.increments if by_coordinates else layout.entries, layout.increments] = 1.0
+        for block, _, entries, own in layout.others:
+            whole[own if by_coordinates else entries, own] = of(block.domain, np.array(block.nominal), delta[own])
         return whole
 
     def check(self, values: Array, names: Sequence[str] | None = None) -> None:
