@@ -10,6 +10,7 @@ from pathlib import Path
 
 NAMES = {
     **dict.fromkeys(("told", "found", "each", "wanted", "asked"), "the thing: residuals, estimate, record, candidates"),
+    "wished": "preferred",
     "Voice": "Console",
     "Crew": "WorkerPool",
     "Conduct": "AcquisitionRun",

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from armcal.calibration.compensation.search import NEAREST, QUICK, WISHED, Goal, Manner, Near, Search
+from armcal.calibration.compensation.search import NEAREST, PREFERRED, QUICK, Goal, Manner, Near, Search
 from armcal.calibration.compensation.step import slopes, step_function
 from armcal.functions.batch_function import EvaluatorChoice
 from armcal.functions.compiler import find_compiler
@@ -85,8 +85,8 @@ def test_targets_out_of_reach_end_at_the_nearest() -> None:
 def test_wishes_and_joints_that_are_held() -> None:
     pair = Pair("five", False)
     goal = pair.goal(200)
-    wished = replace(goal, towards=drawn(pair.found, 200, seed=3).T)
-    assert pair.alike(wished, WISHED) > 0.3
+    preferred = replace(goal, towards=drawn(pair.found, 200, seed=3).T)
+    assert pair.alike(preferred, PREFERRED) > 0.3
     held = replace(goal, held=(1, 4))
     assert pair.alike(held, QUICK) > 0.05
     answer = pair.compiled(held, QUICK, NEAR)
@@ -136,15 +136,15 @@ def test_neighbours_do_not_matter() -> None:
     wild[:3, ::8] = 1e6
     order = np.random.default_rng(0).permutation(61)
     for search in (pair.compiled, pair.interpreted):
-        answer = search(goal, WISHED, NEAR)
-        turned = search(goal.subset(order), WISHED, NEAR)
-        beside = search(replace(goal, record=wild), WISHED, NEAR)
+        answer = search(goal, PREFERRED, NEAR)
+        turned = search(goal.subset(order), PREFERRED, NEAR)
+        beside = search(replace(goal, record=wild), PREFERRED, NEAR)
         for name in ("commands", "states", "distances", "there"):
             whole = getattr(answer, name)
             assert (getattr(turned, name) == whole[..., order]).all()
             assert (np.delete(getattr(beside, name) == whole, np.arange(0, 61, 8), axis=-1)).all()
             for i in range(0, 61, 10):
-                alone = search(goal.subset(np.array([i])), WISHED, NEAR)
+                alone = search(goal.subset(np.array([i])), PREFERRED, NEAR)
                 assert (getattr(alone, name)[..., 0] == whole[..., i]).all()
 
 
@@ -164,7 +164,7 @@ def test_what_counts_as_there_is_what_is_given(kind: str) -> None:
     """Not an earlier step that moved less but was not at rest, or was turned too far: a few of 1000 have such steps."""
     pair, near = Pair("lrm", True), Near(metres=1e-9, radians=1e-8, rest=1e-11)
     goal = pair.goal(1000)
-    found = getattr(pair, kind)(replace(goal, towards=drawn(pair.found, 1000, seed=3).T), WISHED, near)
+    found = getattr(pair, kind)(replace(goal, towards=drawn(pair.found, 1000, seed=3).T), PREFERRED, near)
     record, free = goal.record.copy(), np.ones((6, 1000))
     record[:6] = found.commands
     expression = pair.found.expression
@@ -181,4 +181,4 @@ def test_without_limits_and_with_nothing_that_may_move(held: tuple[int, ...]) ->
     pair = Pair("lift", False, np.array([[-np.inf, np.inf], [-np.inf, 0.3], [-0.2, np.inf]]))
     goal = replace(pair.goal(100), held=held)
     assert (pair.alike(goal, QUICK) > 0.3) == (not held)
-    pair.alike(replace(goal, towards=drawn(pair.found, 100, seed=3).T), WISHED)
+    pair.alike(replace(goal, towards=drawn(pair.found, 100, seed=3).T), PREFERRED)

@@ -11,8 +11,8 @@ from armcal.base.domains import Array
 from armcal.calibration.compensation.request import FARTHEST_M, Mask
 from armcal.calibration.compensation.search import (
     NEAREST,
+    PREFERRED,
     QUICK,
-    WISHED,
     Goal,
     Rows,
     Solutions,
@@ -94,7 +94,7 @@ class Finder:
     def onward(self, record: Array, target: Array, at: Array) -> Solutions:
         """The commands nearest to others (n x N): beside them, else in whatever posture is nearest of many."""
         beside = self._direct(record, target, at, at)
-        lost = np.flatnonzero(~beside.there)  # with the wish to stay
+        lost = np.flatnonzero(~beside.there)  # preferred: to stay
         if lost.size:
             beside.replace(lost, self.straight(record[:, lost], target[:, lost], at[:, lost]))
         far = np.flatnonzero(~beside.there | (np.abs(beside.commands - at).max(axis=0) > _BESIDE))
@@ -128,19 +128,19 @@ class Finder:
         return solutions
 
     def towards(self, record: Array, target: Array, preferred: Array, solutions: Solutions) -> None:
-        """As near to wished commands (n x N) as the targets allow, in place; only those that are reached."""
+        """As near to preferred commands (n x N) as the targets allow, in place; only those that are reached."""
         at = np.flatnonzero(solutions.there)
         goal = Goal(with_commands(record, solutions.commands), solutions.states, target, preferred, self._held)
-        attempt = self._solver(goal.subset(at), WISHED)
+        attempt = self._solver(goal.subset(at), PREFERRED)
         nearer = _apart(attempt.commands, preferred[:, at]) < _apart(solutions.commands[:, at], preferred[:, at])
         good = np.flatnonzero(attempt.there & nearer & self._may(attempt.commands))
         solutions.put(at[good], attempt, good)
 
     def _direct(self, record: Array, target: Array, at: Array, towards: Array | None = None) -> Solutions:
-        """One search from commands (n x N), near to others where such are wished: what it reaches."""
+        """One search from commands (n x N), near to preferred ones where there are any: what it reaches."""
         solutions = self._nothing(record.shape[1])
         goal = Goal(with_commands(record, at), np.zeros_like(solutions.states), target, towards, self._held)
-        attempt = self._solver(goal, QUICK if towards is None else WISHED)
+        attempt = self._solver(goal, QUICK if towards is None else PREFERRED)
         good = np.flatnonzero(attempt.there & self._may(attempt.commands))
         solutions.replace(good, attempt.subset(good))
         return solutions

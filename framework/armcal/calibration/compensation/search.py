@@ -32,7 +32,7 @@ class Goal:
         record: channels x N; with the commands from which the search starts.
         state: n_d x N; where the search starts.
         target: position, and where turns count the rotation column by column (3 or 12 x N).
-        towards: commands to come near to where the target leaves a choice (n x N); None for no such wish.
+        towards: commands to come near to where the target leaves a choice (n x N); None for no preference.
         held: joints that stay where the search starts, by index.
     """
 
@@ -110,8 +110,8 @@ QUICK = Manner(damping=1e-2, patience=5, steps=40)
 """To a target that can be reached."""
 NEAREST = Manner(damping=1.0, patience=25, steps=100)
 """To the nearest where it cannot: what is left must not throw the arm about."""
-WISHED = Manner(damping=1e-2, patience=20, steps=100)
-"""Along targets towards wished commands."""
+PREFERRED = Manner(damping=1e-2, patience=20, steps=100)
+"""Along targets towards preferred commands."""
 
 
 @dataclass(frozen=True)

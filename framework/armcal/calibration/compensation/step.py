@@ -6,7 +6,7 @@ slope is T_q + T_d D. With the error e (position, and turn times a length) and t
 
     M r + M J^T (J M J^T + damping I)^-1 (e - J M r),
 
-M the joints that are free to move and r what is wished beside the target, which only moves the arm where the target
+M the joints that are free to move and r the preferred step beside the target, which only moves the arm where the target
 does not care [Nakamura1986]; or the same by the joints where there are fewer of them than equations.
 
 Near a pose in which the arm cannot turn some way, the way to the target is long and bent: errors may grow for a few
@@ -30,12 +30,12 @@ from armcal.calibration.tool_expression import ToolExpression
 FIRST_DAMPING, _LEAST_DAMPING = 1e-3, 1e-14
 _LONGEST = 0.4
 """rad or m in one step."""
-_WISHED_ENOUGH = 1e-4
-"""Wishes beside the target count as met when they move no joint by more (rad or m)."""
+_NEAR_PREFERRED = 1e-4
+"""Preferred commands are reached when they move no joint by more (rad or m)."""
 _WILD = 2.0
 """A deflection beyond this (rad or m) is started anew."""
 _FINITE = 1e300
-SETTINGS = ("damping", "patience", "steps", "metres", "radians", "rest", "wished")
+SETTINGS = ("damping", "patience", "steps", "metres", "radians", "rest", "preferred")
 """Of a search; after them come the lowest and the highest command of each joint, and whether it is held."""
 REACHED = 2.0
 """How a search ends that reaches its target; others end with 1, and go on at 0."""
@@ -109,7 +109,7 @@ def tool_error(own_slopes: Slopes, position: Expression, rotation: Expression | 
 
 
 def step_function(expression: ToolExpression, own_slopes: Slopes, turns: bool, length: float) -> ca.Function:
-    """(record, target, wish, free, damping, state) -> (step, state left, state moved, error, pull).
+    """(record, target, preference, free, damping, state) -> (step, state left, state moved, error, pull).
 
     ``target`` is a position (3; m) and, where the tool ``turns`` to one, a rotation (9, column by column);
     ``preference`` (n) moves the arm where the target does not care; ``free`` (n) is one for joints
@@ -118,7 +118,7 @@ def step_function(expression: ToolExpression, own_slopes: Slopes, turns: bool, l
     """
     count = len(expression.joints)
     target = ca.SX.sym("target", 12 if turns else 3)
-    preference, free, damping = ca.SX.sym("wish", count), ca.SX.sym("free", count), ca.SX.sym("damping")
+    preference, free, damping = ca.SX.sym("preference", count), ca.SX.sym("free", count), ca.SX.sym("damping")
     error, slope = tool_error(own_slopes, target[:3], ca.reshape(target[3:], 3, 3) if turns else None)
     weight = ca.SX([1.0] * 3 + [length] * (error.numel() - 3))
     weighted = ca.diag(weight) @ slope
@@ -140,7 +140,7 @@ def search_function(expression: ToolExpression, own_slopes: Slopes, turns: bool,
     """(settings, record, target, towards, progress) -> progress, one step on.
 
     ``target`` is a position (3; m) and, where the tool ``turns`` to one, a rotation (9, column by column); ``towards``
-    are commands to come near to where that is ``wished``. A radian counts as ``length`` metres.
+    are commands to come near to where that is ``preferred``. A radian counts as ``length`` metres.
     """
     joints, states = len(expression.joints), expression.state.numel()
     settings, progress = ca.SX.sym("settings", len(SETTINGS) + 3 * joints), progress_places(joints, states)
@@ -148,7 +148,7 @@ def search_function(expression: ToolExpression, own_slopes: Slopes, turns: bool,
     before = ca.SX.sym("progress", progress["end"].stop)
     search = _Search(joints, settings, {name: before[place] for name, place in progress.items()})
     now = search.now
-    preference = search.stated["wished"] * (towards - now["commands"])
+    preference = search.stated["preferred"] * (towards - now["commands"])
     preference *= _shortening(_largest(preference))  # as a whole: joint by joint it would point elsewhere
     record = ca.vertcat(now["commands"], expression.record[joints:])
     one_step = step_function(expression, own_slopes, turns, length)
@@ -179,17 +179,17 @@ class _Search:
     ) -> dict[str, Expression]:
         """The best so far, and whether the search is at an end.
 
-        With a wish, how far that moves the arm counts. What has reached its target need not be the best: an earlier
-        step may have been better by this measure, and turned too far or not at rest.
+        Where commands are preferred, how far that moves the arm counts. What has reached its target need not be the
+        best: an earlier step may have been better by this measure, and turned too far or not at rest.
         """
         now, stated = self.now, self.stated
         distance, turn, size = _norm(error[:3]), _norm(error[3:]), _largest(step)
-        wishes = ca.logic_and(size <= _WISHED_ENOUGH, ca.logic_not(_any(self._pulled_back(pull, _WISHED_ENOUGH))))
+        is_near = ca.logic_and(size <= _NEAR_PREFERRED, ca.logic_not(_any(self._pulled_back(pull, _NEAR_PREFERRED))))
         near = ca.logic_and(distance <= stated["metres"], turn <= stated["radians"])
         at_rest = ca.logic_not(_any(ca.logic_not(ca.fabs(left) <= stated["rest"])))
-        reached = ca.logic_and(ca.logic_and(near, at_rest), ca.logic_or(ca.logic_not(stated["wished"]), wishes))
+        reached = ca.logic_and(ca.logic_and(near, at_rest), ca.logic_or(ca.logic_not(stated["preferred"]), is_near))
         error_cost = distance**2 + (length * turn) ** 2
-        cost = error_cost + ca.if_else(stated["wished"], (length * size) ** 2, 0)
+        cost = error_cost + ca.if_else(stated["preferred"], (length * size) ** 2, 0)
         is_least = cost < now["cost"]
         is_best = ca.logic_or(reached, is_least)
         least = ca.if_else(is_least, cost, now["cost"])
