@@ -18,11 +18,21 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from armcal_simulation.mission_changes import MovingTruth, moving_truth, scheduled
+from armcal_simulation.mission_events import PayloadSettings, PlaySettings
 from armcal_simulation.mission_settings import LossSettings, MissionSettings, RecordSettings, TiltSettings, began_at
-from armcal_simulation.readings import approach_of, at_truth, disturbed, measured_while_moving, with_outliers
+from armcal_simulation.mission_surprise import befallen, probing_poses, random_plan
+from armcal_simulation.readings import (
+    approach_of,
+    at_truth,
+    disturbed,
+    measured_while_moving,
+    with_exchanged,
+    with_outliers,
+)
 
-_STREAMS = ("times", "losses", "tilt", "poses", "creep", "noise", "outliers")
+_STREAMS = ("times", "losses", "tilt", "poses", "creep", "noise", "outliers", "exchanged")
 _HOUR_S = 3600.0
+_PROBES = 40
 
 
 def record_times(days: float, records: RecordSettings, random: np.random.Generator) -> Array:
@@ -38,10 +48,12 @@ def record_times(days: float, records: RecordSettings, random: np.random.Generat
 
 
 def arriving(times: Array, losses: LossSettings, random: np.random.Generator) -> NDArray[np.bool_]:
-    """Which records arrive (N): not in an hour without contact, nor if they are lost alone."""
+    """Which records arrive (N): not in a gap or an hour without contact, nor if they are lost alone."""
     hours = np.floor(times / _HOUR_S).astype(int)
-    silent = random.random(int(hours.max(initial=0)) + 1) < losses.hours
-    return ~silent[hours] & (random.random(len(times)) >= losses.fraction)
+    silent = (random.random(int(hours.max(initial=0)) + 1) < losses.hours)[hours]
+    for gap in losses.gaps:
+        silent |= (times >= gap.day * DAY_S) & (times < gap.day * DAY_S + gap.duration)
+    return ~silent & (random.random(len(times)) >= losses.fraction)
 
 
 @dataclass(frozen=True)
@@ -129,20 +141,35 @@ class MissionOfDays:
         arm = next(iter(request.arms.values()))
         commands = self._commands(arm, times, truth, random["poses"])
         standing = with_channels(commands, _gravity(stands.gravity(times, level, stands.turns)))
-        read, wrong = self._read(request, standing, times, truth, random)
+        read, wrong, exchanged = self._read(request, standing, times, truth, random)
         shown = with_channels(standing, {**_gravity(stands.gravity(times, level, stands.readings)), **read})
         kept = np.flatnonzero(there)
         return Mission(
             records=shown.subset(kept),
             times=times[kept],
             outliers=wrong[kept],
+            exchanged=exchanged[kept],
             truth=truth,
-            events=scheduled(settings),
+            events=scheduled(settings, _joints(request)),
             power_cuts=tuple(sorted(day * DAY_S for day in settings.power_cuts if day < settings.days)),
             began=began_at(settings.start),
             seconds=settings.days * DAY_S,
             lost=int(np.sum(~there)),
         )
+
+    def planted(self, request: SimulationRequest, seed: int) -> Mapping[str, Any]:
+        """Keys of these settings that plant a random selection of events and disturbances; the same for a seed.
+
+        Raises:
+            ConfigError: a joint has no range, or the truth names unknown parameters.
+        """
+        settings, random = self._settings.model_copy(update={"events": ()}), np.random.default_rng(0)
+        true, arm = at_truth(request, settings.truth), next(iter(request.arms.values()))
+        times, truth = np.arange(float(_PROBES)), moving_truth(true.parameters, settings, random)
+        poses = probing_poses(self._commands(arm, times, truth, random), arm, random)
+        plan = random_plan(befallen(true, poses), settings.days, _bends(request), seed)
+        kept = settings.losses.to_config()
+        return plan | ({"losses": {**kept, **plan["losses"]}} if "losses" in plan else {})
 
     def _commands(self, arm: Arm, times: Array, truth: MovingTruth, random: np.random.Generator) -> Dataset:
         """Random commands, and when the arm is there; nothing hangs on the tool."""
@@ -171,9 +198,10 @@ class MissionOfDays:
         times: Array,
         truth: MovingTruth,
         random: Mapping[str, np.random.Generator],
-    ) -> tuple[dict[str, Array], NDArray[np.bool_]]:
-        """Readings of the cameras, where they stand at each time, and which records are wrong."""
-        exact = measured_while_moving(request, standing, truth.values_at(times))
+    ) -> tuple[dict[str, Array], NDArray[np.bool_], NDArray[np.bool_]]:
+        """Readings of the cameras, where they stand at each time; which records are wrong, and which exchanged."""
+        loaded = with_channels(standing, _payload(truth.payload_at(times)))
+        exact = measured_while_moving(request, loaded, truth.values_at(times))
         camera_T_base = truth.camera_T_base_at(times)
         for name in request.measurements:
             axes = [f"{name}.{axis}" for axis in "xyz"]
@@ -181,7 +209,9 @@ class MissionOfDays:
             moved = np.einsum("nij,nj->ni", camera_T_base[:, :3, :3], position) + camera_T_base[:, :3, 3]
             exact |= dict(zip(axes, moved.T, strict=True))
         noisy = disturbed(request, standing, exact, self._settings.noise, random["noise"])
-        return with_outliers(noisy, self._settings.outliers, random["outliers"])
+        wild, wrong = with_outliers(noisy, self._settings.outliers, random["outliers"])
+        read, exchanged = with_exchanged(wild, self._settings.exchanged.fraction, random["exchanged"])
+        return read, wrong, exchanged
 
 
 def _check(request: SimulationRequest, settings: MissionSettings) -> None:
@@ -192,12 +222,35 @@ def _check(request: SimulationRequest, settings: MissionSettings) -> None:
                 f"simulation: {name} reads {', '.join(channels) or 'nothing'}, expected a position x, y, z.",
                 hint="A mission is measured by instruments such as tip_position.",
             )
-    joints = [f"{arm.name}.{joint}" for arm in request.arms.values() for joint in arm.commanded]
+    joints, effects = _joints(request), {f"{arm.name}.{name}" for arm in request.arms.values() for name in arm.effects}
     for event in settings.events:
         joint = getattr(event, "joint", joints[0])
         if fault := unknown_joint([joint], joints):
             raise ConfigError(f"simulation.events: {fault}.")
+        if isinstance(event, PlaySettings) and event.parameter.rpartition(".")[0] not in effects:
+            raise ConfigError(
+                f"simulation.events: {event.parameter} is no play of a joint, it belongs to no joint effect.",
+                hint="Give the arm an effect such as approach_backlash, and its half-width here (arm.lag.lag3).",
+            )
+        if isinstance(event, PayloadSettings) and not _bends(request):
+            raise ConfigError(
+                "simulation.events: a payload bends nothing here.",
+                hint="Give the arm a spring effect, such as torsional_spring, and gravity in the section statics.",
+            )
+
+
+def _bends(request: SimulationRequest) -> bool:
+    arm = next(iter(request.arms.values()))
+    return bool(arm.deflection_size) and any(request.environment.gravity)
+
+
+def _joints(request: SimulationRequest) -> list[str]:
+    return [f"{arm.name}.{joint}" for arm in request.arms.values() for joint in arm.commanded]
 
 
 def _gravity(vectors: Array) -> dict[str, Array]:
     return {f"gravity_{axis}": vectors[i] for i, axis in enumerate("xyz")}
+
+
+def _payload(hung: Array) -> dict[str, Array]:
+    return dict(zip(("payload", "payload_x", "payload_y", "payload_z"), hung.T, strict=True))

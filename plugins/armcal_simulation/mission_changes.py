@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from armcal.base.domains import Array
@@ -15,13 +16,19 @@ from armcal.errors import ConfigError
 from armcal.estimate.simulation import DAY_S, MissionEvent
 from scipy.spatial.transform import Rotation
 
-from armcal_simulation.mission_settings import (
+from armcal_simulation.mission_events import (
+    BendSettings,
+    BiasSettings,
     BumpSettings,
-    MissionSettings,
+    ClimateSettings,
+    CreepSettings,
+    PayloadSettings,
+    PlaySettings,
     SlipSettings,
-    TemperatureSettings,
+    SwapSettings,
     parsed_creep,
 )
+from armcal_simulation.mission_settings import MissionSettings, TemperatureSettings
 
 _WALK_STEP_S = 3600.0
 
@@ -61,8 +68,11 @@ class MovingTruth:
     paths: tuple[Path, ...]
     steps: tuple[Step, ...]
     warmings: tuple[Warming, ...]
-    bumps: tuple[BumpSettings, ...]
     temperature: TemperatureSettings
+    bumps: tuple[BumpSettings, ...] = ()
+    biases: tuple[BiasSettings, ...] = ()
+    payloads: tuple[PayloadSettings, ...] = ()
+    climates: tuple[ClimateSettings, ...] = ()
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -95,12 +105,29 @@ class MovingTruth:
             moved[:3, :3], moved[:3, 3] = Rotation.from_rotvec(bump.turn).as_matrix(), bump.shift
             after = times >= bump.day * DAY_S
             poses[after] = moved @ poses[after]
+        for bias in self.biases:
+            days = np.clip(times / DAY_S, bias.day, math.inf if bias.until is None else bias.until) - bias.day
+            poses[:, :3, 3] += days[:, None] * np.array(bias.per_day)
         return poses
 
     def temperature_at(self, times: Array) -> Array:
         """N, degrees Celsius."""
         sine, since_warmest = self.temperature, times - self.temperature.warmest * 3600.0
-        return sine.mean + sine.swing * np.cos(2 * np.pi * since_warmest / sine.period)
+        mean, swing = np.full(len(times), sine.mean), np.full(len(times), sine.swing)
+        for climate in self.climates:
+            after = times >= climate.day * DAY_S
+            mean[after], swing[after] = climate.mean, climate.swing
+        return mean + swing * np.cos(2 * np.pi * since_warmest / sine.period)
+
+    def payload_at(self, times: Array) -> Array:
+        """Mass (kg) and centre in the tool frame (m) of all that hangs there, N x 4."""
+        mass, moment = np.zeros(len(times)), np.zeros((len(times), 3))
+        for payload in self.payloads:
+            last = math.inf if payload.until is None else payload.until
+            there = (times >= payload.day * DAY_S) & (times < last * DAY_S)
+            mass += there * payload.mass
+            moment += there[:, None] * (payload.mass * np.array(payload.lever))
+        return np.column_stack([mass, moment / np.where(mass > 0, mass, 1.0)[:, None]])
 
 
 def moving_truth(parameters: Parameters, settings: MissionSettings, random: np.random.Generator) -> MovingTruth:
@@ -114,46 +141,41 @@ def moving_truth(parameters: Parameters, settings: MissionSettings, random: np.r
         for glob, thermal in settings.thermal.items()
         for name in parameters.select([glob])
     ]
-    bumps = [event for event in settings.events if isinstance(event, BumpSettings)]
+    events = sorted(settings.events, key=lambda event: event.day)
     return MovingTruth(
         parameters,
-        tuple(_paths(parameters, settings, random)),
+        (*_paths(parameters, settings, random), *_growths(parameters, settings)),
         tuple(_steps(parameters, settings)),
         tuple(warmings),
-        tuple(sorted(bumps, key=lambda bump: bump.day)),
         settings.temperature,
+        tuple(event for event in events if isinstance(event, BumpSettings)),
+        tuple(event for event in events if isinstance(event, BiasSettings)),
+        tuple(event for event in events if isinstance(event, PayloadSettings)),
+        tuple(event for event in events if isinstance(event, ClimateSettings)),
     )
 
 
-def scheduled(settings: MissionSettings) -> tuple[MissionEvent, ...]:
-    """The events within the mission, in order."""
+def scheduled(settings: MissionSettings, joints: Sequence[str]) -> tuple[MissionEvent, ...]:
+    """The events of the mission, in order; a payload that is set down is another one then. ``joints`` in order."""
     events: list[MissionEvent] = []
     for event in settings.events:
-        if isinstance(event, SlipSettings):
-            label = f"{event.joint} slips by {math.degrees(_slip(event)):.1f} deg"
-        elif isinstance(event, BumpSettings):
-            shift, turn = (float(np.linalg.norm(vector)) for vector in (event.shift, event.turn))
-            label = f"camera bumped by {1000 * shift:.1f} mm, {math.degrees(turn):.1f} deg"
-        else:
-            label = f"servo of {event.joint} replaced"
-        if event.day < settings.days:
-            events.append(MissionEvent(event.kind, event.day * DAY_S, getattr(event, "joint", ""), label))
+        joint, until, beside = getattr(event, "joint", ""), event.day, ""
+        if isinstance(event, CreepSettings | PlaySettings | BiasSettings):
+            until = settings.days if event.until is None else min(event.until, settings.days)
+        if isinstance(event, BendSettings):
+            beside = dict(pairwise(joints)).get(joint, "")
+        events.append(MissionEvent(event.kind, event.day * DAY_S, joint, event.label, until * DAY_S, beside))
+        if isinstance(event, PayloadSettings) and event.until is not None and event.until < settings.days:
+            down = event.until * DAY_S
+            events.append(MissionEvent(event.kind, down, "", "payload set down", down))
     return tuple(sorted(events, key=lambda event: event.time))
-
-
-def _slip(event: SlipSettings) -> float:
-    return event.angle if event.angle is not None else 2 * math.pi * (event.teeth or 0) / event.of_teeth
 
 
 def _paths(parameters: Parameters, settings: MissionSettings, random: np.random.Generator) -> Iterator[Path]:
     end = settings.days * DAY_S
     for glob, text in settings.creep.items():
-        written: str | float
-        written, over, walks = parsed_creep(text)
-        with contextlib.suppress(ValueError):  # without a unit: the plain number that dimensionless parameters have
-            written = float(written)
         for name in parameters.select([glob]):
-            amount = _amount(parameters, name, written)
+            amount, over, walks = _creep(parameters, name, text)
             entry = _entry(parameters, name)
             if not walks:
                 yield Path(entry, np.array([0.0, end]), np.array([0.0, amount * end / over]))
@@ -163,20 +185,43 @@ def _paths(parameters: Parameters, settings: MissionSettings, random: np.random.
             yield Path(entry, times, np.concatenate([[0.0], np.cumsum(steps)]))
 
 
+def _growths(parameters: Parameters, settings: MissionSettings) -> Iterator[Path]:
+    """Creep and play that begin on a day."""
+    for event in settings.events:
+        if isinstance(event, CreepSettings | PlaySettings):
+            amount, over, _ = _creep(parameters, event.parameter, event.change)
+            if isinstance(event, PlaySettings) and not amount > 0:
+                raise ConfigError(
+                    f"simulation.events: found play that changes by {event.change}, expected one that grows.",
+                    hint="Write an amount above zero, such as 0.3 deg in 10 d.",
+                )
+            begin = event.day * DAY_S
+            end = (settings.days if event.until is None else event.until) * DAY_S
+            times, changes = np.array([begin, end]), np.array([0.0, amount * (end - begin) / over])
+            yield Path(_entry(parameters, event.parameter), times, changes)
+
+
+def _creep(parameters: Parameters, name: str, text: str) -> tuple[float, float, bool]:
+    """The amount (SI), over how many s, and whether it walks at random."""
+    written: str | float
+    written, over, walks = parsed_creep(text)
+    with contextlib.suppress(ValueError):  # without a unit: the plain number that dimensionless parameters have
+        written = float(written)
+    return _amount(parameters, name, written), over, walks
+
+
 def _steps(parameters: Parameters, settings: MissionSettings) -> Iterator[Step]:
     for event in settings.events:
-        if isinstance(event, BumpSettings):
-            continue
         if isinstance(event, SlipSettings):
             block = parameters[parameters.select([event.parameter])[0]]
             if block.unit != "rad":
                 raise ConfigError(
                     f"simulation.events: {block.name} is no angle.", hint="Give the joint's offset, such as theta3."
                 )
-            yield Step(_entry(parameters, event.parameter), event.day * DAY_S, _slip(event))
-            continue
-        for name, change in event.changes.items():
-            yield Step(_entry(parameters, name), event.day * DAY_S, _amount(parameters, name, change))
+            yield Step(_entry(parameters, event.parameter), event.day * DAY_S, event.turned)
+        elif isinstance(event, SwapSettings | BendSettings):
+            for name, change in event.changes.items():
+                yield Step(_entry(parameters, name), event.day * DAY_S, _amount(parameters, name, change))
 
 
 def _entry(parameters: Parameters, name: str) -> int:

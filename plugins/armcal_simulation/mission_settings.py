@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-import re
 from datetime import datetime
-from typing import Annotated, Literal
+from typing import Annotated
 
-from armcal.base.settings import Angle, Angle3, Duration, InputPath, Length, Length3, Settings, Temperature
+from armcal.base.settings import Angle, Duration, InputPath, Length, Settings, Temperature
 from pydantic import Field, field_validator, model_validator
 
+from armcal_simulation.mission_events import Day, Event, parsed_creep
 from armcal_simulation.readings import OutlierSettings
 
-_CREEP = re.compile(r"\s*(?P<walk>walk\s+)?(?P<amount>\S.*?)\s+in\s+(?P<over>[0-9.]+)\s*(?P<unit>d|h|min|s)\s*")
-_SECONDS = {"d": 86400.0, "h": 3600.0, "min": 60.0, "s": 1.0}
-
 Fraction = Annotated[float, Field(ge=0, le=1)]
-Day = Annotated[float, Field(ge=0)]
 
 
 class RecordSettings(Settings):
@@ -40,11 +36,22 @@ class RecordSettings(Settings):
         return self
 
 
+class GapSettings(Settings):
+    """A time without records: from a ``day`` on, for a ``duration``."""
+
+    day: Day
+    duration: Annotated[Duration, Field(gt=0)]
+
+
 class LossSettings(Settings):
-    """Which ``fraction`` of the records never arrives, and in which fraction of the ``hours`` there is no contact."""
+    """Which ``fraction`` of the records never arrives, and in which fraction of the ``hours`` there is no contact.
+
+    In each of the ``gaps`` no record arrives at all.
+    """
 
     fraction: Fraction = 0.0
     hours: Fraction = 0.0
+    gaps: tuple[GapSettings, ...] = ()
 
 
 class TiltSettings(Settings):
@@ -74,50 +81,18 @@ class ThermalSettings(Settings):
     reference: Temperature = 20.0
 
 
-class SlipSettings(Settings):
-    """A horn slips on its shaft: a joint's offset ``parameter`` jumps by whole ``teeth`` or by an ``angle``."""
+class ExchangeSettings(Settings):
+    """In which ``fraction`` of the records the measurement is delivered with the joints of the next one."""
 
-    kind: Literal["slip"]
-    day: Day
-    joint: str
-    parameter: str
-    teeth: int | None = None
-    of_teeth: Annotated[int, Field(ge=1)] = 25
-    angle: Angle | None = None
-
-    @model_validator(mode="after")
-    def _one(self) -> SlipSettings:
-        if (self.teeth is None) == (self.angle is None):
-            raise ValueError("found both or neither of teeth and angle, expected one of them: write teeth: 1")
-        return self
-
-
-class SwapSettings(Settings):
-    """A servo is replaced: what changes by how much, with units (``{arm.mdh.theta3: 2 deg}``)."""
-
-    kind: Literal["swap"]
-    day: Day
-    joint: str
-    changes: Annotated[dict[str, str | float], Field(min_length=1)]
-
-
-class BumpSettings(Settings):
-    """The camera moves: what is measured is turned about the base's origin (a rotation vector), then shifted."""
-
-    kind: Literal["bump"]
-    day: Day
-    shift: Length3 = (0.0, 0.0, 0.0)
-    turn: Angle3 = (0.0, 0.0, 0.0)
-
-
-Event = Annotated[SlipSettings | SwapSettings | BumpSettings, Field(discriminator="kind")]
+    fraction: Fraction = 0.0
 
 
 class MissionSettings(Settings):
     """The truth, and the mission over it; ``noise`` defaults to what each measurement declares.
 
     ``creep`` moves parameters (globs) along a line (``0.05 deg in 30 d``) or at random (``walk 0.05 deg in 30 d``: the
-    standard deviation after that time). ``thermal`` moves them with the temperature. ``start`` is the date of the
+    standard deviation after that time). ``thermal`` moves them with the temperature. ``events`` befall the arm, its
+    payload, the camera or the weather; those of the same ``day`` come at once. ``start`` is the date of the
     mission's midnight; without one time counts from 0. The power is cut on the days ``power_cuts``.
     """
 
@@ -135,6 +110,7 @@ class MissionSettings(Settings):
     power_cuts: tuple[Day, ...] = ()
     noise: Annotated[Length, Field(ge=0)] | None = None
     outliers: OutlierSettings = Field(default_factory=OutlierSettings)
+    exchanged: ExchangeSettings = Field(default_factory=ExchangeSettings)
 
     @field_validator("creep")
     @classmethod
@@ -146,19 +122,15 @@ class MissionSettings(Settings):
     @model_validator(mode="after")
     def _sane(self) -> MissionSettings:
         began_at(self.start)
+        begin = [(f"the {event.kind}", event.day) for event in self.events]
+        begin += [("the gap", gap.day) for gap in self.losses.gaps]
+        for what, day in begin:
+            if day >= self.days:
+                raise ValueError(
+                    f"found {what} on day {day:g}, expected one before the mission ends after {self.days:g} days: "
+                    "change its day, or leave it out"
+                )
         return self
-
-
-def parsed_creep(text: str) -> tuple[str, float, bool]:
-    """The amount as written, over how many s, and whether it walks at random.
-
-    Raises:
-        ValueError: it is not written so.
-    """
-    match = _CREEP.fullmatch(text)
-    if match is None or not float(match["over"]) > 0:
-        raise ValueError(f"found {text!r}, expected an amount and a time, such as 0.05 deg in 30 d")
-    return match["amount"], float(match["over"]) * _SECONDS[match["unit"]], match["walk"] is not None
 
 
 def began_at(start: str | None) -> float:

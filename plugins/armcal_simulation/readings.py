@@ -18,16 +18,30 @@ from armcal.config.yaml_source import load_config
 from armcal.estimate.simulation import SimulationRequest, measured_with_noise
 from armcal.problem.problem import Problem
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import Field, model_validator
 
 _QUATERNION = ("qw", "qx", "qy", "qz")
 
 
 class OutlierSettings(Settings):
-    """Some measurements are wrong: how many, and by how much at least (in a random direction)."""
+    """Some measurements are wrong: how many, and by how much at least (in a random direction).
+
+    They are off by once to twice the ``size``; with a ``largest`` by any size between the two, each factor as likely
+    as every other, so that few are very large (density 1 / size).
+    """
 
     fraction: Annotated[float, Field(ge=0, le=1)] = 0.0
-    size: Length = 0.03
+    size: Annotated[Length, Field(gt=0)] = 0.03
+    largest: Length | None = None
+
+    @model_validator(mode="after")
+    def _in_order(self) -> OutlierSettings:
+        if self.largest is not None and self.largest < self.size:
+            raise ValueError(
+                f"found outliers of {1000 * self.size:g} mm at least and {1000 * self.largest:g} mm at most: "
+                "write a larger largest"
+            )
+        return self
 
 
 def at_truth(request: SimulationRequest, truth: Path) -> SimulationRequest:
@@ -69,15 +83,31 @@ def is_orientation(channel: str) -> bool:
 def with_outliers(
     measured: Mapping[str, Array], outliers: OutlierSettings, random: np.random.Generator
 ) -> tuple[dict[str, Array], NDArray[np.bool_]]:
-    """Channels (N each, m) with some records pushed away by once to twice the size, and which those are (N)."""
+    """Channels (N each, m) with some records pushed away by a size as stated, and which those are (N)."""
     count = len(next(iter(measured.values())))
     wrong = random.random(count) < outliers.fraction
     push = random.normal(size=(len(measured), count))
-    push *= outliers.size * (1 + random.random(count)) / np.linalg.norm(push, axis=0)
+    share, most = random.random(count), outliers.largest
+    times = 1 + share if most is None else (most / outliers.size) ** share
+    push *= outliers.size * times / np.linalg.norm(push, axis=0)
     pushed = {
         channel: values + np.where(wrong, push[row], 0.0) for row, (channel, values) in enumerate(measured.items())
     }
     return pushed, wrong
+
+
+def with_exchanged(
+    measured: Mapping[str, Array], fraction: float, random: np.random.Generator
+) -> tuple[dict[str, Array], NDArray[np.bool_]]:
+    """Channels (N each) of which some neighbours have each other's measurement, and which those are (N)."""
+    count = len(next(iter(measured.values())))
+    order, exchanged = np.arange(count), np.zeros(count, dtype=bool)
+    # Two records a time: half as many exchanges make the fraction.
+    for first in np.flatnonzero(random.random(max(count - 1, 0)) < fraction / 2):
+        if not exchanged[first : first + 2].any():
+            order[[first, first + 1]] = first + 1, first
+            exchanged[first : first + 2] = True
+    return {channel: values[order] for channel, values in measured.items()}, exchanged
 
 
 def approach_of(commands: Array) -> Array:

@@ -13,13 +13,16 @@ from armcal.estimate.simulation import DAY_S, Mission, MissionSimulator, Simulat
 from armcal.run.experiment import Experiment
 from armcal_simulation.mission import Stands
 from armcal_simulation.mission_settings import MissionSettings, TiltSettings, parsed_creep
-from armcal_simulation.readings import approach_of
+from armcal_simulation.mission_surprise import Joint, befallen, probing_poses, random_plan
+from armcal_simulation.readings import approach_of, at_truth
 from scipy.spatial.transform import Rotation
 
 CONFIG = Path(__file__).resolve().parents[2] / "configs" / "lrm_arm" / "mission.yaml"
 MOON = np.array([0.0, 0.0, -1.62])
 TIP = [f"tracker.{axis}" for axis in "xyz"]
 GRAVITY = [f"gravity_{axis}" for axis in "xyz"]
+SLIP = {"kind": "slip", "day": 6.4, "joint": "arm.q3", "parameter": "arm.mdh.theta3", "teeth": 1}
+CREEP = {"kind": "creep", "day": 1, "joint": "arm.q3", "parameter": "arm.mdh.theta3", "change": "1 deg in 1 d"}
 QUIET = {
     "noise": 0.0,
     "creep": {},
@@ -76,7 +79,7 @@ def tips_at(made: Mission, values: np.ndarray) -> np.ndarray:
 
 
 def test_the_same_seed_gives_the_same_mission_and_another_does_not() -> None:
-    one, two, other = (mission(quiet=False, days=4, seed=seed) for seed in (3, 3, 4))
+    one, two, other = (mission(quiet=False, days=4, seed=seed, events=[]) for seed in (3, 3, 4))
     assert one.records.ids == two.records.ids and np.array_equal(one.outliers, two.outliers)
     assert all(np.array_equal(one.records.channels[name], two.records.channels[name]) for name in one.records.channels)
     assert len(other.records) != len(one.records) or not np.array_equal(tips(one), tips(other))
@@ -104,7 +107,7 @@ def test_a_still_mission_is_what_the_ordinary_forward_model_gives() -> None:
 
 def test_parameters_that_move_are_those_of_each_record() -> None:
     """Record by record through a model that knows one value vector at a time."""
-    made = mission(quiet=False, days=8, noise=0.0, **{"outliers.fraction": 0, "tilt.error_deg": 0})
+    made = mission(quiet=False, days=8, noise=0.0, events=[SLIP], **{"outliers.fraction": 0, "tilt.error_deg": 0})
     values = made.truth.values_at(made.times)
     for i in np.linspace(0, len(made.times) - 1, 12).astype(int):
         alone = replace(made, records=made.records.subset([i]))
@@ -254,6 +257,175 @@ def test_joints_stay_within_their_ranges() -> None:
         assert angles.min() > -most and angles.max() < most and np.ptp(angles) > 1.9 * most
 
 
+THETA3 = "arm.mdh.theta3"
+
+
+def moved_by(made: Mission, *days: float) -> dict[str, np.ndarray]:
+    """Which entries change between days, by how much on each of them against the mission's beginning (SI)."""
+    values = made.truth.values_at(np.array([0.0, *days]) * DAY_S)
+    changes = dict(zip(made.truth.names, (values[1:] - values[0]).T, strict=True))
+    return {name: change for name, change in changes.items() if change.any()}
+
+
+def test_a_creep_begins_on_its_day_adds_to_what_creeps_already_and_ends() -> None:
+    event = {"kind": "creep", "day": 1, "joint": "arm.q3", "parameter": THETA3, "change": "2 deg in 1 d", "until": 2}
+    made = mission(days=3, events=[event], creep={THETA3: "0.3 deg in 1 d"})
+    moved = moved_by(made, 0.5, 1, 1.5, 2, 2.9)
+    assert set(moved) == {THETA3}
+    assert np.allclose(np.degrees(moved[THETA3]), [0.15, 0.3, 1.45, 2.6, 2.87])
+    values = made.truth.values_at(made.times)
+    for i in (0, len(made.times) // 2, len(made.times) - 1):
+        alone = replace(made, records=made.records.subset([i]))
+        assert np.abs(tips(made)[i] - tips_at(alone, values[i])[0]).max() < 1e-10
+    (planned,) = made.events
+    assert (planned.kind, planned.joint, planned.time, planned.until) == ("creep", "arm.q3", DAY_S, 2 * DAY_S)
+
+
+def test_growing_play_moves_tips_apart_by_the_side_they_came_from() -> None:
+    event = {"kind": "play", "day": 0, "joint": "arm.q2", "parameter": "arm.lag.lag2", "change": "1 deg in 1 d"}
+    made, still = mission(days=1, events=[event]), mission(days=1)
+    # A play is an offset of the joint against the direction of its last motion.
+    grown = np.deg2rad(made.times / DAY_S) * made.records.column("arm.approach.q2")
+    values = still.truth.values_at(np.zeros(1))[0]
+    for i in np.linspace(1, len(made.times) - 1, 5).astype(int):
+        offset = values.copy()
+        offset[made.truth.names.index("arm.mdh.theta2")] -= grown[i] * (
+            1 + values[made.truth.names.index("arm.servo.gain2")]
+        )
+        alone = replace(made, records=made.records.subset([i]))
+        assert (
+            np.abs(tips(made)[i] - tips_at(alone, offset)[0]).max()
+            < 2e-5
+            < np.abs(tips(made)[i] - tips(still)[i]).max()
+        )
+
+
+def test_a_bent_link_changes_its_length_and_twist_at_once_and_lies_between_two_joints() -> None:
+    event = {
+        "kind": "bend",
+        "day": 0.5,
+        "joint": "arm.q3",
+        "changes": {"arm.mdh.a3": "4 mm", "arm.mdh.alpha3": "2 deg"},
+    }
+    made = mission(days=1, events=[event])
+    moved = moved_by(made, 0.49, 0.5)
+    assert {name: change[0] for name, change in moved.items()} == {"arm.mdh.a3": 0.0, "arm.mdh.alpha3": 0.0}
+    assert moved["arm.mdh.a3"][1] == pytest.approx(0.004)
+    assert moved["arm.mdh.alpha3"][1] == pytest.approx(np.deg2rad(2))
+    assert (made.events[0].joint, made.events[0].beside, made.events[0].until) == ("arm.q3", "arm.q4", 0.5 * DAY_S)
+
+
+def test_an_unreported_payload_bends_the_arm_and_no_record_shows_it() -> None:
+    event = {"kind": "payload", "day": 0.4, "mass_g": 200, "lever_mm": [0, 30, 60], "until": 0.6}
+    made, plain = mission(days=1, events=[event]), mission(days=1)
+    hung = (made.times >= 0.4 * DAY_S) & (made.times < 0.6 * DAY_S)
+    assert hung.any() and np.abs(tips(made) - tips(plain))[~hung].max() < 1e-12
+    assert np.all(made.records.column("payload") == 0) and not made.records.has("payload_x")
+    told = {"payload": 0.2, "payload_x": 0.0, "payload_y": 0.03, "payload_z": 0.06}
+    channels = {name: np.full(len(made.times), value) for name, value in told.items()}
+    loaded = replace(made, records=replace(made.records, channels={**made.records.channels, **channels}))
+    expected = tips_at(loaded, plain.truth.values_at(np.zeros(1))[0])
+    assert np.abs(tips(made) - expected)[hung].max() < 1e-10 < 1e-4 < np.abs(tips(made) - tips(plain))[hung].max()
+    assert [(e.kind, e.time / DAY_S) for e in made.events] == [("payload", 0.4), ("payload", 0.6)]
+    assert np.allclose(made.truth.payload_at(np.array([0.3, 0.5, 0.7]) * DAY_S)[:, 0], [0, 0.2, 0])
+
+
+def test_payloads_at_once_weigh_together_about_their_common_centre() -> None:
+    one = {"kind": "payload", "day": 0.1, "mass_g": 100, "lever_mm": [30, 0, 0]}
+    other = {"kind": "payload", "day": 0.1, "mass_g": 300, "lever_mm": [0, 0, 40]}
+    (hung,) = mission(days=1, events=[one, other]).truth.payload_at(np.array([0.5 * DAY_S]))
+    assert np.allclose(hung, [0.4, 0.0075, 0, 0.03])
+
+
+def test_a_bias_grows_by_so_much_a_day_whatever_the_pose() -> None:
+    event = {"kind": "bias", "day": 1.0, "per_day_mm": [0.5, 0, -0.2], "until": 2.5}
+    made, plain = mission(days=3, events=[event]), mission(days=3)
+    days = np.clip(made.times / DAY_S, 1.0, 2.5) - 1.0
+    assert np.abs(tips(made) - tips(plain) - days[:, None] * [0.0005, 0, -0.0002]).max() < 1e-12
+    assert made.truth.moving == ()
+
+
+def test_days_and_nights_change_on_the_day_of_a_climate() -> None:
+    made = mission(days=3, events=[{"kind": "climate", "day": 1.0, "mean_C": -50, "swing_C": 10}])
+    assert np.allclose(made.truth.temperature_at(np.array([14, 38, 50]) * 3600.0), [40, -40, -60])
+
+
+def test_two_events_of_one_day_come_at_once() -> None:
+    pair = [
+        {"kind": "slip", "day": 0.5, "joint": f"arm.q{i}", "parameter": f"arm.mdh.theta{i}", "angle_deg": 3}
+        for i in (2, 4)
+    ]
+    made = mission(days=1, events=pair)
+    assert [(event.joint, event.time) for event in made.events] == [("arm.q2", 43200.0), ("arm.q4", 43200.0)]
+    assert set(moved_by(made, 0.5)) == {"arm.mdh.theta2", "arm.mdh.theta4"}
+
+
+def test_outliers_are_of_any_size_few_of_them_large() -> None:
+    """Log-uniform from 30 to 500 mm: the median is their geometric mean, 122 mm."""
+    plain = mission(days=40)
+    made = mission(days=40, **{"outliers.fraction": 0.2, "outliers.size_m": 0.03, "outliers.largest_m": 0.5})
+    away = np.linalg.norm(tips(made) - tips(plain), axis=1)[made.outliers]
+    assert made.outliers.mean() == pytest.approx(0.2, abs=0.02)
+    assert away.min() >= 0.0299 and away.max() <= 0.5001
+    assert np.median(away) == pytest.approx(np.sqrt(0.03 * 0.5), rel=0.1)
+
+
+def test_no_record_arrives_in_a_gap() -> None:
+    plain, made = mission(days=3), mission(days=3, **{"losses.gaps": [{"day": 1.0, "duration_h": 30}]})
+    inside = (plain.times >= DAY_S) & (plain.times < DAY_S + 30 * 3600)
+    assert inside.sum() > 50
+    assert made.records.ids == plain.records.subset(np.flatnonzero(~inside)).ids and made.lost == inside.sum()
+
+
+def test_exchanged_records_have_their_neighbours_measurements_and_their_own_joints() -> None:
+    plain, made = mission(days=20), mission(days=20, exchanged={"fraction": 0.1})
+    assert np.array_equal(made.records.column("arm.q1"), plain.records.column("arm.q1"))
+    assert made.exchanged.mean() == pytest.approx(0.1, abs=0.03) and not made.outliers.any()
+    assert np.array_equal(tips(made)[~made.exchanged], tips(plain)[~made.exchanged])
+    for i in np.flatnonzero(made.exchanged):
+        same = [j for j in (i - 1, i + 1) if 0 <= j < len(made.times) and np.array_equal(tips(made)[i], tips(plain)[j])]
+        assert len(same) == 1 and made.exchanged[same[0]]
+
+
+JOINTS = tuple(
+    Joint(f"arm.q{i}", "angle", f"arm.mdh.theta{i}", f"arm.lag.lag{i}", {"a": f"arm.mdh.a{i}"} if i < 6 else {})
+    for i in range(1, 7)
+)
+
+
+def test_a_surprise_is_the_same_for_a_seed_and_what_is_configured_stays() -> None:
+    simulator = experiment().simulator()
+    assert isinstance(simulator, MissionSimulator)
+    plan = simulator.planted(request(), 3)
+    assert plan == simulator.planted(request(), 3)
+    assert plan["losses"]["fraction"] == 0.03 and plan["losses"]["gaps"]
+    assert MissionSettings.model_validate({"truth": "truth.yaml", "days": 30, **plan}).events
+
+
+def test_a_surprise_finds_what_acts_as_a_joints_offset_and_play_and_which_link_it_carries() -> None:
+    built, asked = experiment().simulator(), request()
+    arm, random_ = asked.arms["arm"], np.random.default_rng(0)
+    poses = probing_poses(mission(days=0.7).records, arm, random_)
+    joints = befallen(at_truth(asked, built._settings.truth), poses)
+    for i, joint in enumerate(joints, 1):
+        assert (joint.name, joint.offset, joint.play) == (f"arm.q{i}", f"arm.mdh.theta{i}", f"arm.lag.lag{i}")
+        assert joint.link == ({"a": f"arm.mdh.a{i}", "alpha": f"arm.mdh.alpha{i}"} if i < 6 else {})
+
+
+def test_surprises_reach_every_kind_and_some_come_in_pairs() -> None:
+    plans = [random_plan(JOINTS, 30, True, seed) for seed in range(40)]
+    kinds = {event["kind"] for plan in plans for event in plan["events"]}
+    assert kinds == {"slip", "swap", "bend", "creep", "play", "payload", "bump", "bias", "climate"}
+    assert {key for plan in plans for key in plan} == {"events", "outliers", "losses", "exchanged"}
+    pairs = [len(plan["events"]) - len({event["day"] for event in plan["events"]}) for plan in plans]
+    assert 0 < np.mean(pairs) < 3 and len({str(plan) for plan in plans}) == 40
+    for plan in plans:
+        assert MissionSettings.model_validate({"truth": "truth.yaml", "days": 30, **plan})
+    bare = [replace(joint, offset="", play="", link={}) for joint in JOINTS]
+    of_bare = {event["kind"] for seed in range(20) for event in random_plan(bare, 30, False, seed)["events"]}
+    assert of_bare == {"bump", "bias", "climate"}
+
+
 @pytest.mark.parametrize(
     ("changes", "told"),
     [
@@ -261,6 +433,11 @@ def test_joints_stay_within_their_ranges() -> None:
         ({"creep": {"arm.mdh.theta1": "1 mm in 3 d"}}, "length"),
         ({"events": [{"kind": "slip", "day": 1, "joint": "arm.q9", "parameter": "arm.mdh.theta3", "teeth": 1}]}, "q9"),
         ({"events": [{"kind": "slip", "day": 1, "joint": "arm.q3", "parameter": "arm.mdh.a3", "teeth": 1}]}, "angle"),
+        ({"events": [{"kind": "bend", "day": 1, "joint": "arm.q9", "changes": {"arm.mdh.a3": "1 mm"}}]}, "q9"),
+        ({"events": [{**CREEP, "parameter": "arm.mdh.thetta3"}]}, "thetta3"),
+        ({"events": [{**CREEP, "change": "3 mm in 1 d"}]}, "length"),
+        ({"events": [{**CREEP, "kind": "play"}]}, "no play of a joint"),
+        ({"events": [{**CREEP, "kind": "play", "parameter": "arm.lag.lag3", "change": "-1 deg in 1 d"}]}, "grows"),
         ({"records.ranges_rad": {"q1": [-1, 1]}}, "q2"),
         ({"records.ranges_rad": {"q7": [-1, 1]}}, "q7"),
     ],
@@ -278,7 +455,14 @@ def test_what_does_not_fit_the_arm_is_refused(changes: dict[str, object], told: 
         ({"start": "soon"}, "date"),
         ({"records": {"hours": [18, 8]}}, "end before they begin"),
         ({"events": [{"kind": "slip", "day": 1, "joint": "arm.q3", "parameter": "arm.mdh.theta3"}]}, "teeth"),
-        ({"events": [{"kind": "quake", "day": 1}]}, "quake"),
+        ({"events": [{"kind": "quake", "day": 0}]}, "quake"),
+        ({"events": [{**CREEP, "day": 1}]}, "before the mission ends"),
+        ({"events": [{**CREEP, "day": 0, "change": "walk 1 deg in 1 d"}]}, "along a line"),
+        ({"events": [{**CREEP, "day": 0.5, "until": 0.4}]}, "a later day"),
+        ({"events": [{"kind": "payload", "day": 0, "mass_g": 0}]}, "greater than 0"),
+        ({"events": [{"kind": "bias", "day": 0, "per_day_mm": [0, 0, 0]}]}, "does not grow"),
+        ({"losses": {"gaps": [{"day": 2, "duration_h": 3}]}}, "before the mission ends"),
+        ({"outliers": {"size_mm": 50, "largest_mm": 40}}, "larger largest"),
     ],
 )
 def test_settings_that_make_no_sense_are_refused_in_words(changes: dict[str, object], told: str) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Literal, Protocol, runtime_checkable
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +19,7 @@ from armcal.problem.problem import Problem
 from armcal.problem.readings import disturbed_records
 
 DAY_S = 86400.0
-EventKind = Literal["slip", "swap", "bump"]
+EventKind = Literal["slip", "swap", "bend", "creep", "play", "payload", "bump", "bias", "climate"]
 
 
 @dataclass(frozen=True)
@@ -98,19 +98,26 @@ def with_channels(dataset: Dataset, channels: Mapping[str, Array]) -> Dataset:
 
 @dataclass(frozen=True)
 class MissionEvent:
-    """Something that happened to the arm or the camera.
+    """Something that happened to the arm, its payload, the camera or the weather.
 
     Attributes:
-        kind: ``slip`` (a horn slipped on its shaft), ``swap`` (a servo was replaced), ``bump`` (the camera moved).
+        kind: ``slip`` (a horn slipped on its shaft), ``swap`` (a servo was replaced), ``bend`` (a link is bent),
+            ``creep`` (a joint creeps), ``play`` (a joint's backlash grows), ``payload`` (picked up or set down, which
+            no record reports), ``bump`` (the camera moved), ``bias`` (the camera's readings move away), ``climate``
+            (days and nights change).
         time: s since the mission began.
-        joint: whose, ``arm.q3``; empty for the camera.
+        joint: whose, ``arm.q3``; empty where it is no joint's.
         label: a few words for figures and tables.
+        until: when it no longer changes anything, s since the mission began; ``time`` of one that is over at once.
+        beside: another joint that it may be taken for: the one at the other end of a bent link.
     """
 
     kind: EventKind
     time: float
     joint: str
     label: str
+    until: float
+    beside: str = ""
 
 
 class MissionTruth(Protocol):
@@ -133,6 +140,9 @@ class MissionTruth(Protocol):
     def temperature_at(self, times: Array) -> Array:
         """N, degrees Celsius."""
 
+    def payload_at(self, times: Array) -> Array:
+        """What hangs on the tool without any record of it: mass (kg), centre in the tool frame (m) (N x 4)."""
+
 
 @dataclass(frozen=True)
 class Mission:
@@ -142,6 +152,7 @@ class Mission:
         records: what arrived, in order.
         times: of the records, s since the mission began (N).
         outliers: which measurements were made wrong (N).
+        exchanged: which were delivered with the joints of another record (N).
         truth: at any time.
         events: in order.
         power_cuts: s since the mission began, in order.
@@ -153,6 +164,7 @@ class Mission:
     records: Dataset
     times: Array
     outliers: NDArray[np.bool_]
+    exchanged: NDArray[np.bool_]
     truth: MissionTruth
     events: tuple[MissionEvent, ...]
     power_cuts: tuple[float, ...]
@@ -170,3 +182,6 @@ class MissionSimulator(Protocol):
 
     def mission(self, request: SimulationRequest) -> Mission:
         """Records and truth; the same request gives the same mission."""
+
+    def planted(self, request: SimulationRequest, seed: int) -> Mapping[str, Any]:
+        """Keys of the simulator's settings that plant a random selection of what may happen; the same for a seed."""

@@ -18,7 +18,7 @@ from armcal.plugins import PluginRegistry
 from armcal.run.pipeline import Stopwatch
 
 from armcal_online.commands.recalibrate import setup_of
-from armcal_online.mission.files import figures, write_files
+from armcal_online.mission.files import SURPRISE, figures, write_files
 from armcal_online.mission.mission import (
     BENCH,
     CALIBRATION,
@@ -36,7 +36,7 @@ from armcal_online.tracking.settings import RecalibrateSettings
 
 TRUTH = ("truth.csv", "truth.json")
 FIGURES = ("mission.csv", "mission.json", "mission.png")
-OURS = (BENCH, RECORDS, CALIBRATION, RECALIBRATION, *TRUTH, *FIGURES)
+OURS = (BENCH, RECORDS, CALIBRATION, RECALIBRATION, SURPRISE, *TRUTH, *FIGURES)
 """What a mission leaves; an earlier one's moves to ``earlier/N``."""
 
 _NAMED = {"right": "named right", "wrong": "named wrong", "seen": "seen but not named", "missed": "missed"}
@@ -45,14 +45,23 @@ _NAMED = {"right": "named right", "wrong": "named wrong", "seen": "seen but not 
 @click.command()
 @click.argument("config", type=click.Path(path_type=Path))
 @click.option("--out", required=True, type=click.Path(path_type=Path), help="Where the mission goes.")
+@click.option(
+    "--surprise",
+    "seed",
+    type=click.IntRange(min=0),
+    metavar="SEED",
+    help="Plant a random selection of events and disturbances, drawn from SEED, in place of the configured events.",
+)
 @overrides
 @speaking
-def mission(console: Console, config: Path, out: Path, overrides: tuple[str, ...]) -> None:
+def mission(console: Console, config: Path, out: Path, seed: int | None, overrides: tuple[str, ...]) -> None:
     """Simulate the mission of CONFIG, recalibrate over all of it, and judge that against the truth."""
     watch = Stopwatch()
     kept = click.get_current_context().with_resource(reserved(out, OURS))
     registry = console.registry()
     plan = MissionPlan.load(config, overrides, registry)
+    if seed is not None:
+        plan = plan.surprised(seed, overrides)
     kept.place({})
     with console.progress() as progress:
         result = run_mission(plan, out, loop_session(registry), registry, progress, watch)

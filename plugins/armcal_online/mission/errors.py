@@ -14,7 +14,7 @@ from armcal.base.parameters import Parameters
 from armcal.base.se3 import Expression
 from armcal.config.system import System
 from armcal.errors import ConfigError
-from armcal.estimate.simulation import Mission
+from armcal.estimate.simulation import Mission, with_channels
 from armcal.functions.batch_function import EvaluatorChoice
 from armcal.measure.contact import Contact
 from armcal.measure.measurement import Measurement
@@ -25,6 +25,7 @@ from armcal_online.mission.judge import ErrorCurve, MissionLog
 from armcal_online.mission.settings import MissionRunSettings
 
 _HOUR_S = 3600.0
+_PAYLOAD = ("payload", "payload_x", "payload_y", "payload_z")
 
 
 def error_curve(
@@ -60,11 +61,14 @@ def error_curve(
     tips = Tips.of(system, instrument, parameters, changing, poses, evaluator)
     recalibrated, start = tips.again(poses), tips.again(poses).at(frozen)
     cameras, numbers = mission.truth.camera_T_base_at(times), log.estimate_numbers(times)
+    hung = mission.truth.payload_at(times)
+    loads, load_of = np.unique(hung, axis=0, return_inverse=True)
+    really = [tips.again(with_payload(poses, load)) for load in loads]
     errors, now = np.zeros((2, len(times))), start
     for i in range(len(times)):
         if i == 0 or numbers[i] != numbers[i - 1]:
             now = recalibrated.at(estimated[numbers[i]])
-        truth = tips.at(true[i]) @ cameras[i, :3, :3].T + cameras[i, :3, 3]
+        truth = really[load_of[i]].at(true[i]) @ cameras[i, :3, :3].T + cameras[i, :3, 3]
         errors[:, i] = [float(np.linalg.norm(tip - truth, axis=1).mean()) for tip in (start, now)]
     is_record, is_hour = np.isin(times, mission.times), np.isin(times, hours)
     return ErrorCurve(times, is_hour, is_record, errors[0], errors[1], log.levels_at(times))
@@ -135,4 +139,10 @@ def random_poses(records: Dataset, joints: Sequence[str], arm: str, count: int, 
         angles = records.column(f"{arm}.{joint}")
         channels[f"{arm}.{joint}"] = random.uniform(angles.min(), angles.max(), count)
         channels[f"{arm}.approach.{joint}"] = random.choice([-1.0, 1.0], count)
-    return Dataset(tuple(map(str, range(count))), channels, source="random poses")
+    return with_payload(Dataset(tuple(map(str, range(count))), channels, source="random poses"), np.zeros(4))
+
+
+def with_payload(poses: Dataset, payload: Array) -> Dataset:
+    """The poses with a payload: its mass (kg) and its centre in the tool frame (m)."""
+    channels = {name: np.full(len(poses), payload[i]) for i, name in enumerate(_PAYLOAD)}
+    return with_channels(poses, channels)

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import yaml
 from armcal.base.config_text import as_json
 from armcal.base.domains import Array
 from armcal.base.parameters import Parameters
@@ -24,6 +25,7 @@ from armcal_online.mission.judge import Decision, ErrorCurve, Judgement, Mission
 from armcal_online.mission.mission import MissionResult
 from armcal_online.mission.settings import MissionPlan
 
+SURPRISE = "surprise.yaml"
 _MM = 1000.0
 _SHOWN = {"m": "mm", "rad": "deg"}
 
@@ -41,6 +43,8 @@ def write_files(folder: Path, plan: MissionPlan, result: MissionResult, content:
         "mission.csv": curve_text(curve, truth.temperature_at(curve.times)),
         "mission.json": as_json(content) + "\n",
     }
+    if plan.planted:
+        texts[SURPRISE] = surprise_text(plan)
     files = {name: text.encode() for name, text in texts.items()}
     files["mission.png"] = mission_figure(result.mission, result.judgement, name)
     try:
@@ -50,6 +54,14 @@ def write_files(folder: Path, plan: MissionPlan, result: MissionResult, content:
     except OSError as fault:
         text = f"it cannot be written ({fault.strerror or fault})."
         raise InputError(text, where=Location(str(folder)), hint="Check the room on the disk.") from fault
+
+
+def surprise_text(plan: MissionPlan) -> str:
+    """A configuration that plants the same again, beside the one that it extends."""
+    name = plan.experiment.source.path.name
+    above = f"# What was planted. Beside {name} this file repeats the mission, whatever later versions would draw.\n"
+    content = {"extends": name, "simulation": dict(plan.planted)}
+    return above + yaml.safe_dump(content, default_flow_style=None, sort_keys=False, width=100)
 
 
 def truth_text(mission: Mission, parameters: Parameters) -> str:
@@ -66,9 +78,11 @@ def truth_text(mission: Mission, parameters: Parameters) -> str:
         columns[name if unit == "1" else f"{name}_{unit}"] = to_unit(values[:, entry], unit)
     cameras = mission.truth.camera_T_base_at(mission.times)
     columns |= {f"camera_{axis}_mm": cameras[:, i, 3] * _MM for i, axis in enumerate("xyz")}
-    outlier = ["yes" if wrong else "no" for wrong in mission.outliers]
-    rows = zip(mission.records.ids, *(v.tolist() for v in columns.values()), outlier, strict=True)
-    return _csv(["pose_id", *columns, "outlier"], rows)
+    hung = mission.truth.payload_at(mission.times)
+    columns |= {"payload_g": hung[:, 0] * _MM} | {f"payload_{a}_mm": hung[:, i] * _MM for i, a in enumerate("xyz", 1)}
+    flags = [["yes" if flag else "no" for flag in flags] for flags in (mission.outliers, mission.exchanged)]
+    rows = zip(mission.records.ids, *(v.tolist() for v in columns.values()), *flags, strict=True)
+    return _csv(["pose_id", *columns, "outlier", "exchanged"], rows)
 
 
 def schedule(mission: Mission) -> dict[str, Any]:
@@ -77,11 +91,19 @@ def schedule(mission: Mission) -> dict[str, Any]:
         "days": mission.seconds / DAY_S,
         "began": mission.began,
         "events": [
-            {"day": e.time / DAY_S, "kind": e.kind, "joint": e.joint or None, "label": e.label} for e in mission.events
+            {
+                "day": e.time / DAY_S,
+                "until_day": e.until / DAY_S,
+                "kind": e.kind,
+                "joint": e.joint or None,
+                "label": e.label,
+            }
+            for e in mission.events
         ],
         "power_cuts": [time / DAY_S for time in mission.power_cuts],
         "lost": mission.lost,
         "outliers": [text for text, wrong in zip(mission.records.ids, mission.outliers, strict=True) if wrong],
+        "exchanged": [text for text, other in zip(mission.records.ids, mission.exchanged, strict=True) if other],
     }
 
 

@@ -22,6 +22,10 @@ EXPECTED = {
     "slip": ("joint_slipped", "joint_replaced"),
     "swap": ("joint_slipped", "joint_replaced"),
     "bump": ("sensor_moved",),
+    "bias": ("sensor_moved",),
+    "bend": ("joint_slipped", "joint_replaced"),
+    "creep": ("joint_slipped", "joint_replaced"),
+    "play": ("joint_slipped", "joint_replaced"),
 }
 """The decisions that name an event right."""
 _WINDOW_S = 2 * DAY_S
@@ -171,7 +175,8 @@ def judge(mission: Mission, log: MissionLog, curve: ErrorCurve, limit: float, re
         limit: of the mean tip error for use, m.
         recovered: the error is back within so many times what it was before an event.
     """
-    ends = [*(event.time for event in mission.events), mission.seconds][1:]
+    times = [*sorted({event.time for event in mission.events}), mission.seconds]
+    ends = [times[times.index(event.time) + 1] for event in mission.events]
     events = list(zip(mission.events, ends, strict=True))
     reports = [_event_report(event, end, log, curve, recovered) for event, end in events]
     windows = [(event.time, min(event.time + _WINDOW_S, end)) for event, end in events]
@@ -206,7 +211,7 @@ def _event_report(event: MissionEvent, end: float, log: MissionLog, curve: Error
     decision = next((alarm for alarm in alarms if alarm.kind in NAMING), alarms[0] if alarms else None)
     named = "missed" if decision is None else "seen"
     if decision is not None and decision.kind in NAMING:
-        right = decision.kind in EXPECTED[event.kind] and decision.joint == event.joint
+        right = decision.kind in EXPECTED.get(event.kind, ()) and decision.joint == event.joint
         named = "right" if right else "wrong"
     return EventReport(
         event=event,

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
+import yaml
 from armcal.base.settings import InputPath, Length, Settings
 from armcal.config.validate import validate
 from armcal.config.yaml_source import load_config
@@ -56,12 +57,26 @@ class MissionPlan:
         simulator: knows the truth.
         settings: of the run.
         recalibrate: settings of the recalibration.
+        planted: keys of the simulation that were drawn at random; empty where all is as configured.
     """
 
     experiment: Experiment
     simulator: MissionSimulator
     settings: MissionRunSettings
     recalibrate: RecalibrateSettings
+    planted: Mapping[str, Any] = field(default_factory=dict)
+
+    def surprised(self, seed: int, overrides: Sequence[str] = ()) -> MissionPlan:
+        """The same mission with what its simulator draws from a seed; ``overrides`` as it was loaded with.
+
+        Raises:
+            ConfigError: what is drawn does not fit the configuration.
+        """
+        drawn = self.simulator.planted(self.experiment.simulation_request, seed)
+        texts = [f"simulation.{key}={_one_line(value)}" for key, value in drawn.items()]
+        source = self.experiment.source
+        loaded = MissionPlan.load(source.path, (*overrides, *texts), self.experiment.registry)
+        return replace(loaded, planted=drawn)
 
     @classmethod
     def load(cls, path: Path, overrides: Sequence[str] = (), registry: PluginRegistry | None = None) -> MissionPlan:
@@ -84,3 +99,7 @@ class MissionPlan:
                 hint="Write simulation: {type: mission, ...}.",
             )
         return cls(experiment, simulator, settings, recalibrate)
+
+
+def _one_line(value: Any) -> str:
+    return yaml.safe_dump(value, default_flow_style=True, sort_keys=False, width=1 << 20).strip()

@@ -1,0 +1,220 @@
+"""What may happen in a simulated mission: to a joint, a link, the payload, the camera, the weather."""
+
+from __future__ import annotations
+
+import math
+import re
+from typing import Annotated, Literal
+
+import numpy as np
+from armcal.base.settings import Angle, Angle3, Length3, Mass, Settings, Temperature
+from pydantic import Field, field_validator, model_validator
+
+_CREEP = re.compile(r"\s*(?P<walk>walk\s+)?(?P<amount>\S.*?)\s+in\s+(?P<over>[0-9.]+)\s*(?P<unit>d|h|min|s)\s*")
+_SECONDS = {"d": 86400.0, "h": 3600.0, "min": 60.0, "s": 1.0}
+
+Day = Annotated[float, Field(ge=0)]
+
+
+def parsed_creep(text: str) -> tuple[str, float, bool]:
+    """The amount as written, over how many s, and whether it walks at random.
+
+    Raises:
+        ValueError: it is not written so.
+    """
+    match = _CREEP.fullmatch(text)
+    if match is None or not float(match["over"]) > 0:
+        raise ValueError(f"found {text!r}, expected an amount and a time, such as 0.05 deg in 30 d")
+    return match["amount"], float(match["over"]) * _SECONDS[match["unit"]], match["walk"] is not None
+
+
+class EventSettings(Settings):
+    """What all events have: the ``day`` on which they begin, counted from the mission's midnight."""
+
+    day: Day
+
+    @property
+    def label(self) -> str:
+        """A few words for figures and tables."""
+        raise NotImplementedError
+
+
+class LastingSettings(EventSettings):
+    """An event that lasts ``until`` a day, or as long as the mission."""
+
+    until: Day | None = None
+
+    @model_validator(mode="after")
+    def _ends_later(self) -> LastingSettings:
+        if self.until is not None and self.until <= self.day:
+            raise ValueError(f"found until: {self.until:g} of an event on day {self.day:g}: write a later day")
+        return self
+
+
+class SlipSettings(EventSettings):
+    """A horn slips on its shaft: a joint's offset ``parameter`` jumps by whole ``teeth`` or by an ``angle``."""
+
+    kind: Literal["slip"]
+    joint: str
+    parameter: str
+    teeth: int | None = None
+    of_teeth: Annotated[int, Field(ge=1)] = 25
+    angle: Angle | None = None
+
+    @model_validator(mode="after")
+    def _one(self) -> SlipSettings:
+        if (self.teeth is None) == (self.angle is None):
+            raise ValueError("found both or neither of teeth and angle, expected one of them: write teeth: 1")
+        return self
+
+    @property
+    def turned(self) -> float:
+        """By how much it slips (rad)."""
+        return self.angle if self.angle is not None else 2 * math.pi * (self.teeth or 0) / self.of_teeth
+
+    @property
+    def label(self) -> str:
+        """By how many degrees."""
+        return f"{self.joint} slips by {math.degrees(self.turned):.1f} deg"
+
+
+class SwapSettings(EventSettings):
+    """A servo is replaced: what changes by how much, with units (``{arm.mdh.theta3: 2 deg}``)."""
+
+    kind: Literal["swap"]
+    joint: str
+    changes: Annotated[dict[str, str | float], Field(min_length=1)]
+
+    @property
+    def label(self) -> str:
+        """Of which joint."""
+        return f"servo of {self.joint} replaced"
+
+
+class BendSettings(EventSettings):
+    """The link behind a joint is bent: its lengths and angles jump (``{arm.mdh.a3: 3 mm, arm.mdh.alpha3: 1 deg}``).
+
+    ``joint`` carries the link; the next joint is carried by it.
+    """
+
+    kind: Literal["bend"]
+    joint: str
+    changes: Annotated[dict[str, str | float], Field(min_length=1)]
+
+    @property
+    def label(self) -> str:
+        """By how much."""
+        return f"link behind {self.joint} bent ({', '.join(str(change) for change in self.changes.values())})"
+
+
+class JointCreepSettings(LastingSettings):
+    """A ``parameter`` of a joint that changes along a line from the event's day on: ``change: 0.5 deg in 10 d``."""
+
+    joint: str
+    parameter: str
+    change: str
+
+    @field_validator("change")
+    @classmethod
+    def _readable(cls, value: str) -> str:
+        if parsed_creep(value)[2]:
+            raise ValueError(f"found {value!r}, expected a change along a line, such as 0.5 deg in 10 d")
+        return value
+
+
+class CreepSettings(JointCreepSettings):
+    """A joint begins to creep, or creeps faster than ``creep`` has it."""
+
+    kind: Literal["creep"]
+
+    @property
+    def label(self) -> str:
+        """How fast."""
+        return f"{self.joint} creeps by {self.change}"
+
+
+class PlaySettings(JointCreepSettings):
+    """The play of a joint grows: ``parameter`` is its half-width in an effect of backlash (``arm.lag.lag3``)."""
+
+    kind: Literal["play"]
+
+    @property
+    def label(self) -> str:
+        """How fast."""
+        return f"play of {self.joint} grows by {self.change}"
+
+
+class PayloadSettings(LastingSettings):
+    """The tool picks up a ``mass`` that no record reports, and sets it down on the day ``until``.
+
+    ``lever`` is its centre in the tool frame.
+    """
+
+    kind: Literal["payload"]
+    mass: Annotated[Mass, Field(gt=0)]
+    lever: Length3 = (0.0, 0.0, 0.0)
+
+    @property
+    def label(self) -> str:
+        """How heavy, and how far out."""
+        return f"unreported payload of {1000 * self.mass:.0f} g at {1000 * float(np.linalg.norm(self.lever)):.0f} mm"
+
+
+class BumpSettings(EventSettings):
+    """The camera moves: what is measured is turned about the base's origin (a rotation vector), then shifted."""
+
+    kind: Literal["bump"]
+    shift: Length3 = (0.0, 0.0, 0.0)
+    turn: Angle3 = (0.0, 0.0, 0.0)
+
+    @property
+    def label(self) -> str:
+        """How far."""
+        shift, turn = (float(np.linalg.norm(vector)) for vector in (self.shift, self.turn))
+        return f"camera bumped by {1000 * shift:.1f} mm, {math.degrees(turn):.1f} deg"
+
+
+class BiasSettings(LastingSettings):
+    """What the camera measures is off by more each day: ``per_day`` along the axes of the base frame."""
+
+    kind: Literal["bias"]
+    per_day: Length3
+
+    @field_validator("per_day")
+    @classmethod
+    def _moves(cls, value: tuple[float, float, float]) -> tuple[float, float, float]:
+        if not any(value):
+            raise ValueError("found a bias that does not grow: write for example per_day_mm: [0.3, 0, 0]")
+        return value
+
+    @property
+    def label(self) -> str:
+        """How fast."""
+        return f"camera's bias grows by {1000 * float(np.linalg.norm(self.per_day)):.2f} mm a day"
+
+
+class ClimateSettings(EventSettings):
+    """Days and nights change: from now on the temperature swings by ``swing`` about ``mean``."""
+
+    kind: Literal["climate"]
+    mean: Temperature
+    swing: Temperature
+
+    @property
+    def label(self) -> str:
+        """To what."""
+        return f"temperature now {self.mean - self.swing:.0f} to {self.mean + self.swing:.0f} C"
+
+
+Event = Annotated[
+    SlipSettings
+    | SwapSettings
+    | BendSettings
+    | CreepSettings
+    | PlaySettings
+    | PayloadSettings
+    | BumpSettings
+    | BiasSettings
+    | ClimateSettings,
+    Field(discriminator="kind"),
+]
